@@ -9,8 +9,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from evofsm.driving.by_state import RiskByState, assess_states
-from evofsm.driving.judge import LatentRisk
+from evofsm.driving.judge import LatentRisk, RiskByState, assess_states
 from evofsm.driving.leaders import REAL_DRIVES
 from evofsm.driving.measures import is_dead_end
 from evofsm.driving.rehearsal import HARDEST, critical_decelerations

@@ -1,7 +1,5 @@
 from . import measures as measures
 from .attached import attach as attach
-from .by_state import RiskByState as RiskByState
-from .by_state import assess_states as assess_states
 from .cars import SAFETY_RULE as SAFETY_RULE
 from .cars import guard_for_cars as guard_for_cars
 from .cars import guard_for_family as guard_for_family
@@ -26,6 +24,8 @@ from .family import Numbers as Numbers
 from .family import held_out as held_out
 from .family import training as training
 from .judge import LatentRisk as LatentRisk
+from .judge import RiskByState as RiskByState
+from .judge import assess_states as assess_states
 from .leaders import REAL_DRIVES as REAL_DRIVES
 from .leaders import BrakeWatch as BrakeWatch
 from .leaders import LeaderBrakes as LeaderBrakes

@@ -1,7 +1,17 @@
-"""Attach guards to a running SUMO simulation, or only watch: which cars, and what came of it."""
+"""Attach guards to a running SUMO simulation, or only watch: which cars, and what came of it.
+
+SUMO goes on driving them. A guard says how hard a car may accelerate in the next step, at most;
+where that is less than its own driver might want, the speed is set, and SUMO still minds all else:
+red lights, right of way, stops. What a driver wanted shows in what SUMO does; only where it is held
+back, its car-following model is asked.
+
+SUMO's ``getLeader`` and ``getFollower`` take off minGap of whoever follows; where it counts a
+collision before the bumpers touch (``--collision.mingap-factor``), the gap ends there.
+"""
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 import time as clock
@@ -9,14 +19,20 @@ import warnings
 import weakref
 import zlib
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from evofsm.driving.guarding import GuardedStep, Guarding, Seeing
+from evofsm.driving.judge import LatentRisk
+from evofsm.driving.leaders import BrakeWatch, Manoeuvres
 from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
-from evofsm.guard import TOLERANCE, Guard
+from evofsm.driving.naming import VARIABLES
+from evofsm.driving.scenarios import steps_between
+from evofsm.driving.traffic import COLUMNS, LEADER_DECEL, Role, TrafficRisk, guard_for_traffic
+from evofsm.guard import TOLERANCE, ActionJudge, ActionReviser, Guard, Mode, Revision
 
 # What is done with the chosen cars.
 _MODES = ("act", "shadow", "watch")
@@ -31,6 +47,371 @@ _NUMBERS = itertools.count()
 _ATTACHED: weakref.WeakSet[Attachment] = weakref.WeakSet()
 # Two that touched within this time before still do [s].
 _SAME_COLLISION = 5.0
+# How far one looks at least [m]; further by what it takes to stop.
+_NEAR, _GENTLE = 30.0, 3.0
+_WIDTH = 1.8
+# A speed that is lower by no more is what the driver wanted [m/s].
+_SAME = 1e-6
+# SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
+# and 1), but braking as hard as it has to (bit 2). Red lights and right of way stay as they were.
+_ON, _OFF = 0b011, 0b100
+
+
+# -- What SUMO says of the cars around one --------------------------------------------------------
+
+
+class Neighbour(NamedTuple):
+    """Another car in one's lane."""
+
+    id: str
+    gap: float  #: from bumper to bumper [m]
+    room: float  #: what is left of it until SUMO counts a collision, in its step [m]
+    speed: float  #: [m/s]
+
+
+class _Facts(NamedTuple):
+    """What does not change about a car."""
+
+    length: float  #: [m]
+    min_gap: float  #: [m]
+    decel: float  #: [m/s²]
+
+
+class Seeing:
+    """Reads the cars around one of them, by libsumo or traci."""
+
+    def __init__(self, sumo: Any) -> None:
+        self._vehicle, self._simulation = sumo.vehicle, sumo.simulation
+        self._bodies: dict[str, _Facts] = {}
+        self.look_up()
+
+    def look_up(self) -> None:
+        """Look up what holds in this simulation; no car of another one is known."""
+        simulation = self._simulation
+        factor = float(simulation.getOption("collision.mingap-factor"))
+        # Share of minGap that SUMO wants kept; below 0 each model has its own, at most all of it.
+        self._factor = factor if factor >= 0.0 else 1.0
+        #: Time of a step [s].
+        self.dt = float(simulation.getDeltaT())
+        ballistic = str(simulation.getOption("step-method.ballistic")).lower() in ("true", "1")
+        # In SUMO's Euler step a car drives all of it at the speed of its end. Against what is
+        # rehearsed, a slower follower is nearer by half a step's worth of the difference; and
+        # whoever brakes to a standstill within a step gets further by up to an eighth of its
+        # braking over the square of the step. What the Euler step adds to the gap is not counted:
+        # with an actionStepLength in any type SUMO steps ballistically, and no option says so.
+        self._euler = 0.0 if ballistic else self.dt
+        self._bodies.clear()
+
+    def forget(self, car: str) -> None:
+        """It has left."""
+        self._bodies.pop(car, None)
+
+    def body(self, car: str) -> _Facts:
+        """Of a car; that its type changes is not noticed."""
+        body = self._bodies.get(car)
+        if body is None:
+            vehicle = self._vehicle
+            facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car)
+            body = self._bodies[car] = _Facts(*facts)
+        return body
+
+    def pair(self, car: str) -> tuple[float, float, float] | None:
+        """Gap from bumper to bumper [m], its speed and that of whoever is ahead [m/s]."""
+        speed = self._vehicle.getSpeed(car)
+        found = self.ahead(car, speed)
+        return None if found is None else (found.gap, speed, found.speed)
+
+    def ahead(self, car: str, speed: float) -> Neighbour | None:
+        """Whoever is ahead on its route, if near enough to matter."""
+        found = self._vehicle.getLeader(car, _far(speed))
+        if not found or not found[0]:
+            return None
+        leader, gap = found
+        its, body = self._vehicle.getSpeed(leader), self.body(car)
+        return Neighbour(leader, gap + body.min_gap, self._room(gap, body, speed - its), its)
+
+    def behind(self, car: str, speed: float) -> Neighbour | None:
+        """Whoever is behind."""
+        follower, gap = self._vehicle.getFollower(car, _far(speed))
+        if not follower:
+            return None
+        its, body = self._vehicle.getSpeed(follower), self.body(follower)
+        return Neighbour(follower, gap + body.min_gap, self._room(gap, body, its - speed), its)
+
+    def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
+        """The speed that a car's own model wants after the next step [m/s].
+
+        By whoever is ahead, the limit and what the car can do. Red lights and right of way may make
+        it lower, dawdling too.
+        """
+        vehicle = self._vehicle
+        fastest = min(vehicle.getAllowedSpeed(car), speed + vehicle.getAccel(car) * self.dt)
+        if ahead is None:
+            return float(fastest)
+        gap = ahead.gap - self.body(car).min_gap  # as SUMO's models take it
+        decel = vehicle.getApparentDecel(ahead.id)
+        wanted = vehicle.getFollowSpeed(car, speed, gap, ahead.speed, decel, ahead.id)
+        slowest = speed - vehicle.getEmergencyDecel(car) * self.dt
+        return float(max(min(wanted, fastest), slowest, 0.0))
+
+    def _room(self, gap: float, follower: _Facts, closing: float) -> float:
+        euler = self._euler
+        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * min(0.0, closing)
+        return gap + (1.0 - self._factor) * follower.min_gap - late
+
+    def rows(
+        self, car: str, speed: float, ahead: Neighbour | None, behind: Neighbour | None
+    ) -> NDArray[np.float64]:
+        """The scene as `Scene.rows` has it, x counted from the front bumper of the car."""
+        rows = np.zeros((3, len(COLUMNS)))  # oneself, ahead and behind
+        length = self.body(car).length
+        rows[0] = 1.0, -0.5 * length, 0.0, speed, 0.0, length, _WIDTH
+        for row, one, from_, way in ((rows[1], ahead, 0.0, 1.0), (rows[2], behind, -length, -1.0)):
+            if one is not None:
+                its = self.body(one.id).length
+                row[:] = 1.0, from_ + way * (one.room + 0.5 * its), 0.0, one.speed, 0.0, its, _WIDTH
+        return rows.ravel()
+
+
+def _far(speed: float) -> float:
+    return _NEAR + speed + 0.5 * speed * speed / _GENTLE
+
+
+# -- Guarding ---------------------------------------------------------------------------------
+
+
+class GuardedStep(NamedTuple):
+    """What a guard said of a car for one step, and what came of it."""
+
+    time: float  #: at which it was decided [s]
+    car: str
+    wish: float  #: acceleration that the car's own driver wanted [m/s²]
+    deed: float  #: acceleration that it had [m/s²]
+    revision: Revision
+    other: str  #: the car that the risk is of; empty where there is none
+    role: Role | None  #: where that one is
+
+
+@dataclass(eq=False)
+class _Car:
+    id: str
+    guard: Guard
+    high: float  # the hardest acceleration
+    mode: int | None = None  # SUMO's speed mode before it was taken over
+    leader: str = ""
+    speed: float = 0.0
+    limit: float = 0.0  # the speed that was set
+    wish: float = 0.0  # the speed that its model wants instead
+    time: float = 0.0
+    seen: NDArray[np.float64] | None = None  # what is decided on
+    around: tuple[Neighbour | None, Neighbour | None] = (None, None)
+    revision: Revision | None = None
+    about: tuple[str, Role | None] = ("", None)
+
+
+class Guarding:
+    """Guards each car, by a guard of its own; what leaders do all of them share."""
+
+    def __init__(
+        self,
+        sumo: Any,
+        seeing: Seeing,
+        guard: Guard | None,
+        acts: bool,
+        tolerance: float,
+        learn: bool,
+        report: Callable[[GuardedStep], None] | None,
+    ) -> None:
+        self._vehicle, self._seeing, self._acts, self._report = sumo.vehicle, seeing, acts, report
+        self._template, self._tolerance, self._learn = guard, tolerance, learn
+        self._judges: dict[tuple[float, float, float], TrafficRisk] = {}
+        self.cars: dict[str, _Car] = {}  #: by id
+        self._watches: dict[str, BrakeWatch] = {}
+        self.leaders = _leaders_of(guard)  #: how hard they were seen to brake
+        if guard is not None:
+            self._tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
+        self.begin_anew()
+        self.decisions = 0
+        #: Steps in which a car drove slower than its driver wanted; in shadow, would have.
+        self.revised = 0
+
+    def begin_anew(self) -> None:
+        """Another simulation, or another moment of it, begins."""
+        own = None if self._template is None else self._template.interval
+        self.interval = self._seeing.dt if own is None else own
+        self._every = steps_between(self.interval, self._seeing.dt)
+        self._steps = 0
+        self._watches.clear()
+        self._judges.clear()
+
+    def add(self, car: str) -> None:
+        """Guard it from now on."""
+        high = self._vehicle.getAccel(car)
+        guard = self._guard_for(car, high)
+        # What a guard cannot allow either way it does not forbid.
+        self.cars[car] = _Car(car, guard, min(high, guard.actions.high))
+
+    def remove(self, car: str) -> None:
+        """Guard it no longer: it is handed back."""
+        self._hand_back(self.cars.pop(car))
+
+    def step(self, time: float) -> None:
+        """Say what came of the step that is over, and decide on the next."""
+        decides = self._steps % self._every == 0
+        self._steps += 1
+        seen_leaders: dict[str, float] = {}
+        for one in self.cars.values():
+            speed = self._vehicle.getSpeed(one.id)
+            if one.seen is not None:
+                self._look_back(one, speed)
+            if decides:
+                self._look(one, speed, time)
+                if one.around[0] is not None:
+                    seen_leaders[one.around[0].id] = one.around[0].speed
+                if one.seen is not None and self._acts:
+                    self._decide(one, one.high)
+            one.speed, one.time = speed, time
+            if self._acts:
+                self._act(one, speed)
+        if decides and self._learn:
+            self._watch(seen_leaders)
+
+    # -- A step ---------------------------------------------------------------------------------
+
+    def _look(self, one: _Car, speed: float, time: float) -> None:
+        """See what is around; without anybody, a guard of one leader has nothing to decide on."""
+        ahead = self._seeing.ahead(one.id, speed)
+        scene = isinstance(one.guard.reviser.risk, TrafficRisk)  # type: ignore[attr-defined]
+        # Who is behind matters only where one brakes: if acting, because somebody is ahead.
+        alone = ahead is None and self._acts
+        behind = self._seeing.behind(one.id, speed) if scene and not alone else None
+        one.around = ahead, behind
+        leader = "" if ahead is None else ahead.id
+        if leader != one.leader:  # what is known of the one before does not hold of this one
+            one.leader = leader
+            one.guard.begin()
+        one.revision = None
+        if ahead is None and behind is None:
+            one.seen = None
+        elif scene:
+            one.seen = self._seeing.rows(one.id, speed, ahead, behind)
+        else:
+            assert ahead is not None
+            one.seen = np.array([ahead.room, speed, ahead.speed])
+
+    def _decide(self, one: _Car, proposal: float) -> None:
+        assert one.seen is not None
+        one.revision = one.guard.decide(one.seen, proposal)
+        self.decisions += 1
+        judge = one.guard.reviser.risk  # type: ignore[attr-defined]
+        if isinstance(judge, TrafficRisk) and judge.worst is not None:
+            other = one.around[judge.worst.number - 1]
+            one.about = ("" if other is None else other.id, judge.worst.role)
+        else:
+            one.about = one.leader, Role.AHEAD if one.leader else None
+
+    def _act(self, one: _Car, speed: float) -> None:
+        """Set the speed, where the guard allows less than the car might want."""
+        revision = one.revision
+        if revision is None or revision.executed >= one.high:
+            self._hand_back(one)
+            return
+        if one.mode is None:
+            one.mode = self._vehicle.getSpeedMode(one.id)
+            self._vehicle.setSpeedMode(one.id, one.mode & ~_OFF | _ON)
+        reached = max(0.0, speed + float(revision.executed) * self._seeing.dt)
+        # Nor faster than it would drive on a free road.
+        one.limit = min(reached, self._vehicle.getAllowedSpeed(one.id))
+        one.wish = self._seeing.wish(one.id, speed, one.around[0])
+        self._vehicle.setSpeed(one.id, one.limit)
+
+    def _hand_back(self, one: _Car) -> None:
+        if one.mode is not None:
+            self._vehicle.setSpeed(one.id, -1.0)
+            self._vehicle.setSpeedMode(one.id, one.mode)
+            one.mode = None
+
+    def _look_back(self, one: _Car, speed: float) -> None:
+        """What the driver wanted, now that it shows; in shadow it is what is judged."""
+        wanted = speed
+        # Slower than the limit is what SUMO itself wanted, such as to stop at a red light.
+        if one.mode is not None and speed >= one.limit - _SAME:
+            wanted = max(one.wish, speed)
+        wish, deed = ((each - one.speed) / self._seeing.dt for each in (wanted, speed))
+        if not self._acts and one.revision is None:
+            self._decide(one, wish)
+        revision = one.revision
+        assert revision is not None
+        if self._acts:
+            self.revised += speed < wanted - _SAME
+        else:
+            self.revised += bool(revision.advised < wish - _SAME)
+        if self._report is not None:
+            self._report(GuardedStep(one.time, one.id, wish, deed, revision, *one.about))
+
+    def _watch(self, speeds: dict[str, float]) -> None:
+        """Learn how hard leaders brake, each by itself, whoever follows it."""
+        ended = []
+        for leader, speed in speeds.items():
+            if leader not in self._watches:
+                self._watches[leader] = BrakeWatch(self.interval)
+            ended.append(self._watches[leader].see(0.0, speed, speed))
+        for leader in sorted(self._watches.keys() - speeds.keys()):
+            ended.append(self._watches.pop(leader).end())
+        self.leaders.remember(*ended)
+
+    # -- Guards ---------------------------------------------------------------------------------
+
+    def _guard_for(self, car: str, high: float) -> Guard:
+        mode = Mode.ACT if self._acts else Mode.SHADOW
+        if self._template is None:
+            decel = self._vehicle.getDecel(car)
+            limits = -max(self._vehicle.getEmergencyDecel(car), decel), high, decel
+            how: dict[str, Any] = {"tolerance": self._tolerance, "mode": mode}
+            return guard_for_traffic(*limits, self.interval, judge=self._judge_for(*limits), **how)
+        guard = self._template.copy()
+        guard.freeze()
+        reviser = guard.reviser
+        assert isinstance(reviser, ActionReviser)
+        reviser.mode = mode
+        latent = _latent(reviser.risk)
+        if isinstance(latent, LatentRisk):
+            latent.manoeuvres = self.leaders
+        return guard
+
+    def _judge_for(self, low: float, high: float, decel: float) -> TrafficRisk:
+        """One for all cars that can do the same: it remembers nothing of any."""
+        judge = self._judges.get((low, high, decel))
+        if judge is None:
+            ahead = LatentRisk.given(-decel, decel, LEADER_DECEL, self.interval)
+            ahead.manoeuvres = self.leaders
+            judge = TrafficRisk(ahead, low, high)
+            self._judges[low, high, decel] = judge
+        return judge
+
+
+def _latent(judge: ActionJudge) -> ActionJudge:
+    """Who judges a pair, in which it is a `LatentRisk` that learns how hard leaders brake."""
+    return judge.ahead if isinstance(judge, TrafficRisk) else judge
+
+
+def _leaders_of(guard: Guard | None) -> Manoeuvres:
+    """What a guard knows of leaders; what is assumed without one."""
+    if guard is None:
+        return Manoeuvres(LEADER_DECEL)
+    if not isinstance(guard.reviser, ActionReviser):
+        raise TypeError(f"the guard has a {type(guard.reviser).__name__}; it needs a judge")
+    judge = _latent(guard.reviser.risk)
+    if judge.labels.names != VARIABLES:
+        raise ValueError(
+            f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must be a "
+            f"TrafficRisk, or observe {', '.join(VARIABLES)}"
+        )
+    known = judge.manoeuvres if isinstance(judge, LatentRisk) else Manoeuvres(LEADER_DECEL)
+    return copy.deepcopy(known)
+
+
+# -- Which cars, and what came of them ------------------------------------------------------------
 
 
 def choose(vehicles: str | float | Iterable[str], seed: int = 0) -> Callable[[Any, str], bool]:
@@ -44,24 +425,20 @@ def choose(vehicles: str | float | Iterable[str], seed: int = 0) -> Callable[[An
         kind = vehicles.removeprefix(_TYPE)
         return lambda sumo, car: sumo.vehicle.getTypeID(car) == kind
     if isinstance(vehicles, (str, int, float)):
-        limit = _share(vehicles) * 2.0**32
+        text = str(vehicles)
+        try:
+            share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+        except ValueError:
+            share = math.nan
+        if not 0.0 < share <= 1.0:
+            raise ValueError(
+                f"vehicles is {vehicles!r}; it is 'all', 'type:NAME', a share above 0 up to 1, "
+                "such as 0.1 or '10%', or a list of ids"
+            )
+        limit = share * 2.0**32
         return lambda _, car: zlib.crc32(f"{seed}:{car}".encode()) < limit
     ids = frozenset(vehicles)
     return lambda _, car: car in ids
-
-
-def _share(vehicles: str | float) -> float:
-    text = str(vehicles)
-    try:
-        share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
-    except ValueError:
-        share = math.nan
-    if not 0.0 < share <= 1.0:
-        raise ValueError(
-            f"vehicles is {vehicles!r}; it is 'all', 'type:NAME', a share above 0 up to 1, such as "
-            "0.1 or '10%', or a list of ids"
-        )
-    return share
 
 
 class Watching:

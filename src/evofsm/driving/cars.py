@@ -125,8 +125,7 @@ def learners_of(guard: Guard) -> tuple[EvolvingFSM, LearningJudge]:
 
 def name_judge(judge: LearningJudge) -> str:
     """Which of the judges for cars it is; a TypeError if none."""
-    if isinstance(judge, LatentRisk):
-        return "kinematic"
-    if isinstance(judge, LearntRisk):
-        return "learnt"
+    for name, kind in zip(TOLD, (LatentRisk, LearntRisk), strict=True):
+        if isinstance(judge, kind):
+            return name
     raise TypeError(f"a {type(judge).__name__} is none of the judges for cars: {', '.join(TOLD)}")

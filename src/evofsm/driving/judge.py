@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,8 @@ from evofsm.driving.perception import Perception, is_whole
 from evofsm.driving.rehearsal import HARDEST, Body, Three, critical_decelerations
 from evofsm.driving.revisers import GENTLE_BRAKE
 from evofsm.fsm.kernels import compiled, inner_kernel
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
@@ -44,6 +46,8 @@ from evofsm.store import (
 
 # Slower than this a car stands, though a sensor may show that it moves [m/s].
 _STANDS = 0.1
+# States of a smaller belief are left out.
+_LEAST_BELIEF = 1e-3
 # Where a situation is not sure, it may be worse by so many standard deviations.
 _CAUTION = 2.5
 
@@ -174,26 +178,19 @@ class LatentRisk:
     # -- Learning -------------------------------------------------------------------------------
 
     def learn(
-        self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
+        self,
+        observation: ArrayLike,
+        acceleration: float,
+        belief: ArrayLike = (1.0,),
+        *,
+        watched: bool = False,
     ) -> None:
         """Take in an observation and the acceleration commanded after it [m/s²].
 
         Where one of gap [m] and both speeds [m/s] is NaN nothing is learnt, and what is under way
         is not gone on with; a TypeError or ValueError leaves what was learnt as it was. It learns
-        alike in all states, whatever the ``belief``.
+        alike in all states, whatever the ``belief``. ``watched`` is as `watch` says.
         """
-        self._learn(observation, acceleration, watched=False)
-
-    def watch(
-        self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
-    ) -> None:
-        """Learn as `learn` does, where someone else drives, as in shadow mode.
-
-        Hard braking shows what the brakes can do; ordinary braking not what they cannot.
-        """
-        self._learn(observation, acceleration, watched=True)
-
-    def _learn(self, observation: ArrayLike, acceleration: float, *, watched: bool) -> None:
         seen = _three_finite(observation, whole=False)
         command = _one_finite("acceleration", acceleration)
         if not is_whole(seen):
@@ -207,6 +204,15 @@ class LatentRisk:
                 self._own_watch.clear()
             self.brakes.show(self._own_watch.see(0.0, seen[1], seen[1], self._of_change(1)))
         self._watched = watched
+
+    def watch(
+        self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
+    ) -> None:
+        """Learn as `learn` does, where someone else drives, as in shadow mode.
+
+        Hard braking shows what the brakes can do; ordinary braking not what they cannot.
+        """
+        self.learn(observation, acceleration, watched=True)
 
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
         """Keep up with what happens, as `learn`, without learning from it."""
@@ -397,6 +403,80 @@ class LatentRisk:
             "doubts_brought": self.brakes.brought.rows.reshape(-1),
             "doubts_shortfalls": self.brakes.shortfalls.rows.reshape(-1),
         }
+
+
+# -- Of states ----------------------------------------------------------------------------------
+
+
+class RiskByState:
+    """Judges actions by the states that a situation is recognised as.
+
+    The ``risk`` answers all but how dangerous actions are. Where states disagree, ``caution``
+    standard deviations are added to their mean risk.
+    """
+
+    labels, fallback = LatentRisk.labels, LatentRisk.fallback
+
+    def __init__(self, risk: LatentRisk, machine: EvolvingFSM, caution: float = 1.0) -> None:
+        self.risk, self.machine, self.caution = risk, machine, caution
+        self.why, self.trial = risk.why, risk.trial
+        self.effective, self.refuse_unfit = risk.effective, risk.refuse_unfit
+
+    def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
+        """Latent risk of each acceleration: of the states, weighed by the belief."""
+        taking_part = np.flatnonzero(situation.belief >= _LEAST_BELIEF)
+        if len(taking_part) == 0 or self.machine.n_states == 0:
+            return self.risk.judge(situation, accelerations)
+        belief, centers = situation.belief[taking_part], self.machine.centers[taking_part]
+        critical = np.stack([self.risk.critical(center, accelerations) for center in centers])
+        weights = belief / belief.sum()
+        risks = self.risk.manoeuvres.harder(critical)
+        risk = weights @ risks
+        disagreement = np.sqrt(weights @ (risks - risk) ** 2)
+        cautious = np.minimum(risk + self.caution * disagreement, 1.0)
+        evidence = float(len(self.risk.manoeuvres))
+        bounds = [wilson_bounds(each, evidence + 1.0) for each in cautious.tolist()]
+        low, high = np.transpose(bounds)
+        return Judgement(cautious, low, high, weights @ critical, evidence, situation.seen)
+
+
+class StateRisk(NamedTuple):
+    """How dangerous it is to be in a state."""
+
+    state: int
+    risk: float  #: latent risk if one brakes in full at once, with the leader: high in a dead end
+    margin: float  #: escape margin: how much lower that is than if speed is kept
+    critical: float  #: hardest braking of a leader that is then survived [m/s²]
+    seconds: float  #: time for which the state was seen [s]
+    failures: float  #: number of failures that ended in it
+
+    @property
+    def is_dead_end(self) -> bool:
+        """Whether a hard brake of the leader now is more likely than not to end in failure."""
+        return self.risk > 0.5
+
+
+def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[StateRisk]:
+    """Latent risk at the centre of every state, in the order of creation.
+
+    Examples
+    --------
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
+    >>> trace = machine.learn_many([[50.0, 5.0, 5.0], [9.0, 20.0, 20.0]], [0, 0])
+    >>> risk = LatentRisk(lowest=-4.0)
+    >>> [state.is_dead_end for state in assess_states(machine, risk)]
+    [False]
+    """
+    actions = np.array([risk.lowest, 0.0])
+    critical = [risk.critical(center, actions) for center in known.centers]
+    braking, keeping = risk.manoeuvres.harder(np.reshape(critical, (-1, 2))).T
+    hardest = [survived[0] for survived in critical]
+    columns = braking, keeping - braking, hardest, known.visits * risk.dt, known.endings
+    rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
+    return [StateRisk(state, *row) for state, row in enumerate(rows)]
+
+
+# -- Numbers ------------------------------------------------------------------------------------
 
 
 def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:

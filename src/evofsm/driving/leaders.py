@@ -164,7 +164,7 @@ class BrakeWatch:
         ``noise`` is the standard deviation of that on the difference of two speeds [m/s].
         """
         now = gap, speed, leader_speed
-        if self._recent and self._is_another(self._recent[-1], now):
+        if self._recent and self._is_another(now):
             ended = self.end()
             self.clear()
             self._recent.append(now)
@@ -203,10 +203,9 @@ class BrakeWatch:
         """So many decisions, or more if noise blurs a deceleration over them."""
         return max(span, round(self._noise / (blur * self.dt)))
 
-    def _is_another(
-        self, before: tuple[float, float, float], now: tuple[float, float, float]
-    ) -> bool:
-        expected = before[0] + 0.5 * self.dt * (before[2] + now[2] - before[1] - now[1])
-        if abs(now[2] - before[2]) > HARDEST * self.dt + _ANOTHER_SPEED:
+    def _is_another(self, now: tuple[float, float, float]) -> bool:
+        gap, speed, leader_speed = self._recent[-1]
+        expected = gap + 0.5 * self.dt * (leader_speed + now[2] - speed - now[1])
+        if abs(now[2] - leader_speed) > HARDEST * self.dt + _ANOTHER_SPEED:
             return True
         return abs(now[0] - expected) > _ANOTHER_GAP

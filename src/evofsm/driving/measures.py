@@ -91,11 +91,6 @@ class TimeToCollision(_ShortTime):
     """Danger where the time to collision is below a ``threshold`` [s]; blind at equal speeds.
 
     That of 1.5 s is of the Swedish conflict technique (Hydén 1987).
-
-    Examples
-    --------
-    >>> TimeToCollision().score(np.array([[20.0, 25.0, 20.0], [5.0, 25.0, 20.0]]), dt=0.1) > 0.0
-    array([False,  True])
     """
 
     threshold: float = 1.5

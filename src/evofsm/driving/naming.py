@@ -30,8 +30,6 @@ def name_state(center: ArrayLike, decimals: int = 0) -> str:
 
     Examples
     --------
-    >>> name_state([9.2, 4.1, 3.0])
-    'close (9 m), slow (4 m/s), closing at 1 m/s'
     >>> name_state([60.0, 25.0, 27.3], decimals=1)
     'far (60.0 m), fast (25.0 m/s), opening at 2.3 m/s'
     """

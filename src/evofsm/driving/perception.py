@@ -53,7 +53,11 @@ class Estimate(NamedTuple):
 
     def deviation(self, weights: Three) -> float:
         """Standard deviation of a weighed sum of the three."""
-        return 0.0 if self.covariance == _EXACT else _deviation(self.covariance, weights)
+        variance = 0.0
+        for one, row in zip(weights, self.covariance, strict=True):
+            for other, each in zip(weights, row, strict=True):
+                variance += one * other * each
+        return sqrt(max(variance, 0.0))
 
 
 class Perception:
@@ -192,15 +196,6 @@ def _filtered(
         (spread[1, 0], spread[1, 1], spread[1, 2]),
         (spread[2, 0], spread[2, 1], spread[2, 2]),
     )
-
-
-@compiled
-def _deviation(covariance: Matrix, weights: Three) -> float:
-    variance = 0.0
-    for j in range(3):
-        for k in range(3):
-            variance += weights[j] * weights[k] * covariance[j][k]
-    return sqrt(max(variance, 0.0))
 
 
 # -- The noise ----------------------------------------------------------------------------------

@@ -63,11 +63,7 @@ class Episode:
 
     @property
     def realised(self) -> NDArray[np.float64]:
-        """(T,) ndarray: what the follower did after each row [m/s²]; NaN after the last.
-
-        It differs from what was commanded where the body could not follow, or the car came to a
-        standstill.
-        """
+        """(T,) ndarray: what the follower did after each row [m/s²]; NaN after the last."""
         change = np.diff(self.record[:, SPEED], append=np.nan)
         return change / np.diff(self.time, append=np.nan)
 
