@@ -8,6 +8,7 @@ import socket
 import sys
 import threading
 import time
+import tracemalloc
 import unittest.mock
 from contextlib import contextmanager
 
@@ -16,7 +17,6 @@ import pytest
 from evofsm.cli.monitor.decider import Decider, guard_of_monitor
 from evofsm.cli.monitor.messages import LONGEST
 from evofsm.cli.monitor.transports import (
-    Lines,
     Server,
     SocketTransport,
     Stream,
@@ -54,30 +54,45 @@ def told(data):
     return [json.loads(one) for one in data.splitlines()]
 
 
-@pytest.mark.parametrize("size", [53, 1000, 1 << 20])
-def test_lines_are_the_same_however_they_are_cut(size):
-    data, lines, found = b"one\r\n\ntwo\n" + b"x" * 90_000 + b"\nthree", Lines(), []
-    for k in range(0, len(data), size):
-        found += lines.feed(data[k : k + size])
-    found += lines.feed(b"")
-    assert [one[:10] for one in found] == [b"one", b"", b"two", b"x" * 10, b"three"]
-    assert LONGEST < len(found[3])
-    for _ in range(100):
-        assert lines.feed(b"x" * LONGEST) == []
-    assert len(lines._begun) == LONGEST + 1
+class Pieces(io.BytesIO):
+    """A stream that comes in pieces of a size."""
+
+    size = 1 << 20
+
+    def read(self, _):
+        return super().read(self.size)
+
+
+def answered(data, size=1 << 20):
+    source, sink = Pieces(data), io.BytesIO()
+    source.size = size
+    Server(Decider(guard_of_monitor(0.1, 6.0))).run(Stream(source, sink))
+    return told(sink.getvalue())
 
 
 def test_a_pipe_is_answered_line_by_line_whatever_comes_between(plain):
-    def answered(data):
-        sink = io.BytesIO()
-        Server(Decider(guard_of_monitor(0.1, 6.0))).run(Stream(io.BytesIO(data), sink))
-        return told(sink.getvalue())
-
     assert answered(b"".join(ROWS)[:-1]) == plain
     pairs = zip(JUNK * 9, ROWS, strict=False)
     answers = answered(b"".join(one + b"\n" + row for one, row in pairs))
     assert answers[1::2] == plain
     assert {one["kind"] for one in answers[::2]} == {"error"}
+
+
+@pytest.mark.parametrize("size", [53, 1000, 1 << 20])
+def test_lines_are_the_same_however_they_are_cut(plain, size):
+    data = ROWS[0][:-1] + b"\r\n\n" + b"x" * 90_000 + b"\n" + ROWS[1][:-1]
+    first, empty, long, last = answered(data, size)
+    assert [first, last] == plain[:2]
+    assert empty["error"] == "is empty"
+    assert long["error"] == f"is longer than {LONGEST} bytes"
+
+
+def test_a_line_without_an_end_takes_no_more_memory_than_the_longest():
+    pieces = iter([b"x" * LONGEST] * 200)
+    tracemalloc.start()
+    Server(Decider(guard_of_monitor(0.1, 6.0))).converse(lambda _: next(pieces, b""), id)
+    assert tracemalloc.get_traced_memory()[1] < 20 * LONGEST
+    tracemalloc.stop()
 
 
 def test_a_heartbeat_where_nothing_comes():

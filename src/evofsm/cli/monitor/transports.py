@@ -13,7 +13,7 @@ import socket
 import stat
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -33,19 +33,6 @@ _MOST_LINES, _MOST_PEERS = 100, 100
 _LONGEST_WAIT = 0.5
 
 
-class Lines:
-    r"""Cuts what comes in into lines; one that is too long is cut off, and so refused."""
-
-    def __init__(self) -> None:
-        self._begun = b""
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """The lines that are whole with this; with nothing, which is the end, the rest."""
-        *whole, begun = (self._begun + (data or b"\n" * bool(self._begun))).split(b"\n")
-        self._begun = begun[: LONGEST + 1]  # however long it gets
-        return [line.removesuffix(b"\r") for line in whole]
-
-
 class Server:
     """A decider that threads share: lines in, lines out, a sign of life where nothing comes."""
 
@@ -63,6 +50,15 @@ class Server:
             answers = b"".join([_line(self.decider.answer(line)) for line in lines])
             self._heard = self._said = time.monotonic()
         return answers
+
+    def converse(self, read: Callable[[int], bytes], write: Callable[[bytes], object]) -> None:
+        """Answer the lines of a stream to its end; one that is too long is cut off, and refused."""
+        begun, data = b"", b"\n"
+        while data:
+            data = read(_CHUNK)
+            *whole, begun = (begun + (data or b"\n" * bool(begun))).split(b"\n")
+            begun = begun[: LONGEST + 1]  # however long it gets
+            write(self.answer(line.removesuffix(b"\r") for line in whole))
 
     def answer_packet(self, data: bytes) -> bytes:
         """What is answered to some lines that came at once."""
@@ -140,10 +136,7 @@ class Stream:
 
     def serve(self, server: Server) -> None:
         """Answer line by line."""
-        lines, data = Lines(), b"\n"
-        while data:
-            data = self._source.read(_CHUNK)
-            self.send(server.answer(lines.feed(data)))
+        server.converse(self._source.read, self.send)
 
     def send(self, line: bytes) -> None:
         """Write it."""
@@ -214,13 +207,12 @@ class SocketTransport:
         self.path.unlink(missing_ok=True)
 
     def _attend(self, peer: socket.socket, server: Server) -> None:
-        lines, data = Lines(), b"\n"
+        def send(answers: bytes) -> None:
+            with self._peers[peer]:
+                peer.sendall(answers)
+
         with suppress(OSError), peer:
-            while data:
-                data = peer.recv(_CHUNK)
-                answers = server.answer(lines.feed(data))
-                with self._peers[peer]:
-                    peer.sendall(answers)
+            server.converse(peer.recv, send)
         del self._peers[peer]
 
 
