@@ -57,7 +57,7 @@ class Recording:
         self._episodes = [one for one in self._run.episodes if len(one.columns["time"])]
         if not self._episodes:
             raise ValueError(f"{path} holds no episode with a decision")
-        self._tolerance = _number(self._run.about.get("tolerance"), TOLERANCE)
+        self._tolerance = float(self._run.about.get("tolerance", TOLERANCE))
         self.revising = self._run.about.get("mode", "act") == "act"
         self.start = self.restart(0)
 
@@ -67,7 +67,7 @@ class Recording:
         if not 0 <= case < len(self._episodes):
             raise ValueError(f"episode is {case + 1}; there are 1 to {len(self._episodes)}")
         self._episode = self._episodes[case]
-        self._cars = _cars(self._episode)
+        self._frames = list(_frames(self._episode, revising=self.revising))
         self._number = 0
         self._chronicle = Chronicle(self._tolerance)
         self.start = self._begun(case)
@@ -76,13 +76,12 @@ class Recording:
     def step(self) -> Frame:
         """The next frame."""
         number, decisions = self._number, len(self._episode.columns["time"])
-        frame = self._moved(number)
+        frame = self._frames[number]
         if number < decisions:
             frame = frame._replace(**_decided(self._episode.columns, number))
         else:
-            frame = frame._replace(
-                over=True, collided=self._episode.collided, rear_ended=self._episode.rear_ended
-            )
+            collided, rear_ended = self._episode.collided, self._episode.rear_ended
+            frame = frame._replace(over=True, collided=collided, rear_ended=rear_ended)
         self._number += 1
         return frame._replace(story=self._chronicle.tell(frame))
 
@@ -107,26 +106,6 @@ class Recording:
             judge=about.get("judge", "kinematic"),
         )
 
-    def _moved(self, number: int) -> Frame:
-        """Where the cars are; the rest is as in a frame in which nothing is decided."""
-        cars = self._cars
-        observed = cars["observed"][number]
-        gap, speed, leader_speed = observed.tolist()
-        return Frame(
-            number=number,
-            time=float(cars["time"][number]),
-            gap=gap,
-            v_follower=speed,
-            v_leader=leader_speed,
-            a_follower=float(cars["a_follower"][number]),
-            a_leader=float(cars["a_leader"][number]),
-            x_follower=float(cars["x_follower"][number]),
-            observation=(gap, speed, leader_speed),
-            time_to_collision=float(time_to_collision(observed)),
-            time_headway=float(time_headway(observed)),
-            revising=self.revising,
-        )
-
 
 def _decided(columns: Any, number: int) -> dict[str, Any]:
     """What was recognised, judged and decided, by the names of a frame."""
@@ -147,23 +126,32 @@ def _decided(columns: Any, number: int) -> dict[str, Any]:
     }
 
 
-def _cars(episode: RecordedEpisode) -> dict[str, NDArray[np.float64]]:
+def _frames(episode: RecordedEpisode, *, revising: bool) -> Iterator[Frame]:
     """Where the cars are at each decision and at the end, and how they got there."""
     columns = episode.columns
     time = np.append(columns["time"], episode.end_time)
     observed = np.column_stack([columns[name] for name in VARIABLES])
     observed = _held(np.vstack([observed, episode.end]))
-    lasted, speeds = np.diff(time), observed[:, 1:]
+    lasted, speeds = np.diff(time, prepend=math.nan), observed[:, 1:]
     with np.errstate(divide="ignore", invalid="ignore"):
-        accelerations = np.diff(speeds, axis=0) / lasted[:, None]
-    moved = 0.5 * (speeds[1:, 0] + speeds[:-1, 0]) * lasted
-    return {
-        "time": time,
-        "observed": observed,
-        "a_follower": np.insert(accelerations[:, 0], 0, math.nan),
-        "a_leader": np.insert(accelerations[:, 1], 0, math.nan),
-        "x_follower": np.insert(np.cumsum(moved), 0, 0.0),
-    }
+        accelerations = np.diff(speeds, axis=0, prepend=math.nan) / lasted[:, None]
+    moved = 0.5 * (speeds[1:, 0] + speeds[:-1, 0]) * lasted[1:]
+    positions = np.insert(np.cumsum(moved), 0, 0.0)
+    for number, (gap, speed, leader_speed) in enumerate(observed.tolist()):
+        yield Frame(
+            number=number,
+            time=float(time[number]),
+            gap=gap,
+            v_follower=speed,
+            v_leader=leader_speed,
+            a_follower=float(accelerations[number, 0]),
+            a_leader=float(accelerations[number, 1]),
+            x_follower=float(positions[number]),
+            observation=(gap, speed, leader_speed),
+            time_to_collision=float(time_to_collision(observed[number])),
+            time_headway=float(time_headway(observed[number])),
+            revising=revising,
+        )
 
 
 def _held(rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -174,13 +162,6 @@ def _held(rows: NDArray[np.float64]) -> NDArray[np.float64]:
             latest = np.searchsorted(known, np.arange(len(column)), side="right") - 1
             column[:] = column[known[np.maximum(latest, 0)]]
     return rows
-
-
-def _number(text: str | None, default: float) -> float:
-    try:
-        return default if text is None else float(text)
-    except ValueError:
-        return default
 
 
 # -- A log of others -------------------------------------------------------------------------------
