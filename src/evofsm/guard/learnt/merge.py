@@ -10,27 +10,44 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import TypeVar
 
 import numpy as np
 
 from evofsm.guard.learnt import library
 from evofsm.guard.learnt.dynamics import MOST, Dynamics
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.learnt.regression import Recent
+from evofsm.guard.learnt.regression import Drift, Recent
 from evofsm.guard.learnt.replay import Floats, Sums, n_products
-
-_Item = TypeVar("_Item")
-_ENDS = ("lowest", "highest")
 
 
 def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     """Merge judges that learnt apart, between episodes, into one that shares nothing with them.
 
-    Of sequences, failures, jumps and situations the newest of all are kept; backups are those of
-    the judge that learnt from most episodes, which evolve on; the margin is the largest.
+    Of disturbances, failures, jumps and situations the newest of each are kept; backups are those
+    of the judge that learnt from most episodes, which evolve on; the margin is the largest.
 
-    A ValueError if there is none, or actions, intervals or numbers of variables differ.
+    Parameters
+    ----------
+    judges : sequence of LearntRisk
+        Of guards of the same system, each with its own share of the episodes.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or actions, intervals or numbers of variables differ.
+
+    Examples
+    --------
+    >>> from evofsm.guard import Guard, merge_judges
+    >>> guards = [Guard(n_actions=2, interval=0.1) for _ in range(2)]
+    >>> for guard in guards:
+    ...     for z in range(12):
+    ...         revision = guard.decide([z], 0)
+    ...     guard.end(failed=False)
+    >>> judge = merge_judges([guard.judge for guard in guards])
+    >>> print(judge.remembered)
+    what 2.4 s brought
+    >>> guard = Guard(n_actions=2, interval=0.1, judge=judge)
     """
     if not judges:
         raise ValueError("judges is empty; there must be at least one to merge")
@@ -51,13 +68,14 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
         setattr(merged, name, sum(getattr(one, name) for one in told))
     for name in ("margin", "time_to_failure", "horizon"):
         setattr(merged, name, max(getattr(one, name) for one in told))
-    merged.situations = np.vstack(_newest([list(one.situations) for one in told], library.KEPT))
     if merged.backups is not None:
+        each = library.KEPT // len(told)
+        seen = [one.situations[-each:] for one in told if len(one.situations)]
+        merged.situations = np.vstack(seen)
         policies = merged.backups.policies[merged.backups.ranks[:2]]
-        disturbances = library.choose(
+        merged.disturbances = library.choose(
             merged.dynamics, merged.situations, merged.horizon, policies, merged.disturbance_scale
         )
-        merged.disturbances = disturbances
         merged.backups = merged.evolved(np.random.default_rng([merged.seed, merged.n_studied]))
     merged.start_episode(learn=False)
     return merged
@@ -67,57 +85,47 @@ def _merged(parts: Sequence[Dynamics]) -> Dynamics:
     """What dynamics learnt in all, counted from the origin of the first."""
     merged = copy.deepcopy(parts[0])
     merged.forget_episode()
-    m, a, p = merged.n_variables, merged.size, len(merged.weights)
-    off = np.array([part.origin - merged.origin for part in parts])
-    shifts = [_moved(each, a, p) for each in off]
-    of = Sums(*map(np.array, zip(*(part.sums for part in parts), strict=True)))
-    observed, learnt = of.counts.T
-    known = learnt * (of.scale[:, 0] > 0.0)
-    mean = observed @ (off + of.mean) / observed.sum()
-    pairs = list(zip(shifts, of.squares, of.products, strict=True))
-    early = [rows[: int(n)] for rows, n in zip(of.early, learnt, strict=True)]
-    merged.sums = of._replace(
-        counts=of.counts.sum(0),
-        squares=np.sum([T @ squares @ T.T for T, squares, _ in pairs], axis=0),
-        products=np.sum([T @ products for T, _, products in pairs], axis=0),
+    m, a, p, each = merged.n_variables, merged.size, len(merged.weights), MOST // len(parts)
+
+    def of(name: str) -> Floats:
+        return np.array([getattr(part, name) for part in parts])
+
+    off = of("origin") - merged.origin
+    sums = Sums(*map(np.array, zip(*(part.sums for part in parts), strict=True)))
+    T = np.array([_moved(d, a, p) for d in off])
+    observed, learnt = sums.counts.T
+    known = learnt * (sums.scale[:, 0] > 0.0)
+    mean = observed @ (off + sums.mean) / observed.sum()
+    early = [rows[: int(n)] for rows, n in zip(sums.early, learnt, strict=True)]
+    merged.sums = sums._replace(
+        counts=sums.counts.sum(0),
+        squares=(T @ sums.squares @ T.transpose(0, 2, 1)).sum(0),
+        products=(T @ sums.products).sum(0),
         mean=mean,
-        scatter=of.scatter.sum(0) + observed @ (off + of.mean - mean) ** 2,
-        early=np.resize(np.concatenate(early), of.early[0].shape),
-        least=of.least.min(0),
-        most=of.most.max(0),
-        low=of.low.min(0),
-        high=of.high.max(0),
-        **{name: _average(getattr(of, name), learnt) for name in ("variance", "unit", "moving")},
-        **{name: _average(getattr(of, name), known) for name in ("scale", "noise")},
+        scatter=sums.scatter.sum(0) + observed @ (off + sums.mean - mean) ** 2,
+        early=np.resize(np.concatenate(early), sums.early[0].shape),
+        **{name: getattr(sums, name).min(0) for name in ("least", "low")},
+        **{name: getattr(sums, name).max(0) for name in ("most", "high")},
+        **{name: _average(getattr(sums, name), learnt) for name in ("variance", "unit", "moving")},
+        **{name: _average(getattr(sums, name), known) for name in ("scale", "noise")},
     )
-    merged.used = np.sum([part.used for part in parts], axis=0)
-    merged.missed = _average(np.array([part.missed for part in parts]), learnt)
-    merged.doubt_of_lags = float(_average(np.array([one.doubt_of_lags for one in parts]), learnt))
-    lowest, highest = (np.array([getattr(part, name) for part in parts]) for name in _ENDS)
+    merged.used = of("used").sum(0)
+    merged.missed = _average(of("missed"), learnt)
+    merged.doubt_of_lags = float(_average(of("doubt_of_lags"), learnt))
+    lowest, highest = of("lowest"), of("highest")
     merged.lowest, merged.highest = lowest.min(0), highest.max(0)
-    reached, spread = np.array([part.reached for part in parts]), merged.highest - merged.lowest
-    at_lowest, at_highest = lowest - merged.lowest, merged.highest - highest
-    there = np.stack([at_lowest, at_highest], 2) <= 1e-9 * np.maximum(spread, 0.0)[:, None]
-    merged.reached = np.where(there, reached, 0.0).sum(0)
-    total = merged.n_episodes = sum(part.n_episodes for part in parts)
-    later = [total - part.n_episodes for part in parts]
-    sequences = [
-        [one._replace(episode=one.episode + more) for one in part.sequences]
-        for part, more in zip(parts, later, strict=True)
-    ]
-    merged.sequences = _newest(sequences, len(parts) * merged.remembered)
-    merged.drifts = sorted(
-        one._replace(since=one.since + more, noticed=one.noticed + more)
-        for part, more in zip(parts, later, strict=True)
-        for one in part.drifts
-    )
-    failures = _newest([list(part.failures) for part in parts], MOST)
-    merged.failures = np.array(failures).reshape(-1, m)
-    merged.jumps = [
-        np.array(_newest([list(part.jumps[j]) for part in parts], MOST)).reshape(-1, m + 1)
-        for j in range(m)
-    ]
-    merged.recent, merged.latest = Recent.none(p, m, total), None
+    there = np.stack([lowest, highest], 2), np.stack([merged.lowest, merged.highest], 1)
+    merged.reached = np.where(np.isclose(*there, 1e-9, 0.0), of("reached"), 0.0).sum(0)
+    merged.n_episodes, merged.sequences, drifts = int(of("n_episodes").sum()), [], []
+    for part in parts:  # the latest episode of each is the latest of all
+        later, newest = merged.n_episodes - part.n_episodes, part.sequences[-merged.remembered :]
+        merged.sequences += [one._replace(episode=one.episode + later) for one in newest]
+        drifts += [Drift(j, since + later, noticed + later) for j, since, noticed in part.drifts]
+    merged.drifts = sorted(drifts)
+    merged.failures = np.concatenate([part.failures[-each:] for part in parts])
+    jumps = zip(*(part.jumps for part in parts), strict=True)
+    merged.jumps = [np.concatenate([rows[-each:] for rows in seen]) for seen in jumps]
+    merged.recent, merged.latest = Recent.none(p, m, merged.n_episodes), None
     merged.settle()
     return merged
 
@@ -128,24 +136,13 @@ def _average(rows: Floats, weights: Floats) -> Floats:
 
 def _moved(d: Floats, a: int, p: int) -> Floats:
     """(p, p) what features become where variables are larger by ``d`` (m,)."""
-    m = len(d)
-    T = np.eye(p)
+    m, T = len(d), np.eye(p)
     T[1 : 1 + m, 0] = d
-    k = p - n_products(m, a)
-    for i in range(a):
-        T[k : k + m, 1 + 2 * m + i] = d
-        k += m
-    for i in range(m):
-        for j in range(i, m):
-            T[k, 0] = d[i] * d[j]
-            T[k, 1 + i] += d[j]
-            T[k, 1 + j] += d[i]
-            k += 1
+    products = T[p - n_products(m, a) :]
+    for k in range(a):
+        products[k * m : (k + 1) * m, 1 + 2 * m + k] = d
+    for row, i, j in zip(products[a * m :], *np.triu_indices(m), strict=True):
+        row[0] = d[i] * d[j]
+        row[1 + i] += d[j]
+        row[1 + j] += d[i]
     return T
-
-
-def _newest(lists: Sequence[Sequence[_Item]], most: int) -> list[_Item]:
-    """The last of all lists, evenly, up to so many; the newest last."""
-    longest = max(map(len, lists))
-    by_age = [one[-1 - age] for age in range(longest) for one in lists if len(one) > age]
-    return by_age[:most][::-1]
