@@ -2,6 +2,8 @@
 
 import io
 import math
+import sys
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -512,3 +514,33 @@ def test_a_decision_takes_no_snapshot_of_the_machine(monkeypatch):
     for z in np.random.default_rng(0).normal(size=(20, 2)):
         guard.decide(z, 0.5)
     assert guard.situation.seen > 0.0
+
+
+def test_threads_share_a_guard_and_what_is_saved_meanwhile_loads(tmp_path):
+    guard, errors, over = Guard(low=-1.0, high=1.0, interval=0.1), [], threading.Event()
+
+    def work(seed):
+        draw = np.random.default_rng(seed)
+        try:
+            while not over.is_set():
+                guard.decide(draw.normal(size=2), draw.uniform(-1.0, 1.0))
+                if draw.random() < 0.05:
+                    guard.end(failed=draw.random() < 0.5)
+        except BaseException as error:
+            errors.append(error)
+
+    usual = sys.getswitchinterval()
+    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(3)]
+    sys.setswitchinterval(1e-5)
+    try:
+        for thread in threads:
+            thread.start()
+        for _ in range(20):
+            guard.save(tmp_path / "guard.evofsm")
+            Guard.load(tmp_path / "guard.evofsm")
+    finally:
+        over.set()
+        sys.setswitchinterval(usual)
+        for thread in threads:
+            thread.join()
+    assert not errors

@@ -61,15 +61,21 @@ _ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers", 
 _FLOAT64 = np.dtype(np.float64)
 # Compiled code of a step, with and without a limit to the states.
 _LIMITED, _UNLIMITED = entry(stepping.learn_rows), entry(stepping.learn_rows)
-# Every machine there is, for a process that is forked.
-_MACHINES: WeakSet[EvolvingFSM] = WeakSet()
+# All that threads share, for a process that is forked.
+_SHARED: WeakSet[Any] = WeakSet()
 
 
-def _alone(method: Method) -> Method:
-    """A method during which no other thread changes the machine."""
+def share(one: Any) -> None:
+    """Give an object a lock, so that threads may share it."""
+    one._lock = RLock()
+    _SHARED.add(one)
+
+
+def alone(method: Method) -> Method:
+    """A method of what is shared, during which no other thread changes it."""
 
     @wraps(method)
-    def locked(self: EvolvingFSM, *args: Any, **kwargs: Any) -> Any:
+    def locked(self: Any, *args: Any, **kwargs: Any) -> Any:
         with self._lock:
             return method(self, *args, **kwargs)
 
@@ -188,7 +194,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
 
     # -- Learning -------------------------------------------------------------------------------
 
-    @_alone
+    @alone
     def observe(
         self, z: ArrayLike, *, failed: bool | None = None, missing: Missing = Missing.REJECT
     ) -> Step:
@@ -219,7 +225,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
                 return self._observe_partly(given, absent, missing, failed)
         return self._step(z, NO_ACTION, failed)
 
-    @_alone
+    @alone
     def act(self, i: SupportsIndex) -> None:
         """Say which action (from 0) was commanded after the latest observation.
 
@@ -232,7 +238,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
             raise ValueError("act before observe: this episode has no observation to act on yet")
         now["action"] = i
 
-    @_alone
+    @alone
     def learn_one(self, z: ArrayLike, i: SupportsIndex) -> Step:
         """Observe, then act; the action shows in the next step.
 
@@ -243,7 +249,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         """
         return self._step(z, valid.check_action(i, self.n_actions), None)
 
-    @_alone
+    @alone
     def learn_many(
         self,
         Z: ArrayLike,
@@ -293,12 +299,12 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
                 beliefs = np.pad(beliefs, [(0, 0), (0, self._capacity - beliefs.shape[1])])
         return trace._replace(belief=beliefs[:, : self.n_states]) if belief else trace
 
-    @_alone
+    @alone
     def start_episode(self) -> None:
         """Begin a new episode: no transition is learnt from the last observation to the next."""
         self._learnt.now[["action", "chained"]] = NO_ACTION, 0
 
-    @_alone
+    @alone
     def fail(self) -> None:
         """End the episode in failure, to which the action after the latest observation led."""
         if not self._learnt.now["chained"][0]:
@@ -306,7 +312,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         self._make_room()
         stepping.fail(self._learnt, self._settings)
 
-    @_alone
+    @alone
     def onset(self) -> None:
         """Count that something unexpected began in the state before the latest observation's.
 
@@ -324,7 +330,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
 
     # -- Asking ---------------------------------------------------------------------------------
 
-    @_alone
+    @alone
     def predict(self, i: SupportsIndex, horizon: int = 1, policy: Policy = "marginal") -> Floats:
         """(n,) forecast of the state, ``belief @ P[i] @ P*^(horizon - 1)``: Section 2.3.2.
 
@@ -348,7 +354,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
             return np.full(n, 1.0 / max(n, 1))
         return np.asarray(self.belief @ self._learnt.matrices[place, :n, :n])
 
-    @_alone
+    @alone
     def explain(
         self, action: SupportsIndex | None = None, labels: Labels | None = None
     ) -> Explanation:
@@ -371,7 +377,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         """(n,) belief of an observation, or (N, n) of many, as `FSMModel.recognise` tells it."""
         return self.model().recognise(z)
 
-    @_alone
+    @alone
     def model(
         self,
         *,
@@ -458,7 +464,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         return len(self._learnt.variables)
 
     @property
-    @_alone
+    @alone
     def state_ids(self) -> NDArray[np.int64]:
         """(n,) number of each state's creation, from 0.
 
@@ -467,7 +473,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         return self._learnt.states["id"][: self.n_states].astype(np.int64)
 
     @property
-    @_alone
+    @alone
     def centers(self) -> Floats:
         """(n, m) the observation at the centre of each state."""
         return self._learnt.centers[:, : self.n_states].T.copy()
@@ -478,13 +484,13 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         return bool(self._learnt.now["failures_told"][0])
 
     @property
-    @_alone
+    @alone
     def visits(self) -> Floats:
         """(n,) ndarray: observations in which each state was the most probable."""
         return self._learnt.sums[SUMS.index("visits"), : self.n_states].copy()
 
     @property
-    @_alone
+    @alone
     def width(self) -> float:
         """Width of recognition, a squared distance; 0 before the first observation."""
         now = self._learnt.now[0]
@@ -493,7 +499,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         return float(width(self._settings, now["scatter"] / seen)) if seen else 0.0
 
     @property
-    @_alone
+    @alone
     def belief(self) -> Floats:
         """(n,) the present distribution over states, uniform as an episode starts."""
         n = self.n_states
@@ -502,7 +508,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         return np.full(n, 1.0 / max(n, 1))
 
     @property
-    @_alone
+    @alone
     def state(self) -> int | None:
         """Index of the most probable state; None until an episode's first observation."""
         now = self._learnt.now[0]
@@ -514,7 +520,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         """An independent machine in the same state."""
         return copy.copy(self)
 
-    @_alone
+    @alone
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write it to a file: arrays and a JSON header.
 
@@ -554,7 +560,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         return self.settings | {"rule": rules.describe_rule(self._rule)}
 
     # A copy, or what another process gets, has a lock and arrays of its own.
-    @_alone
+    @alone
     def __getstate__(self) -> dict[str, Any]:
         learnt = [array.copy() for array in self._learnt]
         return {"rule": self._rule, "settings": self._settings, "learnt": learnt}
@@ -575,11 +581,11 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
 
     def _share(self) -> None:
         """Be ready for threads. They wait for whoever steps, grows, or takes a copy."""
-        self._lock, self._limit = RLock(), self.max_states
+        share(self)
+        self._limit = self.max_states
         # Room for a single row.
         flags = np.zeros((2, 1), np.bool_)
         self._one = np.empty(1, np.int64), *flags, blank_trace(1), np.empty((0, 0))
-        _MACHINES.add(self)
 
     @property
     def _capacity(self) -> int:
@@ -688,8 +694,8 @@ def opened(machine: EvolvingFSM) -> tuple[Learnt, Settings]:
 
 def _unlock_all() -> None:
     """In a process just forked: it lacks the threads that held locks and would release them."""
-    for machine in _MACHINES:
-        machine._lock = RLock()
+    for one in _SHARED:
+        one._lock = RLock()
 
 
 if hasattr(os, "register_at_fork"):

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm import store
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.explanation import explain
-from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.machine import EvolvingFSM, alone, share
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
@@ -172,6 +172,10 @@ class Guard:
 
     Notes
     -----
+    Threads may share a guard: each call is done before the next begins, and what it decides on is
+    one stream of observations. A file is saved between two calls. What an attribute returns, as
+    `machine` or `judge`, has to be left alone meanwhile.
+
     An input that is refused leaves the guard as it was. Where the judge itself raises, the
     observation was taken in; asking again with the same time decides on it.
 
@@ -273,6 +277,7 @@ class Guard:
         explaining: bool = False,
         missing: Missing = Missing.PARTIAL,
     ) -> None:
+        share(self)
         self.actions = reviser.actions
         self.interval = positive("interval", interval)
         asked = reviser.risk if isinstance(reviser, ActionReviser) else judge
@@ -333,6 +338,7 @@ class Guard:
         return self._learn
 
     @learn.setter
+    @alone
     def learn(self, learn: bool) -> None:
         self._learn = learn
         if self.judge is not None and hasattr(self.judge, "learning"):
@@ -357,6 +363,7 @@ class Guard:
             raise RuntimeError("no observation was given yet in this episode")
         return self._latest
 
+    @alone
     def begin(self) -> None:
         """Begin an episode; one that is under way is broken off, and nothing follows from it."""
         self._monitor = InputMonitor(self.missing, self.interval)
@@ -371,6 +378,7 @@ class Guard:
             self.audit.begin(self)
         self._under_way = True
 
+    @alone
     def decide(
         self,
         observation: ArrayLike,
@@ -413,6 +421,7 @@ class Guard:
             return self.actions.checked("proposal", action)
         return float(action)  # type: ignore[arg-type]
 
+    @alone
     def recognise(self, observation: ArrayLike, time: float) -> Situation:
         """The first half of `decide`: where the system is; machine and judge learn from it.
 
@@ -481,6 +490,7 @@ class Guard:
             seen = float(machine.visits[state]) * self.interval
         return Situation(z, belief, state, surprise, time, intake, seen)
 
+    @alone
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """The second half of `decide`: what to execute; machine and judge learn from it.
 
@@ -499,6 +509,7 @@ class Guard:
             return revision._replace(executed=int(revision.executed), advised=int(revision.advised))
         return revision
 
+    @alone
     def take_in(self, situation: Situation, proposal: Proposal, executed: Action) -> None:
         """Instead of `revise`, where it was decided elsewhere: learn from what was executed.
 
@@ -545,6 +556,7 @@ class Guard:
             text = explain(self._frozen, situation.belief, action, self._labels, nearest).text
         return revision._replace(explanation=text)
 
+    @alone
     def end(self, failed: bool = False, observation: ArrayLike | None = None) -> None:
         """End the episode, and learn from how it ended.
 
@@ -586,8 +598,18 @@ class Guard:
         if self.audit is not None:
             self.audit.ended(z, failed=failed)
 
+    # What another process gets has a lock of its own.
+    @alone
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        share(self)
+
     # -- Keeping it -----------------------------------------------------------------------------
 
+    @alone
     def copy(self, *, states: bool = True) -> Self:
         """A twin that learns for itself, as between two episodes; without the audit log.
 
@@ -606,6 +628,7 @@ class Guard:
         settings = {name: getattr(self, name) for name in names}
         return type(self).of(reviser, judge=judge, machine=machine if states else None, **settings)
 
+    @alone
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write all of it to one file: machine, judge and settings.
 
@@ -724,8 +747,9 @@ def _loaded(
 
 
 def _bytes(saved: EvolvingFSM | LearningJudge | None) -> NDArray[np.uint8]:
-    """The file that it saves itself to; empty where there is none."""
+    """The file that it saves itself to, which can be loaded; empty where there is none."""
     file = BytesIO()
     if saved is not None:
         saved.save(file)
+        type(saved).load(BytesIO(file.getvalue()))
     return np.frombuffer(file.getvalue(), np.uint8)
