@@ -7,7 +7,7 @@ colour alone. The same colours stand in ``io/graphs.py`` and ``cli/watch/live/pa
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,6 +43,8 @@ COLORS = {
 # Up to so many states are drawn as discs with numbers, a matrix has room for its values, and each
 # state has its number on an axis.
 _DISCS, _VALUES, _TICKS = 20, 8, 12
+# Of the arrows between states so many of each are dark; the widest of all [points].
+_DARK, _WIDEST = 2, 1.6
 # -- Of a model -----------------------------------------------------------------------------------
 
 
@@ -55,8 +57,7 @@ def states(
 ) -> Axes:
     """Centres of the states in the plane of two variables.
 
-    Where discs would overlap they are moved apart. What is on the axes before sets their limits as
-    well.
+    Where discs would overlap they are moved apart. What is on the axes before stays in view.
 
     Parameters
     ----------
@@ -94,8 +95,8 @@ def states(
     limits = ax.axis()
     draw_centers(ax, centers, dead_ends, size=13.0)
     ax.axis(limits)
-    ax.set_xlabel(model.labels.variable(variables[0]))
-    ax.set_ylabel(model.labels.variable(variables[1]))
+    across, up = map(model.labels.variable, variables)
+    ax.set(xlabel=across, ylabel=up)
     return ax
 
 
@@ -104,9 +105,8 @@ def graph(
 ) -> Axes:
     """The states on a circle, with arrows as wide as the next state is probable.
 
-    Staying is written beside the state; the two likeliest ways out of each state are dark. Axes,
-    dead ends, result and errors are as in `states`; ``policy`` is how actions are weighed, as in
-    ``averaged_matrix``.
+    Staying is written beside the state; the two likeliest ways out of each are dark. Axes, dead
+    ends, result and errors are as in `states`; ``policy`` weighs actions as in ``averaged_matrix``.
 
     Examples
     --------
@@ -120,9 +120,35 @@ def graph(
     """
     _refuse_unknown(model.n_states, dead_ends)
     ax = _given_or_new(ax)
-    matrix = model.averaged_matrix(policy)
-    notes = [f"stays {100 * value:.0f} %" for value in np.diag(matrix)]
-    draw_chain(ax, matrix, notes, dead_ends, widest=1.6, strongest=2)
+    matrix, n = model.averaged_matrix(policy), model.n_states
+    angle = 0.5 * np.pi - 2.0 * np.pi * np.arange(n) / n
+    places = np.column_stack([np.cos(angle), np.sin(angle)])  # from the top, clockwise
+    numbered = n <= _DISCS
+    for state, (x, y) in enumerate(places):
+        dead_end, note = state in dead_ends, f"stays {100 * matrix[state, state]:.0f} %"
+        draw_state(ax, x, y, state, 13.0, dead_end=dead_end, numbered=numbered)
+        if numbered or dead_end:  # among many there is room for dead ends alone
+            ha = "center" if abs(x) < 0.2 else "left" if x > 0.0 else "right"
+            va = "center" if abs(y) < 0.5 else "bottom" if y > 0.0 else "top"
+            color = COLORS["dead end"] if dead_end else ink()
+            said = f"dead end\n{note}" if dead_end else note
+            write(ax, said, (x, y), (11.0 * x, 11.0 * y), ha=ha, va=va, color=color)
+    ax.set(xlim=(-1.75, 1.75), ylim=(-1.35, 1.35), aspect="equal")
+    ax.set_axis_off()
+    between = matrix * (1.0 - np.eye(n))
+    heaviest = max(float(between.max(initial=0.0)), 1e-12)
+    rank = np.argsort(np.argsort(-between, axis=1), axis=1)
+    for i, j in np.argwhere(between > 0.005 * heaviest):
+        pale = rank[i, j] >= _DARK
+        if pale and not numbered:
+            continue
+        way = places[j] - places[i]
+        bend = 0.28 / float(np.hypot(*way))
+        look: Look = {"connectionstyle": f"arc3,rad={bend}", "arrowstyle": "-|>"}
+        look |= {"mutation_scale": 6.5, "shrinkA": 7.5, "shrinkB": 8.5}
+        look |= {"linewidth": max(_WIDEST * between[i, j] / heaviest, 0.4)}
+        look["color"] = ink(0.19) if pale else COLORS["dead end"] if j in dead_ends else ink(0.69)
+        ax.add_patch(FancyArrowPatch(places[i], places[j], zorder=1.5 if pale else 2.0, **look))
     return ax
 
 
@@ -251,8 +277,8 @@ def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = No
     between = np.array([revision.interval for revision in revisions]).T
     _draw_decisions(ax, drive, (proposed, executed), between, "follower", "90 % interval")
     if tolerance is not None:
-        label = f"tolerance, {tolerance:g}"
-        ax.axhline(tolerance, color=ink(), linestyle=":", linewidth=1.0, label=label)
+        look: Look = {"linestyle": ":", "linewidth": 1.0, "label": f"tolerance, {tolerance:g}"}
+        ax.axhline(tolerance, color=ink(), **look)
     ax.set(ylim=(-0.03, 1.03), ylabel="latent risk")
     return _finished(ax, drive, 0.0)
 
@@ -411,57 +437,6 @@ def _apart(places: NDArray[np.float64], size: float) -> NDArray[np.float64]:
         way += aside[:, None] - aside
         places = places + 0.5 * np.sum((push / (distance + 1e-3))[:, :, None] * way, axis=1)
     return places
-
-
-def draw_chain(
-    axes: Axes,
-    weights: NDArray[np.float64],
-    notes: Sequence[str],
-    dead_ends: States,
-    widest: float,
-    strongest: int | None = None,
-    counted: bool = False,
-) -> None:
-    """Draw states on a circle, with notes, and arrows between them as wide as their weights.
-
-    With ``strongest`` all but so many arrows of each state are pale; ``counted`` weights are
-    written on the arrows.
-    """
-    n = len(notes)
-    angle = 0.5 * np.pi - 2.0 * np.pi * np.arange(n) / max(n, 1)
-    places = np.column_stack([np.cos(angle), np.sin(angle)])  # from the top, clockwise
-    numbered = n <= _DISCS
-    for state, ((x, y), note) in enumerate(zip(places, notes, strict=True)):
-        dead_end = state in dead_ends
-        draw_state(axes, x, y, state, 13.0, dead_end=dead_end, numbered=numbered)
-        if numbered or dead_end:  # among many there is room for dead ends alone
-            ha = "center" if abs(x) < 0.2 else "left" if x > 0.0 else "right"
-            va = "center" if abs(y) < 0.5 else "bottom" if y > 0.0 else "top"
-            color = COLORS["dead end"] if dead_end else ink()
-            said = f"dead end\n{note}" if dead_end else note
-            write(axes, said, (x, y), (11.0 * x, 11.0 * y), ha=ha, va=va, color=color)
-    axes.set(xlim=(-1.75, 1.75), ylim=(-1.35, 1.35), aspect="equal")
-    axes.set_axis_off()
-    between = weights * (1.0 - np.eye(n))
-    heaviest = max(float(between.max(initial=0.0)), 1e-12)
-    rank = np.argsort(np.argsort(-between, axis=1), axis=1)
-    for i, j in np.argwhere(between > 0.005 * heaviest):
-        pale = strongest is not None and rank[i, j] >= strongest
-        if pale and not numbered:
-            continue
-        way = places[j] - places[i]
-        bend = 0.28 / float(np.hypot(*way))
-        look: Look = {"connectionstyle": f"arc3,rad={bend}", "arrowstyle": "-|>"}
-        look |= {"mutation_scale": 6.5, "shrinkA": 7.5, "shrinkB": 8.5}
-        look |= {"linewidth": max(widest * between[i, j] / heaviest, 0.4)}
-        look["color"] = ink(0.19) if pale else COLORS["dead end"] if j in dead_ends else ink(0.69)
-        zorder = 1.5 if pale else 2.0
-        axes.add_patch(FancyArrowPatch(places[i], places[j], zorder=zorder, **look))
-        if counted and numbered:
-            middle = 0.5 * (places[i] + places[j]) + 0.5 * bend * np.array([way[1], -way[0]])
-            box: Look = {"boxstyle": "round,pad=0.12", "facecolor": ink(0.0), "edgecolor": "none"}
-            look = {"ha": "center", "va": "center_baseline", "zorder": 3}
-            write(axes, f"{weights[i, j]:.0f}", tuple(middle), bbox=box, **look)
 
 
 def label_states(axis: Axis, n: int, dead_ends: States = (), *, called: str = "") -> None:

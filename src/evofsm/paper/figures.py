@@ -66,9 +66,8 @@ def figures(study: PaperStudy) -> Iterator[Figure]:
     yield Figure(
         "graph",
         "State graph",
-        "Left, what the machine has learnt: the probability that one state follows another in the "
-        "next step, over all actions as often as each was used; staying is written beside the "
-        "state. Right, how often the most probable state changed from one to another.",
+        "What the machine has learnt: the probability that one state follows another in the next "
+        "step, over all actions as often as each was used; staying is written beside the state.",
         partial(draw_graph, study),
     )
 
@@ -255,16 +254,7 @@ def draw_space(study: PaperStudy) -> Drawn:
 
 
 def draw_graph(study: PaperStudy) -> Drawn:
-    """The state graph twice: learnt probabilities, and changes of the recognised state."""
-    model = study.model
-    figure = Drawn(figsize=(WIDTH, 3.6))
-    learnt, recognised = figure.subplots(1, 2)
-    figure.subplots_adjust(0.0, 0.05, 1.0, 0.94, wspace=0.0)
-    plot.graph(model, learnt, dead_ends=study.dead_ends)
-    learnt.set_title("learnt: probability of the next state, per step", x=0.03)
-    changes = model.changes - np.diag(np.diag(model.changes))
-    share = model.visits / max(float(model.visits.sum()), 1.0)
-    notes = [f"{100 * value:.0f} % of time" for value in share]
-    plot.draw_chain(recognised, changes, notes, study.dead_ends, widest=3.0, counted=True)
-    recognised.set_title(f"recognised: changes of state in {len(study.runs)} runs", x=0.03)
+    """What leads to what, as the machine has learnt it."""
+    figure = Drawn(figsize=(WIDTH, 3.6), layout="constrained")
+    plot.graph(study.model, figure.subplots(), dead_ends=study.dead_ends)
     return figure

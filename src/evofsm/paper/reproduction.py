@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from evofsm.driving.measures import time_to_collision
 from evofsm.driving.naming import UNITS, VARIABLES
@@ -98,24 +97,7 @@ def reproduce(
     settings: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Reproduction:
-    """Drive the four cases of the paper, round by round, and hold every claim against the runs.
-
-    Parameters
-    ----------
-    world : str
-        ``"sumo"``, or ``"kinematic"`` for the same motion in closed form.
-    rounds : int
-        How often the four cases are driven.
-    settings : pathlib.Path, optional
-        TOML file with settings in place of the paper's.
-    progress : callable
-        Told how many runs are done, of how many.
-
-    Raises
-    ------
-    ValueError
-        If there is no such world, or the file holds what is not known.
-    """
+    """Drive the four cases of the paper, round by round, and hold every claim against the runs."""
     told = Settings.load(settings)
     with open_world(world) as place:
         study = run_paper(place, world, told, rounds, progress)
@@ -125,16 +107,13 @@ def reproduce(
 def _trace(number: int, run: Run) -> pl.DataFrame:
     """A run's rows; states and actions are indices, from 0."""
     episode = run.episode
-    gap, v_follower, v_leader = episode.observations.T
     return pl.DataFrame(
         {
             "run": np.full(len(episode.time), number),
             "name": [run.name] * len(episode.time),
             "round": np.full(len(episode.time), run.round),
             "time": episode.time,
-            "gap": gap,
-            "v_follower": v_follower,
-            "v_leader": v_leader,
+            **dict(zip(VARIABLES, episode.observations.T, strict=True)),
             "a_follower": episode.accelerations,
             "a_follower_realised": episode.realised,
             "a_leader": episode.leader_accelerations,
@@ -222,18 +201,19 @@ def _table_of_states(study: PaperStudy) -> Table:
     created = zip(study.creations, study.model.centers.tolist(), strict=True)
     hopeless = np.concatenate([study.in_dead_end(run) for run in study.runs])
     ends = [run.state[-1] for run in study.runs if run.episode.collided]
-    rows = [
-        {
+    rows = []
+    for state, ((run, time), center) in enumerate(created):
+        here = recognised == state
+        row = {
             "state": state + 1,
             **dict(zip(VARIABLES, center, strict=True)),
             "run": run + 1,
             "time": time,
-            "share": float((recognised == state).mean()),
-            "dead end": _mean(hopeless[recognised == state]),
+            "share": float(here.mean()),
+            "dead end": float(hopeless[here].mean()) if here.any() else None,
             "collisions": ends.count(state),
         }
-        for state, ((run, time), center) in enumerate(created)
-    ]
+        rows.append(row)
     centers = zip(VARIABLES, UNITS, strict=True)
     return Table(
         "States",
@@ -249,10 +229,6 @@ def _table_of_states(study: PaperStudy) -> Table:
         "Time: share of all. Dead end: share of the state's time in which, by an oracle, the cars "
         "would collide if both braked as hard as they can.",
     )
-
-
-def _mean(values: NDArray[np.bool_]) -> float | None:
-    return float(values.mean()) if len(values) else None
 
 
 def _table_of_lead_times(study: PaperStudy) -> Table:

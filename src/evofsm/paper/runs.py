@@ -162,12 +162,10 @@ class PaperStudy:
     @property
     def creations(self) -> list[tuple[int, float]]:
         """In which run each state was created, and when in it [s]."""
-        ends = np.cumsum([len(run.state) for run in self.runs])
         rows = np.asarray(self.model.created).astype(int) - 1
-        numbers = np.searchsorted(ends, rows, side="right")
-        found = zip(numbers.tolist(), rows.tolist(), strict=True)
-        times = [(run, self.runs[run].episode.time, row - ends[run]) for run, row in found]
-        return [(run, float(time[row])) for run, time, row in times]  # rows from the run's end
+        numbers = np.repeat(range(len(self.runs)), [len(run.state) for run in self.runs])[rows]
+        times = np.concatenate([run.episode.time for run in self.runs])[rows]
+        return list(zip(numbers.tolist(), times.tolist(), strict=True))
 
     @property
     def dead_ends(self) -> tuple[int, ...]:
@@ -185,11 +183,6 @@ class PaperStudy:
         return is_dead_end(run.episode.observations, self.settings.decel, leader.brake_decel)
 
 
-def as_it_is(number: int, episode: Episode) -> NDArray[np.float64]:
-    """What the paper's machine observes of a run: what truly happened."""
-    return episode.observations
-
-
 def _widen(belief: NDArray[np.float64], n: int) -> NDArray[np.float64]:
     """Beliefs (..., n) over n states, 0 for those created since."""
     return np.pad(belief, [(0, 0)] * (belief.ndim - 1) + [(0, n - belief.shape[-1])])
@@ -203,7 +196,7 @@ def run_paper(
     progress: Callable[[int, int], None] = lambda done, total: None,
     *,
     order: Sequence[int] = CASES,
-    observe: Callable[[int, Episode], NDArray[np.float64]] = as_it_is,
+    observe: Callable[[int, Episode], NDArray[np.float64]] | None = None,
     beliefs: bool = True,
 ) -> PaperStudy:
     """Drive and learn all runs.
@@ -222,8 +215,9 @@ def run_paper(
         Told how many runs are done, of how many.
     order : sequence of int
         In which the cases are driven in each round.
-    observe : callable
-        What the machine observes of a run, (T, 3): told how many runs came before, and the run.
+    observe : callable, optional
+        What the machine observes of a run, (T, 3), told how many runs came before, and the run;
+        without it what truly happened.
     beliefs : bool
         Whether to keep every belief. The claims do without, and with hundreds of states they take
         gigabytes; `Run.belief` then has no columns, and `Run.first_surprise` is NaN.
@@ -235,13 +229,13 @@ def run_paper(
     machine = EvolvingFSM(settings.actions.n_actions, **settings.machine)
     total = rounds * len(CASES) + len(settings.brake_at) + 2
     runs: list[Run] = []
-
     extra_runs: list[Run] = []
 
     def learn(machine: EvolvingFSM, name: str, case: int, round_: int, scenario: Scenario) -> Run:
         """Drive a run and show it to the machine, row by row."""
         episode = world.run(scenario, settings.drivers[case])
-        seen = observe(len(runs) + len(extra_runs), episode)
+        before = len(runs) + len(extra_runs)
+        seen = observe(before, episode) if observe else episode.observations
         n, action = machine.n_states, settings.actions.encode(episode.accelerations)
         # Of the first row: the uniform belief through the marginal matrix.
         foreseen = np.full(n, 1.0 / max(n, 1)) @ machine.marginal_matrix
@@ -250,7 +244,7 @@ def run_paper(
         belief = np.empty((len(action), 0)) if trace.belief is None else trace.belief
         known = beliefs and n > 0
         first = jensen_shannon(_widen(foreseen, machine.n_states), belief[0]) if known else math.nan
-        progress(len(runs) + len(extra_runs) + 1, total)
+        progress(before + 1, total)
         found = action, trace.state, trace.n_states, belief, trace.surprise, float(first)
         return Run(name, case, round_, episode, *found)
 
