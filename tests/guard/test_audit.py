@@ -258,11 +258,11 @@ def test_quiet_decisions_are_held_back_for_a_while_only(tmp_path, monkeypatch):
     path = tmp_path / "log"
     with AuditLog(path) as log:
         guard = Guard.of(Unrevised(ACTIONS), interval=0.25, audit=log)
-        for _ in range(12):
+        for _ in range(11):
             guard.decide([50.0, 9.0, 9.0], 0.5)
         assert kinds(path) == ["start", "begin", "quiet", "quiet"]
     assert kinds(path)[-1] == "quiet"  # closing writes the rest
-    assert audit(path).replayed == 12
+    assert audit(path).replayed == 11
 
 
 def test_each_record_is_on_the_disk_before_its_action_is_executed(tmp_path, monkeypatch):

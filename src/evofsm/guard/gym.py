@@ -101,7 +101,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         penalty: float = 0.0,
     ) -> None:
         super().__init__(env)
-        self.guard = guard
+        self.guard, self.failed = guard, failed
         spaces = env.observation_space, env.action_space
         terms = Terms(guard, *spaces, observe, failed, penalty)
         self._lane = Lane(terms, shared=False)

@@ -507,6 +507,7 @@ class Memory:
         if fitted:
             known = past.between(0, fitted)
             self._fit_spreads(known)
+            self._fit_motion(known)
             self._conclude(known)
 
     def _fit(self, past: Past) -> Past:
@@ -525,7 +526,6 @@ class Memory:
         return past
 
     def _conclude(self, past: Past) -> None:
-        self._fit_motion(past)
         self._fit_oneself(past)
         self._fit_contact(past)
         self._fit_objects(past)
