@@ -100,9 +100,9 @@ def test_who_is_warm_compiles_no_more():
 def test_a_machine_without_a_limit_compiles_nothing_that_merges_states():
     """What is rare stays out of the kernel of every step: it takes as long to compile as a step."""
     code = (
-        "import numpy as np, evofsm, evofsm.fsm.limit as limit\n"
+        "import numpy as np, evofsm, evofsm.fsm.transitions as kernels\n"
         "evofsm.EvolvingFSM(1).observe(np.zeros(2))\n"
-        "print(len(limit.merge_closest.signatures))"
+        "print(len(kernels.merge_closest.signatures))"
     )
     fresh = {**os.environ, "NUMBA_CACHE_DIR": tempfile.mkdtemp()}
     finished = subprocess.run(
@@ -111,15 +111,9 @@ def test_a_machine_without_a_limit_compiles_nothing_that_merges_states():
     assert finished.stdout.split() == ["0"]
 
 
-def test_compiling_that_takes_long_is_announced_once(caplog, monkeypatch):
-    monkeypatch.setattr(kernels._Announcement, "_PATIENCE", 0.05)
+def test_compiling_is_announced_once(caplog):
     told = kernels._Announcement()
-    told.on_start(None)
-    told.on_end(None)  # quick
     for _ in range(2):
         told.on_start(None)
-        told.on_start(None)  # for another kernel
-        told.on_end(None)
-        told._timer.join()
         told.on_end(None)
     assert [record.getMessage()[:23] for record in caplog.records] == ["compiling kernels, once"]

@@ -24,6 +24,7 @@ from evofsm.fsm.validation import Floats
 UNCHANGED: int = 0
 MOVED: int = 1
 CREATED: int = 2
+MERGED: int = 4
 #: Which rule judges an observation.
 PAPER: int = 0
 EDGES: int = 1

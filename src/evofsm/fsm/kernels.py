@@ -11,11 +11,10 @@ import os
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
-from threading import Timer
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
@@ -163,39 +162,22 @@ _log = logging.getLogger("evofsm")
 
 
 class _Announcement(event.Listener):
-    """Says once that kernels are compiled, where that takes longer than a second."""
+    """Says once that kernels are compiled."""
 
-    _PATIENCE: ClassVar = 1.0  # [s]
-
-    def __init__(self) -> None:
-        self._depth, self._timer, self._said = 0, Timer(0.0, self._say), False
+    said = False
 
     def on_start(self, event: object) -> None:
-        self._depth += 1
-        if self._depth == 1:
-            self._timer = Timer(self._PATIENCE, self._say)
-            self._timer.daemon = True
-            self._timer.start()
-
-    def on_end(self, event: object) -> None:
-        self._depth -= 1
-        if self._depth == 0:
-            self._timer.cancel()
-
-    def _say(self) -> None:
-        if not self._said:
+        if not self.said:
             _log.warning("compiling kernels, once; this takes some seconds ...")
-        self._said = True
+        self.said = True
+
+    def on_end(self, event: object) -> None: ...
 
 
-_announced: list[_Announcement] = []
-
-
+@cache
 def announce_compiling() -> None:
-    """From now on, log once (on stderr, unless told otherwise) where compiling takes long."""
-    if not _announced:
-        _announced.append(_Announcement())
-        event.register("numba:compile", _announced[0])
+    """From now on, log once (on stderr, unless told otherwise) that kernels are compiled."""
+    event.register("numba:compile", _Announcement())
 
 
 # -- Caches ---------------------------------------------------------------------------------------

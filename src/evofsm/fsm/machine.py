@@ -16,7 +16,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Self, SupportsIndex, TypeVar, cast
+from typing import Any, Self, SupportsIndex, TypeVar, cast
 from weakref import WeakSet
 
 import numpy as np
@@ -41,7 +41,7 @@ from evofsm.fsm.clusters import PAPER, width_of
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.explanation import Explanation, Nearest, explain
 from evofsm.fsm.kernels import LINE, entry
-from evofsm.fsm.model import Counts, FSMModel, Policy, believed, check_forecast
+from evofsm.fsm.model import FSMModel, Policy, believed, check_forecast
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import StateRule
@@ -82,7 +82,7 @@ def alone(method: Method) -> Method:
     return cast(Method, locked)
 
 
-class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # by __getattr__
+class EvolvingFSM:
     """A finite state machine that grows its states and transitions from what it observes.
 
     It has the arrays of a snapshot, `FSMModel`, under their names, as `visits`.
@@ -130,21 +130,6 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
     >>> machine.predict(0).round(3), machine.predict(1).round(3)  # 1 was never tried
     (array([0.48, 0.52]), array([0.5, 0.5]))
     """
-
-    radius: float
-    distance_weight: float
-    learning_rate: float
-    prior_frequency: float
-    spread: float
-    max_states: int | None
-    belief_tolerance: float
-    failure_horizon: int | None
-    potentials: Floats
-    transition_matrices: Floats
-    origin_frequency: Floats
-    uses: Floats
-    joint_frequency: Floats
-    marginal_matrix: Floats
 
     def __init__(
         self,

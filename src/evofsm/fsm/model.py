@@ -39,41 +39,7 @@ _NONE: Any = None
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Counts:
-    """What was counted; machines and models have it under these names.
-
-    n is the number of states, q of actions. Counts never forget. An episode is counted once for
-    each state it came to, and each action it took there, for its observations are no independent
-    evidence; the one that is going on is not shown yet. It failed *soon* after it was in a state if
-    no more than ``failure_horizon`` observations lay between; without that, if it failed at all.
-
-    Examples
-    --------
-    >>> from evofsm import EvolvingFSM
-    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0], [0, 2], [3])
-    >>> machine.visits, machine.endings, machine.episodes, machine.failed_soon
-    (array([3., 1.]), array([0., 1.]), array([2., 1.]), array([1., 1.]))
-    >>> machine.decisions[0], machine.failures[0], machine.tried[0], machine.failed_after[0]
-    (array([2., 0.]), array([1., 0.]), array([2., 0.]), array([1., 0.]))
-    """
-
-    visits: Floats = _NONE  #: (n,) observations in which each state was the most probable
-    created: Floats = _NONE  #: (n,) number of the observation that created each state, from 1
-    changes: Floats = _NONE  #: (n, n) steps from the most probable state to the next (column)
-    decisions: Floats = _NONE  #: (q, n) transitions that began in each state, by belief
-    failures: Floats = _NONE  #: (q, n) those of `decisions` that led straight into failure
-    endings: Floats = _NONE  #: (n,) failures whose last observation was recognised as each state
-    episodes: Floats = _NONE  #: (n,) episodes that came to each state
-    failed_soon: Floats = _NONE  #: (n,) those of `episodes` that failed soon after they were there
-    joined: Floats = _NONE  #: (n,) 1 where states were joined, so that an episode may count twice
-    tried: Floats = _NONE  #: (q, n) episodes that took each action in each state
-    failed_after: Floats = _NONE  #: (q, n) those of `tried` that failed soon after they did
-    onsets: Floats = _NONE  #: (n,) times that something unexpected began there, as it was told
-
-
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class FSMModel(Counts):
+class FSMModel:
     """States and transitions as they stood when the snapshot was taken.
 
     n is the number of states, m of variables, q of actions. Distances and potentials are those of
@@ -81,12 +47,19 @@ class FSMModel(Counts):
     read-only, and counts that are not given are 0. Parts that do not fit each other, or hold what
     cannot be, are refused.
 
+    Counts never forget. An episode is counted once for each state it came to, and each action it
+    took there, for its observations are no independent evidence; the one that is going on is not
+    shown yet. It failed *soon* after it was in a state if no more than ``failure_horizon``
+    observations lay between; without that, if it failed at all.
+
     Examples
     --------
     >>> from evofsm import EvolvingFSM
     >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], failures=[3])
     >>> model = machine.model(names=["gap"], units=["m"])
+    >>> model.visits, model.endings, model.episodes, model.failed_soon
+    (array([3., 1.]), array([0., 1.]), array([1., 1.]), array([1., 1.]))
     >>> model
     FSMModel(2 states of gap, 2 actions, 4 observations, Paper())
     >>> model.recognise([[0.0], [0.5]]).round(3)
@@ -111,6 +84,18 @@ class FSMModel(Counts):
     names: tuple[str, ...] = ()  #: of the m variables
     units: tuple[str, ...] = ()  #: of the m variables
     dt: float | None = None  #: time between two observations [s]
+    visits: Floats = _NONE  #: (n,) observations in which each state was the most probable
+    created: Floats = _NONE  #: (n,) number of the observation that created each state, from 1
+    changes: Floats = _NONE  #: (n, n) steps from the most probable state to the next (column)
+    decisions: Floats = _NONE  #: (q, n) transitions that began in each state, by belief
+    failures: Floats = _NONE  #: (q, n) those of `decisions` that led straight into failure
+    endings: Floats = _NONE  #: (n,) failures whose last observation was recognised as each state
+    episodes: Floats = _NONE  #: (n,) episodes that came to each state
+    failed_soon: Floats = _NONE  #: (n,) those of `episodes` that failed soon after they were there
+    joined: Floats = _NONE  #: (n,) 1 where states were joined, so that an episode may count twice
+    tried: Floats = _NONE  #: (q, n) episodes that took each action in each state
+    failed_after: Floats = _NONE  #: (q, n) those of `tried` that failed soon after they did
+    onsets: Floats = _NONE  #: (n,) times that something unexpected began there, as it was told
 
     def __post_init__(self) -> None:
         m, q, n = self.n_variables, self.n_actions, self.n_states

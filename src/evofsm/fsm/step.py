@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.fsm.arrays import ENDINGS, EPISODES, FAILED_SOON, NO_ACTION, VISITS, Learnt, Settings
-from evofsm.fsm.clusters import CREATED, MOVED, UNCHANGED, determine, recognise, width_of
+from evofsm.fsm.clusters import CREATED, MERGED, MOVED, UNCHANGED, determine, recognise, width_of
 from evofsm.fsm.divergence import jensen_shannon_kernel
 from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced_kernel
-from evofsm.fsm.limit import MERGED, merge_closest
-from evofsm.fsm.transitions import expand, forecast_and_identify, place_of, room_for
+from evofsm.fsm.transitions import expand, forecast_and_identify, merge_closest, place_of, room_for
 from evofsm.fsm.validation import Floats
 
 #: The most states, or None: without a limit a kernel is compiled in half of the time.
