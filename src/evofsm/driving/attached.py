@@ -139,11 +139,7 @@ class Seeing:
         return Neighbour(follower, gap + body.min_gap, self._room(gap, body, its - speed), its)
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
-        """The speed that a car's own model wants after the next step [m/s].
-
-        By whoever is ahead, the limit and what the car can do. Red lights and right of way may make
-        it lower, dawdling too.
-        """
+        """The speed that a car's own model wants after the next step [m/s], but for red lights."""
         vehicle = self._vehicle
         fastest = min(vehicle.getAllowedSpeed(car), speed + vehicle.getAccel(car) * self.dt)
         if ahead is None:
@@ -415,10 +411,7 @@ def _leaders_of(guard: Guard | None) -> Manoeuvres:
 
 
 def choose(vehicles: str | float | Iterable[str], seed: int = 0) -> Callable[[Any, str], bool]:
-    """A test of whether a vehicle is one of those that are meant, as `attach` takes them.
-
-    Of a share, id and seed alone decide: the same vehicles are meant in every run.
-    """
+    """A test of whether a vehicle is one of those that are meant, the same in every run."""
     if vehicles == "all":
         return lambda sumo, car: True
     if isinstance(vehicles, str) and vehicles.startswith(_TYPE):

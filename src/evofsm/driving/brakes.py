@@ -184,10 +184,9 @@ class OwnBrakes:
 
     def _is_sure_to_fall_short(self) -> bool:
         """Without noise the latest few tell; in noise it takes more."""
-        if len(self.shortfalls) < _FEWEST:
-            return False
-        _, of_few = self.shortfalls.mean_and_bound(_SURE, _FEWEST)
-        return of_few > _SHORTFALL or self.shortfalls.mean_and_bound(_SURE)[1] > _SHORTFALL
+        seen = self.shortfalls
+        bounds = (seen.mean_and_bound(_SURE, latest)[1] for latest in (_FEWEST, None))
+        return len(seen) >= _FEWEST and any(bound > _SHORTFALL for bound in bounds)
 
 
 @compiled

@@ -106,11 +106,7 @@ def shadow_drive(
     *,
     failed: bool = False,
 ) -> Episode:
-    """Let a guard in shadow mode decide on each row of a recorded episode, and learn from it.
-
-    Its decisions have what was done as the proposal, and what the guard would have done as
-    ``advised``.
-    """
+    """Let a guard in shadow mode decide on each row of a recorded episode, and learn from it."""
     mode = getattr(guard.reviser, "mode", Mode.ACT)
     if mode not in (Mode.SHADOW, Mode.OFF):
         raise ValueError(f"the guard's mode is {mode.value}; what was recorded needs shadow or off")

@@ -2,8 +2,8 @@
 
 A `Family` has a function ``make(numbers)`` that returns a scenario and who drives the follower. It
 asks `Numbers` for whatever is drawn, each number by the place that it is for, such as
-``scenario.initial_gap``. Each place has random numbers of its own: two families that differ in one
-number draw the same ones everywhere else. All numbers are SI units.
+``scenario.initial_gap``. Each place has random numbers of its own, whatever else is drawn. All are
+in SI units.
 """
 
 from __future__ import annotations
@@ -224,24 +224,20 @@ class Family:
 
     def _check_limits(self, scenario: Scenario, driver: IDM | ChangingIDM) -> None:
         """Who is given the limits must be able to rely on them."""
-        leader = scenario.leader
+        where, leader = self.source or f"family {self.name}", scenario.leader
         leader_brakes = max([leader.brake_decel, *(-wave for _, wave in leader.waves)])
         if leader_brakes > self.leader_decel + _ROUNDING:
             raise ValueError(
-                f"{self._where}: a leader brakes by {leader_brakes:g} m/s², but leader_decel is "
+                f"{where}: a leader brakes by {leader_brakes:g} m/s², but leader_decel is "
                 f"{self.leader_decel:g}"
             )
         commanded = min(self.low, float(driver.parameters[:, 7].min()))
         brakes = -max(scenario.body.lowest, commanded)
         if brakes > self.decel + _ROUNDING:
             raise ValueError(
-                f"{self._where}: the follower can brake by {brakes:g} m/s², but decel is "
+                f"{where}: the follower can brake by {brakes:g} m/s², but decel is "
                 f"{self.decel:g}; bound its body, or the driver and the actions"
             )
-
-    @property
-    def _where(self) -> str:
-        return self.source or f"family {self.name}"
 
     def __reduce__(self) -> Any:
         """From a file it is read anew in other processes, which do not know its functions."""

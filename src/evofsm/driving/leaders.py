@@ -3,10 +3,9 @@
 What a leader does next hardly depends on the follower, so each hard manoeuvre seen anywhere counts
 everywhere. The chance that the next one is harder than some deceleration is read from a kernel
 density over those remembered (Epanechnikov's kernel, Silverman's bandwidth), together with one
-manoeuvre that was only assumed, as hard as a cautious engineer would have it: with N remembered it
-weighs 1 / (N + 1), which is also the chance that the next one is harder than all before it. So it
-takes 49 hard brakes until a risk of 2 % can be told from the assumption, unless one begins with a
-table of them (`LeaderBrakes`).
+manoeuvre that was only assumed: with N remembered it weighs 1 / (N + 1), which is also the chance
+that the next one is harder than all before it. So it takes 49 hard brakes until a risk of 2 % can
+be told from the assumption, unless one begins with a table of them (`LeaderBrakes`).
 """
 
 from __future__ import annotations

@@ -64,9 +64,14 @@ class _ShortTime(_Measure):
 
     threshold: float
 
-    def _score(self, time: Floats) -> Floats:
+    def score(self, observations: Floats, dt: float) -> Floats:
+        """1 / time − 1 / threshold [1/s]; infinite where the cars have met."""
+        time = self._time(observations, dt)
         with np.errstate(divide="ignore", over="ignore"):
             return np.asarray(1.0 / time - 1.0 / self.threshold)
+
+    def _time(self, observations: Floats, dt: float) -> Floats:
+        raise NotImplementedError
 
 
 # -- Time to collision ----------------------------------------------------------------------------
@@ -95,9 +100,8 @@ class TimeToCollision(_ShortTime):
 
     threshold: float = 1.5
 
-    def score(self, observations: Floats, dt: float) -> Floats:
-        """1 / time to collision − 1 / threshold [1/s]; infinite where the cars have met."""
-        return self._score(time_to_collision(observations))
+    def _time(self, observations: Floats, dt: float) -> Floats:
+        return time_to_collision(observations)
 
 
 def modified_time_to_collision(observations: Floats, dt: float) -> Floats:
@@ -122,9 +126,8 @@ class ModifiedTimeToCollision(_ShortTime):
 
     threshold: float = 1.5
 
-    def score(self, observations: Floats, dt: float) -> Floats:
-        """1 / modified time to collision − 1 / threshold [1/s]; infinite where the cars met."""
-        return self._score(modified_time_to_collision(observations, dt))
+    def _time(self, observations: Floats, dt: float) -> Floats:
+        return modified_time_to_collision(observations, dt)
 
 
 def time_headway(observations: Floats) -> Floats:
@@ -138,16 +141,12 @@ def time_headway(observations: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class TimeHeadway(_ShortTime):
-    """Danger where the time headway is below a ``threshold`` [s] (Vogel 2003).
-
-    Below 1 s Sweden fines.
-    """
+    """Danger where the time headway is below a ``threshold`` [s] (Vogel 2003)."""
 
     threshold: float = 1.0
 
-    def score(self, observations: Floats, dt: float) -> Floats:
-        """1 / time headway − 1 / threshold [1/s]; infinite where the cars have met."""
-        return self._score(time_headway(observations))
+    def _time(self, observations: Floats, dt: float) -> Floats:
+        return time_headway(observations)
 
 
 # -- Needed braking -------------------------------------------------------------------------------
@@ -357,9 +356,8 @@ class FuzzySafety(_Measure):
 
     def score(self, observations: Floats, dt: float) -> Floats:
         """The larger one of PFS and CFS − threshold; 1 − threshold where the cars have met."""
-        return np.maximum(self.proactive(observations), self.critical(observations, dt)) - (
-            self.threshold
-        )
+        larger = np.maximum(self.proactive(observations), self.critical(observations, dt))
+        return larger - self.threshold
 
     def proactive(self, observations: Floats) -> Floats:
         """PFS, how unsafe the gap is should the leader brake in full (Mattas et al. 2020).

@@ -33,10 +33,7 @@ def name_state(center: ArrayLike, decimals: int = 0) -> str:
     >>> name_state([60.0, 25.0, 27.3], decimals=1)
     'far (60.0 m), fast (25.0 m/s), opening at 2.3 m/s'
     """
-    where = real_array("center", center, 1)
-    if len(where) != 3:
-        raise ValueError(f"center has {len(where)} variables; a name needs gap and both speeds")
-    gap, speed, leader = where.tolist()
+    gap, speed, leader = real_array("center", center, 1).tolist()
     closing = speed - leader
     change = f"{'closing' if closing > 0.0 else 'opening'} at {abs(closing):.{decimals}f} m/s"
     if abs(closing) < _EQUAL and decimals == 0:

@@ -202,10 +202,7 @@ def _filtered(
 
 
 class _Sizes:
-    """Absolute values of the latest residuals, and their standard deviation.
-
-    It is told from the median, so that a few odd ones do not matter.
-    """
+    """Absolute values of the latest residuals, and their deviation: robust, from the median."""
 
     def __init__(self, sizes: Iterable[float] = ()) -> None:
         self.latest = deque(map(abs, sizes), maxlen=_MEMORY)
@@ -233,8 +230,6 @@ def _noise(sizes: Iterable[_Sizes], dt: float) -> Three:
     gap, own, leader = [each.deviation() for each in sizes]
     own, leader = own / _SIX, leader / _SIX
     gap = sqrt(max(gap**2 - 0.5 * dt**2 * (own**2 + leader**2), 0.0) / 2.0)
-    return (
-        gap if gap >= _FINEST[0] else 0.0,
-        own if own >= _FINEST[1] else 0.0,
-        leader if leader >= _FINEST[2] else 0.0,
-    )
+    found = zip((gap, own, leader), _FINEST, strict=True)
+    gap, own, leader = (size if size >= finest else 0.0 for size, finest in found)
+    return gap, own, leader

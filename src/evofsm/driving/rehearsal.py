@@ -2,9 +2,8 @@
 
 The follower does what is asked of it for one decision interval and then brakes in full; the leader
 brakes from now on until it stands. The *critical deceleration* is the hardest braking of the leader
-that ends without a collision. Only kinematics is taken as known; the rest is for others to learn.
-Asking for the fixed cautious policy, and not for the best of many uncertain answers, keeps luck
-out of the estimate.
+that ends without a collision. Asking for the fixed cautious policy, and not for the best of many
+uncertain answers, keeps luck out of the estimate.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ HARDEST = 15.0
 
 # Halvings of [0, HARDEST] in search of the critical deceleration: to 0.015 m/s².
 _HALVINGS = 10
-
 
 #: Gap [m], speed of the follower and of the leader [m/s].
 Three: TypeAlias = tuple[float, float, float]

@@ -67,7 +67,7 @@ class EnvelopeReviser:
     def described(self) -> dict[str, Any] | None:
         """What it takes to make it again; None where its measure is someone's own."""
         cls = type(self.measure)
-        if cls is not _own_measure(cls.__name__) and part_name(self.measure) is None:
+        if cls is not getattr(measures, cls.__name__, None) and part_name(self.measure) is None:
             return None
         return {"dt": self.dt, "measure": {"class": cls.__name__, **asdict(self.measure)}}  # type: ignore[call-overload]
 
@@ -76,11 +76,8 @@ class EnvelopeReviser:
         """The one that was `described`."""
         given = dict(described["measure"])
         name = given.pop("class")
-        return cls((_own_measure(name) or part_class(name))(**given), actions, described["dt"])
-
-
-def _own_measure(name: str) -> Any:
-    return getattr(measures, name, None)
+        kind = getattr(measures, name, None) or part_class(name)
+        return cls(kind(**given), actions, described["dt"])
 
 
 class Unrevised:

@@ -265,14 +265,6 @@ class Road:
         """Whether the car behind has hit the follower."""
         return bool(self._record[self.row, GAP_BEHIND] <= 0.0)
 
-    @property
-    def realised(self) -> float:
-        """What the follower did in the latest step [m/s²]; NaN before the first."""
-        if self.row == 0:
-            return math.nan
-        now, before = self._record[self.row, SPEED], self._record[self.row - 1, SPEED]
-        return float((now - before) / self.scenario.dt)
-
     def episode(self, first: int = 0) -> Episode:
         """What was recorded so far, from a row on."""
         rows = slice(first, self.row + 1)

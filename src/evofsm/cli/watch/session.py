@@ -211,7 +211,7 @@ class Session:
             gap=float(now[GAP]),
             v_follower=float(speeds[-1]),
             v_leader=float(now[LEADER_SPEED]),
-            a_follower=road.realised,
+            a_follower=float(road.episode(max(0, road.row - 1)).realised[0]),
             a_leader=math.nan if first else float(record[-2, LEADER_ACCELERATION]),
             x_follower=self._position,
             gap_behind=float(now[GAP_BEHIND]),
