@@ -281,18 +281,16 @@ def test_lags_foresee_what_the_action_before_does_a_step_later():
     assert dynamics.doubt_of_lags == 0.0
 
 
-def test_where_certificates_were_violated_ever_more_often_disturbances_are_worse():
-    def seen(*violated, failed=False):
+def test_where_certificates_are_violated_ever_more_often_disturbances_are_worse():
+    def since(violated, failed=False):
         found = Violations(share=0.05)
         for episode, one in enumerate(violated):
             found = found.after(episode, violated=one, failed=failed and one)
         return found.worse
 
-    assert seen(*[True] * 4) == 0
-    assert seen(*[False] * 9, *[True] * 4) == 9
-    assert seen(*[True] * 2, failed=True) == 0  # each says twice as much
-    assert seen(*[True] * 2) == seen(*[True, False, False] * 9) == -1
-    assert Violations().after(0, violated=True).worse == -1  # where half are, nothing is told apart
+    assert since([True] * 4) == since([True] * 2, failed=True) == 0
+    assert since([False] * 9 + [True] * 4) == 9
+    assert since([True] * 2) == since([True, False, False] * 9) == -1
 
 
 def walk(noise, episodes=20, disturbed=0.0, dynamics=None, **settings):

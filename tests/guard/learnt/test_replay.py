@@ -1,12 +1,11 @@
 """Replays, and which action passes by them."""
 
-from typing import Any, NamedTuple
-
 import numpy as np
 import pytest
 
 from evofsm.guard.learnt.library import Backups, harm
 from evofsm.guard.learnt.replay import (
+    CHANGED,
     KEPT,
     NOTHING_PASSES,
     Disturbances,
@@ -129,66 +128,58 @@ def test_the_kernel_replays_as_a_plain_loop_does(choices, planned):
 # -- Which action passes ------------------------------------------------------------------------
 
 
-class Found(NamedTuple):
-    """What a search found."""
-
-    action: Any
-    backup: int
-    safety_margin: float
-    alike: bool
-
-
 def search_for(model, proposal, policies, margin=0.0, place=0.0, disturbances=None, allowed=0):
-    """What is found there, if nothing disturbs."""
-    policies, a = np.array(policies), len(proposal)
+    """What is found there, if nothing disturbs: how, the action, the backup, and what is left."""
     disturbances = Disturbances.none(1, STEPS, 1) if disturbances is None else disturbances
-    here = np.concatenate([[place, 0.0], np.zeros(a)])
-    ranks = np.arange(len(policies))
-    world = here, policies, ranks, disturbances, 1.0, np.array(proposal), margin, allowed
-    how, action, backup, left = search(model, *world)
-    if how == NOTHING_PASSES:
-        return Found(None, backup, -np.inf, left < 0.02)
-    assert (how == KEPT) == (action == proposal).all()
-    return Found(action, backup, left, False)
+    here, policies = np.array([place, 0.0, *[0.0] * len(proposal)]), np.array(policies)
+    asked = here, policies, np.arange(len(policies)), disturbances, 1.0, np.array(proposal)
+    return search(model, *asked, margin, allowed)
 
 
 def test_where_full_action_only_just_holds_nothing_passes():
     """No distance says that: it is as far from the wall as ever."""
     model = mover()
     model.weights[0] = 0.999  # what it withstands
-    policies = [[[-1.0, 0.0]]]
-    assert search_for(model, [-1.0], policies, 0.0, place=80.0).action is not None
-    assert search_for(model, [-1.0], policies, 0.25, place=99.0).action is not None
-    assert search_for(model, [-1.0], policies, 0.25, place=99.74).action is None
+    for margin, place, how in (
+        (0.0, 80.0, KEPT),
+        (0.25, 99.0, KEPT),
+        (0.25, 99.74, NOTHING_PASSES),
+    ):
+        assert search_for(model, [-1.0], [[[-1.0, 0.0]]], margin, place)[0] == how
 
 
 def test_what_is_refused_is_changed_by_no_more_than_it_takes():
-    found = search_for(mover(), [1.0], [[[-1.0, 0.0]]], place=WALL - 0.2)
-    assert 0.0 < found.action[0] <= 0.2
-    assert found.safety_margin == pytest.approx(0.2 - found.action[0])
-    choices = search_for(mover(choices=2), [0.0, 1.0], [[[1.0, 0.0], [0.0, 0.0]]], place=WALL - 0.2)
-    assert choices.action.tolist() == [1.0, 0.0]
+    how, action, _, left = search_for(mover(), [1.0], [[[-1.0, 0.0]]], place=WALL - 0.2)
+    assert how == CHANGED
+    assert 0.0 < action[0] <= 0.2
+    assert left == pytest.approx(0.2 - action[0])
+    policies = [[[1.0, 0.0], [0.0, 0.0]]]
+    how, action, _, _ = search_for(mover(choices=2), [0.0, 1.0], policies, place=WALL - 0.2)
+    assert action.tolist() == [1.0, 0.0]
 
 
 def test_where_nothing_passes_the_backup_that_lasts_longest_is_told_and_whether_all_are_alike():
     to, still, away = [[1.0, 0.0]], [[0.0, 0.0]], [[-0.1, 0.0]]
     model = mover()
     model.weights[0] = 0.5
-    found = search_for(model, [1.0], [to, still, away], place=WALL - 2.0)
-    assert (found.action, found.backup, found.alike) == (None, 2, False)
-    assert search_for(model, [1.0], [to, to], place=WALL - 2.0).alike
+    how, action, backup, apart = search_for(model, [1.0], [to, still, away], place=WALL - 2.0)
+    assert (how, backup, action.tolist()) == (NOTHING_PASSES, 2, [-0.1])
+    assert search_for(model, [1.0], [to, to], place=WALL - 2.0)[-1] < 0.02 < apart
 
 
 def test_so_many_disturbances_need_not_be_survived_but_that_none_begins():
-    pushed = Disturbances.none(3, STEPS, 1)
+    pushed, doomed = Disturbances.none(3, STEPS, 1), mover()
     pushed.residuals[0, 0, 1:] = 5.0, 8.0
-    asked = {"place": WALL - 3.0, "disturbances": pushed}
-    assert search_for(mover(), [0.0], [[[0.0, 0.0]]], allowed=1, **asked).action is None
-    found = search_for(mover(), [0.0], [[[0.0, 0.0]]], allowed=2, **asked)
-    assert found.safety_margin == pytest.approx(3.0)  # of those that are
-    doomed = mover()
     doomed.weights[0] = 1.0
-    assert search_for(doomed, [0.0], [[[0.0, 0.0]]], allowed=2, **asked).action is None
+    asked = {"place": WALL - 3.0, "disturbances": pushed}
+    for model, allowed, how in (
+        (mover(), 1, NOTHING_PASSES),
+        (mover(), 2, KEPT),
+        (doomed, 2, NOTHING_PASSES),
+    ):
+        found = search_for(model, [0.0], [[[0.0, 0.0]]], allowed=allowed, **asked)
+        assert found[0] == how
+        assert how != KEPT or found[-1] == pytest.approx(3.0)  # of those that are survived
 
 
 # -- Backups ------------------------------------------------------------------------------------
