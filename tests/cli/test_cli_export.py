@@ -106,8 +106,8 @@ def test_no_text_from_a_file_tells_the_terminal_what_to_do(evofsm, tmp_path):
     (tmp_path / "text").write_text("x")
     printed = [
         *(("inspect", tmp_path / "model"), ("inspect", tmp_path / "model", "--json")),
-        ("inspect", tmp_path / "model", "--state", "all"),
-        ("inspect", tmp_path / "model", "--state", 1, "--json"),
+        ("explain", tmp_path / "model", "--state", "all"),
+        ("explain", tmp_path / "model", "--state", 1, "--json"),
         *(("export", tmp_path / "model", "--to", to) for to in ("dot", "prism")),
         ("inspect", tmp_path / evil),
     ]

@@ -1,4 +1,4 @@
-"""`evofsm inspect --at` and `--state`: what was learnt of a situation."""
+"""`evofsm explain`: what was learnt of a situation."""
 
 import json
 
@@ -22,7 +22,7 @@ def saved(tmp_path_factory):
 
 def test_every_state_is_explained_with_the_words_of_its_family(evofsm, saved):
     folder, machine = saved
-    answer = evofsm("inspect", folder, "--state", "all")
+    answer = evofsm("explain", folder, "--state", "all")
     assert answer.exit_code == 0
     told = answer.stdout.replace("\n   ", " ").splitlines()
     numbers = [line.split(":")[0] for line in told]
@@ -33,7 +33,7 @@ def test_every_state_is_explained_with_the_words_of_its_family(evofsm, saved):
 
 def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
     folder, machine = saved
-    found = evofsm("inspect", folder, "--at", "9,14,14", "--action", "12", "--json")
+    found = evofsm("explain", folder, "--observation", "9,14,14", "--action", "12", "--json")
     (one,) = json.loads(found.stdout)["situations"]
     assert one["state"] == machine.model().recognise([9.0, 14.0, 14.0]).argmax()
     assert one["here"]["episodes"] == machine.episodes[one["state"]]
@@ -47,26 +47,26 @@ def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
     [
         (("--state", 0), "--state is 0; there are 1 to"),
         (("--state", "close"), "--state is close; there are 1 to"),
-        (("--at", "a,b"), "write numbers"),
-        (("--at", "1,2,3", "--state", 1), "exclude each other"),
+        (("--observation", "a,b"), "write numbers"),
+        (("--observation", "1,2,3", "--state", 1), "name one situation"),
         (("--state", 1, "--action", 99), "--action is 99; there are 1 to 17"),
-        (("--action", 1), "--action needs a situation"),
+        (("--action", 1), "name one situation"),
     ],
 )
 def test_what_is_not_there_is_refused_in_one_line(refused, saved, arguments, says):
-    assert says in refused("inspect", saved[0], *arguments)
+    assert says in refused("explain", saved[0], *arguments)
 
 
 def test_a_far_observation_is_never_seen_and_silence_about_failures_is_said(evofsm, tmp_path):
     machine = EvolvingFSM(1)
     machine.learn_many([[0.0], [5.0]] * 20, [0] * 40, range(0, 40, 2))
     machine.save(tmp_path / "machine")
-    answer = evofsm("inspect", tmp_path / "machine", "--at", "500")
+    answer = evofsm("explain", tmp_path / "machine", "--observation", "500")
     assert "tells nothing of failures: none was ever told" in answer.stdout
     assert "Never seen" in answer.stdout
-    told = evofsm("inspect", tmp_path / "machine", "--at", "500", "--json").stdout
+    told = evofsm("explain", tmp_path / "machine", "--observation", "500", "--json").stdout
     assert json.loads(told)["situations"][0]["never_seen"] is True
     machine.tell_of_failures()
     machine.save(tmp_path / "machine")
-    told = evofsm("inspect", tmp_path / "machine", "--state", "all").stdout
+    told = evofsm("explain", tmp_path / "machine", "--state", "all").stdout
     assert "tells nothing of failures" not in told

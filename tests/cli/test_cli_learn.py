@@ -191,19 +191,19 @@ def test_failures_are_learnt_from_a_column_or_a_comparison(evofsm, crashes, tmp_
     text = " ".join(evofsm("learn", crashes, "--failed", "hit").stdout.split())
     assert "failures 2 episodes ended with hit; 18 rows after them" in text
     assert "failures 2 episodes ended in one" in " ".join(evofsm("inspect", path).stdout.split())
-    assert "2 of 4" in " ".join(evofsm("inspect", path, "--state", "1").stdout.split())
+    assert "2 of 4" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
 
 
 def test_a_log_that_tells_nothing_of_failures_is_said_to(evofsm, crashes, tmp_path):
     path = tmp_path / "model"
     learnt = evofsm("learn", crashes, "--out", path)
     assert "failures not told; --failed" in " ".join(learnt.stdout.split())
-    text = " ".join(evofsm("inspect", path, "--state", "all").stdout.split())
+    text = " ".join(evofsm("explain", path, "--state", "all").stdout.split())
     assert "tells nothing of failures" in text
     assert "0 of" not in text
     safe = tmp_path / "safe"
     assert evofsm("learn", crashes, "--failed", "gap<-9", "--out", safe).exit_code == 0
-    text = " ".join(evofsm("inspect", safe, "--state", "all").stdout.split())
+    text = " ".join(evofsm("explain", safe, "--state", "all").stdout.split())
     assert "tells nothing of failures" not in text
     assert "0 of 3 (at most 48 %) failed later on" in text
 

@@ -14,7 +14,7 @@ from evofsm.cli.audit import audit
 from evofsm.cli.check import check
 from evofsm.cli.drive import drive
 from evofsm.cli.export import export
-from evofsm.cli.inspect import inspect
+from evofsm.cli.inspect import explain, inspect
 from evofsm.cli.learn import learn
 from evofsm.cli.monitor import monitor
 from evofsm.cli.paper import paper
@@ -85,7 +85,7 @@ def _options(
 def application() -> typer.Typer:
     """All commands, in the order in which the help names them."""
     about = _options.__doc__ or ""
-    app = group(about, paper, learn, inspect, drive, watch, monitor, audit, export, check)
+    app = group(about, paper, learn, inspect, explain, drive, watch, monitor, audit, export, check)
     app.callback()(_options)
     return app
 

@@ -1,4 +1,4 @@
-"""`evofsm inspect`: what was learnt, as a whole and of one situation."""
+"""`evofsm inspect` and `evofsm explain`: what was learnt, as a whole and of one situation."""
 
 from __future__ import annotations
 
@@ -30,29 +30,12 @@ _UNTOLD = (
 )
 
 
-def inspect(
-    file: Saved,
-    at: Annotated[
-        str | None, option("Explain an observation: its values, with commas between them.")
-    ] = None,
-    state: Annotated[str | None, option("Explain a state by its number, from 1; or all.")] = None,
-    action: Annotated[
-        int | None, option("With --at or --state: what came of this action, from 1.")
-    ] = None,
-    as_json: Json = False,
-) -> None:
-    """Print what was learnt: states, the transitions that matter, actions; or explain a situation.
+def inspect(file: Saved, as_json: Json = False) -> None:
+    """Print what was learnt: states, the transitions that matter, actions.
 
-    All numbers of an explanation were counted, once for each episode that came to a state;
-    intervals are of 90 %. That one action ended better than another does not say that it was the
-    reason.
+    evofsm explain says what came of one situation.
     """
     model, header = load_model(file)
-    if at is not None or state is not None:
-        _explain(file, model, at, state, action, as_json=as_json)
-        return
-    if action is not None:
-        raise ValueError("--action needs a situation: --at or --state")
     provenance = {} if header is None else header.provenance
     if as_json:
         print_json({"file": file, **model_document(model), "provenance": provenance})
@@ -244,21 +227,26 @@ def _aligned(values: NDArray[np.float64]) -> list[str]:
 # -- Of one situation -----------------------------------------------------------------------------
 
 
-def _explain(
-    file: Path,
-    model: FSMModel,
-    at: str | None,
-    state: str | None,
-    action: int | None,
-    *,
-    as_json: bool,
+def explain(
+    file: Saved,
+    observation: Annotated[
+        str | None, option("Its values, with commas between them: --observation=-9,14,14.")
+    ] = None,
+    state: Annotated[str | None, option("A state by its number, from 1; or all.")] = None,
+    action: Annotated[int | None, option("What came of this action there, from 1.")] = None,
+    as_json: Json = False,
 ) -> None:
-    """Print a paragraph for each situation."""
-    if at is not None and state is not None:
-        raise ValueError("--at and --state exclude each other")
+    """Explain a situation, by its observation or state: what came of those like it.
+
+    All numbers were counted, once for each episode that came to a state; intervals are of 90 %.
+    That one action ended better than another does not say that it was the reason.
+    """
+    if (observation is None) == (state is None):
+        raise ValueError("name one situation, by --observation or by --state")
+    model, _ = load_model(file)
     done = None if action is None else _index("--action", action, model.n_actions)
-    if at is not None:
-        found = [model.explain(action=done, observation=_values(at))]
+    if observation is not None:
+        found = [model.explain(action=done, observation=_values(observation))]
     elif state == "all":
         found = [model.explain(each, done) for each in range(model.n_states)]
     else:
@@ -287,7 +275,7 @@ def _values(text: str) -> list[float]:
     try:
         return [float(value) for value in text.split(",")]
     except ValueError:
-        raise ValueError(f"--at is {text!r}; write numbers, such as 9,24,24") from None
+        raise ValueError(f"--observation is {text!r}; write numbers, such as 9,24,24") from None
 
 
 def _document(model: FSMModel, found: Explanation) -> dict[str, Any]:

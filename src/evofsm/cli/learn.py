@@ -125,7 +125,7 @@ def learn(
     y, vx, vy, length, lane) and traces of ASAM OSI read.
 
     The time may be seconds, or dates of ISO 8601. Without --failed a log tells nothing of failures,
-    and evofsm inspect --at says so.
+    and evofsm explain says so.
 
     With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
     to the same result. The file stays at the end: run again, the command prints it at once.
@@ -303,7 +303,7 @@ def _check_out(out: Path | None) -> None:
         raise PermissionError(f"--out {out}: the folder {out.parent} may not be written")
     if out.is_dir():
         raise IsADirectoryError(f"--out {out} is a folder; name a file in it")
-    if out.exists():
+    if out.exists() and out.suffix != ".evofsm":  # so are ours called, whatever wrote them
         try:
             store.read_header(out)
         except (ValueError, OSError):
