@@ -240,16 +240,10 @@ def _write_decisions(path: Path, rows: Sequence[Outcomes]) -> None:
     """Every decision, as a table."""
     with needs("polars", "tables", "writing decisions as Parquet"):
         import polars
-    columns: dict[str, Any] = {
-        "episode": [row["episode"] for row in rows for _ in row["decided"]["time"]]
-    }
-    for name in DECISION_TABLE:
-        kind = DECISION_COLUMNS[name].kind
-        values = [value for row in rows for value in row["decided"][name]]
-        if kind is float:  # JSON has no NaN
-            values = [math.nan if value is None else value for value in values]
-        columns[name] = polars.Series(values, dtype=polars.Int64 if kind is int else None)
-    table = polars.DataFrame(columns)
+    kinds = {name: polars.List(DECISION_COLUMNS[name].kind) for name in DECISION_TABLE}
+    told = [{"episode": row["episode"], **row["decided"]} for row in rows]
+    table = polars.DataFrame(told, {"episode": polars.Int64, **kinds}).explode(*kinds)
+    table = table.with_columns(polars.selectors.float().fill_null(math.nan))  # as JSON has none
     with store.replacing(path) as file:
         table.write_parquet(file)
 
