@@ -159,7 +159,9 @@ def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
     shown = Recording(out)
     assert shown.start.about == "recorded in objects.csv"
     assert not shown.revising
-    assert shown.step().v_follower == pytest.approx(20.0)
+    first, *_, last = drive(shown)
+    assert first.v_follower == pytest.approx(20.0)
+    assert [last.a_follower, last.a_leader, last.x_follower] == pytest.approx([0.0, -5.0, 158.0])
 
 
 # -- The clock ------------------------------------------------------------------------------------
