@@ -48,8 +48,8 @@ def test_a_dead_end_is_tinted_as_long_as_a_brake_could_not_be_survived(study):
     """Not as long as one state is recognised, which would look like a warning withdrawn."""
     lasted = []
     for run in study.last_round:
-        axes = draw_case(study, run).axes[0]
-        found = [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches]
+        tint = draw_case(study, run).axes[0].collections[0]
+        found = [path.get_extents().intervalx for path in tint.get_paths() if len(path.vertices)]
         times = run.episode.time[study.in_dead_end(run)]
         expected = [(times[0], times[-1])] if len(times) else []  # one stretch in these cases
         np.testing.assert_allclose(found, expected, atol=0.05)

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import polars as pl
 import pytest
+from matplotlib.figure import Figure as Drawn
+from rich.console import Console
 
 from evofsm.paper import Figure, Page, Table, print_page, write_page
 from evofsm.paper.page import cell
@@ -14,8 +16,6 @@ EVIL = '<script>alert("1 & 2")</script>'
 
 
 def drawn():
-    from matplotlib.figure import Figure as Drawn
-
     figure = Drawn(figsize=(2, 1))
     figure.add_subplot().plot([0, 1])
     return figure
@@ -91,10 +91,7 @@ def test_what_is_told_is_text_and_never_markup(written):
 
 
 @pytest.mark.parametrize("width", [40, 80, 200])
-def test_the_terminal_says_the_same_and_cuts_no_number(width, monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", str(width))
-    from rich.console import Console
-
+def test_the_terminal_says_the_same_and_cuts_no_number(width, capsys):
     wide = pl.DataFrame({"name": ["[bold]row"], **{f"column {k}": [12345.25] for k in range(20)}})
     empty = Table("Empty", AREAS[:0], {"who": "{who}", "x": "{area:.1f}"})
     parts = [Table("Wide", wide), empty]

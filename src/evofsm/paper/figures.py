@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm import plot
 from evofsm.extras import needs
@@ -78,12 +77,6 @@ def _panels(rows: int, columns: int, height: float, **others: bool) -> tuple[Dra
     return figure, figure.subplots(rows, columns, **shared)
 
 
-def _stretches(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and last row of each stretch of rows in which ``mask`` holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
-
-
 # -- Over time ------------------------------------------------------------------------------------
 
 
@@ -143,9 +136,10 @@ def _title_of(study: PaperStudy, run: Run) -> str:
 def _tint(figure: Drawn, panels: Sequence[Axes], study: PaperStudy, run: Run) -> None:
     """Tint the time in which a full brake of the leader could not be survived."""
     time, settings = run.episode.time, study.settings
-    for first, last in _stretches(hopeless := study.in_dead_end(run)):
-        for axes in panels:
-            axes.axvspan(time[first], time[last], **_TINT)
+    hopeless = study.in_dead_end(run)
+    for axes in panels:
+        height: Look = {"transform": axes.get_xaxis_transform(), "where": hopeless}
+        axes.fill_between(time, 0.0, 1.0, **height, **_TINT)
     if hopeless.any():
         text = (
             f"dead end: if the leader braked now ({settings.scenario.leader.brake_decel:g} m/s²),\n"
@@ -188,13 +182,6 @@ def draw_divergence(study: PaperStudy) -> Drawn:
         name = f"the paper's bound, {LARGEST_DIVERGENCE:g} bit"
         axes.axhline(LARGEST_DIVERGENCE, label=name, **bound)
         axes.plot(time, surprise, linewidth=0.8, label="one-step forecasts", **_FOLLOWER)
-        if np.isfinite(surprise).any():
-            row = int(np.nanargmax(surprise))
-            x, y, late = time[row], surprise[row], row >= 0.9 * len(time)
-            look: Look = {"marker": "o", "markerfacecolor": "none", "color": COLORS["ink"]}
-            plot.mark(axes, x, y, markersize=5, label="largest of them", **look)
-            aside = {"offset": (-6.0 if late else 6.0, 0.0), "ha": "right" if late else "left"}
-            plot.write(axes, f"{y:.3f}", (x, y), **aside)  # type: ignore[arg-type]
         name = "the run's first forecast"
         edge: Look = {"markeredgecolor": COLORS["ink"], "markeredgewidth": 0.6, "label": name}
         plot.mark(axes, time[0], run.first_surprise, **edge, **first)
@@ -240,9 +227,8 @@ def draw_space(study: PaperStudy) -> Drawn:
             gap = np.maximum(run.episode.observations[:, 0], 0.0)
             speed = run.episode.observations[:, variable]
             axes.plot(gap, speed, **look)
-            for first, last in _stretches(run.state == study.dead_end):
-                part = slice(first, last + 1)
-                axes.plot(gap[part], speed[part], zorder=1.8, solid_capstyle="butt", **_VEIL)
+            veiled = np.where(run.state == study.dead_end, gap, np.nan)
+            axes.plot(veiled, speed, zorder=1.8, solid_capstyle="butt", **_VEIL)
             if run.episode.collided:
                 plot.draw_collision(axes, float(gap[-1]), float(speed[-1]))
             else:

@@ -13,7 +13,7 @@ from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from string import Formatter
 from typing import TYPE_CHECKING, Any
@@ -269,11 +269,8 @@ def _summary(pages: Sequence[Page]) -> Table:
 def _versions(more: Sequence[str]) -> dict[str, str]:
     """What the numbers were computed with."""
     found = {"evofsm": evofsm.__version__, "Python": platform.python_version()}
-    for name in (*_PACKAGES, *more):
-        try:
-            found["SUMO (libsumo)" if name == "libsumo" else name] = version(name)
-        except PackageNotFoundError:  # on the path without having been installed
-            found[name] = "unknown"
+    names = {"libsumo": "SUMO (libsumo)"}
+    found |= {names.get(name, name): version(name) for name in (*_PACKAGES, *more)}
     return {**found, "system": f"{platform.system()} on {platform.machine()}"}
 
 

@@ -198,17 +198,14 @@ def _table_of_losses(study: PaperStudy) -> Table:
 def _table_of_states(study: PaperStudy) -> Table:
     """Where the states lie, and for how much of their time an oracle sees a dead end."""
     recognised = np.concatenate([run.state for run in study.runs])
-    created = zip(study.creations, study.model.centers.tolist(), strict=True)
     hopeless = np.concatenate([study.in_dead_end(run) for run in study.runs])
     ends = [run.state[-1] for run in study.runs if run.episode.collided]
     rows = []
-    for state, ((run, time), center) in enumerate(created):
+    for state, center in enumerate(study.model.centers.tolist()):
         here = recognised == state
         row = {
             "state": state + 1,
             **dict(zip(VARIABLES, center, strict=True)),
-            "run": run + 1,
-            "time": time,
             "share": float(here.mean()),
             "dead end": float(hopeless[here].mean()) if here.any() else None,
             "collisions": ends.count(state),
@@ -221,7 +218,6 @@ def _table_of_states(study: PaperStudy) -> Table:
         {
             "state": "#{state}",
             **{f"{name} [{unit}]": f"{{{name}:.1f}}" for name, unit in centers},
-            "created": "run {run}: {time:.1f} s",
             "time": "{share:%}",
             "dead end": "{dead end:%}",
             "collisions": "{collisions}",

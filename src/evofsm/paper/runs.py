@@ -160,14 +160,6 @@ class PaperStudy:
     dead_end: int  #: index of the state that stands at most collisions; -1 without collisions
 
     @property
-    def creations(self) -> list[tuple[int, float]]:
-        """In which run each state was created, and when in it [s]."""
-        rows = np.asarray(self.model.created).astype(int) - 1
-        numbers = np.repeat(range(len(self.runs)), [len(run.state) for run in self.runs])[rows]
-        times = np.concatenate([run.episode.time for run in self.runs])[rows]
-        return list(zip(numbers.tolist(), times.tolist(), strict=True))
-
-    @property
     def dead_ends(self) -> tuple[int, ...]:
         """The dead end, if there is one, as the states to mark."""
         return (self.dead_end,) if self.dead_end >= 0 else ()
