@@ -28,7 +28,6 @@ LENGTHS = {
 }
 ACTIONS = {
     "a number": (1.0, TypeError, "action is 1.0; it must be an integer index"),
-    "NaN": (NAN, TypeError, "action is nan; it must be an integer index"),
     "a text": ("1", TypeError, "action is '1'; it must be an integer index"),
     "nothing": (None, TypeError, "action is None; it must be an integer index"),
     "a list": ([1], TypeError, r"action is \[1\]; it must be an integer index"),
@@ -41,33 +40,20 @@ BATCHES = {
     "NaN": ([[0.0, 1.0], [2.0, NAN]], [0, 0], [], ValueError, "row 1, variable 1: nan .*finite"),
     "too large": ([[0.0, 1.0], [1e200, 0.0]], [0, 0], [], ValueError, r"row 1.*1e\+200.*1e\+100"),
     "texts": ([["a", "b"]], [0], [], TypeError, "observations has dtype <U1.*text"),
-    "a None": ([[None, 0.0]], [0], [], TypeError, "observations has dtype object.*None"),
-    "ragged rows": (RAGGED, [0, 0], [], ValueError, "observations: rows have different lengths"),
     "one axis": ([0.0, 1.0], [0, 0], [], ValueError, r"observations has shape \(2,\).*\(rows, var"),
     "no variables": (np.empty((3, 0)), [0, 0, 0], [], ValueError, r"shape \(3, 0\).*not empty"),
     "too few actions": (ROWS, [0, 0], [], ValueError, r"actions .*\(2,\); 3 observations"),
-    "too many actions": (ROWS, [0] * 4, [], ValueError, r"actions .*\(4,\); 3 observations"),
-    "ragged actions": (ROWS, [[0], [0, 1], 2], [], (TypeError, ValueError), "actions"),
     "numbers as actions": (ROWS, [0.0, 1.0, 2.0], [], TypeError, "actions .*float64.*integer"),
     "action too high": (ROWS, [0, 1, 3], [], ValueError, "row 2 is 3; .*0 to 2, and -1 for none"),
     "action too low": (ROWS, [0, -2, 1], [], ValueError, "row 1 is -2; .*0 to 2, and -1 for none"),
     "start beyond": (ROWS, [0, 0, 0], [0, 3], ValueError, "episode_starts names row 3.* 3 rows"),
-    "start before": (ROWS, [0, 0, 0], [-1], ValueError, "episode_starts names row -1"),
     "numbers as starts": (ROWS, [0, 0, 0], [0.0], TypeError, "episode_starts .*float64.*row"),
     "flags as starts": (ROWS, [0] * 3, [True, False, False], TypeError, "episode_starts .*bool"),
-    "ragged starts": (ROWS, [0] * 3, [[0], [1, 2]], (TypeError, ValueError), "episode_starts"),
 }
 BATCH_LENGTHS = {
     "too short": (ROWS[:, :1], [0] * 3, [], ValueError, "observation has 1 var.*started with 2"),
     "too long": (np.ones((1, 3)), [0], [], ValueError, "observation has 3 var.*started with 2"),
     "NaN and too long": ([[NAN] * 3], [0], [], ValueError, "observation has 3 var.*with 2"),
-}
-
-
-FAILURES = {
-    "failure beyond": ([0, 3], ValueError, "failures names row 3, but there are 3 rows"),
-    "failure before": ([-1], ValueError, "failures names row -1"),
-    "flags as failures": ([True, False, False], TypeError, "failures has dtype bool.*row"),
 }
 
 
@@ -141,9 +127,10 @@ def test_a_batch_of_another_length(grown, refuses, Z, I, starts, error, words):
     refuses(grown, lambda m: m.learn_many(Z, I, starts), error, words)
 
 
-@pytest.mark.parametrize(("failures", "error", "words"), cases(FAILURES))
-def test_failures_of_a_batch_that_cannot_be_right(machine, refuses, failures, error, words):
-    refuses(machine, lambda m: m.learn_many(ROWS, [0] * 3, [], failures), error, words)
+def test_failures_of_a_batch_that_cannot_be_right(grown, refuses):
+    for failures, error in (([0, 3], ValueError), ([-1], ValueError), ([True] * 3, TypeError)):
+        words = "failures (names row|has dtype bool)"
+        refuses(grown, lambda m, rows=failures: m.learn_many(ROWS, [0] * 3, [], rows), error, words)
 
 
 def test_a_failure_before_any_observation(refuses):

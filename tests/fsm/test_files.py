@@ -81,35 +81,25 @@ def test_numbers_of_every_size_are_kept_and_read_again(snapshot, tmp_path):
 
 MACHINES = [
     ("n_states", 1e6, "n_states is 1000000"),
-    ("n_states", -3.0, "n_states of -3"),
     ("action", 1e9, "action is 1000000000"),
     ("before", 1e9, "before is 1000000000"),
     ("place", 7.0, "place of an action"),
     ("belief", np.nan, "belief of nan"),
     ("belief", 0.5, "belief is no distribution"),
     ("matrices", 0.7, "a row of matrices is no distribution"),
-    ("scatter", -1.0, "scatter of -1"),
     ("centers", 1e308, r"centers of 1e\+308"),
     ("visits", -1.0, "visits of -1"),
     ("failures", 1e9, "failures cannot be more than decisions"),
     ("radius", 1e308, r"radius of 1e\+308"),
-    ("n_actions", None, "lacks n_actions"),
-    ("n_actions", [], "n_actions has shape"),
     ("n_actions", 10**6, r"has shape \(3,\), not \(1000000,\)"),
-    ("max_states", 0.5, "max_states of 0.5"),
     ("learning_rate", 1.0, "learning_rate of 1"),
-    ("spread", "wide", "spread is 'wide'; it must be a number"),
-    ("radius", True, "radius is True; it must be a number"),
     ("gain", 2.0, "gain"),
     ("failures_told", 2, "failures_told of 2"),
     ("rule", {"name": "magic"}, "rule is .*magic.*; it must be one of paper, edges"),
-    ("rule", {}, "must be one of"),
     ("rule", None, "rule"),
     ("rule", {"name": "novelty", "gain": 1.0}, "gain"),
-    ("rule", {"name": "novelty", "radius": -1.0}, "rule.radius of -1"),
     ("rule", {"name": "novelty", "scales": [1e308, 1.0]}, r"rule.scales of 1e\+308"),
     ("rule", {"name": "novelty", "scales": [1.0]}, "scales"),
-    ("rule", {"name": "novelty", "spread": 1e308}, r"rule.spread of 1e\+308"),
 ]
 
 
@@ -125,14 +115,11 @@ def test_a_machine_that_no_learning_could_have_left_is_refused(
 
 
 MODELS = [
-    ("transition_matrices", np.nan, "transition_matrices of nan"),
     ("visits", -1.0, "visits of -1"),
     ("centers", -1e308, r"centers of -1e\+308"),
     ("width", np.nan, "width of nan"),
-    ("width", -1.0, "width of -1"),
     ("dt", 1e308, r"dt of 1e\+308"),
     ("settings", {"spread": 1e308}, r"settings.spread of 1e\+308"),
-    ("settings", {"failure_horizon": 0.5}, "settings.failure_horizon of 0.5"),
     ("actions", {"low": -1e308, "high": 0.0, "width": 1e308}, "actions.low of -1e"),
     ("actions", {"low": -0.5, "high": 1.0, "width": 1e-12}, "more than 3 intervals"),
     ("failures_told", {}, "failures_told is {}; it must be of type bool"),

@@ -41,25 +41,19 @@ def matrix(forecasts, action, steps):
     return forecasts.predict(np.eye(forecasts.n_states), action, steps)
 
 
-def divergences(forecasts, machine, walk, steps, by_action=True):
+@pytest.mark.parametrize("steps", [1, 5])
+def test_held_out_rows_are_foreseen_better_than_by_persistence(taught, machine, walk, steps):
     Z, actions = walk
     beliefs = machine.model().recognise(Z[1500:])
     now, then = beliefs[:-steps], beliefs[steps:]
-    predicted = forecasts.predict(now, actions[1500:-steps] if by_action else None, steps)
-    return jensen_shannon(predicted, then).mean(), jensen_shannon(now, then).mean()
-
-
-@pytest.mark.parametrize("steps", [1, 5])
-def test_held_out_rows_are_foreseen_better_than_by_persistence(taught, machine, walk, steps):
-    ours, persistence = divergences(taught, machine, walk, steps)
-    assert ours < 0.8 * persistence
+    predicted = taught.predict(now, actions[1500:-steps], steps)
+    assert jensen_shannon(predicted, then).mean() < 0.8 * jensen_shannon(now, then).mean()
 
 
 @pytest.mark.parametrize("action", [None, 0, 1])
 def test_rows_of_matrices_are_distributions(taught, action):
     for steps in taught.steps:
         P = matrix(taught, action, steps)
-        assert P.shape == (taught.n_states, taught.n_states)
         assert (P > 0.0).all()
         np.testing.assert_allclose(P.sum(axis=1), 1.0, atol=1e-9)
 

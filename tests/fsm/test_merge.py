@@ -45,15 +45,14 @@ def assert_alike(one, other, atol):
     model, expected = one.model(), other.model()
     assert model.centers.shape == expected.centers.shape
     a, b = np.lexsort(model.centers.T), np.lexsort(expected.centers.T)
-    for name in ("centers", "potentials", "visits", "created", "endings"):
-        left, right = getattr(model, name)[a], getattr(expected, name)[b]
-        np.testing.assert_allclose(left, right, atol=atol, err_msg=name)
+    names = ("centers", "potentials", "visits", "created", "endings")
+    pairs = [(getattr(model, name)[a], getattr(expected, name)[b]) for name in names]
     for name in ("origin_frequency", "decisions", "failures"):
-        left, right = getattr(model, name)[:, a], getattr(expected, name)[:, b]
-        np.testing.assert_allclose(left, right, atol=atol, err_msg=name)
-    pairs = np.ix_(range(len(model.uses)), a, a), np.ix_(range(len(model.uses)), b, b)
-    left, right = model.transition_matrices[pairs[0]], expected.transition_matrices[pairs[1]]
-    np.testing.assert_allclose(left, right, atol=atol)
+        pairs.append((getattr(model, name)[:, a], getattr(expected, name)[:, b]))
+    matrices = model.transition_matrices[:, a][:, :, a]
+    pairs.append((matrices, expected.transition_matrices[:, b][:, :, b]))
+    for left, right in pairs:
+        np.testing.assert_allclose(left, right, atol=atol)
     assert (model.uses == expected.uses).all()
 
 
