@@ -26,16 +26,16 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 # Kernels own no memory, so there are no references to count. A product and a sum may be one
 # instruction, but sums are in the order as written: a batch and single steps agree bit for bit.
-_OPTIONS = {"fastmath": {"contract"}, "_nrt": False, "no_cfunc_wrapper": True}
+_OPTIONS = {"fastmath": {"contract"}, "_nrt": False}
+_njit: Any = partial(numba.njit, error_model="numpy", no_cfunc_wrapper=True)
 
 
-def compiled(function: Function, *signature: object, **options: Any) -> Function:
+def compiled(function: Function, **options: Any) -> Function:
     """Compile with Numba on the first call, and keep the code on disk where there is a place."""
-    compile_: Any = partial(numba.njit, *signature, error_model="numpy", **options)
     try:
-        return cast(Function, compile_(cache=True)(function))
+        return cast(Function, _njit(cache=True, **options)(function))
     except RuntimeError:  # neither the package nor the user's cache folder may be written
-        return cast(Function, compile_()(function))
+        return cast(Function, _njit(**options)(function))
 
 
 def kernel(function: Function) -> Function:
@@ -59,8 +59,7 @@ def rare_kernel(function: Function) -> Function:
 
 
 def _inside(function: Function, **options: Any) -> Function:
-    njit: Any = partial(numba.njit, error_model="numpy", no_cpython_wrapper=True)
-    return cast(Function, njit(**_OPTIONS, **options)(function))
+    return cast(Function, _njit(no_cpython_wrapper=True, **_OPTIONS, **options)(function))
 
 
 def entry(kernel: Any) -> Callable[..., Any]:

@@ -17,19 +17,10 @@ from functools import cache
 from operator import itemgetter
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.kernels import Function, compiled, entry
-
-inner_kernel = numba.njit(inline="always", error_model="numpy")
-
-
-def kernel(function: Function) -> Function:
-    """A function that Python calls; it is cached where there is a place."""
-    return compiled(function, no_cfunc_wrapper=True)
-
+from evofsm.fsm.kernels import compiled, entry, lanes, spliced_kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -58,8 +49,6 @@ MOVING = 0.5
 ONSET = 4.0
 # Residuals beyond so many of their scale weigh less.
 _OUTLIER = 4.0
-# Numbers in a cache line: loops over whole lines have no rest to work off one by one.
-_LINE = 8
 
 
 class Model(NamedTuple):
@@ -184,7 +173,7 @@ def limited(model: Model, move: Floats) -> Floats:
     return np.minimum(np.maximum(move, low), high)
 
 
-@inner_kernel
+@spliced_kernel
 def fill_features(
     z: Floats,
     change: Floats,
@@ -228,7 +217,7 @@ def fill_features(
             k += 1
 
 
-@inner_kernel
+@spliced_kernel
 def expect(weights: Floats, found: Floats, move: Floats) -> None:
     """The changes (m, n) that are expected of features (p, n), into ``move``."""
     (p, n), m = found.shape, len(move)
@@ -280,13 +269,13 @@ class Sums(NamedTuple):
         return cls(**arrays | {"low": first.copy(), "high": first.copy()})
 
 
-@inner_kernel
+@spliced_kernel
 def _is_beyond(expected: float, seen: float, low: float, high: float, close: float) -> bool:
     """Whether it is expected beyond where it saturates, and stays there."""
     return (expected < low and seen <= low + close) or (expected > high and seen >= high - close)
 
 
-@kernel
+@compiled
 def learn_transition(
     sums: Sums, model: Model, close: Floats, z: Floats, u: Floats, i: int, jumped: Floats
 ) -> bool:
@@ -369,7 +358,7 @@ def learn_transition(
 # -- Replays --------------------------------------------------------------------------------------
 
 
-@inner_kernel
+@spliced_kernel
 def _follow_policy(model: Model, policy: Floats, z: Floats, end: float, action: Floats) -> None:
     """Actions (a, n) of a linear policy (a, 1 + m): saturated at ``end``, or the largest of few."""
     (a, n), m, choices = action.shape, policy.shape[1] - 1, model.choices
@@ -393,7 +382,7 @@ def _follow_policy(model: Model, policy: Floats, z: Floats, end: float, action: 
                 action[i, l] = 1.0 if i == best else 0.0
 
 
-@kernel
+@compiled
 def _replay(
     model: Model,
     situations: Floats,
@@ -416,7 +405,7 @@ def _replay(
     m, (a, _), p = len(model.origin), policy.shape, len(model.weights)
     (steps, _, each), sides = disturbances.residuals.shape, len(model.thresholds)
     count = len(situations) * each
-    n = (count + _LINE - 1) // _LINE * _LINE
+    n = lanes(count)
     z, change, move, after = np.empty((m, n)), np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
     before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
     which, survived, near = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)
