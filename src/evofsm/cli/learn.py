@@ -362,7 +362,9 @@ def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, An
 def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     read, actions = learning.read, learning.model.actions
     yield "rows", f"{read.rows:,}, one every {learning.model.dt:g} s"
-    yield "episodes", f"{read.episodes:,}, together {read.seconds:,.1f} s"
+    minutes = read.seconds / 60.0
+    together = f"{read.seconds:.1f} s" if minutes < 2.0 else f"{minutes:,.1f} min"
+    yield "episodes", f"{read.episodes:,}, together {together}"
     yield "transitions", f"{learning.transitions:,}"
     if read.jumps:
         yield "time jumps", f"{read.jumps:,}; each begins an episode"
@@ -394,7 +396,8 @@ def _read_otherwise(
 def _skills(skills: Sequence[Skill]) -> Iterator[RenderableType]:
     rows = []
     for one in skills:
-        skill = "none" if math.isnan(one.skill) else f"{one.skill:+,.2f}"
+        digits = "+.2f" if abs(one.skill) < 10.0 else "+,.0f"
+        skill = "none" if math.isnan(one.skill) else f"{one.skill:{digits}}"
         divergences = f"{one.divergence:.2g}", f"{one.persistence:.2g}"
         rows.append((f"{one.seconds:g} s", *divergences, skill))
     header = ("ahead", "forecast [bit]", "persistence [bit]", "skill")
