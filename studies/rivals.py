@@ -43,7 +43,7 @@ class Rival(ABC):
     """A judge that is told what it knows; one that learns has ``end`` and ``freeze`` as well."""
 
     told: str  #: in a few words
-    interval: float | None = None  #: between decisions, and the latest situation, as guards have
+    interval: float = math.nan  #: between decisions, and the latest situation, as guards have
     situation: Any = None
 
     def begin(self) -> None:  # noqa: B027
