@@ -178,16 +178,17 @@ def _packed(kind: Kind, header: Header, arrays: Mapping[str, NDArray[Any]]) -> l
         entries[name] = _Entry(_NAMES[array.dtype], list(array.shape), [begin, end])
         begin = end
     told = json.dumps(header._asdict())
-    _refuse_numbers(kind, arrays, _refuse_unfit(kind, json.loads(told)["settings"], entries))
+    sizes = _refuse_unfit(kind, json.loads(told)["settings"], entries)
+    for name, numbers in kind.arrays.items():
+        numbers.refuse_others(name, arrays[name], sizes)
     index: dict[str, Any] = {name: entry._asdict() for name, entry in entries.items()}
     encoded = json.dumps({"__metadata__": {"sha256": _UNSIGNED, "evofsm": told}, **index}).encode()
     encoded += b" " * (-len(encoded) % 8)  # so that numbers begin at a multiple of eight
     if len(encoded) > _LARGEST_HEADER or begin > _LARGEST_FILE:
         raise ValueError(f"{kind.name} is too large for a file: more than {_LARGEST_FILE:,} bytes")
-    numbers = [np.ascontiguousarray(array).data for array in arrays.values()]
-    digest = _sha256(encoded, numbers).encode()
-    signed = encoded.replace(_UNSIGNED.encode(), digest, 1)
-    return [len(signed).to_bytes(8, "little"), signed, *numbers]
+    content = [np.ascontiguousarray(array).data for array in arrays.values()]
+    signed = encoded.replace(_UNSIGNED.encode(), _sha256(encoded, content).encode(), 1)
+    return [len(signed).to_bytes(8, "little"), signed, *content]
 
 
 def only_writer(file: BinaryIO, path: str | os.PathLike[str], otherwise: str) -> None:
@@ -323,7 +324,8 @@ def read(place: Place, kind: Kind) -> tuple[dict[str, Any], dict[str, NDArray[An
             unsigned = encoded.replace(sha256.encode(), _UNSIGNED.encode(), 1)
             if _sha256(unsigned, [array.data for array in arrays.values()]) != sha256:
                 raise ValueError("its SHA-256 is another one: it was changed or damaged")
-            _refuse_numbers(kind, arrays, sizes)
+            for name, numbers in kind.arrays.items():
+                numbers.refuse_others(name, arrays[name], sizes)
     return header.settings, arrays
 
 
@@ -419,13 +421,6 @@ def _refuse_unfit(
             raise ValueError(f"{name} is of type {entries[name].dtype}, not {expected}")
         numbers.refuse_shape(name, tuple(entries[name].shape), sizes)
     return sizes
-
-
-def _refuse_numbers(
-    kind: Kind, arrays: Mapping[str, NDArray[Any]], sizes: dict[int | str, int]
-) -> None:
-    for name, numbers in kind.arrays.items():
-        numbers.refuse_others(name, arrays[name], sizes)
 
 
 def _refuse_settings(

@@ -33,7 +33,6 @@ from evofsm.fsm.arrays import (
     NOT_OPEN,
     OF_ACTIONS,
     OF_MODEL,
-    SUMS,
     Learnt,
     Settings,
 )
@@ -358,10 +357,6 @@ class EvolvingFSM:
         labels = Labels() if labels is None else labels
         return explain(self.model(), self.belief, index, labels, self._nearest(self.state))
 
-    def recognise(self, z: ArrayLike) -> Floats:
-        """(n,) belief of an observation, or (N, n) of many, as `FSMModel.recognise` tells it."""
-        return self.model().recognise(z)
-
     @alone
     def model(
         self,
@@ -472,7 +467,7 @@ class EvolvingFSM:
     @alone
     def visits(self) -> Floats:
         """(n,) ndarray: observations in which each state was the most probable."""
-        return self._learnt.sums[SUMS.index("visits"), : self.n_states].copy()
+        return self._learnt.sums[arrays.VISITS, : self.n_states].copy()
 
     @property
     @alone
