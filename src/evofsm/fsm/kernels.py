@@ -62,17 +62,17 @@ def _inside(function: Function, **options: Any) -> Function:
     return cast(Function, _njit(no_cpython_wrapper=True, **_OPTIONS, **options)(function))
 
 
-def entry(kernel: Any) -> Callable[..., Any]:
+class Entry:
     """The quick way into a kernel: the types of the first call are those of all that follow."""
-    found: Callable[..., Any] | None = None
 
-    def enter(*given: Any) -> Any:
-        nonlocal found
-        if found is None:
-            found = kernel.compile(tuple(map(numba.typeof, given)))
-        return found(*given)
+    def __init__(self, kernel: Any) -> None:
+        self._kernel = kernel
+        #: The kernel; once it is compiled, that is no call of Python.
+        self.call: Callable[..., Any] = self._first
 
-    return enter
+    def _first(self, *given: Any) -> Any:
+        self.call = self._kernel.compile(tuple(map(numba.typeof, given)))
+        return self.call(*given)
 
 
 #: Numbers in a cache line.

@@ -39,7 +39,7 @@ from evofsm.fsm.arrays import (
 from evofsm.fsm.clusters import PAPER, width_of
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.explanation import Explanation, Nearest, explain
-from evofsm.fsm.kernels import LINE, entry
+from evofsm.fsm.kernels import LINE, Entry
 from evofsm.fsm.model import FSMModel, Policy, believed, check_forecast
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
@@ -59,7 +59,7 @@ _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_f
 _ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers", "visits"}
 _FLOAT64 = np.dtype(np.float64)
 # Compiled code of a step, with and without a limit to the states.
-_LIMITED, _UNLIMITED = entry(stepping.learn_rows), entry(stepping.learn_rows)
+_LIMITED, _UNLIMITED = Entry(stepping.learn_rows), Entry(stepping.learn_rows)
 # All that threads share, for a process that is forked.
 _SHARED: WeakSet[Any] = WeakSet()
 
@@ -578,7 +578,7 @@ class EvolvingFSM:
         actions[0], failures[0] = action, bool(failed)
         scratch = np.empty((3, len(self._learnt.belief)))
         given = self._settings, self._limit, row, actions, starts, failures, failed is not None
-        learn_row = _UNLIMITED if self._limit is None else _LIMITED
+        learn_row = (_UNLIMITED if self._limit is None else _LIMITED).call
         while not learn_row(self._learnt, *given, scratch, 0, trace, none):
             self._make_room()
             scratch = np.empty((3, len(self._learnt.belief)))

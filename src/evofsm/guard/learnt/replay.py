@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.kernels import compiled, entry, lanes, spliced_kernel
+from evofsm.fsm.kernels import Entry, compiled, lanes, spliced_kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -505,7 +505,7 @@ def _replay(
     return lost, left
 
 
-_enter = entry(_replay)
+_enter = Entry(_replay)
 
 
 def replay(
@@ -527,7 +527,7 @@ def replay(
     """
     count = len(situations) * disturbances.residuals.shape[2]
     ends = Ends(np.empty(count), np.empty(count))
-    _enter(model, situations, plan, policy, disturbances, harder, enough, count, ends)
+    _enter.call(model, situations, plan, policy, disturbances, harder, enough, count, ends)
     return ends
 
 
@@ -567,7 +567,7 @@ def search(
     def survives(action: Floats, backup: int) -> tuple[bool, float]:
         """Whether the backup survives after the action, and by how much."""
         plan[0] = action
-        lost, left = _enter(model, here, plan, policies[backup], *given)
+        lost, left = _enter.call(model, here, plan, policies[backup], *given)
         return lost <= allowed and left >= margin, left
 
     for q in ranks:
