@@ -123,9 +123,10 @@ def learn_rows(
 def fail(learnt: Learnt, settings: Settings) -> None:
     """End the episode in failure, to which the pending action led; there is room for its matrix."""
     now = learnt.now[0]
-    if now.action != NO_ACTION:
+    pending = now.action != NO_ACTION  # a variable: with True itself it would be compiled again
+    if pending:
         place = place_of(learnt, now.action, settings.prior_frequency)
-        _count_decision(learnt, place, now.n_states, True)
+        _count_decision(learnt, place, now.n_states, pending)
     _end(learnt, settings)
 
 

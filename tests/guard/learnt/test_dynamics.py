@@ -263,15 +263,6 @@ def test_lags_that_are_doubted_enough_are_left_out_until_they_foresee_again():
     assert np.abs(dynamics.weights[where]).max() > 0.5
 
 
-@pytest.mark.parametrize(("starts", "failed"), [([55, 58], False), ([], False), ([5, 20], True)])
-def test_of_too_few_steps_or_a_failure_nothing_speaks_for_lags(starts, failed):
-    dynamics = coasting()
-    dynamics.doubt_of_lags = 0.5
-    dynamics.latest = dynamics.latest._replace(failed=failed)
-    dynamics.refute(np.array(starts, int), 10)
-    assert dynamics.doubt_of_lags == 0.5
-
-
 def test_lags_foresee_what_the_action_before_does_a_step_later():
     draw, dynamics = np.random.default_rng(0), Dynamics(-1.0, 1.0, horizon=10)
     for push in draw.uniform(-1.0, 1.0, (4, 60)):

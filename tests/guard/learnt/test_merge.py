@@ -2,10 +2,21 @@
 
 import numpy as np
 import pytest
-from tests.guard.learnt.test_dynamics import Dynamics, ahead, content, drive, follow
+from tests.guard.learnt.test_dynamics import Dynamics, ahead, content, drive, follow, taught
 
 from evofsm.guard import LearntRisk, merge_judges
-from evofsm.guard.learnt.merge import _merged
+from evofsm.guard.learnt.merge import _merged, _moved
+from evofsm.guard.learnt.replay import features
+
+
+def test_features_from_another_origin_are_those_of_before_moved():
+    dynamics, draw = taught(2), np.random.default_rng(0)
+    z, u = draw.normal(size=(5, 3)), draw.uniform(-1.0, 1.0, (5, 1))
+    model, d = dynamics.model._replace(reach=np.full(3, 9.0)), draw.normal(size=3)
+    given = z, 0.1 * z, u, -u
+    moved = features(model._replace(origin=model.origin - d), *given)
+    T = _moved(d, 1, moved.shape[1])
+    np.testing.assert_allclose(moved, features(model, *given) @ T.T, atol=1e-12)
 
 
 def test_of_two_halves_comes_what_comes_of_all():
@@ -18,7 +29,7 @@ def test_of_two_halves_comes_what_comes_of_all():
     before = [content(half) for half in halves]
     merged = _merged(halves)
     assert [content(half) for half in halves] == before
-    assert merged.n_episodes == 8
+    assert max(one.episode for one in merged.sequences) < merged.n_episodes == 8
     np.testing.assert_array_equal(merged.sums.counts, whole.sums.counts)
     for name in ("mean", "scatter", "low", "high", "least", "most"):
         one, other = (getattr(each.sums, name) for each in (merged, whole))

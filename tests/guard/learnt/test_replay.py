@@ -185,31 +185,19 @@ def test_so_many_disturbances_need_not_be_survived_but_that_none_begins():
 # -- Backups ------------------------------------------------------------------------------------
 
 
-def evolved(episodes, **options):
-    """Between two walls it takes feedback: each constant one runs into one of them."""
+def test_feedback_evolves_where_no_constant_action_survives():
+    """Between two walls: each constant one runs into one of them."""
     walls = np.array([[0.0, 1.0, 3.0, 1.0], [0.0, -1.0, -3.0, 1.0]])
     random = np.random.default_rng(1)
     seen, done = random.normal(size=(30, 1)).cumsum(0), random.uniform(-1.0, 1.0, (29, 1))
-    model, found = mover(thresholds=walls), Backups.of(seen, done, choices=False, **options)
+    model, found = mover(thresholds=walls), Backups.of(seen, done, choices=False)
     pushed = Disturbances.none(3, STEPS, 1)
     pushed.residuals[:, 0, 1], pushed.residuals[:, 0, 2] = 0.5, -0.5
     situations = np.array([[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    for _ in range(episodes):
+    for _ in range(10):
         found = found.evolved(model, situations, pushed, 1.0, random)
-    best = found.policies[found.ranks[:1]]
-    return found, harm(model, situations, best, pushed)
-
-
-def test_feedback_evolves_where_no_constant_action_survives():
-    found, ends = evolved(10)
+    ends = harm(model, situations, found.policies[found.ranks[:1]], pushed)
     assert found.ranks[0] >= found.n_constant
     assert found.policies[found.ranks[0], 0, 1] < 0.0  # back to the middle
     assert (ends >= 0.0).all()
     assert (np.diff(found.scores[found.ranks]) <= 0.0).all()
-
-
-def test_without_evolving_there_are_constant_ones_alone():
-    found, ends = evolved(3, evolving=False)
-    assert len(found.policies) == found.n_constant == 3
-    assert (found.policies[:, :, 1:] == 0.0).all()
-    assert (ends < 0.0).any()
