@@ -204,16 +204,10 @@ class Backups:
 
     @classmethod
     def of(cls, z: Floats, u: Floats, *, choices: bool, evolving: bool = True) -> Backups:
-        """Those that nothing was learnt of yet.
+        """Those that nothing was learnt of yet, by observations and actions of the first episode.
 
-        Parameters
-        ----------
-        z, u : ndarray
-            Observations and actions of the first episode.
-        choices : bool
-            Whether an action is one of a few: then the largest of b + K'z is taken.
-        evolving : bool
-            Whether there are linear ones.
+        Where an action is one of a few ``choices`` the largest of b + K'z is taken. There are
+        linear ones if they are ``evolving``.
         """
         a, m = u.shape[1], z.shape[1]
         off = z - z.mean(0)
@@ -247,10 +241,7 @@ class Backups:
     def restored(cls, n_constant: int, m: int, a: int, arrays: dict[str, Floats]) -> Self:
         """Those that arrays of a file hold, of m variables and actions of a numbers.
 
-        Raises
-        ------
-        ValueError
-            If arrays contradict that, or each other: kernels check no index.
+        A ValueError if arrays contradict that, or each other: kernels check no index.
         """
         count, size, features = arrays["policies"].shape
         if (size, features) != (a, 1 + m):
