@@ -114,6 +114,51 @@ def test_fcd_says_which_lengths_it_assumed(evofsm, tmp_path):
     assert "#1 48.0" in text
 
 
+OWN = ("--observe", "dist,ego_kmh,lead_kmh", "--action", "accel", "--unit", "ego_kmh=km/h")
+OWN += ("--unit", "lead_kmh=km/h", "--episode", "trip")
+
+
+@pytest.fixture
+def own(tmp_path):
+    """Drives in somebody's own columns, in km/h; each second one ends in a collision."""
+    path = tmp_path / "own.csv"
+    rows = ["trip,time,dist,ego_kmh,lead_kmh,accel,hit"]
+    for trip in range(6):
+        for k in range(60):
+            gap, lead = 22.0 - (0.4 * k if trip % 2 else 0.0), 72.0 - 15.0 * (trip % 2)
+            rows.append(f"{trip},{k / 10:.1f},{gap:.2f},72,{lead},0.0,{int(gap <= 0.0)}")
+    path.write_text("\n".join([*rows, ""]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("judge", "keys"),
+    [("kinematic", ("gap", "v_follower", "v_leader")), ("learnt", ("dist", "ego_kmh", "lead_kmh"))],
+)
+def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judge, keys):
+    path, rows = tmp_path / "car.evofsm", tmp_path / "rows.jsonl"
+    options = ("--failed", "hit", "--action-range", "-6:2:0.5", "--judge", judge)
+    told = evofsm("learn", own, *OWN, *options, "--guard", path)
+    assert f"--guard {path} takes rows of time [s], {keys[0]}" in told.stdout
+    seen = dict(zip(keys, (3.0, 20.0, 15.8), strict=True))
+    rows.write_text(json.dumps({"time": 0.0, "proposal": 1.0, **seen}) + "\n")
+    answer = json.loads(evofsm("monitor", rows, "--guard", path).stdout)
+    assert answer["alarm"]
+    assert answer["mode"] == "shadow"
+    assert answer["evidence"] > 0
+    text = " ".join(evofsm("inspect", path).stdout.split())
+    assert "3 episodes ended in one" in text
+
+
+def test_a_guard_that_could_not_be_taught_is_refused_before_the_work(refused, own, tmp_path):
+    options = ("learn", own, *OWN, "--guard", tmp_path / "car.evofsm")
+    assert "nothing tells of them: --failed" in refused(*options)
+    two = ("--observe", "dist,ego_kmh", "--judge", "kinematic", "--unit", "ego_kmh=km/h")
+    assert "--observe has to name the three columns" in refused(*options[:2], *two, *options[-2:])
+    discrete = ("--observe", "dist,hit=0/1", "--failed", "hit")
+    assert "numbers alone" in refused(*options[:2], *discrete, *options[-2:])
+
+
 # -- What goes wrong ------------------------------------------------------------------------------
 
 

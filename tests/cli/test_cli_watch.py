@@ -36,6 +36,7 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c():
     [
         (["paper", "--case", "5"], "case is 5; paper has 1 to 4"),
         (["paper", "--learn", "nowhere"], "nowhere/guard.evofsm: no such file or directory"),
+        (["paper", "--unit", "v=km/h"], "options of columns are for a log, and paper is none"),
         (["missing.mcap"], "missing.mcap: no such file or directory"),
     ],
 )

@@ -11,8 +11,9 @@ from evofsm.cli.watch.session import Session, learn_first, watched_guard
 from evofsm.cli.watch.shown import Chronicle, Judged
 from evofsm.cli.watch.words import tell
 from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
+from evofsm.fsm.observations import ObservationEncoder
 from evofsm.guard import Mode
-from evofsm.io import read_run, recording
+from evofsm.io import LogColumns, read_run, recording
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -162,6 +163,23 @@ def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
     first, *_, last = drive(shown)
     assert first.v_follower == pytest.approx(20.0)
     assert [last.a_follower, last.a_leader, last.x_follower] == pytest.approx([0.0, -5.0, 158.0])
+
+
+def test_a_log_is_watched_by_its_own_columns_and_units(tmp_path, capsys):
+    path, out = tmp_path / "own.csv", tmp_path / "run.mcap"
+    rows = [f"{100 * k},{40 - k},72,{72 - 3 * k},0.1" for k in range(20)]
+    path.write_text("\n".join(["t,dist,ego_kmh,lead_kmh,accel", *rows, ""]))
+    names = ("dist", "ego_kmh", "lead_kmh")
+    units = {"t": "ms", "ego_kmh": "km/h", "lead_kmh": "km/h"}
+    columns = LogColumns(ObservationEncoder(*names), "accel", "t", units=units)
+    record_log(str(path), out, columns, brakes=4.0)
+    found = read_run(out).episodes[0].columns
+    assert [found[name][0] for name in ("gap", "v_follower", "v_leader")] == [40.0, 20.0, 20.0]
+    assert found["time"][1] == pytest.approx(0.1)
+    assert found["risk_proposed"][-1] > 0.9
+    assert "brakes of the own car of 4 m/s² (--brakes)" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="has to name the three columns in this order"):
+        record_log(str(path), out, LogColumns(ObservationEncoder("dist"), "accel", "t"))
 
 
 # -- The clock ------------------------------------------------------------------------------------

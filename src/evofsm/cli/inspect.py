@@ -150,7 +150,7 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
     stays = np.diag(model.changes) / np.maximum(model.changes.sum(axis=1), 1.0)
     names = model.names or [f"variable {j + 1}" for j in range(model.n_variables)]
     units = model.units or [""] * model.n_variables
-    heads = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
+    heads = map(with_unit, names, units)
     centers = zip(*map(_aligned, model.centers.T), strict=True)
     states = [
         (f"#{i + 1}", *center, f"{visits / total:.1%}", f"{stays[i]:.3f}", f"{created:,.0f}")
@@ -176,6 +176,11 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
         "\nTimes and share: of the steps from that state, as recognised. Learnt: probability per "
         "step that the matrices give. Where it is far above the share, beliefs are wide."
     )
+
+
+def with_unit(name: str, unit: str) -> str:
+    """A name, and in brackets its unit where that is known."""
+    return f"{name} [{unit}]" if unit else name
 
 
 def _model_facts(model: FSMModel) -> list[tuple[str, str]]:

@@ -9,8 +9,27 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from evofsm.cli.inspect import model_document, tables_of
-from evofsm.cli.options import Json, argument, option, split_names
+from evofsm.cli.inspect import model_document, tables_of, with_unit
+from evofsm.cli.options import (
+    BRAKES,
+    ActionColumn,
+    Brakes,
+    EpisodeColumns,
+    Failed,
+    Json,
+    Judge,
+    Lengths,
+    NoLeader,
+    Observed,
+    Step,
+    TimeColumn,
+    Tolerance,
+    TopicsFile,
+    Units,
+    argument,
+    log_columns,
+    option,
+)
 from evofsm.cli.show import facts, print_json, progress, say, show, table, warn
 
 if TYPE_CHECKING:
@@ -20,6 +39,8 @@ if TYPE_CHECKING:
     from evofsm.fsm.actions import IntervalActions
     from evofsm.fsm.machine import EvolvingFSM
     from evofsm.fsm.observations import ObservationEncoder
+    from evofsm.guard import Guard
+    from evofsm.io import LogColumns
     from evofsm.io.logs import Noted
 
 
@@ -38,50 +59,19 @@ def learn(
             "traces of ASAM OSI (.osi, MCAP), bags of ROS 2 (folder, MCAP, db3)."
         ),
     ],
-    observe: Annotated[
-        str, option("Columns to observe. A discrete one has its values: light=red/green.")
-    ] = "gap,v_follower,v_leader",
-    action: Annotated[
-        str, option("Column of the action taken from a row to the next.")
-    ] = "a_follower",
+    observe: Observed = "gap,v_follower,v_leader",
+    action: ActionColumn = "a_follower",
     action_range: Annotated[
         str, option("Its intervals, LOW:HIGH:WIDTH; what lies beyond goes into the end ones.")
     ] = "-2.5:2.5:0.3",
-    time: Annotated[str, option("Column of the time, in seconds.")] = "time",
-    episode: Annotated[
-        str | None,
-        option(
-            "An episode begins where one of these columns changes, and in each file; none of them: "
-            "''. [default: those of run,pair,segment that exist]"
-        ),
-    ] = None,
-    dt: Annotated[float | None, option("From a row to the next [s], without a clock.")] = None,
-    failed: Annotated[
-        str | None,
-        option(
-            "What tells of failures: a column of truth values, or a comparison such as 'gap<=0'. "
-            "The row with which it becomes true ends the episode in failure."
-        ),
-    ] = None,
-    unit: Annotated[
-        list[str] | None,
-        option("Of a column, or of all that begin so: v=km/h, time=ms. May be repeated."),
-    ] = None,
-    topics: Annotated[
-        Path | None, option("TOML: which field of which topic of a bag is which variable.")
-    ] = None,
-    no_leader: Annotated[
-        str | None,
-        option(
-            "'end': a row in which a number is missing ends the episode, and is left out. A "
-            "condition, such as 'precedingId==0': so does a row in which it holds. "
-            "[default: a missing number is refused]"
-        ),
-    ] = None,
-    vehicle_length: Annotated[
-        list[str] | None,
-        option("FCD: of vehicles [m], or of a type: truck=12. May be repeated. [default: 5.0]"),
-    ] = None,
+    time: TimeColumn = "time",
+    episode: EpisodeColumns = None,
+    dt: Step = None,
+    failed: Failed = None,
+    unit: Units = None,
+    topics: TopicsFile = None,
+    no_leader: NoLeader = None,
+    vehicle_length: Lengths = None,
     rule: Annotated[
         Rule,
         option(
@@ -108,6 +98,21 @@ def learn(
         int | None, option("At so many, two are merged for each new one. [default: no limit]")
     ] = None,
     out: Annotated[Path | None, option("File to save the model to.")] = None,
+    guard: Annotated[
+        Path | None,
+        option(
+            "File to save a guard to that decided on each row: evofsm monitor --guard takes it."
+        ),
+    ] = None,
+    judge: Annotated[
+        Judge | None,
+        option(
+            "Of --guard: kinematic is given how cars follow each other, learnt nothing but what "
+            "failed. [default: kinematic for gap,v_follower,v_leader]"
+        ),
+    ] = None,
+    brakes: Brakes = BRAKES,
+    tolerance: Tolerance = 0.02,
     checkpoint: Annotated[
         Path | None, option("Save what was learnt every minute; where it exists, go on from it.")
     ] = None,
@@ -127,33 +132,28 @@ def learn(
     The time may be seconds, or dates of ISO 8601. Without --failed a log tells nothing of failures,
     and evofsm explain says so.
 
+    With --guard, a guard in shadow mode then goes through all rows and learns from them too.
+
     With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
     to the same result. The file stays at the end: run again, the command prints it at once.
     """
-    from evofsm.cli.learning import Checkpoint, learn_traces
+    from evofsm.cli.learning import Checkpoint, guard_of_log, learn_traces, teach
     from evofsm.driving.naming import UNITS, VARIABLES
-    from evofsm.fsm.validation import positive
-    from evofsm.io import LogColumns, Topics, VehicleLengths, read_traces
-    from evofsm.io.logs import Noted, parse_units
+    from evofsm.io import Topics, VehicleLengths, read_traces
+    from evofsm.io.logs import Noted
 
     _check_out(out)
-    actions, encoder = _actions(action_range), _encoder(observe)
+    _check_out(guard, "--guard")
+    actions = _actions(action_range)
+    columns = log_columns(observe, action, time, episode, dt, failed, unit, no_leader)
+    encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
-    columns = LogColumns(
-        observe=encoder,
-        action=action,
-        time=time,
-        episode=None if episode is None else split_names(episode),
-        dt=None if dt is None else positive("--dt", dt),
-        failed=failed,
-        units=parse_units(unit or ()),
-        no_leader=no_leader,
-    )
+    kind = None if guard is None else _judge_of(judge, columns)
     lengths, noted = VehicleLengths.parse(vehicle_length or ()), Noted()
     known = [{"name": file, "bytes": _size(file)} for file in files]
     keeper = None
     if checkpoint is not None:
-        _check_apart(checkpoint, out, files)
+        _check_apart(checkpoint, [out, guard], files)
         names = ("action", "time", "failed", "dt", "no_leader")
         settings = {name: getattr(columns, name) for name in names}
         settings |= {"observe": observe, "episode": columns.episode, "units": unit or []}
@@ -163,6 +163,7 @@ def learn(
         keeper = Checkpoint(checkpoint, settings)
     read_topics = None if topics is None else Topics.load(topics)
     units = dict(zip(VARIABLES, UNITS, strict=True))
+    si = [units.get(name, "") for name in encoder.names]
     with progress("Learning", sum(file["bytes"] for file in known)) as move:  # type: ignore[misc]
         chunks = read_traces(
             files, columns, lengths, lambda count: move(advance=count), noted, read_topics
@@ -172,7 +173,7 @@ def learn(
             machine,
             actions,
             encoder.names,
-            [units.get(name, "") for name in encoder.names],
+            si,
             keeper,
             lambda: {"noted": asdict(noted), "lengths": str(lengths) if lengths.seen else ""},
         )
@@ -183,9 +184,29 @@ def learn(
         warn(f"warning: {warning}")
     if out is not None:
         _save(learning, out, provenance, checkpoint)
+    taught = None
+    if guard is not None:
+        assert kind is not None
+        assert learning.model.dt is not None
+        taught = guard_of_log(
+            kind, learning.model.dt, brakes, tolerance, actions, machine, encoder.names, si
+        )
+        with progress("Teaching the guard", learning.read.rows) as move:
+            rows = read_traces(files, columns, lengths, topics=read_topics)
+            teach(taught, rows, lambda count: move(count))
+        taught.save(guard, provenance)
     if as_json:
         document = _document(learning, provenance)
-        print_json({"files": files, "saved": out, **document, "noted": noted, "warnings": warnings})
+        print_json(
+            {
+                "files": files,
+                "saved": out,
+                "guard": guard,
+                **document,
+                "noted": noted,
+                "warnings": warnings,
+            }
+        )
         return
     read = [*_read(learning, action), *_read_otherwise(noted, failed, learning)]
     if assumed := learning.read.notes["lengths"]:
@@ -198,10 +219,13 @@ def learn(
             "smaller --spread sharpens recognition."
         )
     show("", *_skills(learning.skills), "")
-    if out is None:
+    if out is None and taught is None:
         say("Nothing was saved; --out MODEL saves the model.")
-    else:
+    elif out is not None:
         say(f"Saved to {out}. Look at it again: evofsm inspect {out}")
+    if taught is not None:
+        for line in _of_guard(taught, guard, brakes, learning.read.failures):
+            say(line)
 
 
 # -- What was asked for ---------------------------------------------------------------------------
@@ -221,19 +245,6 @@ def _actions(text: str) -> IntervalActions:
         return IntervalActions(low, high, width, outside="clip")
     except ValueError as error:
         raise ValueError(f"--action-range {text}: {error}") from None
-
-
-def _encoder(text: str) -> ObservationEncoder:
-    from evofsm.fsm.observations import Category, ObservationEncoder
-
-    def variable(name: str) -> str | Category:
-        name, discrete, values = name.partition("=")
-        return Category(name, values.split("/")) if discrete else name
-
-    try:
-        return ObservationEncoder(*map(variable, split_names(text)))
-    except ValueError as error:
-        raise ValueError(f"--observe {text}: {error}") from None
 
 
 def _machine(
@@ -291,29 +302,50 @@ def _size(file: str) -> int:
     return sum(entry.stat().st_size for entry in os.scandir(file))
 
 
-def _check_out(out: Path | None) -> None:
+def _judge_of(judge: Judge | None, columns: LogColumns) -> Judge:
+    """By what the guard is to judge, from what is observed where nobody said."""
+    from evofsm.driving.naming import VARIABLES
+
+    names = columns.observe.names
+    if any(not isinstance(one, str) for one in columns.observe.variables):
+        raise ValueError("--guard takes numbers alone, and --observe names a discrete column")
+    judge = judge or ("kinematic" if names == VARIABLES else "learnt")
+    if judge == "kinematic" and len(names) != len(VARIABLES):
+        raise ValueError(
+            f"--judge kinematic knows cars by their {', '.join(VARIABLES)}; --observe has to name "
+            f"the three columns in this order, and names {', '.join(names)}"
+        )
+    if judge == "learnt" and columns.failed is None:
+        raise ValueError(
+            "--guard learns from failures, and nothing tells of them: --failed COLUMN or --failed "
+            "'gap<=0' does; of cars that follow each other, --judge kinematic needs none"
+        )
+    return judge
+
+
+def _check_out(out: Path | None, option: str = "--out") -> None:
     """Refuse before the long work what could not be saved after it."""
     from evofsm import store
 
     if out is None:
         return
     if not out.parent.is_dir():
-        raise FileNotFoundError(f"--out {out}: there is no folder {out.parent}")
+        raise FileNotFoundError(f"{option} {out}: there is no folder {out.parent}")
     if not os.access(out.parent, os.W_OK):
-        raise PermissionError(f"--out {out}: the folder {out.parent} may not be written")
+        raise PermissionError(f"{option} {out}: the folder {out.parent} may not be written")
     if out.is_dir():
-        raise IsADirectoryError(f"--out {out} is a folder; name a file in it")
+        raise IsADirectoryError(f"{option} {out} is a folder; name a file in it")
     if out.exists() and out.suffix != ".evofsm":  # so are ours called, whatever wrote them
         try:
             store.read_header(out)
         except (ValueError, OSError):
             what = "exists and is no file of evofsm; it was left alone"
-            raise ValueError(f"--out {out}: {what}") from None
+            raise ValueError(f"{option} {out}: {what}") from None
 
 
-def _check_apart(checkpoint: Path, out: Path | None, files: Sequence[str]) -> None:
+def _check_apart(checkpoint: Path, outs: Sequence[Path | None], files: Sequence[str]) -> None:
     """Refuse a checkpoint that would take the place of something else."""
-    others = [*files, *([] if out is None else [str(out)])]
+    others = [*files, *(str(out) for out in outs if out is not None)]
     if checkpoint.resolve() in {Path(other).resolve() for other in others}:
         raise ValueError(f"--checkpoint {checkpoint} is named twice; give it a file of its own")
 
@@ -333,6 +365,21 @@ def _provenance(
     if unit:
         provenance["units converted"] = ", ".join(unit)
     return provenance
+
+
+def _of_guard(guard: Guard, path: Path | None, brakes: float, failures: int) -> Iterator[str]:
+    """Where it is, what it takes, and what it reckons with."""
+    from evofsm.guard import LearntRisk
+
+    assert guard.judge is not None
+    units = guard.judge.labels.units
+    keys = ", ".join(map(with_unit, ("time", *guard.variables), ("s", *units)))
+    takes = f"evofsm monitor --guard {path} takes rows of {keys}, and proposal, the action."
+    yield f"The guard was saved to {path}. {takes}"
+    if not isinstance(guard.judge, LearntRisk):
+        yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
+    elif not failures:
+        yield "It judges nothing yet, for no failure is known."
 
 
 def _save(

@@ -22,12 +22,15 @@ from numpy.typing import NDArray
 
 from evofsm import store
 from evofsm.cli.journal import differences
+from evofsm.cli.monitor.decider import guard_of_monitor
+from evofsm.driving import guard_for_cars
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.step import Trace
-from evofsm.io import Chunk
+from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
+from evofsm.io import Chunk, episodes_of
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +43,8 @@ HORIZON = 1.0
 _FIRST_BLOCK, _LARGEST_BLOCK, _SCORED = 64, 8192, 256
 # A checkpoint is written so often [s].
 _EVERY = 60.0
+# The strongest acceleration that a car may propose, as in `evofsm monitor` [m/s²].
+_HIGHEST = 2.5
 
 
 class Skill(NamedTuple):
@@ -158,6 +163,51 @@ def learn_traces(
         )
     certainty = read.certainty / read.scored if read.scored else np.nan
     return Learning(machine, model, read, transitions, certainty, tuple(_skills(read)))
+
+
+# -- A guard --------------------------------------------------------------------------------------
+
+
+def guard_of_cars(judge: str, dt: float, brakes: float, tolerance: float) -> Guard:
+    """A guard of car following that decides on a log, as `evofsm monitor` makes one."""
+    told = guard_of_monitor(dt, brakes).judge if judge == "kinematic" else None
+    return guard_for_cars(
+        -brakes,
+        _HIGHEST,
+        dt,
+        tolerance=tolerance,
+        mode=Mode.SHADOW,
+        judge=told or judge,
+    )
+
+
+def guard_of_log(
+    judge: str,
+    dt: float,
+    brakes: float,
+    tolerance: float,
+    actions: IntervalActions,
+    machine: EvolvingFSM,
+    names: Sequence[str],
+    units: Sequence[str],
+) -> Guard:
+    """A guard in shadow mode that has learnt nothing yet, of cars or of any other system."""
+    if judge == "kinematic":
+        return guard_of_cars(judge, dt, brakes, tolerance)
+    learnt = LearntRisk(dt, actions.low, actions.high, names=names, units=units)
+    reviser = ActionReviser(learnt, actions, tolerance=tolerance, mode=Mode.SHADOW)
+    return Guard.of(reviser, interval=dt, machine=machine.copy())
+
+
+def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) -> None:
+    """Let a guard decide on each row, and learn from it; ``show`` is told how many were."""
+    taken = 0
+    for episode in episodes_of(chunks):
+        seen, times = episode.observations, episode.times - episode.times[0]
+        for row, proposal, at in zip(seen[:-1], episode.actions, times, strict=False):
+            guard.decide(row, proposal, at)
+        guard.end(episode.failures is not None and len(episode.failures) > 0, seen[-1])
+        show(taken := taken + len(times))
 
 
 def _ahead(chunks: Iterable[Chunk]) -> Iterator[Chunk]:

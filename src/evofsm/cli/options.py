@@ -14,6 +14,7 @@ from evofsm.extras import install
 
 if TYPE_CHECKING:
     from evofsm.driving import Family
+    from evofsm.io import LogColumns
 
 
 #: Where to drive.
@@ -52,7 +53,67 @@ ByJudge = Annotated[
 Tolerance = Annotated[
     float, option("Share of hard brakes (learnt: of disturbances) that need not be survived.")
 ]
+#: What a car's brakes are reckoned with where nobody said [m/s²].
+BRAKES = 6.0
+Brakes = Annotated[
+    float,
+    option("Hardest braking of the own car, that a guard reckons with [m/s²].", min=0.5, max=20.0),
+]
 Switches = Annotated[str, option("noise, delay, actuator, jerk, third_car; with commas.", "--with")]
+
+# What the columns of a log mean; `log_columns` takes them.
+Observed = Annotated[
+    str, option("Columns to observe. A discrete one has its values: light=red/green.", "--observe")
+]
+ActionColumn = Annotated[
+    str, option("Column of the action taken from a row to the next.", "--action")
+]
+TimeColumn = Annotated[str, option("Column of the time, in seconds.", "--time")]
+EpisodeColumns = Annotated[
+    str | None,
+    option(
+        "An episode begins where one of these columns changes, and in each file; none of them: "
+        "''. [default: those of run,pair,segment that exist]",
+        "--episode",
+    ),
+]
+Step = Annotated[float | None, option("From a row to the next [s], without a clock.", "--dt")]
+Failed = Annotated[
+    str | None,
+    option(
+        "What tells of failures: a column of truth values, or a comparison such as 'gap<=0'. "
+        "The row with which it becomes true ends the episode in failure.",
+        "--failed",
+    ),
+]
+Units = Annotated[
+    list[str] | None,
+    option(
+        "Of a column, or of all that begin so: v=km/h, time=ms. May be repeated. [default: of a "
+        "row of units below the names, if there is one]",
+        "--unit",
+    ),
+]
+TopicsFile = Annotated[
+    Path | None,
+    option("TOML: which field of which topic of a bag is which variable.", "--topics"),
+]
+NoLeader = Annotated[
+    str | None,
+    option(
+        "'end': a row in which a number is missing ends the episode, and is left out. A "
+        "condition, such as 'precedingId==0': so does a row in which it holds. "
+        "[default: a missing number is refused]",
+        "--no-leader",
+    ),
+]
+Lengths = Annotated[
+    list[str] | None,
+    option(
+        "FCD: of vehicles [m], or of a type: truck=12. May be repeated. [default: 5.0]",
+        "--vehicle-length",
+    ),
+]
 
 
 def require(**extras: str) -> None:
@@ -101,3 +162,39 @@ def family_of(name: str, switches: str) -> Family:
     from evofsm.driving import load_family
 
     return load_family(name).with_switches(split_names(switches))
+
+
+def log_columns(
+    observe: str,
+    action: str,
+    time: str,
+    episode: str | None,
+    dt: float | None,
+    failed: str | None,
+    unit: list[str] | None,
+    no_leader: str | None,
+) -> LogColumns:
+    """What the columns of a log mean, from the options of those names."""
+    from evofsm.fsm.observations import Category, ObservationEncoder
+    from evofsm.fsm.validation import positive
+    from evofsm.io import LogColumns
+    from evofsm.io.logs import parse_units
+
+    def variable(text: str) -> str | Category:
+        name, discrete, values = text.partition("=")
+        return Category(name, values.split("/")) if discrete else name
+
+    try:
+        encoder = ObservationEncoder(*map(variable, split_names(observe)))
+    except ValueError as error:
+        raise ValueError(f"--observe {observe}: {error}") from None
+    return LogColumns(
+        observe=encoder,
+        action=action,
+        time=time,
+        episode=None if episode is None else split_names(episode),
+        dt=None if dt is None else positive("--dt", dt),
+        failed=failed,
+        units=parse_units(unit or ()),
+        no_leader=no_leader,
+    )

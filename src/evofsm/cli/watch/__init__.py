@@ -10,15 +10,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import (
+    BRAKES,
+    ActionColumn,
+    Brakes,
     ByJudge,
+    EpisodeColumns,
+    Failed,
     InWorld,
     Judge,
+    Lengths,
+    NoLeader,
+    Observed,
     Seed,
+    Step,
     Switches,
+    TimeColumn,
     Tolerance,
+    TopicsFile,
+    Units,
     World,
     argument,
     family_of,
+    log_columns,
     option,
     require,
     require_world,
@@ -30,6 +43,7 @@ if TYPE_CHECKING:
     from evofsm.cli.watch.session import Session
     from evofsm.driving import Family
     from evofsm.guard import Guard
+    from evofsm.io import LogColumns, Topics, VehicleLengths
 
 # Of a simulation of somebody else's that are watched [s].
 _SECONDS = 600.0
@@ -53,18 +67,35 @@ def watch(
     seed: Seed = 0,
     learn_first: Annotated[int, option("Episodes to learn from before.", min=0)] = 60,
     learn: Annotated[Path | None, option("Begin with what a folder of drive --out holds.")] = None,
-    topics: Annotated[Path | None, option("Of a bag: which field is which variable.")] = None,
+    brakes: Brakes = BRAKES,
+    observe: Observed = "gap,v_follower,v_leader",
+    action: ActionColumn = "a_follower",
+    time: TimeColumn = "time",
+    episode: EpisodeColumns = None,
+    dt: Step = None,
+    failed: Failed = None,
+    unit: Units = None,
+    topics: TopicsFile = None,
+    no_leader: NoLeader = None,
+    vehicle_length: Lengths = None,
     port: Annotated[int, option("Of the page; 0 for any that is free.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
 ) -> None:
     """Watch a run in the browser while it is driven, and act on it; or one that was recorded.
+
+    A log is read with the options of evofsm learn, from --observe to --vehicle-length; its gap,
+    own speed and leader's speed are named in this order.
 
     The page shows the cars, what the machine believes, risk and time to collision, and what was
     done about it. It is served to this computer only, at the address that is printed, and the run
     begins when the page is first opened. Ctrl-C ends it.
     """
     require(websockets="watch")
+    from evofsm.io import Topics, VehicleLengths
+
     is_log = _is_log(what)
+    if not is_log and any((episode, dt, failed, unit, topics, no_leader, vehicle_length)):
+        raise ValueError(f"options of columns are for a log, and {what} is none")
     is_recorded = is_log or what.endswith(".mcap")
     if is_recorded:
         require(scipy="study", mcap="mcap")
@@ -72,7 +103,11 @@ def watch(
         require_world(world)
     opened: AbstractContextManager[Watched]
     if is_recorded:
-        opened = _recorded(what, case, topics, judge, tolerance, is_log=is_log)
+        columns = log_columns(observe, action, time, episode, dt, failed, unit, no_leader)
+        lengths = VehicleLengths.parse(vehicle_length or ())
+        known = None if topics is None else Topics.load(topics)
+        reading = (columns, lengths, known) if is_log else None
+        opened = _recorded(what, case, judge, tolerance, brakes, reading)
     else:
         family = family_of(what, switches)
         guard, learnt = _guard(family, judge, tolerance, seed, learn_first, learn)
@@ -112,16 +147,20 @@ def _is_log(what: str) -> bool:
 
 
 def _recorded(
-    what: str, case: int, topics: Path | None, judge: Judge, tolerance: float, *, is_log: bool
+    what: str,
+    case: int,
+    judge: Judge,
+    tolerance: float,
+    brakes: float,
+    reading: tuple[LogColumns, VehicleLengths, Topics | None] | None,
 ) -> AbstractContextManager[Watched]:
     """A run that was recorded, or a log with what a guard would have said; read beforehand."""
     from tempfile import TemporaryDirectory
 
     from evofsm.cli.sumocfg import trace_configuration
     from evofsm.cli.watch.recorded import MOST_ROWS, Recording, record_log
-    from evofsm.io.rosbag import Topics
 
-    if not is_log:
+    if reading is None:
         recording = Recording(what)
     else:
         with TemporaryDirectory() as folder, progress("Reading", MOST_ROWS) as move:
@@ -129,8 +168,10 @@ def _recorded(
             if log.endswith(".sumocfg"):
                 log = str(Path(folder) / f"{Path(what).stem}.xml")
                 trace_configuration(Path(what), Path(log), seconds=_SECONDS)
-            given = None if topics is None else Topics.load(topics)
-            if record_log(log, run, topics=given, judge=judge, tolerance=tolerance, show=move):
+            more = record_log(
+                log, run, *reading, judge=judge, brakes=brakes, tolerance=tolerance, show=move
+            )
+            if more:
                 warn(f"watched are the first {MOST_ROWS:,} rows; there are more")
             recording = Recording(run)
     recording.restart(case - 1)

@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.cli.learning import guard_of_cars
+from evofsm.cli.options import BRAKES
+from evofsm.cli.show import warn
 from evofsm.cli.watch.shown import (
     RECORDED,
     Chronicle,
@@ -21,16 +24,16 @@ from evofsm.cli.watch.shown import (
     graph_of,
     most_believed,
 )
-from evofsm.driving import guard_for_cars
 from evofsm.driving.episodes import shadow_drive
 from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.driving.naming import VARIABLES
-from evofsm.guard import TOLERANCE, Mode
+from evofsm.guard import TOLERANCE
 from evofsm.guard.record import RECORD
 from evofsm.io.foxglove import recording
-from evofsm.io.logs import Chunk, episodes_of, read_traces
+from evofsm.io.logs import Chunk, LogColumns, Noted, episodes_of, read_traces
 from evofsm.io.rosbag import Topics
 from evofsm.io.runs import RecordedEpisode, Run, read_run
+from evofsm.io.vehicles import VehicleLengths
 
 #: More rows of a log are not watched.
 MOST_ROWS = 20_000
@@ -38,8 +41,6 @@ MOST_ROWS = 20_000
 # So many of a log's episodes can be chosen among.
 _MOST_EPISODES = 500
 _NONE = -1
-# What a car can do at most [m/s²]; nobody says of a log what this one could.
-_LOWEST, _HIGHEST = -8.0, 4.0
 # Whoever wants to see something needs as many.
 _FEWEST_ROWS = 10
 
@@ -170,9 +171,12 @@ def _held(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 def record_log(
     path: str,
     out: Path,
-    *,
+    columns: LogColumns | None = None,
+    lengths: VehicleLengths | None = None,
     topics: Topics | None = None,
+    *,
     judge: str = "kinematic",
+    brakes: float = BRAKES,
     tolerance: float = TOLERANCE,
     show: Callable[[int], object] = lambda rows: None,
 ) -> bool:
@@ -181,7 +185,14 @@ def record_log(
     Returns whether rows after the first `MOST_ROWS` were left out; ``show`` is told how many
     were decided on.
     """
-    reading = read_traces([path], topics=topics)
+    names = VARIABLES if columns is None else columns.observe.names
+    if len(names) != len(VARIABLES):
+        raise ValueError(
+            f"cars are watched by {', '.join(VARIABLES)}; --observe has to name the three columns "
+            f"in this order, and names {', '.join(names)}"
+        )
+    noted = Noted()
+    reading = read_traces([path], columns, lengths, noted=noted, topics=topics)
     taken, more = 0, False
     about: dict[str, Any] = {"source": Path(path).name, "mode": "shadow", "judge": judge}
     guard = None
@@ -193,14 +204,7 @@ def record_log(
             show(taken)
             if len(episode.times) >= _FEWEST_ROWS:
                 if guard is None:
-                    guard = guard_for_cars(
-                        _LOWEST,
-                        _HIGHEST,
-                        episode.dt,
-                        mode=Mode.SHADOW,
-                        tolerance=tolerance,
-                        judge=judge,
-                    )
+                    guard = guard_of_cars(judge, episode.dt, brakes, tolerance)
                 log.add(
                     shadow_drive(
                         guard,
@@ -214,6 +218,9 @@ def record_log(
             raise ValueError(f"{path}: nobody follows anybody for {_FEWEST_ROWS} rows")
         if guard.machine is not None:
             log.attach(guard.machine.model(names=VARIABLES))
+    for warning in noted.warnings("time" if columns is None else columns.time):
+        warn(f"warning: {warning}")
+    warn(f"reckoned with: brakes of the own car of {brakes:g} m/s² (--brakes)")
     return more
 
 
