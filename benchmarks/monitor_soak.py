@@ -162,8 +162,8 @@ def soak(hours: float, seed: int = 0, learn: bool = False, episode: int = EPISOD
 
 def is_next(place: Place, row: dict[str, float]) -> bool:
     """Whether the row was taken in already, before a restart: the one before it is late then."""
-    latest = place.decider._latest
-    return latest is not None and isinstance(latest[0], Row) and latest[0].time == row["time"]
+    latest = place.decider._before
+    return isinstance(latest, Row) and latest.time == row["time"]
 
 
 def main() -> int:

@@ -139,6 +139,32 @@ def test_however_it_ends_it_goes_on_bit_for_bit(tmp_path, name):
 
 @posix
 @pytest.mark.slow
+def test_streams_that_are_closed_or_do_not_wait_end_it_in_a_line_or_not_at_all():
+    base = shlex.join([sys.executable, "-m", "evofsm", "monitor"])
+    for closed, name in (("<&-", "input"), (">&-", "output")):
+        done = subprocess.run(f"{base} {closed}", shell=True, capture_output=True, text=True)
+        assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+        assert f"standard {name} is closed" in done.stderr
+    (source, feed), (drain, sink) = os.pipe(), os.pipe()
+    with started("--heartbeat", "1e10", stdin=source, stdout=sink) as process:
+        os.write(feed, ROWS[0] + b"\n")
+        out = os.read(drain, 1 << 16)
+        for shared in (source, sink):  # as who shares them with it may do at any time
+            os.set_blocking(shared, False)
+        os.close(sink)
+        os.write(feed, b"x\n" * 3000 + ROWS[1])
+        os.close(feed)
+        time.sleep(0.5)  # the answers are more than a pipe holds
+        while data := os.read(drain, 1 << 16):
+            out += data
+        said = process.stderr.read().decode()
+    assert (process.returncode, said, len(out.splitlines())) == (0, "", 3002)
+    os.close(source)
+    os.close(drain)
+
+
+@posix
+@pytest.mark.slow
 def test_a_reader_that_vanishes_ends_it_in_a_line():
     with started() as process:
         asked(process, ROWS[0])

@@ -199,6 +199,8 @@ def _model_facts(model: FSMModel) -> list[tuple[str, str]]:
 def _learnt_from(provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """What a file says of where it comes from, line by line."""
     for name, value in provenance.items():
+        if name == "monitor":  # what one goes on from
+            continue
         text = f"{value:,}" if isinstance(value, int) else str(value)
         if name == "files":
             shown = [f"{file['name']} ({file['bytes']:,} bytes)" for file in value[:_MOST_FILES]]

@@ -75,6 +75,40 @@ def test_an_episode_ends_where_it_is_told_to_and_learns_of_it():
     assert decider.answer(b'{"end": true}')["kind"] == "end"  # nothing is under way: nothing to do
 
 
+def in_flight():
+    """Two episodes that end alike, the second of which begins at 0 s again; and an end by time."""
+    rows_told = [line(row | {"gap": 60.0 + row["time"]}) for row in rows(30)]
+    end = b'{"end": true, "failed": true}'
+    messages = [*rows_told[:20], end, *[line(row) for row in rows(4)], end]
+    messages += [line(row | {"gap": 61.0}) for row in rows(2)]
+    messages.append(b'{"end": true, "failed": true, "time": 0.2}')
+    messages.append(line(next(rows(1)) | {"gap": 62.0}))
+    return messages
+
+
+@pytest.mark.parametrize("answered", [*range(1, 20), 22, 23, 24, 27, 28])
+@pytest.mark.parametrize("decided", [24, 26, 28, 29])
+def test_what_was_in_flight_and_is_sent_again_is_decided_once(answered, decided):
+    messages = in_flight()
+    plain, guard = Decider(made(learn=True)), made(learn=True)
+    expected = [plain.answer(message) for message in messages]
+    decider = Decider(guard)
+    for message in messages[:decided]:
+        decider.answer(message)
+    again = min(answered, decided)
+    assert [decider.answer(message) for message in messages[again:]] == expected[again:]
+    assert guard.machine.endings.sum() == plain.guard.machine.endings.sum() == 3.0
+
+
+@pytest.mark.parametrize("end", [[], [b'{"end": true}']])
+def test_a_recording_that_is_played_again_is_decided_again(end):
+    decider = Decider(made())
+    lap = [*[line(row) for row in rows(30)], *end]
+    kinds = [decider.answer(message)["kind"] for message in lap * 4]
+    assert kinds == (["decision"] * 30 + ["end"] * len(end)) * 4
+    assert decider.n == 120
+
+
 def test_an_end_that_is_sent_again_counts_once():
     guard = made(learn=True)
     decider = Decider(guard)

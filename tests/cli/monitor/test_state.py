@@ -2,7 +2,7 @@ import pytest
 
 from evofsm.cli.monitor.decider import Decider, guard_of_monitor
 from evofsm.cli.monitor.state import State
-from evofsm.guard import Mode
+from evofsm.guard import Guard, Mode
 from evofsm.store import read_header
 from monitor_rows import JUNK, line, scenes, traffic
 
@@ -137,6 +137,63 @@ def test_killed_as_the_guard_is_saved_it_goes_on(tmp_path, moment, monkeypatch):
     decider, state = opened(tmp_path / "state.evofsm")
     assert [decider.answer(row) for row in rows[699:]] == expected[699:]
     state.close()
+
+
+def test_rows_in_flight_across_an_end_are_decided_once_though_it_is_killed(tmp_path):
+    rows = [line(row) for row in traffic(720)]
+    messages = [*rows[:700], b'{"end": true, "failed": true}', *rows[700:]]
+    plain = Decider(made())
+    expected = [plain.answer(message) for message in messages]
+    decider, state = opened(tmp_path / "state.evofsm")
+    for lost in (5, 695, 699, 702):  # the guard is written with message 700
+        for message in messages[max(0, lost - 9) : lost + 9]:
+            decider.answer(message)
+        abandoned(state)
+        decider, state = opened(tmp_path / "state.evofsm")
+        assert [decider.answer(m) for m in messages[lost : lost + 9]] == expected[lost : lost + 9]
+        for message in messages[lost + 9 : 690]:
+            decider.answer(message)
+    state.close()
+
+
+def test_a_refused_end_stops_no_restart(tmp_path):
+    decider, state = opened(
+        tmp_path / "state.evofsm", fresh=lambda: Guard(n_actions=2, interval=0.1)
+    )
+    for k, seen in enumerate(("[3.4e38]", "[1, 2, 3]", "[1e100, 1]", "[null]")):
+        row = {"time": 0.1 * k, "observation": [1.0, 2.0], "proposal": 0}
+        assert decider.answer(line(row))["kind"] == "decision"
+        end = f'{{"end": true, "failed": true, "observation": {seen}}}'
+        assert decider.answer(end.encode())["kind"] == "error"
+        abandoned(state)
+        decider, state = opened(tmp_path / "state.evofsm")
+        assert (decider.n, decider.rows) == (k + 1, k + 1)
+    state.close()
+
+
+def test_what_cannot_be_taken_in_again_is_left_out_and_said(tmp_path, monkeypatch, caplog):
+    decider, state = opened(tmp_path / "state.evofsm")
+    for message in [*(line(row) for row in traffic(3)), b'{"end": true}']:
+        decider.answer(message)
+    abandoned(state)
+
+    def fails(*_):
+        raise RuntimeError("another version")
+
+    monkeypatch.setattr(Guard, "end", fails)
+    decider, state = opened(tmp_path / "state.evofsm")
+    assert (decider.n, decider.rows) == (3, 3)
+    assert "a message is left out: another version" in caplog.text
+    state.close()
+
+
+def test_a_guard_that_was_replaced_is_not_taken_for_that_of_the_journal(tmp_path):
+    decider, state = opened(tmp_path / "state.evofsm")
+    decider.answer(line(next(traffic(1))))
+    state.close()
+    made().save(tmp_path / "state.evofsm")
+    with pytest.raises(ValueError, match="holds what came after another guard"):
+        opened(tmp_path / "state.evofsm")
 
 
 def test_two_monitors_do_not_keep_themselves_in_one_place(tmp_path):

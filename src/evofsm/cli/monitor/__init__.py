@@ -144,6 +144,8 @@ def _transport(
         warn(f"listens to {zenoh}/row")
     elif file is None and sys.stdin is None:
         raise ValueError("standard input is closed; give FILE, --socket, --udp or --zenoh")
+    elif sys.stdout is None:
+        raise ValueError("standard output is closed; give --socket, --udp or --zenoh")
     else:
         source = sys.stdin.buffer if file is None else stack.enter_context(file.open("rb"))
         transport = Stream(source, sys.stdout.buffer)

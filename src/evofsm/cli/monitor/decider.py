@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -24,6 +25,8 @@ _log = logging.getLogger(__name__)
 
 #: Rows after which an episode ends, as soon as no alarm is on; at twice as many it ends anyway.
 EPISODE = 6000
+# So many of the latest messages are known again when they are sent again.
+_RECENT = 256
 # What is older by less is late; what is older by more comes from a sender that began anew [s].
 _LATE = 1.0
 # A gap in time, and rows that come too often, in intervals.
@@ -55,7 +58,8 @@ class Decider:
         self.n = 0  #: decisions so far
         self.refused = 0  #: messages that were refused, since the process began
         self.rows = 0  #: of the episode under way; 0 where none is
-        self._latest: tuple[Message, Answer] | None = None
+        self._recent: deque[tuple[Message, Answer]] = deque(maxlen=_RECENT)
+        self._next: int | None = None  # of the recent ones, where they are being sent again
         self._said_often = self._has_failed = False
         reviser = guard.reviser
         self._has_margin = isinstance(reviser, ActionReviser) and not isinstance(
@@ -73,16 +77,15 @@ class Decider:
     def answer(self, line: bytes) -> Answer:
         """What is answered to a line: a decision, an end, or an error that names the key.
 
-        A message that is sent again, as after a connection was lost, gets the answer of before.
+        Messages that are sent again, as after a connection was lost, get the answers of before.
         """
         try:
             told = self.form.read(line)
-            if self._latest is not None:
-                before, answer = self._latest
-                if told == before:
-                    return answer
-                if isinstance(told, Row) and isinstance(before, Row):
-                    _refuse_stale(told, before)
+            self._next = self._sent_before(told)
+            if self._next is not None:
+                return self._recent[self._next][1]
+            if isinstance(told, Row) and isinstance(self._before, Row):
+                _refuse_stale(told, self._before)
         except MessageError as refused:
             return self.error(refused.about, str(refused), refused.time)
         try:
@@ -92,6 +95,26 @@ class Decider:
         self.keep(told)
         return answer
 
+    def _sent_before(self, told: Message) -> int | None:
+        """Where among the recent messages one is that is sent again; None if it is a new one.
+
+        Who plays a recording once more begins with its first row, or does what was done before
+        after the same: that is no repetition.
+        """
+        recent, latest = self._recent, self._before
+        following = len(recent) if self._next is None else self._next + 1
+        if following < len(recent) and recent[following][0] == told:
+            return following
+        if told == latest:
+            return len(recent) - 1
+        if isinstance(told, End) and told.time is None:
+            return None  # it says of no episode in particular that it ended
+        for place in range(len(recent) - 2, -1, -1):
+            if recent[place][0] == told:
+                before = recent[place - 1][0] if place else None
+                return None if _begins_anew(told, before, latest) else place
+        return None
+
     def error(self, about: str, what: str, time: float | None = None) -> Answer:
         """What is answered where a message is refused."""
         self.refused += 1
@@ -100,8 +123,7 @@ class Decider:
 
     def heartbeat(self, silent: float) -> Answer:
         """What is said where nothing came for so long [s]."""
-        row = None if self._latest is None else self._latest[0]
-        time = row.time if isinstance(row, Row) else None
+        time = self._before.time if isinstance(self._before, Row) else None
         return self._of(
             "heartbeat", time=time, silent=silent, refused=self.refused, mode=self.mode.value
         )
@@ -119,14 +141,14 @@ class Decider:
             answer = self._of("end", failed=told.failed)
         else:
             answer = self._decided(told)
-        self._latest = told, answer
+        self._recent.append((told, answer))
         if self.rows >= self.episode and (not answer.get("alarm") or self.rows >= 2 * self.episode):
-            self.end()
+            self._end_unasked()
         return answer
 
     @property
     def _before(self) -> Message | None:
-        return None if self._latest is None else self._latest[0]
+        return self._recent[-1][0] if self._recent else None
 
     def end(self, failed: bool = False, observation: Any = None) -> None:
         """End the episode under way."""
@@ -135,6 +157,14 @@ class Decider:
         except OSError as error:  # only the audit log writes
             self._lose_audit(error)
         self.rows, self._said_often = 0, False
+
+    def _end_unasked(self) -> None:
+        """The same where nobody waits for an answer to it; what somebody's judge raises is said."""
+        try:
+            self.end()
+        except Exception:
+            _log.exception("an episode could not be ended")
+            self.rows = 0
 
     def _decided(self, row: Row) -> Answer:
         notes = self._notes(row)
@@ -177,10 +207,10 @@ class Decider:
             return []
         step = row.time - latest.time
         if step < 0.0:
-            self.end()
+            self._end_unasked()
             return [f"time went back from {latest.time:g} s: a new episode"]
         if row.ahead != latest.ahead:
-            self.end()
+            self._end_unasked()
             return ["another one is ahead: a new episode"] if row.observation else []
         if step > _HOLE * interval:
             return [f"{step:.3g} s without a row: nothing is learnt or carried across"]
@@ -218,15 +248,22 @@ class Decider:
 
     def memory(self) -> dict[str, Any]:
         """What it knows between two episodes, beside the guard: for JSON."""
-        latest = None if self._latest is None else msgspec.to_builtins(list(self._latest))
-        return {"n": self.n, "latest": latest}
+        return {"n": self.n, "recent": msgspec.to_builtins(list(self._recent))}
 
     def remember(self, memory: Mapping[str, Any]) -> None:
         """Go on from what `memory` returned."""
         self.n = int(memory["n"])
-        if memory["latest"] is not None:
-            told, answer = memory["latest"]
-            self._latest = msgspec.convert(told, Message), dict(answer)
+        for told, answer in memory["recent"]:
+            self._recent.append((msgspec.convert(told, Message), dict(answer)))
+
+
+def _begins_anew(told: Message, before: Message | None, latest: Message | None) -> bool:
+    """Whether what first came after ``before`` is no repetition where it comes after another."""
+    if isinstance(latest, End):
+        return before is None or isinstance(before, End)
+    if before is None and isinstance(told, Row) and isinstance(latest, Row):
+        return told.time < latest.time - _LATE
+    return before == latest
 
 
 def _refuse_stale(row: Row, latest: Row) -> None:

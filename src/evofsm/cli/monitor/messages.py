@@ -62,6 +62,7 @@ class End(msgspec.Struct, frozen=True, tag="end"):
 
     failed: bool
     observation: tuple[float | None, ...] | None = None  #: the last one; nothing was decided on it
+    time: float | None = None  #: [s]
 
 
 Message = Row | End
@@ -138,10 +139,10 @@ class Form:
             raise MessageError("end", "is false; it must be true")
         given = [name for name in self._names if getattr(told, name) is not UNSET]
         if not given:
-            return End(told.failed)
+            return End(told.failed, time=told.time)
         if lacking := [name for name in self._names if name not in given]:
             raise MessageError(lacking[0], "is missing; a variable that was not seen is null")
-        return End(told.failed, self._observed(told))
+        return End(told.failed, self._observed(told), told.time)
 
     def _of_scene(self, told: Any) -> Row:
         if not (self.scenes or self.variables == VARIABLES):

@@ -60,6 +60,11 @@ class State:
         self._provenance = dict(store.read_header(self.path).provenance)
         saved = self._provenance.pop(_PROVENANCE, None)
         if saved is None:
+            if journal.records:
+                raise ValueError(
+                    f"{journal.path} holds what came after another guard than {self.path}; put "
+                    "that back, or delete the journal to begin anew"
+                )
             return Guard.load(self.path)
         if found := differences(saved["settings"], self.settings):
             raise ValueError(
@@ -86,7 +91,10 @@ class State:
             return 0
         self._count = len(self._journal.records)
         for record in self._journal.records:
-            decider.act(msgspec.convert(record["told"], Message))
+            try:
+                decider.act(msgspec.convert(record["told"], Message))
+            except Exception as error:  # of another version: no reason not to begin
+                _log.error("%s: a message is left out: %s", self._journal.path, error)
         return self._count
 
     def close(self) -> None:
@@ -104,7 +112,7 @@ class State:
             self._count += 1
             if decider.rows == 0 and self._count >= _EVERY:
                 self._save(decider)
-        except OSError as error:  # the decisions are what matters: it is said, and gone on without
+        except Exception as error:  # decisions matter most: it is said, and gone on without
             self.failure = f"{self.path} is not saved any more: {error}"
             _log.error(self.failure)
 

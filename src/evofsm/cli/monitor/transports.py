@@ -29,6 +29,8 @@ from evofsm.fsm.naming import visible
 _CHUNK = 1 << 16
 # So many lines may come in one datagram or sample, and so many peers may be connected.
 _MOST_LINES, _MOST_PEERS = 100, 100
+# What would block is tried again after so long [s].
+_POLL = 0.005
 # A signal that another thread took is seen after so long [s].
 _LONGEST_WAIT = 0.5
 
@@ -136,13 +138,20 @@ class Stream:
 
     def serve(self, server: Server) -> None:
         """Answer line by line."""
-        server.converse(self._source.read, self.send)
+        server.converse(self._read, self.send)
+
+    def _read(self, count: int) -> bytes:
+        while (data := self._source.read(count)) is None:  # made so by whoever shares it
+            time.sleep(_POLL)
+        return bytes(data)
 
     def send(self, line: bytes) -> None:
         """Write it."""
         with self._writing:
             while line:
-                line = line[self._sink.write(line) :]
+                if (written := self._sink.write(line)) is None:
+                    time.sleep(_POLL)
+                line = line[written or 0 :]
 
     def close(self) -> None:
         """Others opened them."""
