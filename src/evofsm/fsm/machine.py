@@ -64,10 +64,10 @@ _LIMITED, _UNLIMITED = Entry(stepping.learn_rows), Entry(stepping.learn_rows)
 _SHARED: WeakSet[Any] = WeakSet()
 
 
-def share(one: Any) -> None:
-    """Give an object a lock, so that threads may share it."""
-    one._lock = RLock()
+def share(one: Any) -> Any:
+    """A lock of an object, so that threads may share it: its ``_lock``."""
     _SHARED.add(one)
+    return RLock()
 
 
 def alone(method: Method) -> Method:
@@ -561,7 +561,7 @@ class EvolvingFSM:
 
     def _share(self) -> None:
         """Be ready for threads. They wait for whoever steps, grows, or takes a copy."""
-        share(self)
+        self._lock = share(self)
         self._limit = self.max_states
         # Room for a single row.
         flags = np.zeros((2, 1), np.bool_)

@@ -277,7 +277,7 @@ class Guard:
         explaining: bool = False,
         missing: Missing = Missing.PARTIAL,
     ) -> None:
-        share(self)
+        self._lock = share(self)
         self.actions = reviser.actions
         self.interval = positive("interval", interval)
         asked = reviser.risk if isinstance(reviser, ActionReviser) else judge
@@ -378,7 +378,6 @@ class Guard:
             self.audit.begin(self)
         self._under_way = True
 
-    @alone
     def decide(
         self,
         observation: ArrayLike,
@@ -409,11 +408,12 @@ class Guard:
         TypeError, ValueError
             If observation or proposal are not real numbers, or an entry is infinite or too large.
         """
-        wanted = proposal.action if isinstance(proposal, Proposal) else proposal
-        wanted = no_action(self.actions) if wanted is None else self._proposed(wanted)
-        if time is None:
-            time = self._decisions * self.interval if self._under_way else 0.0
-        return self.revise(self.recognise(observation, time), Proposal(wanted))
+        with self._lock:
+            wanted = proposal.action if isinstance(proposal, Proposal) else proposal
+            wanted = no_action(self.actions) if wanted is None else self._proposed(wanted)
+            if time is None:
+                time = self._decisions * self.interval if self._under_way else 0.0
+            return self.revise(self.recognise(observation, time), Proposal(wanted))
 
     def _proposed(self, action: ArrayLike) -> Action:
         """An action of the right type, whatever its values."""
@@ -421,7 +421,6 @@ class Guard:
             return self.actions.checked("proposal", action)
         return float(action)  # type: ignore[arg-type]
 
-    @alone
     def recognise(self, observation: ArrayLike, time: float) -> Situation:
         """The first half of `decide`: where the system is; machine and judge learn from it.
 
@@ -433,22 +432,25 @@ class Guard:
         observation, time
             As in `decide`.
         """
-        z = self._checked(observation)
-        if not self._under_way:
-            self.begin()
-        intake = self._monitor.take(z, time)
-        if intake and intake & STALE and self._latest is not None:
-            situation = self._latest._replace(intake=intake)
-        else:
-            if intake and intake & Intake.GAP:  # what comes does not follow from what was before
-                if self.machine is not None and self._learn:
-                    self.machine.start_episode()  # first, as a judge learns from what it made of it
-                if self.judge is not None:
-                    self.judge.start_episode(learn=self._learn)
-            situation = self._latest = self._recognised(z, time, intake)
-        if self.audit is not None:
-            self.audit.seen(z, time)
-        return situation
+        with self._lock:
+            z = self._checked(observation)
+            if not self._under_way:
+                self.begin()
+            intake = self._monitor.take(z, time)
+            if intake and intake & STALE and self._latest is not None:
+                situation = self._latest._replace(intake=intake)
+            else:
+                # What comes after a gap does not follow from what was before. The machine begins
+                # first, as a judge learns from what it made of it.
+                if intake and intake & Intake.GAP:
+                    if self.machine is not None and self._learn:
+                        self.machine.start_episode()
+                    if self.judge is not None:
+                        self.judge.start_episode(learn=self._learn)
+                situation = self._latest = self._recognised(z, time, intake)
+            if self.audit is not None:
+                self.audit.seen(z, time)
+            return situation
 
     def _checked(self, observation: ArrayLike) -> NDArray[np.float64]:
         """An observation that judge and machine can take in; NaN stays."""
@@ -487,10 +489,9 @@ class Guard:
             if began and machine is not None:
                 machine.onset()
         if machine is not None and state is not None:
-            seen = float(machine.visits[state]) * self.interval
+            seen = float((known or machine).visits[state]) * self.interval
         return Situation(z, belief, state, surprise, time, intake, seen)
 
-    @alone
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """The second half of `decide`: what to execute; machine and judge learn from it.
 
@@ -499,15 +500,17 @@ class Guard:
         situation, proposal
             What `recognise` returned, and what the controller wants.
         """
-        revision = self.reviser.revise(situation, proposal)
-        if self.explaining or self.audit is not None:
-            revision = self._explained(situation, revision)
-        if self.audit is not None:
-            self.audit.decided(situation, proposal, revision)
-        self._take_in(situation, revision.executed)
-        if isinstance(self.actions, Choices):
-            return revision._replace(executed=int(revision.executed), advised=int(revision.advised))
-        return revision
+        with self._lock:
+            revision = self.reviser.revise(situation, proposal)
+            if self.explaining or self.audit is not None:
+                revision = self._explained(situation, revision)
+            if self.audit is not None:
+                self.audit.decided(situation, proposal, revision)
+            self._take_in(situation, revision.executed)
+            if isinstance(self.actions, Choices):
+                executed, advised = int(revision.executed), int(revision.advised)
+                revision = revision._replace(executed=executed, advised=advised)
+            return revision
 
     @alone
     def take_in(self, situation: Situation, proposal: Proposal, executed: Action) -> None:
@@ -605,7 +608,7 @@ class Guard:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        share(self)
+        self._lock = share(self)
 
     # -- Keeping it -----------------------------------------------------------------------------
 
