@@ -269,6 +269,16 @@ def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, refused, tmp_
     assert "rows 29, one every 0.1 s" in text
     assert told.stderr == ""
     assert FSMModel.load(tmp_path / "model").centers[0].tolist() == pytest.approx([20, 15, 15])
+    own = tmp_path / "own.csv"
+    own.write_text(
+        "\n".join(["time,ego_kmh,jerk,u", "s,,m/s^3,", *(f"{k},79.2,1,0" for k in range(9)), ""])
+    )
+    named = ("learn", own, "--observe", "ego_kmh,jerk", "--action", "u", "--out", tmp_path / "own")
+    assert "ego_kmh is called as if it were in km/h" in evofsm(*named).stderr
+    text = " ".join(evofsm(*named, "--unit", "ego_kmh=km/h").stdout.split())
+    assert "ego_kmh [m/s] jerk [m/s3]" in text
+    assert "#1 22.00" in text
+    assert "ego_kmh [m/s]" in evofsm("inspect", tmp_path / "own").stdout
     warned = evofsm("learn", path, "--no-leader", "end")
     assert "a row every 100 s: is the time in ms? --unit time=ms converts it" in warned.stderr
 

@@ -111,7 +111,9 @@ def test_skill_is_what_its_definition_says(trace, monkeypatch, dt, steps):
 def test_counts_say_what_was_learnt(trace):
     Z, actions = trace
     marked = [one._replace(jumps=1) for one in chunks(Z, actions, size=50)]
-    learnt = learn_traces(marked, machine(), ACTIONS, ["x", "y"], ["m", "s"])
+    learnt = learn_traces(
+        marked, machine(), ACTIONS, ["x", "y"], notes=lambda: {"units": ["m", "s"]}
+    )
     read, model = learnt.read, learnt.model
     assert (read.rows, read.episodes, read.jumps) == (200, 4, 4)
     assert read.seconds == pytest.approx(0.1 * (200 - 4))

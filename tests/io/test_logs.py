@@ -451,6 +451,56 @@ def test_units_are_converted_before_anything_is_learnt(tmp_path):
     assert re.search("a row every 100 s.*--unit time=ms", step)
 
 
+@pytest.mark.parametrize("row", ["-,[s],m,km/h,kph,m/s^2,", ",ms,cm,m/s,mps,g,-"])
+def test_a_row_of_units_below_the_names_is_none_of_the_log(tmp_path, row):
+    lines = [f"p,{k},9,36,36,1,0" for k in range(4)]
+    path, noted = write(tmp_path / "a.csv", [row, *lines], SHORT), Noted()
+    (chunk,) = read(path, noted=noted)
+    assert len(chunk.times) == 4
+    in_si = row.startswith("-")
+    assert chunk.observations[0] == pytest.approx([9, 10, 10] if in_si else [0.09, 36, 36])
+    assert chunk.actions[0] == pytest.approx(1.0 if in_si else 9.80665)
+    assert chunk.dt == pytest.approx(1.0 if in_si else 0.001)
+    assert noted.warnings() == []
+    (chunk,) = read(path, units={"v_follower": "mph"})  # who says otherwise is right
+    assert chunk.observations[0, 1] == pytest.approx(36 * 0.44704)
+    bad = write(tmp_path / "b.csv", [*lines, "p,9,9,36,fast,1,0"], SHORT)
+    assert "line 6, column 'v_leader'" in refusal(bad)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("ego_kmh", "km/h"), ("speed [km/h]", "km/h"), ("egoMph", "mph"), ("dist_cm", "cm")],
+)
+def test_a_unit_in_a_column_s_name_is_asked_about_unless_it_was_told(tmp_path, name, unit):
+    header, lines = f"time,{name},u", [f"{k / 10},79,0" for k in range(3)]
+    path = write(tmp_path / "a.csv", lines, header)
+    columns = {"observe": ObservationEncoder(name), "action": "u"}
+    noted = Noted()
+    read(path, noted=noted, **columns)
+    (warning,) = noted.warnings()
+    assert f"{name} is called as if it were in {unit}" in warning
+    assert f"--unit {name}={unit} converts it" in warning
+    told = Noted()
+    read(path, noted=told, units={name: unit}, **columns)
+    assert told.warnings() == []
+
+
+@pytest.mark.parametrize(
+    ("step", "unit"), [(20, "ms"), (100, "ms"), (100_000, "us"), (10**8, "ns"), (2 * 10**7, "ns")]
+)
+def test_the_unit_of_the_time_is_told_from_its_step(tmp_path, step, unit):
+    lines = [f"p,{1_700_000_000_000_000_000 + step * k},9,10,10,0,0" for k in range(5)]
+    if unit != "ns":
+        lines = [f"p,{step * k},9,10,10,0,0" for k in range(5)]
+    noted, path = Noted(), write(tmp_path / "a.csv", lines, SHORT)
+    read(path, noted=noted)
+    (warning,) = noted.warnings()
+    assert f"is the time in {unit}? --unit time={unit} converts it" in warning
+    (chunk,) = read(path, units={"time": unit})
+    assert chunk.dt in (0.02, 0.1)
+
+
 @pytest.mark.parametrize(
     ("columns", "says"),
     [

@@ -141,6 +141,7 @@ def learn(
     from evofsm.driving.naming import UNITS, VARIABLES
     from evofsm.io import Topics, VehicleLengths, read_traces
     from evofsm.io.logs import Noted
+    from evofsm.io.tables import SI
 
     _check_out(out)
     _check_out(guard, "--guard")
@@ -163,7 +164,6 @@ def learn(
         keeper = Checkpoint(checkpoint, settings)
     read_topics = None if topics is None else Topics.load(topics)
     units = dict(zip(VARIABLES, UNITS, strict=True))
-    si = [units.get(name, "") for name in encoder.names]
     with progress("Learning", sum(file["bytes"] for file in known)) as move:  # type: ignore[misc]
         chunks = read_traces(
             files, columns, lengths, lambda count: move(advance=count), noted, read_topics
@@ -173,9 +173,15 @@ def learn(
             machine,
             actions,
             encoder.names,
-            si,
             keeper,
-            lambda: {"noted": asdict(noted), "lengths": str(lengths) if lengths.seen else ""},
+            lambda: {
+                "noted": asdict(noted),
+                "lengths": str(lengths) if lengths.seen else "",
+                "units": [
+                    SI.get(noted.units.get(name, ""), noted.units.get(name, units.get(name, "")))
+                    for name in encoder.names
+                ],
+            },
         )
     noted = Noted(**learning.read.notes["noted"])
     provenance = _provenance(learning, known, action, failed, unit)
@@ -189,7 +195,14 @@ def learn(
         assert kind is not None
         assert learning.model.dt is not None
         taught = guard_of_log(
-            kind, learning.model.dt, brakes, tolerance, actions, machine, encoder.names, si
+            kind,
+            learning.model.dt,
+            brakes,
+            tolerance,
+            actions,
+            machine,
+            encoder.names,
+            learning.model.units,
         )
         with progress("Teaching the guard", learning.read.rows) as move:
             rows = read_traces(files, columns, lengths, topics=read_topics)
@@ -427,6 +440,8 @@ def _read_otherwise(
     noted: Noted, failed: str | None, learning: Learning
 ) -> Iterator[tuple[str, str]]:
     """What was not learnt as it stands in the files."""
+    from evofsm.io.tables import UNITS
+
     if failed is None:
         yield "failures", "not told; --failed COLUMN or --failed 'gap<=0' tells of them"
     else:
@@ -435,8 +450,9 @@ def _read_otherwise(
         yield "failures", text + (left_out if noted.after_failure else "")
     if noted.leaderless:
         yield "no leader", f"in {noted.leaderless:,} rows, left out; there an episode ends"
-    if noted.units:
-        given = (f"{name} from {one}" for name, one in noted.units.items())
+    told = {name: unit for name, unit in noted.units.items() if UNITS.get(unit, 1.0) != 1.0}
+    if told:
+        given = (f"{name} from {one}" for name, one in told.items())
         yield "converted", f"{', '.join(given)} to units of the SI"
 
 

@@ -137,11 +137,13 @@ def learn_traces(
     machine: EvolvingFSM,
     actions: IntervalActions,
     names: Sequence[str] = (),
-    units: Sequence[str] = (),
     checkpoint: Checkpoint | None = None,
     notes: Callable[[], dict[str, Any]] = dict,
 ) -> Learning:
-    """Learn all chunks in their order, each row once; notes are taken once they are read."""
+    """Learn all chunks in their order, each row once; notes are taken once they are read.
+
+    Their ``units`` are those of the variables.
+    """
     machine, read = machine.copy(), Progress()
     if checkpoint is not None:
         machine, read = checkpoint.begin(machine)
@@ -155,6 +157,7 @@ def learn_traces(
         read.finished, read.notes = True, notes()
         if checkpoint is not None:
             checkpoint.save(machine, read)
+    units = read.notes.get("units", ())
     model = machine.model(actions=actions, names=names, units=units, dt=read.dt)
     if (transitions := int(model.uses.sum())) == 0:
         raise ValueError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -16,6 +17,7 @@ from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import vehicles
 from evofsm.io.tables import (
+    SI,
     TIMES,
     UNITS,
     CsvTable,
@@ -41,11 +43,17 @@ _FIRST_ROWS = 8192
 # Share by which the usual steps of two files may differ.
 _SAME_STEP = 0.05
 # Speeds [m/s] and usual steps [s] beyond these are most likely in another unit.
-_FASTEST, _LONGEST_USUAL = 60.0, 10.0
+_FASTEST, _LONGEST_USUAL = 60.0, 5.0
+# Units of time that logs are in, of which that counts by which a row comes every 0.1 s or so.
+_SHORTER = ("ms", "us", "ns")
 # Numbers that stand for nobody in many recordings.
 _NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
 _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
 _MICROSECOND = 1e-6
+# A unit at the end of a column's name, behind another letter or as a word of its own.
+_WORD = "(?:^|[^A-Za-z]|(?<=[a-z])(?=[A-Z]))"
+_CALLED = re.compile(_WORD + "((?i:km[/_ ]?p?h|kph|mph|knots|feet|ft|cm|mm|km))[^A-Za-z]*$")
+_TIME_CALLED = re.compile(_WORD + "((?i:ms|us|ns))(?:ec)?[^A-Za-z]*$")
 
 _SIGNS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt}
 _SIGNS |= {"==": operator.eq, "!=": operator.ne}
@@ -84,7 +92,8 @@ class Chunk(NamedTuple):
 class Noted:
     """What was noticed while logs were read, for people."""
 
-    units: dict[str, str] = field(default_factory=dict)  #: that columns were converted from
+    units: dict[str, str] = field(default_factory=dict)  #: of columns, as they were told
+    called: dict[str, str] = field(default_factory=dict)  #: in columns' names, and not converted
     leaderless: int = 0  #: rows without a leader, left out
     after_failure: int = 0  #: rows left out because the failure before them still held
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
@@ -115,9 +124,16 @@ class Noted:
             f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
             f"mph? --unit {name}=km/h converts it"
             for name, fastest in self.fastest.items()
+            if name not in self.called
         ]
-        if (step := self.longest_step) > 0.0:
-            cause = f"is the time in ms? --unit {time}=ms converts it"
+        found += [
+            f"{name} is called as if it were in {unit}, and was read as one of the SI: --unit "
+            f"{name}={unit} converts it (--unit {name}={SI[unit].replace('²', '2')}: it is right)"
+            for name, unit in self.called.items()
+        ]
+        if (step := self.longest_step) > 0.0 and time not in self.called:
+            unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
+            cause = f"is the time in {unit}? --unit {time}={unit} converts it"
             found.append(f"there is a row every {step:,.6g} s: {cause}")
         same = [one for one in self.at_once.items() if one[1] in _NOBODY or self.failed_at_once > 1]
         if same and self.failed_at_once >= self.failed / 2:
@@ -149,7 +165,7 @@ def parse_units(texts: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def units_of(units: Mapping[str, str], used: Sequence[str], time: str) -> dict[str, str]:
+def units_of(units: Mapping[str, str], used: Sequence[str]) -> dict[str, str]:
     """The unit of each column in use that was given one.
 
     A name that is no column's is the beginning of all that it fits; the longest one counts.
@@ -163,13 +179,26 @@ def units_of(units: Mapping[str, str], used: Sequence[str], time: str) -> dict[s
                 f"read are {', '.join(used)}"
             )
         found |= dict.fromkeys(fit, units[name])
-    for name, unit in found.items():
-        if (unit in TIMES) != (name == time):
-            raise ValueError(
-                f"--unit gives column {name!r} the unit {unit}; the column of the time needs a "
-                "unit of time, and no other one may have it"
-            )
     return found
+
+
+def refuse_other_times(units: Mapping[str, str], time: str) -> None:
+    """Raise where the column of the time has no unit of time, or another one has."""
+    for name, unit in units.items():
+        if unit in UNITS and (unit in TIMES) != (name == time):
+            raise ValueError(
+                f"column {name!r} has the unit {unit}; the column of the time needs a unit of "
+                "time, and no other one may have it (--unit says which it has)"
+            )
+
+
+def _called(name: str, *, is_time: bool) -> str:
+    """The unit that is part of a column's name, if it is none of the SI."""
+    found = (_TIME_CALLED if is_time else _CALLED).search(name)
+    if found is None:
+        return ""
+    word = found[1].lower()
+    return {"feet": "ft", "knots": "kn"}.get(word) or (word if word in UNITS else "km/h")
 
 
 class Condition(NamedTuple):
@@ -495,7 +524,8 @@ class _Clock:
             )
         first = steps[:_FIRST_ROWS]
         if np.isnan(self._usual) and not np.isnan(first).all():
-            self._settle(round(float(np.nanmedian(first)), 9))
+            exact = -math.log10(np.spacing(abs(times[-1])))  # digits that such times can have
+            self._settle(round(float(np.nanmedian(first)), min(9, int(exact))))
         unusual = (steps > LONGEST_STEP * self._usual) | (steps < self._usual / LONGEST_STEP)
         return np.asarray(unusual)
 
@@ -604,14 +634,21 @@ class _Reader:
         date = columns.time if clock and table.holds_dates(columns.time) else None
         numbers = [*learnt, *compared, *(clock if date is None else [])]
         try:
-            given = units_of(columns.units, numbers, columns.time)
+            given = {name: unit for name in numbers if (unit := table.units.get(name))}
+            given |= units_of(columns.units, numbers)
+            refuse_other_times(given, columns.time)
         except ValueError as error:
             raise ValueError(f"{table.path}: {error}") from None
         self._noted.units |= given
+        self._noted.called |= {
+            name: unit
+            for name in numbers
+            if name not in given and (unit := _called(name, is_time=name == columns.time))
+        }
         gaps = [name for name in compared if name not in learnt]
         gaps += learnt if columns.no_leader else []
         wanted = Wanted(numbers, [*self._episode, *categories, *told], gaps, date)
-        return wanted, {name: UNITS[unit] for name, unit in given.items()}
+        return wanted, {name: UNITS[unit] for name, unit in given.items() if unit in UNITS}
 
     def _times(self, piece: Piece, date: str | None) -> NDArray[np.float64]:
         if not self._clock.ticks:

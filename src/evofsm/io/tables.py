@@ -57,15 +57,33 @@ _PROFILE = len(_MCAP) + 1 + 8 + 4
 
 #: Factors that turn units of time into s, and all units into s, m, m/s or m/s².
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
-UNITS: Mapping[str, float] = {
-    **TIMES,
-    **{"m": 1.0, "mm": 1e-3, "cm": 0.01, "km": 1000.0, "ft": 0.3048},
-    **{"m/s": 1.0, "cm/s": 0.01, "km/h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0},
-    **{"ft/s": 0.3048, "m/s2": 1.0, "cm/s2": 0.01, "ft/s2": 0.3048, "g": 9.80665},
+_GROUPS: Mapping[str, Mapping[str, float]] = {
+    "s": TIMES,
+    "m": {"m": 1.0, "mm": 1e-3, "cm": 0.01, "km": 1000.0, "ft": 0.3048},
+    "m/s": {"m/s": 1.0, "cm/s": 0.01, "km/h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0}
+    | {"ft/s": 0.3048},
+    "m/s²": {"m/s2": 1.0, "cm/s2": 0.01, "ft/s2": 0.3048, "g": 9.80665},
 }
+UNITS = {unit: factor for group in _GROUPS.values() for unit, factor in group.items()}
+#: Of each unit the one that it is turned into.
+SI = {unit: base for base, group in _GROUPS.items() for unit in group}
+_SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": "m/s", "sec": "s"}
+_SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
 # What stands in a field where there is no number.
 _NOTHING = ("", "na", "n/a", "null", "none")
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
+
+
+def unit_of(text: str) -> str:
+    """A unit as we call it, of one in brackets or spelt otherwise; others as they are.
+
+    >>> unit_of("[km/h]"), unit_of("m/s^2"), unit_of("deg")
+    ('km/h', 'm/s2', 'deg')
+    """
+    text = text.strip().strip("[]()<>").replace(" ", "").replace("²", "2").replace("^", "")
+    return next(
+        (one for one in (text, text.lower()) if one in UNITS), _SPELT.get(text.lower(), text)
+    )
 
 
 def silent(count: int) -> None:
@@ -265,6 +283,8 @@ class Table:
 
     path: str
     columns: Sequence[str]
+    #: As a row below the names says; empty of a column of which it does not.
+    units: Mapping[str, str] = {}
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """Read columns, in the order of rows."""
@@ -288,14 +308,20 @@ class CsvTable(Table):
         self.path = path
         self._on_read = on_read
         with Source(path) as source:
-            header, first, *_ = *source.rows().split(b"\n", 2), b""
+            header, *first = source.rows().split(b"\n", 3)[:3]
         text = self._decoded(header, 0).removeprefix("\ufeff").rstrip("\r")
         self._separator = max(",;\t", key=text.count)
         self.columns = [name.strip() for name in self._split(text, 1)]
         # With nothing in it that has a meaning; polars is not to be left alone with others.
         quoted = f'"[^"{self._separator}\\r\\n]*"(?=[{self._separator}\\r\\n])'
         self._quoted = re.compile(quoted.encode())
-        self._first_row = self._split(first.decode(errors="replace").rstrip("\r"), 2)
+        rows = [self._split(row.decode(errors="replace").rstrip("\r"), 2) for row in first]
+        self._above = 1  # lines before the first row
+        told = [unit_of(text) for text in rows[0]] if rows else []
+        if any(one in UNITS for one in told) and not any(map(_is_number, told)):
+            self.units = dict(zip(self.columns, told, strict=False))
+            self._above, rows = 2, rows[1:]
+        self._first_row = rows[0] if rows else []
         if all(_is_number(name) for name in self.columns):
             raise ValueError(
                 f"{path}, line 1: {text.strip()[:200]!r} is no header; the first line must name "
@@ -326,8 +352,8 @@ class CsvTable(Table):
         with Source(self.path, self._on_read) as source:
             reached = 0
             while block := source.rows():
-                if reached == 0:
-                    block, reached = block.partition(b"\n")[2], 1
+                while reached < self._above:
+                    block, reached = block.partition(b"\n")[2], reached + 1
                 found = self._plain(block, places, wanted.numbers)
                 is_plain = found is not None
                 if found is None:
