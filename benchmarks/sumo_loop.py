@@ -14,10 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from evofsm.driving.episodes import drive, teach
 from evofsm.driving.families import load_family
 from evofsm.driving.family import Draw, Family
 from evofsm.driving.sumo import SumoWorld
+from evofsm.driving.trials import drive, teach
 from evofsm.driving.world import Episode
 from evofsm.guard.guard import Guard
 from guard_rows import FAMILY, many_states

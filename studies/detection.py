@@ -875,7 +875,7 @@ def _stream(study: Detection, name: str, learning_seed: int) -> list[dict[str, A
         once = fixed_threshold(before, rate, of)
         for stage, by_score in stages:
             then = by_score[score]
-            # As the level is now, with a delay of one; see the proof in `evofsm.guard.alarms`.
+            # As the level is now, with a delay of one; see the proof in `evofsm.guard.conformal`.
             most = alarm.level / study.alarm_step + 2.0 - rate
             adaptive = np.array(list(said_by(alarm, then)), np.bool_)
             fixed = then.score > once if of == "false alarms" else then.score >= once

@@ -37,6 +37,7 @@ from scipy.stats import beta
 from evofsm.cli import print_json
 from evofsm.extras import install
 from evofsm.paper import Page, print_page, write_page
+from evofsm.plot import COLORS
 
 #: Rows of a study by name; those of its main table are called ``"rows"``.
 Frames = Mapping[str, pl.DataFrame]
@@ -516,10 +517,8 @@ def isotonic(score: ArrayLike, truth: ArrayLike) -> Calibration:
 # well, so that neither is needed.
 
 Look = dict[str, Any]
-BLUE, GREEN, RED, PINK, INK, SOFT = (
-    *("#0072B2", "#009E73", "#D55E00", "#CC79A7"),
-    *("#222222", "#777777"),
-)
+_NAMES = ("follower", "leader", "dead end", "third", "ink", "soft")
+BLUE, GREEN, RED, PINK, INK, SOFT = (COLORS[name] for name in _NAMES)
 #: Of who is ours, of fixed constants, of what is tuned or told, of another learner, and of chance.
 OURS: Look = {"color": BLUE, "marker": "o"}
 FIXED: Look = {"color": RED, "marker": "s"}

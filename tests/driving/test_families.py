@@ -9,10 +9,10 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from evofsm.driving.episodes import drive, unrevised_guard
 from evofsm.driving.families import FAMILIES, fixed_family, load_family
 from evofsm.driving.family import SWITCHES
 from evofsm.driving.measures import is_dead_end
+from evofsm.driving.trials import drive, unrevised_guard
 from evofsm.driving.world import KinematicWorld
 from evofsm.paper.runs import Settings
 

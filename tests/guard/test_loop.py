@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from evofsm.driving.drivers import IDM
-from evofsm.driving.episodes import drive
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.scenarios import Body, Leader, Scenario, Sensors
+from evofsm.driving.trials import drive
 from evofsm.driving.world import COMMANDED, SPEED
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM

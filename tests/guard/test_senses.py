@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from evofsm.driving.drivers import IDM
-from evofsm.driving.episodes import drive
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.measures import TimeToCollision
 from evofsm.driving.revisers import EnvelopeReviser
 from evofsm.driving.scenarios import Leader, Scenario
+from evofsm.driving.trials import drive
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing

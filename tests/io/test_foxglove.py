@@ -22,7 +22,7 @@ from evofsm.driving.naming import DECISION_COLUMNS, VARIABLES
 from evofsm.driving.world import Episode
 from evofsm.guard import Guard
 from evofsm.guard.api import Intake
-from evofsm.guard.episodes import Decision
+from evofsm.guard.loop import Decision
 from evofsm.guard.reviser import Mode
 from evofsm.io.foxglove import FOXGLOVE_LAYOUT, FoxgloveSink, RunWriter, recording
 from evofsm.io.runs import _column, read_run, schemas_of

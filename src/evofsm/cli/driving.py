@@ -37,9 +37,9 @@ from evofsm.driving import (
     summarise,
 )
 from evofsm.driving.cars import name_judge
-from evofsm.driving.episodes import Row, Trial
 from evofsm.driving.measures import FIXED_MEASURES
 from evofsm.driving.naming import DECISION_COLUMNS
+from evofsm.driving.trials import Row, Trial
 from evofsm.driving.world import World
 from evofsm.extras import needs
 from evofsm.guard import TOLERANCE, DecisionLogger, Guard, Mode, Reviser

@@ -1,6 +1,5 @@
 from .actions import BoxActions as BoxActions
 from .actions import Choices as Choices
-from .alarms import ConformalAlarm as ConformalAlarm
 from .api import BELIEF_TOLERANCE as BELIEF_TOLERANCE
 from .api import TOLERANCE as TOLERANCE
 from .api import ActionJudge as ActionJudge
@@ -19,14 +18,15 @@ from .api import Situation as Situation
 from .audit_log import AuditLog as AuditLog
 from .audit_log import Head as Head
 from .check import check_contract as check_contract
-from .episodes import Decision as Decision
-from .episodes import run_episode as run_episode
+from .conformal import ConformalAlarm as ConformalAlarm
 from .guard import DecisionLogger as DecisionLogger
 from .guard import Guard as Guard
 from .gym import RevisedActions as RevisedActions
 from .gym import RevisedVectorActions as RevisedVectorActions
 from .learnt.judge import LearntRisk as LearntRisk
 from .learnt.merge import merge_judges as merge_judges
+from .loop import Decision as Decision
+from .loop import run_episode as run_episode
 from .pettingzoo import RevisedAgents as RevisedAgents
 from .replay import audit as audit
 from .reviser import ActionReviser as ActionReviser

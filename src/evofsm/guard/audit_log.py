@@ -31,8 +31,8 @@ import evofsm
 from evofsm import store
 from evofsm.guard.actions import written
 from evofsm.guard.api import Proposal, Revision, Situation
-from evofsm.guard.episodes import Decision
 from evofsm.guard.guard import Guard
+from evofsm.guard.loop import Decision
 from evofsm.guard.parts import can_be_made_again, settings_of
 from evofsm.guard.record import RECORD
 from evofsm.guard.reviser import is_spoken

@@ -24,9 +24,9 @@ from evofsm.cli.watch.shown import (
     graph_of,
     most_believed,
 )
-from evofsm.driving.episodes import shadow_drive
 from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.driving.naming import VARIABLES
+from evofsm.driving.trials import shadow_drive
 from evofsm.guard import TOLERANCE
 from evofsm.guard.record import RECORD
 from evofsm.io.foxglove import recording

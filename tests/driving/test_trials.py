@@ -7,7 +7,11 @@ pytest.importorskip("scipy")
 
 from evofsm.driving.cars import TOLD, guard_for_cars, guard_for_family, learners_of, name_judge
 from evofsm.driving.drivers import IDM
-from evofsm.driving.episodes import (
+from evofsm.driving.families import load_family
+from evofsm.driving.family import held_out, training
+from evofsm.driving.judge import LatentRisk
+from evofsm.driving.scenarios import Leader, Scenario
+from evofsm.driving.trials import (
     Trial,
     drive,
     lead_time,
@@ -19,10 +23,6 @@ from evofsm.driving.episodes import (
     try_out,
     unrevised_guard,
 )
-from evofsm.driving.families import load_family
-from evofsm.driving.family import held_out, training
-from evofsm.driving.judge import LatentRisk
-from evofsm.driving.scenarios import Leader, Scenario
 from evofsm.driving.world import KinematicWorld
 from evofsm.guard.guard import Guard
 from evofsm.guard.learnt.judge import LearntRisk

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm.guard.alarms import ConformalAlarm
+from evofsm.guard.conformal import ConformalAlarm
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
 KINDS = ("false alarms", "misses")
