@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> tuple[Result, Result]:
         return np.array([car.draw.controller.propose(observation, info["time"]).action])
 
     guard = guard_for_family(car.family)
-    revised = RevisedActions(env, guard, failed=lambda info: info["failed"])
+    revised = RevisedActions(env, guard, failed=lambda step: step.info["failed"])
     results = compare(
         revised,
         aggressive,

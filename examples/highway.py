@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> tuple[Result, Result]:
         RescaleAction(env, np.float32(-FULL), np.float32(FULL)),
         guard_for_cars(-FULL, FULL, INTERVAL, width=0.5),
         observe=ahead,
-        failed=lambda info: info["crashed"],
+        failed=lambda step: step.info["crashed"],
     )
     held_out = range(chosen.seed, chosen.seed + chosen.episodes)
     training = range(held_out.stop, held_out.stop + chosen.train)
@@ -93,6 +93,7 @@ def main(argv: Sequence[str] | None = None) -> tuple[Result, Result]:
         [{"seed": seed} for seed in training],
         [{"seed": seed} for seed in held_out],
         speed=lambda observation: observation[0, SPEED],
+        failed="crashed",
     )
     revised.close()
     return results

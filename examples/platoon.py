@@ -109,7 +109,7 @@ def main(argv: Sequence[str] | None = None) -> tuple[int, int]:
     episodes = parser.parse_args(argv).episodes
     platoon = Platoon()
     guard = guard_for_family(platoon.family)
-    guarded = RevisedAgents(platoon, guard, failed=lambda info: info["failed"])
+    guarded = RevisedAgents(platoon, guard, failed=lambda step: step.info["failed"])
     found = failures(platoon, episodes), failures(guarded, episodes)
     print(f"Of {episodes} runs end in a collision: {found[0]} unguarded, {found[1]} guarded")
     return found

@@ -23,7 +23,7 @@ def make(guard=None):
     """The environment, under a guard if there is one, scaled for the network."""
     env = gymnasium.make("evofsm.driving.env:evofsm/CarFollowing-v0")
     if guard is not None:  # innermost: it has to see metres and m/s²
-        env = RevisedActions(env, guard, failed=lambda info: info["failed"], penalty=1.0)
+        env = RevisedActions(env, guard, failed=lambda step: step.info["failed"], penalty=1.0)
     env = gymnasium.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
     seen = gymnasium.spaces.Box(-np.inf, np.inf, (3,))
     env = gymnasium.wrappers.TransformObservation(env, lambda z: np.float32(z / SCALE), seen)

@@ -12,7 +12,7 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete  # noqa: E402
 from gymnasium.utils.env_checker import check_env  # noqa: E402
-from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper  # noqa: E402
 
 from evofsm.driving import CarFollowing, guard_for_cars  # noqa: E402
 from evofsm.fsm import Labels  # noqa: E402
@@ -116,7 +116,7 @@ def guard_for(space, judge=None, **others):
 
 
 def of_cars(env):
-    return RevisedActions(env, guard_for_cars(-2.5, 2.5), failed=lambda info: info["failed"])
+    return RevisedActions(env, guard_for_cars(-2.5, 2.5), failed=lambda step: step.info["failed"])
 
 
 def drive(env, policy, **reset):
@@ -314,8 +314,11 @@ def test_observations_become_a_vector(space, observation, observe, seen):
         ({}, None, True, True),  # nobody says otherwise
         ({}, None, False, False),
         ({}, lambda z: z[0] < 0.0, True, False),  # the guard knows
-        ({"failed": lambda info: False}, None, True, False),
-        ({"failed": lambda info: info["of"] == "step"}, None, False, True),
+        ({"failed": lambda step: False}, None, True, False),
+        ({"failed": lambda step: step.info["of"] == "step"}, None, False, True),
+        ({"failed": lambda step: step.reward == 1.5}, None, False, True),  # without the penalty
+        ({"failed": lambda step: step.observation[0] > 0 and step.terminated}, None, True, True),
+        ({"failed": lambda step: np.array([step.truncated])}, None, True, False),
     ],
 )
 def test_what_is_terminated_has_failed_unless_somebody_says_otherwise(
@@ -328,6 +331,46 @@ def test_what_is_terminated_has_failed_unless_somebody_says_otherwise(
     env.reset()
     assert [ended[-1] for ended in guard.judge.episodes] == [failed]
     assert guard.machine.endings.sum() == failed
+
+
+@pytest.mark.parametrize("failed", ["failed", {"failed": True}])
+def test_what_is_no_function_is_refused(failed):
+    for name in ("failed", "observe"):
+        with pytest.raises(TypeError, match=f"{name} is .* it must be a function of a"):
+            RevisedActions(Script(FAR), guard_for(ONE), **{name: failed})
+
+
+@pytest.mark.parametrize(
+    "failed",
+    [
+        lambda info: info["failed"],
+        lambda info: info.get("failed"),
+        lambda info: "failed" in info,
+        lambda step: step.info["crashed"],
+    ],
+)
+def test_a_function_of_something_else_than_a_step_is_told_what_it_gets(failed):
+    env = RevisedActions(Script(FAR, FAR), guard_for(ONE), failed=failed)
+    env.reset()
+    with pytest.raises((TypeError, AttributeError, KeyError)) as found:
+        env.step(np.array([0.0]))
+    assert "failed=lambda step: step.info['failed']" in found.value.__notes__[0]
+
+
+@pytest.mark.parametrize("answer", [None, "no", [True, False]])
+def test_an_answer_that_is_neither_yes_nor_no_is_refused(answer):
+    env = RevisedActions(Script(FAR, FAR), guard_for(ONE), failed=lambda step: answer)
+    env.reset()
+    with pytest.raises(TypeError, match="failed returned"):
+        env.step(np.array([0.0]))
+
+
+def test_more_values_than_a_guard_can_take_are_refused_at_once():
+    script = Script(0)
+    script.observation_space = Discrete(500)
+    with pytest.raises(ValueError, match=r"each of 500 values .* at most 64"):
+        RevisedActions(script, guard_for(ONE))
+    RevisedActions(script, guard_for(ONE), lambda place: divmod(place, 20))
 
 
 # -- Many at once ------------------------------------------------------------------------------
@@ -378,7 +421,7 @@ def drive_all(envs, steps, seed=0, wish=None):
         _, _, terminated, truncated, infos = envs.step(actions)
         over = terminated | truncated
         said.append((over, infos))
-        if envs.metadata["autoreset_mode"] is DISABLED and over.any():
+        if envs.metadata.get("autoreset_mode") is DISABLED and over.any():
             envs.reset(options={"reset_mask": over})
     return said
 
@@ -441,15 +484,76 @@ def test_a_failure_is_told_by_the_environments_own_info(mode):
     guard = guard_for(envs.single_action_space)
     asked = []
 
-    def failed(info):
-        asked.append(info)
-        return info["length"] == 12
+    def failed(step):
+        asked.append(step)
+        return step.info["length"] == 12
 
     drive_all(RevisedVectorActions(envs, guard, failed=failed), 60)
     learnt = [failed for *_, failed in guard.judge.episodes]
     assert learnt == [len(rows) == 12 for rows, *_ in ended]
-    assert all("_length" not in info for info in asked)
+    assert all("_length" not in step.info and step.reward == 1.0 for step in asked)
+    last = [tuple(map(float, step.observation)) for step in asked if step.terminated]
+    assert last == [seen for _, seen, terminated in ended if terminated]
     envs.close()
+
+
+class Bare(VectorWrapper):
+    """Leaves out what the documents of a vector call optional."""
+
+    def __init__(self, envs, without):
+        super().__init__(envs)
+        self.without = without
+        if "autoreset_mode" in without:
+            self.metadata = {}
+
+    def step(self, actions):
+        *answer, infos = self.env.step(actions)
+        kept = {name: value for name, value in infos.items() if name not in self.without}
+        if "masks" in self.without:
+            kept = {name: value for name, value in kept.items() if name[:1] != "_"}
+        return *answer, kept | {"of": "all"}
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "without",
+    [
+        ("masks", "final_info"),
+        ("length", "_length", "final_info", "_final_info"),
+        ("final_info", "_final_info", "final_obs", "_final_obs"),
+        ("autoreset_mode", "_final_obs"),
+    ],
+)
+def test_what_the_documents_call_optional_may_be_absent(mode, without):
+    envs, ended = recorded("CartPole-v1", 3, mode, 12)
+    guard = guard_for(envs.single_action_space)
+    if mode is DISABLED and "autoreset_mode" in without:
+        without = ()
+
+    def failed(step):
+        assert step.info.get("length", 1) >= 1
+        return step.terminated and step.reward == 1.0
+
+    drive_all(RevisedVectorActions(Bare(envs, without), guard, failed=failed), 60)
+    if mode is SAME_STEP and "final_obs" in without:
+        ended = [(rows, None, failed) for rows, _, failed in ended]
+    assert guard.judge.episodes == ended
+    envs.close()
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_a_change_costs_reward_of_any_shape(width):
+    class Wide(VectorWrapper):
+        def step(self, actions):
+            seen, rewards, *others = self.env.step(actions)
+            return seen, np.tile(rewards[:, None], width), *others
+
+    envs = Wide(SyncVectorEnv([lambda: Script(FAR, NEAR, FAR)] * 3))
+    revised = RevisedVectorActions(envs, guard_for(ONE, Spy(above_half)), penalty=1.0)
+    revised.reset()
+    _, rewards, *_, infos = revised.step(np.full((3, 1), 2.5))
+    assert rewards.shape == (3, width)
+    assert (rewards == 1.5 - infos["reviser/penalty"][:, None]).all()
 
 
 def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
@@ -472,7 +576,7 @@ def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
 def test_with_one_environment_it_comes_to_the_same_bit_for_bit(mode, snapshot):
     envs = SyncVectorEnv([CarFollowing], autoreset_mode=mode)
     many = RevisedVectorActions(
-        envs, guard_for_cars(-2.5, 2.5), failed=lambda info: bool(info["failed"])
+        envs, guard_for_cars(-2.5, 2.5), failed=lambda step: bool(step.info["failed"])
     )
     one = of_cars(CarFollowing())
     alone = infos_of(drive(one, full_throttle, seed=1) + drive(one, full_throttle))
@@ -570,6 +674,54 @@ def test_the_guard_learns_each_agents_episode_whole_and_info_says_what_was_done(
     env.step({agent: np.array([0.0]) for agent in env.agents})
     env.reset()  # what is under way ends without failure
     assert [failed for *_, failed in guard.judge.episodes] == [True, True, True, False]
+
+
+@pytest.mark.parametrize("silent", ["infos", "rewards", "observations", "all"])
+def test_what_an_agent_is_not_told_is_optional(crowd, silent):
+    from evofsm.guard import RevisedAgents
+
+    class Silent(crowd):
+        def step(self, actions):
+            said = dict(
+                zip(
+                    ("observations", "rewards", "terminated", "truncated", "infos"),
+                    super().step(actions),
+                    strict=True,
+                )
+            )
+            said["truncated"] = {}
+            for name, each in said.items():
+                if silent in (name, "all"):
+                    said[name] = {one: value for one, value in each.items() if one in self.agents}
+            return tuple(said.values())
+
+    guard = guard_for(ONE)
+    steps = []
+    env = RevisedAgents(Silent(2, 4), guard, failed=lambda step: steps.append(step) or False)
+    drive_agents(env, 0.0)
+    last = None if silent in ("observations", "all") else tuple(NEAR)
+    assert [(len(rows), end) for rows, end, _ in guard.judge.episodes] == [(1, last), (3, last)]
+    assert sum(step.terminated for step in steps) == (0 if silent == "all" else 2)
+    assert sum(math.isnan(step.reward) for step in steps) == 2 * (silent in ("rewards", "all"))
+
+
+def test_what_an_agent_meets_after_a_step_without_an_action_is_no_consequence(crowd):
+    from evofsm.guard import RevisedAgents
+
+    class Turns(crowd):
+        def step(self, actions):
+            return super().step({one: actions.get(one, [0.0]) for one in self.agents})
+
+    guard = guard_for(ONE)
+    env = RevisedAgents(Turns(6, 6), guard)
+    env.reset()
+    for acting in (["a0", "a1"], ["a0"], ["a0", "a1"], ["a0", "a1"], ["a0", "a1"]):
+        env.step({agent: np.array([0.0]) for agent in acting})
+    assert [(len(rows), failed) for rows, _, failed in guard.judge.episodes] == [
+        (1, False),
+        (5, True),
+        (3, True),
+    ]
 
 
 def test_pettingzoo_finds_nothing_to_complain_of(crowd):

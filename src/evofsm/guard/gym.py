@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
@@ -33,8 +34,23 @@ with needs("gymnasium", "gym", "a wrapper for Gymnasium"):
 
 _Seen = NDArray[np.float64] | None
 Observe = Callable[[Any], ArrayLike | None]
-Failed = Callable[[dict[str, Any]], bool]
 _Convert = Callable[[Any], Any]
+# Each value of ``Discrete`` is a variable of its own; more of them would take too long.
+_MOST_VALUES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """What a step of an environment came to: what ``failed`` of a wrapper is called with."""
+
+    observation: Any  #: None where an environment of many does not tell the last one
+    reward: Any  #: before any penalty
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
+
+
+Failed = Callable[[StepResult], bool]
 
 
 class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -57,19 +73,23 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         such as no car ahead: then nothing is revised or learnt. Without it a box is flattened, and
         each value of ``Discrete`` is a variable that is 1 or 0.
     failed : callable, optional
-        From the ``info`` of a step to whether it ended in failure. Without it the guard's own
+        From a step to whether it ended in failure: of ``step.observation``, ``step.reward``,
+        ``step.terminated``, ``step.truncated`` and ``step.info``. Without it the guard's own
         function says so; where it has none either, **an episode that is terminated has failed**,
         as in CartPole, and one that is truncated has not. Give it where an environment also
-        terminates on success (MountainCar, LunarLander); ``lambda info: False`` stands for never.
+        terminates on success: ``lambda step: step.terminated and step.reward <= 0`` for FrozenLake,
+        ``step.reward <= -100`` for LunarLander and BipedalWalker, ``lambda step: False`` for never.
     penalty : float
         Subtracted from the reward per unit of ``reviser/penalty``: half ranges of the action, in a
         box the root of the sum of squares over its components; 1 for another index.
 
     Raises
     ------
+    TypeError
+        If ``observe`` or ``failed`` is no function.
     ValueError
         If actions of ``env`` are not the guard's, its observations are neither a box nor
-        ``Discrete`` and ``observe`` is missing, or the penalty is negative.
+        ``Discrete`` of at most 64 values and ``observe`` is missing, or the penalty is negative.
 
     Notes
     -----
@@ -81,7 +101,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     >>> from evofsm.driving import CarFollowing, guard_for_family
     >>> env = CarFollowing()
     >>> guard = guard_for_family(env.family)
-    >>> env = RevisedActions(env, guard, failed=lambda info: info["failed"])
+    >>> env = RevisedActions(env, guard, failed=lambda step: step.info["failed"])
     >>> observation, info = env.reset(seed=1)
     >>> over = False
     >>> while not over:  # at full throttle
@@ -124,7 +144,8 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Execute the guard's revision of ``action``."""
         decided = self._lane.decide(action)
         observation, reward, terminated, truncated, info = self.env.step(decided.executed)
-        self._lane.follow(observation, info, bool(terminated), bool(truncated))
+        ends = bool(terminated), bool(truncated)
+        self._lane.follow(StepResult(observation, reward, *ends, info))
         return observation, decided.paid(reward), terminated, truncated, {**info, **decided.info}
 
 
@@ -144,7 +165,7 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         Shared by all; ask it nothing else while episodes run. It may be frozen.
     observe, failed, penalty
         As in `RevisedActions`: of a single environment. ``failed`` gets its own part of
-        ``infos``, without the masks.
+        ``infos``, without the masks; what has neither a mask nor a value for each is for all.
 
     Raises
     ------
@@ -157,7 +178,8 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     ``infos`` has the names of a single environment, as arrays over the environments, each with a
     mask as Gymnasium has it: ``_reviser/reason`` and so on are False where nothing was decided, in
     a step that only resets (``AutoresetMode.NEXT_STEP``) or after an episode that was not reset
-    (``DISABLED``).
+    (``DISABLED``). Where the metadata name no mode, it is ``SAME_STEP`` where ``infos`` hold
+    ``final_obs``, or else ``NEXT_STEP``.
 
     Examples
     --------
@@ -165,7 +187,7 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     >>> from evofsm.driving import CarFollowing, guard_for_cars
     >>> envs = gymnasium.vector.SyncVectorEnv([CarFollowing] * 2)
     >>> guard = guard_for_cars(low=-2.5, high=2.5, interval=0.25)
-    >>> envs = RevisedVectorActions(envs, guard, failed=lambda info: info["failed"])
+    >>> envs = RevisedVectorActions(envs, guard, failed=lambda step: step.info["failed"])
     >>> observations, infos = envs.reset(seed=1)
     >>> *_, infos = envs.step(envs.action_space.high)
     >>> infos["reviser/executed_action"].shape, infos["_reviser/executed_action"].tolist()
@@ -186,8 +208,7 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         self.guard = guard
         spaces = env.single_observation_space, env.single_action_space
         terms = Terms(guard, *spaces, observe, failed, penalty)
-        # Gymnasium 1.0 has no other mode, and names none.
-        mode = env.metadata.get("autoreset_mode", "NextStep")
+        mode = env.metadata.get("autoreset_mode")  # which not everybody names
         self._mode = getattr(mode, "value", mode)
         self._lanes = [Lane(terms, shared=True) for _ in range(self.num_envs)]
 
@@ -218,9 +239,10 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         into: Any = create_empty_array(space, self.num_envs)
         executed = concatenate(space, [one.executed for one in decided], into)
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
-        self._learn(observations, terminated, truncated, infos)
+        self._learn(observations, rewards, terminated, truncated, infos)
         if any(one.cost for one in decided):
-            rewards = rewards - np.array([one.cost for one in decided])
+            each = (-1,) + (1,) * (np.ndim(rewards) - 1)
+            rewards = rewards - np.reshape([one.cost for one in decided], each)
         for k, (one, was_open) in enumerate(zip(decided, were_open, strict=True)):
             infos = self._add_info(infos, one.info, k)
             if not was_open:
@@ -228,30 +250,42 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
                     infos[f"_{name}"][k] = False
         return observations, rewards, terminated, truncated, infos
 
-    def _learn(self, observations: Any, terminated: Any, truncated: Any, infos: Any) -> None:
+    def _learn(
+        self, observations: Any, rewards: Any, terminated: Any, truncated: Any, infos: Any
+    ) -> None:
         """Tell each environment's lane what followed."""
         each = iterate(self.env.observation_space, observations)
+        mode = self._mode or ("SameStep" if "final_obs" in infos else "NextStep")
         for k, (lane, observation) in enumerate(zip(self._lanes, each, strict=True)):
             ends = bool(terminated[k]), bool(truncated[k])
             if not lane.is_open:
-                if self._mode == "NextStep" and not any(ends):  # this step was the reset
+                if mode == "NextStep" and not any(ends):  # this step was the reset
                     lane.begin(observation)
                 continue
-            info, last, resets = _of_one(infos, k), observation, False
-            if any(ends) and self._mode == "SameStep":
-                info, last, resets = info["final_info"], infos["final_obs"][k], True
-            lane.follow(last, info, *ends)
+            info, last = _of_one(infos, k, self.num_envs), observation
+            resets = any(ends) and mode == "SameStep"
+            if resets:
+                last = info.pop("final_obs", None)
+                info = info.pop("final_info", info)
+            lane.follow(StepResult(last, rewards[k], *ends, info))
             if resets:
                 lane.begin(observation)
 
 
-def _of_one(infos: Mapping[str, Any], k: int) -> dict[str, Any]:
-    """The part of ``infos`` that belongs to one environment."""
-    return {
-        name: _of_one(value, k) if isinstance(value, dict) else value[k]
-        for name, value in infos.items()
-        if f"_{name}" in infos and infos[f"_{name}"][k]
-    }
+def _of_one(infos: Mapping[str, Any], k: int, count: int) -> dict[str, Any]:
+    """The part of ``infos`` that belongs to one environment of so many."""
+    found = {}
+    for name, value in infos.items():
+        if (name[:1] == "_" and name[1:] in infos) or (
+            f"_{name}" in infos and not infos[f"_{name}"][k]
+        ):
+            continue
+        if isinstance(value, dict):
+            found[name] = _of_one(value, k, count)
+        else:
+            many = len(value) if isinstance(value, list | tuple) else (*np.shape(value), 0)[0]
+            found[name] = value[k] if many == count else value
+    return found
 
 
 # -- One environment's episodes under a guard ---------------------------------------------------
@@ -304,15 +338,14 @@ class Lane:
             self._past.append((self._seen, proposal, self.revision.executed))
         return terms.decided(action, self.revision)
 
-    def follow(
-        self, observation: Any, info: dict[str, Any], terminated: bool, truncated: bool
-    ) -> None:
+    def follow(self, step: StepResult) -> None:
         """What followed in the environment."""
-        failed = self.terms.failed(info, terminated)
-        self._seen = self.terms.look(observation)
-        if failed or terminated or truncated or self._seen is None:
+        failed = self.terms.failed(step)
+        self._seen = self.terms.look(step.observation)
+        over = step.terminated or step.truncated
+        if failed or over or self._seen is None:
             self.end(failed=failed)
-        if terminated or truncated:
+        if over:
             self.is_open = False
 
     def end(self, *, failed: bool) -> None:
@@ -330,6 +363,13 @@ class Lane:
         guard.end(failed, self._seen)
 
 
+_SUCH_AS = {
+    "observe": "n observation, such as observe=lambda seen: seen['state']",
+    "failed": " step: its observation, reward, terminated, truncated and info, such as "
+    "failed=lambda step: step.info['failed'] or failed=lambda step: step.reward <= -100",
+}
+
+
 class Terms:
     """How a guard and an environment understand each other's actions, observations, failures."""
 
@@ -344,6 +384,9 @@ class Terms:
     ) -> None:
         if not 0.0 <= penalty < math.inf:
             raise ValueError(f"penalty is {penalty}; it must be 0 or above, and finite")
+        for name, given in (("observe", observe), ("failed", failed)):
+            if given is not None and not callable(given):
+                raise TypeError(f"{name} is {given!r}; it must be a function of a{_SUCH_AS[name]}")
         self.guard = guard
         self.penalty = penalty
         self._observe, self._failed = observe or _flat(observations), failed
@@ -371,15 +414,22 @@ class Terms:
         }
         return Decided(executed, info, self.penalty * size)
 
-    def failed(self, info: dict[str, Any], terminated: bool) -> bool:
+    def failed(self, step: StepResult) -> bool:
         """Whether a step ended in failure, unless the guard finds that itself."""
-        if self._failed is not None:
-            return bool(self._failed(info))
-        return terminated and self.guard.failed is None
+        if self._failed is None:
+            return step.terminated and self.guard.failed is None
+        try:
+            found = self._failed(step)
+        except (AttributeError, KeyError, TypeError) as error:
+            error.add_note(f"failed was called with a{_SUCH_AS['failed']}")
+            raise
+        if np.size(found) != 1 or np.asarray(found).dtype.kind not in "biu":
+            raise TypeError(f"failed returned {found!r}; it must be True or False")
+        return bool(found)
 
     def look(self, observation: Any) -> _Seen:
         """What the guard observes; None where there is nothing to judge."""
-        given = self._observe(observation)
+        given = None if observation is None else self._observe(observation)
         if given is None:
             return None
         seen, names = np.array(given, dtype=np.float64), self.guard.variables
@@ -395,10 +445,16 @@ class Terms:
 def _flat(space: Space[Any]) -> Observe:
     """From an observation to a vector."""
     if isinstance(space, Box):
-        return lambda observation: None if observation is None else np.reshape(observation, -1)
+        return lambda observation: np.reshape(observation, -1)
     if isinstance(space, Discrete):
+        if space.n > _MOST_VALUES:
+            raise ValueError(
+                f"the environment's observations are {space}: each of {space.n} values would be a "
+                f"variable, and at most {_MOST_VALUES} are taken; give observe, which makes a few "
+                "numbers of them (row and column of a place)"
+            )
         first, each = int(space.start), np.eye(int(space.n))
-        return lambda observation: None if observation is None else each[int(observation) - first]
+        return lambda observation: each[int(observation) - first]
     raise ValueError(
         f"the environment's observations are {space}, neither a Box nor Discrete; give observe, "
         "which makes a vector of them"

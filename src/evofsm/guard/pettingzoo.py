@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any
 
 from evofsm.extras import needs
 from evofsm.guard.api import Revision
 from evofsm.guard.guard import Guard
-from evofsm.guard.gym import Failed, Lane, Observe, Terms
+from evofsm.guard.gym import Failed, Lane, Observe, StepResult, Terms
 
 with needs("pettingzoo", "pettingzoo", "a wrapper for PettingZoo"):
     from pettingzoo import ParallelEnv
@@ -31,7 +32,7 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
     guard : Guard
         Shared by all; ask it nothing else while episodes run. It may be frozen.
     observe, failed, penalty
-        As in `RevisedActions`: of a single agent.
+        As in `RevisedActions`: of a single agent. A reward that it does not get is NaN.
 
     Raises
     ------
@@ -81,13 +82,22 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
         executed = {agent: one.executed for agent, one in decided.items()}
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         infos, rewards = dict(infos), dict(rewards)
-        for agent, one in decided.items():
-            if agent not in terminated:
+        alive = {*self.env.agents}
+        for agent, lane in self._lanes.items():
+            if not lane.is_open:
                 continue
-            info, ends = infos.get(agent, {}), (bool(terminated[agent]), bool(truncated[agent]))
-            self._lanes[agent].follow(observations[agent], info, *ends)
-            rewards[agent] = one.paid(rewards[agent])
-            infos[agent] = {**info, **one.info}
+            over, left = bool(terminated.get(agent)), agent not in alive
+            ends = over, bool(truncated.get(agent)) or (left and not over)
+            info = infos.get(agent, {})
+            seen, reward = observations.get(agent), rewards.get(agent, math.nan)
+            lane.follow(StepResult(seen, reward, *ends, info))
+            if agent not in decided:  # what it does now follows from no action of before
+                lane.end(failed=False)
+        for agent, one in decided.items():
+            if agent in rewards:
+                rewards[agent] = one.paid(rewards[agent])
+            if agent in infos or agent in terminated:
+                infos[agent] = {**infos.get(agent, {}), **one.info}
         self._begin({one: seen for one, seen in observations.items() if one in self.env.agents})
         return observations, rewards, terminated, truncated, infos
 
