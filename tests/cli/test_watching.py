@@ -5,6 +5,7 @@ import math
 
 import pytest
 
+from evofsm.cli.monitor.decider import Decider, guard_of_monitor
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.recorded import Recording, record_log
 from evofsm.cli.watch.session import Session, learn_first, watched_guard
@@ -14,6 +15,7 @@ from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_f
 from evofsm.fsm.observations import ObservationEncoder
 from evofsm.guard import Mode
 from evofsm.io import LogColumns, read_run, recording
+from monitor_rows import line, traffic
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -177,7 +179,7 @@ def test_a_log_is_watched_by_its_own_columns_and_units(tmp_path, capsys):
     assert [found[name][0] for name in ("gap", "v_follower", "v_leader")] == [40.0, 20.0, 20.0]
     assert found["time"][1] == pytest.approx(0.1)
     assert found["risk_proposed"][-1] > 0.9
-    assert "brakes of the own car of 4 m/s² (--brakes)" in capsys.readouterr().err
+    assert "the own car brakes with 4 m/s² (--brakes)" in capsys.readouterr().err
     with pytest.raises(ValueError, match="has to name the three columns in this order"):
         record_log(str(path), out, LogColumns(ObservationEncoder("dist"), "accel", "t"))
 
@@ -258,3 +260,20 @@ def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
     for frame, told in frames:  # what it changes where it sees no danger, it changes for the margin
         story = frame.story
         assert ("by a margin" in told.done) == (story.danger is None and story.revised > 0)
+
+
+def test_the_same_rows_get_the_same_risks_as_from_the_monitor(tmp_path):
+    path, out = tmp_path / "drive.csv", tmp_path / "run.mcap"
+    told = ["time,gap,v_follower,v_leader,a_follower"]
+    for k, row in enumerate(traffic(2500)):  # leaders brake hard now and then: it could learn
+        values = (row[name] for name in ("gap", "v_follower", "v_leader", "proposal"))
+        told.append(",".join(map(str, (k / 10, *values))))
+    path.write_text("\n".join([*told, ""]))
+    record_log(str(path), out)
+    watched = read_run(out).episodes[0].columns["risk_proposed"]
+    guard = guard_of_monitor(0.1, 6.0)
+    guard.learn = False
+    decider = Decider(guard)
+    said = [decider.answer(line(row))["risk_proposed"] for row in traffic(2500)][: len(watched)]
+    assert said == pytest.approx(watched, abs=1e-6)
+    assert max(said) > 0.02

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from evofsm import store
 from evofsm.cli.journal import differences
 from evofsm.cli.monitor.decider import guard_of_monitor
-from evofsm.driving import guard_for_cars
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM
@@ -43,8 +42,6 @@ HORIZON = 1.0
 _FIRST_BLOCK, _LARGEST_BLOCK, _SCORED = 64, 8192, 256
 # A checkpoint is written so often [s].
 _EVERY = 60.0
-# The strongest acceleration that a car may propose, as in `evofsm monitor` [m/s²].
-_HIGHEST = 2.5
 
 
 class Skill(NamedTuple):
@@ -171,19 +168,6 @@ def learn_traces(
 # -- A guard --------------------------------------------------------------------------------------
 
 
-def guard_of_cars(judge: str, dt: float, brakes: float, tolerance: float) -> Guard:
-    """A guard of car following that decides on a log, as `evofsm monitor` makes one."""
-    told = guard_of_monitor(dt, brakes).judge if judge == "kinematic" else None
-    return guard_for_cars(
-        -brakes,
-        _HIGHEST,
-        dt,
-        tolerance=tolerance,
-        mode=Mode.SHADOW,
-        judge=told or judge,
-    )
-
-
 def guard_of_log(
     judge: str,
     dt: float,
@@ -196,7 +180,7 @@ def guard_of_log(
 ) -> Guard:
     """A guard in shadow mode that has learnt nothing yet, of cars or of any other system."""
     if judge == "kinematic":
-        return guard_of_cars(judge, dt, brakes, tolerance)
+        return guard_of_monitor(dt, brakes, tolerance)
     learnt = LearntRisk(dt, actions.low, actions.high, names=names, units=units)
     reviser = ActionReviser(learnt, actions, tolerance=tolerance, mode=Mode.SHADOW)
     return Guard.of(reviser, interval=dt, machine=machine.copy())

@@ -33,6 +33,15 @@ def test_it_decides_as_the_guard_does():
     assert answer["alarm"]
 
 
+@pytest.mark.parametrize(
+    ("gap", "own", "leader", "alarms"),
+    [(6, 24, 24, True), (6, 22, 24, True), (25, 28, 28, True), (60, 24, 24, False)],
+)
+def test_where_a_full_brake_of_the_leader_cannot_be_survived_it_alarms(gap, own, leader, alarms):
+    row = {"time": 0.0, "gap": gap, "v_follower": own, "v_leader": leader, "proposal": 0.0}
+    assert Decider(made()).answer(line(row))["alarm"] is alarms  # as in the picture of README.md
+
+
 def test_in_act_what_is_executed_is_the_guards():
     guard = made()
     guard.reviser.mode = Mode.ACT

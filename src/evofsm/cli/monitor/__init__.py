@@ -9,7 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from evofsm.cli.options import ModeName, argument, option, require
+from evofsm.cli.options import BRAKES, TOLERANCE, ModeName, argument, option, require
 from evofsm.cli.show import warn
 
 if TYPE_CHECKING:
@@ -22,8 +22,16 @@ def monitor(
     guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
     interval: Annotated[float, option("Time between two rows [s], without --guard.")] = 0.1,
     brakes: Annotated[
-        float, option("Hardest braking of the own car [m/s²], without --guard.", min=0.5, max=20.0)
-    ] = 6.0,
+        float | None,
+        option(
+            f"Hardest braking of the own car [m/s²], without --guard. [default: {BRAKES:g}]",
+            min=0.5,
+            max=20.0,
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float | None, option(f"It alarms above this risk. [default: of --guard, or {TOLERANCE:g}]")
+    ] = None,
     traffic: Annotated[
         bool, option("Judge all objects of scenes, who is behind included.", "--traffic")
     ] = False,
@@ -67,30 +75,39 @@ def monitor(
             "--traffic learns nothing: it goes with none of --guard, --state and --learn"
         )
     require(**({} if zenoh is None else {"zenoh": "zenoh"}))
-    from evofsm.cli.monitor.decider import Decider, guard_of_monitor, guard_of_traffic
+    from evofsm.cli.monitor.decider import (
+        Decider,
+        assumptions,
+        guard_of_monitor,
+        guard_of_traffic,
+    )
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.transports import Server
     from evofsm.fsm.validation import positive
     from evofsm.guard import Guard
 
+    if guard is not None and brakes is not None:
+        raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
+    reckoned, tolerated = brakes or BRAKES, TOLERANCE if tolerance is None else tolerance
+
     def fresh() -> Guard:
         if guard is not None:
             return Guard.load(guard)
-        return (guard_of_traffic if traffic else guard_of_monitor)(interval, brakes)
+        return (guard_of_traffic if traffic else guard_of_monitor)(interval, reckoned, tolerated)
 
     with ExitStack() as stack:
         saved = None
         if state is not None:
             is_other = guard is not None and guard.resolve() != state.resolve()
             given = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
-            made = {"interval": interval, "brakes": brakes} if guard is None else {}
-            told = {"mode": mode, "learn": learn, "episode": episode}
+            made = {"interval": interval, "brakes": reckoned} if guard is None else {}
+            told = {"mode": mode, "learn": learn, "episode": episode, "tolerance": tolerance}
             saved = State(state, {"guard": given, **made, **told})
             stack.callback(saved.close)
         elif learn:
             warn("nothing of what is learnt is saved; --state FILE saves it")
         used = fresh() if saved is None else saved.guard(fresh)
-        _prepare(used, mode, audit, stack, learn=learn)
+        _prepare(used, mode, tolerance, audit, stack, learn=learn)
         decider = Decider(used, episode=episode)
         if warm:
             _compile(used, scenes=decider.form.scenes)
@@ -100,8 +117,12 @@ def monitor(
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
         each = math.inf if heartbeat is None else positive("--heartbeat", heartbeat)
         server = Server(decider, each)
+        transport, where = _transport(file, socket, udp, zenoh, stack)
+        warn(_of_saved(guard, used) if guard else assumptions(reckoned, tolerated))
+        if where:
+            warn(f"listens to {where}")
         try:
-            server.run(_transport(file, socket, udp, zenoh, stack))
+            server.run(transport)
         except BrokenPipeError:
             warn("nobody reads the decisions any more")
             return 1
@@ -112,13 +133,23 @@ def monitor(
 
 
 def _prepare(
-    guard: Guard, mode: ModeName, audit: Path | None, stack: ExitStack, *, learn: bool
+    guard: Guard,
+    mode: ModeName,
+    tolerance: float | None,
+    audit: Path | None,
+    stack: ExitStack,
+    *,
+    learn: bool,
 ) -> None:
     """Set how far it goes, whether it learns, and who writes it down."""
     from evofsm.guard import ActionReviser, AuditLog, Mode
 
     if isinstance(guard.reviser, ActionReviser):
         guard.reviser.mode = Mode(mode)
+        if tolerance is not None:
+            if not 0.0 < tolerance < 1.0:
+                raise ValueError(f"--tolerance is {tolerance:g}; it must be between 0 and 1")
+            guard.reviser.tolerance = tolerance
     elif mode != "act":
         name = type(guard.reviser).__name__
         raise ValueError(f"a {name} knows no --mode {mode}: what it says is executed")
@@ -127,29 +158,32 @@ def _prepare(
         guard.audit = stack.enter_context(AuditLog(audit, sync="episode"))
 
 
+def _of_saved(path: Path, guard: Guard) -> str:
+    """What a guard that was saved reckons with, in a line."""
+    tolerance = getattr(guard.reviser, "tolerance", None)
+    alarm = "" if tolerance is None else f"; alarm above a risk of {tolerance:.3g} (--tolerance)"
+    return f"assumed: what {path} was given and has learnt{alarm}"
+
+
 def _transport(
     file: Path | None, socket: Path | None, udp: int | None, zenoh: str | None, stack: ExitStack
-) -> Transport:
-    """Where rows come from; who listens says where."""
+) -> tuple[Transport, str]:
+    """Where rows come from; and, where it listens, to what."""
     from evofsm.cli.monitor.transports import SocketTransport, Stream, UdpTransport, ZenohTransport
 
     if socket is not None:
-        transport: Transport = SocketTransport(socket)
-        warn(f"listens to {socket}")
-    elif udp is not None:
-        transport = by_udp = UdpTransport(udp)
-        warn(f"listens to UDP port {by_udp.port}")
-    elif zenoh is not None:
-        transport = ZenohTransport(zenoh)
-        warn(f"listens to {zenoh}/row")
-    elif file is None and sys.stdin is None:
+        return SocketTransport(socket), str(socket)
+    if udp is not None:
+        by_udp = UdpTransport(udp)
+        return by_udp, f"UDP port {by_udp.port}"
+    if zenoh is not None:
+        return ZenohTransport(zenoh), f"{zenoh}/row"
+    if file is None and sys.stdin is None:
         raise ValueError("standard input is closed; give FILE, --socket, --udp or --zenoh")
-    elif sys.stdout is None:
+    if sys.stdout is None:
         raise ValueError("standard output is closed; give --socket, --udp or --zenoh")
-    else:
-        source = sys.stdin.buffer if file is None else stack.enter_context(file.open("rb"))
-        transport = Stream(source, sys.stdout.buffer)
-    return transport
+    source = sys.stdin.buffer if file is None else stack.enter_context(file.open("rb"))
+    return Stream(source, sys.stdout.buffer), ""
 
 
 def _compile(guard: Guard, *, scenes: bool) -> None:

@@ -14,12 +14,22 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
 
 from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
 from evofsm.cli.show import plain
 from evofsm.driving import REAL_DRIVES, LatentRisk, TrafficRisk, guard_for_cars, guard_for_traffic
 from evofsm.fsm.validation import positive
-from evofsm.guard import ActionReviser, BoxActions, Guard, Mode, Revision, SearchingJudge, is_spoken
+from evofsm.guard import (
+    TOLERANCE,
+    ActionReviser,
+    BoxActions,
+    Guard,
+    Mode,
+    Revision,
+    SearchingJudge,
+    is_spoken,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -31,10 +41,13 @@ _RECENT = 256
 _LATE = 1.0
 # A gap in time, and rows that come too often, in intervals.
 _HOLE, _OFTEN = 1.5, 0.5
-# The strongest acceleration that may be proposed where no guard is given [m/s²].
-_HIGHEST = 2.5
-# The weight of one brake so hard is added to those of the table [m/s²].
-_HARDEST = 10.0
+#: The strongest acceleration that may be proposed where no guard is given [m/s²].
+HIGHEST = 2.5
+# As hard a leader brakes in full [m/s²].
+_FULL = 10.0
+#: Leaders' brakes where no guard is given. Nobody brakes in an emergency in public drives, which
+#: does not say that nobody does: with the one that a judge assumes anyway one in 20 is in full.
+LEADERS = REAL_DRIVES._replace(counts=(*REAL_DRIVES.counts, *(0,) * 14, 4))
 
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
 
@@ -286,21 +299,54 @@ def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None
 # -- Where no guard is given ----------------------------------------------------------------------
 
 
-def guard_of_monitor(interval: float, brakes: float) -> Guard:
-    """A guard of car following that is given how hard its car brakes, in shadow mode.
+def guard_of_monitor(
+    interval: float,
+    brakes: float,
+    tolerance: float = TOLERANCE,
+    given: type[LatentRisk] = LatentRisk,
+) -> Guard:
+    """A guard of car following that is given how hard its car brakes, in shadow mode."""
+    judge = _ahead(interval, brakes, given)
+    settings: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW}
+    return guard_for_cars(-brakes, HIGHEST, interval, judge=judge, **settings)
 
-    How hard leaders brake it begins with from public drives (`evofsm.driving.REAL_DRIVES`).
-    """
-    judge = _ahead(interval, brakes)
-    return guard_for_cars(-brakes, _HIGHEST, interval, judge=judge, mode=Mode.SHADOW)
 
-
-def guard_of_traffic(interval: float, brakes: float) -> Guard:
+def guard_of_traffic(interval: float, brakes: float, tolerance: float = TOLERANCE) -> Guard:
     """The same among any number of objects, who is behind included; it learns nothing."""
-    judge = TrafficRisk(_ahead(interval, brakes), -brakes, _HIGHEST)
-    return guard_for_traffic(-brakes, _HIGHEST, brakes, interval, judge=judge, mode=Mode.SHADOW)
+    judge = TrafficRisk(_ahead(interval, brakes), -brakes, HIGHEST)
+    settings: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW}
+    return guard_for_traffic(-brakes, HIGHEST, brakes, interval, judge=judge, **settings)
 
 
-def _ahead(interval: float, brakes: float) -> LatentRisk:
+def assumptions(brakes: float, tolerance: float) -> str:
+    """What such a guard reckons with, in a line."""
+    share = (1 + LEADERS.counts[-1]) / (1 + sum(LEADERS.counts))
+    return (
+        f"assumed: the own car brakes with {brakes:g} m/s² (--brakes), {share:.0%} of leaders' "
+        f"hard brakes are in full ({_FULL:g} m/s²), the others as in public drives; "
+        f"alarm above a risk of {tolerance:.3g} (--tolerance)"
+    )
+
+
+class Given(LatentRisk):
+    """Keeps to what it was given, whatever it sees, while a machine learns."""
+
+    def learn(
+        self,
+        observation: ArrayLike,
+        acceleration: float,
+        belief: ArrayLike = (1.0,),
+        *,
+        watched: bool = False,
+    ) -> None:
+        """Only follow."""
+        self.follow(observation, acceleration)
+
+    def start_episode(self, *, learn: bool = True) -> None:
+        """Learn nothing."""
+        super().start_episode(learn=False)
+
+
+def _ahead(interval: float, brakes: float, given: type[LatentRisk] = LatentRisk) -> LatentRisk:
     braking, step = positive("brakes", brakes), positive("interval", interval)
-    return LatentRisk.given(-braking, braking, _HARDEST, step, leaders=REAL_DRIVES)
+    return given.given(-braking, braking, _FULL, step, leaders=LEADERS)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli.learning import guard_of_cars
+from evofsm.cli.monitor.decider import HIGHEST, Given, assumptions, guard_of_monitor
 from evofsm.cli.options import BRAKES
 from evofsm.cli.show import warn
 from evofsm.cli.watch.shown import (
@@ -24,10 +24,11 @@ from evofsm.cli.watch.shown import (
     graph_of,
     most_believed,
 )
+from evofsm.driving import guard_for_cars
 from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.driving.naming import VARIABLES
 from evofsm.driving.trials import shadow_drive
-from evofsm.guard import TOLERANCE
+from evofsm.guard import TOLERANCE, Guard, Mode
 from evofsm.guard.record import RECORD
 from evofsm.io.foxglove import recording
 from evofsm.io.logs import Chunk, LogColumns, Noted, episodes_of, read_traces
@@ -204,7 +205,7 @@ def record_log(
             show(taken)
             if len(episode.times) >= _FEWEST_ROWS:
                 if guard is None:
-                    guard = guard_of_cars(judge, episode.dt, brakes, tolerance)
+                    guard = _guard(judge, episode.dt, brakes, tolerance)
                 log.add(
                     shadow_drive(
                         guard,
@@ -220,8 +221,17 @@ def record_log(
             log.attach(guard.machine.model(names=VARIABLES))
     for warning in noted.warnings("time" if columns is None else columns.time):
         warn(f"warning: {warning}")
-    warn(f"reckoned with: brakes of the own car of {brakes:g} m/s² (--brakes)")
+    if judge == "kinematic":
+        warn(assumptions(brakes, tolerance))
     return more
+
+
+def _guard(judge: str, interval: float, brakes: float, tolerance: float) -> Guard:
+    """States are learnt; what it was given stays, so that it says what `evofsm monitor` does."""
+    if judge == "kinematic":
+        return guard_of_monitor(interval, brakes, tolerance, Given)
+    settings: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW, "judge": judge}
+    return guard_for_cars(-brakes, HIGHEST, interval, **settings)
 
 
 def _first(chunks: Iterable[Chunk], most: int) -> Iterator[Chunk]:
