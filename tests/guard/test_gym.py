@@ -221,7 +221,8 @@ def test_where_nothing_is_ahead_a_usable_proposal_is_kept_and_nothing_is_learnt(
 
 
 def test_what_is_executed_stays_in_the_environments_space():
-    env = of_cars(Script(NEAR, NEAR, action_space=Box(-2.0, 2.0, (), np.float32)))
+    env = Script(NEAR, NEAR, action_space=Box(-2.0, 2.0, (), np.float32))
+    env = RevisedActions(env, guard_for_cars(-2.0, 1.0))
     env.reset()
     info = env.step(np.float32(1.0))[-1]
     assert info["reviser/executed_action"] in env.action_space
@@ -232,6 +233,18 @@ def test_what_is_executed_stays_in_the_environments_space():
 def test_an_observation_that_is_not_the_guards_is_refused(seen):
     with pytest.raises(ValueError, match="v_leader"):
         of_cars(Script(seen)).reset()
+
+
+def test_a_guard_whose_actions_go_beyond_the_environments_is_refused():
+    for space in (Box(-1.0, 2.0, (1,), np.float32), Box(-2.0, 1.0, (1,)), Box(-1.0, 1.0, ())):
+        with pytest.raises(
+            ValueError, match=r"from -2\.0 to 2\.0, beyond those of the environment"
+        ):
+            RevisedActions(Script(FAR, action_space=space), Guard(-2.0, 2.0, interval=0.1))
+    wide = Box(-0.1, np.inf, (2,), np.float32)  # -0.1 is another number in 32 bits
+    RevisedActions(Script(FAR, action_space=wide), Guard([-0.1] * 2, [0.1] * 2, interval=0.1))
+    with pytest.raises(ValueError, match="beyond"):
+        RevisedActions(Script(FAR, action_space=wide), Guard([-0.1, -0.2], [1.0] * 2, interval=0.1))
 
 
 @pytest.mark.parametrize(

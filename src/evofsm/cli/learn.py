@@ -237,7 +237,7 @@ def learn(
     elif out is not None:
         say(f"Saved to {out}. Look at it again: evofsm inspect {out}")
     if taught is not None:
-        for line in _of_guard(taught, guard, brakes, learning.read.failures):
+        for line in _of_guard(taught, guard, brakes):
             say(line)
 
 
@@ -380,7 +380,7 @@ def _provenance(
     return provenance
 
 
-def _of_guard(guard: Guard, path: Path | None, brakes: float, failures: int) -> Iterator[str]:
+def _of_guard(guard: Guard, path: Path | None, brakes: float) -> Iterator[str]:
     """Where it is, what it takes, and what it reckons with."""
     from evofsm.guard import LearntRisk
 
@@ -391,8 +391,8 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, failures: int) -> 
     yield f"The guard was saved to {path}. {takes}"
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
-    elif not failures:
-        yield "It judges nothing yet, for no failure is known."
+    elif not guard.judge.dynamics.thresholds:
+        yield f"It judges nothing yet: {guard.judge.told_by_experience}."
 
 
 def _save(

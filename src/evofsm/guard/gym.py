@@ -88,8 +88,9 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     TypeError
         If ``observe`` or ``failed`` is no function.
     ValueError
-        If actions of ``env`` are not the guard's, its observations are neither a box nor
-        ``Discrete`` of at most 64 values and ``observe`` is missing, or the penalty is negative.
+        If actions of ``env`` are not the guard's or do not reach as far, its observations are
+        neither a box nor ``Discrete`` of at most 64 values and ``observe`` is missing, or the
+        penalty is negative.
 
     Notes
     -----
@@ -473,6 +474,15 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
             f"the environment's actions are {space}, but the guard's are {actions}: make a guard "
             "of such actions, n_actions of Discrete and arrays low and high of Box, or wrap the "
             "environment first (RescaleAction, TransformAction of gymnasium.wrappers)"
+        )
+
+    low, high = (np.reshape(end, space.shape) for end in (actions.low, actions.high))
+    slack = 1e-6 * (high - low)  # what a float32 may round
+    if (low < space.low - slack).any() or (high > space.high + slack).any():
+        raise ValueError(
+            f"the guard's actions go from {actions.low} to {actions.high}, beyond those of the "
+            f"environment, {space}: what it learns would not be what is executed; make a guard of "
+            "the environment's low and high"
         )
 
     def to_guard(action: Any) -> Action:

@@ -210,6 +210,8 @@ class SceneRisk(ActionJudge):
     def _foreseen(self, situation: Situation) -> Foreseen | str:
         """What each action brings, or why nothing can be said."""
         seen = self._read(situation.observation)
+        if self.memory.contact is None and (known := self.memory.failures):
+            return f"no object was seen in any of the failures ({known}), so nothing is refused"
         if self.memory.contact is None:
             return "no failure is known yet, so nothing is refused"
         if not np.isfinite(seen.own).all():

@@ -4,13 +4,14 @@ import copy
 import math
 import pickle
 import re
+import warnings
 from contextlib import suppress
 from io import BytesIO
 
 import numpy as np
 import pytest
 
-from evofsm.guard import Mode
+from evofsm.guard import Guard, Mode
 from evofsm.guard.actions import same_action
 from evofsm.guard.api import Situation
 from evofsm.guard.audit_log import AuditLog
@@ -54,6 +55,44 @@ def test_told_what_failure_is_it_keeps_from_the_first_one(point):
     guard = point.guard(failed=lambda z: z[0] >= 1.0)
     assert sum(point.play(guard, k)[1] for k in range(6)) <= 1
     assert not any(point.play(guard, 100 + k)[1] for k in range(5))
+
+
+@pytest.mark.parametrize(
+    ("failed", "says"),
+    [
+        (lambda z: z[0] >= 0.4, None),
+        (lambda z: bool((np.abs(z) >= [0.4, 2.0]).any()), None),
+        (lambda z: z[0] + z[1] >= 0.4, "says otherwise in"),
+        (lambda z: bool(np.hypot(*z) >= 0.4), "says otherwise in"),
+        (lambda z: bool((z <= -5.0).all()), "true along no variable alone"),
+    ],
+)
+def test_a_function_of_failures_that_is_no_box_is_told_of(points, failed, says):
+    point = points["box"]
+    guard = point.guard(failed=failed)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        for k in range(4):
+            point.play(guard, k, steps=20)
+    told = guard.judge.told_by_experience
+    assert [
+        str(one.message) for one in warned if says is None or says not in str(one.message)
+    ] == []
+    assert len(warned) == (says is not None)
+    assert (says or "fails where") in told
+    assert ("otherwise" in told) == (says is not None and "otherwise" in says)
+
+
+def test_failures_that_no_threshold_explains_are_not_denied():
+    guard = Guard(-1.0, 1.0, interval=0.1)
+    rng = np.random.default_rng(0)
+    for k in range(30):
+        for z in np.vstack([rng.uniform(-1.0, 1.0, (12, 2)), -np.ones(2), np.ones(2), np.zeros(2)]):
+            reason = guard.decide(z, proposal=0.5).reason
+        guard.end(failed=k > 12)
+    assert guard.judge.n_failed == 17
+    assert reason.startswith("16 failures seen, but at values of each variable that were survived")
+    assert guard.judge.told_by_experience.startswith("17 failures seen")
 
 
 def test_where_all_that_it_may_remember_are_lost_its_interval_has_no_end(points):

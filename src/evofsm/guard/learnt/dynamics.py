@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from evofsm.fsm.validation import real_array, refuse_unusable, whole
 from evofsm.guard.learnt import regression
-from evofsm.guard.learnt.failures import explain_failures, probe
+from evofsm.guard.learnt.failures import difference, explain_failures, probe
 from evofsm.guard.learnt.regression import Drift, Recent
 from evofsm.guard.learnt.replay import (
     EARLY,
@@ -374,6 +374,18 @@ class Dynamics:
             unit = np.maximum(sums.unit, 1e-300)
             self.thresholds = explain_failures(self.failures, self.lowest, self.highest, unit, blur)
         self.rebuild()
+
+    @property
+    def difference(self) -> float:
+        """Share of the states around in which a given function says otherwise than thresholds."""
+        if self.failed is None or not self.thresholds:
+            return 0.0
+        return difference(self.failed, self.thresholds, self.lowest, self.highest)
+
+    @property
+    def is_no_box(self) -> bool:
+        """Whether a function of failures is given that its thresholds do not say as well."""
+        return self.failed is not None and (not self.thresholds or self.difference > 0.0)
 
     def _extend(self, safe: Floats) -> None:
         """How far variables went, and in how many episodes they came to those ends by moving."""

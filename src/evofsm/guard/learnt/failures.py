@@ -8,7 +8,7 @@ such failures was seen.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ _FARTHEST, _HALVINGS = 40, 60
 _FIRST = 2
 # Beyond an end is what is so many ordinary changes beyond; blurred ends are so wide.
 _BEYOND, _BLUR = 1e-12, 5.0
+# States in which a function is compared with its thresholds, and how far beyond them.
+_COMPARED, _AROUND = 256, 0.25
 
 
 def explain_failures(
@@ -93,3 +95,24 @@ def probe(
                 near, far = (near, half) if failed(z) else (half, far)
             found.append((j, sign, float(safe[j] + sign * near)))
     return found
+
+
+def difference(
+    failed: Callable[[_Floats], bool],
+    thresholds: Sequence[tuple[int, float, float]],
+    lowest: _Floats,
+    highest: _Floats,
+) -> float:
+    """Share of the states around in which a function says otherwise than its thresholds.
+
+    Around is what was survived, from ``lowest`` to ``highest`` (m,), and some way past thresholds.
+    """
+    low, high = lowest.copy(), highest.copy()
+    for j, sign, at in thresholds:
+        past = at + sign * _AROUND * max(abs(at - lowest[j]), abs(at - highest[j]))
+        low[j], high[j] = min(low[j], past), max(high[j], past)
+    if not np.isfinite(high - low).all():  # nothing was survived yet
+        return 0.0
+    z = np.random.default_rng(0).uniform(low, high, (_COMPARED, len(low)))
+    beyond = np.any([sign * (z[:, j] - at) > 0.0 for j, sign, at in thresholds], 0)
+    return float(np.mean([bool(failed(one)) for one in z] != beyond))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import operator
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from typing import Any, ParamSpec, Self, TypeVar
@@ -185,6 +186,7 @@ class LearntRisk:
         #: Certificates that were violated, and whether more are than used to be.
         self.n_violated, self.violations = 0, Violations()
         self.n_studied = self.n_scanned = 0
+        self.n_failed = 0  #: episodes that it was told of that failed
         #: Steps that it takes to fail at the latest, where that cannot be avoided.
         self.time_to_failure = _HORIZON / _AHEAD
         #: Steps in which a dead end is believed to fail, at most: the model was refuted beyond.
@@ -243,14 +245,21 @@ class LearntRisk:
         """What was learnt so far, in words."""
         dynamics, names = self.dynamics, self.labels.names
         if not dynamics.n_variables:
-            return words.experience((), self.remembered, self.margin)
+            return self._no_threshold
         called = names or [f"variable {j + 1}" for j in range(dynamics.n_variables)]
         fails = [(called[j], sign < 0.0, at) for j, sign, at in dynamics.thresholds]
         latest = {one.variable: one.since + 1 for one in dynamics.drifts}
         drifts = [(called[j], since) for j, since in latest.items()]
         noisy = [name for name, gain in zip(called, dynamics.gains, strict=True) if gain < 1.0]
-        worse = self.violations.worse + 1
-        return words.experience(fails, self.remembered, self.margin, drifts, worse, noisy)
+        known = fails, self.remembered, self.margin, drifts, self.violations.worse + 1, noisy
+        return words.experience(*known, dynamics.difference, self._no_threshold)
+
+    @property
+    def _no_threshold(self) -> str:
+        """Why nothing is refused."""
+        dynamics = self.dynamics
+        was_asked = bool(dynamics.n_variables) and dynamics.sums.counts[1] >= 1.0
+        return words.no_threshold(self.n_failed, is_given=was_asked and dynamics.failed is not None)
 
     def search(
         self, situation: Situation, wanted: Any, *, tolerance: float, revising: bool
@@ -266,7 +275,7 @@ class LearntRisk:
         if here is None:
             return Search(one, _unjudged(1), 0, words.NOTHING_SEEN)
         if not dynamics.thresholds:
-            return Search(one, _unjudged(1), 0, words.NO_FAILURE)
+            return Search(one, _unjudged(1), 0, self._no_threshold)
         model, proposal, scale = dynamics.model, dynamics.encode(wanted), self.disturbance_scale
         remembered, ranks = self.remembered, self._ranks[:_ASKED]
         allowed = self._allowed(tolerance, remembered)
@@ -478,10 +487,13 @@ class LearntRisk:
     @_atomic
     def end(self, observation: Floats | None, *, failed: bool) -> None:
         """Learn from an episode; its last observation was taken in (`observe`)."""
+        self.n_failed += int(failed)
         seen_whole = observation is None or not math.isnan(observation.dot(observation))
         self.dynamics.end(failed=failed and seen_whole)
         if self.dynamics.n_episodes != self.n_studied:
             self._study()
+            if self.n_studied == 1 and self.dynamics.is_no_box:
+                warnings.warn(self.told_by_experience, stacklevel=5)
         self._forget()
 
     def _forget(self) -> None:
@@ -667,7 +679,7 @@ class LearntRisk:
 
 # Numbers that it goes on with, and the arrays of backups: each action has features of its own.
 _TIMES = ("margin", "time_to_failure", "believed")
-_COUNTS = ("n_violated", "n_studied", "n_scanned")
+_COUNTS = ("n_violated", "n_failed", "n_studied", "n_scanned")
 _NUMBERS = (*_TIMES, *_COUNTS, "horizon")
 _BACKUPS: dict[str, tuple[str, ...]] = {
     "policies": ("b", "a", "f"),

@@ -64,7 +64,7 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
         return merged
     merged.dynamics = _merged([one.dynamics for one in told])
     merged.n_studied = merged.dynamics.n_episodes
-    for name in ("n_violated", "n_scanned"):
+    for name in ("n_violated", "n_failed", "n_scanned"):
         setattr(merged, name, sum(getattr(one, name) for one in told))
     for name in ("margin", "time_to_failure", "horizon"):
         setattr(merged, name, max(getattr(one, name) for one in told))

@@ -91,6 +91,16 @@ def lasting(backup: str) -> str:
     return f"no action passes; {backup} lasts longest"
 
 
+def no_threshold(n_failed: int, *, is_given: bool) -> str:
+    """Why nothing is refused where no threshold is known."""
+    if is_given:
+        return "failed= is true along no variable alone, so nothing is refused"
+    if not n_failed:
+        return NO_FAILURE
+    seen = "1 failure" if n_failed == 1 else f"{n_failed:,} failures"
+    return f"{seen} seen, but at values of each variable that were survived: nothing is refused"
+
+
 def experience(
     fails: Sequence[tuple[str, bool, float]],
     remembered: Remembered,
@@ -98,10 +108,13 @@ def experience(
     drifts: Sequence[tuple[str, int]] = (),
     worse: int = 0,
     noisy: Sequence[str] = (),
+    differs: float = 0.0,
+    nothing: str = NO_FAILURE,
 ) -> str:
     """What was learnt so far: variables that fail, whether below a threshold, and which.
 
     Since which episode, from 1, variables move otherwise and disturbances are worse (0: none are).
+    In which share of the states around a given function says otherwise than the thresholds.
     """
     since = "".join(f"; since episode {first} {name} moves otherwise" for name, first in drifts)
     if worse:
@@ -109,7 +122,12 @@ def experience(
     if noisy:
         since += f"; sensors are noisy: {', '.join(noisy)}"
     if not fails:
-        return NO_FAILURE + since
+        return nothing + since
+    if differs:
+        since += (
+            "; failed= is not of these thresholds alone, for it says otherwise in "
+            f"{differs:.0%} of the states around: what decides are the thresholds"
+        )
     where = " or ".join(
         f"{name} is {'below' if low else 'above'} {at:.3g}" for name, low, at in fails
     )
