@@ -94,6 +94,29 @@ def test_what_spreadsheets_do_to_a_csv_changes_nothing(tmp_path, change):
         assert np.array_equal(getattr(plain, field), getattr(changed, field))
 
 
+@pytest.mark.parametrize(
+    ("name", "foreign", "encoding"),
+    [
+        ("Größe", "Straße", "latin1"),
+        ("x,x,,", "1,2,,", "utf8"),
+        ("note", "z" * 200_000, "utf8"),
+        ("note", '"a\n' + "y" * 200_000 + '"', "utf8"),
+        ("note", 'a 5" wheel\b', "utf8"),
+        ("ab", "\ufeff\0😀", "utf8"),
+    ],
+)
+@pytest.mark.parametrize("before", ["", "\ufeff", "sep=,\n"])
+def test_columns_that_nobody_asked_for_may_hold_anything(tmp_path, name, foreign, encoding, before):
+    lines, path = log(5), tmp_path / "a.csv"
+    text = "\n".join([f"{HEADER},{name}", *(f"{line},{foreign}" for line in lines), ""])
+    path.write_bytes(((before if encoding == "utf8" else "") + text).encode(encoding))
+    (chunk,), (plain,) = read(str(path)), read(write(tmp_path / "b.csv", lines))
+    assert (chunk.observations == plain.observations).all()
+    if name == "Größe":  # and is read where somebody does
+        light = ObservationEncoder("gap", Category("Größe", ["Straße", "Weg"]))
+        assert read(str(path), observe=light)[0].observations.shape == (5, 3)
+
+
 FIELDS = st.text(st.sampled_from('ab ",;\n\t\u00e9'), max_size=5).map(str.strip)
 NUMBERS = st.floats(-1e90, 1e90) | st.integers(-(10**20), 10**20) | st.floats(-9, 9, width=16)
 
@@ -274,7 +297,8 @@ def test_time_runs_forward_at_the_step_of_the_first_file(tmp_path, monkeypatch):
         (b"\xfd7zXZ\0" + bytes(50), "compressed by xz; unpack it"),
         (b"#ROSBAG V2.0\n", "a bag of ROS 1; convert it"),
         (b"PK\3\4" + bytes(50), "an Excel workbook"),
-        (f"{HEADER}\nr,a,0,0,1,1,1,1\nr,é".encode("latin1"), "after line 2: this is not text"),
+        (f"{HEADER}\nr,a,0,0,1,1,1,1\nr,\0é".encode("latin1"), "after line 2: this is not text"),
+        (HEADER.encode("utf-16"), "in UTF-16; write it in UTF-8"),
         (f"{HEADER.replace('segment', 'gap')}\n1,2".encode(), "two columns are called 'gap'"),
         (f'{HEADER}\nr,"v1,0,1\n{"x" * 90}'.encode(), "unclosed quote"),
         (f'{HEADER}\nr,"a"b,0,0,1,1,1,1\n'.encode(), "line 2: ',' expected after '\"'"),

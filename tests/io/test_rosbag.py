@@ -17,6 +17,7 @@ EGO, OTHER = "/ego/odometry", "/other/odometry"
 SECOND = 1_000_000_000
 SQLITE, MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
 PLAIN, COMPRESSED = CompressionMode.NONE, CompressionMode.MESSAGE
+PACKED = CompressionMode.FILE
 TOLD = {
     "interval": 0.1,
     "oldest": 0.5,
@@ -47,8 +48,8 @@ def odometry(x, v, at=0):
     )
 
 
-def write(path, messages, plugin=SQLITE, mode=PLAIN):
-    """Messages are (time [s], topic, message)."""
+def write(path, messages, plugin=SQLITE, mode=PLAIN, foreign=()):
+    """Messages are (time [s], topic, message); foreign topics hold what nobody understands."""
     writer = Writer(path, version=9, storage_plugin=plugin)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
@@ -59,6 +60,12 @@ def write(path, messages, plugin=SQLITE, mode=PLAIN):
                 topics[topic] = writer.add_connection(topic, kind, typestore=STORE)
             data = STORE.serialize_cdr(message, kind)
             writer.write(topics[topic], round((100.0 + time) * SECOND), data)
+        for number, (kind, definition, packed) in enumerate(foreign):
+            of_kind = {"msgdef": definition, "rihs01": f"RIHS01_{number:064}"}
+            where = writer.add_connection(
+                f"/{number}/_service_event", kind, serialization_format=packed, **of_kind
+            )
+            writer.write(where, 100 * SECOND, b"\xff")
     return str(path)
 
 
@@ -75,7 +82,9 @@ def read(path, told=TOLD, **columns):
     return list(read_traces([path], LogColumns(**columns), topics=Topics.of(told)))
 
 
-@pytest.mark.parametrize(("plugin", "mode"), [(SQLITE, PLAIN), (SQLITE, COMPRESSED), (MCAP, PLAIN)])
+@pytest.mark.parametrize(
+    ("plugin", "mode"), [(SQLITE, PLAIN), (SQLITE, COMPRESSED), (SQLITE, PACKED), (MCAP, PLAIN)]
+)
 def test_rows_hold_the_latest_values_before_them(tmp_path, plugin, mode):
     path = write(tmp_path / "bag", drive(), plugin, mode)
     (chunk,) = read(path)
@@ -86,7 +95,57 @@ def test_rows_hold_the_latest_values_before_them(tmp_path, plugin, mode):
     assert np.isnan(chunk.actions[-1])
     assert (chunk.starts.tolist(), chunk.dt) == ([0], pytest.approx(0.1))
     (file,) = (one for one in (tmp_path / "bag").iterdir() if one.suffix != ".yaml")
+    if mode is PACKED:
+        file.unlink()
+        with pytest.raises(FileNotFoundError, match=re.escape(file.name)):
+            read(path)
+        return
     assert (read(str(file))[0].observations == chunk.observations).all()  # without its folder
+
+
+FOREIGN = [
+    ("own/msg/Own", "float64 x\nown/Other y\n", "cdr"),
+    ("own/msg/Idl", "module own { nonsense <<< };", "cdr"),
+    ("own/srv/Do_Event", "service_msgs/ServiceEventInfo info\n", "cdr"),
+    ("own/msg/Empty", "", "json"),
+    ("nav_msgs/msg/Odometry", "wstring what\n", "cdr"),  # of another version
+]
+
+
+@pytest.mark.parametrize("plugin", [SQLITE, MCAP])
+def test_topics_that_nobody_asked_for_may_hold_anything(tmp_path, plugin):
+    path = write(tmp_path / "bag", drive(), plugin, foreign=FOREIGN)
+    (plain,) = read(write(tmp_path / "plain", drive(), plugin))
+    (file,) = (one for one in (tmp_path / "bag").iterdir() if one.suffix != ".yaml")
+    for place in (path, str(file)):
+        assert (read(place)[0].observations == plain.observations).all()
+    told = {"variables": {**TOLD["variables"], "gap": "/3/_service_event.x"}}
+    with pytest.raises(ValueError, match="are packed as json, not as CDR"):
+        read(path, told)
+
+
+def test_mcap_that_was_merged_with_others_is_read_by_its_topics(tmp_path):
+    writing = pytest.importorskip("mcap.writer")
+    path = tmp_path / "merged.mcap"
+    with path.open("wb") as file:
+        writer = writing.Writer(file)
+        writer.start(profile="", library="another")
+        for name, language in (("foxglove.Log", "protobuf"), ("x", "jsonschema"), ("y", "flat")):
+            schema = writer.register_schema(name, language, b"\xff\xfe")
+            writer.add_message(writer.register_channel(name, language, schema), 0, b"\xff", 0)
+        writer.add_message(writer.register_channel("/none", "json", 0), 0, b"{}", 0)
+        topics = {}
+        for time, topic, message in drive():
+            kind = message.__msgtype__
+            if topic not in topics:
+                told = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
+                schema = writer.register_schema(kind, "ros2msg", told)
+                topics[topic] = writer.register_channel(topic, "cdr", schema)
+            at, data = round((100.0 + time) * SECOND), bytes(STORE.serialize_cdr(message, kind))
+            writer.add_message(topics[topic], at, data, at)
+        writer.finish()
+    (plain,) = read(write(tmp_path / "plain", drive(), MCAP))
+    assert (read(str(path))[0].observations == plain.observations).all()
 
 
 def test_what_is_too_old_is_a_hole_in_time(tmp_path):

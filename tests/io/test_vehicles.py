@@ -129,11 +129,11 @@ def test_so_many_waiting_rows_are_handed_on_before_the_pairs_part(tmp_path, monk
 
 
 def test_persons_and_vehicles_off_the_road_are_passed_over(tmp_path):
-    text = xml({0.0: PAIR}).replace(
-        "</timestep>",
+    foreign = (
         '<person id="p" pos="30" speed="1" edge="e"/><vehicle id="x" pos="1" speed="0"/>'
-        '<vehicle id="y" lane="" pos="-1073741824.0" speed="0"/></timestep>',
+        '<vehicle id="y" lane="" pos="-1073741824.0" speed="0"/><note><b who="me"/></note>'
     )
+    text = xml({0.0: PAIR}).replace('0.0">', f'0.0">{foreign}')
     ((observations, _, _),) = episodes(write(tmp_path / "a.xml", text))
     assert observations.tolist() == [[25.0, 2.0, 1.0]]
     # SUMO names the columns after what it writes first, here a person.
@@ -248,14 +248,15 @@ def test_the_leader_is_the_nearest_one_ahead_on_the_same_lane(tmp_path):
         t = 0.1 * k
         rows += [("ego", t, 2 * k, 0, 20 - k, 0, 4, 1), ("beside", t, 8, 4, 11, 0, 4, 2)]
         rows += [("far", t, 60 + k, 0, 12, 0, 4, 1), ("near", t, 30 + k, 0, 13, 0, 6, 1)]
-        rows += [("off the road", t, 10, 0, 14, 0, 4, "")]
+        rows += [("off the road", t, 10, 0, 14, 0, 4, ""), ("sign", t, "", "nan", "", 0, 0, "")]
     path = objects(tmp_path / "a.csv", rows)
     found = sorted(episodes(path), key=lambda one: one[0][0, 1])
     assert [len(times) for _, _, times in found] == [3, 3]
     assert found[0][0].tolist() == [[25.0, 13.0, 12.0]] * 3
     assert found[1][0].tolist() == [[25.0, 20.0, 13.0], [24.0, 19.0, 13.0], [23.0, 18.0, 13.0]]
     assert found[1][1][:2] == pytest.approx([-10.0, -10.0])
-    polars.read_csv(path).write_parquet(tmp_path / "a.parquet")
+    numbers = dict.fromkeys(("x", "y", "vx"), polars.Float64)
+    polars.read_csv(path, schema_overrides=numbers).write_parquet(tmp_path / "a.parquet")
     again = sorted(episodes(tmp_path / "a.parquet"), key=lambda one: one[0][0, 1])
     assert again[1][0].tolist() == found[1][0].tolist()
 
@@ -371,6 +372,7 @@ def test_osi_that_cannot_be_right_is_refused_in_words(tmp_path, osi):
         (next(osi.osi_traces(length=0.0)), "object 2 is 0 m long, at (50, 0) m"),
         (next(osi.osi_traces(x=math.nan)), "it needs a length, and numbers"),
         (beside, "no vehicle ever follows another one"),
+        (next(osi.osi_traces(lane=0, length=0.0, x=math.nan)), "no vehicle ever follows"),
         (b"", "no object is on a lane"),
     ):
         path.write_bytes(content)

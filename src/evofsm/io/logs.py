@@ -441,7 +441,7 @@ def _open(
 ) -> Table:
     """The rows of a file, whatever it holds."""
     kind = file_kind(path)
-    if kind == "bag":
+    if kind == "bag" or (kind == "mcap" and topics is not None):  # whatever its profile says
         if topics is None:
             raise ValueError(
                 f"{path} is a bag of ROS 2; --topics names a file that says which field of which "

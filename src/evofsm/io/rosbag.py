@@ -10,11 +10,15 @@ from __future__ import annotations
 
 import math
 import re
+import sqlite3
 import tomllib
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import closing
+from itertools import chain
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -29,6 +33,7 @@ with needs("msgspec", "ros", "a bag of ROS 2"):
     from msgspec import Meta
 
 _NANOSECONDS = 1_000_000_000
+_MCAP = b"\x89MCAP0\r\n"
 _ZSTD = b"\x28\xb5\x2f\xfd"  # how what is compressed begins; no message in CDR does
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+\])*)")
 
@@ -125,7 +130,7 @@ class Topics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             If it is no TOML, or says something else; the message names it.
         """
         try:
-            return cls.of(tomllib.loads(Path(path).read_text(encoding="utf-8")))
+            return cls.of(tomllib.loads(Path(path).read_text(encoding="utf-8-sig")))
         except ValueError as error:  # that of TOML is one
             raise ValueError(f"{path}: {error}") from error
 
@@ -228,35 +233,36 @@ class BagTable(Table):
         """Of each topic that is wanted, when its messages were, and what stands in their fields."""
         with needs("rosbags", "ros", f"{self.path}: a bag of ROS 2"):
             import zstandard  # of rosbags
-            from rosbags.highlevel import AnyReader
-            from rosbags.typesys import Stores, get_typestore
+            from rosbags.typesys.store import Typestore
         texts = {text for one in self._topics.variables.values() for text in one.fields}
         fields = [Field.parse(text) for text in texts]
         of_topic = {one.topic: [f for f in fields if f.topic == one.topic] for one in fields}
         stamps = {topic: array("q") for topic in of_topic}
         values = {text: array("d") for text in texts}
-        usual = get_typestore(Stores.LATEST)
-        with AnyReader([Path(self.path)], default_typestore=usual) as reader:
-            there = sorted({one.topic for one in reader.connections})
-            if lacking := sorted(set(of_topic) - set(there)):
-                raise RefusedError(f"it has no topic {lacking[0]!r}; it has {', '.join(there)}")
-            connections = [one for one in reader.connections if one.topic in of_topic]
-            for connection, stamp, data in reader.messages(connections=connections):
-                self._on_read(len(data))
-                if data.startswith(_ZSTD):  # as only the folder's metadata.yaml would say
-                    data = zstandard.decompress(data)
-                message = reader.deserialize(data, connection.msgtype)
-                if self._topics.stamp == "header":
-                    if not hasattr(message, "header"):
-                        raise RefusedError(
-                            f"messages of {connection.topic!r} ({connection.msgtype}) have no "
-                            'header; write stamp = "received"'
-                        )
-                    at = message.header.stamp
-                    stamp = at.sec * _NANOSECONDS + at.nanosec
-                stamps[connection.topic].append(stamp)
-                for field in of_topic[connection.topic]:
-                    values[field.text].append(field.read(message))
+        stores: dict[_Type, Typestore] = {}
+        there: set[str] = set()
+        for topic, kind, stamp, data in chain.from_iterable(
+            _read(file, set(of_topic), there) for file in _files(Path(self.path))
+        ):
+            self._on_read(len(data))
+            if data.startswith(_ZSTD):  # as only the folder's metadata.yaml would say
+                data = zstandard.decompress(data)
+            if kind not in stores:
+                stores[kind] = kind.store(topic)
+            message = stores[kind].deserialize_cdr(data, kind.name)
+            if self._topics.stamp == "header":
+                if not hasattr(message, "header"):
+                    raise RefusedError(
+                        f"messages of {topic!r} ({kind.name}) have no header; write "
+                        'stamp = "received"'
+                    )
+                at = message.header.stamp
+                stamp = at.sec * _NANOSECONDS + at.nanosec
+            stamps[topic].append(stamp)
+            for field in of_topic[topic]:
+                values[field.text].append(field.read(message))
+        if lacking := sorted(set(of_topic) - there):
+            raise RefusedError(f"it has no topic {lacking[0]!r}; it has {', '.join(sorted(there))}")
         found = {}
         for topic, of_one in stamps.items():
             if not len(of_one):
@@ -265,3 +271,94 @@ class BagTable(Table):
             of_fields = {one.text: np.array(values[one.text])[order] for one in of_topic[topic]}
             found[topic] = np.array(of_one)[order], of_fields
         return found
+
+
+# -- Files of a bag -------------------------------------------------------------------------------
+# Read here and not by rosbags, which has to understand the types of all topics before it reads one.
+
+
+class _Type(NamedTuple):
+    """Of the messages of a topic, as the bag defines it."""
+
+    name: str
+    packed: str  #: how messages are
+    language: str  #: of the definition
+    definition: str
+
+    def store(self, topic: str) -> Any:
+        """What unpacks such messages."""
+        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+        if self.packed != "cdr":
+            raise RefusedError(f"messages of {topic!r} are packed as {self.packed}, not as CDR")
+        if not self.definition:
+            return get_typestore(Stores.LATEST)
+        store = get_typestore(Stores.EMPTY)
+        if self.language == "ros2msg":
+            store.register(get_types_from_msg(self.definition, self.name))
+            return store
+        parts = self.definition.split("=" * 80 + "\n")
+        for part in parts[1:] if len(parts) > 1 else parts:
+            store.register(get_types_from_idl(re.sub(r"\AIDL: .*\n", "", part)))
+        return store
+
+
+_Messages = Iterator[tuple[str, _Type, int, bytes]]
+
+
+def _files(path: Path) -> Iterator[Path]:
+    """Those of a bag, unpacked where it is compressed as a whole."""
+    if path.is_file():
+        yield path
+        return
+    import zstandard
+    from ruamel.yaml import YAML
+
+    about = YAML(typ="safe").load(path / "metadata.yaml")["rosbag2_bagfile_information"]
+    for name in about["relative_file_paths"]:
+        file = path / Path(name).name
+        if file.suffix != ".zstd":
+            yield file
+            continue
+        with TemporaryDirectory() as folder, file.open("rb") as packed:
+            with (unpacked := Path(folder) / file.stem).open("wb") as out:
+                zstandard.ZstdDecompressor().copy_stream(packed, out)
+            yield unpacked
+
+
+def _read(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
+    """Messages of topics that are wanted; all that there are are added."""
+    with file.open("rb") as opened:
+        is_mcap = opened.read(len(_MCAP)) == _MCAP
+    yield from (_read_mcap if is_mcap else _read_sqlite)(file, wanted, there)
+
+
+def _read_mcap(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
+    with needs("mcap", "ros", f"{file}: a bag of ROS 2"):
+        from mcap.reader import make_reader
+    with file.open("rb") as opened:
+        reader = make_reader(opened)
+        if (summary := reader.get_summary()) is not None:
+            there |= {channel.topic for channel in summary.channels.values()}
+        for schema, channel, message in reader.iter_messages(wanted, log_time_order=False):
+            there.add(channel.topic)
+            told = ("", "", b"") if schema is None else (schema.name, schema.encoding, schema.data)
+            kind = _Type(told[0], channel.message_encoding, told[1], told[2].decode())
+            yield channel.topic, kind, message.log_time, message.data
+
+
+def _read_sqlite(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
+    with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as bag:
+        named = bag.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+        there |= {topic for _, topic, *_ in named}
+        defined = {}
+        if bag.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
+            columns = "topic_type, encoding, encoded_message_definition"
+            for name, *told in bag.execute(f"SELECT {columns} FROM message_definitions"):
+                defined[name] = told
+        for number, topic, name, packed in named:
+            if topic in wanted:
+                kind = _Type(name, packed, *defined.get(name, ("", "")))
+                rows = "SELECT timestamp, data FROM messages WHERE topic_id = ? ORDER BY timestamp"
+                for stamp, data in bag.execute(rows, (number,)):
+                    yield topic, kind, stamp, data

@@ -50,6 +50,8 @@ _FOREIGN = {
     b"LOGG": "is a CAN log of Vector (BLF); decode it to CSV: python-can, cantools",
     b"MDF ": "is a measurement in ASAM MDF (MF4); write it as Parquet or CSV: asammdf",
     b"ARROW1": "is an Arrow (Feather) file; write it as Parquet: pyarrow, polars or pandas",
+    b"\xff\xfe": "is text in UTF-16; write it in UTF-8: iconv -f UTF-16 -t UTF-8 FILE",
+    b"\xfe\xff": "is text in UTF-16; write it in UTF-8: iconv -f UTF-16 -t UTF-8 FILE",
     b"\x93NUMPY": "is an array of NumPy; write it as CSV with names of columns: numpy.savetxt",
 }
 # Where an MCAP file has its profile: behind the mark, an opcode and two lengths.
@@ -71,6 +73,8 @@ _SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": 
 _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
 # What stands in a field where there is no number.
 _NOTHING = ("", "na", "n/a", "null", "none")
+# What no text holds.
+_CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
 
 
@@ -307,20 +311,22 @@ class CsvTable(Table):
             import polars  # noqa: F401 (said here, before the work begins)
         self.path = path
         self._on_read = on_read
+        # A field may be long that nobody asks for; lines are bounded.
+        csv.field_size_limit(max(csv.field_size_limit(), _CSV_BYTES + 2 * _LONGEST_LINE))
         with Source(path) as source:
-            header, *first = source.rows().split(b"\n", 3)[:3]
-        text = self._decoded(header, 0).removeprefix("\ufeff").rstrip("\r")
+            lines = self._text(source.rows(), 0).removeprefix("\ufeff").split("\n", 4)[:4]
+        self._above = 1 + lines[0].startswith("sep=")  # lines before the first row
+        text, *first = (line.rstrip("\r") for line in lines[self._above - 1 :] or [""])
         self._separator = max(",;\t", key=text.count)
         self.columns = [name.strip() for name in self._split(text, 1)]
         # With nothing in it that has a meaning; polars is not to be left alone with others.
         quoted = f'"[^"{self._separator}\\r\\n]*"(?=[{self._separator}\\r\\n])'
         self._quoted = re.compile(quoted.encode())
-        rows = [self._split(row.decode(errors="replace").rstrip("\r"), 2) for row in first]
-        self._above = 1  # lines before the first row
+        rows = [self._split(row, 2) for row in first]
         told = [unit_of(text) for text in rows[0]] if rows else []
         if any(one in UNITS for one in told) and not any(map(_is_number, told)):
             self.units = dict(zip(self.columns, told, strict=False))
-            self._above, rows = 2, rows[1:]
+            self._above, rows = self._above + 1, rows[1:]
         self._first_row = rows[0] if rows else []
         if all(_is_number(name) for name in self.columns):
             raise ValueError(
@@ -352,6 +358,8 @@ class CsvTable(Table):
         with Source(self.path, self._on_read) as source:
             reached = 0
             while block := source.rows():
+                if not block.isascii():
+                    block = self._text(block, reached).encode()
                 while reached < self._above:
                     block, reached = block.partition(b"\n")[2], reached + 1
                 found = self._plain(block, places, wanted.numbers)
@@ -396,7 +404,7 @@ class CsvTable(Table):
 
     def _odd(self, block: bytes, reached: int) -> tuple[list[int], list[list[str]]]:
         """The lines of rows, and their fields."""
-        text = io.StringIO(self._decoded(block, reached), newline="")
+        text = io.StringIO(block.decode(), newline="")
         rows = csv.reader(text, delimiter=self._separator, strict=True)
         lines, found = list[int](), list[list[str]]()
         try:
@@ -418,10 +426,13 @@ class CsvTable(Table):
         text = "" if name is None else rows[row][self.columns.index(name)]
         return f"{self.path}, line {lines[row]}", text
 
-    def _decoded(self, block: bytes, reached: int) -> str:
+    def _text(self, block: bytes, reached: int) -> str:
+        """Lines in UTF-8 or, where they are none, in the encoding of Western Europe."""
         try:
             return block.decode()
         except UnicodeDecodeError as error:
+            if not _CONTROL.search(block):
+                return block.decode("cp1252", errors="replace")
             line = reached + block.count(b"\n", 0, error.start)
             raise ValueError(
                 f"{self.path}, after line {line}: this is not text in UTF-8 (a file of another "

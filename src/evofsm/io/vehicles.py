@@ -237,7 +237,7 @@ class _FcdReader:
         # Told the encoding, it asks no codec for the one that a file names: SUMO writes UTF-8.
         parser = self._parser = expat.ParserCreate("utf-8")
         self._fed = self._depth = 0
-        self._lanes_seen = False
+        self._lanes_seen, self._without = False, ""  # and where a vehicle had none
         self._time = (math.nan, 0)
         self._rows: list[_FcdRow] = []
         parser.StartElementHandler = self._start
@@ -257,6 +257,8 @@ class _FcdReader:
         self._fed += len(data)
         if self._fed - self._parser.CurrentByteIndex > _LONGEST_TAG:
             self._refuse(f"a tag or comment of more than {_LONGEST_TAG:,} bytes begins here")
+        if last and self._without and not self._lanes_seen:
+            _refuse_lack(self._without, "lane")
         rows, self._rows = self._rows, []
         return rows
 
@@ -277,8 +279,8 @@ class _FcdReader:
             self._rows.append((place, self._time, None, "", None, None, ""))
             return
         lane = attributes.get("lane")
-        if lane is None and not self._lanes_seen:
-            _refuse_lack(place(), "lane")
+        if lane is None and not self._without:
+            self._without = place()
         self._lanes_seen = self._lanes_seen or bool(lane)
         who, along, speed = (attributes.get(name) for name in ("id", "pos", "speed"))
         kind = attributes.get("type", "")
@@ -358,7 +360,7 @@ class Object(NamedTuple):
     """A vehicle at one time."""
 
     id: str
-    lane: str  #: empty where none is known: it follows nobody, and nobody follows it
+    lane: str
     x: float  #: of the middle of its box [m]
     y: float  #: [m]
     vx: float  #: [m/s]
@@ -379,14 +381,20 @@ class Scene(NamedTuple):
 
 def scenes_of_table(table: Table) -> Iterator[Scene]:
     """Read a table of objects, whose rows of one time stand together."""
-    gaps = [_HEADING] if _HEADING in table.columns else []
-    wanted = Wanted(["t", "x", "y", "vx", "vy", "length", *gaps], ["id", "lane"], gaps)
+    headings = [_HEADING] if _HEADING in table.columns else []
+    numbers = ["x", "y", "vx", "vy", "length"]
+    wanted = Wanted(["t", *numbers, *headings], ["id", "lane"], [*numbers, *headings])
     for time, of_time in groupby(_rows(table, wanted), key=itemgetter(1)):
         objects, places = list[Object](), list[Place]()
         for place, _, x, y, vx, vy, length, *heading, name, lane in of_time:
+            places = places or [place]
+            if not lane:  # whoever follows nobody may lack anything
+                continue
+            for column, value in zip(numbers, (x, y, vx, vy, length), strict=True):
+                if not abs(value) <= LARGEST_OBSERVATION:
+                    raise ValueError(f"{place()}, column {column!r}: {explained(f'{value:g}')}")
             if not length > 0.0:
                 raise ValueError(f"{place()}: the length is {length:g}; it must be positive")
-            places = places or [place]
             objects.append(Object(name, lane, x, y, vx, vy, length, *(heading or [math.nan])))
         yield Scene(time, places[0], objects)
 
@@ -409,8 +417,7 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene]) -> Iterator[Moment]:
                     "recordings in one file?)"
                 )
             names.add(one.id)
-            if one.lane:
-                lanes[one.lane].append(_pointing(one, pointed))
+            lanes[one.lane].append(_pointing(one, pointed))
         has_lanes = has_lanes or bool(lanes)
         pairs = [pair for lane in lanes.values() for pair in _following(scene, lane)]
         yield Moment(scene.time, scene.place, pairs)
@@ -533,7 +540,7 @@ def _is_view(osi: Any, data: bytes) -> bool:
 
 
 def _scene(osi: Any, place: str, data: bytes, is_view: bool) -> Scene:
-    """The moving objects of a message, but pedestrians and animals."""
+    """The moving objects on lanes, but pedestrians and animals."""
     try:
         message = (osi.SensorView if is_view else osi.GroundTruth).from_binary(data)
     except ValueError as error:
@@ -545,15 +552,22 @@ def _scene(osi: Any, place: str, data: bytes, is_view: bool) -> Scene:
     stamp = (truth and truth.timestamp) or message.timestamp or osi.Timestamp()
     on_foot = (osi.MovingObject.Type.PEDESTRIAN, osi.MovingObject.Type.ANIMAL)
     objects = [
-        _object(place, moving)
+        _object(place, moving, lane)
         for moving in (truth.moving_object if truth else ())
-        if moving.base and moving.type not in on_foot
+        if moving.base and moving.type not in on_foot and (lane := _lane(moving))
     ]
     return Scene(stamp.seconds + 1e-9 * stamp.nanos, lambda: place, objects)
 
 
-def _object(place: str, moving: Any) -> Object:
-    base, classified = moving.base, moving.moving_object_classification
+def _lane(moving: Any) -> str:
+    """Where it is; empty where that is not known: it follows nobody, and nobody follows it."""
+    classified = moving.moving_object_classification
+    lanes = (classified and classified.assigned_lane_id) or moving.assigned_lane_id
+    return str(lanes[0].value) if lanes else ""
+
+
+def _object(place: str, moving: Any, lane: str) -> Object:
+    base = moving.base
     name = str(moving.id.value) if moving.id else "without an id"
     x, y = (base.position.x, base.position.y) if base.position else (math.nan, math.nan)
     vx, vy = (base.velocity.x, base.velocity.y) if base.velocity else (math.nan, math.nan)
@@ -564,6 +578,5 @@ def _object(place: str, moving: Any) -> Object:
             f"{place}: object {name} is {length:g} m long, at ({x:g}, {y:g}) m, with "
             f"({vx:g}, {vy:g}) m/s; it needs a length, and numbers"
         )
-    lanes = (classified and classified.assigned_lane_id) or moving.assigned_lane_id
     heading = base.orientation.yaw if base.orientation else math.nan
-    return Object(name, str(lanes[0].value) if lanes else "", x, y, vx, vy, length, heading)
+    return Object(name, lane, x, y, vx, vy, length, heading)
