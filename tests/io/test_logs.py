@@ -13,9 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evofsm.cli.learning import warnings_of
+from evofsm.cli.options import units_given
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import tables
-from evofsm.io.logs import LogColumns, Noted, episodes_of, parse_units, read_traces, rows_of
+from evofsm.io.logs import LogColumns, Noted, episodes_of, read_traces, rows_of
 from evofsm.io.tables import CsvTable, Wanted
 
 polars = pytest.importorskip("polars")
@@ -409,7 +411,7 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, monkeypatch, nothing, at
     assert "line 3, column 'a_follower'" in refusal(path, no_leader="end")
     path = write(tmp_path / "d.csv", [lines[0], lines[1].replace(",,", ",1,")], SHORT)
     read(path, noted=noted, no_leader="end", failed="crash")
-    assert "1 failures lie in rows without a leader" in " ".join(noted.warnings())
+    assert "1 failures lie in rows without a leader" in " ".join(warnings_of(noted))
 
 
 def test_a_number_may_stand_for_no_leader(tmp_path):
@@ -417,12 +419,12 @@ def test_a_number_may_stand_for_no_leader(tmp_path):
     path, noted = write(tmp_path / "a.csv", lines, SHORT), Noted()
     found = together(path, noted=noted, no_leader="crash==0", failed="gap<=0")
     assert found[:2] == ([5, 4, 3, 2], [0, 2])
-    assert (noted.leaderless, noted.failed, noted.warnings()) == (3, 0, [])
+    assert (noted.leaderless, noted.failed, warnings_of(noted)) == (3, 0, [])
     assert "(--no-leader names the right one" in refusal(path, no_leader="lead==0")
     noted = Noted()
     read(path, noted=noted, failed="gap<=0")
-    assert "1 of 2 failed episodes fail with their first row, and gap is 0" in noted.warnings()[0]
-    assert "--no-leader 'gap==0'" in noted.warnings()[0]
+    assert "1 of 2 failed episodes fail with their first row, and gap is 0" in warnings_of(noted)[0]
+    assert "--no-leader 'gap==0'" in warnings_of(noted)[0]
 
 
 # -- Dates and units -------------------------------------------------------------------------------
@@ -464,13 +466,13 @@ def test_dates_that_are_none_are_refused(tmp_path, texts, says):
 
 def test_units_are_converted_before_anything_is_learnt(tmp_path):
     lines = [f"p,{100 * k},{1000 * k},36,72,0,0" for k in range(4)]
-    units = parse_units(["v=km/h", "v_l=m/s", "time=ms", "gap=cm"])  # the longest name counts
+    units = units_given(["v=km/h", "v_l=m/s", "time=ms", "gap=cm"])  # the longest name counts
     path, noted = write(tmp_path / "a.csv", lines, SHORT), Noted()
     (chunk,) = read(path, units=units)
     assert chunk.observations[1] == pytest.approx([10.0, 10.0, 72.0])
     assert chunk.dt == 0.1
     read(path, noted=noted)
-    speed, step = noted.warnings("time")
+    speed, step = warnings_of(noted, "time")
     assert re.search("v_leader reaches 72 m/s.*--unit v_leader=km/h", speed)
     assert re.search("a row every 100 s.*--unit time=ms", step)
 
@@ -485,7 +487,7 @@ def test_a_row_of_units_below_the_names_is_none_of_the_log(tmp_path, row):
     assert chunk.observations[0] == pytest.approx([9, 10, 10] if in_si else [0.09, 36, 36])
     assert chunk.actions[0] == pytest.approx(1.0 if in_si else 9.80665)
     assert chunk.dt == pytest.approx(1.0 if in_si else 0.001)
-    assert noted.warnings() == []
+    assert warnings_of(noted) == []
     (chunk,) = read(path, units={"v_follower": "mph"})  # who says otherwise is right
     assert chunk.observations[0, 1] == pytest.approx(36 * 0.44704)
     bad = write(tmp_path / "b.csv", [*lines, "p,9,9,36,fast,1,0"], SHORT)
@@ -502,12 +504,12 @@ def test_a_unit_in_a_column_s_name_is_asked_about_unless_it_was_told(tmp_path, n
     columns = {"observe": ObservationEncoder(name), "action": "u"}
     noted = Noted()
     read(path, noted=noted, **columns)
-    (warning,) = noted.warnings()
+    (warning,) = warnings_of(noted)
     assert f"{name} is called as if it were in {unit}" in warning
     assert f"--unit {name}={unit} converts it" in warning
     told = Noted()
     read(path, noted=told, units={name: unit}, **columns)
-    assert told.warnings() == []
+    assert warnings_of(told) == []
 
 
 @pytest.mark.parametrize(
@@ -519,7 +521,7 @@ def test_the_unit_of_the_time_is_told_from_its_step(tmp_path, step, unit):
         lines = [f"p,{step * k},9,10,10,0,0" for k in range(5)]
     noted, path = Noted(), write(tmp_path / "a.csv", lines, SHORT)
     read(path, noted=noted)
-    (warning,) = noted.warnings()
+    (warning,) = warnings_of(noted)
     assert f"is the time in {unit}? --unit time={unit} converts it" in warning
     (chunk,) = read(path, units={"time": unit})
     assert chunk.dt in (0.02, 0.1)

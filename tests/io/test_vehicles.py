@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evofsm.cli.options import lengths_given
 from evofsm.fsm.observations import ObservationEncoder
 from evofsm.io import vehicles
 from evofsm.io.logs import LogColumns, episodes_of, read_traces
-from evofsm.io.vehicles import VehicleLengths
 
 polars = pytest.importorskip("polars")
 
@@ -93,14 +93,14 @@ def test_an_episode_ends_when_somebody_cuts_in_or_a_pair_is_away(tmp_path):
 def test_lengths_are_those_of_the_leader_s_type(tmp_path):
     road = {0.0: [("a", "e_0", 50.0, 1.0, "truck@a"), ("b", "e_0", 20.0, 1.0, "car")]}
     path = write(tmp_path / "a.xml", xml(road))
-    assert episodes(path, VehicleLengths.parse(["4", "truck=12"]))[0][0][0, 0] == 18.0
-    assert episodes(path, VehicleLengths.parse(["4"]))[0][0][0, 0] == 26.0
-    assert str(VehicleLengths.parse(["4", "truck=12"])) == "truck 12 m, others 4 m"
+    assert episodes(path, lengths_given(["4", "truck=12"]))[0][0][0, 0] == 18.0
+    assert episodes(path, lengths_given(["4"]))[0][0][0, 0] == 26.0
+    assert str(lengths_given(["4", "truck=12"])) == "truck 12 m, others 4 m"
     with pytest.raises(ValueError, match=r"has the type 'lorry' .* the types are truck"):
-        episodes(path, VehicleLengths.parse(["lorry=12"]))
+        episodes(path, lengths_given(["lorry=12"]))
     for text in ("truck=", "-1", "nan"):
         with pytest.raises(ValueError, match="--vehicle-length is"):
-            VehicleLengths.parse([text])
+            lengths_given([text])
 
 
 def test_variables_may_be_chosen_and_ordered_and_nothing_else(tmp_path):
@@ -229,7 +229,7 @@ def sumo(tmp_path_factory, sumo_road):
 def test_pairs_are_those_that_sumo_drove(sumo, ending):
     path = sumo(f"truth.{ending}", "--precision", "6")
     truth = np.array(json.loads(Path(path).with_name("truth.json").read_text()))
-    found = episodes(path, VehicleLengths.parse(["truck=12"]))
+    found = episodes(path, lengths_given(["truck=12"]))
     (mine,) = [rows for rows, _, _ in found if abs(rows[0, 0] - truth[0, 0]) < 1e-5]
     assert len(mine) == len(truth) > 30
     assert mine == pytest.approx(truth, abs=2e-6)

@@ -27,6 +27,7 @@ from evofsm.cli.options import (
     TopicsFile,
     Units,
     argument,
+    lengths_given,
     log_columns,
     option,
 )
@@ -137,9 +138,9 @@ def learn(
     With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
     to the same result. The file stays at the end: run again, the command prints it at once.
     """
-    from evofsm.cli.learning import Checkpoint, guard_of_log, learn_traces, teach
+    from evofsm.cli.learning import Checkpoint, guard_of_log, learn_traces, teach, warnings_of
     from evofsm.driving.naming import UNITS, VARIABLES
-    from evofsm.io import Topics, VehicleLengths, read_traces
+    from evofsm.io import Topics, read_traces
     from evofsm.io.logs import Noted
     from evofsm.io.tables import SI
 
@@ -150,7 +151,7 @@ def learn(
     encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
     kind = None if guard is None else _judge_of(judge, columns)
-    lengths, noted = VehicleLengths.parse(vehicle_length or ()), Noted()
+    lengths, noted = lengths_given(vehicle_length or ()), Noted()
     known = [{"name": file, "bytes": _size(file)} for file in files]
     keeper = None
     if checkpoint is not None:
@@ -185,7 +186,7 @@ def learn(
         )
     noted = Noted(**learning.read.notes["noted"])
     provenance = _provenance(learning, known, action, failed, unit)
-    warnings = noted.warnings(time)
+    warnings = warnings_of(noted, time)
     for warning in warnings:
         warn(f"warning: {warning}")
     if out is not None:

@@ -9,6 +9,7 @@ that came is measured by the Jensen-Shannon divergence.
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,6 +31,8 @@ from evofsm.fsm.model import FSMModel
 from evofsm.fsm.step import Trace
 from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
 from evofsm.io import Chunk, episodes_of
+from evofsm.io.logs import Noted
+from evofsm.io.tables import SI, TIMES, UNITS
 
 _log = logging.getLogger(__name__)
 
@@ -42,6 +45,14 @@ HORIZON = 1.0
 _FIRST_BLOCK, _LARGEST_BLOCK, _SCORED = 64, 8192, 256
 # A checkpoint is written so often [s].
 _EVERY = 60.0
+# A unit at the end of a column's name, behind another letter or as a word of its own.
+_WORD = "(?:^|[^A-Za-z]|(?<=[a-z])(?=[A-Z]))"
+_CALLED = re.compile(_WORD + "((?i:km[/_ ]?p?h|kph|mph|knots|feet|ft|cm|mm|km))[^A-Za-z]*$")
+_TIME_CALLED = re.compile(_WORD + "((?i:ms|us|ns))(?:ec)?[^A-Za-z]*$")
+# Units of time that logs are in, of which that counts by which a row comes every 0.1 s or so.
+_SHORTER = ("ms", "us", "ns")
+# Numbers that stand for nobody in many recordings.
+_NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
 
 
 class Skill(NamedTuple):
@@ -163,6 +174,50 @@ def learn_traces(
         )
     certainty = read.certainty / read.scored if read.scored else np.nan
     return Learning(machine, model, read, transitions, certainty, tuple(_skills(read)))
+
+
+# -- What was noticed in reading ------------------------------------------------------------------
+
+
+def _called(name: str, *, is_time: bool) -> str:
+    """The unit that is part of a column's name, if it is none of the SI."""
+    found = (_TIME_CALLED if is_time else _CALLED).search(name)
+    if found is None:
+        return ""
+    word = found[1].lower()
+    return {"feet": "ft", "knots": "kn"}.get(word) or (word if word in UNITS else "km/h")
+
+
+def warnings_of(noted: Noted, time: str = "time") -> list[str]:
+    """What is most likely a mistake, and what would mend it."""
+    called = {name: unit for name in noted.untold if (unit := _called(name, is_time=name == time))}
+    found = [
+        f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
+        f"mph? --unit {name}=km/h converts it"
+        for name, fastest in noted.fastest.items()
+        if name not in called
+    ]
+    found += [
+        f"{name} is called as if it were in {unit}, and was read as one of the SI: --unit "
+        f"{name}={unit} converts it (--unit {name}={SI[unit].replace('²', '2')}: it is right)"
+        for name, unit in called.items()
+    ]
+    if (step := noted.longest_step) > 0.0 and time not in called:
+        unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
+        cause = f"is the time in {unit}? --unit {time}={unit} converts it"
+        found.append(f"there is a row every {step:,.6g} s: {cause}")
+    same = [one for one in noted.at_once.items() if one[1] in _NOBODY or noted.failed_at_once > 1]
+    if same and noted.failed_at_once >= noted.failed / 2:
+        name, value = min(same, key=lambda one: one[1] not in _NOBODY)
+        found.append(
+            f"{noted.failed_at_once:,} of {noted.failed:,} failed episodes fail with their first "
+            f"row, and {name} is {value:g} there each time: does that stand for no leader? "
+            f"--no-leader '{name}=={value:g}' leaves such rows out"
+        )
+    if noted.unplaced:
+        why = "lie in rows without a leader, belong to no episode, and were not counted"
+        found.append(f"{noted.unplaced:,} failures {why}")
+    return found
 
 
 # -- A guard --------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,7 +15,7 @@ from evofsm.extras import install
 
 if TYPE_CHECKING:
     from evofsm.driving import Family
-    from evofsm.io import LogColumns
+    from evofsm.io import LogColumns, VehicleLengths
 
 
 #: Where to drive.
@@ -180,7 +181,6 @@ def log_columns(
     from evofsm.fsm.observations import Category, ObservationEncoder
     from evofsm.fsm.validation import positive
     from evofsm.io import LogColumns
-    from evofsm.io.logs import parse_units
 
     def variable(text: str) -> str | Category:
         name, discrete, values = text.partition("=")
@@ -197,6 +197,43 @@ def log_columns(
         episode=None if episode is None else split_names(episode),
         dt=None if dt is None else positive("--dt", dt),
         failed=failed,
-        units=parse_units(unit or ()),
+        units=units_given(unit or ()),
         no_leader=no_leader,
     )
+
+
+def units_given(texts: Iterable[str]) -> dict[str, str]:
+    """Units by the column, or the beginning of columns, from what --unit was given."""
+    from evofsm.io.tables import UNITS
+
+    found: dict[str, str] = {}
+    for text in texts:
+        name, _, unit = (part.strip() for part in text.rpartition("="))
+        if not (name and unit in UNITS):
+            raise ValueError(f"--unit is {text!r}; write NAME=UNIT with one of {', '.join(UNITS)}")
+        if name in found:
+            raise ValueError(f"--unit names {name!r} twice")
+        found[name] = unit
+    return found
+
+
+def lengths_given(texts: Iterable[str]) -> VehicleLengths:
+    """Lengths of vehicles from texts such as ``5.0`` and ``truck=12``."""
+    from evofsm.fsm.validation import positive
+    from evofsm.io import VehicleLengths
+
+    lengths = VehicleLengths()
+    for text in texts:
+        kind, _, number = text.rpartition("=")
+        try:
+            length = positive("length", float(number))
+        except ValueError:
+            raise ValueError(
+                f"--vehicle-length is {text!r}; write a positive length such as 5.0, or "
+                "truck=12 for one type"
+            ) from None
+        if kind:
+            lengths.by_type[kind] = length
+        else:
+            lengths.default = length
+    return lengths

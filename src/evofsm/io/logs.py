@@ -17,7 +17,6 @@ from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import vehicles
 from evofsm.io.tables import (
-    SI,
     TIMES,
     UNITS,
     CsvTable,
@@ -44,16 +43,8 @@ _FIRST_ROWS = 8192
 _SAME_STEP = 0.05
 # Speeds [m/s] and usual steps [s] beyond these are most likely in another unit.
 _FASTEST, _LONGEST_USUAL = 60.0, 5.0
-# Units of time that logs are in, of which that counts by which a row comes every 0.1 s or so.
-_SHORTER = ("ms", "us", "ns")
-# Numbers that stand for nobody in many recordings.
-_NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
 _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
 _MICROSECOND = 1e-6
-# A unit at the end of a column's name, behind another letter or as a word of its own.
-_WORD = "(?:^|[^A-Za-z]|(?<=[a-z])(?=[A-Z]))"
-_CALLED = re.compile(_WORD + "((?i:km[/_ ]?p?h|kph|mph|knots|feet|ft|cm|mm|km))[^A-Za-z]*$")
-_TIME_CALLED = re.compile(_WORD + "((?i:ms|us|ns))(?:ec)?[^A-Za-z]*$")
 
 _SIGNS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt}
 _SIGNS |= {"==": operator.eq, "!=": operator.ne}
@@ -93,7 +84,7 @@ class Noted:
     """What was noticed while logs were read, for people."""
 
     units: dict[str, str] = field(default_factory=dict)  #: of columns, as they were told
-    called: dict[str, str] = field(default_factory=dict)  #: in columns' names, and not converted
+    untold: list[str] = field(default_factory=list)  #: columns of which no unit was told
     leaderless: int = 0  #: rows without a leader, left out
     after_failure: int = 0  #: rows left out because the failure before them still held
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
@@ -118,51 +109,8 @@ class Noted:
                 same = self.at_once.items() & here.items() if self.failed_at_once else here
                 self.at_once, self.failed_at_once = dict(same), self.failed_at_once + 1
 
-    def warnings(self, time: str = "time") -> list[str]:
-        """What is most likely a mistake, and what would mend it."""
-        found = [
-            f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
-            f"mph? --unit {name}=km/h converts it"
-            for name, fastest in self.fastest.items()
-            if name not in self.called
-        ]
-        found += [
-            f"{name} is called as if it were in {unit}, and was read as one of the SI: --unit "
-            f"{name}={unit} converts it (--unit {name}={SI[unit].replace('²', '2')}: it is right)"
-            for name, unit in self.called.items()
-        ]
-        if (step := self.longest_step) > 0.0 and time not in self.called:
-            unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
-            cause = f"is the time in {unit}? --unit {time}={unit} converts it"
-            found.append(f"there is a row every {step:,.6g} s: {cause}")
-        same = [one for one in self.at_once.items() if one[1] in _NOBODY or self.failed_at_once > 1]
-        if same and self.failed_at_once >= self.failed / 2:
-            name, value = min(same, key=lambda one: one[1] not in _NOBODY)
-            found.append(
-                f"{self.failed_at_once:,} of {self.failed:,} failed episodes fail with their first "
-                f"row, and {name} is {value:g} there each time: does that stand for no leader? "
-                f"--no-leader '{name}=={value:g}' leaves such rows out"
-            )
-        if self.unplaced:
-            why = "lie in rows without a leader, belong to no episode, and were not counted"
-            found.append(f"{self.unplaced:,} failures {why}")
-        return found
-
 
 # -- What columns mean ----------------------------------------------------------------------------
-
-
-def parse_units(texts: Iterable[str]) -> dict[str, str]:
-    """Units by the column, or the beginning of columns, from what --unit was given."""
-    found: dict[str, str] = {}
-    for text in texts:
-        name, _, unit = (part.strip() for part in text.rpartition("="))
-        if not (name and unit in UNITS):
-            raise ValueError(f"--unit is {text!r}; write NAME=UNIT with one of {', '.join(UNITS)}")
-        if name in found:
-            raise ValueError(f"--unit names {name!r} twice")
-        found[name] = unit
-    return found
 
 
 def units_of(units: Mapping[str, str], used: Sequence[str]) -> dict[str, str]:
@@ -190,15 +138,6 @@ def refuse_other_times(units: Mapping[str, str], time: str) -> None:
                 f"column {name!r} has the unit {unit}; the column of the time needs a unit of "
                 "time, and no other one may have it (--unit says which it has)"
             )
-
-
-def _called(name: str, *, is_time: bool) -> str:
-    """The unit that is part of a column's name, if it is none of the SI."""
-    found = (_TIME_CALLED if is_time else _CALLED).search(name)
-    if found is None:
-        return ""
-    word = found[1].lower()
-    return {"feet": "ft", "knots": "kn"}.get(word) or (word if word in UNITS else "km/h")
 
 
 class Condition(NamedTuple):
@@ -640,11 +579,7 @@ class _Reader:
         except ValueError as error:
             raise ValueError(f"{table.path}: {error}") from None
         self._noted.units |= given
-        self._noted.called |= {
-            name: unit
-            for name in numbers
-            if name not in given and (unit := _called(name, is_time=name == columns.time))
-        }
+        self._noted.untold += [name for name in numbers if name not in given]
         gaps = [name for name in compared if name not in learnt]
         gaps += learnt if columns.no_leader else []
         wanted = Wanted(numbers, [*self._episode, *categories, *told], gaps, date)

@@ -242,7 +242,8 @@ class BagTable(Table):
         stores: dict[_Type, Typestore] = {}
         there: set[str] = set()
         for topic, kind, stamp, data in chain.from_iterable(
-            _read(file, set(of_topic), there) for file in _files(Path(self.path))
+            (_of_mcap if is_mcap else _of_sqlite)(file, set(of_topic), there)
+            for file, is_mcap in _files(Path(self.path))
         ):
             self._on_read(len(data))
             if data.startswith(_ZSTD):  # as only the folder's metadata.yaml would say
@@ -306,34 +307,29 @@ class _Type(NamedTuple):
 _Messages = Iterator[tuple[str, _Type, int, bytes]]
 
 
-def _files(path: Path) -> Iterator[Path]:
-    """Those of a bag, unpacked where it is compressed as a whole."""
-    if path.is_file():
-        yield path
-        return
-    import zstandard
-    from ruamel.yaml import YAML
+def _files(path: Path) -> Iterator[tuple[Path, bool]]:
+    """Those of a bag, unpacked where it is compressed as a whole, and whether each is MCAP."""
+    files = [path]
+    if path.is_dir():
+        from ruamel.yaml import YAML
 
-    about = YAML(typ="safe").load(path / "metadata.yaml")["rosbag2_bagfile_information"]
-    for name in about["relative_file_paths"]:
-        file = path / Path(name).name
-        if file.suffix != ".zstd":
-            yield file
-            continue
-        with TemporaryDirectory() as folder, file.open("rb") as packed:
-            with (unpacked := Path(folder) / file.stem).open("wb") as out:
-                zstandard.ZstdDecompressor().copy_stream(packed, out)
-            yield unpacked
+        about = YAML(typ="safe").load(path / "metadata.yaml")["rosbag2_bagfile_information"]
+        files = [path / Path(name).name for name in about["relative_file_paths"]]
+    with TemporaryDirectory() as folder:
+        for file in files:
+            if file.suffix == ".zstd":
+                import zstandard
 
-
-def _read(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
-    """Messages of topics that are wanted; all that there are are added."""
-    with file.open("rb") as opened:
-        is_mcap = opened.read(len(_MCAP)) == _MCAP
-    yield from (_read_mcap if is_mcap else _read_sqlite)(file, wanted, there)
+                unpacked = Path(folder) / file.stem
+                with file.open("rb") as packed, unpacked.open("wb") as out:
+                    zstandard.ZstdDecompressor().copy_stream(packed, out)
+                file = unpacked
+            with file.open("rb") as opened:
+                is_mcap = opened.read(len(_MCAP)) == _MCAP
+            yield file, is_mcap
 
 
-def _read_mcap(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
+def _of_mcap(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
     with needs("mcap", "ros", f"{file}: a bag of ROS 2"):
         from mcap.reader import make_reader
     with file.open("rb") as opened:
@@ -347,7 +343,7 @@ def _read_mcap(file: Path, wanted: Collection[str], there: set[str]) -> _Message
             yield channel.topic, kind, message.log_time, message.data
 
 
-def _read_sqlite(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
+def _of_sqlite(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
     with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as bag:
         named = bag.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
         there |= {topic for _, topic, *_ in named}

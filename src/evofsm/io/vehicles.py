@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, groupby, pairwise
 from operator import itemgetter
-from typing import Any, NamedTuple, NoReturn, Self
+from typing import Any, NamedTuple, NoReturn
 from xml.parsers import expat
 
 import numpy as np
@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from evofsm.driving.naming import VARIABLES
 from evofsm.extras import needs
-from evofsm.fsm.validation import positive
 from evofsm.io.tables import OnRead, Piece, Source, Table, Wanted, explained
 from evofsm.store import LARGEST_OBSERVATION
 
@@ -144,31 +143,6 @@ class VehicleLengths:
     default: float = 5.0
     by_type: dict[str, float] = field(default_factory=dict)
     seen: set[str] = field(default_factory=set, init=False)  #: types met so far
-
-    @classmethod
-    def parse(cls, texts: Iterable[str]) -> Self:
-        """Lengths from texts such as ``5.0`` and ``truck=12``.
-
-        Examples
-        --------
-        >>> VehicleLengths.parse(["4.5", "truck=12"]).by_type
-        {'truck': 12.0}
-        """
-        lengths = cls()
-        for text in texts:
-            kind, _, number = text.rpartition("=")
-            try:
-                length = positive("length", float(number))
-            except ValueError:
-                raise ValueError(
-                    f"--vehicle-length is {text!r}; write a positive length such as 5.0, or "
-                    "truck=12 for one type"
-                ) from None
-            if kind:
-                lengths.by_type[kind] = length
-            else:
-                lengths.default = length
-        return lengths
 
     def of(self, kind: str) -> float:
         """Length of a vehicle of the given type [m]."""

@@ -31,6 +31,7 @@ from evofsm.cli.options import (
     World,
     argument,
     family_of,
+    lengths_given,
     log_columns,
     option,
     require,
@@ -91,7 +92,7 @@ def watch(
     begins when the page is first opened. Ctrl-C ends it.
     """
     require(websockets="watch")
-    from evofsm.io import Topics, VehicleLengths
+    from evofsm.io import Topics
 
     is_log = _is_log(what)
     if not is_log and any((episode, dt, failed, unit, topics, no_leader, vehicle_length)):
@@ -104,7 +105,7 @@ def watch(
     opened: AbstractContextManager[Watched]
     if is_recorded:
         columns = log_columns(observe, action, time, episode, dt, failed, unit, no_leader)
-        lengths = VehicleLengths.parse(vehicle_length or ())
+        lengths = lengths_given(vehicle_length or ())
         known = None if topics is None else Topics.load(topics)
         reading = (columns, lengths, known) if is_log else None
         opened = _recorded(what, case, judge, tolerance, brakes, reading)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.cli.learning import warnings_of
 from evofsm.cli.monitor.decider import HIGHEST, Given, assumptions, guard_of_monitor
 from evofsm.cli.options import BRAKES
 from evofsm.cli.show import warn
@@ -219,7 +220,7 @@ def record_log(
             raise ValueError(f"{path}: nobody follows anybody for {_FEWEST_ROWS} rows")
         if guard.machine is not None:
             log.attach(guard.machine.model(names=VARIABLES))
-    for warning in noted.warnings("time" if columns is None else columns.time):
+    for warning in warnings_of(noted, "time" if columns is None else columns.time):
         warn(f"warning: {warning}")
     if judge == "kinematic":
         warn(assumptions(brakes, tolerance))
