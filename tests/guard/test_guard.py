@@ -19,6 +19,7 @@ from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Search
 from evofsm.guard.guard import KIND
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.reviser import Mode
+from evofsm.guard.scene import SceneRisk
 
 DT = 0.1
 PUSHES = (-4.0, -1.0, 0.0, 1.0, 4.0)
@@ -514,6 +515,40 @@ def test_a_decision_takes_no_snapshot_of_the_machine(monkeypatch):
     for z in np.random.default_rng(0).normal(size=(20, 2)):
         guard.decide(z, 0.5)
     assert guard.situation.seen > 0.0
+
+
+@pytest.mark.parametrize(
+    ("guard", "row", "says"),
+    [
+        (Guard(low=-1.0, high=1.0, interval=DT), [0.1, 0.2], "failure: 2 failures seen"),
+        (
+            Guard(n_actions=3, interval=DT, judge=SceneRisk(DT, 3)),
+            [1.0] * 5,
+            "failure: no failure with an object in sight is known",
+        ),
+        (guard_for_cars(-2.5, 2.5, DT), [9.0, 5.0, 5.0], "own brakes: not known yet"),
+        (continuous(), [0.1, 0.2], "judge: Balance (ActionReviser, tolerance 0.02, mode act)"),
+    ],
+)
+def test_a_guard_in_print_says_what_it_learnt_from(guard, row, says):
+    guard = guard.copy()
+    for failed in (False, True, True):
+        guard.decide(row, 0)
+        guard.end(failed=failed)
+    guard.save(file := io.BytesIO())
+    again = Guard.load(io.BytesIO(file.getvalue()), judge=type(guard.judge))
+    assert str(guard) == str(again) == str(guard.copy())
+    assert says in str(guard)
+    assert "episodes: 3, failures: 2, states: 1, frozen: no" in str(guard)
+    guard.freeze()
+    guard.end(failed=True)
+    assert "failures: 2, states: 1, frozen: yes" in str(guard)
+
+
+def test_a_failure_function_that_is_none_is_refused():
+    for failed in ("failed", True):
+        with pytest.raises(TypeError, match=r"failed is .*; it must be a function"):
+            continuous(failed=failed)
 
 
 def test_threads_share_a_guard_and_what_is_saved_meanwhile_loads(tmp_path):

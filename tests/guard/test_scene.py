@@ -100,7 +100,7 @@ def test_before_the_first_failure_all_is_kept_and_it_says_why():
     said, failed = world.play(world.guard(), 0)
     assert not failed
     assert all(same_action(one.executed, one.proposed) for one in said)
-    assert all("no failure is known yet" in one.reason for one in said)
+    assert all("no failure with an object in sight is known yet" in one.reason for one in said)
 
 
 def test_what_is_harmless_is_kept_and_what_is_changed_is_changed_for_a_reason(taught):

@@ -272,18 +272,11 @@ def _summary(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
 
 def _learnt(guard: Guard) -> str:
     from evofsm.driving import LatentRisk, assess_states, learners_of
-    from evofsm.guard import LearntRisk
 
     machine, judge = learners_of(guard)
     states = f"{machine.n_states} states"
-    if isinstance(judge, LearntRisk):
-        return f"{states}; {judge.told_by_experience}"
-    if not isinstance(judge, LatentRisk):
-        return states
-    ends = sum(one.is_dead_end for one in assess_states(machine, judge))
-    brakes = judge.brakes
-    own = f"{brakes.decel:.1f} m/s²" if brakes.known else "not known yet"
-    return (
-        f"{states}, {ends} of them dead ends; {len(judge.manoeuvres)} manoeuvres of leaders, "
-        f"1 % brake harder than {judge.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {own}"
-    )
+    if isinstance(judge, LatentRisk):
+        ends = sum(one.is_dead_end for one in assess_states(machine, judge))
+        states += f", {ends} of them dead ends"
+    told = getattr(judge, "told_by_experience", "")
+    return f"{states}; {told}" if told else states

@@ -256,6 +256,15 @@ class LatentRisk:
         """What the latest command brings until the next decision, most likely [m/s²]."""
         return self.brakes.expected(*self._commands)
 
+    @property
+    def told_by_experience(self) -> str:
+        """What was learnt so far, in words."""
+        own = f"{self.brakes.decel:.1f} m/s²" if self.brakes.known else "not known yet"
+        return (
+            f"{len(self.manoeuvres)} manoeuvres of leaders, 1 % brake harder than "
+            f"{self.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {own}"
+        )
+
     # -- Judging --------------------------------------------------------------------------------
 
     def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:

@@ -42,7 +42,7 @@ from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.parts import outline, part_class, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.warming import warm_judge, warm_machine
-from evofsm.store import SIZE, Kind, Numbers, Place
+from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
 
 # Intervals that a range of actions is divided into for the machine.
 _INTERVALS = 17
@@ -104,7 +104,7 @@ class DecisionLogger(Protocol):
 
 
 # Settings that stand in a file as they are.
-_PLAIN = ("explaining", "interval", "learn")
+_PLAIN = ("explaining", "interval", "learn", "n_episodes", "n_failed")
 # What a judge has that learns.
 _LEARNS = ("dt", "learn", "watch", "follow", "start_episode", "end", "sums", "save", "load")
 # The files of the machine and of the judge, as bytes.
@@ -113,6 +113,7 @@ KIND = Kind(
     {name: Numbers((name,), dtype=np.uint8) for name in ("machine", "judge")},
     {
         **dict.fromkeys(("explaining", "failed", "learn"), bool),
+        **dict.fromkeys(("n_episodes", "n_failed"), COUNT),
         "interval": SIZE,
         "missing": str,
         "judge": str | None,
@@ -190,6 +191,11 @@ class Guard:
     >>> revision.executed, revision.risk_proposed, guard.machine.n_states
     (-2.5, 1.0, 1)
     >>> guard.end(failed=False, observation=[8.7, 20.0, 19.5])
+    >>> print(guard)
+    Guard of actions from -2.5 to 2.5, each 0.25 s
+    judge: LatentRisk (ActionReviser, tolerance 0.02, mode act)
+    episodes: 1, failures: 0, states: 1, frozen: no
+    failure: 0 manoeuvres of leaders, 1 % brake harder than 10.0 m/s²; own brakes: not known yet
     """
 
     def __init__(
@@ -277,7 +283,14 @@ class Guard:
         audit: DecisionLogger | None = None,
         explaining: bool = False,
         missing: Missing = Missing.PARTIAL,
+        n_episodes: int = 0,
+        n_failed: int = 0,
     ) -> None:
+        if failed is not None and not callable(failed):
+            raise TypeError(
+                f"failed is {failed!r}; it must be a function of an observation, such as "
+                "failed=lambda z: z[0] <= 0"
+            )
         self._lock = share(self)
         self.actions = reviser.actions
         self.interval = positive("interval", interval)
@@ -325,6 +338,8 @@ class Guard:
             actions=self.actions if isinstance(self.actions, IntervalActions) else None,
             dt=interval,
         )
+        #: Episodes that it learnt from, and those of them that failed.
+        self.n_episodes, self.n_failed = n_episodes, n_failed
         self._frozen: FSMModel | None = None
         self._monitor = InputMonitor(missing, interval)
         self._latest: Situation | None = None
@@ -599,8 +614,34 @@ class Guard:
             else:
                 self.judge.start_episode(learn=False)
         self._under_way = False
+        if self._learn:
+            self.n_episodes += 1
+            self.n_failed += bool(failed)
         if self.audit is not None:
             self.audit.ended(z, failed=failed)
+
+    @alone
+    def __str__(self) -> str:
+        """Its judge, what it learnt from, and what it knows of failure, a line each."""
+        judge, actions = getattr(self.reviser, "risk", self.judge), self.actions
+        span = (
+            f"{actions.n_actions} actions"
+            if isinstance(actions, Choices)
+            else f"actions from {actions.low} to {actions.high}"
+        )
+        how = type(self.reviser).__name__
+        if isinstance(self.reviser, ActionReviser):
+            how += f", tolerance {self.reviser.tolerance:g}, mode {self.reviser.mode.value}"
+        lines = [
+            f"{type(self).__name__} of {span}, each {self.interval:g} s",
+            f"judge: {'none' if judge is None else type(judge).__name__} ({how})",
+            f"episodes: {self.n_episodes}, failures: {self.n_failed}, states: "
+            f"{0 if self.machine is None else self.machine.n_states}, "
+            f"frozen: {'no' if self._learn else 'yes'}",
+        ]
+        if known := getattr(judge, "told_by_experience", ""):
+            lines.append(f"failure: {known}")
+        return "\n".join(lines)
 
     # What another process gets has a lock of its own.
     @alone
@@ -628,7 +669,7 @@ class Guard:
             (self.reviser, self.judge),
             {} if self.machine is None else {id(self.machine): machine},
         )
-        names = ("interval", "learn", "failed", "explaining", "missing")
+        names = (*_PLAIN, "failed", "missing")
         settings = {name: getattr(self, name) for name in names}
         return type(self).of(reviser, judge=judge, machine=machine if states else None, **settings)
 

@@ -127,7 +127,7 @@ class SceneRisk(ActionJudge):
     >>> guard = Guard(n_actions=5, interval=1.0, judge=judge)
     >>> ego, car = [1.0, 0.0, 4.0, 25.0, 0.0], [1.0, 30.0, 0.0, -5.0, 0.0]
     >>> guard.decide(ego + car, proposal=3).reason
-    'no failure is known yet, so nothing is refused'
+    'no failure with an object in sight is known yet, so nothing is refused'
     """
 
     _seen: list[Seen]
@@ -207,13 +207,18 @@ class SceneRisk(ActionJudge):
         ahead, risk = _STEPS * self.dt, 100.0 * judged.risk[0]
         return f"whatever follows, an object is met within {ahead:g} s: {risk:.2g} %"
 
+    @property
+    def told_by_experience(self) -> str:
+        """What was learnt so far, in words."""
+        if self.memory.contact is None:
+            return "no failure with an object in sight is known yet, so nothing is refused"
+        return f"how close is too close was learnt of {self.memory.failures} failures"
+
     def _foreseen(self, situation: Situation) -> Foreseen | str:
         """What each action brings, or why nothing can be said."""
         seen = self._read(situation.observation)
-        if self.memory.contact is None and (known := self.memory.failures):
-            return f"no object was seen in any of the failures ({known}), so nothing is refused"
         if self.memory.contact is None:
-            return "no failure is known yet, so nothing is refused"
+            return self.told_by_experience
         if not np.isfinite(seen.own).all():
             return "own row is not seen"
         return self.memory.foresee(seen)

@@ -91,7 +91,7 @@ def test_failures_that_no_threshold_explains_are_not_denied():
             reason = guard.decide(z, proposal=0.5).reason
         guard.end(failed=k > 12)
     assert guard.judge.n_failed == 17
-    assert reason.startswith("16 failures seen, but at values of each variable that were survived")
+    assert reason.startswith("16 failures seen, but beyond no value that was survived")
     assert guard.judge.told_by_experience.startswith("17 failures seen")
 
 

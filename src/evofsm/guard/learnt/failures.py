@@ -36,7 +36,7 @@ def explain_failures(
     blurs them; 0 where a variable saturates.
     """
     m = len(unit)
-    if not len(failures):
+    if not len(failures) or not np.isfinite(lowest).all():  # or nothing was survived yet
         return []
     ends = np.concatenate([lowest, highest])
     far = np.hstack([lowest - failures, failures - highest])

@@ -98,7 +98,7 @@ def no_threshold(n_failed: int, *, is_given: bool) -> str:
     if not n_failed:
         return NO_FAILURE
     seen = "1 failure" if n_failed == 1 else f"{n_failed:,} failures"
-    return f"{seen} seen, but at values of each variable that were survived: nothing is refused"
+    return f"{seen} seen, but beyond no value that was survived, so nothing is refused"
 
 
 def experience(
