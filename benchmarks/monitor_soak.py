@@ -22,9 +22,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from evofsm.cli.monitor.decider import EPISODE, Answer, Decider, guard_of_monitor
+from evofsm.cli.monitor.decider import EPISODE, Answer, Decider
 from evofsm.cli.monitor.messages import Row
 from evofsm.cli.monitor.state import State
+from evofsm.driving.assumed import guard_of_monitor
 from evofsm.guard import Guard
 from monitor_rows import JUNK, line, traffic
 
@@ -162,7 +163,7 @@ def soak(hours: float, seed: int = 0, learn: bool = False, episode: int = EPISOD
 
 def is_next(place: Place, row: dict[str, float]) -> bool:
     """Whether the row was taken in already, before a restart: the one before it is late then."""
-    latest = place.decider._before
+    latest = place.decider.latest
     return isinstance(latest, Row) and latest.time == row["time"]
 
 

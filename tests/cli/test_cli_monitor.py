@@ -16,7 +16,8 @@ pytest.importorskip("rich")
 from typer.testing import CliRunner
 
 from evofsm.cli.app import application
-from evofsm.cli.monitor.decider import Decider, guard_of_monitor
+from evofsm.cli.monitor.decider import Decider
+from evofsm.driving.assumed import guard_of_monitor
 from evofsm.guard import audit
 from monitor_rows import JUNK, closing_in, line, traffic
 
@@ -99,9 +100,52 @@ def test_the_audit_log_is_good(tmp_path):
     assert (found.is_good, found.replayed) == (True, 65)
 
 
+def numbers_of(text):
+    """The cells of each line that begins with a number."""
+    cells = [one.split() for one in text.splitlines()]
+    return [one for one in cells if one and one[0].replace(".", "").isdecimal()]
+
+
+def test_a_summary_says_how_often_it_alarms_by_tolerance_and_where_it_is_worst(tmp_path):
+    rows = [*traffic(1200), *(one | {"gap": one["gap"] + 60.0} for one in traffic(300))]
+    log, lines = tmp_path / "own.csv", tmp_path / "rows.jsonl"
+    told_rows = [",".join(map(str, (int(k >= 1200), *row.values()))) for k, row in enumerate(rows)]
+    log.write_text("\n".join(["trip,t,dist,own,lead,acc", *told_rows, ""]))
+    lines.write_bytes(b"junk\n" + b"\n".join([*map(line, rows[:1199]), b'{"end": true}']))
+    decider = Decider(guard_of_monitor(0.1, 5.0, 0.05))
+    decider.guard.learn = False
+    risks = [decider.answer(line(row))["risk_proposed"] for row in rows[:1199]]
+    columns = ("--observe", "dist,own,lead", "--action", "acc", "--time", "t", "--episode", "trip")
+    made = ("--summary", "--brakes", 5, "--tolerance", 0.05)
+    result = evofsm(log, *made, *columns)
+    assert result.exit_code == 0, result.stderr
+    assert "assumed: the own car brakes with 5 m/s²" in result.stderr
+    assert "1,498 in 2 episodes, 0.0416 h" in result.stdout
+    found = numbers_of(result.stdout)
+    by_tolerance, worst = found[:6], found[6:]
+    for tolerance, alarms, hourly, share in by_tolerance:
+        above = [risk > float(tolerance) for risk in risks]
+        begun = sum(now and not before for before, now in zip([False, *above], above, strict=False))
+        assert (int(alarms), share) == (begun, f"{sum(above) / 1498:.2%}")
+        assert float(hourly) == pytest.approx(begun * 3600.0 / 149.8, abs=0.06)
+    assert 0 < len(worst) <= 10
+    assert worst[0][-2] == f"{max(risks):.1%}"
+    assert float(worst[0][1]) == rows[risks.index(max(risks))]["time"]
+    by_lines = evofsm(lines, *made)
+    assert "refused  1 messages, the first because line: is no JSON" in by_lines.stdout
+    assert [one[1] for one in numbers_of(by_lines.stdout)[:6]] == [one[1] for one in by_tolerance]
+    guard = tmp_path / "guard.evofsm"
+    decider.guard.save(guard)
+    by_guard = evofsm(log, "--summary", "--guard", guard, *columns)
+    assert numbers_of(by_guard.stdout)[:6] == by_tolerance
+    assert f"what {guard} was given and has learnt; alarm above a risk of 0.05" in by_guard.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (("--summary",), "--summary needs FILE"),
+        (("--episode", "trip"), "must be a number of rows, or columns of a log"),
         (("--mode", "drive"), "'drive' is not one of 'off', 'shadow', 'advise', 'act'"),
         (("--udp", 0, "--socket", "x"), "give one of FILE, --socket, --udp and --zenoh"),
         (("--guard", "nowhere"), "nowhere: no such file or directory"),

@@ -5,13 +5,14 @@ import math
 
 import pytest
 
-from evofsm.cli.monitor.decider import Decider, guard_of_monitor
+from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.recorded import Recording, record_log
 from evofsm.cli.watch.session import Session, learn_first, watched_guard
 from evofsm.cli.watch.shown import Chronicle, Judged
 from evofsm.cli.watch.words import tell
 from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
+from evofsm.driving.assumed import guard_of_monitor
 from evofsm.fsm.observations import ObservationEncoder
 from evofsm.guard import Mode
 from evofsm.io import LogColumns, read_run, recording

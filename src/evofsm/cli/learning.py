@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from evofsm import store
 from evofsm.cli.journal import differences
-from evofsm.cli.monitor.decider import guard_of_monitor
+from evofsm.driving.assumed import guard_of_monitor
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM

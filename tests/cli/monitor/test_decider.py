@@ -2,8 +2,9 @@ import json
 
 import pytest
 
-from evofsm.cli.monitor.decider import Decider, guard_of_monitor, guard_of_traffic
+from evofsm.cli.monitor.decider import Decider
 from evofsm.driving import AlwaysBrake, guard_for_cars
+from evofsm.driving.assumed import guard_of_monitor, guard_of_traffic
 from evofsm.guard import AuditLog, Guard, Mode
 from monitor_rows import closing_in as rows
 from monitor_rows import line

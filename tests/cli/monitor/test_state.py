@@ -1,7 +1,8 @@
 import pytest
 
-from evofsm.cli.monitor.decider import Decider, guard_of_monitor
+from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.state import State
+from evofsm.driving.assumed import guard_of_monitor
 from evofsm.guard import Guard, Mode
 from evofsm.store import read_header
 from monitor_rows import JUNK, line, scenes, traffic

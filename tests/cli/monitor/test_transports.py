@@ -14,7 +14,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from evofsm.cli.monitor.decider import Decider, guard_of_monitor
+from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.messages import LONGEST
 from evofsm.cli.monitor.transports import (
     Server,
@@ -23,6 +23,7 @@ from evofsm.cli.monitor.transports import (
     UdpTransport,
     ZenohTransport,
 )
+from evofsm.driving.assumed import guard_of_monitor
 from monitor_rows import JUNK, closing_in, line
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="sockets and signals of POSIX")

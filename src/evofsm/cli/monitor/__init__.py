@@ -4,21 +4,46 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
 from contextlib import ExitStack
 from hashlib import sha256
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from evofsm.cli.options import BRAKES, TOLERANCE, ModeName, argument, option, require
-from evofsm.cli.show import warn
+from evofsm.cli.options import (
+    BRAKES,
+    TOLERANCE,
+    ActionColumn,
+    Failed,
+    Lengths,
+    ModeName,
+    NoLeader,
+    Step,
+    TimeColumn,
+    TopicsFile,
+    Units,
+    argument,
+    lengths_given,
+    log_columns,
+    option,
+    require,
+)
+from evofsm.cli.show import show, warn
 
 if TYPE_CHECKING:
     from evofsm.cli.monitor.transports import Transport
     from evofsm.guard import Guard
+    from evofsm.io import Chunk, LogColumns
+
+# What other files end with is read as JSON lines.
+_LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
 
 
 def monitor(
-    file: Annotated[Path | None, argument("JSON lines. [default: standard input]")] = None,
+    file: Annotated[
+        Path | None, argument("JSON lines; with --summary a log too. [default: standard input]")
+    ] = None,
     guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
     interval: Annotated[float, option("Time between two rows [s], without --guard.")] = 0.1,
     brakes: Annotated[
@@ -44,8 +69,12 @@ def monitor(
     ] = None,
     audit: Annotated[Path | None, option("Write an audit log to this file.")] = None,
     episode: Annotated[
-        int, option("Rows of an episode at most: it learns and saves after each.", min=1)
-    ] = 6000,
+        str | None,
+        option(
+            "Rows of an episode at most: it learns and saves after each. Of a log columns, as in "
+            "evofsm learn. [default: 6000]"
+        ),
+    ] = None,
     socket: Annotated[Path | None, option("Listen to a UNIX socket.")] = None,
     udp: Annotated[
         int | None, option("Listen to this port on 127.0.0.1; 0 for any.", min=0, max=65535)
@@ -57,6 +86,24 @@ def monitor(
         float | None, option("Say that it is there where so long nothing came [s].")
     ] = None,
     warm: Annotated[bool, option("Compile before the first row comes.", "--warm")] = False,
+    summary: Annotated[
+        bool,
+        option(
+            "Print alarms per hour, their share of the time, and the worst moments.", "--summary"
+        ),
+    ] = False,
+    observe: Annotated[
+        str | None,
+        option("Columns of a log to observe. [default: the variables of the guard]", "--observe"),
+    ] = None,
+    action: ActionColumn = "a_follower",
+    time: TimeColumn = "time",
+    dt: Step = None,
+    failed: Failed = None,
+    unit: Units = None,
+    topics: TopicsFile = None,
+    no_leader: NoLeader = None,
+    vehicle_length: Lengths = None,
 ) -> int | None:
     """Decide beside a stack of your own: rows in, decisions out, a JSON line each.
 
@@ -67,6 +114,9 @@ def monitor(
     Rows come from standard input, a file, a socket, UDP or Zenoh. Nothing is learnt without
     --learn, and nothing is changed without --mode act. Ctrl-C or SIGTERM ends it, with everything
     saved.
+
+    With --summary it reads FILE, such lines or a log as evofsm learn reads it (by the options from
+    --observe to --vehicle-length), and prints how often it would have alarmed, by tolerance.
     """
     if sum(one is not None for one in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
@@ -74,15 +124,16 @@ def monitor(
         raise ValueError(
             "--traffic learns nothing: it goes with none of --guard, --state and --learn"
         )
+    if summary and (file is None or any((state, audit, heartbeat, warm))):
+        raise ValueError(
+            "--summary needs FILE, and goes with none of --state, --audit, --heartbeat and --warm"
+        )
     require(**({} if zenoh is None else {"zenoh": "zenoh"}))
-    from evofsm.cli.monitor.decider import (
-        Decider,
-        assumptions,
-        guard_of_monitor,
-        guard_of_traffic,
-    )
+    from evofsm.cli.monitor.decider import EPISODE, Decider
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.transports import Server
+    from evofsm.driving.assumed import assumptions, guard_of_monitor, guard_of_traffic
+    from evofsm.driving.naming import VARIABLES
     from evofsm.fsm.validation import positive
     from evofsm.guard import Guard
 
@@ -95,20 +146,45 @@ def monitor(
             return Guard.load(guard)
         return (guard_of_traffic if traffic else guard_of_monitor)(interval, reckoned, tolerated)
 
+    is_log = file is not None and (file.suffix in _LOGS or file.is_dir())
+    if is_log and not summary:
+        warn(f"warning: {file} is read as JSON lines; of a log, --summary says where it alarms")
+    elif episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
+        raise ValueError(
+            f"--episode is {episode!r}; it must be a number of rows, or columns of a log"
+        )
+    rows = EPISODE if episode is None or is_log else int(episode)
     with ExitStack() as stack:
+        if summary and file is not None:
+            from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
+
+            if is_log:
+                names = observe or ",".join(Guard.load(guard).variables if guard else VARIABLES)
+                columns = log_columns(names, action, time, episode, dt, failed, unit, no_leader)
+                chunks, interval = _episodes(file, columns, vehicle_length, topics)
+            used = fresh()
+            _prepare(used, mode, tolerance, None, stack, learn=learn)
+            warn(_of_saved(guard, used) if guard else assumptions(reckoned, tolerated))
+            decider = Decider(used, episode=rows)
+            if is_log:
+                answers = decided_on_log(decider, chunks)
+            else:
+                answers = decided_on_lines(decider, stack.enter_context(file.open("rb")))
+            show(*summary_of(decider, answers, str(file)))
+            return None
         saved = None
         if state is not None:
             is_other = guard is not None and guard.resolve() != state.resolve()
             given = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
             made = {"interval": interval, "brakes": reckoned} if guard is None else {}
-            told = {"mode": mode, "learn": learn, "episode": episode, "tolerance": tolerance}
+            told = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
             saved = State(state, {"guard": given, **made, **told})
             stack.callback(saved.close)
         elif learn:
             warn("nothing of what is learnt is saved; --state FILE saves it")
         used = fresh() if saved is None else saved.guard(fresh)
         _prepare(used, mode, tolerance, audit, stack, learn=learn)
-        decider = Decider(used, episode=episode)
+        decider = Decider(used, episode=rows)
         if warm:
             _compile(used, scenes=decider.form.scenes)
         if saved is not None:
@@ -130,6 +206,30 @@ def monitor(
             if saved is None and decider.rows:
                 decider.end()
     return None
+
+
+def _episodes(
+    file: Path, columns: LogColumns, lengths: list[str] | None, topics: Path | None
+) -> tuple[Iterator[Chunk], float]:
+    """The episodes of a log, and the time between two rows [s]."""
+    from evofsm.cli.learning import warnings_of
+    from evofsm.io import Topics, episodes_of, read_traces
+    from evofsm.io.logs import Noted
+
+    noted, known = Noted(), None if topics is None else Topics.load(topics)
+    chunks = read_traces(
+        [str(file)], columns, lengths_given(lengths or ()), noted=noted, topics=known
+    )
+    episodes = (one for one in episodes_of(chunks) if len(one.times) > 1)
+    if (first := next(episodes, None)) is None:
+        raise ValueError(f"{file}: no episode has two rows")
+
+    def all_of_them() -> Iterator[Chunk]:
+        yield from chain([first], episodes)
+        for warning in warnings_of(noted, columns.time):
+            warn(f"warning: {warning}")
+
+    return all_of_them(), first.dt
 
 
 def _prepare(

@@ -14,14 +14,10 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike
 
 from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
 from evofsm.cli.show import plain
-from evofsm.driving import REAL_DRIVES, LatentRisk, TrafficRisk, guard_for_cars, guard_for_traffic
-from evofsm.fsm.validation import positive
 from evofsm.guard import (
-    TOLERANCE,
     ActionReviser,
     BoxActions,
     Guard,
@@ -39,16 +35,8 @@ EPISODE = 6000
 _RECENT = 256
 # What is older by less is late; what is older by more comes from a sender that began anew [s].
 _LATE = 1.0
-# A gap in time, and rows that come too often, in intervals.
-_HOLE, _OFTEN = 1.5, 0.5
-#: The strongest acceleration that may be proposed where no guard is given [m/s²].
-HIGHEST = 2.5
-# As hard a leader brakes in full [m/s²].
-_FULL = 10.0
-#: Leaders' brakes where no guard is given. Nobody brakes in an emergency in public drives, which
-#: does not say that nobody does: with the one that a judge assumes anyway one in 20 is in full.
-LEADERS = REAL_DRIVES._replace(counts=(*REAL_DRIVES.counts, *(0,) * 14, 4))
-
+#: A gap in time, and rows that come too often, in intervals.
+HOLE, _OFTEN = 1.5, 0.5
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
 
 Answer = dict[str, Any]
@@ -97,8 +85,8 @@ class Decider:
             self._next = self._sent_before(told)
             if self._next is not None:
                 return self._recent[self._next][1]
-            if isinstance(told, Row) and isinstance(self._before, Row):
-                _refuse_stale(told, self._before)
+            if isinstance(told, Row) and isinstance(self.latest, Row):
+                _refuse_stale(told, self.latest)
         except MessageError as refused:
             return self.error(refused.about, str(refused), refused.time)
         try:
@@ -114,7 +102,7 @@ class Decider:
         Who plays a recording once more begins with its first row, or does what was done before
         after the same: that is no repetition.
         """
-        recent, latest = self._recent, self._before
+        recent, latest = self._recent, self.latest
         following = len(recent) if self._next is None else self._next + 1
         if following < len(recent) and recent[following][0] == told:
             return following
@@ -136,7 +124,7 @@ class Decider:
 
     def heartbeat(self, silent: float) -> Answer:
         """What is said where nothing came for so long [s]."""
-        time = self._before.time if isinstance(self._before, Row) else None
+        time = self.latest.time if isinstance(self.latest, Row) else None
         return self._of(
             "heartbeat", time=time, silent=silent, refused=self.refused, mode=self.mode.value
         )
@@ -149,7 +137,7 @@ class Decider:
     def act(self, told: Message) -> Answer:
         """Take in what was accepted, and answer it."""
         if isinstance(told, End):
-            if self.rows or (told.failed and not isinstance(self._before, End)):
+            if self.rows or (told.failed and not isinstance(self.latest, End)):
                 self.end(told.failed, _numbers(told.observation))
             answer = self._of("end", failed=told.failed)
         else:
@@ -160,7 +148,8 @@ class Decider:
         return answer
 
     @property
-    def _before(self) -> Message | None:
+    def latest(self) -> Message | None:
+        """What was accepted latest."""
         return self._recent[-1][0] if self._recent else None
 
     def end(self, failed: bool = False, observation: Any = None) -> None:
@@ -215,7 +204,7 @@ class Decider:
 
     def _notes(self, row: Row) -> list[str]:
         """What is odd about when a row comes, and what it follows; may end the episode."""
-        latest, interval = self._before, self.guard.interval
+        latest, interval = self.latest, self.guard.interval
         if not isinstance(latest, Row) or not self.rows:
             return []
         step = row.time - latest.time
@@ -225,7 +214,7 @@ class Decider:
         if row.ahead != latest.ahead:
             self._end_unasked()
             return ["another one is ahead: a new episode"] if row.observation else []
-        if step > _HOLE * interval:
+        if step > HOLE * interval:
             return [f"{step:.3g} s without a row: nothing is learnt or carried across"]
         if step < _OFTEN * interval and not self._said_often:
             self._said_often = True
@@ -294,59 +283,3 @@ def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None
     if observation is None:
         return None
     return [math.nan if value is None else value for value in observation]
-
-
-# -- Where no guard is given ----------------------------------------------------------------------
-
-
-def guard_of_monitor(
-    interval: float,
-    brakes: float,
-    tolerance: float = TOLERANCE,
-    given: type[LatentRisk] = LatentRisk,
-) -> Guard:
-    """A guard of car following that is given how hard its car brakes, in shadow mode."""
-    judge = _ahead(interval, brakes, given)
-    settings: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW}
-    return guard_for_cars(-brakes, HIGHEST, interval, judge=judge, **settings)
-
-
-def guard_of_traffic(interval: float, brakes: float, tolerance: float = TOLERANCE) -> Guard:
-    """The same among any number of objects, who is behind included; it learns nothing."""
-    judge = TrafficRisk(_ahead(interval, brakes), -brakes, HIGHEST)
-    settings: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW}
-    return guard_for_traffic(-brakes, HIGHEST, brakes, interval, judge=judge, **settings)
-
-
-def assumptions(brakes: float, tolerance: float) -> str:
-    """What such a guard reckons with, in a line."""
-    share = (1 + LEADERS.counts[-1]) / (1 + sum(LEADERS.counts))
-    return (
-        f"assumed: the own car brakes with {brakes:g} m/s² (--brakes), {share:.0%} of leaders' "
-        f"hard brakes are in full ({_FULL:g} m/s²), the others as in public drives; "
-        f"alarm above a risk of {tolerance:.3g} (--tolerance)"
-    )
-
-
-class Given(LatentRisk):
-    """Keeps to what it was given, whatever it sees, while a machine learns."""
-
-    def learn(
-        self,
-        observation: ArrayLike,
-        acceleration: float,
-        belief: ArrayLike = (1.0,),
-        *,
-        watched: bool = False,
-    ) -> None:
-        """Only follow."""
-        self.follow(observation, acceleration)
-
-    def start_episode(self, *, learn: bool = True) -> None:
-        """Learn nothing."""
-        super().start_episode(learn=False)
-
-
-def _ahead(interval: float, brakes: float, given: type[LatentRisk] = LatentRisk) -> LatentRisk:
-    braking, step = positive("brakes", brakes), positive("interval", interval)
-    return given.given(-braking, braking, _FULL, step, leaders=LEADERS)

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.cli.learning import warnings_of
-from evofsm.cli.monitor.decider import HIGHEST, Given, assumptions, guard_of_monitor
 from evofsm.cli.options import BRAKES
 from evofsm.cli.show import warn
 from evofsm.cli.watch.shown import (
@@ -26,6 +25,7 @@ from evofsm.cli.watch.shown import (
     most_believed,
 )
 from evofsm.driving import guard_for_cars
+from evofsm.driving.assumed import HIGHEST, Given, assumptions, guard_of_monitor
 from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.driving.naming import VARIABLES
 from evofsm.driving.trials import shadow_drive

@@ -1,0 +1,105 @@
+"""What a monitor says of all that was recorded: alarms by tolerance, and what was worst."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from evofsm.cli.monitor.decider import HOLE, Answer, Decider
+from evofsm.cli.monitor.messages import End, Row
+from evofsm.cli.show import facts, table
+from evofsm.io.logs import Chunk
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from rich.console import RenderableType
+
+# Beside the guard's own.
+_TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+# So many moments and variables are shown; without an alarm a moment lasts so long [s].
+_WORST, _SHOWN, _MOMENT = 10, 4, 5.0
+
+Answers = Iterable[tuple[Answer, Row | None]]
+
+
+def decided_on_log(decider: Decider, episodes: Iterable[Chunk]) -> Answers:
+    """The answers to the rows of a log; with the last row of an episode it ends."""
+    for episode in episodes:
+        *seen, last = (
+            tuple(None if math.isnan(value) else value for value in row)
+            for row in episode.observations.tolist()
+        )
+        for here, wanted, time in zip(seen, episode.actions.tolist(), episode.times, strict=False):
+            row = Row(float(time), here, None if math.isnan(wanted) else wanted)
+            yield decider.act(row), row
+        failed = episode.failures is not None and len(episode.failures) > 0
+        decider.act(End(failed, last))
+
+
+def decided_on_lines(decider: Decider, lines: Iterable[bytes]) -> Answers:
+    """The answers to messages; of those that are refused, the error."""
+    for line in lines:
+        answer = decider.answer(line.rstrip(b"\r\n"))
+        yield answer, decider.latest if isinstance(decider.latest, Row) else None
+
+
+def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[RenderableType]:
+    """Tables of what was decided; a ValueError if nothing was."""
+    rows: list[Row] = []
+    numbers, refused = [], []
+    for answer, row in answers:
+        if answer["kind"] == "decision" and row is not None:
+            rows.append(row)
+            risk, begins = answer["risk_proposed"] or 0.0, decider.rows == 1 or len(rows) == 1
+            numbers.append((row.time, risk, answer["alarm"], begins))
+        elif answer["kind"] == "error":
+            refused.append(f"{answer['about']}: {answer['error']}")
+    if not rows:
+        raise ValueError(f"{title}: nothing was decided ({'; '.join(refused[:1]) or 'no rows'})")
+    times, risks, alarms, begins = np.array(numbers, np.float64).T
+    steps, interval = np.diff(times, prepend=math.nan), decider.guard.interval
+    follows = (begins == 0.0) & (steps > 0.0) & (steps <= HOLE * interval)
+    lasted = np.where(follows, steps, interval)
+
+    def counted(above: NDArray[np.bool_]) -> tuple[str, str, str]:
+        count = (above & ~(np.roll(above, 1) & follows)).sum()
+        hourly = count * 3600.0 / lasted.sum()
+        return f"{count:,}", f"{hourly:,.1f}", f"{above @ lasted / lasted.sum():.2%}"
+
+    count, hourly, share = counted(alarms > 0.0)
+    told = f"{len(rows):,} in {begins.sum():,.0f} episodes, {lasted.sum() / 3600.0:.3g} h"
+    pairs = [("rows", told), ("alarms", f"{count}, or {hourly} an hour, {share} of the time")]
+    if refused:
+        pairs.append(("refused", f"{len(refused):,} messages, the first because {refused[0]}"))
+    yield facts(title, pairs)
+    own = getattr(decider.guard.reviser, "tolerance", None)
+    known = sorted({*_TOLERANCES, *([] if own is None else [own])})
+    lines = [(f"{t:g}", *counted(alarms > 0.0 if t == own else risks > t)) for t in known]
+    bold = [place for place, tolerance in enumerate(known) if tolerance == own]
+    yield table(
+        "\nBy tolerance", ("tolerance", "alarms", "an hour", "of the time"), lines, bold=bold
+    )
+    # A moment lasts while an alarm does; the highest risk within it stands for it.
+    calm = (alarms == 0.0) & (np.diff(times // _MOMENT, prepend=0.0) != 0.0)
+    moments = np.cumsum(~follows | calm | (np.diff(alarms, prepend=0.0) != 0.0))
+    order = np.lexsort((-risks, moments))
+    highest = order[np.unique(moments[order], return_index=True)[1]]
+    long = np.bincount(moments, lasted * alarms)[moments[highest]]
+    ranked = np.lexsort((-long, -risks[highest]))[:_WORST]
+    names = decider.form.variables or [f"{k + 1}" for k in range(len(rows[0].observation or ()))]
+    names = () if decider.form.scenes else names[:_SHOWN]
+    episodes, worst = np.cumsum(begins), []
+    for at, seconds in zip(highest[ranked].tolist(), long[ranked], strict=True):
+        if risks[at] or alarms[at]:
+            seen = [_shown(value) for value in (rows[at].observation or ())[: len(names)]]
+            where = (f"{episodes[at]:.0f}", f"{times[at]:.10g}", *seen, _shown(rows[at].proposal))
+            worst.append((*where, f"{risks[at]:.1%}", f"{seconds:.1f}"))
+    header = ("episode", "time", *names, "proposed", "risk", "alarm lasts [s]")
+    yield table("\nThe worst moments", header, worst)
+
+
+def _shown(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float | int) else "" if value is None else str(value)
