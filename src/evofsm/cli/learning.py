@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm import store
-from evofsm.cli.journal import differences
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.divergence import jensen_shannon
@@ -30,6 +29,7 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.step import Trace
 from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
+from evofsm.guard.journal import differences
 from evofsm.io import Chunk, episodes_of
 from evofsm.io.logs import Noted
 from evofsm.io.tables import SI, TIMES, UNITS
