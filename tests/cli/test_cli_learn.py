@@ -300,6 +300,49 @@ def test_another_rule_is_told_by_its_name(evofsm, crashes, tmp_path, options, ru
     assert FSMModel.load(tmp_path / "model").rule == rule
 
 
+RULE = """
+from dataclasses import dataclass
+from evofsm import Novelty, register_rule
+
+@dataclass(frozen=True)
+class Coarse(Novelty):
+    radius: float = 3.0
+
+register_rule("coarse", Coarse)
+"""
+
+
+def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
+    evofsm, refused, crashes, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "coarse_rule.py").write_text(RULE)
+    said = "'coarse'; it must be one of paper, edges, novelty"
+    assert said in refused("learn", crashes, "--rule", "coarse")
+    monkeypatch.setattr(
+        "evofsm.fsm.rules._RULES", {"paper": Paper, "edges": Edges, "novelty": Novelty}
+    )
+    for name in ("coarse_rule:Coarse", "coarse"):  # which its module has registered
+        text = " ".join(evofsm("learn", crashes, "--rule", name, "--out", "m").stdout.split())
+        assert "rule coarse (--rule), radius 3.0" in text
+        assert FSMModel.load("m").rule.radius == 3.0
+
+
+def test_at_most_twenty_states_are_listed_and_where_they_are_one_blur_it_is_said_what_to_try(
+    evofsm, log, own, tmp_path
+):
+    told = evofsm("learn", log, "--rule", "novelty", "--radius", "0.2", "--out", tmp_path / "m")
+    states = [line for line in told.stdout.splitlines() if line.startswith("#") and "→" not in line]
+    n_states = FSMModel.load(tmp_path / "m").n_states
+    assert len(states) == 20 < n_states
+    assert f"and {n_states - 20} more states, together" in " ".join(told.stdout.split())
+    assert "rule novelty (--rule), radius 0.2" in " ".join(told.stdout.split())
+    wide = " ".join(evofsm("learn", own, *OWN, "--spread", "100").stdout.split())
+    assert "States are hardly told apart" in wide
+    assert "Try --rule novelty --scale dist=" in wide
+    assert "--rule novelty" not in evofsm("learn", log, "--rule", "edges", "--spread", "99").stdout
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

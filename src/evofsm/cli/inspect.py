@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 _MODELS = ("guard.evofsm", "model.evofsm")
 # So many files that something was learnt from are named.
 _MOST_FILES = 3
+# So many states are listed, those with most of the time.
+_MOST_STATES = 20
 _UNTOLD = (
     "What was learnt tells nothing of failures: none was ever told. From a log, evofsm learn "
     "--failed COLUMN or --failed 'gap<=0' tells of them."
@@ -159,8 +161,19 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
         )
     ]
     title = "States (stays: share of its steps; first seen: at which row)"
+    most = sorted(np.argsort(-model.visits, kind="stable")[:_MOST_STATES].tolist())
     yield ""
-    yield table(title, ("", *heads, "share of time", "stays", "first seen"), states)
+    yield table(
+        title,
+        ("", *heads, "share of time", "stays", "first seen"),
+        [states[k] for k in most],
+    )
+    if (others := model.n_states - len(most)) > 0:
+        share = 1.0 - float(model.visits[most].sum()) / total
+        yield (
+            f"and {others:,} more states, together {share:.1%} of the time (--json prints all, "
+            "evofsm explain says what came of one)"
+        )
     yield ""
     found = passages(model)
     if not found:

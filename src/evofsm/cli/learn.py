@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.inspect import model_document, tables_of, with_unit
 from evofsm.cli.options import (
@@ -27,6 +27,7 @@ from evofsm.cli.options import (
     TopicsFile,
     Units,
     argument,
+    imported,
     lengths_given,
     log_columns,
     option,
@@ -39,17 +40,17 @@ if TYPE_CHECKING:
     from evofsm.cli.learning import Learning, Skill
     from evofsm.fsm.actions import IntervalActions
     from evofsm.fsm.machine import EvolvingFSM
+    from evofsm.fsm.model import FSMModel
     from evofsm.fsm.observations import ObservationEncoder
     from evofsm.guard import Guard
     from evofsm.io import LogColumns
     from evofsm.io.logs import Noted
 
 
-Rule = Literal["paper", "edges", "novelty"]
-
 _MOST_ACTIONS = 1000
-# With less of the belief, the most probable state is hardly told apart from the others.
-_UNCERTAIN = 0.5
+# With a smaller share of what lies between a blind guess and certainty, the most probable state is
+# hardly told apart from the others.
+_UNCERTAIN = 0.45
 
 
 def learn(
@@ -74,10 +75,11 @@ def learn(
     no_leader: NoLeader = None,
     vehicle_length: Lengths = None,
     rule: Annotated[
-        Rule,
+        str,
         option(
-            "How states are made: as in the paper; with states at edges too; or one wherever "
-            "nothing like it was seen (novelty, recommended for logs)."
+            "How states are made: paper; edges, with states at edges too; novelty, one wherever "
+            "nothing like it was seen, recommended for logs; or a rule of your own, as it is "
+            "registered or as module:Name."
         ),
     ] = "paper",
     radius: Annotated[
@@ -146,6 +148,8 @@ def learn(
 
     _check_out(out)
     _check_out(guard, "--guard")
+    if guard is not None and out is not None and guard.resolve() == out.resolve():
+        raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
     actions = _actions(action_range)
     columns = log_columns(observe, action, time, episode, dt, failed, unit, no_leader)
     encoder = columns.observe
@@ -226,12 +230,9 @@ def learn(
     if assumed := learning.read.notes["lengths"]:
         read.append(("vehicle lengths", f"assumed, for FCD has none: {assumed}"))
     show(facts("What was read", read), *tables_of(learning.model))
-    if learning.model.n_states > 1 and learning.certainty < _UNCERTAIN:
-        show(
-            f"\nStates are hardly told apart: the most probable one has {learning.certainty:.0%} "
-            f"of the belief on average ({1 / learning.model.n_states:.0%} is a blind guess). A "
-            "smaller --spread sharpens recognition."
-        )
+    blind = 1.0 / learning.model.n_states
+    if learning.certainty - blind < _UNCERTAIN * (1.0 - blind):
+        show(_hardly_told_apart(learning.model, learning.certainty, rule))
     show("", *_skills(learning.skills), "")
     if out is None and taught is None:
         say("Nothing was saved; --out MODEL saves the model.")
@@ -263,7 +264,7 @@ def _actions(text: str) -> IntervalActions:
 
 def _machine(
     n_actions: int,
-    rule: Rule,
+    rule: str,
     radius: float | None,
     spread: float | None,
     scale: list[str] | None,
@@ -271,7 +272,7 @@ def _machine(
     encoder: ObservationEncoder,
 ) -> EvolvingFSM:
     from evofsm.fsm.machine import EvolvingFSM
-    from evofsm.fsm.rules import Edges, Novelty
+    from evofsm.fsm.rules import Novelty, rule_named
 
     if scale and rule != "novelty":
         raise ValueError(f"--scale is for --rule novelty, not {rule}")
@@ -279,8 +280,9 @@ def _machine(
         width = {} if spread is None else {"spread": spread}
         novelty = Novelty(1.0 if radius is None else radius, _scales(scale, encoder), **width)
         return EvolvingFSM(n_actions, rule=novelty, max_states=max_states)
-    edges = Edges() if rule == "edges" else None
-    return EvolvingFSM(n_actions, radius, spread=spread, max_states=max_states, rule=edges)
+    found = imported(rule) if ":" in rule else rule_named(rule)
+    own = found() if isinstance(found, type) else found
+    return EvolvingFSM(n_actions, radius, spread=spread, max_states=max_states, rule=own)
 
 
 def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]:
@@ -421,6 +423,8 @@ def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, An
 
 
 def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
+    from evofsm.fsm.rules import describe_rule
+
     read, actions = learning.read, learning.model.actions
     yield "rows", f"{read.rows:,}, one every {learning.model.dt:g} s"
     minutes = read.seconds / 60.0
@@ -435,6 +439,29 @@ def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
         text += f"; {read.clipped_below:,} below and {read.clipped_above:,} above "
         text += f"({clipped / read.rows:.1%} of rows) were put into the end intervals"
     yield "actions", text if clipped else f"{text}; none was beyond"
+    settings = describe_rule(learning.machine.rule)
+    for name in ("radius", "spread"):  # which the rule may have itself
+        settings.setdefault(name, learning.machine.settings[name])
+    named = settings.pop("name")
+    told = (f"{name} {value}" for name, value in settings.items())
+    yield "rule", f"{named} (--rule), {', '.join(told)}"
+
+
+def _hardly_told_apart(model: FSMModel, certainty: float, rule: str) -> str:
+    """What to do about it."""
+    import numpy as np
+
+    from evofsm.driving.naming import VARIABLES
+
+    # A tenth of what the states cover is a difference that may count as 1.
+    tenths = zip(model.names, 0.1 * np.ptp(model.centers, axis=0), strict=True)
+    scales = [f"--scale {name}={max(x, 1e-3):.1g}" for name, x in tenths if name not in VARIABLES]
+    other = f"Try {' '.join(['--rule novelty', *scales])}, or a" if rule == "paper" else "A"
+    return (
+        f"\nStates are hardly told apart: the most probable one has {certainty:.0%} of the belief "
+        f"on average ({1 / model.n_states:.0%} is a blind guess). {other} smaller --spread, which "
+        "sharpens recognition."
+    )
 
 
 def _read_otherwise(

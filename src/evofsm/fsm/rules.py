@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from importlib.metadata import entry_points
 from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
@@ -156,6 +157,20 @@ def register_rule(name: str, rule: type) -> None:
     _RULES[name] = rule  # anew where its module, or a cell of a notebook, was run again
 
 
+def rule_named(name: object) -> Any:
+    """The class of a rule that was registered, or that an installed package declares."""
+    if isinstance(name, str) and name not in _RULES:
+        for point in entry_points(group="evofsm.rules", name=name):
+            register_rule(name, point.load())
+    if name not in _RULES:
+        raise ValueError(
+            f"rule is {name!r}; it must be one of {', '.join(_RULES)} (one of your own is known "
+            "once its module was imported and has called register_rule, or by an entry point of "
+            "evofsm.rules)"
+        )
+    return _RULES[name]
+
+
 def check_rule(rule: StateRule) -> StateRule:
     """One of the rules, as an object."""
     if type(rule) not in _RULES.values():
@@ -189,8 +204,8 @@ def describe_rule(rule: StateRule) -> dict[str, Any]:
 
 def restore_rule(description: Mapping[str, Any]) -> StateRule:
     """The rule that `describe_rule` put into words."""
-    if not isinstance(description, Mapping) or description.get("name") not in _RULES:
-        raise ValueError(f"rule is {description!r}; it must be one of {', '.join(_RULES)}")
+    if not isinstance(description, Mapping) or not isinstance(description.get("name"), str):
+        raise ValueError(f"rule is {description!r}; it must have a name")
     settings = {name: value for name, value in description.items() if name != "name"}
-    rule: StateRule = _RULES[description["name"]](**settings)
+    rule: StateRule = rule_named(description["name"])(**settings)
     return rule
