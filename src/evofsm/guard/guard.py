@@ -482,6 +482,8 @@ class Guard:
         if known and len(z) != known:
             named = f" ({', '.join(self.variables)})" if self.variables else ""
             raise ValueError(f"observation has {len(z)} variables; it must have {known}{named}")
+        if (judge := self._observing) and len(z) != judge.dynamics.n_variables:
+            judge.dynamics.refuse(len(z))
         return z
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:

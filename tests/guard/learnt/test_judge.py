@@ -6,10 +6,13 @@ import pickle
 import re
 import warnings
 from contextlib import suppress
+from dataclasses import replace
 from io import BytesIO
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from evofsm.guard import Guard, Mode
 from evofsm.guard.actions import same_action
@@ -19,6 +22,7 @@ from evofsm.guard.learnt import library
 from evofsm.guard.learnt.dynamics import Dynamics
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.regression import Drift
+from evofsm.guard.learnt.replay import MOST_PRODUCTS, n_features, refuse_too_many
 from evofsm.guard.replay import audit
 
 
@@ -93,6 +97,37 @@ def test_failures_that_no_threshold_explains_are_not_denied():
     assert guard.judge.n_failed == 17
     assert reason.startswith("16 failures seen, but beyond no value that was survived")
     assert guard.judge.told_by_experience.startswith("17 failures seen")
+
+
+@given(m=st.integers(1, 100), a=st.integers(1, 150), box=st.booleans())
+def test_features_grow_with_the_number_of_variables_or_it_is_refused(m, a, box):
+    try:
+        refuse_too_many(m, a, box=box)
+    except ValueError:
+        assert m > 64 or 2 * m + (5 if box else 2) * a > 255
+    else:
+        assert n_features(m, a, box=box) <= 5 * (m + a) + 2 * MOST_PRODUCTS
+        assert m <= 64
+
+
+@pytest.mark.parametrize("places", [7, 20, 32])
+def test_many_variables_are_learnt_of_in_a_few_episodes_too(points, places, content):
+    many = replace(points["box"], places=places)
+    guard = many.taught(4)
+    assert guard.judge.backups is not None
+    assert Guard.load(BytesIO(content(guard))).judge.dynamics.n_variables == 2 * places
+    assert not many.play(guard, 99)[1]
+
+
+@pytest.mark.parametrize("m", [65, 500, 21_168])
+def test_too_many_variables_are_refused_before_anything_is_allocated(point, content, m):
+    guard = point.guard()
+    before = content(guard)
+    for act in (lambda z: guard.decide(z, None), lambda z: guard.end(observation=z)):
+        with pytest.raises(ValueError, match=rf"has {m} variables; .* at most 64: .* observe="):
+            act(np.zeros(m))
+        assert content(guard) == before
+    point.play(guard, 0)
 
 
 def test_where_all_that_it_may_remember_are_lost_its_interval_has_no_end(points):

@@ -26,6 +26,7 @@ from evofsm.guard.learnt.replay import (
     learn_transition,
     n_features,
     n_products,
+    refuse_too_many,
     replay,
     residuals,
 )
@@ -168,6 +169,7 @@ class Dynamics:
     def _begin(self, z: Floats) -> None:
         """Make room for what is learnt; variables are counted from the first observation on."""
         m, a = len(z), self.size
+        self.refuse(m)
         p = n_features(m, a, box=not self.choices)
         self.n_variables, self.origin = m, z.copy()
         self.sums, self.weights, self.ready = Sums.none(z, p), np.zeros((p, m)), False
@@ -181,6 +183,10 @@ class Dynamics:
         self.doubt_of_lags = 0.0
         self.rebuild()
         self.forget_episode()
+
+    def refuse(self, m: int) -> None:
+        """Raise a ValueError for more variables than can be learnt of."""
+        refuse_too_many(m, self.size, box=not self.choices)
 
     def observe(self, z: Floats) -> bool:
         """Take in an observation (m,), all finite; whether something unexpected began with it."""
@@ -595,6 +601,7 @@ class Dynamics:
             self.used = arrays["used"]
             return
         told, rows, jumps = arrays["sequences"], arrays["sequence_rows"], arrays["jumps"]
+        self.refuse(m)
         if p != n_features(m, a, box=not self.choices):
             raise ValueError(f"sums of {p} features are not of {m} variables and {a} numbers")
         for name in ("thresholds", "drifts", "jumps"):

@@ -86,6 +86,11 @@ class LearntRisk:
     there is nothing that it could prevent, and all is kept; in the first episode also where failure
     was given as a function.
 
+    It learns of at most 64 variables, fewer where actions have more than 25 numbers, and refuses
+    others. Products of two variables count in what it expects up to 12 variables, those of actions
+    with variables as long as there are at most 80 of them: the cost grows with the square of the
+    number of variables.
+
     Parameters
     ----------
     dt : float

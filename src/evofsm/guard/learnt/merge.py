@@ -17,7 +17,7 @@ from evofsm.guard.learnt import library
 from evofsm.guard.learnt.dynamics import MOST, Dynamics
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.regression import Drift, Recent
-from evofsm.guard.learnt.replay import Floats, Sums, n_products
+from evofsm.guard.learnt.replay import Floats, Sums, crossed, n_products, pairs
 
 
 def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
@@ -139,9 +139,9 @@ def _moved(d: Floats, a: int, p: int) -> Floats:
     m, T = len(d), np.eye(p)
     T[1 : 1 + m, 0] = d
     products = T[p - n_products(m, a) :]
-    for k in range(a):
+    for k in range(crossed(m, a)):
         products[k * m : (k + 1) * m, 1 + 2 * m + k] = d
-    for row, i, j in zip(products[a * m :], *np.triu_indices(m), strict=True):
+    for row, i, j in zip(products[crossed(m, a) * m :], *pairs(m), strict=True):
         row[0] = d[i] * d[j]
         row[1 + i] += d[j]
         row[1 + j] += d[i]

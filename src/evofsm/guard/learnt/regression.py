@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,9 @@ _PRIOR, _SHY_PRIOR, _CLEAREST = 0.01, 20.0, 1e-3
 # The least variance of a feature, and what all weights are held to 0 by, of its mean square: far
 # more than rounding, so that features that did not vary yet always share what they explain alike.
 _LEAST, _ALL_ALIKE = 1e-6, 1e-10
+# From so many features on BLAS would call threads for a matrix, which wait for a second where other
+# processes are busy, and variables are solved for together whose noise is as large to a third.
+_LARGE, _THIRD = 100, 3.0
 
 
 def early_unit(sums: Sums, n: int) -> Floats:
@@ -84,8 +87,13 @@ def solve(sums: Sums, a: int, without: Floats) -> Floats:
     left_out = np.where(without > 0.0, 1e12 * np.maximum(size, 1.0), 0.0)
     known = sums.noise > 0.0
     noisy = np.where(known, sums.noise / np.where(known, sums.variance, 1.0), 1.0)
-    weights = np.empty_like(sums.products)
-    for j, share in enumerate(noisy.clip(_CLEAREST, 1.0).tolist()):
+    weights, shares = np.empty_like(sums.products), noisy.clip(_CLEAREST, 1.0)
+    groups: Sequence[Any] = range(m)
+    if len(size) >= _LARGE:
+        shares = _THIRD ** np.round(np.log(shares) / np.log(_THIRD))
+        groups = [np.flatnonzero(shares == share) for share in np.unique(shares)]
+    for j in groups:
+        share = shares[j].max()
         prior = np.where(shy, _SHY * _RIDGE + share * _SHY_PRIOR / n, _RIDGE + share * _PRIOR / n)
         held = prior * times * variance + left_out
         weights[:, j] = ridge(squares, sums.products[:, j], held)
@@ -98,8 +106,22 @@ def ridge(squares: Floats, products: Floats, held: Floats) -> Floats:
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
     scaled = scale[:, None] * (squares + np.diag(held)) * scale
     scaled[np.diag_indices_from(scaled)] += _ALL_ALIKE
-    found: Floats = (scale * np.linalg.solve(scaled, (scale * products.T).T).T).T
+    found: Floats = (scale * _solved(scaled, (scale * products.T).T).T).T
     return found
+
+
+def _solved(squares: Floats, products: Floats) -> Floats:
+    """Of a positive definite matrix, halved until its parts are too small for threads."""
+    if len(squares) < _LARGE:
+        return np.asarray(np.linalg.solve(squares, products))
+    n, columns = len(squares) // 2, products.reshape(len(products), -1)
+    upper = _solved(squares[:n, :n], np.hstack([squares[:n, n:], columns[:n]]))
+    rest = np.hstack([squares[n:, n:], columns[n:]])
+    rest = rest - np.einsum("ij,jk->ik", squares[n:, :n], upper)
+    left = len(squares) - n
+    below = _solved(rest[:, :left], rest[:, left:])
+    above = upper[:, left:] - np.einsum("ij,jk->ik", upper[:, :left], below)
+    return np.vstack([above, below]).reshape(products.shape)
 
 
 # -- Drift: whether the system still moves as was learnt ------------------------------------------

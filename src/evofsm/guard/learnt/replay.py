@@ -27,6 +27,11 @@ Ints = NDArray[np.int64]
 
 #: Where the effect of an action may bend, in each dimension of a box.
 KNOTS = (-0.5, 0.0, 0.5)
+#: Products of two variables are features only where there are at most so many, as of 12 variables;
+#: and so are products of actions with variables.
+MOST_PRODUCTS = 80
+# Variables, and features, of which a model is learnt at most.
+_MOST_VARIABLES, _MOST_FEATURES = 64, 256
 
 # After a change, so many times the largest change there was may be foreseen.
 _FARTHER = 3.0
@@ -115,7 +120,21 @@ def n_features(m: int, a: int, *, box: bool) -> int:
 
 def n_products(m: int, a: int) -> int:
     """Number of products: of actions with variables, and of two variables; they come last."""
-    return a * m + m * (m + 1) // 2
+    return crossed(m, a) * m + len(pairs(m)[0])
+
+
+def refuse_too_many(m: int, a: int, *, box: bool) -> None:
+    """Raise a ValueError for more variables than can be learnt of, before there is room for them.
+
+    The cost of a step grows with their square.
+    """
+    most = min(_MOST_VARIABLES, (_MOST_FEATURES - n_features(0, a, box=box)) // 2)
+    if m > most:
+        raise ValueError(
+            f"observation has {m} variables; with actions of {a} numbers a judge learns of at most "
+            f"{max(most, 0)}: choose those on which failure depends, as with observe= of "
+            "RevisedActions"
+        )
 
 
 def lags(m: int, a: int) -> Ints:
@@ -133,15 +152,21 @@ def features(model: Model, z: Floats, change: Floats, before: Floats, action: Fl
     parts = [np.ones((len(z), 1)), off, lagged, action, before]
     if not model.choices:
         parts.append(np.abs(action[:, :, None] - KNOTS).reshape(len(z), -1))
-    parts.append((action[:, :, None] * off[:, None]).reshape(len(z), -1))
-    one, other = _pairs(m)
+    acts = action[:, : crossed(m, action.shape[1]), None]
+    parts.append((acts * off[:, None]).reshape(len(z), -1))
+    one, other = pairs(m)
     return np.concatenate([*parts, off[:, one] * off[:, other]], axis=1)
 
 
 @cache
-def _pairs(m: int) -> tuple[Ints, Ints]:
+def pairs(m: int) -> tuple[Ints, Ints]:
     """Of which variables products are features."""
-    return np.triu_indices(m)
+    return np.triu_indices(m if m * (m + 1) // 2 <= MOST_PRODUCTS else 0)
+
+
+def crossed(m: int, a: int) -> int:
+    """Of how many numbers of an action products with variables are features."""
+    return a if a * m <= MOST_PRODUCTS else 0
 
 
 def residuals(
@@ -205,12 +230,12 @@ def fill_features(
                 for l in range(n):
                     found[k, l] = abs(action[i, l] - knot)
                 k += 1
-    for i in range(a):
+    for i in range(a if a * m <= MOST_PRODUCTS else 0):
         for j in range(m):
             for l in range(n):
                 found[k, l] = action[i, l] * found[1 + j, l]
             k += 1
-    for i in range(m):
+    for i in range(m if m * (m + 1) // 2 <= MOST_PRODUCTS else 0):
         for j in range(i, m):
             for l in range(n):
                 found[k, l] = found[1 + i, l] * found[1 + j, l]
