@@ -35,6 +35,8 @@ from evofsm import store
 from evofsm.cli import driving as driving_module
 from evofsm.cli.driving import GUARD, Results, Setup, drive_in_turn, make_guard
 from evofsm.cli.learning import Checkpoint, learn_traces
+from evofsm.cli.monitor.decider import Decider
+from evofsm.cli.monitor.state import State
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.families import load_family
 from evofsm.driving.judge import LatentRisk
@@ -43,7 +45,7 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.arrays import MACHINE
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.guard import Guard
+from evofsm.guard import Guard, warm
 from evofsm.io.logs import Chunk, read_traces
 
 #: What must not happen, in the order in which it is printed.
@@ -57,6 +59,8 @@ WRONG = (
     "left behind",
     "lost observations",
     "locks held",
+    "stuck monitors",
+    "states not of one owner",
 )
 _REFUSED, _CRASHED = 3, 4
 
@@ -276,6 +280,87 @@ class _Child:
         """Whether it ended before it was killed."""
         os.kill(self._number, signal.SIGKILL)
         return os.WIFEXITED(os.waitpid(self._number, 0)[1])
+
+
+# -- Monitors -------------------------------------------------------------------------------------
+
+# What no guard of two variables takes at its end.
+_REFUSED_ENDS = ("[3.4e38, 0]", "[1e100, 1]", "[1, 2, 3]", "[null]")
+
+
+def restart(times: int, folder: Path, random: np.random.Generator) -> Counter[str]:
+    """Kill a monitor that refuses ends, again and again; each begins where the last one was."""
+    found: Counter[str] = Counter()
+    warm()  # before it is forked
+    with tempfile.TemporaryDirectory(dir=folder) as name:
+        path, n = Path(name) / "state", 0
+        for _ in range(times):
+            read, write = os.pipe()
+            work = partial(_monitor, path, write, int(random.integers(1, 6)))
+            child = _Child(work)
+            os.close(write)
+            with open(read, "rb") as told:  # until it ends by its own hand
+                counts = [int(line) for line in told]
+            found["restarts"] += 1
+            found["stuck monitors"] += child.has_crashed() or not counts
+            found["lost observations"] += bool(counts) and counts[0] != n
+            n = counts[-1] if counts else n
+        found["decisions"] = n
+    return found
+
+
+def _monitor(path: Path, write: int, rows: int) -> None:
+    """Say how many decisions there are, after each answer, and die."""
+    logging.disable()
+    state = State(path, {})
+    decider = Decider(state.guard(lambda: Guard(n_actions=2, interval=0.1)), episode=40)
+    state.begin(decider)
+    os.write(write, f"{decider.n}\n".encode())
+    for k in range(decider.n, decider.n + rows):
+        row = {"time": 0.1 * k, "observation": [k % 7, k % 5], "proposal": k % 2}
+        kinds = [decider.answer(json.dumps(row).encode())["kind"]]
+        for seen in _REFUSED_ENDS:
+            end = f'{{"end": true, "failed": true, "observation": {seen}}}'
+            kinds.append(decider.answer(end.encode())["kind"])
+        if kinds != ["decision"] + ["error"] * len(_REFUSED_ENDS):
+            return
+        os.write(write, f"{decider.n}\n".encode())
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def rival(times: int, folder: Path, random: np.random.Generator) -> Counter[str]:
+    """Start two monitors at once on one state, which they know by two paths."""
+    found: Counter[str] = Counter()
+    for _ in range(times):
+        with tempfile.TemporaryDirectory(dir=folder) as name:
+            one, other = Path(name) / "a" / "state", Path(name) / "b" / "link"
+            for place in (one, other):
+                place.parent.mkdir()
+            other.symlink_to(one)
+            (read, write), (hold, go) = os.pipe(), os.pipe()
+            children = [_Child(partial(_own, place, write, hold, go)) for place in (one, other)]
+            os.close(write)
+            os.close(hold)
+            owners = sum(os.read(read, 1) == b"1" for _ in children)
+            os.close(go)
+            os.close(read)
+            found["rivals"] += len(children)
+            found["crashes"] += sum(child.has_crashed() for child in children)
+            found["states not of one owner"] += owners != 1
+    return found
+
+
+def _own(path: Path, write: int, hold: int, go: int) -> None:
+    """Say whether it owns the state, and keep it until all have said so."""
+    os.close(go)
+    try:
+        state = State(path, {})
+        state.begin(Decider(state.guard(lambda: Guard(n_actions=2, interval=0.1))))
+        os.write(write, b"1")
+    except ValueError:
+        os.write(write, b"0")
+    os.read(hold, 1)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 # -- Files that are damaged -----------------------------------------------------------------------
@@ -527,6 +612,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     kills, disks, loads, files = (20, 4, 100, 200) if asked.short else (500, 100, 5000, 10_000)
     shared = 4 if asked.short else 200  # machines
+    starts, rivals = (20, 5) if asked.short else (1000, 200)
     store._OLD = 0.0  # all that writes a file here is known
     driving_module._EVERY = 0.0
     driving_module._write_decisions = lambda path, rows: None  # polars must not be forked
@@ -544,6 +630,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ("disk full while driving", partial(fill, drive, disks // 4)),
             ("two threads on one file", partial(share, False, loads)),
             ("two processes on one file", partial(share, True, loads)),
+            ("monitors that refuse ends", partial(restart, starts)),
+            ("two monitors on one state", partial(rival, rivals)),
             ("damaged files", partial(damage, files)),
             ("four threads a machine", partial(one_machine.threads, shared)),
             (
