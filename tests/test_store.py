@@ -144,6 +144,17 @@ def test_any_other_file_is_refused_by_name(content, tmp_path):
             attempt(tmp_path / "other")
 
 
+def test_a_file_that_is_larger_than_any_is_refused_at_once(whole, tmp_path):
+    (tmp_path / "bomb").write_bytes(whole)
+    os.truncate(tmp_path / "bomb", 1 << 30)
+    began = time.process_time()
+    with pytest.raises(
+        ValueError, match="1,073,741,824 bytes; no file holds more than 536,870,912"
+    ):
+        store.read(tmp_path / "bomb", DRAWS)
+    assert time.process_time() - began < 0.1
+
+
 def test_another_kind_a_missing_file_and_a_missing_folder_are_named(tmp_path):
     write(tmp_path / "file")
     with pytest.raises(ValueError, match=f"{tmp_path / 'file'} holds a draws, not a machine"):

@@ -46,7 +46,7 @@ _VERSION = 1
 # In place of the checksum, as that is taken.
 _UNSIGNED = "0" * 64
 # No file holds more [bytes], nor a header.
-_LARGEST_FILE, _LARGEST_HEADER = 1 << 32, 1 << 24
+_LARGEST_FILE, _LARGEST_HEADER = 1 << 29, 1 << 24
 # The names of types in a file. No objects: those could run.
 _TYPES = {"BOOL": np.bool_, "U8": np.uint8, "I64": np.int64, "F64": np.float64}
 _NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
@@ -340,6 +340,8 @@ class _Entry(NamedTuple):
 def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
     """Read the header of an open file, as it was written too, and its checksum."""
     size = file.seek(0, os.SEEK_END)
+    if size > _LARGEST_FILE + _LARGEST_HEADER:
+        raise ValueError(f"it has {size:,} bytes; no file holds more than {_LARGEST_FILE:,}")
     file.seek(0)
     length = int.from_bytes(file.read(8), "little")
     if not 2 <= length <= min(size - 8, _LARGEST_HEADER):

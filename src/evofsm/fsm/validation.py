@@ -71,6 +71,13 @@ def positive(name: str, value: SupportsFloat) -> float:
     return number
 
 
+def probability(name: str, value: float) -> float:
+    """The value, if it lies between 0 and 1, neither included."""
+    if not 0.0 < value < 1.0:
+        raise ValueError(f"{name} is {value}; it is a probability, between 0 and 1")
+    return value
+
+
 def whole(name: str, value: SupportsIndex) -> int:
     """A positive integer."""
     try:

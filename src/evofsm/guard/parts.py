@@ -14,6 +14,7 @@ from typing import Any
 
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.validation import probability
 from evofsm.guard.actions import ActionSet, BoxActions, Choices
 from evofsm.guard.api import ActionJudge, LearningJudge, Reviser
 from evofsm.guard.reviser import ActionReviser, Mode
@@ -97,8 +98,10 @@ def rebuild(
         return parts | {"reviser": part_class(reviser["class"]).restored(reviser, actions)}
     named = reviser["judge"]
     asked = judge if risk is None else risk
-    if named is not None and part_class(named["class"]) is not type(risk):
-        asked = part_class(named["class"]).restored(named, machine, risk)
+    if named is not None and (of := part_class(named["class"])) is not type(risk):
+        if not hasattr(of, "restored"):
+            raise ValueError(f"what its {named['class']} has learnt is missing")
+        asked = of.restored(named, machine, risk)
     if asked is None:
         raise ValueError("no installed package declares its judge; give the judge as it is")
     again = ActionReviser(asked, actions)
@@ -116,4 +119,5 @@ def settings_of(reviser: Reviser) -> dict[str, Any]:
 def set_again(reviser: Reviser, settings: Mapping[str, Any]) -> None:
     """Give a reviser the `settings_of` another time."""
     if isinstance(reviser, ActionReviser):
-        reviser.mode, reviser.tolerance = Mode(settings["mode"]), float(settings["tolerance"])
+        tolerance = probability("tolerance", float(settings["tolerance"]))
+        reviser.mode, reviser.tolerance = Mode(settings["mode"]), tolerance

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.fsm.validation import probability
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -142,12 +143,10 @@ class ActionReviser:
         tolerance: float = TOLERANCE,
         mode: Mode = Mode.ACT,
     ) -> None:
-        if not 0.0 < tolerance < 1.0:
-            raise ValueError(f"tolerance is {tolerance}; it is a probability, between 0 and 1")
         risk.refuse_unfit(*limits(actions))
         self.risk = risk
         self.actions = actions
-        self.tolerance = tolerance
+        self.tolerance = probability("tolerance", tolerance)
         self.mode = mode
         self._searches = isinstance(risk, SearchingJudge)
         self._lowest, self._highest = nearest_bounds(actions)

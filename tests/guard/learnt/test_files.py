@@ -73,6 +73,57 @@ def test_a_file_that_contradicts_itself_is_refused(judge, settings, arrays, why)
         LearntRisk.load(BytesIO(bad.getvalue()))
 
 
+@pytest.mark.parametrize("name", ["backups_policies", "sums_mean"])
+def test_numbers_that_nothing_could_have_learnt_are_refused(judge, name):
+    settings, arrays = judge
+    with pytest.raises(ValueError, match=name):
+        store.write(BytesIO(), KIND, settings, arrays | {name: arrays[name] * 0.0 + np.inf})
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"n_actions": 10**9}, "at most 1,000"),
+        ({"given_horizon": 1e9}, "looks at most 10,000 ahead"),
+        ({"horizon": 10**9}, "horizon of 1e[+]09"),
+        ({"seed": -1}, "seed of -1"),
+        ({"seed": None}, "lacks seed"),
+        ({"names": None}, "names is None"),
+        ({"dynamics": []}, r"dynamics is \[\]"),
+        ({"margin": []}, "margin"),
+    ],
+)
+def test_a_forged_file_is_refused_before_it_asks_for_memory(
+    points, content, forge, tmp_path, change, why
+):
+    path = tmp_path / "judge"
+    points["choices"].taught(1).judge.save(path)
+    forge(path, change)
+    with pytest.raises(ValueError, match=why):
+        LearntRisk.load(path)
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "why"), [(1e9, "tolerance is 1000000000.0"), (-1, "tolerance"), (None, "float")]
+)
+def test_a_forged_tolerance_and_a_missing_judge_are_refused(
+    points, forge, tmp_path, tolerance, why
+):
+    def change(told, entries, numbers):
+        told["settings"]["reviser"]["settings"]["tolerance"] = tolerance
+
+    path = tmp_path / "guard"
+    points["box"].guard().save(path)
+    forge(path, change)
+    with pytest.raises(ValueError, match=why):
+        Guard.load(path)
+    settings, arrays = store.read(path, GUARD)
+    settings["reviser"]["settings"]["tolerance"] = 0.1
+    store.write(path, GUARD, settings, arrays | {"judge": np.zeros(0, np.uint8)})
+    with pytest.raises(ValueError, match="what its LearntRisk has learnt is missing"):
+        Guard.load(path)
+
+
 def test_a_judge_of_other_actions_or_variables_is_refused(points, content):
     box, plane = (points[name].taught(3) for name in ("box", "plane"))
     files = [BytesIO(content(guard)) for guard in (box, plane)]

@@ -271,6 +271,8 @@ def test_after_a_gap_in_time_nothing_follows_from_what_was(points):
         ({"n_actions": 2, "without": ("luck",)}, "without names"),
         ({"n_actions": 2, "dt": 0.0}, "dt"),
         ({"n_actions": 2, "horizon": 0.0}, "horizon"),
+        ({"n_actions": 2, "horizon": 1e9}, "10,000,000,000 decisions of 0.1 s; .* at most 10,000"),
+        ({"n_actions": 10**9}, "takes at most 1,000 actions"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(told, why):

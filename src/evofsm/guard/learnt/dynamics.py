@@ -59,6 +59,8 @@ _STUDIED = 5
 _REACHED = 2
 # Failures, and jumps of each variable, that are remembered.
 MOST = 200
+# Choices that actions are told apart by, each of which has features of its own.
+_MOST_CHOICES = 1_000
 # Jumps that would have shown no dependence, for each variable.
 _JUMP_PRIOR = 3.0
 # Of one that is where it saturates, a noisy sensor may say that it is so many residuals from there.
@@ -118,6 +120,10 @@ class Dynamics:
         without: Sequence[str] = (),
     ) -> None:
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
+        if self.choices > _MOST_CHOICES:
+            raise ValueError(
+                f"n_actions is {n_actions}; a learnt judge takes at most {_MOST_CHOICES:,} actions"
+            )
         self.low, self.high = _range(low, high, is_none=n_actions is not None)
         self._middle, self._half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         self.size = self.choices or len(self.low)
@@ -647,7 +653,8 @@ _OWN: dict[str, Numbers] = {
     "used": COUNT.of("a", 2),
 }
 _OF_SUMS: dict[str, Numbers] = {
-    **{name: Numbers(("m",)) for name in ("mean", "least", "most")},
+    "mean": Numbers(("m",), -1e31, 1e31),
+    **{name: Numbers(("m",)) for name in ("least", "most")},
     **{name: _NOT_NEGATIVE.of("m") for name in ("scatter", "variance", "unit", "scale", "noise")},
     **{name: _OBSERVED.of("m") for name in ("low", "high")},
     "counts": COUNT.of(2),

@@ -54,6 +54,8 @@ _HORIZON, _SHORTEST, _FARTHEST, _AHEAD = 64, 32, 144, 1.5
 _LATEST, _REFUTED = 0.98, 0.8
 # Backups closer than this are alike; an action that was used less often is tried.
 _ALIKE, _TRIES = 0.02, 8
+# No horizon that is given has more steps: memory and the time of a decision grow with it.
+_MOST_STEPS = 10_000
 # From so many situations on backups evolve, and disturbances are looked for.
 _ENOUGH = 3
 
@@ -166,7 +168,7 @@ class LearntRisk:
         self.dt = positive("dt", dt)
         self.given_horizon = None if horizon is None else positive("horizon", horizon)
         #: Steps that it looks ahead.
-        self.horizon = _HORIZON if horizon is None else max(1, round(horizon / self.dt))
+        self.horizon = _HORIZON if horizon is None else _steps(horizon, self.dt)
         self.seed = operator.index(seed)
         if unknown := set(without) - set(JUDGE_PARTS):
             raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(JUDGE_PARTS)}")
@@ -701,6 +703,7 @@ KIND = Kind(
     {
         "situations": Numbers(("s", "w")),
         **{f"backups_{name}": _SOME.of(*shape) for name, shape in _BACKUPS.items()},
+        "backups_policies": Numbers(_BACKUPS["policies"]),
         **ARRAYS,
     },
     {
@@ -710,7 +713,7 @@ KIND = Kind(
         **dict.fromkeys(("low", "high"), _ENDS),
         **dict.fromkeys(_TIMES, _TIME),
         **dict.fromkeys(("seed", *_COUNTS, "n_constant"), COUNT),
-        "horizon": FROM_1,
+        "horizon": FROM_1._replace(most=_MOST_STEPS),
         **dict.fromkeys(("names", "units", "without"), list[str]),
         "violations": {
             "share": SHARE,
@@ -725,6 +728,16 @@ KIND = Kind(
         },
     },
 )
+
+
+def _steps(horizon: float, dt: float) -> int:
+    """The steps of a horizon that is given, if they are not too many."""
+    if horizon / dt > _MOST_STEPS:
+        raise ValueError(
+            f"horizon is {horizon:g} s, {horizon / dt:,.0f} decisions of {dt:g} s; a learnt judge "
+            f"looks at most {_MOST_STEPS:,} ahead (is it in seconds?)"
+        )
+    return max(1, round(horizon / dt))
 
 
 def _fallback(dynamics: Dynamics) -> Fallback:
