@@ -69,10 +69,11 @@ def test_a_configuration_that_sumo_refuses_is_one_line(refused, configuration):
 
 def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tmp_path):
     log, run = tmp_path / "my.xml", tmp_path / "run.mcap"
-    trace_configuration(configuration, log, seconds=30.0)
-    assert not record_log(str(log), run)
-    recorded = Recording(run)
-    recorded.restart(0)
+    assert trace_configuration(configuration, log, 30.0, 10**6) == 30.0
+    assert trace_configuration(configuration, log, 30.0, 40) < 30.0
+    names, _ = record_log(str(log), run)
+    recorded = Recording(run, names)
+    assert recorded.start.cases[0].startswith("ego behind lead (")
     frames = [recorded.step() for _ in range(20)]
     assert frames[-1].time > frames[0].time
     assert _is_log(str(configuration))

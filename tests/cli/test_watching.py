@@ -153,7 +153,8 @@ def objects(path, rows=80):
 
 def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
     out = tmp_path / "run.mcap"
-    assert not record_log(objects(tmp_path / "objects.csv"), out)
+    names, more = record_log(objects(tmp_path / "objects.csv"), out)
+    assert (names, more) == (["ego behind other"], False)
     columns = read_run(out).episodes[0].columns
     assert (columns["executed"] == columns["proposed"]).all()
     assert columns["gap"][0] == pytest.approx(36.0)
@@ -166,6 +167,32 @@ def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
     first, *_, last = drive(shown)
     assert first.v_follower == pytest.approx(20.0)
     assert [last.a_follower, last.a_leader, last.x_follower] == pytest.approx([0.0, -5.0, 158.0])
+
+
+def test_episodes_of_a_log_are_sorted_by_what_came_of_them_and_begin_where_it_is_worth_a_look(
+    tmp_path,
+):
+    lines = ["pair,time,gap,v_follower,v_leader,a_follower"]
+    for pair, (far, closing) in enumerate([(90, 0), (20, 1), (4, 0)]):
+        for k in range(300):
+            gap = far - max(0, k - 200) * 0.3 * closing
+            if gap < -0.3:
+                break
+            lines.append(f"{pair},{k / 10:.1f},{gap:.2f},20,{20 - 3 * closing},0")
+    (tmp_path / "log.csv").write_text("\n".join([*lines, ""]))
+    names, _ = record_log(str(tmp_path / "log.csv"), tmp_path / "run.mcap")
+    shown = Recording(tmp_path / "run.mcap", names)
+    worst, second, third = shown.start.cases
+    assert worst == "episode 2 (collision)"
+    assert second.startswith("episode 3 (risk ")
+    assert third == "episode 1 (risk 0.0%)"
+    frames = drive(shown)
+    assert frames[-1].collided
+    assert shown.start.begins == pytest.approx(frames[-1].time - 10.0)
+    told = tell(frames[-1], shown.start)
+    assert "it only watched, in shadow mode" in told.done
+    assert "off" not in told.done
+    assert shown.choose(2).case == 1  # the third of the log
 
 
 def test_a_log_is_watched_by_its_own_columns_and_units(tmp_path, capsys):
@@ -183,6 +210,20 @@ def test_a_log_is_watched_by_its_own_columns_and_units(tmp_path, capsys):
     assert "the own car brakes with 4 m/s² (--brakes)" in capsys.readouterr().err
     with pytest.raises(ValueError, match="has to name the three columns in this order"):
         record_log(str(path), out, LogColumns(ObservationEncoder("dist"), "accel", "t"))
+
+
+def test_what_was_before_is_shown_at_once():
+    session, told = opened(), []
+    session.start = session.start._replace(begins=2.0)
+
+    async def play():
+        player = Player(session, lambda kind, what: told.append(kind), speed=0.25)
+        playing = asyncio.create_task(player.play())
+        await asyncio.sleep(1.0)
+        playing.cancel()
+
+    asyncio.run(play())
+    assert 8 <= told.count("frame") <= 12  # one every 0.25 s of the run, then one a second
 
 
 # -- The clock ------------------------------------------------------------------------------------

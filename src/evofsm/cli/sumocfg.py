@@ -71,11 +71,19 @@ def drive_configuration(
     }
 
 
-def trace_configuration(file: Path, out: Path, *, seconds: float) -> None:
-    """Run a configuration as it is, and write where its cars were as an FCD file."""
+def trace_configuration(file: Path, out: Path, seconds: float, enough: int) -> float:
+    """Run a configuration as it is, and write where its cars were as an FCD file.
+
+    So many seconds at most, and no more once so many positions were written; returns how long [s].
+    """
     with _running(file, "--fcd-output", str(out)) as (sumo, steps):
-        end = sumo.simulation.getTime() + seconds
-        next((now for now in steps if now >= end), None)
+        begun, written = float(sumo.simulation.getTime()), 0
+        now = begun
+        for now in steps:
+            written += sumo.vehicle.getIDCount()
+            if now >= begun + seconds or written >= enough:
+                break
+        return now - begun
 
 
 @contextmanager

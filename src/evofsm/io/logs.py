@@ -63,6 +63,8 @@ class Chunk(NamedTuple):
     jumps: int = 0  #: episodes that begin because of a hole in time
     #: (K,) rows with which an episode ended in failure; None where nothing tells of failures
     failures: NDArray[np.int64] | None = None
+    #: (E,) who followed whom in them, in a recording of many vehicles
+    names: Sequence[str] = ()
 
     def rows(self, first: int, end: int) -> Chunk:
         """Some of its rows."""
@@ -76,6 +78,7 @@ class Chunk(NamedTuple):
             times=self.times[first:end],
             starts=within(self.starts),
             failures=None if self.failures is None else within(self.failures),
+            names=[n for n, k in zip(self.names, self.starts, strict=False) if first <= k < end],
         )
 
 
@@ -128,16 +131,6 @@ def units_of(units: Mapping[str, str], used: Sequence[str]) -> dict[str, str]:
             )
         found |= dict.fromkeys(fit, units[name])
     return found
-
-
-def refuse_other_times(units: Mapping[str, str], time: str) -> None:
-    """Raise where the column of the time has no unit of time, or another one has."""
-    for name, unit in units.items():
-        if unit in UNITS and (unit in TIMES) != (name == time):
-            raise ValueError(
-                f"column {name!r} has the unit {unit}; the column of the time needs a unit of "
-                "time, and no other one may have it (--unit says which it has)"
-            )
 
 
 class Condition(NamedTuple):
@@ -532,6 +525,9 @@ class _Reader:
                 # Where the table knows its episodes, the action may be derived, and NaN.
                 for name in (*self._observed, *([columns.action] if piece.starts is None else [])):
                     piece.refuse_unusable(name, kept)
+            episodes = (
+                np.searchsorted(piece.starts or (), np.flatnonzero(starts & kept), "right") - 1
+            )
             rows = slice(None) if kept.all() else kept  # a slice copies nothing
             yield Chunk(
                 source=self._table.path,
@@ -542,6 +538,7 @@ class _Reader:
                 dt=clock.dt,
                 jumps=int(holes[rows].sum()),
                 failures=None if self._failed is None else np.flatnonzero(fails[rows]),
+                names=[piece.names[k] for k in episodes] if piece.names else (),
             )
 
     def _wanted(self) -> tuple[Wanted, dict[str, float]]:
@@ -575,7 +572,12 @@ class _Reader:
         try:
             given = {name: unit for name in numbers if (unit := table.units.get(name))}
             given |= units_of(columns.units, numbers)
-            refuse_other_times(given, columns.time)
+            for name, unit in given.items():
+                if unit in UNITS and (unit in TIMES) != (name == columns.time):
+                    raise ValueError(
+                        f"column {name!r} has the unit {unit}; the column of the time needs a unit "
+                        "of time, and no other one may have it (--unit says which it has)"
+                    )
         except ValueError as error:
             raise ValueError(f"{table.path}: {error}") from None
         self._noted.units |= given

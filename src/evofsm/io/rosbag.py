@@ -189,7 +189,7 @@ class BagTable(Table):
                 f"{self.path}: at no time are all variables known, none older than "
                 f"{self._topics.oldest:g} s (oldest in the file of --topics)"
             )
-        piece = Piece.of_numbers(self.path, 0, numbers, [0])
+        piece = Piece.of_numbers(self.path, 0, numbers, [0], ())
         for name in wanted.numbers:
             if name in self._topics.variables and name not in wanted.gaps:
                 piece.refuse_unusable(name)
@@ -325,8 +325,7 @@ def _files(path: Path) -> Iterator[tuple[Path, bool]]:
                     zstandard.ZstdDecompressor().copy_stream(packed, out)
                 file = unpacked
             with file.open("rb") as opened:
-                is_mcap = opened.read(len(_MCAP)) == _MCAP
-            yield file, is_mcap
+                yield file, opened.read(len(_MCAP)) == _MCAP
 
 
 def _of_mcap(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
@@ -347,14 +346,13 @@ def _of_sqlite(file: Path, wanted: Collection[str], there: set[str]) -> _Message
     with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as bag:
         named = bag.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
         there |= {topic for _, topic, *_ in named}
-        defined = {}
+        defined: dict[str, list[str]] = {}
         if bag.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
-            columns = "topic_type, encoding, encoded_message_definition"
-            for name, *told in bag.execute(f"SELECT {columns} FROM message_definitions"):
-                defined[name] = told
+            columns = "topic_type, encoding, encoded_message_definition FROM message_definitions"
+            defined = {name: told for name, *told in bag.execute(f"SELECT {columns}")}
         for number, topic, name, packed in named:
             if topic in wanted:
                 kind = _Type(name, packed, *defined.get(name, ("", "")))
-                rows = "SELECT timestamp, data FROM messages WHERE topic_id = ? ORDER BY timestamp"
-                for stamp, data in bag.execute(rows, (number,)):
+                query = "SELECT timestamp, data FROM messages WHERE topic_id = ? ORDER BY timestamp"
+                for stamp, data in bag.execute(query, (number,)):
                     yield topic, kind, stamp, data

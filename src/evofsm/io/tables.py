@@ -23,6 +23,7 @@ from evofsm.store import LARGEST_OBSERVATION
 if TYPE_CHECKING:
     import polars
 
+Numbers = dict[str, NDArray[np.float64]]
 Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag", "run"]
 #: Called with the number of bytes each time some were read from a file.
 OnRead = Callable[[int], object]
@@ -210,15 +211,16 @@ class Piece:
     """Some consecutive rows of a table: T values for each column that was asked for."""
 
     rows: int
-    numbers: dict[str, NDArray[np.float64]]  #: NaN where one is missing
+    numbers: Numbers  #: NaN where one is missing
     find: Find
     texts: dict[str, polars.Series] = field(default_factory=dict)
     #: Rows that begin an episode, of a table that knows; None where columns tell episodes apart.
     starts: Sequence[int] | None = None
+    names: Sequence[str] = ()  #: of these episodes, of a table that knows
 
     @classmethod
     def of_numbers(
-        cls, path: str, before: int, numbers: dict[str, NDArray[np.float64]], starts: Sequence[int]
+        cls, path: str, before: int, numbers: Numbers, starts: Sequence[int], names: Sequence[str]
     ) -> Self:
         """Rows of numbers alone, after so many others."""
 
@@ -226,7 +228,7 @@ class Piece:
             text = "" if name is None else str(numbers[name][row])
             return f"{path}, row {before + row + 1}", text
 
-        return cls(len(next(iter(numbers.values()))), numbers, find, starts=starts)
+        return cls(len(next(iter(numbers.values()))), numbers, find, starts=starts, names=names)
 
     def at(self, row: int) -> str:
         """Where a row stands, for a message."""

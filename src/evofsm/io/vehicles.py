@@ -70,19 +70,20 @@ class PairTable(Table):
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """All columns, whichever are wanted."""
-        before, starts, waiting = 0, [0], list[NDArray[np.float64]]()
-        for rows in chain(self._episodes(), [None]):
+        before, starts, waiting, names = 0, [0], list[NDArray[np.float64]](), list[str]()
+        for (_, follower, leader), rows in chain(self._episodes(), [(("", "", ""), None)]):
             if rows is not None:
                 waiting.append(rows)
+                names.append(f"{follower} behind {leader}")
                 starts.append(starts[-1] + len(rows))
             if waiting and (rows is None or starts[-1] >= _ROWS_AT_ONCE):
                 numbers = dict(zip(COLUMNS, np.concatenate(waiting).T, strict=True))
-                yield Piece.of_numbers(self.path, before, numbers, starts[:-1])
-                before, starts, waiting = before + starts[-1], [0], []
+                yield Piece.of_numbers(self.path, before, numbers, starts[:-1], names)
+                before, starts, waiting, names = before + starts[-1], [0], [], []
         if before == 0:
             raise ValueError(f"{self.path}: no vehicle ever follows another one on the same lane")
 
-    def _episodes(self) -> Iterator[NDArray[np.float64]]:
+    def _episodes(self) -> Iterator[tuple[tuple[str, str, str], NDArray[np.float64] | None]]:
         """Rows of a pair for as long as it stays one, or until too many wait."""
         open_pairs: dict[tuple[str, str, str], array[float]] = {}
         waiting, before = 0, -math.inf
@@ -99,14 +100,14 @@ class PairTable(Table):
                 rows.extend((moment.time, pair.gap, pair.v_follower, pair.v_leader))
                 present[pair.who] = rows
             waiting += len(moment.pairs)
-            for rows in open_pairs.values():
+            for who, rows in open_pairs.items():
                 waiting -= len(rows) // 4
-                yield _with_actions(rows)
+                yield who, _with_actions(rows)
             open_pairs = present
             if waiting > _MOST_WAITING:
-                yield from map(_with_actions, open_pairs.values())
+                yield from ((who, _with_actions(rows)) for who, rows in open_pairs.items())
                 open_pairs, waiting = {}, 0
-        yield from map(_with_actions, open_pairs.values())
+        yield from ((who, _with_actions(rows)) for who, rows in open_pairs.items())
 
 
 def _with_actions(rows: array[float]) -> NDArray[np.float64]:

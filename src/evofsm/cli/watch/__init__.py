@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from evofsm.guard import Guard
     from evofsm.io import LogColumns, Topics, VehicleLengths
 
-# Of a simulation of somebody else's that are watched [s].
-_SECONDS = 600.0
+# Of a simulation of somebody else's that are watched [s], and positions of cars in them.
+_SECONDS, _ENOUGH = 600.0, 100_000
 
 
 def watch(
@@ -60,7 +60,14 @@ def watch(
             metavar="FAMILY|FILE",
         ),
     ] = "paper",
-    case: Annotated[int, option("Which of its cases, draws or episodes.", min=1)] = 1,
+    case: Annotated[
+        int | None,
+        option(
+            "Which of its cases, draws or episodes. [default: the first; of a log the one with a "
+            "collision, or most in danger]",
+            min=1,
+        ),
+    ] = None,
     world: InWorld = "kinematic",
     judge: ByJudge = "kinematic",
     tolerance: Tolerance = 0.02,
@@ -112,7 +119,7 @@ def watch(
     else:
         family = family_of(what, switches)
         guard, learnt = _guard(family, judge, tolerance, seed, learn_first, learn)
-        opened = _driven(family, guard, world, case, seed, learnt)
+        opened = _driven(family, guard, world, case or 1, seed, learnt)
     with suppress(KeyboardInterrupt), opened as watched:
         asyncio.run(_serve(watched, port, live=not is_recorded, browse=not no_browser))
     say("\nThe page is closed.")
@@ -149,7 +156,7 @@ def _is_log(what: str) -> bool:
 
 def _recorded(
     what: str,
-    case: int,
+    case: int | None,
     judge: Judge,
     tolerance: float,
     brakes: float,
@@ -167,15 +174,17 @@ def _recorded(
         with TemporaryDirectory() as folder, progress("Reading", MOST_ROWS) as move:
             run, log = Path(folder) / "run.mcap", what
             if log.endswith(".sumocfg"):
-                log = str(Path(folder) / f"{Path(what).stem}.xml")
-                trace_configuration(Path(what), Path(log), seconds=_SECONDS)
-            more = record_log(
+                log = str(Path(folder) / Path(what).name)
+                written = trace_configuration(Path(what), Path(log), _SECONDS, _ENOUGH)
+                warn(f"watched are the first {written:,.0f} s of the simulation")
+            names, more = record_log(
                 log, run, *reading, judge=judge, brakes=brakes, tolerance=tolerance, show=move
             )
             if more:
                 warn(f"watched are the first {MOST_ROWS:,} rows; there are more")
-            recording = Recording(run)
-    recording.restart(case - 1)
+            recording = Recording(run, names)
+    if case is not None:
+        recording.choose(case - 1)
     return nullcontext(recording)
 
 

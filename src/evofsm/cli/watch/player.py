@@ -120,7 +120,10 @@ class Player:
                     interval = self._watched.start.interval / self._speed
                     # What came late is not made up for.
                     self._due = max(self._due, time.monotonic() - _LATE) + interval
-                    self._show(self._watched.step())
+                    frame = self._watched.step()
+                    if frame.time < self._watched.start.begins:
+                        self._due = time.monotonic()
+                    self._show(frame)
         except Exception as error:
             # Whoever looks on must learn why nothing moves any more.
             self._audience("failed", f"{type(error).__name__}: {error}")

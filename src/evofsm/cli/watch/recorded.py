@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,8 @@ MOST_ROWS = 20_000
 # So many of a log's episodes can be chosen among.
 _MOST_EPISODES = 500
 _NONE = -1
+# So much is played before what an episode of a log is worth a look for [s].
+_BEFORE = 10.0
 # Whoever wants to see something needs as many.
 _FEWEST_ROWS = 10
 
@@ -54,12 +56,25 @@ class Recording:
     which states are dead ends; those in which a collision ended are marked instead.
     """
 
-    def __init__(self, path: str | PathLike[str]) -> None:
+    def __init__(self, path: str | PathLike[str], names: Sequence[str] = ()) -> None:
         self._run: Run = read_run(path)
         self._name = self._run.about.get("source", Path(path).name)
         self._episodes = [one for one in self._run.episodes if len(one.columns["time"])]
         if not self._episodes:
             raise ValueError(f"{path} holds no episode with a decision")
+        self._names = [f"episode {k + 1}" for k in range(len(self._episodes))]
+        self._order = list(range(len(self._episodes)))
+        self._jumps = bool(names)
+        if names:
+            risks = [
+                float(np.nanmax([0.0, *one.columns["risk_proposed"]])) for one in self._episodes
+            ]
+            rank = [(-one.collided, -risk) for one, risk in zip(self._episodes, risks, strict=True)]
+            self._order.sort(key=rank.__getitem__)
+            self._names = [
+                f"{name} ({'collision' if one.collided else f'risk {risk:.1%}'})"
+                for one, risk, name in zip(self._episodes, risks, names, strict=True)
+            ]
         self._tolerance = float(self._run.about.get("tolerance", TOLERANCE))
         self.revising = self._run.about.get("mode", "act") == "act"
         self.start = self.restart(0)
@@ -69,12 +84,16 @@ class Recording:
         case = self.start.case if case is None else case
         if not 0 <= case < len(self._episodes):
             raise ValueError(f"episode is {case + 1}; there are 1 to {len(self._episodes)}")
-        self._episode = self._episodes[case]
+        self._episode = self._episodes[self._order[case]]
         self._frames = list(_frames(self._episode, revising=self.revising))
         self._number = 0
         self._chronicle = Chronicle(self._tolerance)
         self.start = self._begun(case)
         return self.start
+
+    def choose(self, number: int) -> Start:
+        """Show an episode by its number in the log, from 0."""
+        return self.restart(self._order.index(number) if number in self._order else number)
 
     def step(self) -> Frame:
         """The next frame."""
@@ -100,14 +119,23 @@ class Recording:
         return Start(
             family=about.get("family", self._name),
             about=f"recorded in {self._name}",
-            cases=tuple(f"episode {k + 1}" for k in range(len(self._episodes[:_MOST_EPISODES]))),
+            cases=tuple(self._names[k] for k in self._order[:_MOST_EPISODES]),
             case=case,
             tolerance=self._tolerance,
             interval=float(np.median(np.diff(times))),
             actions=(float(np.nanmin(commands)), float(np.nanmax(commands))),
             learnt=0,
             judge=about.get("judge", "kinematic"),
+            shadow=not self.revising,
+            begins=self._worst() - _BEFORE if self._jumps else 0.0,
         )
+
+    def _worst(self) -> float:
+        """When it collided, or was in most danger [s]."""
+        risks = self._episode.columns["risk_proposed"]
+        if self._episode.collided or np.isnan(risks).all():
+            return self._episode.end_time
+        return float(self._episode.columns["time"][np.nanargmax(risks)])
 
 
 def _decided(columns: Any, number: int) -> dict[str, Any]:
@@ -181,11 +209,11 @@ def record_log(
     brakes: float = BRAKES,
     tolerance: float = TOLERANCE,
     show: Callable[[int], object] = lambda rows: None,
-) -> bool:
+) -> tuple[list[str], bool]:
     """Write the episodes of a log of cars as a run, decided on by a guard that learns on the way.
 
-    Returns whether rows after the first `MOST_ROWS` were left out; ``show`` is told how many
-    were decided on.
+    Returns what they are called, and whether rows after the first `MOST_ROWS` were left out;
+    ``show`` is told how many were decided on.
     """
     names = VARIABLES if columns is None else columns.observe.names
     if len(names) != len(VARIABLES):
@@ -195,7 +223,7 @@ def record_log(
         )
     noted = Noted()
     reading = read_traces([path], columns, lengths, noted=noted, topics=topics)
-    taken, more = 0, False
+    taken, more, called = 0, False, list[str]()
     about: dict[str, Any] = {"source": Path(path).name, "mode": "shadow", "judge": judge}
     guard = None
     with recording(out, about | {"controller": "as recorded", "tolerance": tolerance}) as log:
@@ -207,6 +235,7 @@ def record_log(
             if len(episode.times) >= _FEWEST_ROWS:
                 if guard is None:
                     guard = _guard(judge, episode.dt, brakes, tolerance)
+                called += episode.names or [f"episode {len(called) + 1}"]
                 log.add(
                     shadow_drive(
                         guard,
@@ -224,7 +253,7 @@ def record_log(
         warn(f"warning: {warning}")
     if judge == "kinematic":
         warn(assumptions(brakes, tolerance))
-    return more
+    return called, more
 
 
 def _guard(judge: str, interval: float, brakes: float, tolerance: float) -> Guard:

@@ -82,6 +82,8 @@ class Start(NamedTuple):
     car_length: float = 5.0  #: as it is drawn; worlds need none [m]
     ttc_threshold: float = _TTC.threshold  #: time to collision below which it warns [s]
     headway_threshold: float = _HEADWAY.threshold  #: the same of time headway [s]
+    shadow: bool = False  #: recorded by a guard that changed nothing
+    begins: float = 0.0  #: what was before is shown at once [s]
 
 
 class Frame(NamedTuple):

@@ -49,7 +49,7 @@ def tell(frame: Frame, start: Start) -> Told:
         why, done = _no_danger(frame, knows_leaders), _quiet(story, knows_leaders)
     else:
         when = _when(story, danger, knows_leaders)
-        why, done = _why(danger.began), _done(danger, frame)
+        why, done = _why(danger.began), _done(danger, frame, start)
     others = (
         f"Time to collision (below {start.ttc_threshold:g} s) "
         f"{_noticed(story.time_to_collision, story.first)}; "
@@ -131,13 +131,14 @@ def _why(began: Frame) -> str:
     )
 
 
-def _done(danger: Danger, frame: Frame) -> str:
+def _done(danger: Danger, frame: Frame, start: Start) -> str:
     first, share = danger.stepped_in, f"{danger.revised} of {danger.decisions} decisions in danger"
     if first is None:
         if frame.revising:
             return "The reviser has changed nothing yet."
         instead = _instead(danger.began.advised, danger.began.proposed)
-        return f"Nothing: the reviser is off. It would have begun at once, {instead}."
+        why = "it only watched, in shadow mode" if start.shadow else "the reviser is off"
+        return f"Nothing: {why}. It would have begun at once, {instead}."
     if not frame.revising:
         return f"The reviser changed {share}, but now it is off."
     hardest = ""

@@ -72,7 +72,7 @@ function showControls() {
 
 function showMode() {
   at("live").hidden = run.isLive;
-  const recorded = run.start && !run.start.live ? "recorded" : "live";
+  const recorded = !run.start || run.start.live ? "live" : run.start.shadow ? "shadow" : "recorded";
   const mode = !run.isLive ? "past" : run.clock.over ? "ended" : run.clock.paused ? "paused" : recorded;
   if (socket.readyState === WebSocket.OPEN) at("mode").textContent = mode;
   at("time").textContent = `${run.shown.toFixed(1)} s`;

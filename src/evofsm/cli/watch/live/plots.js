@@ -3,6 +3,7 @@
 import { colour, fresh, line, text } from "./paint.js";
 
 const LEFT = 40, RIGHT = 12;
+const MOST_BAND = 0.3; // a wider interval says little, and would fill the panel
 
 /** What is drawn in each panel; `name` answers a frame's value, null where there is none. */
 function panels(start) {
@@ -210,7 +211,8 @@ function drawBand(pen, frames, band, x, y) {
     stretch = [];
   };
   for (const frame of frames) {
-    if (band(frame).high === null) fill();
+    const { low, high } = band(frame);
+    if (high === null || high - low > MOST_BAND) fill();
     else stretch.push(frame);
   }
   fill();

@@ -2,7 +2,8 @@
 
 import { colour, fresh, hexagon, line, text } from "./paint.js";
 
-const MOST_BARS = 4, FEW = 80;
+const MOST_BARS = 4;
+const APART = [20, 16]; // of two numbers, or of what a circle would cover of one [px]
 const EDGE = { left: 36, right: 14, top: 14, bottom: 34 };
 
 export function drawBelief(list, run) {
@@ -69,10 +70,17 @@ export function drawMap(canvas, run) {
   }
   drawTrail(pen, run, where, graph);
   const most = Math.max(...graph.states.map((state) => state.visits), 1);
-  for (const state of graph.states) {
-    drawState(pen, state, where(state.state), 4 + 6 * Math.sqrt(state.visits / most), graph.states.length <= FEW, false);
-  }
   const present = graph.states[decision.state];
+  // The most usual ones are numbered first, and none over another one's number.
+  const taken = present ? [where(present.state)] : [];
+  const free = ([a, b]) => taken.every(([c, d]) => Math.abs(a - c) > APART[0] || Math.abs(b - d) > APART[1]);
+  const numbered = new Set([...graph.states].sort((a, b) => b.visits - a.visits)
+    .filter((state) => free(where(state.state)) && taken.push(where(state.state))));
+  const inOrder = [...graph.states].sort((a, b) => numbered.has(a) - numbered.has(b)); // circles below
+  for (const state of inOrder) {
+    const radius = 4 + 6 * Math.sqrt(state.visits / most);
+    drawState(pen, state, where(state.state), radius, numbered.has(state), false);
+  }
   if (present) drawState(pen, present, where(present.state), 11, true, true);
   canvas.setAttribute("aria-label", present
     ? `${graph.states.length} states; now in number ${present.state + 1}: ${present.name}`
