@@ -225,6 +225,7 @@ def test_in_a_file_it_is_kept_as_it_is_also_between_two_fits(more):
         ("links", lambda array: np.zeros_like(array), "another moment"),
         ("actions", lambda array: np.full_like(array, 7.0), "an action is none"),
         ("lost", lambda array: np.ones_like(array), "end of an episode"),
+        ("links", lambda array: np.full_like(array, -1), "no object is seen twice"),
         ("own", lambda array: array[:, :2], "other columns"),
     ],
 )
@@ -235,6 +236,21 @@ def test_a_file_that_contradicts_itself_is_refused(taught, name, change, what):
     store.write(bad, _KIND, content, arrays | {name: change(arrays[name])})
     with pytest.raises(ValueError, match=what):
         SceneRisk.load(BytesIO(bad.getvalue()))
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"n_actions": 10**9}, "n_actions"),
+        ({"own": np.inf}, "own of inf"),
+        ({"failures": []}, "failures"),
+    ],
+)
+def test_a_forged_file_is_refused(taught, forge, tmp_path, change, why):
+    taught.judge.save(tmp_path / "judge")
+    forge(tmp_path / "judge", change)
+    with pytest.raises(ValueError, match=why):
+        SceneRisk.load(tmp_path / "judge")
 
 
 # -- How close is too close --------------------------------------------------------------------

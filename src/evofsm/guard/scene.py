@@ -63,10 +63,12 @@ _ROWS = 10
 _POINTS = 6
 # Shapes of the box around an object that are tried: how much longer than wide, as powers of e.
 _SHAPES = np.linspace(-3.5, 3.5, 29)
+# Actions, each of which is foreseen by itself.
+_MOST_ACTIONS = 1_000
 # Closest steps that were survived, of which each counts.
 _CLOSEST = 2000
 
-_SOME = Numbers(least=-math.inf, most=math.inf)
+_SOME = Numbers(least=-1e31, most=1e31)
 _INDEX = Numbers(least=-1.0, most=MOST_COUNTED, whole=True)
 _KIND = Kind(
     "scenerisk",
@@ -81,7 +83,7 @@ _KIND = Kind(
     },
     {
         "dt": SIZE,
-        "n_actions": FROM_1,
+        "n_actions": FROM_1._replace(most=_MOST_ACTIONS),
         "columns": FROM_1,
         "failures": COUNT,
         "fitted": COUNT,
@@ -153,6 +155,8 @@ class SceneRisk(ActionJudge):
         self.relative = relative
         #: What was learnt.
         self.memory = Memory(operator.index(n_actions), self.columns - 1 - _P)
+        if n_actions > _MOST_ACTIONS:
+            raise ValueError(f"n_actions is {n_actions}; it must be at most {_MOST_ACTIONS:,}")
         self._seen, self._actions = [], []
 
     def refuse_unfit(self, low: Action, high: Action) -> None:
@@ -515,6 +519,8 @@ class Memory:
             known = past.between(0, fitted)
             self._fit_spreads(known)
             self._fit_motion(known)
+            if self._motion is None:
+                raise ValueError(f"{fitted} episodes were learnt from, but no object is seen twice")
             self._conclude(known)
 
     def _fit(self, past: Past) -> Past:
