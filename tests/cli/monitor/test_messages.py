@@ -34,6 +34,7 @@ def refused(form, message):
 
 def test_a_row_is_read_to_the_last_bit():
     assert FORM.read(line(gap=0.1 + 0.2)) == Row(1.0, (0.1 + 0.2, 20.0, 18.0), 0.5)
+    assert FORM.read(b"\xef\xbb\xbf" + line(gap=0.1 + 0.2)) == FORM.read(line(gap=0.1 + 0.2))
     assert FORM.read(line(schema=1, gap=None, proposal=None)) == Row(1.0, (None, 20.0, 18.0), None)
 
 

@@ -111,6 +111,7 @@ class Form:
 
     def read(self, line: bytes) -> Message:
         """The message on a line."""
+        line = line.removeprefix(b"\xef\xbb\xbf")  # a byte order mark, before the first line
         if len(line) > LONGEST:
             raise MessageError("line", f"is longer than {LONGEST} bytes")
         kind = self._row
