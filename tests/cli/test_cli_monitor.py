@@ -158,7 +158,7 @@ def test_a_summary_says_how_often_it_alarms_by_tolerance_and_where_it_is_worst(t
     ("arguments", "said"),
     [
         (("--summary",), "--summary needs FILE"),
-        (("--episode", "trip"), "must be a number of rows, or columns of a log"),
+        (("--episode", "trip"), "is a number of rows, or columns of a log"),
         (("--mode", "drive"), "'drive' is not one of 'off', 'shadow', 'advise', 'act'"),
         (("--udp", 0, "--socket", "x"), "give one of FILE, --socket, --udp and --zenoh"),
         (("--guard", "nowhere"), "nowhere: no such file or directory"),

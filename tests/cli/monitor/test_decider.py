@@ -74,6 +74,13 @@ def test_gaps_in_time_and_rows_that_come_too_often_are_noted():
     assert notes[4] is None
 
 
+def test_speeds_that_must_be_of_another_unit_are_noted_once():
+    decider = Decider(made())
+    row = next(iter(rows(1))) | {"v_follower": 79.0}
+    notes = [decider.answer(line(row | {"time": 0.1 * k})).get("note") for k in range(3)]
+    assert notes == ["v_follower is above 60 m/s: is that km/h?", None, None]
+
+
 def test_an_episode_ends_where_it_is_told_to_and_learns_of_it():
     guard = made(learn=True)
     decider = Decider(guard)

@@ -32,6 +32,7 @@ from evofsm.cli.options import (
 from evofsm.cli.show import show, warn
 
 if TYPE_CHECKING:
+    from evofsm.cli.monitor.decider import Decider
     from evofsm.cli.monitor.transports import Transport
     from evofsm.guard import Guard
     from evofsm.io import Chunk, LogColumns
@@ -121,13 +122,9 @@ def monitor(
     if sum(one is not None for one in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
     if traffic and (guard or state or learn):
-        raise ValueError(
-            "--traffic learns nothing: it goes with none of --guard, --state and --learn"
-        )
-    if summary and (file is None or any((state, audit, heartbeat, warm))):
-        raise ValueError(
-            "--summary needs FILE, and goes with none of --state, --audit, --heartbeat and --warm"
-        )
+        raise ValueError("--traffic learns nothing: it goes with no --guard, --state or --learn")
+    if summary and (file is None or state or audit):
+        raise ValueError("--summary needs FILE, and goes with no --state or --audit")
     require(**({} if zenoh is None else {"zenoh": "zenoh"}))
     from evofsm.cli.monitor.decider import EPISODE, Decider
     from evofsm.cli.monitor.state import State
@@ -150,9 +147,7 @@ def monitor(
     if is_log and not summary:
         warn(f"warning: {file} is read as JSON lines; of a log, --summary says where it alarms")
     elif episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
-        raise ValueError(
-            f"--episode is {episode!r}; it must be a number of rows, or columns of a log"
-        )
+        raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns of a log")
     rows = EPISODE if episode is None or is_log else int(episode)
     with ExitStack() as stack:
         if summary and file is not None:
@@ -186,7 +181,7 @@ def monitor(
         _prepare(used, mode, tolerance, audit, stack, learn=learn)
         decider = Decider(used, episode=rows)
         if warm:
-            _compile(used, scenes=decider.form.scenes)
+            _compile(decider)
         if saved is not None:
             again = saved.begin(decider)
             if decider.n:
@@ -286,16 +281,14 @@ def _transport(
     return Stream(source, sys.stdout.buffer), ""
 
 
-def _compile(guard: Guard, *, scenes: bool) -> None:
+def _compile(decider: Decider) -> None:
     """Decide a few times on a copy, which then is thrown away."""
     import numpy as np
 
     from evofsm.driving import Object, Scene
 
-    twin = guard.copy()
-    count = len(twin.variables) or (0 if twin.machine is None else twin.machine.n_variables)
-    seen = np.array([30.0, 20.0, 20.0]) if count == 3 else np.ones(max(1, count))
-    if scenes:
+    twin, seen = decider.guard.copy(), np.ones(decider.form.count or 1)
+    if decider.form.scenes:
         own, other = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
         seen = Scene(own, [other, other._replace(x=-20.0)]).rows(2)
     for k in range(4):

@@ -17,6 +17,7 @@ import numpy as np
 
 from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
 from evofsm.cli.show import plain
+from evofsm.driving.naming import VARIABLES
 from evofsm.guard import (
     ActionReviser,
     BoxActions,
@@ -33,6 +34,8 @@ _log = logging.getLogger(__name__)
 EPISODE = 6000
 # So many of the latest messages are known again when they are sent again.
 _RECENT = 256
+# No car is faster [m/s].
+_FAST = 60.0
 # What is older by less is late; what is older by more comes from a sender that began anew [s].
 _LATE = 1.0
 #: A gap in time, and rows that come too often, in intervals.
@@ -61,7 +64,7 @@ class Decider:
         self.rows = 0  #: of the episode under way; 0 where none is
         self._recent: deque[tuple[Message, Answer]] = deque(maxlen=_RECENT)
         self._next: int | None = None  # of the recent ones, where they are being sent again
-        self._said_often = self._has_failed = False
+        self._said_often = self._said_fast = self._has_failed = False
         reviser = guard.reviser
         self._has_margin = isinstance(reviser, ActionReviser) and not isinstance(
             reviser.risk, SearchingJudge
@@ -158,7 +161,7 @@ class Decider:
             self.guard.end(failed, observation)
         except OSError as error:  # only the audit log writes
             self._lose_audit(error)
-        self.rows, self._said_often = 0, False
+        self.rows, self._said_often, self._said_fast = 0, False, False
 
     def _end_unasked(self) -> None:
         """The same where nobody waits for an answer to it; what somebody's judge raises is said."""
@@ -169,7 +172,7 @@ class Decider:
             self.rows = 0
 
     def _decided(self, row: Row) -> Answer:
-        notes = self._notes(row)
+        notes = self._notes(row) + self._odd_speeds(row)
         note = {"note": "; ".join(notes)} if notes else {}
         self.n += 1
         who = {} if row.ahead is None else {"ahead": row.ahead}
@@ -220,6 +223,13 @@ class Decider:
             self._said_often = True
             return [f"rows come every {step:.3g} s, but the guard was made for {interval:g} s"]
         return []
+
+    def _odd_speeds(self, row: Row) -> list[str]:
+        """What can hardly be m/s; said once in an episode."""
+        seen = zip(self.form.variables, row.observation or (), strict=False)
+        fast = [name for name, value in seen if name in VARIABLES[1:] and abs(value or 0.0) > _FAST]
+        was_said, self._said_fast = self._said_fast, self._said_fast or bool(fast)
+        return [f"{fast[0]} is above {_FAST:g} m/s: is that km/h?"] if fast and not was_said else []
 
     def _revision(self, row: Row) -> Revision:
         proposal: Any = row.proposal

@@ -94,12 +94,11 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
     episodes, worst = np.cumsum(begins), []
     for at, seconds in zip(highest[ranked].tolist(), long[ranked], strict=True):
         if risks[at] or alarms[at]:
-            seen = [_shown(value) for value in (rows[at].observation or ())[: len(names)]]
-            where = (f"{episodes[at]:.0f}", f"{times[at]:.10g}", *seen, _shown(rows[at].proposal))
+            seen = [*(rows[at].observation or ())[: len(names)], rows[at].proposal]
+            shown = [
+                f"{v:.4g}" if isinstance(v, float) else str("" if v is None else v) for v in seen
+            ]
+            where = (f"{episodes[at]:.0f}", f"{times[at]:.10g}", *shown)
             worst.append((*where, f"{risks[at]:.1%}", f"{seconds:.1f}"))
     header = ("episode", "time", *names, "proposed", "risk", "alarm lasts [s]")
     yield table("\nThe worst moments", header, worst)
-
-
-def _shown(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float | int) else "" if value is None else str(value)
