@@ -187,6 +187,10 @@ def _refuse_impossible(learnt: Learnt) -> None:
             )
     if now["n_observations"] < n:
         raise ValueError(f"n_observations is {now['n_observations']}, but there are {n} states")
+    latest = {"began": now["began"], "latest_visit": learnt.states["latest_visit"]}
+    for name, when in (latest | {"latest_try": learnt.tries["latest_try"]}).items():
+        if np.max(when, initial=0.0) > now["clock"]:
+            raise ValueError(f"{name} is after the latest of {now['clock']} observations")
     if sorted(learnt.actions["place"][learnt.actions["place"] != NOT_OPEN]) != list(range(s)):
         raise ValueError("place of an action is not that of a matrix")
     refuse_more_failures(by_name(learnt))
