@@ -59,6 +59,7 @@ WRONG = (
     "left behind",
     "lost observations",
     "locks held",
+    "over their time",
     "stuck monitors",
     "states not of one owner",
 )
@@ -601,6 +602,44 @@ def _peak() -> int:
     return tracemalloc.get_traced_memory()[1]
 
 
+# -- Many variables -------------------------------------------------------------------------------
+
+# What a decision and an end may take with 40 variables [s of the processor], and more as their
+# square: all but one of a hundred decisions.
+_DECIDES, _ENDS = 0.005, 0.5
+
+
+def dimensions(most: int, folder: Path, random: np.random.Generator) -> Counter[str]:
+    """Guard what fails where the first of m variables goes too far, for each m."""
+    found: Counter[str] = Counter()
+    for m in range(1, most + 1):
+        guard = Guard(-1.0, 1.0, interval=0.05)
+        took: list[float] = []
+        ends: list[float] = []
+        for _ in range(4):
+            z, failed = np.zeros(m), False
+            while not failed and len(took) < 200 * (1 + len(ends)):
+                began = time.thread_time()
+                action = float(guard.decide(z, random.uniform(-0.3, 1.0)).executed)
+                took.append(time.thread_time() - began)
+                z += 0.2 * (np.append(z[0], z[:-1]) - z) + 0.02 * random.normal(size=m)
+                z[0] += 0.05 * action
+                failed = bool(z[0] > 1.0)
+            began = time.thread_time()
+            guard.end(failed, z)
+            ends.append(time.thread_time() - began)
+        decides, room = float(np.quantile(took, 0.99)), max(1.0, m / 40.0) ** 2
+        if m % 10 == 0:
+            print(
+                f"  {m} variables: {1e3 * decides:.1f} ms, an end {1e3 * max(ends):.0f} ms; "
+                f"bounds {1e3 * room * _DECIDES:.1f} and {1e3 * room * _ENDS:.0f} ms",
+                flush=True,
+            )
+        found["dimensions"] += 1
+        found["over their time"] += (decides > room * _DECIDES) + (max(ends) > room * _ENDS)
+    return found
+
+
 # -- All of it ------------------------------------------------------------------------------------
 
 
@@ -633,6 +672,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ("monitors that refuse ends", partial(restart, starts)),
             ("two monitors on one state", partial(rival, rivals)),
             ("damaged files", partial(damage, files)),
+            ("many variables", partial(dimensions, 60)),
             ("four threads a machine", partial(one_machine.threads, shared)),
             (
                 "interrupted at a line",

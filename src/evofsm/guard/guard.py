@@ -39,6 +39,7 @@ from evofsm.guard.api import (
     Situation,
 )
 from evofsm.guard.learnt.judge import LearntRisk
+from evofsm.guard.learnt.replay import refuse_too_many
 from evofsm.guard.parts import outline, part_class, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.warming import warm_judge, warm_machine
@@ -483,7 +484,8 @@ class Guard:
             named = f" ({', '.join(self.variables)})" if self.variables else ""
             raise ValueError(f"observation has {len(z)} variables; it must have {known}{named}")
         if (judge := self._observing) and len(z) != judge.dynamics.n_variables:
-            judge.dynamics.refuse(len(z))
+            learnt = judge.dynamics
+            refuse_too_many(len(z), learnt.size, box=not learnt.choices)
         return z
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:

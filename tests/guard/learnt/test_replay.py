@@ -6,6 +6,7 @@ import pytest
 from evofsm.guard.learnt.library import Backups, harm
 from evofsm.guard.learnt.replay import (
     CHANGED,
+    CUT_SHORT,
     KEPT,
     NOTHING_PASSES,
     Disturbances,
@@ -128,12 +129,14 @@ def test_the_kernel_replays_as_a_plain_loop_does(choices, planned):
 # -- Which action passes ------------------------------------------------------------------------
 
 
-def search_for(model, proposal, policies, margin=0.0, place=0.0, disturbances=None, allowed=0):
+def search_for(
+    model, proposal, policies, margin=0.0, place=0.0, disturbances=None, allowed=0, most=np.inf
+):
     """What is found there, if nothing disturbs: how, the action, the backup, and what is left."""
     disturbances = Disturbances.none(1, STEPS, 1) if disturbances is None else disturbances
     here, policies = np.array([place, 0.0, *[0.0] * len(proposal)]), np.array(policies)
     asked = here, policies, np.arange(len(policies)), disturbances, 1.0, np.array(proposal)
-    return search(model, *asked, margin, allowed)
+    return search(model, *asked, margin, allowed, most)
 
 
 def test_where_full_action_only_just_holds_nothing_passes():
@@ -165,6 +168,14 @@ def test_where_nothing_passes_the_backup_that_lasts_longest_is_told_and_whether_
     how, action, backup, apart = search_for(model, [1.0], [to, still, away], place=WALL - 2.0)
     assert (how, backup, action.tolist()) == (NOTHING_PASSES, 2, [-0.1])
     assert search_for(model, [1.0], [to, to], place=WALL - 2.0)[-1] < 0.02 < apart
+
+
+@pytest.mark.parametrize(("most", "how"), [(0, CUT_SHORT), (2, CUT_SHORT), (3, CHANGED)])
+def test_a_search_is_cut_short_after_so_many_steps_with_the_backup_that_passed_last(most, how):
+    back, still = [[-1.0, 0.0]], [[-0.5, 0.0]]
+    found = search_for(mover(), [1.0], [back, still], place=WALL - 0.2, most=most)
+    assert found[0] == how
+    assert how == CHANGED or (found[1].tolist(), found[2]) == ([-1.0], 0)
 
 
 def test_so_many_disturbances_need_not_be_survived_but_that_none_begins():

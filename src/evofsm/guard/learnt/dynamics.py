@@ -26,6 +26,7 @@ from evofsm.guard.learnt.replay import (
     learn_transition,
     n_features,
     n_products,
+    pairs,
     refuse_too_many,
     replay,
     residuals,
@@ -67,6 +68,8 @@ _JUMP_PRIOR = 3.0
 _CLOSE = 3.0
 # So many times the sequences that are kept there may be until somebody chooses.
 _SPARE = 4
+# Sequences that are kept of many variables: with none at all they fill a cache line.
+_REMEMBERED_OF_MANY = 7
 
 
 class Episode(NamedTuple):
@@ -79,10 +82,7 @@ class Episode(NamedTuple):
 
 
 class DisturbanceSequence(NamedTuple):
-    """What happened for a while, as it was observed: residuals follow from it at any time.
-
-    Unless it was observed of a system that moves otherwise now: then they are kept with it.
-    """
+    """What happened for a while, as observed; residuals follow, unless it moves otherwise now."""
 
     observations: Floats  #: (L + 2, m), the first one step before it began
     actions: Floats  #: (L + 1, a), the first one step before it began
@@ -175,8 +175,10 @@ class Dynamics:
     def _begin(self, z: Floats) -> None:
         """Make room for what is learnt; variables are counted from the first observation on."""
         m, a = len(z), self.size
-        self.refuse(m)
+        refuse_too_many(m, a, box=not self.choices)
         p = n_features(m, a, box=not self.choices)
+        if not len(pairs(m)[0]):
+            self.remembered = min(self.remembered, _REMEMBERED_OF_MANY)
         self.n_variables, self.origin = m, z.copy()
         self.sums, self.weights, self.ready = Sums.none(z, p), np.zeros((p, m)), False
         #: (m,) of all that was survived, and (m, 2) in how many episodes those ends were reached.
@@ -189,10 +191,6 @@ class Dynamics:
         self.doubt_of_lags = 0.0
         self.rebuild()
         self.forget_episode()
-
-    def refuse(self, m: int) -> None:
-        """Raise a ValueError for more variables than can be learnt of."""
-        refuse_too_many(m, self.size, box=not self.choices)
 
     def observe(self, z: Floats) -> bool:
         """Take in an observation (m,), all finite; whether something unexpected began with it."""
@@ -607,7 +605,7 @@ class Dynamics:
             self.used = arrays["used"]
             return
         told, rows, jumps = arrays["sequences"], arrays["sequence_rows"], arrays["jumps"]
-        self.refuse(m)
+        refuse_too_many(m, a, box=not self.choices)
         if p != n_features(m, a, box=not self.choices):
             raise ValueError(f"sums of {p} features are not of {m} variables and {a} numbers")
         for name in ("thresholds", "drifts", "jumps"):

@@ -26,7 +26,7 @@ from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.learnt import library, words
 from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics
 from evofsm.guard.learnt.library import Backups, Violations
-from evofsm.guard.learnt.replay import KEPT, NOTHING_PASSES, Disturbances, Floats, Ints, search
+from evofsm.guard.learnt.replay import CUT_SHORT, KEPT, Disturbances, Floats, Ints, search
 from evofsm.guard.learnt.words import Remembered
 from evofsm.store import COUNT, FLAG, FROM_1, SHARE, SIZE, Kind, Numbers, Place
 
@@ -40,6 +40,8 @@ JUDGE_PARTS: tuple[str, ...] = ("margin", "backups", "breaks", *DYNAMICS_PARTS)
 _REMEMBERED = 10
 # Backups that are asked in a decision, and disturbances that mutants are tried on, besides none.
 _ASKED, _TRIED_ON = 3, 5
+# Products in the replays of a search, after which it is cut short: at most, and in a second.
+_WORK, _WORK_RATE = 7e6, 8.75e8
 # The margin [ordinary changes]: at first, at most, what is left of it an episode later, and what a
 # violated certificate adds, which is also the least, for so many that may be.
 _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
@@ -88,10 +90,8 @@ class LearntRisk:
     there is nothing that it could prevent, and all is kept; in the first episode also where failure
     was given as a function.
 
-    It learns of at most 64 variables, fewer where actions have more than 25 numbers, and refuses
-    others. Products of two variables count in what it expects up to 12 variables, those of actions
-    with variables as long as there are at most 80 of them: the cost grows with the square of the
-    number of variables.
+    It learns of at most 64 variables, fewer where actions have more than 25 numbers, and expects
+    products of two up to 12 variables, of actions with variables up to 80 such products.
 
     Parameters
     ----------
@@ -119,6 +119,9 @@ class LearntRisk:
 
     Notes
     -----
+    A search is cut short after as many steps of replays as take a tenth of the interval, of three
+    at least; its reason says so. They are counted, not timed: it comes out the same again.
+
     The risk of an action is the probability that within the horizon something begins that no
     backup survives after it: ``1 - exp(-unsurvived / exposure * horizon)``, from the number of
     remembered disturbances that are not survived and the time in which they were seen; 1 where not
@@ -150,6 +153,7 @@ class LearntRisk:
     _notes: list[tuple[bool, bool]]  # both, of each observation that is to be studied
     _fails_after: float  # steps after which what was refused fails, at the latest
     _unsurvived: int
+    _asked: int  # number of backups under which it is judged
     _ranks: Ints  # of backups, those first that passed last
 
     def __init__(
@@ -287,18 +291,22 @@ class LearntRisk:
         remembered, ranks = self.remembered, self._ranks[:_ASKED]
         allowed = self._allowed(tolerance, remembered)
         asked = model, here, backups.policies, ranks, disturbances, scale
-        how, action, which, left = search(*asked, proposal, self.margin, allowed)
+        each = model.weights.size * disturbances.residuals.shape[2]
+        most = max(min(_WORK, _WORK_RATE * self.dt) / each, _ASKED * self.horizon)
+        how, action, which, left = search(*asked, proposal, self.margin, allowed, most)
         tried = None
         if which != ranks[0]:  # what passed now is asked first the next time
             self._ranks = np.append(which, self._ranks[self._ranks != which])
-        passes, self._refused = how != NOTHING_PASSES, how != KEPT
+        passes, self._refused, cut = how < CUT_SHORT, how != KEPT, how == CUT_SHORT
         self._holds = passes
         if not passes:
-            if self._certified:
-                again = search(*asked, action, 0.0, allowed)
-                self._holds = again[0] != NOTHING_PASSES
+            if self._certified and not cut:
+                how = search(*asked, action, 0.0, allowed, most)[0]
+                self._holds = how < CUT_SHORT
+            self._certified &= how != CUT_SHORT  # whether one is violated is not known
             tried = self._untried(action) if self.learning and left < _ALIKE else None
             action = action if tried is None else tried
+        self._asked = 1 if most < 2 * _ASKED * self.horizon else _ASKED
         judged, self._dead_end, fails_after = self._judged(
             situation,
             here,
@@ -313,7 +321,7 @@ class LearntRisk:
         if passes:
             instead = words.changed(backup, remembered, self.margin, allowed)
         else:
-            instead = words.TRIED if tried is not None else words.lasting(backup)
+            instead = words.TRIED if tried is not None else words.lasting(backup, cut=cut)
         executed = np.reshape(dynamics.decode(action), np.shape(wanted))
         return Search(np.array((one[0], executed)), judged, 1, f"{why}; {instead}")
 
@@ -339,7 +347,7 @@ class LearntRisk:
         latest.
         """
         asked = actions if passes is None else actions[:-1]
-        each = [self._foresee(here, action[None], self._ranks[:_ASKED]) for action in asked]
+        each = [self._foresee(here, action[None], self._ranks[: self._asked]) for action in asked]
         if passes is not None:
             each.append((0.0, passes, 0.0))
         unsurvived, left, after = zip(*each, strict=True)
@@ -382,7 +390,7 @@ class LearntRisk:
         if math.isinf(unsurvived):
             return 1.0, 0.0, 1.0
         low, high = poisson_bounds(int(unsurvived))
-        high = high if unsurvived < _REMEMBERED else math.inf
+        high = high if unsurvived < self.dynamics.remembered else math.inf
         return -math.expm1(-unsurvived * soon), -math.expm1(-low * soon), -math.expm1(-high * soon)
 
     def _allowed(self, tolerance: float, remembered: Remembered) -> int:
@@ -508,7 +516,7 @@ class LearntRisk:
         self._certified = self._was_certified = self._holds = self._violated = False
         self._refused = self._dead_end = False
         self._notes = []
-        self._unsurvived, self._fails_after = 0, 0.0
+        self._unsurvived, self._fails_after, self._asked = 0, 0.0, _ASKED
         self._ranks = np.zeros(0, int) if self.backups is None else self.backups.ranks
 
     @_atomic

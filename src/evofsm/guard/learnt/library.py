@@ -55,6 +55,11 @@ _ROUNDED = 9
 _MOST_CORNERS = 3
 
 
+def fewer(number: int, m: int) -> int:
+    """So many as are tried or kept with m variables: with more than 12 each replay costs more."""
+    return max(1, number * 12 // max(m, 12))
+
+
 # -- Disturbances and situations ------------------------------------------------------------------
 
 
@@ -92,7 +97,7 @@ def noted(
 ) -> Floats:
     """Situations with one more of an episode, a tight one, and some before failure."""
     z, u = episode.observations, episode.actions
-    T = len(u)
+    T, most = len(u), fewer(KEPT, z.shape[1])
     steps = list(random.integers(1, T, 1))
     tights = np.flatnonzero(tight[1:T]) + 1
     if len(tights):
@@ -102,11 +107,11 @@ def noted(
         steps += list(np.maximum(1, T - 1 - back))
     for t in steps:
         one = np.concatenate([z[t], z[t] - z[t - 1], u[t - 1]])
-        if len(situations) < KEPT:
+        if len(situations) < most:
             situations = np.vstack([situations.reshape(-1, len(one)), one])
         else:
             situations = situations.copy()
-            situations[int(random.integers(KEPT))] = one
+            situations[int(random.integers(most))] = one
     return situations
 
 
@@ -125,9 +130,9 @@ def scan(
     if not len(safe):
         return
     safe = random.permutation(safe)[:_TRIED]
-    steps = np.arange(n)
-    if n > _MOST_STARTS:
-        steps = np.sort(random.permutation(n)[:_MOST_STARTS])
+    steps, most = np.arange(n), fewer(_MOST_STARTS, m)
+    if n > most:
+        steps = np.sort(random.permutation(n)[:most])
     rest = np.vstack([episode.residuals, np.zeros((horizon, m))])
     begun = Disturbances.none(len(steps), horizon, m)
     begun.residuals[:] = rest[np.arange(horizon)[:, None] + steps].transpose(0, 2, 1)
@@ -281,7 +286,7 @@ class Backups:
         own_order = np.ix_(np.argsort(self.actions), np.argsort(columns))
         signs = np.append(1.0, self.flips) * self.turns[:, None]
         values = np.array([worth(policy) for policy in policies])
-        for _ in range(_MUTANTS if len(linear) else 0):
+        for _ in range(fewer(_MUTANTS, len(self.variables)) if len(linear) else 0):
             parent = linear[values[linear].mean(1).round(_ROUNDED).argmax()]
             if random.random() >= _OF_BEST:
                 parent = ranks[int(random.integers(len(policies)))]
@@ -314,8 +319,7 @@ def _order(rows: Floats) -> Ints:
 
 # -- Certificate violations -----------------------------------------------------------------------
 #
-# A certificate says that all that is remembered is survived. It is violated where something begins
-# that is worse than all of that. That happens now and then; where it suddenly happens in every
+# A certificate says that all that is remembered is survived. Where it is suddenly violated in every
 # second episode, what is remembered is no measure any more of what may begin.
 
 # Of the share of episodes with a violation: what it is at first, how much more it may be than of
@@ -326,18 +330,7 @@ _WEIGHT, _BELIEVED = 0.05, 6.0
 
 
 class Violations(NamedTuple):
-    """In how many episodes certificates were violated, and the doubt that it is still so.
-
-    Examples
-    --------
-    >>> violations = Violations()
-    >>> for episode in range(60):
-    ...     violations = violations.after(episode, violated=episode < 10)
-    >>> for episode in range(60, 64):
-    ...     violations = violations.after(episode, violated=True)
-    >>> violations.worse
-    60
-    """
+    """In how many episodes certificates were violated, and the doubt that it is still so."""
 
     share: float = _SHARE  #: of episodes, those of late count most
     doubt: float = 0.0  #: that it is still so: a log likelihood ratio

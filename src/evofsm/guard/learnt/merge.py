@@ -69,7 +69,7 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     for name in ("margin", "time_to_failure", "horizon"):
         setattr(merged, name, max(getattr(one, name) for one in told))
     if merged.backups is not None:
-        each = library.KEPT // len(told)
+        each = library.fewer(library.KEPT, merged.dynamics.n_variables) // len(told)
         seen = [one.situations[-each:] for one in told if len(one.situations)]
         merged.situations = np.vstack(seen)
         policies = merged.backups.policies[merged.backups.ranks[:2]]

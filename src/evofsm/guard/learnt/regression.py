@@ -126,8 +126,7 @@ def _solved(squares: Floats, products: Floats) -> Floats:
 
 # -- Drift: whether the system still moves as was learnt ------------------------------------------
 #
-# What a hundred episodes taught outweighs ten, and what contradicts it counts as an outlier. So a
-# correction of the model is learnt alongside, from the last few episodes alone. Where that would
+# A correction of the model is learnt alongside, from the last few episodes alone. Where that would
 # have foreseen, an episode ahead, what surprised the model, the doubt grows:
 #
 #     d = max(0, d + sum ln(1 + r^2 / s^2) - 2 ln(1 + r'^2 / s^2)),
@@ -224,9 +223,8 @@ def correction(recent: Recent, weights: Floats, sums: Sums, a: int) -> Floats:
 
 # -- Lags: whether latest changes, and the action before, foresee more than one step --------------
 #
-# A feature may help one step ahead and mislead over many: that what just changed goes on is never
-# contradicted in a replay. So where an episode went on although nothing seemed to help, the model
-# is compared with what came: if it had foreseen more without lags, those are doubted.
+# A feature may help one step ahead and mislead over many. So where an episode went on although
+# nothing seemed to help, it is asked whether more had been foreseen without lags.
 
 # Steps of an episode from which it is tried how much was foreseen.
 _STARTS = 12

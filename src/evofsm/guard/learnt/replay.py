@@ -6,13 +6,13 @@ disturbance times its scale eta,
 
     z' = z + sat(W'phi + eta r),    u = sat(b + K'(z - mean) / spread).
 
-Each variable's change is linear in the features, as the consequents of eTS are (Angelov & Filev,
-"An approach to online identification of Takagi-Sugeno fuzzy models", 2004), of which the paper uses
-the antecedents alone.
+Each variable's change is linear in the features, as the consequents of eTS are (Angelov & Filev
+2004).
 """
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from operator import itemgetter
 from typing import NamedTuple
@@ -124,10 +124,7 @@ def n_products(m: int, a: int) -> int:
 
 
 def refuse_too_many(m: int, a: int, *, box: bool) -> None:
-    """Raise a ValueError for more variables than can be learnt of, before there is room for them.
-
-    The cost of a step grows with their square.
-    """
+    """Raise a ValueError for more variables than can be learnt of."""
     most = min(_MOST_VARIABLES, (_MOST_FEATURES - n_features(0, a, box=box)) // 2)
     if m > most:
         raise ValueError(
@@ -418,8 +415,8 @@ def _replay(
     enough: float,
     allowed: int,
     ends: Ends,
-) -> tuple[int, float]:
-    """`replay` into ``ends``; how many are not survived, and the least distance of the others.
+) -> tuple[int, float, int]:
+    """`replay` into ``ends``; how many are not survived, the least distance of others, and steps.
 
     All end as soon as more than ``allowed`` did, or number 0 did, that is no disturbance at all; if
     all are allowed, each goes on as far as it can.
@@ -445,8 +442,9 @@ def _replay(
         which[l] = l % each if l < count else 0
         for j in range(m):
             jumps |= disturbances.jump_at[which[l], j] >= 0.0
-    lost, end = 0, 1.0 - _RESERVE * enough
+    lost, end, took = 0, 1.0 - _RESERVE * enough, 0
     for t in range(steps):
+        took += 1
         if t < len(plan):
             for i in range(a):
                 for l in range(n):
@@ -527,7 +525,7 @@ def _replay(
                 last = min(last, sign * (at - z[j, l]) * worth)
             distance = 0.5 * (near[l] + last)
         ends.worth[l] = share + _DISTANCE * min(1.0, max(-1.0, _FAR * distance))
-    return lost, left
+    return lost, left, took
 
 
 _enter = Entry(_replay)
@@ -558,8 +556,8 @@ def replay(
 
 # -- What decides ---------------------------------------------------------------------------------
 
-#: What a search finds: the proposal passes, another action passes, or none does.
-KEPT, CHANGED, NOTHING_PASSES = 0, 1, 2
+#: What a search finds: the proposal passes, another action passes, none did in time, or none does.
+KEPT, CHANGED, CUT_SHORT, NOTHING_PASSES = 0, 1, 2, 3
 
 
 def search(
@@ -572,13 +570,15 @@ def search(
     proposal: Floats,
     margin: float,
     allowed: int,
+    most: float = math.inf,
 ) -> tuple[int, Floats, int, float]:
     """Find the action closest to a proposal after which a backup survives by the margin.
 
     The proposal itself if one does; else what the first of ``ranks`` does that survives, and from
     there as near to the proposal as halvings come. All disturbances have to be survived but
     ``allowed``, and that none begins. Where no action passes it is that of the backup that lasts
-    longest. ``situation`` is (2m + a,), proposal and action are (a,).
+    longest. ``situation`` is (2m + a,), proposal and action are (a,). After ``most`` steps of
+    replays it is cut short, with the action of the first of ``ranks``.
 
     Returns what was found, the action, after which backup it passes, and the least distance to
     failure that is then left; where nothing passes, how far apart backups are, near 0 if all last
@@ -587,20 +587,27 @@ def search(
     m, a, choices = len(model.origin), len(proposal), model.choices
     count, plan, here = disturbances.residuals.shape[2], np.empty((1, a)), situation[None]
     ends = Ends(np.empty(count), np.empty(count))
-    given = disturbances, scale, margin, allowed, ends
+    given, done = (disturbances, scale, margin, allowed, ends), 0
 
     def survives(action: Floats, backup: int) -> tuple[bool, float]:
         """Whether the backup survives after the action, and by how much."""
+        nonlocal done
         plan[0] = action
-        lost, left = _enter.call(model, here, plan, policies[backup], *given)
+        lost, left, took = _enter.call(model, here, plan, policies[backup], *given)
+        done += took
         return lost <= allowed and left >= margin, left
 
     for q in ranks:
+        if done >= most:
+            break
         passes, left = survives(proposal, q)
         if passes:
             return KEPT, proposal, q, left
     for q in ranks:
         own = _action_of(model, policies[q], situation[:m])
+        if done >= most:
+            first = _action_of(model, policies[ranks[0]], situation[:m])
+            return CUT_SHORT, first, ranks[0], math.inf
         if choices and (own == proposal).all():
             continue  # it was refused
         passes, left = survives(own, q)

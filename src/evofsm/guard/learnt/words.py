@@ -86,8 +86,10 @@ def changed(backup: str, remembered: Remembered, margin: float, spared: int = 0)
     return f"the closest action after which {backup} survives {them}, by {changes(margin)} or more"
 
 
-def lasting(backup: str) -> str:
+def lasting(backup: str, *, cut: bool) -> str:
     """What is done instead, where no action passes."""
+    if cut:
+        return f"none passed in time, so the search was cut short; {backup} passed last"
     return f"no action passes; {backup} lasts longest"
 
 
