@@ -30,8 +30,9 @@ def guard_of_monitor(
 ) -> Guard:
     """A guard of car following that is given how hard its car brakes, in shadow mode."""
     judge = _ahead(interval, brakes, given)
-    settings: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW}
-    return guard_for_cars(-brakes, HIGHEST, interval, judge=judge, **settings)
+    return guard_for_cars(
+        -brakes, HIGHEST, interval, judge=judge, tolerance=tolerance, mode=Mode.SHADOW
+    )
 
 
 def guard_of_traffic(interval: float, brakes: float, tolerance: float = TOLERANCE) -> Guard:
@@ -54,14 +55,7 @@ def assumptions(brakes: float, tolerance: float) -> str:
 class Given(LatentRisk):
     """Keeps to what it was given, whatever it sees, while a machine learns."""
 
-    def learn(
-        self,
-        observation: ArrayLike,
-        acceleration: float,
-        belief: ArrayLike = (1.0,),
-        *,
-        watched: bool = False,
-    ) -> None:
+    def learn(self, observation: ArrayLike, acceleration: float, *_: Any, **__: Any) -> None:
         """Only follow."""
         self.follow(observation, acceleration)
 
