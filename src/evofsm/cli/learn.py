@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from evofsm.cli.inspect import model_document, tables_of, with_unit
 from evofsm.cli.options import (
     BRAKES,
+    TOLERANCE,
     ActionColumn,
     Brakes,
     EpisodeColumns,
@@ -28,9 +29,8 @@ from evofsm.cli.options import (
     Units,
     argument,
     imported,
-    lengths_given,
-    log_columns,
     option,
+    reading_of,
 )
 from evofsm.cli.show import facts, print_json, progress, say, show, table, warn
 
@@ -115,7 +115,7 @@ def learn(
         ),
     ] = None,
     brakes: Brakes = BRAKES,
-    tolerance: Tolerance = 0.02,
+    tolerance: Tolerance = TOLERANCE,
     checkpoint: Annotated[
         Path | None, option("Save what was learnt every minute; where it exists, go on from it.")
     ] = None,
@@ -142,7 +142,7 @@ def learn(
     """
     from evofsm.cli.learning import Checkpoint, guard_of_log, learn_traces, teach, warnings_of
     from evofsm.driving.naming import UNITS, VARIABLES
-    from evofsm.io import Topics, read_traces
+    from evofsm.io import read_traces
     from evofsm.io.logs import Noted
     from evofsm.io.tables import SI
 
@@ -151,11 +151,13 @@ def learn(
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
     actions = _actions(action_range)
-    columns = log_columns(observe, action, time, episode, dt, failed, unit, no_leader)
+    columns, lengths, known_topics = reading_of(
+        observe, action, time, episode, dt, failed, unit, topics, no_leader, vehicle_length
+    )
     encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
     kind = None if guard is None else _judge_of(judge, columns)
-    lengths, noted = lengths_given(vehicle_length or ()), Noted()
+    noted = Noted()
     known = [{"name": file, "bytes": _size(file)} for file in files]
     keeper = None
     if checkpoint is not None:
@@ -167,11 +169,10 @@ def learn(
         settings |= {"actions": action_range, "lengths": vehicle_length or []}
         settings |= {"machine": repr(machine), "topics": topics and topics.read_text("utf-8")}
         keeper = Checkpoint(checkpoint, settings)
-    read_topics = None if topics is None else Topics.load(topics)
     units = dict(zip(VARIABLES, UNITS, strict=True))
     with progress("Learning", sum(file["bytes"] for file in known)) as move:  # type: ignore[misc]
         chunks = read_traces(
-            files, columns, lengths, lambda count: move(advance=count), noted, read_topics
+            files, columns, lengths, lambda count: move(advance=count), noted, known_topics
         )
         learning = learn_traces(
             chunks,
@@ -210,7 +211,7 @@ def learn(
             learning.model.units,
         )
         with progress("Teaching the guard", learning.read.rows) as move:
-            rows = read_traces(files, columns, lengths, topics=read_topics)
+            rows = read_traces(files, columns, lengths, topics=known_topics)
             teach(taught, rows, lambda count: move(count))
         taught.save(guard, provenance)
     if as_json:

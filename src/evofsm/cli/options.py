@@ -15,7 +15,10 @@ from evofsm.extras import install
 
 if TYPE_CHECKING:
     from evofsm.driving import Family
-    from evofsm.io import LogColumns, VehicleLengths
+    from evofsm.io import LogColumns, Topics, VehicleLengths
+
+    # How a log is read.
+    Reading = tuple[LogColumns, VehicleLengths, Topics | None]
 
 
 #: Where to drive.
@@ -64,7 +67,7 @@ Brakes = Annotated[
 ]
 Switches = Annotated[str, option("noise, delay, actuator, jerk, third_car; with commas.", "--with")]
 
-# What the columns of a log mean; `log_columns` takes them.
+# What the columns of a log mean; `reading_of` takes them.
 Observed = Annotated[
     str, option("Columns to observe. A discrete one has its values: light=red/green.", "--observe")
 ]
@@ -167,7 +170,7 @@ def family_of(name: str, switches: str) -> Family:
     return load_family(name).with_switches(split_names(switches))
 
 
-def log_columns(
+def reading_of(
     observe: str,
     action: str,
     time: str,
@@ -175,12 +178,14 @@ def log_columns(
     dt: float | None,
     failed: str | None,
     unit: list[str] | None,
+    topics: Path | None,
     no_leader: str | None,
-) -> LogColumns:
-    """What the columns of a log mean, from the options of those names."""
+    vehicle_length: list[str] | None,
+) -> Reading:
+    """How a log is read, from the options of those names."""
     from evofsm.fsm.observations import Category, ObservationEncoder
     from evofsm.fsm.validation import positive
-    from evofsm.io import LogColumns
+    from evofsm.io import LogColumns, Topics
 
     def variable(text: str) -> str | Category:
         name, discrete, values = text.partition("=")
@@ -190,7 +195,7 @@ def log_columns(
         encoder = ObservationEncoder(*map(variable, split_names(observe)))
     except ValueError as error:
         raise ValueError(f"--observe {observe}: {error}") from None
-    return LogColumns(
+    columns = LogColumns(
         observe=encoder,
         action=action,
         time=time,
@@ -200,6 +205,8 @@ def log_columns(
         units=units_given(unit or ()),
         no_leader=no_leader,
     )
+    lengths = lengths_given(vehicle_length or ())
+    return columns, lengths, None if topics is None else Topics.load(topics)
 
 
 def units_given(texts: Iterable[str]) -> dict[str, str]:

@@ -24,9 +24,8 @@ from evofsm.cli.options import (
     TopicsFile,
     Units,
     argument,
-    lengths_given,
-    log_columns,
     option,
+    reading_of,
     require,
 )
 from evofsm.cli.show import show, warn
@@ -34,8 +33,9 @@ from evofsm.cli.show import show, warn
 if TYPE_CHECKING:
     from evofsm.cli.monitor.decider import Decider
     from evofsm.cli.monitor.transports import Transport
+    from evofsm.cli.options import Reading
     from evofsm.guard import Guard
-    from evofsm.io import Chunk, LogColumns
+    from evofsm.io import Chunk
 
 # What other files end with is read as JSON lines.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
@@ -153,11 +153,12 @@ def monitor(
         if summary and file is not None:
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
 
+            used = fresh() if guard else None
             if is_log:
-                names = observe or ",".join(Guard.load(guard).variables if guard else VARIABLES)
-                columns = log_columns(names, action, time, episode, dt, failed, unit, no_leader)
-                chunks, interval = _episodes(file, columns, vehicle_length, topics)
-            used = fresh()
+                names = observe or ",".join(used.variables if used else VARIABLES)
+                asked = names, action, time, episode, dt, failed, unit, topics, no_leader
+                chunks, interval = _episodes(file, reading_of(*asked, vehicle_length))
+            used = used or fresh()
             _prepare(used, mode, tolerance, None, stack, learn=learn)
             warn(_of_saved(guard, used) if guard else assumptions(reckoned, tolerated))
             decider = Decider(used, episode=rows)
@@ -203,18 +204,15 @@ def monitor(
     return None
 
 
-def _episodes(
-    file: Path, columns: LogColumns, lengths: list[str] | None, topics: Path | None
-) -> tuple[Iterator[Chunk], float]:
+def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
     """The episodes of a log, and the time between two rows [s]."""
     from evofsm.cli.learning import warnings_of
-    from evofsm.io import Topics, episodes_of, read_traces
+    from evofsm.io import episodes_of, read_traces
     from evofsm.io.logs import Noted
 
-    noted, known = Noted(), None if topics is None else Topics.load(topics)
-    chunks = read_traces(
-        [str(file)], columns, lengths_given(lengths or ()), noted=noted, topics=known
-    )
+    columns, lengths, topics = reading
+    noted = Noted()
+    chunks = read_traces([str(file)], columns, lengths, noted=noted, topics=topics)
     episodes = (one for one in episodes_of(chunks) if len(one.times) > 1)
     if (first := next(episodes, None)) is None:
         raise ValueError(f"{file}: no episode has two rows")

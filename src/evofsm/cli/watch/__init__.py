@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import (
     BRAKES,
+    TOLERANCE,
     ActionColumn,
     Brakes,
     ByJudge,
@@ -31,20 +32,19 @@ from evofsm.cli.options import (
     World,
     argument,
     family_of,
-    lengths_given,
-    log_columns,
     option,
+    reading_of,
     require,
     require_world,
 )
 from evofsm.cli.show import progress, say, warn
 
 if TYPE_CHECKING:
+    from evofsm.cli.options import Reading
     from evofsm.cli.watch.player import Watched
     from evofsm.cli.watch.session import Session
     from evofsm.driving import Family
     from evofsm.guard import Guard
-    from evofsm.io import LogColumns, Topics, VehicleLengths
 
 # Of a simulation of somebody else's that are watched [s], and positions of cars in them.
 _SECONDS, _ENOUGH = 600.0, 100_000
@@ -70,7 +70,7 @@ def watch(
     ] = None,
     world: InWorld = "kinematic",
     judge: ByJudge = "kinematic",
-    tolerance: Tolerance = 0.02,
+    tolerance: Tolerance = TOLERANCE,
     switches: Switches = "",
     seed: Seed = 0,
     learn_first: Annotated[int, option("Episodes to learn from before.", min=0)] = 60,
@@ -99,7 +99,6 @@ def watch(
     begins when the page is first opened. Ctrl-C ends it.
     """
     require(websockets="watch")
-    from evofsm.io import Topics
 
     is_log = _is_log(what)
     if not is_log and any((episode, dt, failed, unit, topics, no_leader, vehicle_length)):
@@ -111,10 +110,8 @@ def watch(
         require_world(world)
     opened: AbstractContextManager[Watched]
     if is_recorded:
-        columns = log_columns(observe, action, time, episode, dt, failed, unit, no_leader)
-        lengths = lengths_given(vehicle_length or ())
-        known = None if topics is None else Topics.load(topics)
-        reading = (columns, lengths, known) if is_log else None
+        asked = observe, action, time, episode, dt, failed, unit, topics, no_leader, vehicle_length
+        reading = reading_of(*asked) if is_log else None
         opened = _recorded(what, case, judge, tolerance, brakes, reading)
     else:
         family = family_of(what, switches)
@@ -160,7 +157,7 @@ def _recorded(
     judge: Judge,
     tolerance: float,
     brakes: float,
-    reading: tuple[LogColumns, VehicleLengths, Topics | None] | None,
+    reading: Reading | None,
 ) -> AbstractContextManager[Watched]:
     """A run that was recorded, or a log with what a guard would have said; read beforehand."""
     from tempfile import TemporaryDirectory
