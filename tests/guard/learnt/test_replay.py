@@ -37,6 +37,7 @@ def mover(choices=0, **others):
         least=-9.0 * one,
         most=9.0 * one,
         thresholds=np.array([[0.0, 1.0, WALL, 1.0]]),
+        regions=np.empty((0, 12)),
         drifted=none,
         mean=none,
         inverse=one,
@@ -46,7 +47,7 @@ def mover(choices=0, **others):
 
 
 def random_model(draw, m, a, choices):
-    """Something that moves, saturates, drifted in part and fails on two sides."""
+    """Something that moves, saturates, drifted in part and fails on two sides and in an ellipse."""
     one = np.ones(m)
     return Model(
         weights=0.05 * draw.normal(size=(n_features(m, a, box=not choices), m)),
@@ -57,6 +58,7 @@ def random_model(draw, m, a, choices):
         least=-0.2 * one,
         most=0.3 * one,
         thresholds=np.array([[0.0, 1.0, 0.7, 2.0], [m - 1.0, -1.0, -1.5, 0.5]]),
+        regions=np.array([[1.0, m - 1.0, 1.5, -0.2, 2.0, 0.5, 1.0, 0.3, 0.1, -0.9, 0.4, -1.2]]),
         drifted=np.resize([1.0, -1.0, 0.0], m),
         mean=draw.normal(size=m),
         inverse=1.0 + draw.random(m),
@@ -68,6 +70,14 @@ def acts(model, policy, z):
     """What a policy does at an observation."""
     action = policy[:, 0] + policy[:, 1:] @ ((z - model.mean) * model.inverse)
     return np.eye(len(action))[action.argmax()] if model.choices else np.clip(action, -1.0, 1.0)
+
+
+def nearest(region, z):
+    """How far an observation is from a region, to first order."""
+    i, j, *at, one, other, c, b, d, p, q, r = region
+    x, y = (z[int(i)] - at[0]) * one, (z[int(j)] - at[1]) * other
+    slope = np.array([b + 2.0 * p * x + q * y, d + q * x + 2.0 * r * y])
+    return -(c + b * x + d * y + p * x * x + q * x * y + r * y * y) / np.sqrt(slope @ slope)
 
 
 def plainly(model, situation, plan, policy, disturbances, k, scale, enough):
@@ -95,7 +105,7 @@ def plainly(model, situation, plan, policy, disturbances, k, scale, enough):
         after = np.clip(after, model.lowest, model.highest)
         z, change, before = after, after - z, u
         left = [s * (at - z[int(j)]) * worth for j, s, at, worth in model.thresholds]
-        near = min(near, *left)
+        near = min(near, *left, *(nearest(row, z) for row in model.regions))
         if near < enough:
             return t, near
     return steps, near

@@ -307,6 +307,7 @@ class Dynamics:
             least=sums.least.copy(),
             most=sums.most.copy(),
             thresholds=np.array(thresholds, np.float64).reshape(-1, 4),
+            regions=np.empty((0, 12)),
             drifted=drifted,
             mean=self.origin + sums.mean,
             inverse=inverse,

@@ -54,6 +54,8 @@ MOVING = 0.5
 ONSET = 4.0
 # Residuals beyond so many of their scale weigh less.
 _OUTLIER = 4.0
+# The square of a gradient that is none: a form that does not change is far from 0.
+_FLAT = 1e-300
 
 
 class Model(NamedTuple):
@@ -68,6 +70,10 @@ class Model(NamedTuple):
     most: Floats  #: (m,) most positive one
     #: (k, 4) failure: variable, sign, threshold, and ordinary changes in a unit of the variable
     thresholds: Floats
+    #: (r, 12) failure in one or two variables i and j: i, j, where each is counted from, in how
+    #: large a unit (its inverse), and a quadratic form in those, above 0 where it fails:
+    #: 1, x, y, x x, x y, y y
+    regions: Floats
     drifted: Floats  #: (m,) 1 of a variable that moves otherwise than it did, -1 of others then
     mean: Floats  #: (m,) of what policies take for their middle
     inverse: Floats  #: (m,) and one over their spread
@@ -404,6 +410,35 @@ def _follow_policy(model: Model, policy: Floats, z: Floats, end: float, action: 
                 action[i, l] = 1.0 if i == best else 0.0
 
 
+@spliced_kernel
+def _distances(model: Model, z: Floats, far: Floats) -> None:
+    """The distance of each of n observations (m, n) to the nearest failure, into ``far`` (n,).
+
+    To a region to first order: its form over the length of its gradient.
+    """
+    n = len(far)
+    for l in range(n):
+        far[l] = np.inf
+    for s in range(len(model.thresholds)):
+        j, sign = int(model.thresholds[s, 0]), model.thresholds[s, 1]
+        threshold, worth = model.thresholds[s, 2], model.thresholds[s, 3]
+        for l in range(n):
+            left = sign * (threshold - z[j, l]) * worth
+            far[l] = left if left < far[l] else far[l]
+    for s in range(len(model.regions)):
+        i, j = int(model.regions[s, 0]), int(model.regions[s, 1])
+        at, to = model.regions[s, 2], model.regions[s, 3]
+        one, other = model.regions[s, 4], model.regions[s, 5]
+        c, b, d = model.regions[s, 6], model.regions[s, 7], model.regions[s, 8]
+        p, q, r = model.regions[s, 9], model.regions[s, 10], model.regions[s, 11]
+        for l in range(n):
+            x, y = (z[i, l] - at) * one, (z[j, l] - to) * other
+            form = c + x * (b + p * x + q * y) + y * (d + r * y)
+            u, v = b + 2.0 * p * x + q * y, d + 2.0 * r * y + q * x
+            left = -form / np.sqrt(u * u + v * v + _FLAT)
+            far[l] = left if left < far[l] else far[l]
+
+
 @compiled
 def _replay(
     model: Model,
@@ -425,12 +460,13 @@ def _replay(
     assigned: that takes a second of compiling each.
     """
     m, (a, _), p = len(model.origin), policy.shape, len(model.weights)
-    (steps, _, each), sides = disturbances.residuals.shape, len(model.thresholds)
+    steps, _, each = disturbances.residuals.shape
     count = len(situations) * each
     n = lanes(count)
     z, change, move, after = np.empty((m, n)), np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
     before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
-    which, survived, near = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)
+    which, survived = np.empty(n, np.int64), np.empty(n, np.int64)
+    near, far = np.empty(n), np.empty(n)
     jumps = False
     for l in range(n):
         start = l // each if l < count else 0
@@ -491,14 +527,11 @@ def _replay(
         for i in range(a):
             for l in range(n):
                 before[i, l] = action[i, l]
-        for s in range(sides):
-            j, sign = int(model.thresholds[s, 0]), model.thresholds[s, 1]
-            threshold, worth = model.thresholds[s, 2], model.thresholds[s, 3]
-            for l in range(n):
-                left = sign * (threshold - z[j, l]) * worth
-                nearer = left if left < near[l] else near[l]
-                near[l] = nearer if survived[l] == steps else near[l]
+        _distances(model, z, far)
         fails = 0
+        for l in range(n):
+            nearer = far[l] if far[l] < near[l] else near[l]
+            near[l] = nearer if survived[l] == steps else near[l]
         for l in range(n):
             fails += 1 if (survived[l] == steps) & (near[l] < enough) else 0
         if fails == 0:
@@ -518,12 +551,7 @@ def _replay(
             left = min(left, near[l])
         ends.value[l] = near[l] if survived[l] == steps else survived[l] - steps - 1.0
         if survived[l] == steps:
-            last = np.inf
-            for s in range(sides):
-                j, sign = int(model.thresholds[s, 0]), model.thresholds[s, 1]
-                at, worth = model.thresholds[s, 2], model.thresholds[s, 3]
-                last = min(last, sign * (at - z[j, l]) * worth)
-            distance = 0.5 * (near[l] + last)
+            distance = 0.5 * (near[l] + far[l])  # those in the end
         ends.worth[l] = share + _DISTANCE * min(1.0, max(-1.0, _FAR * distance))
     return lost, left, took
 
