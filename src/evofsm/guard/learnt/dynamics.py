@@ -51,8 +51,9 @@ _ONSETS, _APART = 3, 3
 # A sequence has at least so many steps.
 _SHORTEST = 4
 # An episode that goes on for so many steps is studied, and goes on; with the last of them, as the
-# last transition is learnt next.
-_LONGEST, _LAST = 1024, 3
+# last transition is learnt next. Of all of them so many tell how noisy sensors are: a decision
+# waits.
+_LONGEST, _LAST, _LATEST = 1024, 3, 256
 # An episode of fewer steps says nothing as a whole.
 _STUDIED = 5
 # An extreme is a saturation if it was reached, by moving, in so many episodes, or if a variable
@@ -363,8 +364,9 @@ class Dynamics:
                 if "drift" not in self.without:
                     self._follow_drift(safe, u[:T])
                 if "observer" not in self.without:
+                    first = T - _LATEST if len(z) == _LONGEST else 0
                     self.missed = regression.tried(
-                        self.missed, self.model, safe, u[:T], self.sums.unit
+                        self.missed, self.model, safe[first:], u[first:T], self.sums.unit
                     )
                     self.rebuild()
             found = residuals(self.model, self.close, safe, u[:T])
