@@ -26,7 +26,15 @@ from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.learnt import library, words
 from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics
 from evofsm.guard.learnt.library import Backups, Violations
-from evofsm.guard.learnt.replay import CUT_SHORT, KEPT, Disturbances, Floats, Ints, search
+from evofsm.guard.learnt.replay import (
+    CUT_SHORT,
+    KEPT,
+    Disturbances,
+    Floats,
+    Ints,
+    pairs,
+    search,
+)
 from evofsm.guard.learnt.words import Remembered
 from evofsm.store import COUNT, FLAG, FROM_1, SHARE, SIZE, Kind, Numbers, Place
 
@@ -38,8 +46,9 @@ JUDGE_PARTS: tuple[str, ...] = ("margin", "backups", "breaks", *DYNAMICS_PARTS)
 
 # Disturbances that are remembered.
 _REMEMBERED = 10
-# Backups that are asked in a decision, and disturbances that mutants are tried on, besides none.
-_ASKED, _TRIED_ON = 3, 5
+# Backups that are asked in a decision, and of many variables; disturbances that mutants are tried
+# on, besides none.
+_ASKED, _ASKED_OF_MANY, _TRIED_ON = 3, 2, 5
 # Products in the replays of a search, after which it is cut short: at most, and in a second.
 _WORK, _WORK_RATE = 7e6, 8.75e8
 # The margin [ordinary changes]: at first, at most, what is left of it an episode later, and what a
@@ -288,11 +297,12 @@ class LearntRisk:
         if not dynamics.thresholds:
             return Search(one, _unjudged(1), 0, self._no_threshold)
         model, proposal, scale = dynamics.model, dynamics.encode(wanted), self.disturbance_scale
-        remembered, ranks = self.remembered, self._ranks[:_ASKED]
+        few = _ASKED if len(pairs(dynamics.n_variables)[0]) else _ASKED_OF_MANY
+        remembered, ranks = self.remembered, self._ranks[:few]
         allowed = self._allowed(tolerance, remembered)
         asked = model, here, backups.policies, ranks, disturbances, scale
         each = model.weights.size * disturbances.residuals.shape[2]
-        most = max(min(_WORK, _WORK_RATE * self.dt) / each, _ASKED * self.horizon)
+        most = max(min(_WORK, _WORK_RATE * self.dt) / each, few * self.horizon)
         how, action, which, left = search(*asked, proposal, self.margin, allowed, most)
         tried = None
         if which != ranks[0]:  # what passed now is asked first the next time
@@ -301,12 +311,12 @@ class LearntRisk:
         self._holds = passes
         if not passes:
             if self._certified and not cut:
-                how = search(*asked, action, 0.0, allowed, most)[0]
+                how = search(*asked, action, 0.0, allowed, most, lasting=False)[0]
                 self._holds = how < CUT_SHORT
             self._certified &= how != CUT_SHORT  # whether one is violated is not known
             tried = self._untried(action) if self.learning and left < _ALIKE else None
             action = action if tried is None else tried
-        self._asked = 1 if most < 2 * _ASKED * self.horizon else _ASKED
+        self._asked = 1 if most < 2 * few * self.horizon else few
         judged, self._dead_end, fails_after = self._judged(
             situation,
             here,

@@ -599,14 +599,17 @@ def search(
     margin: float,
     allowed: int,
     most: float = math.inf,
+    *,
+    lasting: bool = True,
 ) -> tuple[int, Floats, int, float]:
     """Find the action closest to a proposal after which a backup survives by the margin.
 
     The proposal itself if one does; else what the first of ``ranks`` does that survives, and from
     there as near to the proposal as halvings come. All disturbances have to be survived but
     ``allowed``, and that none begins. Where no action passes it is that of the backup that lasts
-    longest. ``situation`` is (2m + a,), proposal and action are (a,). After ``most`` steps of
-    replays it is cut short, with the action of the first of ``ranks``.
+    longest, if that is asked (``lasting``). ``situation`` is (2m + a,), proposal and action are
+    (a,). After ``most`` steps of replays it is cut short, with the action of the first of
+    ``ranks``.
 
     Returns what was found, the action, after which backup it passes, and the least distance to
     failure that is then left; where nothing passes, how far apart backups are, near 0 if all last
@@ -636,7 +639,7 @@ def search(
         if done >= most:
             first = _action_of(model, policies[ranks[0]], situation[:m])
             return CUT_SHORT, first, ranks[0], math.inf
-        if choices and (own == proposal).all():
+        if (own == proposal).all():
             continue  # it was refused
         passes, left = survives(own, q)
         if not passes:
@@ -651,6 +654,8 @@ def search(
             else:
                 refused = half
         return CHANGED, action, q, left
+    if not lasting:
+        return NOTHING_PASSES, proposal, ranks[0], math.inf
     which, longest, shortest, nothing = ranks[0], -np.inf, np.inf, np.empty((0, a))
     for q in ranks:
         lasts = float(replay(model, here, nothing, policies[q], disturbances, scale).worth.mean())
