@@ -9,15 +9,18 @@ counts held-out ``episodes``, ``failed_while_learning`` and ``failed_late`` trai
 (``failures`` says which, from 1); ``kept`` is the share of proposals that were executed exactly,
 ``mean_change`` that of an action in halves of its range (of discrete ones the share changed);
 ``score`` is the mean return, or mobility, with a bootstrap interval over episodes; ``p50_ms`` and
-``p99_ms`` are of a held-out decision, and alone depend on the machine.
+``p99_ms`` are of a held-out decision, and alone depend on the machine. ``goals`` counts held-out
+episodes that arrived; ``steps`` is the mean of decisions to failure, at most those of an episode,
+and ``steps_learning`` that of training episodes from the 11th on; columns that end in ``_alone``
+say the same of the controller alone, in the same draws.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -33,7 +36,8 @@ from evofsm.paper import Figure, Page, Table
 from studies import lib
 from studies.lib import ALL, FIRST, Frames, Study, Target, at_least, at_most, frame_of
 from studies.rivals import Counted, Unrevised, rivals_of
-from studies.systems import SYSTEMS, TASKS, Cars, Start, System, lacking, make_system
+from studies.shapes import PEERS, SHAPES
+from studies.systems import SYSTEMS, TASKS, Cars, Start, System, Vector, lacking, make_system
 
 #: Parts of the learnt judge that can be taken away, each with what is left then.
 PARTS: dict[str, str] = {
@@ -50,6 +54,10 @@ PARTS: dict[str, str] = {
     "backups": "constant backups alone",
     "breaks": "it is not noticed where disturbances get worse",
     "states": "one state only: nothing may change",
+    "regions": "failure by thresholds of single variables alone",
+    "dead-ends": "no dead ends from certificates that were refuted",
+    "places": "a disturbance may begin anywhere",
+    "harm": "it is not tested whether the guard does harm",
 }
 #: Our judges: of variables, and of scenes.
 OURS = ("learnt", "scene")
@@ -66,10 +74,10 @@ def make_judge(name: str, system: System, without: Sequence[str] = (), seed: int
     Parameters
     ----------
     name : str
-        ``learnt``, ``scene``, ``kinematic``, ``counted``, ``unrevised``, one of `rivals_of` the
-        system, or ``module:Name`` of a class that is made with the system and a seed. It has the
-        methods of a `Rival`, or, as an `ActionJudge`, says how dangerous actions are: then a guard
-        is made of it.
+        ``learnt``, ``told`` (the same guard, told the failure function), ``scene``, ``kinematic``,
+        ``counted``, ``unrevised``, one of `rivals_of` the system, or ``module:Name`` of a class
+        that is made with the system and a seed. It has the methods of a `Rival`, or, as an
+        `ActionJudge`, says how dangerous actions are: then a guard is made of it.
     system : System
     without : sequence of str
         Parts of the learnt judge that are taken away.
@@ -93,9 +101,13 @@ def make_judge(name: str, system: System, without: Sequence[str] = (), seed: int
             f"{name} makes a {type(own).__name__}, which is no judge: it has neither judge, "
             "nor begin, decide, end and freeze"
         )
-    if name == "learnt":
+    if name in ("learnt", "told"):
         if system.horizon is not None:
             told["horizon"] = system.horizon
+        if name == "told":
+            if system.has_failed is None:
+                raise ValueError(f"{system.name} does not show in an observation that it failed")
+            told["failed"] = system.has_failed
         return learnt_guard(**told, without=tuple(without))
     if name == "kinematic":
         if not isinstance(system, Cars):
@@ -114,7 +126,7 @@ def make_judge(name: str, system: System, without: Sequence[str] = (), seed: int
         **rivals_of(system),
     }
     if name not in known:
-        names = ", ".join(("learnt", "kinematic", "scene", *known))
+        names = ", ".join(("learnt", "told", "kinematic", "scene", *known))
         raise ValueError(f"{system.name} has no judge {name!r}; there are {names}")
     return known[name]()
 
@@ -128,12 +140,18 @@ _TOLD = {
 
 
 def learnt_guard(
-    *, interval: float, seed: int, without: Sequence[str], horizon: float | None = None, **told: Any
+    *,
+    interval: float,
+    seed: int,
+    without: Sequence[str],
+    horizon: float | None = None,
+    failed: Callable[[Vector], bool] | None = None,
+    **told: Any,
 ) -> Guard:
     """With the learnt judge without some parts; without ``states`` its machine has a single one."""
     parts = [part for part in without if part != "states"]
     judge = LearntRisk(interval, **told, horizon=horizon, seed=seed, without=parts)
-    guard = Guard(**told, interval=interval, horizon=horizon, judge=judge, seed=seed)
+    guard = Guard(**told, interval=interval, horizon=horizon, judge=judge, failed=failed, seed=seed)
     if "states" in without:
         guard.machine = EvolvingFSM(guard.actions.n_actions, max_states=1)
     return guard
@@ -142,6 +160,8 @@ def learnt_guard(
 def told_to(judge: Any) -> str:
     """What a judge is told, in a few words: as it says itself in ``told``, if it is not ours."""
     if isinstance(judge, Guard):  # its own judge is None where that does not learn
+        if judge.failed is not None:
+            return "which observations are failures"
         judge = getattr(judge.reviser, "risk", judge.judge)
     return str(getattr(judge, "told", _TOLD.get(type(judge).__name__, "not said")))
 
@@ -158,6 +178,8 @@ class Ended(NamedTuple):
     changes: float  #: sum over decisions
     times: list[float]  #: of each decision [s]
     speed: float  #: mean [m/s]; NaN where nothing drives
+    arrived: bool
+    steps: int  #: to failure; without it, as many as an episode may have
 
 
 def run(system: System, judge: Any, start: Start) -> Ended:
@@ -169,7 +191,32 @@ def run(system: System, judge: Any, start: Start) -> Ended:
         times.append(one.seconds)
         kept += np.array_equal(executed, proposed)
         changes += system.actions.change(executed, proposed)
-    return Ended(one.failed, system.score, kept, changes, times, system.speed)
+    steps = len(times) if one.failed else system.steps
+    of_all = (kept, changes, times, system.speed)
+    return Ended(one.failed, system.score, *of_all, system.arrived, steps)
+
+
+_system = lru_cache(make_system)
+
+
+@lru_cache(maxsize=4096)
+def alone(name: str, controller: str, start: Start) -> Ended:
+    """The same draw under the controller alone."""
+    return run(_system(name, controller), Unrevised(), start)
+
+
+def _reached(who: str, held_out: Sequence[Ended], late: Sequence[Ended]) -> dict[str, Any]:
+    """What came of episodes, in columns that end in ``who``; means of none are null."""
+    means = {"steps": held_out, "score": held_out, "steps_learning": late}
+    found: dict[str, Any] = {"goals": sum(one.arrived for one in held_out)}
+    for of, some in means.items():
+        steps = [getattr(one, of.removesuffix("_learning")) for one in some]
+        found[of] = float(np.mean(steps)) if steps else None
+    return {name + who: value for name, value in found.items()}
+
+
+# Training episodes before steps are compared with those of the controller alone.
+_LEARNING = 10
 
 
 def trial(
@@ -183,6 +230,7 @@ def trial(
     base: int = 0,
     late: int = 30,
     rounds: int = 100,
+    beside: bool = True,
 ) -> dict[str, Any]:
     """Let a judge learn a system while controlling it, freeze it, and try it on held-out episodes.
 
@@ -204,6 +252,8 @@ def trial(
         A failure after so many training episodes is a late one.
     rounds : int
         Of the bootstrap.
+    beside : bool
+        Whether the controller alone is run in the same draws, too.
 
     Examples
     --------
@@ -223,6 +273,10 @@ def trial(
     low, high = lib.bootstrap(lambda chosen: float(scores[chosen].mean()), test, rounds)
     times = 1e3 * np.array([took for one in held_out for took in one.times])
     speed = float(np.mean([one.speed for one in held_out]))
+    by_itself = partial(alone, name, system.controller)
+    held, late_on = (range(test), range(_LEARNING, train)) if beside else (range(0), range(0))
+    same = [by_itself(Start.held_out(base, k)) for k in held]
+    later = [by_itself(Start.training(base, seed, k)) for k in late_on]
     return {
         "system": name,
         "controller": system.controller,
@@ -238,7 +292,6 @@ def trial(
         "episodes": test,
         "failed": sum(one.failed for one in held_out),
         "measure": system.measure,
-        "score": float(scores.mean()),
         "score_low": low,
         "score_high": high,
         "kept": sum(one.kept for one in held_out) / len(times),
@@ -246,6 +299,8 @@ def trial(
         "p50_ms": float(np.quantile(times, 0.5)),
         "p99_ms": float(np.quantile(times, 0.99)),
         "speed": None if math.isnan(speed) else speed,
+        **_reached("", held_out, learnt[_LEARNING:]),
+        **_reached("_alone", same, later),
     }
 
 
@@ -265,6 +320,10 @@ def summary(rows: pl.DataFrame, by: Sequence[str] = _BY) -> pl.DataFrame:
         (pl.col("failed") / pl.col("episodes")).max().alias("worst"),
         pl.col("failed_while_learning", "failed_late", "p99_ms").max(),
         pl.col("score").min().alias("score_worst"),
+        pl.col("goals", "goals_alone").sum(),
+        pl.col("steps", "steps_alone", "score_alone").mean(),
+        (pl.col("steps") / pl.col("steps_alone")).min().alias("least"),
+        (pl.col("steps_learning") / pl.col("steps_learning_alone")).min().alias("least_learning"),
         *of_middle,
         *medians,
         runs=pl.len(),
@@ -290,6 +349,13 @@ _COSTS = {
     "p50 [ms]": "{p50_ms:.2f}",
     "p99 [ms]": "{p99_ms:.2f}",
 }
+_BESIDE = {
+    "goals (alone)": "{goals} ({goals_alone})",
+    "steps (alone)": "{steps:.0f} ({steps_alone:.0f})",
+    "of alone, worst seed": "{least:%}",
+    "while learning": "{least_learning:%}",
+    "score alone": "{score_alone:.4g}",
+}
 _WHO = {"system": "{system}", "controller": "{controller}", "judge": "{judge}"}
 _NOTE = (
     "Failed: held-out episodes of all learning seeds, which share them; intervals by Clopper and "
@@ -297,6 +363,11 @@ _NOTE = (
     "Score: mobility of cars, else the sum of rewards, of the seed in the middle, with a bootstrap "
     "interval over episodes. Kept: proposals that were executed exactly; change: of the action, in "
     "halves of its range. Times are those of a machine with all cores at work."
+)
+_NOTE_BESIDE = (
+    " Alone: the controller without a guard, in the same draws. Steps: to failure; without one as "
+    "many as an episode may have. Of alone: share of its steps; while learning, from the 11th "
+    "training episode on."
 )
 _IS_OURS = pl.col("judge").is_in(OURS) & _WHOLE
 _MARK = pl.when(_IS_OURS).then(pl.lit("ours"))
@@ -330,6 +401,13 @@ def _draw_failed(lines: pl.DataFrame) -> Drawn:
 _RATE = ("rate_low", "rate_high")
 
 
+def _present(names: Iterable[str]) -> tuple[list[str], dict[str, str]]:
+    """Those whose packages are there, and, as a fact of the page, what is left out."""
+    lacks = {name: lacking(name) for name in dict.fromkeys(names)}
+    said = "; ".join(f"{name} is left out: {lack}" for name, lack in lacks.items() if lack)
+    return [name for name in lacks if not lacks[name]], {"left out": said} if said else {}
+
+
 # -- The study of judges --------------------------------------------------------------------------
 
 
@@ -345,8 +423,15 @@ class Judges(Study):
     needed: ClassVar[dict[str, str]] = {"gymnasium": "gym"}
 
     systems: Annotated[
-        str, Option(help="Systems with commas, or families of scenarios; all is ten.")
+        str,
+        Option(
+            help="Systems with commas, or families of scenarios; all is ten, shapes those whose "
+            "failure is no threshold, peers environments of others."
+        ),
     ] = ALL
+    judges: Annotated[
+        str, Option(help="Judges beside the controller alone: learnt, told, counted.")
+    ] = "learnt"
     without: Annotated[
         str, Option(help="Parts to take away, each by itself, with commas; all, or none.")
     ] = ALL
@@ -372,13 +457,7 @@ class Judges(Study):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Parts that are taken away.
-
-        Raises
-        ------
-        ValueError
-            If there is no such part.
-        """
+        """Parts that are taken away; `ValueError` if there is no such part."""
         if self.without in (ALL, "none"):
             return tuple(PARTS) if self.without == ALL else ()
         named = tuple(dict.fromkeys(lib.names_in(self.without)))
@@ -386,11 +465,16 @@ class Judges(Study):
             raise ValueError(f"there is no part {wrong[0]!r}; there are {', '.join(PARTS)}")
         return named
 
+    @property
+    def _wanted(self) -> list[str]:
+        lists = {ALL: SYSTEMS, "shapes": SHAPES, "peers": PEERS}
+        names = lib.names_in(self.systems)
+        return [one for name in names for one in lists.get(name, [name])]
+
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Try all that is named, system by system."""
         tasks: list[partial[dict[str, Any]]] = []
-        names = SYSTEMS if self.systems == ALL else lib.names_in(self.systems)
-        for name in dict.fromkeys(names):
+        for name in _present(self._wanted)[0]:
             system = make_system(name)
             for controller in system.chosen(self.controllers):
                 one = partial(trial, name, controller, test=self.test, base=self.seed)
@@ -399,7 +483,10 @@ class Judges(Study):
                     learning = partial(one, seed=seed, train=self.train)
                     if isinstance(system, Cars):
                         tasks.append(partial(learning, judge="kinematic"))
-                    tasks += [partial(learning, without=part) for part in ("", *self.parts)]
+                    for judge in lib.names_in(self.judges):
+                        if judge != "told" or system.has_failed:
+                            tasks.append(partial(learning, judge=judge))
+                    tasks += [partial(learning, without=part) for part in self.parts]
         return {"rows": frame_of(lib.parallel(tasks, workers, "Learning and trying"))}
 
     def page(self, found: Frames) -> Page:
@@ -407,7 +494,13 @@ class Judges(Study):
         rows = found["rows"]
         whole = summary(rows.filter(_WHOLE))
         parts: list[Table | Figure] = [
-            Table("The judges on every system", whole, _WHO | _FAILS | _COSTS, _NOTE, _MARK),
+            Table(
+                "The judges on every system",
+                whole,
+                _WHO | _FAILS | _COSTS | _BESIDE,
+                _NOTE + _NOTE_BESIDE,
+                _MARK,
+            ),
             Figure(
                 "judges-failed",
                 "How often systems fail",
@@ -432,6 +525,7 @@ class Judges(Study):
                 )
             )
         ours = whole.filter(judge="learnt")
+        harm = (pl.col("least") < 0.9) | (pl.col("least_learning") < 0.9)
         few = (pl.col("failed") > 0) | (pl.col("kept") < 0.25) | (pl.col("p99_ms") > 1.5)
         both = lib.compared(
             whole.filter(pl.col("judge").is_in(["learnt", "kinematic"])), _IS_OURS, _BY[:2]
@@ -446,6 +540,11 @@ class Judges(Study):
             command=lib.command_line(),
             lost=[
                 Table(
+                    "Harm: less than 0.9 of the controller's own steps, held out or while learning",
+                    ours.filter(harm),
+                    _WHO | _FAILS | _BESIDE,
+                ),
+                Table(
                     "Failures held out, less than a quarter of the proposals kept, or one decision "
                     "of a hundred above 1.5 ms",
                     ours.filter(few),
@@ -459,7 +558,7 @@ class Judges(Study):
                     "The kinematic judge against the learnt one.",
                 ),
             ],
-            facts=self.facts,
+            facts=self.facts | _present(self._wanted)[1],
             packages=("scipy", "gymnasium"),
         )
 
@@ -512,27 +611,17 @@ class Tasks(Study):
             rounds=100,
         )
 
-    def named(self) -> tuple[list[str], list[str]]:
-        """Tasks to run, and a sentence on those whose package is missing."""
+    @property
+    def _wanted(self) -> list[str]:
         wanted = self.tasks or ("" if self.task else ALL)
         names = list(TASKS) if wanted == ALL else lib.names_in(wanted)
-        left_out = [f"{name} is left out: {lacking(name)}" for name in names if lacking(name)]
-        named = [name for name in names if not lacking(name)]
-        return list(dict.fromkeys([self.task, *named] if self.task else named)), left_out
+        return [self.task, *names] if self.task else names
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
-        """Try all that is named, task by task.
-
-        Raises
-        ------
-        ValueError
-            If there is no such task or judge.
-        TypeError
-            If a class of one's own makes none.
-        """
-        names, left_out = self.named()
+        """Try all that is named, task by task; it refuses what is no task or judge."""
+        names, left_out = _present(self._wanted)
         if not names:
-            raise ValueError(f"nothing to run: {'; '.join(left_out)}")
+            raise ValueError(f"nothing to run: {left_out.get('left out', 'no task is named')}")
         tasks: list[partial[dict[str, Any]]] = []
         for name in names:
             system = make_system(name)
@@ -545,7 +634,7 @@ class Tasks(Study):
             late = min(50, train // 2)
             for controller in system.chosen(self.controllers):
                 one = partial(trial, name, controller, test=self.test, base=self.seed)
-                one = partial(one, rounds=self.rounds, late=late)
+                one = partial(one, rounds=self.rounds, late=late, beside=False)
                 tasks += [partial(one, judge, train=0, late=0) for judge in rivals]
                 for seed in range(max(self.seeds, self.acc_seeds) if name in ACC else self.seeds):
                     learners = dict.fromkeys([*own, *system.learners])
@@ -563,7 +652,6 @@ class Tasks(Study):
         above = (pl.col("best") > 0) & (pl.col("score") > 0)
         lines = lines.with_columns(of_told=pl.when(above).then(pl.col("score") / pl.col("best")))
         who, ours = {**_WHO, "told": "{told}"}, rows.filter(pl.col("judge").is_in(OURS))
-        left_out = self.named()[1]
         return Page(
             name=self.name,
             about=_ABOUT_TASKS,
@@ -600,7 +688,7 @@ class Tasks(Study):
             command=lib.command_line(),
             lost=list(_lost(lines)),
             targets=frame_of([*_of_acc(ours), *_of_crashes(rows)]),
-            facts=self.facts | ({"left out": "; ".join(left_out)} if left_out else {}),
+            facts=self.facts | _present(self._wanted)[1],
             packages=("scipy", "gymnasium"),
             sources={
                 "ACC: G. Anderson et al., Guiding Safe Exploration with Weakest Preconditions, "

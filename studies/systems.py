@@ -137,6 +137,8 @@ class System(ABC):
     learners: Sequence[str] = ("learnt", "counted")  #: judges that are told nothing but failures
     #: Judges by name that know this system; see `studies.rivals.rivals_of` for those of ours.
     rivals: Mapping[str, Callable[[], Any]] = {}
+    #: Whether an observation is a failure; None where it does not show.
+    has_failed: Any = None
 
     def __init__(self, controller: str | None = None) -> None:
         self.controller = self.chosen(FIRST if controller is None else controller)[0]
@@ -159,7 +161,7 @@ class System(ABC):
     ) -> tuple[Vector, dict[str, Any]]:
         """Begin the episode ``options["start"]``, or the training episode of a seed."""
         start = (options or {}).get("start", Start("train", 0, seed or 0))
-        self.decisions, self.returned = 0, 0.0
+        self.decisions, self.returned, self.arrived = 0, 0.0, False
         self.chance, self.whim = start.rng(0), start.rng(1)
         self._begin(start)
         return self._observation(), {}
@@ -174,8 +176,10 @@ class System(ABC):
         self.decisions += 1
         reward, failed = self._advance(action)
         self.returned += reward
-        over = not failed and self._is_over()
-        return self._observation(), reward, failed, over, {"failed": failed}
+        self.arrived = not failed and self._has_arrived()
+        ended = failed or self.arrived
+        over = not ended and self._is_over()
+        return self._observation(), reward, ended, over, {"failed": failed}
 
     @property
     def score(self) -> float:
@@ -203,6 +207,10 @@ class System(ABC):
     @abstractmethod
     def _advance(self, action: Action) -> tuple[float, bool]:
         """Reward, and whether it failed."""
+
+    def _has_arrived(self) -> bool:
+        """Whether a goal was reached, which ends the episode."""
+        return False
 
     def _is_over(self) -> bool:
         return self.decisions >= self.steps
@@ -262,12 +270,13 @@ class Acc(System):
 # -- Gymnasium's poles ----------------------------------------------------------------------------
 
 
-def _gymnasium(name: str) -> Any:
+def gymnasium_of(name: str, **given: Any) -> Any:
+    """An environment of Gymnasium, without what it is wrapped in."""
     with needs("gymnasium", "gym", name):
         import gymnasium
     with warnings.catch_warnings():  # that newer versions of a task exist
         warnings.simplefilter("ignore", DeprecationWarning)
-        return gymnasium.make(name).unwrapped
+        return gymnasium.make(name, **given).unwrapped
 
 
 class CartPole(System):
@@ -289,7 +298,7 @@ class CartPole(System):
     def __init__(self, controller: str | None = None, *, gusts: bool = False) -> None:
         self.name, self.train = ("cartpole-gusts", 60) if gusts else ("cartpole", 30)
         self._gusts = gusts
-        self._env = _gymnasium("CartPole-v1")
+        self._env = gymnasium_of("CartPole-v1")
         self._force: float = self._env.force_mag
         super().__init__(controller)
 
@@ -345,7 +354,7 @@ class Pendulum(System):
         self.name = "pendulum-cos" if circular else "pendulum"
         self.variables = (*(("cos", "sin") if circular else ("angle [rad]",)), "rate [rad/s]")
         self.circular = circular
-        self._env = _gymnasium("Pendulum-v1")
+        self._env = gymnasium_of("Pendulum-v1")
         super().__init__(controller)
 
     @property
@@ -644,7 +653,7 @@ class Masa(System):
         self._seen, _ = self._env.reset(seed=1 + int(self.chance.integers(2**31 - 1)))
         self._wanted = None
         self._goes_to = self.whim.uniform(*self._PLACES.T)
-        self._arrived = False
+        self._seen_goal = False
 
     def _observation(self) -> Vector:
         return np.asarray(self._seen, dtype=np.float64)
@@ -652,11 +661,11 @@ class Masa(System):
     def _advance(self, action: Action) -> tuple[float, bool]:
         space = self._env.action_space
         given = np.clip(np.asarray(action, np.float32), space.low, space.high)
-        self._seen, reward, self._arrived, _, _ = self._env.step(given)
+        self._seen, reward, self._seen_goal, _, _ = self._env.step(given)
         return float(reward), self._cost(self._seen) > 0.0
 
-    def _is_over(self) -> bool:
-        return bool(self._arrived) or super()._is_over()
+    def _has_arrived(self) -> bool:
+        return bool(self._seen_goal)
 
 
 # -- highway-env ----------------------------------------------------------------------------------
@@ -679,7 +688,7 @@ class Highway(System):
     def __init__(self, controller: str | None = None, *, task: str) -> None:
         self.name, self.steps = task, self._STEPS[task]
         _habits()
-        self.env = _gymnasium(f"{task}-v0")
+        self.env = gymnasium_of(f"{task}-v0")
         config = self.env.config["observation"]
         count, columns = self.env.observation_space.shape
         #: How a row is laid out: numbers in it, and whether others are relative to the car.
@@ -807,6 +816,11 @@ def lacking(name: str) -> str:
         return f"it needs masa-safe-rl ({_MASA_INSTALL})"
     if name in HIGHWAY and not find_spec("highway_env"):
         return f"it needs highway-env ({install('highway')})"
+    from studies.shapes import NEEDS  # derives its systems from those here
+
+    package, extra = NEEDS.get(name, ("", ""))
+    if package and not find_spec(package):
+        return f"it needs {package} (pip install 'gymnasium[{extra}]')"
     return ""
 
 
@@ -816,9 +830,9 @@ def make_system(name: str, controller: str | None = None) -> System:
     Parameters
     ----------
     name : str
-        One of `SYSTEMS` or `TASKS`, a family of scenarios (``emergency+noise`` with a switch), or
-        ``module:Name`` of a class derived from `System`, which is looked for in the present
-        folder too.
+        One of `SYSTEMS`, `TASKS`, `SHAPES` or `PEERS`, a family of scenarios (``emergency+noise``
+        with a switch), or ``module:Name`` of a class derived from `System`, which is looked for in
+        the present folder too.
     controller : str, optional
         One of its controllers; without it the first.
 
@@ -840,7 +854,9 @@ def make_system(name: str, controller: str | None = None) -> System:
         if not isinstance(made, System):
             raise TypeError(f"{name} makes a {type(made).__name__}, which is no System")
         return made
-    known = SYSTEMS | TASKS
+    from studies.shapes import PEERS, SHAPES  # derives its systems from those here
+
+    known = SYSTEMS | TASKS | SHAPES | PEERS
     families = [*FAMILIES, name] if name.partition("+")[0] in FAMILIES else FAMILIES
     known |= {one: partial(Cars, family=one) for one in families if one not in known}
     if name not in known:

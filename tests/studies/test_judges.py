@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 import pytest
 from studies import judges
-from studies.judges import PARTS, Judges, Tasks, run, summary, trial
+from studies.judges import PARTS, Judges, Tasks, make_judge, run, summary, trial
 from studies.rivals import Rival
 from studies.systems import Start, make_system
 
@@ -118,6 +118,24 @@ def test_every_judge_part_and_seed_has_a_row(made):
     assert parts.cells[1][:4] == ("acc", "margin", "no margin", "0 of 4")
 
 
+def test_goals_and_steps_stand_beside_the_controller_alone_and_harm_is_where_it_loses(made):
+    study = Judges(systems="disc", controllers="first", seeds=1, train=12, test=4, without="none")
+    alone, ours = study.run(workers=1)["rows"].to_dicts()
+    assert alone["steps"] == alone["steps_alone"] == ours["steps_alone"]
+    assert alone["goals"] + alone["failed"] == alone["episodes"] == 4
+    assert (ours["goals"], ours["failed"], ours["steps"]) == (0, 0, 120.0)  # away from all
+    assert ours["steps_learning"] == 120.0 > ours["steps_learning_alone"]
+    harm = study.page({"rows": rows("learnt", steps=[95.0, 89.0])}).losses[0]
+    assert harm.frame["least"].to_list() == [0.89]
+
+
+def test_the_failure_function_is_told_where_an_observation_shows_it(made):
+    make_judge("told", make_system("disc"))
+    assert made[-1].given["failed"](np.array([0.5, 0.5, 0.0, 0.0]))
+    with pytest.raises(ValueError, match="reactor does not show"):
+        make_judge("told", make_system("reactor"))
+
+
 def test_parts_are_named_or_refused():
     assert Judges().parts == tuple(PARTS)
     assert Judges(without="none").parts == Judges().shortened().parts == ()
@@ -134,6 +152,8 @@ def rows(judge, **columns):
     given |= {"failed_late": 0, "score_by_late": 550.0, "kept": 0.5, "mean_change": 0.1}
     given |= {"p50_ms": 1.0, "p99_ms": 2.0, "speed": 20.0, "failed": 0, "score": 1.0}
     given |= {"score_low": 0.0, "score_high": 2.0, "failures": None, "seed": 0}
+    given |= {"goals": 0, "steps": 80.0, "steps_learning": 90.0, "goals_alone": 2}
+    given |= {"steps_alone": 100.0, "steps_learning_alone": 100.0, "score_alone": 1.0}
     missing = [pl.lit(value).alias(name) for name, value in given.items() if name not in columns]
     return frame.with_columns(missing).select(*given)
 

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from studies.judges import make_judge, run, trial
 from studies.rivals import BackupShield, Counted, obstacle_shield, rivals_of
-from studies.systems import HIGHWAY, SYSTEMS, Box, Discrete, Start, System, make_system
+from studies.shapes import PEERS, SHAPES
+from studies.systems import HIGHWAY, SYSTEMS, Box, Discrete, Start, System, lacking, make_system
 
-EVERY = [(name, controller) for name in SYSTEMS for controller in make_system(name).controllers]
+NAMES = [name for name in (*SYSTEMS, *SHAPES, *PEERS) if not lacking(name)]
+EVERY = [(name, controller) for name in NAMES for controller in make_system(name).controllers]
 STARTS = [Start.held_out(11, episode) for episode in range(20)]
 
 
@@ -16,16 +18,17 @@ def play(system, start, policy=None):
     seen, done, paid, over = [observation], [], [], False
     while not over:
         action = system.propose(observation) if policy is None else policy(observation)
-        observation, reward, failed, truncated, info = system.step(action)
-        over = failed or truncated
-        assert info == {"failed": failed}
+        observation, reward, ended, truncated, info = system.step(action)
+        failed, over = info["failed"], ended or truncated
+        assert ended == (failed or system.arrived)
+        assert system.has_failed is None or system.has_failed(observation) == failed
         seen.append(observation)
         done.append(action)
         paid.append(reward)
     return np.array(seen), np.array(done), np.array(paid), failed
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", NAMES)
 def test_an_episode_is_drawn_by_its_start_alone_and_is_what_is_said_of_it(name):
     system, other = make_system(name), make_system(name)
     start = Start.training(0, 3, 1)
@@ -36,7 +39,7 @@ def test_an_episode_is_drawn_by_its_start_alone_and_is_what_is_said_of_it(name):
     assert not np.array_equal(first[0][0], play(system, Start.held_out(0, 1))[0][0])
     seen, done, _, failed = first
     assert seen.shape[1] == len(system.variables)
-    assert len(done) == system.steps or (failed and len(done) < system.steps)
+    assert len(done) == system.steps or ((failed or other.arrived) and len(done) < system.steps)
     if isinstance(system.actions, Box):
         assert (done >= system.actions.low).all()
         assert (done <= system.actions.high).all()
@@ -45,10 +48,17 @@ def test_an_episode_is_drawn_by_its_start_alone_and_is_what_is_said_of_it(name):
 
 
 @pytest.mark.parametrize(("name", "controller"), EVERY)
-def test_a_controller_alone_fails_nearly_always(name, controller):
+def test_a_controller_alone_fails_nearly_always_or_often(name, controller):
     system = make_system(name, controller)
     failed = sum(play(system, start)[3] for start in STARTS)
-    assert failed <= 6 if name == "cut_in" else failed >= 15
+    least = 15 if name in SYSTEMS else 8
+    assert failed <= 6 if name == "cut_in" else failed >= least
+
+
+def test_what_is_missing_is_named_with_the_command_that_installs_it(monkeypatch):
+    monkeypatch.setattr("studies.systems.find_spec", lambda package: None)
+    assert lacking("hopper") == "it needs mujoco (pip install 'gymnasium[mujoco]')"
+    assert lacking("disc") == ""
 
 
 def test_training_and_held_out_episodes_are_others():
