@@ -114,7 +114,7 @@ def test_fcd_says_which_lengths_it_assumed(evofsm, tmp_path):
     assert "#1 48.0" in text
 
 
-OWN = ("--observe", "dist,ego_kmh,lead_kmh", "--action", "accel", "--unit", "ego_kmh=km/h")
+OWN = ("--observe", "dist [m],ego_kmh,lead_kmh", "--action", "accel", "--unit", "ego_kmh=km/h")
 OWN += ("--unit", "lead_kmh=km/h", "--episode", "trip")
 
 
@@ -122,7 +122,7 @@ OWN += ("--unit", "lead_kmh=km/h", "--episode", "trip")
 def own(tmp_path):
     """Drives in somebody's own columns, in km/h; each second one ends in a collision."""
     path = tmp_path / "own.csv"
-    rows = ["trip,time,dist,ego_kmh,lead_kmh,accel,hit"]
+    rows = ["trip,time,dist [m],ego_kmh,lead_kmh,accel,hit"]
     for trip in range(6):
         for k in range(60):
             gap, lead = 22.0 - (0.4 * k if trip % 2 else 0.0), 72.0 - 15.0 * (trip % 2)
@@ -133,16 +133,38 @@ def own(tmp_path):
 
 @pytest.mark.parametrize(
     ("judge", "keys"),
-    [("kinematic", ("gap", "v_follower", "v_leader")), ("learnt", ("dist", "ego_kmh", "lead_kmh"))],
+    [
+        ("kinematic", ("gap", "v_follower", "v_leader")),
+        ("learnt", ("dist [m]", "ego_kmh", "lead_kmh")),
+    ],
 )
 def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judge, keys):
     path, rows = tmp_path / "car.evofsm", tmp_path / "rows.jsonl"
-    options = ("--failed", "hit", "--action-range", "-6:2:0.5", "--judge", judge)
+    options = ("--failed", "hit", "--action-range", "-6:-2:0.5", "--judge", judge)
     told = evofsm("learn", own, *OWN, *options, "--guard", path)
     assert f"--guard {path} takes rows of time [s], {keys[0]}" in told.stdout
+    beyond = (
+        "It judges: fails where dist [m] is below" in told.stdout,
+        "% of the log's" in told.stdout,
+    )
+    assert beyond == (judge == "learnt",) * 2
     seen = dict(zip(keys, (3.0, 20.0, 15.8), strict=True))
-    rows.write_text(json.dumps({"time": 0.0, "proposal": 1.0, **seen}) + "\n")
-    answer = json.loads(evofsm("monitor", rows, "--guard", path).stdout)
+    sent = [{"time": 0.0, "proposal": 1.0, **seen, **odd} for odd in ({keys[0]: "near"}, {})]
+    rows.write_text("".join(json.dumps(one) + "\n" for one in sent))
+    wrong, answer = map(json.loads, evofsm("monitor", rows, "--guard", path).stdout.splitlines())
+    assert (wrong["about"], wrong["error"]) == (keys[0], 'is "near"; it must be float or null')
+    summed = evofsm(
+        "monitor",
+        own,
+        *OWN[2:],
+        *options[:2],
+        "--guard",
+        path,
+        "--summary",
+        *(OWN[:2] if judge == "kinematic" else ()),
+    )
+    assert "failures  3; 3 in alarm by then, for " in summed.stdout
+    assert ("\n0.5 " in summed.stdout) == (judge == "kinematic")  # of which the risk alone decides
     assert answer["alarm"]
     assert answer["mode"] == "shadow"
     assert answer["evidence"] > 0
@@ -153,9 +175,9 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
 def test_a_guard_that_could_not_be_taught_is_refused_before_the_work(refused, own, tmp_path):
     options = ("learn", own, *OWN, "--guard", tmp_path / "car.evofsm")
     assert "nothing tells of them: --failed" in refused(*options)
-    two = ("--observe", "dist,ego_kmh", "--judge", "kinematic", "--unit", "ego_kmh=km/h")
+    two = ("--observe", "dist [m],ego_kmh", "--judge", "kinematic", "--unit", "ego_kmh=km/h")
     assert "--observe has to name the three columns" in refused(*options[:2], *two, *options[-2:])
-    discrete = ("--observe", "dist,hit=0/1", "--failed", "hit")
+    discrete = ("--observe", "dist [m],hit=0/1", "--failed", "hit")
     assert "numbers alone" in refused(*options[:2], *discrete, *options[-2:])
 
 
@@ -339,7 +361,7 @@ def test_at_most_twenty_states_are_listed_and_where_they_are_one_blur_it_is_said
     assert "rule novelty (--rule), radius 0.2" in " ".join(told.stdout.split())
     wide = " ".join(evofsm("learn", own, *OWN, "--spread", "100").stdout.split())
     assert "States are hardly told apart" in wide
-    assert "Try --rule novelty --scale dist=" in wide
+    assert "Try --rule novelty --scale 'dist [m]=" in wide
     assert "--rule novelty" not in evofsm("learn", log, "--rule", "edges", "--spread", "99").stdout
 
 

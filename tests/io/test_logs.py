@@ -7,6 +7,7 @@ import itertools
 import re
 import sys
 import tracemalloc
+from shlex import quote
 
 import numpy as np
 import pytest
@@ -427,6 +428,36 @@ def test_a_number_may_stand_for_no_leader(tmp_path):
     assert "--no-leader 'gap==0'" in warnings_of(noted)[0]
 
 
+@pytest.mark.parametrize(("nobody", "warns"), [((-1, -1), True), ((-1, -2), False)])
+def test_one_number_below_zero_that_comes_again_and_again_is_asked_about(tmp_path, nobody, warns):
+    rows = [(20, 72), *((one, one) for one in nobody * 2), (-0.4, 72)]  # which is a collision
+    lines = [f"{k / 10};{gap};72;{lead};0" for k, (gap, lead) in enumerate(rows)]
+    path, noted = (
+        write(tmp_path / "a.csv", lines, "time;gap;v_follower;v_leader;a_follower"),
+        Noted(),
+    )
+    read(path, noted=noted, units={"v": "km/h"})
+    asked = [one for one in warnings_of(noted) if "in 4 rows, and else never below 0" in one]
+    assert len(asked) == warns
+    if asked:
+        option = re.search("--no-leader (v_leader==[-0-9.]+) leaves such rows out", asked[0])[1]
+        left = together(path, no_leader=option, units={"v": "km/h"})
+        assert left[0] == [20, -0.4]
+
+
+@pytest.mark.parametrize("odd", ["", ";;;;"])
+def test_where_fields_end_at_a_semicolon_numbers_may_have_a_decimal_comma(tmp_path, odd):
+    lines = [f"{k / 10}; {20 - k / 3}; 10,5; 11; -0,5".replace(".", ",") for k in range(4)]
+    header = "time; gap; v_follower; v_leader; a_follower"
+    path = write(tmp_path / "a.csv", [*lines, *filter(None, [odd and '0,4;"9,5";10;11;0'])], header)
+    (chunk,) = read(path)
+    assert chunk.observations[:4, 0].tolist() == [20 - k / 3 for k in range(4)]
+    assert chunk.observations[0].tolist() == [20, 10.5, 11]
+    assert (chunk.dt, chunk.actions[0]) == (0.1, -0.5)
+    bad = write(tmp_path / "b.csv", [*lines, "0,4;1.000,5;10;11;0"], header)
+    assert "line 6, column 'gap': '1.000,5' is no number" in refusal(bad)
+
+
 # -- Dates and units -------------------------------------------------------------------------------
 
 
@@ -506,7 +537,7 @@ def test_a_unit_in_a_column_s_name_is_asked_about_unless_it_was_told(tmp_path, n
     read(path, noted=noted, **columns)
     (warning,) = warnings_of(noted)
     assert f"{name} is called as if it were in {unit}" in warning
-    assert f"--unit {name}={unit} converts it" in warning
+    assert f"--unit {quote(f'{name}={unit}')} converts it" in warning
     told = Noted()
     read(path, noted=told, units={name: unit}, **columns)
     assert warnings_of(told) == []

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.inspect import model_document, tables_of, with_unit
@@ -83,8 +84,7 @@ def learn(
         ),
     ] = "paper",
     radius: Annotated[
-        float | None,
-        option("How far states lie apart. [default: 0.3; of novelty 1.0, in --scale]"),
+        float | None, option("How far states lie apart. [default: 0.3; of novelty 1.0, in --scale]")
     ] = None,
     scale: Annotated[
         list[str] | None,
@@ -94,8 +94,7 @@ def learn(
         ),
     ] = None,
     spread: Annotated[
-        float | None,
-        option("Width of recognition. [default: 3.0; of novelty 1.0]"),
+        float | None, option("Width of recognition. [default: 3.0; of novelty 1.0]")
     ] = None,
     max_states: Annotated[
         int | None, option("At so many, two are merged for each new one. [default: no limit]")
@@ -200,32 +199,15 @@ def learn(
     if guard is not None:
         assert kind is not None
         assert learning.model.dt is not None
-        taught = guard_of_log(
-            kind,
-            learning.model.dt,
-            brakes,
-            tolerance,
-            actions,
-            machine,
-            encoder.names,
-            learning.model.units,
-        )
+        reckoned = kind, learning.model.dt, brakes, tolerance
+        taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
         with progress("Teaching the guard", learning.read.rows) as move:
             rows = read_traces(files, columns, lengths, topics=known_topics)
             teach(taught, rows, lambda count: move(count))
         taught.save(guard, provenance)
     if as_json:
-        document = _document(learning, provenance)
-        print_json(
-            {
-                "files": files,
-                "saved": out,
-                "guard": guard,
-                **document,
-                "noted": noted,
-                "warnings": warnings,
-            }
-        )
+        told = {"files": files, "saved": out, "guard": guard, **_document(learning, provenance)}
+        print_json({**told, "noted": noted, "warnings": warnings})
         return
     read = [*_read(learning, action), *_read_otherwise(noted, failed, learning)]
     if assumed := learning.read.notes["lengths"]:
@@ -240,7 +222,8 @@ def learn(
     elif out is not None:
         say(f"Saved to {out}. Look at it again: evofsm inspect {out}")
     if taught is not None:
-        for line in _of_guard(taught, guard, brakes):
+        beyond = (learning.read.clipped_below + learning.read.clipped_above) / learning.read.rows
+        for line in _of_guard(taught, guard, brakes, beyond):
             say(line)
 
 
@@ -384,7 +367,7 @@ def _provenance(
     return provenance
 
 
-def _of_guard(guard: Guard, path: Path | None, brakes: float) -> Iterator[str]:
+def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
     """Where it is, what it takes, and what it reckons with."""
     from evofsm.guard import LearntRisk
 
@@ -395,8 +378,11 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float) -> Iterator[str]:
     yield f"The guard was saved to {path}. {takes}"
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
-    elif not guard.judge.dynamics.thresholds:
-        yield f"It judges nothing yet: {guard.judge.told_by_experience}."
+        return
+    nothing = "" if guard.judge.dynamics.thresholds else " nothing yet"
+    yield f"It judges{nothing}: {guard.judge.told_by_experience}."
+    if beyond:
+        yield f"It knows no action beyond --action-range, where {beyond:.1%} of the log's are."
 
 
 def _save(
@@ -456,7 +442,10 @@ def _hardly_told_apart(model: FSMModel, certainty: float, rule: str) -> str:
 
     # A tenth of what the states cover is a difference that may count as 1.
     tenths = zip(model.names, 0.1 * np.ptp(model.centers, axis=0), strict=True)
-    scales = [f"--scale {name}={max(x, 1e-3):.1g}" for name, x in tenths if name not in VARIABLES]
+    found = [
+        f"{name}={float(f'{max(x, 1e-3):.1g}'):g}" for name, x in tenths if name not in VARIABLES
+    ]
+    scales = [f"--scale {quote(one)}" for one in found]
     other = f"Try {' '.join(['--rule novelty', *scales])}, or a" if rule == "paper" else "A"
     return (
         f"\nStates are hardly told apart: the most probable one has {certainty:.0%} of the belief "
@@ -474,7 +463,8 @@ def _read_otherwise(
     if failed is None:
         yield "failures", "not told; --failed COLUMN or --failed 'gap<=0' tells of them"
     else:
-        text = f"{learning.read.failures:,} episodes ended with {failed}"
+        several = "" if learning.read.failures == 1 else "s"
+        text = f"{learning.read.failures:,} episode{several} ended with {failed}"
         left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
         yield "failures", text + (left_out if noted.after_failure else "")
     if noted.leaderless:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any, NamedTuple
 
 import msgspec
@@ -193,13 +194,13 @@ def warnings_of(noted: Noted, time: str = "time") -> list[str]:
     called = {name: unit for name in noted.untold if (unit := _called(name, is_time=name == time))}
     found = [
         f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
-        f"mph? --unit {name}=km/h converts it"
+        f"mph? --unit {quote(f'{name}=km/h')} converts it"
         for name, fastest in noted.fastest.items()
         if name not in called
     ]
     found += [
         f"{name} is called as if it were in {unit}, and was read as one of the SI: --unit "
-        f"{name}={unit} converts it (--unit {name}={SI[unit].replace('²', '2')}: it is right)"
+        f"{quote(f'{name}={unit}')} converts it (--unit {quote(f'{name}={SI[unit]}')}: it is right)"
         for name, unit in called.items()
     ]
     if (step := noted.longest_step) > 0.0 and time not in called:
@@ -213,6 +214,12 @@ def warnings_of(noted: Noted, time: str = "time") -> list[str]:
             f"{noted.failed_at_once:,} of {noted.failed:,} failed episodes fail with their first "
             f"row, and {name} is {value:g} there each time: does that stand for no leader? "
             f"--no-leader '{name}=={value:g}' leaves such rows out"
+        )
+    if alone := [(name, *one) for name, one in noted.below.items() if one[0] and one[1] > 2]:
+        name, value, rows = min(alone, key=lambda one: one[1] not in _NOBODY)
+        found.append(
+            f"{name} is {value!r} in {rows:,} rows, and else never below 0: does that stand for no "
+            f"leader? --no-leader {quote(f'{name}=={value!r}')} leaves such rows out"
         )
     if noted.unplaced:
         why = "lie in rows without a leader, belong to no episode, and were not counted"

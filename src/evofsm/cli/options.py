@@ -79,7 +79,7 @@ EpisodeColumns = Annotated[
     str | None,
     option(
         "An episode begins where one of these columns changes, and in each file; none of them: "
-        "''. [default: those of run,pair,segment that exist]",
+        "''. [default: those of run,pair,segment,episode there are]",
         "--episode",
     ),
 ]

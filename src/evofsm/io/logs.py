@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from evofsm.io.rosbag import Topics
 
 #: Columns that tell episodes apart where nothing else was said and they exist.
-USUAL_EPISODE = ("run", "pair", "segment")
+USUAL_EPISODE = ("run", "pair", "segment", "episode")
 #: Steps longer than the usual one times this, or as much shorter, begin a new episode.
 LONGEST_STEP = 1.5
 # Rows of a file whose steps tell the usual one.
@@ -93,6 +93,8 @@ class Noted:
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
     fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
     longest_step: float = 0.0  #: the usual one, beyond belief [s]
+    #: By variable, the number that it is below 0 (0 where there are several), and in how many rows.
+    below: dict[str, tuple[float, int]] = field(default_factory=dict)
     failed: int = 0  #: episodes
     failed_at_once: int = 0  #: of them, those with one row
     #: What a variable was whenever an episode failed at once, if always the same.
@@ -103,6 +105,9 @@ class Noted:
         for name, values in zip(names, chunk.observations.T, strict=True):
             if _SPEED.match(name) and (fastest := float(np.abs(values).max())) > _FASTEST:
                 self.fastest[name] = max(fastest, self.fastest.get(name, 0.0))
+            if len(below := values[values < 0.0]):
+                value, rows = self.below.get(name, (float(below[0]), 0))
+                self.below[name] = value if (below == value).all() else 0.0, rows + len(below)
         if chunk.dt > _LONGEST_USUAL:
             self.longest_step = max(chunk.dt, self.longest_step)
         if chunk.failures is not None:
@@ -186,7 +191,7 @@ class LogColumns:
         Column of the time [s]; not read if ``dt`` is given.
     episode : sequence of str, optional
         An episode begins where one of these columns changes, and in each file; without it,
-        those of run, pair and segment that exist. The rows of an episode stand together.
+        those of run, pair, segment and episode that exist. The rows of an episode stand together.
     dt : float, optional
         Time from a row to the next [s], for a log without a clock.
     failed : str, optional

@@ -30,10 +30,10 @@ OnRead = Callable[[int], object]
 #: Place of a row, for a message, and what stands there in a column.
 Find = Callable[[int, "str | None"], tuple[str, str]]
 
-# Read at once: enough that what Python does in between hardly counts. polars decodes a whole row
-# group for each slice of it, so small slices would only cost time.
+# Read at once. polars decodes a whole row group for each slice of it: small slices cost time.
 _CSV_BYTES, _PARQUET_ROWS = 1 << 21, 1 << 16
 _LONGEST_LINE = 1_000_000
+_PLAIN: Mapping[str, Any] = {"has_header": False, "ignore_errors": True, "raise_if_empty": False}
 
 _BYTE_ORDER_MARK, _GZIP, _PARQUET = b"\xef\xbb\xbf", b"\x1f\x8b", b"PAR1"
 _SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
@@ -304,6 +304,7 @@ class Table:
 class CsvTable(Table):
     """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
 
+    Where they end at a semicolon, a number may have a decimal comma.
     polars reads blocks of plain lines; Python's own reader, which is slower, blocks with anything
     odd, such as a line break within quotes, and what a message is to name.
     """
@@ -368,10 +369,10 @@ class CsvTable(Table):
                 is_plain = found is not None
                 if found is None:
                     rows = self._odd(block, reached)[1]
-                    found = {
-                        name: polars.Series([row[place] for row in rows], dtype=polars.String)
-                        for name, place in places.items()
-                    }
+                    fields = {name: [row[k] for row in rows] for name, k in places.items()}
+                    found = polars.DataFrame(fields, dict.fromkeys(places, polars.String)).to_dict()
+                    for name in wanted.numbers if self._separator == ";" else ():
+                        found[name] = found[name].str.replace(",", ".", literal=True)
                 if n_rows := len(found[wanted.all[0]]):
                     yield wanted.piece(found, partial(self._find, block, reached))
                 reached += n_rows if is_plain else block.count(b"\n")
@@ -387,16 +388,10 @@ class CsvTable(Table):
         # As polars calls columns, for there may be two of one name.
         kinds: dict[str, Any] = {f"column_{k + 1}": polars.String for k in range(len(self.columns))}
         kinds |= {f"column_{places[name] + 1}": polars.Float64 for name in numbers}
+        wanted = [f"column_{place + 1}" for place in places.values()]
+        dialect: Any = {"separator": self._separator, "decimal_comma": self._separator == ";"}
         try:
-            frame = polars.read_csv(
-                block,
-                has_header=False,
-                separator=self._separator,
-                schema=kinds,
-                columns=[f"column_{place + 1}" for place in places.values()],
-                ignore_errors=True,
-                raise_if_empty=False,
-            )
+            frame = polars.read_csv(block, columns=wanted, schema=kinds, **dialect, **_PLAIN)
         except (polars.exceptions.PolarsError, polars.exceptions.PanicException):
             return None
         found = {name: frame[f"column_{place + 1}"] for name, place in places.items()}

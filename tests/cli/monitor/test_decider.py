@@ -126,6 +126,22 @@ def test_a_recording_that_is_played_again_is_decided_again(end):
     assert decider.n == 120
 
 
+@pytest.mark.parametrize("length", [1, 20, 255, 256])
+def test_episodes_of_one_length_end_at_the_same_time_and_each_end_counts(length):
+    guard = made(learn=True)
+    decider = Decider(guard)
+    for gap in (60.0, 70.0, 80.0):
+        told = [row | {"gap": gap, "time": 0.1 * k} for k, row in enumerate(rows(length))]
+        end = line({"end": True, "failed": True, "time": told[-1]["time"]})
+        answers = [decider.answer(message) for message in [*map(line, told), end, end]]
+    assert (decider.n, answers[-1]["n"]) == (3 * length, 3 * length)
+    assert guard.n_failed == 3
+    assert decider.answer(line(told[0] | {"gap": 90.0}))["kind"] == "decision"
+    if 1 < length < 255:
+        assert decider.answer(end) == answers[-1]  # sent again, after a row of another episode
+        assert guard.n_failed == 3
+
+
 def test_an_end_that_is_sent_again_counts_once():
     guard = made(learn=True)
     decider = Decider(guard)

@@ -18,15 +18,7 @@ import numpy as np
 from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
 from evofsm.cli.show import plain
 from evofsm.driving.naming import VARIABLES
-from evofsm.guard import (
-    ActionReviser,
-    BoxActions,
-    Guard,
-    Mode,
-    Revision,
-    SearchingJudge,
-    is_spoken,
-)
+from evofsm.guard import ActionReviser, BoxActions, Guard, Mode, Revision, SearchingJudge, is_spoken
 
 _log = logging.getLogger(__name__)
 
@@ -66,7 +58,7 @@ class Decider:
         self._next: int | None = None  # of the recent ones, where they are being sent again
         self._said_often = self._said_fast = self._has_failed = False
         reviser = guard.reviser
-        self._has_margin = isinstance(reviser, ActionReviser) and not isinstance(
+        self.has_margin = isinstance(reviser, ActionReviser) and not isinstance(
             reviser.risk, SearchingJudge
         )
 
@@ -252,7 +244,7 @@ class Decider:
     def _is_alarm(self, revision: Revision) -> bool:
         """Whether the proposal is too risky, or, where that alone does not decide, is not kept."""
         reviser: Any = self.guard.reviser
-        if self._has_margin:
+        if self.has_margin:
             return bool(revision.risk_proposed > reviser.tolerance)
         return is_spoken(reviser, revision)
 
@@ -271,11 +263,12 @@ class Decider:
 
 def _begins_anew(told: Message, before: Message | None, latest: Message | None) -> bool:
     """Whether what first came after ``before`` is no repetition where it comes after another."""
-    if isinstance(latest, End):
+    if not isinstance(latest, Row):
         return before is None or isinstance(before, End)
-    if before is None and isinstance(told, Row) and isinstance(latest, Row):
-        return told.time < latest.time - _LATE
-    return before == latest
+    if before is None:
+        return isinstance(told, End) or told.time < latest.time - _LATE
+    # Episodes that are as long as each other end alike.
+    return before.time == latest.time if isinstance(told, End) else before == latest
 
 
 def _refuse_stale(row: Row, latest: Row) -> None:

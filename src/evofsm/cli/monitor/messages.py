@@ -96,18 +96,22 @@ class Form:
         self.count = len(self.variables) or known
         length = Meta(min_length=self.count or 1, max_length=self.count or None)
         several: Any = Annotated[list[_Seen], length]
-        seen = [(name, _Seen) for name in self.variables] or [("observation", several)]
-        self._names = [name for name, _ in seen]
+        # By keys of our own: a column may be called "Tank 1 [mm]", which no attribute can be.
+        self._keys = {f"v{k}": name for k, name in enumerate(self.variables or ["observation"])}
+        seen = [(key, _Seen if self.variables else several) for key in self._keys]
         action = ("proposal", _action(guard))
         version = ("schema", Literal[1], SCHEMA)
-        self._row = _struct("Row", ("time", _Number), action, *seen, version)
+        self._row = self._struct("Row", ("time", _Number), action, *seen, version)
         placed = ("ego", _Vehicle), ("objects", list[_Vehicle])
-        self._scene = _struct("Scene", ("time", _Number), action, *placed, version)
-        last = [(name, kind | UnsetType, UNSET) for name, kind in seen]
-        self._end = _struct(
-            "End", ("end", bool), ("failed", bool, False), ("time", _Seen, None), *last, version
-        )
+        self._scene = self._struct("Scene", ("time", _Number), action, *placed, version)
+        last = [(key, kind | UnsetType, UNSET) for key, kind in seen]
+        ended = ("end", bool), ("failed", bool, False), ("time", _Seen, None)
+        self._end = self._struct("End", *ended, *last, version)
         self._decoders = {kind: msgspec.json.Decoder(kind) for kind in (self._row, self._scene)}
+
+    def _struct(self, name: str, *fields: Any) -> Any:
+        strict: Any = {"forbid_unknown_fields": True, "kw_only": True, "rename": self._keys}
+        return msgspec.defstruct(name, fields, **strict)
 
     def read(self, line: bytes) -> Message:
         """The message on a line."""
@@ -132,16 +136,16 @@ class Form:
             raise self._refused(line, kind, str(error)) from None
 
     def _observed(self, told: Any) -> tuple[float | None, ...]:
-        values = [getattr(told, name) for name in self._names]
+        values = [getattr(told, key) for key in self._keys]
         return tuple(values if self.variables else values[0])
 
     def _of_end(self, told: Any) -> End:
         if not told.end:
             raise MessageError("end", "is false; it must be true")
-        given = [name for name in self._names if getattr(told, name) is not UNSET]
-        if not given:
+        lacking = [name for key, name in self._keys.items() if getattr(told, key) is UNSET]
+        if len(lacking) == len(self._keys):
             return End(told.failed, time=told.time)
-        if lacking := [name for name in self._names if name not in given]:
+        if lacking:
             raise MessageError(lacking[0], "is missing; a variable that was not seen is null")
         return End(told.failed, self._observed(told), told.time)
 
@@ -186,7 +190,7 @@ class Form:
             if found[1] == "missing":
                 return MessageError(about, f"is missing{_missing(about)}", time)
             known = msgspec.structs.fields(_Vehicle if place else kind)
-            names = ", ".join(sorted(one.name for one in known))
+            names = ", ".join(sorted(one.encode_name for one in known))
             return MessageError(about[:_SHOWN], f"is not known; known are {names}", time)
         value = _shown(_at(told, place))
         if place == "schema":
@@ -195,10 +199,6 @@ class Form:
             expected = re.sub("^Expected |, got .*|`", "", text).replace(" | ", " or ")
             what = f"is {value}; it must be {expected}"
         return MessageError(place or "line", what, time)
-
-
-def _struct(name: str, *fields: Any) -> Any:
-    return msgspec.defstruct(name, fields, forbid_unknown_fields=True, kw_only=True)
 
 
 def _action(guard: Guard) -> Any:
@@ -289,7 +289,7 @@ def _time(told: dict[str, Any]) -> float | None:
 
 def _at(told: Any, place: str) -> Any:
     """The value at a place such as ``objects[3].vx``."""
-    for part in re.findall(r"[^.\[\]]+", place):
+    for part in [place] if place in told else re.findall(r"[^.\[\]]+", place):
         told = told[int(part)] if isinstance(told, list) else told.get(part)
     return told
 

@@ -36,7 +36,7 @@ def decided_on_log(decider: Decider, episodes: Iterable[Chunk]) -> Answers:
             row = Row(float(time), here, None if math.isnan(wanted) else wanted)
             yield decider.act(row), row
         failed = episode.failures is not None and len(episode.failures) > 0
-        decider.act(End(failed, last))
+        yield decider.act(End(failed, last)), None
 
 
 def decided_on_lines(decider: Decider, lines: Iterable[bytes]) -> Answers:
@@ -49,12 +49,14 @@ def decided_on_lines(decider: Decider, lines: Iterable[bytes]) -> Answers:
 def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[RenderableType]:
     """Tables of what was decided; a ValueError if nothing was."""
     rows: list[Row] = []
-    numbers, refused = [], []
+    numbers, refused, failed = [], [], []
     for answer, row in answers:
         if answer["kind"] == "decision" and row is not None:
             rows.append(row)
             risk, begins = answer["risk_proposed"] or 0.0, decider.rows == 1 or len(rows) == 1
             numbers.append((row.time, risk, answer["alarm"], begins))
+        elif answer["kind"] == "end" and answer["failed"] and rows:
+            failed.append(len(rows) - 1)
         elif answer["kind"] == "error":
             refused.append(f"{answer['about']}: {answer['error']}")
     if not rows:
@@ -72,33 +74,38 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
     count, hourly, share = counted(alarms > 0.0)
     told = f"{len(rows):,} in {begins.sum():,.0f} episodes, {lasted.sum() / 3600.0:.3g} h"
     pairs = [("rows", told), ("alarms", f"{count}, or {hourly} an hour, {share} of the time")]
+    # A moment lasts while an alarm does; the highest risk within it stands for it.
+    calm = (alarms == 0.0) & (np.diff(times // _MOMENT, prepend=0.0) != 0.0)
+    moments = np.cumsum(~follows | calm | (np.diff(alarms, prepend=0.0) != 0.0))
+    long = np.bincount(moments, lasted * alarms)[moments]
+    if failed:
+        before = long[failed]
+        told = f"{len(failed):,}; {(before > 0.0).sum():,} in alarm by then"
+        ahead = f", for {np.median(before[before > 0.0]):.1f} s (median)" if before.any() else ""
+        pairs.append(("failures", told + ahead))
     if refused:
         pairs.append(("refused", f"{len(refused):,} messages, the first because {refused[0]}"))
     yield facts(title, pairs)
     own = getattr(decider.guard.reviser, "tolerance", None)
-    known = sorted({*_TOLERANCES, *([] if own is None else [own])})
+    # Where the risk alone does not decide, only --tolerance tells what another one comes to.
+    known = sorted({*(_TOLERANCES if decider.has_margin else ()), *([] if own is None else [own])})
     lines = [(f"{t:g}", *counted(alarms > 0.0 if t == own else risks > t)) for t in known]
     bold = [place for place, tolerance in enumerate(known) if tolerance == own]
-    yield table(
-        "\nBy tolerance", ("tolerance", "alarms", "an hour", "of the time"), lines, bold=bold
-    )
-    # A moment lasts while an alarm does; the highest risk within it stands for it.
-    calm = (alarms == 0.0) & (np.diff(times // _MOMENT, prepend=0.0) != 0.0)
-    moments = np.cumsum(~follows | calm | (np.diff(alarms, prepend=0.0) != 0.0))
+    header = ("tolerance", "alarms", "an hour", "of the time")
+    yield table("\nBy tolerance", header, lines, bold=bold)
     order = np.lexsort((-risks, moments))
     highest = order[np.unique(moments[order], return_index=True)[1]]
-    long = np.bincount(moments, lasted * alarms)[moments[highest]]
-    ranked = np.lexsort((-long, -risks[highest]))[:_WORST]
+    ranked = np.lexsort((-long[highest], -risks[highest]))[:_WORST]
     names = decider.form.variables or [f"{k + 1}" for k in range(len(rows[0].observation or ()))]
     names = () if decider.form.scenes else names[:_SHOWN]
     episodes, worst = np.cumsum(begins), []
-    for at, seconds in zip(highest[ranked].tolist(), long[ranked], strict=True):
+    for at in highest[ranked].tolist():
         if risks[at] or alarms[at]:
             seen = [*(rows[at].observation or ())[: len(names)], rows[at].proposal]
             shown = [
                 f"{v:.4g}" if isinstance(v, float) else str("" if v is None else v) for v in seen
             ]
             where = (f"{episodes[at]:.0f}", f"{times[at]:.10g}", *shown)
-            worst.append((*where, f"{risks[at]:.1%}", f"{seconds:.1f}"))
+            worst.append((*where, f"{risks[at]:.1%}", f"{long[at]:.1f}"))
     header = ("episode", "time", *names, "proposed", "risk", "alarm lasts [s]")
     yield table("\nThe worst moments", header, worst)

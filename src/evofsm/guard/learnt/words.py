@@ -131,7 +131,7 @@ def experience(
             f"{differs:.0%} of the states around: what decides are the thresholds"
         )
     where = " or ".join(
-        f"{name} is {'below' if low else 'above'} {at:.3g}" for name, low, at in fails
+        f"{name} is {'below' if low else 'above'} {at:.4g}" for name, low, at in fails
     )
     return f"fails where {where}; {remembered}, to be survived by {changes(margin)}{since}"
 
