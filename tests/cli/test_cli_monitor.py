@@ -252,6 +252,28 @@ def listening(tmp_path):
 
 @posix
 @pytest.mark.slow
+def test_the_client_of_the_page_in_cpp_gets_its_alarm_by_udp(tmp_path):
+    if (compiler := shutil.which("g++")) is None:
+        pytest.skip("there is no C++ compiler")
+    source, client = tmp_path / "client.cpp", tmp_path / "client"
+    page = (EXAMPLES.parents[1] / "docs" / "monitor.md").read_text("utf-8")
+    code = page.partition("```cpp\n")[2].partition("```")[0]
+    with started("--warm", "--udp", 0) as process:
+        said = iter(process.stderr.readline, b"")
+        port = next(one for one in said if b"listens" in one).decode().split()[-1]
+        source.write_text(code.replace("4444", port))
+        build = [compiler, "-Wall", "-Wextra", "-Werror", "-o", client, source]
+        subprocess.run(build, check=True)
+        done = subprocess.run([client], capture_output=True, timeout=PATIENCE)
+        process.terminate()
+        ended(process)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["alarm"]
+    assert subprocess.run([client], capture_output=True).returncode == 2  # it is gone
+
+
+@posix
+@pytest.mark.slow
 def test_the_client_in_c_gets_its_alarm(listening, tmp_path):
     compiler = os.environ.get("CC") or shutil.which("cc")
     if compiler is None:
