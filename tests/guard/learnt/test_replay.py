@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evofsm.guard.learnt.library import Backups, harm
+from evofsm.guard.learnt.library import Backups, at_once, harm
 from evofsm.guard.learnt.replay import (
     CHANGED,
     CUT_SHORT,
@@ -216,7 +216,7 @@ def test_feedback_evolves_where_no_constant_action_survives():
     pushed.residuals[:, 0, 1], pushed.residuals[:, 0, 2] = 0.5, -0.5
     situations = np.array([[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     for _ in range(10):
-        found = found.evolved(model, situations, pushed, 1.0, random)
+        found = at_once(found.evolved(model, situations, pushed, 1.0, random))
     ends = harm(model, situations, found.policies[found.ranks[:1]], pushed)
     assert found.ranks[0] >= found.n_constant
     assert found.policies[found.ranks[0], 0, 1] < 0.0  # back to the middle

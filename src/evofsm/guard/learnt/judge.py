@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import operator
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
 from typing import Any, ParamSpec, Self, TypeVar
 
@@ -25,7 +25,7 @@ from evofsm.fsm.validation import action_name, positive
 from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.learnt import library, words
 from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics
-from evofsm.guard.learnt.library import Backups, Violations
+from evofsm.guard.learnt.library import Backups, Parts, Violations
 from evofsm.guard.learnt.replay import (
     CUT_SHORT,
     KEPT,
@@ -69,6 +69,8 @@ _ALIKE, _TRIES = 0.02, 8
 _MOST_STEPS = 10_000
 # From so many situations on backups evolve, and disturbances are looked for.
 _ENOUGH = 3
+# What comes instead of the next part of a study that has none.
+_OVER = object()
 
 
 def _atomic(learn: Callable[_P, _T]) -> Callable[_P, _T]:
@@ -217,6 +219,7 @@ class LearntRisk:
         self.backups: Backups | None = None
         self.disturbances: Disturbances | None = None
         self._pool = np.empty((0, 0))  # residuals, only for disturbances without memory
+        self._rest: Iterator[None] | None = None  # of the study of an episode that goes on
         self._forget()
 
     def trial(self) -> Trial | None:
@@ -463,6 +466,7 @@ class LearntRisk:
             )
         has_gaps = math.isnan(observation.dot(observation))
         if has_gaps or not dynamics.has_acted:
+            self._finish()
             dynamics.end(failed=False)
         return False if has_gaps else dynamics.observe(observation)
 
@@ -492,7 +496,9 @@ class LearntRisk:
         self.follow(observation, action)
         self._notes.append((self._refused, self._dead_end))
         if self.dynamics.n_episodes != self.n_studied:  # it goes on, but was long enough to study
-            self._study()
+            self._rest = self._study()
+        if self._rest is not None:
+            self._go_on()
         del self._notes[: max(0, len(self._notes) - self.dynamics.n_under_way)]
 
     def follow(self, observation: ArrayLike, action: Any) -> None:
@@ -506,6 +512,7 @@ class LearntRisk:
         if learn:
             self.end(None, failed=False)
         else:
+            self._finish()
             self.dynamics.forget_episode()
             self._forget()
 
@@ -514,9 +521,11 @@ class LearntRisk:
         """Learn from an episode; its last observation was taken in (`observe`)."""
         self.n_failed += int(failed)
         seen_whole = observation is None or not math.isnan(observation.dot(observation))
+        self._finish()
         self.dynamics.end(failed=failed and seen_whole)
         if self.dynamics.n_episodes != self.n_studied:
-            self._study()
+            self._rest = self._study()
+            self._finish()
             if self.n_studied == 1 and self.dynamics.is_no_box:
                 warnings.warn(self.told_by_experience, stacklevel=5)
         self._forget()
@@ -530,7 +539,20 @@ class LearntRisk:
         self._ranks = np.zeros(0, int) if self.backups is None else self.backups.ranks
 
     @_atomic
-    def _study(self) -> None:
+    def _go_on(self) -> None:
+        """The next part of a study, of which no decision waits for more."""
+        if self._rest is not None and next(self._rest, _OVER) is _OVER:
+            self._rest = None
+
+    def _finish(self) -> None:
+        """The rest of a study: its episode is over."""
+        while self._rest is not None:
+            self._go_on()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_rest": None}  # a copy, as a file, has what was learnt so far
+
+    def _study(self) -> Iterator[None]:
         """Learn from the latest episode: what to remember, and what to do about it."""
         dynamics = self.dynamics
         self.n_studied = dynamics.n_episodes
@@ -557,25 +579,29 @@ class LearntRisk:
         tight = [refused for refused, _ in self._notes]
         situations = library.noted(self.situations, episode, tight, self.horizon, random)
         self.situations, knows = situations, bool(dynamics.thresholds)
+        yield
         if "stretches" not in dynamics.without and knows and len(situations) > _ENOUGH:
-            library.scan(dynamics, situations, self.horizon, best[:1], random)
+            yield from library.scan(dynamics, situations, self.horizon, best[:1], random)
             self.n_scanned += 1
         dynamics.refute(refuted, self.horizon)
+        yield
         if self.given_horizon is None and self.disturbances is not None and knows:
-            after = library.failing_after(
+            after = yield from library.failing_after(
                 dynamics.model, situations, best[:_ASKED], self.disturbances
             )
             self._look_ahead(after, refuted=len(refuted) > 0, failed=episode.failed)
+            yield
         if "memory" in dynamics.without:
             self.disturbances, self._pool = library.shuffled(
                 dynamics, self._pool, self.horizon, random
             )
         else:
-            self.disturbances = library.choose(
+            self.disturbances = yield from library.choose(
                 dynamics, situations, self.horizon, best[:2], self.disturbance_scale
             )
         if knows and len(situations) >= _ENOUGH:
-            self.backups = self.evolved(random)
+            yield
+            self.backups = yield from self.evolved(random)
         self._ranks = self.backups.ranks
 
     def _is_worse(self) -> bool:
@@ -621,7 +647,7 @@ class LearntRisk:
             self.time_to_failure = max(min(float(after), self.believed), longest)
         self.horizon = int(min(max(_AHEAD * self.time_to_failure, _SHORTEST), _FARTHEST))
 
-    def evolved(self, random: np.random.Generator) -> Backups:
+    def evolved(self, random: np.random.Generator) -> Parts[Backups]:
         """Backups that are worth more in the situations that are kept."""
         disturbances, backups = self.disturbances, self.backups
         assert disturbances is not None

@@ -20,11 +20,11 @@ sum (Page, "Continuous inspection schemes", Biometrika 1954).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as replaced
 from itertools import product
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar, cast
 
 import numpy as np
 
@@ -43,6 +43,8 @@ _AT_ONCE, _BY_FAR = 3, 100.0
 _POOL = 3000
 # Linear policies; mutants that are tried an episode, and of those how many of the best one.
 _LINEAR, _MUTANTS, _OF_BEST = 3, 40, 0.8
+# Products in the replays that a decision may wait for: some 10 ms.
+_PART = 5e7
 # A mutant differs in this share of its numbers, by a size of 10 to a power between these.
 _CHANGED, _SIZES = 0.6, (-1.5, 0.7)
 # What a policy is worth by itself counts so much, compared with what it adds to the others.
@@ -53,6 +55,20 @@ _PREFERRED = 1e-9
 _ROUNDED = 9
 # Boxes of more dimensions have an action along each axis, not one in each corner.
 _MOST_CORNERS = 3
+
+
+_T = TypeVar("_T")
+#: What is done in parts, of so much work each that a decision may wait for one.
+Parts = Generator[None, None, _T]
+
+
+def at_once(parts: Parts[_T]) -> _T:
+    """What comes of parts if nothing is done between them."""
+    while True:
+        try:
+            next(parts)
+        except StopIteration as over:
+            return cast(_T, over.value)
 
 
 def fewer(number: int, m: int) -> int:
@@ -88,6 +104,19 @@ def harm(
     return found.reshape(len(situations), each).T
 
 
+def _harm_in_parts(
+    model: Model, situations: Floats, policies: Floats, disturbances: Disturbances, scale: float
+) -> Parts[Floats]:
+    """`harm` of all situations, a few at a time."""
+    each, found = disturbances.residuals.size * len(model.weights) * len(policies), []
+    few = max(1, int(_PART / each))
+    for k in range(0, len(situations), few):
+        if k:
+            yield
+        found.append(harm(model, situations[k : k + few], policies, disturbances, scale))
+    return np.hstack(found)
+
+
 def noted(
     situations: Floats,
     episode: Episode,
@@ -121,7 +150,7 @@ def scan(
     horizon: int,
     policies: Floats,
     random: np.random.Generator,
-) -> None:
+) -> Parts[None]:
     """Remember those starts of the latest episode that would harm most in a few situations."""
     episode, model = dynamics.latest, dynamics.model
     assert episode is not None
@@ -136,7 +165,7 @@ def scan(
     rest = np.vstack([episode.residuals, np.zeros((horizon, m))])
     begun = Disturbances.none(len(steps), horizon, m)
     begun.residuals[:] = rest[np.arange(horizon)[:, None] + steps].transpose(0, 2, 1)
-    found = harm(model, situations[safe], policies, begun)
+    found = yield from _harm_in_parts(model, situations[safe], policies, begun, 1.0)
     taken = dynamics.onsets(episode.residuals)
     known = len(taken)
     for t in steps[found.argmin(0)].tolist():
@@ -147,14 +176,15 @@ def scan(
 
 def choose(
     dynamics: Dynamics, situations: Floats, horizon: int, policies: Floats, scale: float
-) -> Disturbances:
+) -> Parts[Disturbances]:
     """Keep the most harmful sequences of all that are remembered; return what is kept."""
     found, most, n = dynamics.disturbances(horizon), dynamics.remembered, len(dynamics.sequences)
     if n <= most:
         return found
     keep = np.arange(n)
     if dynamics.thresholds and len(situations):
-        ends = harm(dynamics.model, situations, policies, found, scale)[1:]
+        asked = dynamics.model, situations, policies, found, scale
+        ends = (yield from _harm_in_parts(*asked))[1:]
         ends = np.where(ends < _AT_ONCE - 1.0 - horizon, 1e9, ends)
         value = np.minimum(ends, _BY_FAR).mean(1)
         while len(keep) > most:  # what is worst nowhere goes first
@@ -181,10 +211,10 @@ def shuffled(
 
 def failing_after(
     model: Model, situations: Floats, policies: Floats, disturbances: Disturbances
-) -> int:
+) -> Parts[int]:
     """Steps after which it fails at the latest where it does, under the best of the policies."""
     steps = len(disturbances.residuals)
-    ends = harm(model, situations, policies, disturbances)
+    ends = yield from _harm_in_parts(model, situations, policies, disturbances, 1.0)
     return int(ends[ends < 0.0].max(initial=-1.0 - steps) + 1 + steps)
 
 
@@ -271,7 +301,7 @@ class Backups:
         disturbances: Disturbances,
         scale: float,
         random: np.random.Generator,
-    ) -> Backups:
+    ) -> Parts[Backups]:
         """With mutants in the place of linear ones where all together are worth more then."""
         policies, ranks = self.policies.copy(), self.ranks
         linear = np.arange(self.n_constant, len(policies))
@@ -285,8 +315,15 @@ class Backups:
         shape, columns = policies.shape[1:], np.append(0, 1 + self.variables)
         own_order = np.ix_(np.argsort(self.actions), np.argsort(columns))
         signs = np.append(1.0, self.flips) * self.turns[:, None]
-        values = np.array([worth(policy) for policy in policies])
-        for _ in range(fewer(_MUTANTS, len(self.variables)) if len(linear) else 0):
+        part = max(
+            1, int(_PART / (disturbances.residuals.size * len(situations) * len(model.weights)))
+        )
+        values = np.empty((len(policies), len(situations)))
+        for q, policy in enumerate(policies):
+            values[q] = worth(policy)
+            if q % part == part - 1:
+                yield
+        for n in range(fewer(_MUTANTS, len(self.variables)) if len(linear) else 0):
             parent = linear[values[linear].mean(1).round(_ROUNDED).argmax()]
             if random.random() >= _OF_BEST:
                 parent = ranks[int(random.integers(len(policies)))]
@@ -300,6 +337,8 @@ class Backups:
             best = int(together.round(_ROUNDED).argmax())  # of equals the first: nothing changes
             if best:
                 policies[linear[best - 1]], values[linear[best - 1]] = child, reached
+            if n % part == part - 1:
+                yield
         scores = np.empty(len(policies))
         left, most = list(range(len(values))), np.full(values.shape[1], -1.0)
         while left:  # first the one that is worth most, then whichever adds most

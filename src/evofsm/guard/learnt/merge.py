@@ -73,10 +73,11 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
         seen = [one.situations[-each:] for one in told if len(one.situations)]
         merged.situations = np.vstack(seen)
         policies = merged.backups.policies[merged.backups.ranks[:2]]
-        merged.disturbances = library.choose(
-            merged.dynamics, merged.situations, merged.horizon, policies, merged.disturbance_scale
-        )
-        merged.backups = merged.evolved(np.random.default_rng([merged.seed, merged.n_studied]))
+        situations, scale = merged.situations, merged.disturbance_scale
+        chosen = library.choose(merged.dynamics, situations, merged.horizon, policies, scale)
+        merged.disturbances = library.at_once(chosen)
+        random = np.random.default_rng([merged.seed, merged.n_studied])
+        merged.backups = library.at_once(merged.evolved(random))
     merged.start_episode(learn=False)
     return merged
 

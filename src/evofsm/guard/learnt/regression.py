@@ -50,6 +50,8 @@ _LEAST, _ALL_ALIKE = 1e-6, 1e-10
 # From so many features on BLAS would call threads for a matrix, which wait for a second where other
 # processes are busy, and variables are solved for together whose noise is as large to a third.
 _LARGE, _THIRD = 100, 3.0
+# From so many products on it would for features of all rows, too, and for so many rows it does not.
+_THREADS, _ROWS = 7e5, 16
 
 
 def early_unit(sums: Sums, n: int) -> Floats:
@@ -193,11 +195,19 @@ def compared(
     doubt = np.maximum(recent.doubt + gained.sum(0), 0.0) * (episode >= LEARNT)
     fades = _FADES if young or doubt.any() else 0.0  # before a doubt it moved as ever
     return Recent(
-        fades * recent.squares + found.T @ found,
-        fades * recent.products + found.T @ change,
+        fades * recent.squares + _of_rows(found, found),
+        fades * recent.products + _of_rows(found, change),
         doubt,
         np.where(doubt > 0.0, recent.since, float(episode)),
     )
+
+
+def _of_rows(found: Floats, other: Floats) -> Floats:
+    """(p, k) products of features (T, p) with (T, k), some rows at once where BLAS has threads."""
+    if found.size * found.shape[1] < _THREADS:
+        return found.T @ other
+    few = range(0, len(found), _ROWS)
+    return np.asarray(sum(found[i : i + _ROWS].T @ other[i : i + _ROWS] for i in few))
 
 
 def correction(recent: Recent, weights: Floats, sums: Sums, a: int) -> Floats:
