@@ -18,11 +18,12 @@ from evofsm.guard import Guard, Mode
 from evofsm.guard.actions import same_action
 from evofsm.guard.api import Situation
 from evofsm.guard.audit_log import AuditLog
+from evofsm.guard.learnt import judge as judging
 from evofsm.guard.learnt import library
 from evofsm.guard.learnt.dynamics import Dynamics
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.regression import Drift
-from evofsm.guard.learnt.replay import MOST_PRODUCTS, n_features, refuse_too_many
+from evofsm.guard.learnt.replay import MOST_PRODUCTS, n_features, refuse_too_many, search
 from evofsm.guard.replay import audit
 
 
@@ -200,7 +201,9 @@ def test_a_copy_goes_on_the_same_by_itself_until_it_is_frozen(point, exactly, co
     assert content(guard.judge) == content(twin.judge)
 
 
-def test_a_log_is_replayed_learning_and_frozen(point, tmp_path):
+@pytest.mark.parametrize("most", [math.inf, 2])  # as it is, or cut short after so many steps
+def test_a_log_is_replayed_learning_and_frozen(point, tmp_path, monkeypatch, most):
+    monkeypatch.setattr(judging, "search", lambda *given, **told: search(*given[:9], most, **told))
     with AuditLog(tmp_path / "log") as log:
         guard = point.guard(audit=log)
         for episode in range(4):
@@ -213,6 +216,26 @@ def test_a_log_is_replayed_learning_and_frozen(point, tmp_path):
     assert found.replayed == found.contents.decisions > 150
     assert not found.not_replayed
     assert found.contents.spoke > 20
+    assert (b"cut short" in (tmp_path / "log").read_bytes()) == (most < math.inf)
+
+
+def test_a_long_episode_is_studied_in_parts_a_decision(points, content, monkeypatch):
+    """What comes of them is what comes of the whole."""
+    studied = []
+    for part in (1.0, 1e12):
+        monkeypatch.setattr(library, "_PART", part)
+        guard, draw, steps = points["box"].taught(4), np.random.default_rng(0), []
+        z = np.zeros(2)
+        for _ in range(1025):
+            guard.decide(z, draw.uniform(-1.0, 1.0))
+            steps.append(guard.judge._rest is not None)
+            z = 0.9 * z + 0.02 * draw.normal(size=2)
+        assert np.flatnonzero(steps).tolist() == [1024]
+        copy.deepcopy(guard)
+        guard.end(False, z)
+        assert guard.judge._rest is None
+        studied.append(content(guard))
+    assert studied[0] == studied[1]
 
 
 @pytest.mark.parametrize("mode", [Mode.SHADOW, Mode.ADVISE])
