@@ -7,6 +7,7 @@ from evofsm.guard.learnt.library import Backups, at_once, harm
 from evofsm.guard.learnt.replay import (
     CHANGED,
     CUT_SHORT,
+    GROWN,
     KEPT,
     NOTHING_PASSES,
     Disturbances,
@@ -77,7 +78,7 @@ def nearest(region, z):
     i, j, *at, one, other, c, b, d, p, q, r = region
     x, y = (z[int(i)] - at[0]) * one, (z[int(j)] - at[1]) * other
     slope = np.array([b + 2.0 * p * x + q * y, d + q * x + 2.0 * r * y])
-    return -(c + b * x + d * y + p * x * x + q * x * y + r * y * y) / np.sqrt(slope @ slope)
+    return -(c + b * x + d * y + p * x * x + q * x * y + r * y * y) / np.sqrt(slope @ slope) - GROWN
 
 
 def plainly(model, situation, plan, policy, disturbances, k, scale, enough):

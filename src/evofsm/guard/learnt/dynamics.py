@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm.fsm.validation import real_array, refuse_unusable, whole
-from evofsm.guard.learnt import regression
+from evofsm.guard.learnt import regions, regression
 from evofsm.guard.learnt.failures import difference, explain_failures, probe
 from evofsm.guard.learnt.regression import Drift, Recent
 from evofsm.guard.learnt.replay import (
@@ -36,7 +36,7 @@ from evofsm.store import COUNT, SHARE, Numbers
 #: Parts that can be left out, to see what each is worth.
 DYNAMICS_PARTS: tuple[str, ...] = (
     *("stretches", "memory", "products", "lags", "doubt", "jumps", "carried", "drift"),
-    "observer",
+    *("observer", "regions"),
 )
 
 # Observations before anything is expected: an episode may fail after so few.
@@ -61,6 +61,8 @@ _STUDIED = 5
 _REACHED = 2
 # Failures, and jumps of each variable, that are remembered.
 MOST = 200
+#: Survived observations that are remembered, as many as fill some hundred kilobytes.
+MOST_SURVIVED = 8000
 # Choices that actions are told apart by, each of which has features of its own.
 _MOST_CHOICES = 1_000
 # Jumps that would have shown no dependence, for each variable.
@@ -186,6 +188,10 @@ class Dynamics:
         self.lowest, self.highest = np.full(m, np.inf), np.full(m, -np.inf)
         self.reached = np.zeros((m, 2))
         self.failures = np.empty((0, m))  #: (k, m) observations in which episodes failed
+        self.brinks = np.empty((0, m))  #: (., m) and the last ones before
+        #: (n, m) what was survived, and what is between two such observations
+        self.survived = np.empty((0, m))
+        self.regions = np.empty((0, regions.SIZE))  #: (r, 12) where it fails beyond no threshold
         self.jumps = [np.empty((0, m + 1)) for _ in range(m)]  #: from where, and to where
         self.recent = Recent.none(p, m, self.n_episodes)  #: what the last episodes say of the model
         self.missed = regression.untried(m)  #: by gains of the observer
@@ -308,7 +314,7 @@ class Dynamics:
             least=sums.least.copy(),
             most=sums.most.copy(),
             thresholds=np.array(thresholds, np.float64).reshape(-1, 4),
-            regions=np.empty((0, 12)),
+            regions=regions.in_units(self.regions, 1.25 * sums.unit + 1e-300),
             drifted=drifted,
             mean=self.origin + sums.mean,
             inverse=inverse,
@@ -352,9 +358,11 @@ class Dynamics:
         z, u = self._z[: self.n_under_way].copy(), self._u[: self.n_under_way].copy()
         safe = z[:-1] if failed else z
         self._extend(safe)
+        self._survive(safe)
         if failed:
             self.failures = np.vstack([self.failures[1 - MOST :], z[-1]])
-        self.settle()
+            self.brinks = np.vstack([self.brinks[1 - MOST :], safe[-1:]])
+        self.settle(failed=failed)
         self.sums.squares[:] *= _KEPT
         self.sums.products[:] *= _KEPT
         self.latest = None
@@ -378,15 +386,50 @@ class Dynamics:
                 self.remember(self.onsets(found))
         self.n_episodes += 1
 
-    def settle(self) -> None:
-        """Make of all sums what is known: weights, and where it fails."""
+    def settle(self, *, failed: bool = False) -> None:
+        """Make of all sums what is known: weights, and where it fails, if it ``failed`` anew."""
         self._solve()
         if self.failed is None:
             sums = self.sums
             blur = np.where(self.reached < _REACHED, sums.scale[:, None], 0.0)
             unit = np.maximum(sums.unit, 1e-300)
-            self.thresholds = explain_failures(self.failures, self.lowest, self.highest, unit, blur)
+            found = explain_failures(self.failures, self.lowest, self.highest, unit, blur)
+            if "regions" in self.without:
+                self.thresholds = found
+            else:
+                self._explain(found, anew=failed)
         self.rebuild()
+
+    def _explain(self, found: list[tuple[int, float, float]], *, anew: bool) -> None:
+        """Explain failures by thresholds that were found, and by regions where these do not."""
+        survived = np.concatenate([self.survived, self.brinks])
+        self.regions = regions.without_survived(self.regions, survived)
+        kept = {(j, sign) for j, sign, _ in self.thresholds}
+        stay = [one for one in found if one[:2] in kept] if len(self.regions) else found
+        if anew or not regions.are_explained(self.failures, stay, self.regions):
+            sums = self.sums
+            spread = np.sqrt(sums.scatter / max(1.0, sums.counts[0] - 1.0))
+            unit = 1.25 * np.maximum(sums.unit, 1e-3 * spread + 1e-300)
+            given = self.failures, survived, unit, spread
+            stay, self.regions = regions.explain(found, *given)
+        self.thresholds = stay
+
+    @property
+    def fails(self) -> bool:
+        """Whether it is known of anything that it is failure."""
+        return bool(self.thresholds) or (self.n_variables > 0 and len(self.regions) > 0)
+
+    def _survive(self, safe: Floats) -> None:
+        """Remember what was survived; where that is too much, every second one."""
+        if "regions" in self.without or not len(safe):
+            return
+        change = np.diff(safe, axis=0)
+        jumped = regression.jumps(change, self.sums.unit).any(1)
+        between = (safe[:-1] + 0.5 * change)[~jumped]
+        survived = np.concatenate([self.survived, safe, between])
+        while len(survived) > MOST_SURVIVED:
+            survived = survived[::2]
+        self.survived = survived
 
     @property
     def difference(self) -> float:
@@ -614,6 +657,10 @@ class Dynamics:
         for name in ("thresholds", "drifts", "jumps"):
             if not np.isin(arrays[name][:, 0], np.arange(m)).all():
                 raise ValueError(f"{name} are of variables that there are not")
+        if not np.isin(arrays["regions"][:, :2], np.arange(m)).all():
+            raise ValueError("regions are of variables that there are not")
+        if (arrays["regions"][:, 4:6] <= 0.0).any():
+            raise ValueError("regions have units that are not positive")
         if jumps.shape[1] != m + 2 or rows.shape[1] != 2 * m + a:
             raise ValueError("jumps or sequences are of another number of variables")
         if told[:, 0].sum() != len(rows) or (told[:, 0] < 3.0).any():
@@ -650,6 +697,9 @@ _OWN: dict[str, Numbers] = {
     "highest": _EXTREME.of("m"),
     "reached": COUNT.of("m", 2),
     "failures": _OBSERVED.of("failed", "m"),
+    "brinks": _OBSERVED.of("brinks", "m"),
+    "survived": _OBSERVED.of("survived", "m"),
+    "regions": Numbers(("regions", regions.SIZE)),
     "missed": _NOT_NEGATIVE.of("m", len(regression.GAINS)),
     "used": COUNT.of("a", 2),
 }

@@ -23,7 +23,7 @@ from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.validation import action_name, positive
 from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
-from evofsm.guard.learnt import library, words
+from evofsm.guard.learnt import library, regions, words
 from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics
 from evofsm.guard.learnt.library import Backups, Parts, Violations
 from evofsm.guard.learnt.replay import (
@@ -275,7 +275,10 @@ class LearntRisk:
         drifts = [(called[j], since) for j, since in latest.items()]
         noisy = [name for name, gain in zip(called, dynamics.gains, strict=True) if gain < 1.0]
         known = fails, self.remembered, self.margin, drifts, self.violations.worse + 1, noisy
-        return words.experience(*known, dynamics.difference, self._no_threshold)
+        inside = regions.inside(dynamics.regions, dynamics.failures).sum(1).tolist()
+        rows = zip(dynamics.regions.tolist(), inside, strict=True)
+        there = [words.region(called, row, count) for row, count in rows]
+        return words.experience(*known, dynamics.difference, self._no_threshold, there)
 
     @property
     def _no_threshold(self) -> str:
@@ -297,7 +300,7 @@ class LearntRisk:
             return Search(one, _unjudged(1), 0, words.NOTHING_LEARNT)
         if here is None:
             return Search(one, _unjudged(1), 0, words.NOTHING_SEEN)
-        if not dynamics.thresholds:
+        if not dynamics.fails:
             return Search(one, _unjudged(1), 0, self._no_threshold)
         model, proposal, scale = dynamics.model, dynamics.encode(wanted), self.disturbance_scale
         few = _ASKED if len(pairs(dynamics.n_variables)[0]) else _ASKED_OF_MANY
@@ -341,7 +344,7 @@ class LearntRisk:
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each action, (k,) or (k, d); NaN as long as nothing can be said."""
         given, here = np.asarray(actions, np.float64), self._here(situation.observation)
-        if here is None or self.disturbances is None or not self.dynamics.thresholds:
+        if here is None or self.disturbances is None or not self.dynamics.fails:
             return _unjudged(len(given))
         inner = np.array([self.dynamics.encode(one) for one in given])
         return self._judged(situation, here, inner)[0]
@@ -578,7 +581,7 @@ class LearntRisk:
         refuted = np.flatnonzero([dead_end for _, dead_end in self._notes[: -self.horizon]])
         tight = [refused for refused, _ in self._notes]
         situations = library.noted(self.situations, episode, tight, self.horizon, random)
-        self.situations, knows = situations, bool(dynamics.thresholds)
+        self.situations, knows = situations, dynamics.fails
         yield
         if "stretches" not in dynamics.without and knows and len(situations) > _ENOUGH:
             yield from library.scan(dynamics, situations, self.horizon, best[:1], random)

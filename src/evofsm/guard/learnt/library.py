@@ -182,7 +182,7 @@ def choose(
     if n <= most:
         return found
     keep = np.arange(n)
-    if dynamics.thresholds and len(situations):
+    if dynamics.fails and len(situations):
         asked = dynamics.model, situations, policies, found, scale
         ends = (yield from _harm_in_parts(*asked))[1:]
         ends = np.where(ends < _AT_ONCE - 1.0 - horizon, 1e9, ends)

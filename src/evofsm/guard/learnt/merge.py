@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from evofsm.guard.learnt import library
-from evofsm.guard.learnt.dynamics import MOST, Dynamics
+from evofsm.guard.learnt.dynamics import MOST, MOST_SURVIVED, Dynamics
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.regression import Drift, Recent
 from evofsm.guard.learnt.replay import Floats, Sums, crossed, n_products, pairs
@@ -123,11 +123,14 @@ def _merged(parts: Sequence[Dynamics]) -> Dynamics:
         merged.sequences += [one._replace(episode=one.episode + later) for one in newest]
         drifts += [Drift(j, since + later, noticed + later) for j, since, noticed in part.drifts]
     merged.drifts = sorted(drifts)
-    merged.failures = np.concatenate([part.failures[-each:] for part in parts])
+    for name in ("failures", "brinks"):
+        setattr(merged, name, np.concatenate([getattr(part, name)[-each:] for part in parts]))
+    survived = np.concatenate([part.survived for part in parts])
+    merged.survived = survived[:: -(-len(survived) // MOST_SURVIVED) or 1]
     jumps = zip(*(part.jumps for part in parts), strict=True)
     merged.jumps = [np.concatenate([rows[-each:] for rows in seen]) for seen in jumps]
     merged.recent, merged.latest = Recent.none(p, m, merged.n_episodes), None
-    merged.settle()
+    merged.settle(failed=True)
     return merged
 
 

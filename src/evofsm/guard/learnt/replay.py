@@ -54,8 +54,10 @@ MOVING = 0.5
 ONSET = 4.0
 # Residuals beyond so many of their scale weigh less.
 _OUTLIER = 4.0
-# The square of a gradient that is none: a form that does not change is far from 0.
-_FLAT = 1e-300
+#: The square of a gradient that is none: a form that does not change is far from 0.
+FLAT = 1e-300
+#: So much larger than they were learnt to be regions are taken [ordinary changes].
+GROWN = 1.0
 
 
 class Model(NamedTuple):
@@ -414,7 +416,8 @@ def _follow_policy(model: Model, policy: Floats, z: Floats, end: float, action: 
 def _distances(model: Model, z: Floats, far: Floats) -> None:
     """The distance of each of n observations (m, n) to the nearest failure, into ``far`` (n,).
 
-    To a region to first order: its form over the length of its gradient.
+    To a region to first order: its form over the length of its gradient; a boundary that touches
+    what was survived in one place lies beyond the truth elsewhere, so regions are `GROWN`.
     """
     n = len(far)
     for l in range(n):
@@ -435,7 +438,7 @@ def _distances(model: Model, z: Floats, far: Floats) -> None:
             x, y = (z[i, l] - at) * one, (z[j, l] - to) * other
             form = c + x * (b + p * x + q * y) + y * (d + r * y)
             u, v = b + 2.0 * p * x + q * y, d + 2.0 * r * y + q * x
-            left = -form / np.sqrt(u * u + v * v + _FLAT)
+            left = -form / np.sqrt(u * u + v * v + FLAT) - GROWN
             far[l] = left if left < far[l] else far[l]
 
 

@@ -24,6 +24,7 @@ episode 101 speed moves otherwise'
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -112,6 +113,7 @@ def experience(
     noisy: Sequence[str] = (),
     differs: float = 0.0,
     nothing: str = NO_FAILURE,
+    regions: Sequence[str] = (),
 ) -> str:
     """What was learnt so far: variables that fail, whether below a threshold, and which.
 
@@ -123,7 +125,7 @@ def experience(
         since += f"; since episode {worse} disturbances are worse than those of before"
     if noisy:
         since += f"; sensors are noisy: {', '.join(noisy)}"
-    if not fails:
+    if not fails and not regions:
         return nothing + since
     if differs:
         since += (
@@ -133,7 +135,52 @@ def experience(
     where = " or ".join(
         f"{name} is {'below' if low else 'above'} {at:.4g}" for name, low, at in fails
     )
-    return f"fails where {where}; {remembered}, to be survived by {changes(margin)}{since}"
+    fails_there = " or ".join([*([f"where {where}"] if where else []), *regions])
+    return f"fails {fails_there}; {remembered}, to be survived by {changes(margin)}{since}"
+
+
+def region(names: Sequence[str], row: Sequence[float], failures: int) -> str:
+    """Where a region is (a row as in `regions`), in which so many failures were seen.
+
+    Examples
+    --------
+    >>> region(["x", "y"], [0, 1, 1.0, 2.0, 1.0, 0.5, 4.0, 0.0, 0.0, -1.0, 0.0, -1.0], 3)
+    'inside an ellipse of x and y around (1, 2), 4 wide and 8 high (3 failures)'
+    >>> region(["x", "y"], [0, 1, 0.0, 0.0, 1.0, 1.0, -5.0, 3.0, 4.0, 0.0, 0.0, 0.0], 1)
+    'where 0.6 x + 0.8 y is above 1 (1 failure)'
+    >>> region(["x"], [0, 0, 3.0, 3.0, 1.0, 1.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0], 2)
+    'where x is between 2 and 4 (2 failures)'
+    """
+    seen = f"({failures:,} failure{'s' * (failures != 1)})"
+    i, j, at, to, one, other, c, b, d, p, q, r = row
+    x, y = names[int(i)], names[int(j)]
+    if i == j:
+        spare = b * b - 4.0 * p * c
+        if p == 0.0 or spare < 0.0:
+            return f"where {x} is near {at:.3g} {seen}"
+        low, high = sorted(
+            at + (-b + sign * math.sqrt(spare)) / (2.0 * p * one) for sign in (1, -1)
+        )
+        if p < 0.0:
+            return f"where {x} is between {low:.3g} and {high:.3g} {seen}"
+        return f"where {x} is below {low:.3g} or above {high:.3g} {seen}"
+    if p == q == r == 0.0:
+        length = math.hypot(b * one, d * other)
+        u, v = b * one / length, d * other / length
+        beyond = u * at + v * to - c / length
+        sign = "+" if v >= 0.0 else "-"
+        return f"where {u:.3g} {x} {sign} {abs(v):.3g} {y} is above {beyond:.3g} {seen}"
+    inner = p * r - 0.25 * q * q
+    if inner > 0.0:
+        u, v = (0.25 * q * d - 0.5 * r * b) / inner, (0.25 * q * b - 0.5 * p * d) / inner
+        most = c + 0.5 * (b * u + d * v)
+        if most * p < 0.0:
+            wide, high = (2.0 * math.sqrt(-most * each / inner) for each in (r, p))
+            where = f"around ({at + u / one:.3g}, {to + v / other:.3g})"
+            size = f"{wide / one:.3g} wide and {high / other:.3g} high"
+            side = "inside" if p < 0.0 else "outside"
+            return f"{side} an ellipse of {x} and {y} {where}, {size} {seen}"
+    return f"beyond a curve of {x} and {y}, as at ({at:.3g}, {to:.3g}) {seen}"
 
 
 def constant(values: Sequence[float]) -> str:
