@@ -146,6 +146,10 @@ def saved(guard):
 def test_forged_regions_are_refused(taught, name, change, why):
     taught.judge.save(file := BytesIO())
     settings, arrays = store.read(BytesIO(file.getvalue()), KIND)
-    with pytest.raises(ValueError, match=why):
-        store.write(bad := BytesIO(), KIND, settings, arrays | {name: change(arrays[name])})
+
+    def load(forged):
+        store.write(bad := BytesIO(), KIND, settings, arrays | {name: forged})
         LearntRisk.load(BytesIO(bad.getvalue()))
+
+    with pytest.raises(ValueError, match=why):
+        load(change(arrays[name]))
