@@ -149,9 +149,12 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
     )
     assert beyond == (judge == "learnt",) * 2
     seen = dict(zip(keys, (3.0, 20.0, 15.8), strict=True))
-    sent = [{"time": 0.0, "proposal": 1.0, **seen, **odd} for odd in ({keys[0]: "near"}, {})]
+    odd = {keys[0]: "near"}, {}, {"time": 0.1, keys[1]: 72.0}
+    sent = [{"time": 0.0, "proposal": 1.0, **seen, **one} for one in odd]
     rows.write_text("".join(json.dumps(one) + "\n" for one in sent))
-    wrong, answer = map(json.loads, evofsm("monitor", rows, "--guard", path).stdout.splitlines())
+    answers = evofsm("monitor", rows, "--guard", path).stdout.splitlines()
+    wrong, answer, fast = map(json.loads, answers)
+    assert fast["note"] == f"{keys[1]} is above 60 m/s: is that km/h?"
     assert (wrong["about"], wrong["error"]) == (keys[0], 'is "near"; it must be float or null')
     summed = evofsm(
         "monitor",

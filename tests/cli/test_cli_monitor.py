@@ -122,7 +122,10 @@ def test_a_summary_says_how_often_it_alarms_by_tolerance_and_where_it_is_worst(t
     cells = [(k, *row.values()) for k, trip in enumerate(trips) for row in trip]
     text = "\n".join(",".join(map(str, one)) for one in cells)
     log.write_text(f"trip,t,dist,own,lead,acc\n{text}\n")
-    sent = [[*map(line, trip[:-1]), b'{"end": true}'] for trip in trips]
+    calm = {"time": 0.0, "gap": 150.0, "v_follower": 20.0, "v_leader": 20.0, "proposal": 0.0}
+    failed = b'{"end": true, "failed": true}'
+    ends = [[failed], [b'{"end": true}', line(calm), failed]]
+    sent = [[*map(line, trip[:-1]), *end] for trip, end in zip(trips, ends, strict=True)]
     lines.write_bytes(b"junk\n" + b"\n".join(chain(*sent)))
     decided = sum(map(len, risks))
     columns = ("--observe", "dist,own,lead", "--action", "acc", "--time", "t", "--episode", "trip")
@@ -145,7 +148,8 @@ def test_a_summary_says_how_often_it_alarms_by_tolerance_and_where_it_is_worst(t
     assert 0 < len(worst) <= 10
     assert worst[0][-2] == f"{max(map(max, risks)):.1%}"
     by_lines = evofsm(lines, *made)
-    assert "refused  1 messages, the first because line: is no JSON" in by_lines.stdout
+    assert "refused   1 messages, the first because line: is no JSON" in by_lines.stdout
+    assert "failures  2; 1 in alarm by then, for " in by_lines.stdout
     assert [one[1] for one in numbers_of(by_lines.stdout)[:6]] == [one[1] for one in by_tolerance]
     guard = tmp_path / "guard.evofsm"
     decider.guard.save(guard)

@@ -17,7 +17,6 @@ import numpy as np
 
 from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
 from evofsm.cli.show import plain
-from evofsm.driving.naming import VARIABLES
 from evofsm.guard import ActionReviser, BoxActions, Guard, Mode, Revision, SearchingJudge, is_spoken
 
 _log = logging.getLogger(__name__)
@@ -26,7 +25,7 @@ _log = logging.getLogger(__name__)
 EPISODE = 6000
 # So many of the latest messages are known again when they are sent again.
 _RECENT = 256
-# No car is faster [m/s].
+# Nothing on a road is faster [m/s].
 _FAST = 60.0
 # What is older by less is late; what is older by more comes from a sender that began anew [s].
 _LATE = 1.0
@@ -58,6 +57,7 @@ class Decider:
         self._next: int | None = None  # of the recent ones, where they are being sent again
         self._said_often = self._said_fast = self._has_failed = False
         reviser = guard.reviser
+        self._units = reviser.risk.labels.units if isinstance(reviser, ActionReviser) else ()
         self.has_margin = isinstance(reviser, ActionReviser) and not isinstance(
             reviser.risk, SearchingJudge
         )
@@ -218,8 +218,8 @@ class Decider:
 
     def _odd_speeds(self, row: Row) -> list[str]:
         """What can hardly be m/s; said once in an episode."""
-        seen = zip(self.form.variables, row.observation or (), strict=False)
-        fast = [name for name, value in seen if name in VARIABLES[1:] and abs(value or 0.0) > _FAST]
+        seen = zip(self.form.variables, self._units, row.observation or (), strict=False)
+        fast = [name for name, unit, z in seen if unit == "m/s" and abs(z or 0.0) > _FAST]
         was_said, self._said_fast = self._said_fast, self._said_fast or bool(fast)
         return [f"{fast[0]} is above {_FAST:g} m/s: is that km/h?"] if fast and not was_said else []
 
