@@ -315,6 +315,7 @@ def test_settings_that_cannot_be_are_refused(told, why):
 )
 def test_the_horizon_follows_what_became_of_dead_ends(points, told, least, most):
     judge = points["box"].guard(horizon=None).judge
+    judge.observe(np.zeros(2))
     judge.time_to_failure, judge.horizon, judge.believed = 40.0, 60, 144.0
     judge._fails_after = told.get("fails_after", 0.0)
     judge._was_certified = told.get("certified", False)

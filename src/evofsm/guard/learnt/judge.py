@@ -648,7 +648,9 @@ class LearntRisk:
                 longest = min(_AHEAD * longest, _FARTHEST / _AHEAD)
                 self.believed = max(self.believed, longest)
             self.time_to_failure = max(min(float(after), self.believed), longest)
-        self.horizon = int(min(max(_AHEAD * self.time_to_failure, _SHORTEST), _FARTHEST))
+        each = self.dynamics.model.weights.size * (1 + self.dynamics.remembered)
+        farthest = min(_FARTHEST, _WORK / each / _ASKED_OF_MANY)  # less where a replay costs more
+        self.horizon = int(max(min(_AHEAD * self.time_to_failure, farthest), _SHORTEST))
 
     def evolved(self, random: np.random.Generator) -> Parts[Backups]:
         """Backups that are worth more in the situations that are kept."""
