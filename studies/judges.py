@@ -148,10 +148,14 @@ def learnt_guard(
     failed: Callable[[Vector], bool] | None = None,
     **told: Any,
 ) -> Guard:
-    """With the learnt judge without some parts; without ``states`` its machine has a single one."""
-    parts = [part for part in without if part != "states"]
+    """With the learnt judge without some parts; without ``states`` its machine has a single one.
+
+    Without ``harm`` no episode is driven in shadow.
+    """
+    parts = [part for part in without if part not in ("states", "harm")]
     judge = LearntRisk(interval, **told, horizon=horizon, seed=seed, without=parts)
     guard = Guard(**told, interval=interval, horizon=horizon, judge=judge, failed=failed, seed=seed)
+    guard.shadow = "harm" not in without
     if "states" in without:
         guard.machine = EvolvingFSM(guard.actions.n_actions, max_states=1)
     return guard

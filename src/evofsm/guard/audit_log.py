@@ -535,6 +535,7 @@ def settings_now(guard: Guard) -> dict[str, Any]:
         "learn": guard.learn,
         "missing": guard.missing.value,
         "reviser": settings_of(guard.reviser),
+        "shadow": guard.shadow,
     }
 
 

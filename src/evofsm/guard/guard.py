@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from io import BytesIO
 from typing import Any, Protocol, Self
@@ -105,7 +106,7 @@ class DecisionLogger(Protocol):
 
 
 # Settings that stand in a file as they are.
-_PLAIN = ("explaining", "interval", "learn", "n_episodes", "n_failed")
+_PLAIN = ("explaining", "interval", "learn", "n_episodes", "n_failed", "shadow")
 # What a judge has that learns.
 _LEARNS = ("dt", "learn", "watch", "follow", "start_episode", "end", "sums", "save", "load")
 # The files of the machine and of the judge, as bytes.
@@ -113,7 +114,7 @@ KIND = Kind(
     "guard",
     {name: Numbers((name,), dtype=np.uint8) for name in ("machine", "judge")},
     {
-        **dict.fromkeys(("explaining", "failed", "learn"), bool),
+        **dict.fromkeys(("explaining", "failed", "learn", "shadow"), bool),
         **dict.fromkeys(("n_episodes", "n_failed"), COUNT),
         "interval": SIZE,
         "missing": str,
@@ -166,6 +167,10 @@ class Guard:
         audit log it does for those that change a proposal or warn.
     missing : Missing
         What to do where a variable was not observed (NaN).
+    shadow : bool
+        Whether proposals pass in some episodes while a learnt judge learns and may do harm, and in
+        all once it fails sooner than the controller alone (`evofsm.guard.harm`). Without it, one
+        that does harm is not noticed.
 
     Raises
     ------
@@ -216,6 +221,7 @@ class Guard:
         audit: DecisionLogger | None = None,
         explaining: bool = False,
         missing: Missing = Missing.PARTIAL,
+        shadow: bool = True,
     ) -> None:
         actions = _actions(low, high, n_actions)
         interval = positive("interval", interval)
@@ -237,6 +243,7 @@ class Guard:
             audit=audit,
             explaining=explaining,
             missing=missing,
+            shadow=shadow,
         )
 
     @classmethod
@@ -256,7 +263,7 @@ class Guard:
             Learns from what happens; without it the reviser's own, if it has one that learns.
         learn : bool
             Whether machine and judge learn.
-        failed, audit, explaining, missing
+        failed, audit, explaining, missing, shadow
             As in `Guard`.
 
         Examples
@@ -284,6 +291,7 @@ class Guard:
         audit: DecisionLogger | None = None,
         explaining: bool = False,
         missing: Missing = Missing.PARTIAL,
+        shadow: bool = True,
         n_episodes: int = 0,
         n_failed: int = 0,
     ) -> None:
@@ -344,7 +352,8 @@ class Guard:
         self._frozen: FSMModel | None = None
         self._monitor = InputMonitor(missing, interval)
         self._latest: Situation | None = None
-        self._under_way = False
+        self._under_way, self._passing = False, ""
+        self.shadow = shadow
         self.learn = learn
 
     # -- An episode -----------------------------------------------------------------------------
@@ -369,9 +378,32 @@ class Guard:
         """Learn nothing from now on: what is decided depends on the present episode alone.
 
         The same episode is then decided the same again, bit for bit. An episode that is under way
-        is broken off: nothing more is learnt from it.
+        is broken off: nothing more is learnt from it. Where it steps back, or guarded episodes seem
+        to fail sooner than those of the controller alone, proposals pass, of which it warns.
         """
-        self.learn = False
+        with self._lock:
+            self.learn = False
+            why = self._why_passing()
+        if why:
+            warnings.warn(f"this guard {why}: frozen so, proposals pass", stacklevel=2)
+
+    @property
+    def shadow(self) -> bool:
+        """Whether episodes may be driven in shadow, or it may step back, where it may do harm."""
+        return self._shadow
+
+    @shadow.setter
+    @alone
+    def shadow(self, shadow: bool) -> None:
+        self._shadow = bool(shadow)
+        if self._observing is not None:
+            self._observing.shadow = self._shadow
+
+    def _why_passing(self) -> str:
+        """Why proposals pass in the episode to come; empty where they need not."""
+        if self._observing is None or not self._shadow:
+            return ""
+        return self._observing.harm.passing(learning=self._learn)
 
     @property
     def situation(self) -> Situation:
@@ -381,12 +413,18 @@ class Guard:
         return self._latest
 
     @alone
-    def begin(self) -> None:
-        """Begin an episode; one that is under way is broken off, and nothing follows from it."""
+    def begin(self, twin: Self | None = None) -> None:
+        """Begin an episode; one that is under way is broken off, and nothing follows from it.
+
+        Where it is only taken in (`take_in`), ``twin`` is the guard that decided it already.
+        """
         self._monitor = InputMonitor(self.missing, self.interval)
         self._latest = None
-        self._decisions = 0
+        self._decisions = self._acted = self._watched = self._kept = 0
         self.reviser.start_episode()
+        if isinstance(self.reviser, ActionReviser):
+            self._passing = self._why_passing() if twin is None else twin._passing
+            self.reviser.passing = self._passing
         if self.judge is not None:
             self.judge.start_episode(learn=False)
         if self.machine is not None and self._learn:
@@ -562,8 +600,12 @@ class Guard:
             self.judge.follow(situation.observation, executed)
         elif isinstance(self.reviser, ActionReviser) and not self.reviser.acts:
             self.judge.watch(situation.observation, executed, situation.belief)
+            self._watched += 1
         else:
             self.judge.learn(situation.observation, executed, situation.belief)
+            if isinstance(self.reviser, ActionReviser):
+                self._acted += 1
+                self._kept += not self.reviser.refuses
 
     def _explained(self, situation: Situation, revision: Revision) -> Revision:
         """With what the machine has seen come of what is executed, where that is asked for."""
@@ -619,6 +661,9 @@ class Guard:
                 self.judge.start_episode(learn=False)
         self._under_way = False
         if self._learn:
+            if (judge := self._observing) is not None:
+                driven = self._acted, self._watched, self._kept
+                judge.harm = judge.harm.after(*driven, failed=failed, tests=self._shadow)
             self.n_episodes += 1
             self.n_failed += bool(failed)
         if self.audit is not None:
@@ -636,6 +681,8 @@ class Guard:
         how = type(self.reviser).__name__
         if isinstance(self.reviser, ActionReviser):
             how += f", tolerance {self.reviser.tolerance:g}, mode {self.reviser.mode.value}"
+            if self.reviser.risk is self._observing and self._shadow and self._learn:
+                how += ", in shadow where in doubt"
         lines = [
             f"{type(self).__name__} of {span}, each {self.interval:g} s",
             f"judge: {'none' if judge is None else type(judge).__name__} ({how})",

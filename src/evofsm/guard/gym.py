@@ -357,7 +357,7 @@ class Lane:
         if decider is None or (self._shared and not guard.learn):
             return
         if self._shared:
-            guard.begin()
+            guard.begin(decider)
             for step, (seen, proposal, executed) in enumerate(past):
                 situation = guard.recognise(seen, step * guard.interval)
                 guard.take_in(situation, proposal, executed)

@@ -242,7 +242,7 @@ class _Player:
     def _set(guard: Guard, settings: Mapping[str, Any]) -> None:
         guard.explaining = bool(settings["explaining"])
         guard.missing = Missing(settings["missing"])
-        guard.interval = settings["interval"]
+        guard.interval, guard.shadow = settings["interval"], settings["shadow"]
         if guard.learn != settings["learn"]:
             guard.learn = settings["learn"]
         set_again(guard.reviser, settings["reviser"])

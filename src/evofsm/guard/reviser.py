@@ -148,6 +148,8 @@ class ActionReviser:
         self.actions = actions
         self.tolerance = probability("tolerance", tolerance)
         self.mode = mode
+        #: Why proposals pass in this episode although it might act; empty where they need not.
+        self.passing = ""
         self._searches = isinstance(risk, SearchingJudge)
         self._lowest, self._highest = nearest_bounds(actions)
         self._low, self._high = limits(actions)
@@ -166,7 +168,12 @@ class ActionReviser:
     @property
     def acts(self) -> bool:
         """Whether what it decides is executed."""
-        return self.mode is Mode.ACT
+        return self.mode is Mode.ACT and not self.passing
+
+    @property
+    def refuses(self) -> bool:
+        """Whether the latest proposal would rather not be executed."""
+        return self._revising
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """What to execute instead of the proposal, which is first made usable (`make_usable`)."""
@@ -180,7 +187,7 @@ class ActionReviser:
         executed = best if acts else 0
         is_number = options.ndim == 1
         if not acts and best != 0:
-            reason = f"{self.mode.value}: {reason}"
+            reason = f"{self.passing or self.mode.value}: {reason}"
         unseen = unseen_text(situation, names) if situation.intake else ""
         # Of a situation that is new: whether it is dangerous is another question.
         new = "never seen before" if judged.seen < _NEW else ""

@@ -23,6 +23,7 @@ from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.validation import action_name, positive
 from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
+from evofsm.guard.harm import OUTCOMES, SETTINGS, Harm
 from evofsm.guard.learnt import library, regions, words
 from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics
 from evofsm.guard.learnt.library import Backups, Parts, Violations
@@ -209,6 +210,8 @@ class LearntRisk:
         self.n_violated, self.violations = 0, Violations()
         self.n_studied = self.n_scanned = 0
         self.n_failed = 0  #: episodes that it was told of that failed
+        #: How episodes ended, guarded and alone; and whether a guard may act on that.
+        self.harm, self.shadow = Harm(), True
         #: Steps that it takes to fail at the latest, where that cannot be avoided.
         self.time_to_failure = _HORIZON / _AHEAD
         #: Steps in which a dead end is believed to fail, at most: the model was refuted beyond.
@@ -278,7 +281,8 @@ class LearntRisk:
         inside = regions.inside(dynamics.regions, dynamics.failures).sum(1).tolist()
         rows = zip(dynamics.regions.tolist(), inside, strict=True)
         there = [words.region(called, row, count) for row, count in rows]
-        return words.experience(*known, dynamics.difference, self._no_threshold, there)
+        told = words.experience(*known, dynamics.difference, self._no_threshold, there)
+        return told + words.harm(self.harm, tests=self.shadow, learning=self.learning)
 
     @property
     def _no_threshold(self) -> str:
@@ -674,6 +678,7 @@ class LearntRisk:
             "violated": float(self.n_violated),
             "backups": 0.0 if backups is None else float(backups.policies.sum()),
             "disturbances": 0.0 if disturbances is None else float(disturbances.residuals.sum()),
+            "harm": self.harm.chance + self.harm.kept + self.harm.n_episodes,
         }
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
@@ -686,10 +691,12 @@ class LearntRisk:
             "n_actions": dynamics.choices or None,
             "without": sorted(self.without),
             "violations": self.violations._asdict(),
+            "harm": {name: getattr(self.harm, name) for name in SETTINGS},
             "dynamics": dynamics.numbers(),
             "n_constant": 0 if backups is None else backups.n_constant,
         }
         arrays = {"situations": self.situations, **dynamics.arrays()}
+        arrays["harm"] = np.array(self.harm.outcomes, np.float64).reshape(-1, 4)
         sizes = {"b": 0, "a": dynamics.size, "m": dynamics.n_variables}
         sizes["f"] = 1 + dynamics.n_variables
         for name, shape in _BACKUPS.items():
@@ -718,6 +725,7 @@ class LearntRisk:
         for name in _NUMBERS:
             setattr(judge, name, settings[name])
         judge.violations = Violations(**settings["violations"])
+        judge.harm = Harm.restored(settings["harm"], arrays["harm"])
         m, a = judge.dynamics.n_variables, judge.dynamics.size
         judge.situations = arrays["situations"]
         if len(judge.situations) and judge.situations.shape[1] != 2 * m + a:
@@ -753,6 +761,7 @@ KIND = Kind(
         "situations": Numbers(("s", "w")),
         **{f"backups_{name}": _SOME.of(*shape) for name, shape in _BACKUPS.items()},
         "backups_policies": Numbers(_BACKUPS["policies"]),
+        "harm": OUTCOMES,
         **ARRAYS,
     },
     {
@@ -770,6 +779,7 @@ KIND = Kind(
             "since": COUNT,
             "worse": COUNT._replace(least=-1.0),
         },
+        "harm": SETTINGS,
         "dynamics": {
             **dict.fromkeys(("n_episodes", "quiet"), COUNT),
             "doubt_of_lags": Numbers(least=0.0),

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from evofsm.guard.harm import Harm
 from evofsm.guard.learnt import library
 from evofsm.guard.learnt.dynamics import MOST, MOST_SURVIVED, Dynamics
 from evofsm.guard.learnt.judge import LearntRisk
@@ -24,7 +25,8 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     """Merge judges that learnt apart, between episodes, into one that shares nothing with them.
 
     Of disturbances, failures, jumps and situations the newest of each are kept; backups are those
-    of the judge that learnt from most episodes, which evolve on; the margin is the largest.
+    of the judge that learnt from most episodes, which evolve on; the margin is the largest. Whether
+    they do harm is said anew, of how all their latest episodes ended.
 
     Parameters
     ----------
@@ -68,6 +70,7 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
         setattr(merged, name, sum(getattr(one, name) for one in told))
     for name in ("margin", "time_to_failure", "horizon"):
         setattr(merged, name, max(getattr(one, name) for one in told))
+    merged.harm = Harm.merged([one.harm for one in told])
     if merged.backups is not None:
         each = library.fewer(library.KEPT, merged.dynamics.n_variables) // len(told)
         seen = [one.situations[-each:] for one in told if len(one.situations)]

@@ -26,7 +26,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import median
 from typing import NamedTuple
+
+from evofsm.guard.harm import Harm, Outcome
 
 #: Said as long as there is nothing to judge by.
 NOTHING_LEARNT = "nothing was learnt yet"
@@ -181,6 +184,31 @@ def region(names: Sequence[str], row: Sequence[float], failures: int) -> str:
             side = "inside" if p < 0.0 else "outside"
             return f"{side} an ellipse of {x} and {y} {where}, {size} {seen}"
     return f"beyond a curve of {x} and {y}, as at ({at:.3g}, {to:.3g}) {seen}"
+
+
+def harm(known: Harm, *, tests: bool, learning: bool) -> str:
+    """What is said of a guard that may do harm, or that is none any more."""
+    said = ""
+    if not tests:
+        said = "; no episode is driven in shadow, so that harm would not be noticed"
+    elif known.since or known.seems_worse or (learning and known.is_unproven):
+        before = [one for one in known.outcomes if one.guarded and one.episode < known.since]
+        how, what = "it may do harm", "some are driven in shadow" if learning else "proposals pass"
+        if known.since:
+            how, what = f"steps back since episode {known.since}", "proposals pass"
+        guarded, alone = _ended(before or known.guarded), _ended(known.alone)
+        said = f"; {how}: guarded episodes {guarded}, the controller alone {alone}; {what}"
+    if known.replaces:
+        share = f"{known.kept / known.decided:.0%}"
+        said += f"; it replaces the controller: {share} of proposals are kept; that is no filter"
+    return said
+
+
+def _ended(outcomes: Sequence[Outcome]) -> str:
+    """After how many steps episodes failed."""
+    if not (steps := [one.steps for one in outcomes if one.failed]):
+        return f"did not fail in {len(outcomes)}"
+    return f"failed after {median(steps):g} steps in the median ({len(steps)} of {len(outcomes)})"
 
 
 def constant(values: Sequence[float]) -> str:
