@@ -85,7 +85,8 @@ def plainly(model, situation, plan, policy, disturbances, k, scale, enough):
     """One replay, step by step in NumPy: steps survived, least distance, and that at its end."""
     m = len(model.origin)
     z, change, before = situation[:m], situation[m : 2 * m], situation[2 * m :]
-    (steps, _, _), near = disturbances.residuals.shape, np.inf
+    (steps, _, _), near, clock = disturbances.residuals.shape, np.inf, 0
+    i, sign, threshold, begins, over = disturbances.place[k]
     for t in range(steps):
         u = plan[t] if t < len(plan) else acts(model, policy, z)
         if t >= len(plan) and not model.choices:
@@ -98,11 +99,17 @@ def plainly(model, situation, plan, policy, disturbances, k, scale, enough):
         low = np.minimum(scale * model.least, np.maximum(move, 3.0 * model.least))
         high = np.maximum(scale * model.most, np.minimum(move, 3.0 * model.most))
         low, high = np.where(far, low, scale * model.least), np.where(far, high, scale * model.most)
-        after = z + np.clip(move + scale * disturbances.residuals[t, :, k], low, high)
-        for j in np.flatnonzero(disturbances.jump_at[k] == t):
+        there = i < 0.0 or sign * ((z + move)[int(i)] - threshold) >= 0.0
+        if i >= 0.0 and there and clock >= over:  # it begins again
+            clock = int(begins)
+        plays = i < 0.0 or (clock < over and (there or clock != begins))
+        rest = scale * disturbances.residuals[clock, :, k] if plays else 0.0
+        after = z + np.clip(move + rest, low, high)
+        for j in np.flatnonzero((disturbances.jump_at[k] == clock) & plays):
             seen = np.clip(z, *disturbances.jump_from[k, j].T)
             to = disturbances.jump_to[k, j] + disturbances.jump_slope[k, j] @ seen
             after[j] = np.clip(to, *disturbances.landing[k, j])
+        clock += plays
         after = np.clip(after, model.lowest, model.highest)
         z, change, before = after, after - z, u
         left = [s * (at - z[int(j)]) * worth for j, s, at, worth in model.thresholds]
@@ -122,6 +129,7 @@ def test_the_kernel_replays_as_a_plain_loop_does(choices, planned):
     disturbances.jump_slope[2, 1] = draw.normal(size=m)
     disturbances.jump_from[2, 1] = np.sort(draw.normal(size=(m, 2)))
     disturbances.landing[2, 1] = -0.2, 0.4
+    disturbances.place[2:4] = [[0.0, 1.0, 0.1, 2.0, 9.0], [1.0, -1.0, 0.2, 0.0, 3.0]]
     situations = 0.3 * draw.normal(size=(4, 2 * m + a))
     plan, policy = draw.uniform(-1.0, 1.0, (planned, a)), draw.normal(size=(a, 1 + m))
     ends, found = replay(model, situations, plan, policy, disturbances, 1.3, 0.2), []

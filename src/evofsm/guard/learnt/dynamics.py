@@ -7,11 +7,12 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from evofsm.fsm.validation import real_array, refuse_unusable, whole
 from evofsm.guard.learnt import regions, regression
 from evofsm.guard.learnt.failures import difference, explain_failures, probe
+from evofsm.guard.learnt.places import ANYWHERE, Place, Places, onset
 from evofsm.guard.learnt.regression import Drift, Recent
 from evofsm.guard.learnt.replay import (
     EARLY,
@@ -36,7 +37,7 @@ from evofsm.store import COUNT, SHARE, Numbers
 #: Parts that can be left out, to see what each is worth.
 DYNAMICS_PARTS: tuple[str, ...] = (
     *("stretches", "memory", "products", "lags", "doubt", "jumps", "carried", "drift"),
-    *("observer", "regions"),
+    *("observer", "regions", "places"),
 )
 
 # Observations before anything is expected: an episode may fail after so few.
@@ -54,8 +55,8 @@ _SHORTEST = 4
 # last transition is learnt next. Of all of them so many tell how noisy sensors are: a decision
 # waits.
 _LONGEST, _LAST, _LATEST = 1024, 3, 256
-# An episode of fewer steps says nothing as a whole.
-_STUDIED = 5
+# An episode of fewer steps says nothing of sizes, gains and drift; one of fewer than two nothing.
+_STUDIED, _LEAST = 5, 2
 # An extreme is a saturation if it was reached, by moving, in so many episodes, or if a variable
 # rested there although it was expected to go on.
 _REACHED = 2
@@ -91,6 +92,7 @@ class DisturbanceSequence(NamedTuple):
     actions: Floats  #: (L + 1, a), the first one step before it began
     episode: int  #: in which it was seen, from 0
     unforeseen: Floats  #: (L, m) residuals of then; (0, m) where they follow from the rest
+    place: Place = ANYWHERE  #: where alone it begins
 
 
 class Dynamics:
@@ -196,6 +198,7 @@ class Dynamics:
         self.recent = Recent.none(p, m, self.n_episodes)  #: what the last episodes say of the model
         self.missed = regression.untried(m)  #: by gains of the observer
         self.doubt_of_lags = 0.0
+        self.places = Places.none(m, self.size)
         self.rebuild()
         self.forget_episode()
 
@@ -367,8 +370,9 @@ class Dynamics:
         self.sums.products[:] *= _KEPT
         self.latest = None
         T = len(safe) - 1
-        if self.ready and T >= _STUDIED:
-            if self.sums.scale[0] > 0.0:
+        known, long = self.sums.scale[0] > 0.0, T >= _STUDIED
+        if self.ready and (long or (known and T >= _LEAST)):
+            if known and long:
                 if "drift" not in self.without:
                     self._follow_drift(safe, u[:T])
                 if "observer" not in self.without:
@@ -378,10 +382,14 @@ class Dynamics:
                     )
                     self.rebuild()
             found = residuals(self.model, self.close, safe, u[:T])
-            self._saturate(found, safe)
-            self._rescale(found, safe)
+            if long:
+                self._saturate(found, safe)
+                self._rescale(found, safe)
             self.latest = Episode(safe, u[:T], found, failed)
             self.rebuild()
+            if "places" not in self.without:
+                seen = safe, u[:T], found, self._ordinary
+                self.places = self.places.after(*seen, self.n_episodes, self.model)
             if "stretches" not in self.without:
                 self.remember(self.onsets(found))
         self.n_episodes += 1
@@ -460,7 +468,7 @@ class Dynamics:
     def _follow_drift(self, z: Floats, u: Floats) -> None:
         """Correct the model of what moves otherwise; what was unforeseen before stays so."""
         sums, before, close, young = self.sums, self.model, self.close, self._young
-        known = self.recent, before, sums, close
+        known = self.recent, before, sums, close, self.elsewhere(z)
         self.recent = recent = regression.compared(*known, z, u, self.n_episodes, bool(young))
         begun = np.flatnonzero(recent.doubt > regression.DOUBT).tolist()
         self.drifts = self.drifts + [Drift(j, int(recent.since[j]), self.n_episodes) for j in begun]
@@ -509,16 +517,28 @@ class Dynamics:
             self.reached = np.where(held, np.maximum(self.reached, _REACHED), self.reached)
             self.rebuild()
 
+    def elsewhere(self, z: Floats) -> NDArray[np.bool_]:
+        """(T - 1,) which transitions of T + 1 observations lie where something begins."""
+        found = np.zeros(len(z) - 2, bool)
+        for j, sign, at in {one.place for one in self.sequences}:
+            if j >= 0:
+                inside = sign * (z[:, j] - at) >= 0.0
+                found |= inside[1:-1] | inside[2:]
+        return found
+
     def _rescale(self, found: Floats, safe: Floats) -> None:
         """How large residuals are, but for those of variables that rest at an extreme."""
         sums, size = self.sums, np.abs(found)
         at_end = (safe[2:] == sums.low) | (safe[2:] == sums.high)
         size[(safe[1:-1] == safe[2:]) & at_end & (sums.moving > MOVING)] = 0.0
+        if (here := ~self.elsewhere(safe)).sum() < _STUDIED:
+            return
+        size = size[here]
         scale, square = 1.4826 * np.median(size, 0), (size**2).mean(0)
         known = sums.scale[0] > 0.0
         new = 0.8 * sums.scale + 0.2 * scale if known else scale
         if young := self._young:  # what is learnt anew is no outlier
-            jumped = regression.jumps(np.diff(safe[1:], axis=0), sums.unit)
+            jumped = regression.jumps(np.diff(safe[1:], axis=0), sums.unit)[here]
             ordinary = np.where(jumped, 0.0, size**2).mean(0)
             new[young] = np.maximum(new, np.sqrt(ordinary))[young]
         sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(sums.variance) + 1e-300)
@@ -549,9 +569,33 @@ class Dynamics:
                 more.append(DisturbanceSequence(observed, done, self.n_episodes, nothing))
         self.sequences = [*self.sequences, *more][-_SPARE * self.remembered :]
 
-    def keep(self, which: Sequence[int]) -> None:
-        """Forget all sequences but these, by their numbers from 0."""
-        self.sequences = [self.sequences[k] for k in which]
+    def keep(self, which: Sequence[int], found: Disturbances) -> None:
+        """Forget all sequences but these, by their numbers from 0; they begin as is ``found``."""
+        rows = found.place[1:, :3].tolist()
+        self.sequences = [
+            self.sequences[k]._replace(place=(int(rows[k][0]), *rows[k][1:])) for k in which
+        ]
+
+    def where(self, found: Disturbances, ends: Floats) -> Floats:
+        """(K, 5) as `Disturbances.place` has it, of what began on the way to ``ends`` (K, L, m)."""
+        place, rest = found.place.copy(), found.residuals.transpose(2, 0, 1)
+        place[:, 0] = -1.0
+        if "places" in self.without or not len(self.places.events):
+            return place
+        where = self.places.of(rest, ends, self._ordinary, self.model, self.size)
+        for k, one in enumerate(where):
+            place[k] = *one, *self._span(rest[k])
+        return place
+
+    @property
+    def _ordinary(self) -> Floats:
+        """(m,) the ordinary change; infinite of a variable that never changed."""
+        unit = self.sums.unit
+        return np.where(unit > 0.0, unit, np.inf)
+
+    def _span(self, rest: Floats) -> tuple[int, int]:
+        """At which step of residuals (L, m) something begins, and with which it is over."""
+        return onset(rest / self._ordinary), int(np.flatnonzero(rest.any(1)).max(initial=-1)) + 1
 
     def disturbances(self, steps: int) -> Disturbances:
         """Residuals of what is remembered, as they are seen now; number 0 is none at all."""
@@ -563,6 +607,8 @@ class Dynamics:
                 rows = one.observations[: L + 2], one.actions[: L + 1]
                 missed = residuals(self.model, self.close, *rows, carried=self._carried)
             found.residuals[:L, :, k] = missed
+            if one.place[0] >= 0:
+                found.place[k] = *one.place, *self._span(found.residuals[:, :, k])
         for j, seen in enumerate(self.jumps if "jumps" not in self.without else ()):
             if len(seen):
                 for k, one in enumerate(self.sequences, 1):
@@ -607,6 +653,7 @@ class Dynamics:
             "n_episodes": self.n_episodes,
             "quiet": self.quiet,
             "doubt_of_lags": self.doubt_of_lags if known else 0.0,
+            "exposed": self.places.exposed if known else 0,
             "ready": int(known and self.ready),
         }
 
@@ -622,7 +669,8 @@ class Dynamics:
         jumps = [np.insert(rows, 0, j, axis=1) for j, rows in enumerate(self.jumps)]
         told, rows = [], [np.empty((0, 2 * m + a))]
         for one in self.sequences:
-            told.append((len(one.observations), one.episode, len(one.unforeseen) > 0))
+            kept = len(one.observations), one.episode, len(one.unforeseen) > 0
+            told.append((*kept, *one.place))
             row = np.zeros((len(one.observations), 2 * m + a))
             row[:, :m], row[:-1, m : m + a] = one.observations, one.actions
             row[: len(one.unforeseen), m + a :] = one.unforeseen
@@ -634,7 +682,9 @@ class Dynamics:
             "thresholds": np.array(self.thresholds, np.float64).reshape(-1, 3),
             "drifts": np.array(self.drifts, np.float64).reshape(-1, 3),
             "jumps": np.vstack(jumps),
-            "sequences": np.array(told, np.float64).reshape(-1, 3),
+            "sequences": np.array(told, np.float64).reshape(-1, 6),
+            "places_events": self.places.events,
+            "places_exposure": self.places.exposure,
             "sequence_rows": np.vstack(rows),
         }
 
@@ -663,6 +713,8 @@ class Dynamics:
             raise ValueError("regions have units that are not positive")
         if jumps.shape[1] != m + 2 or rows.shape[1] != 2 * m + a:
             raise ValueError("jumps or sequences are of another number of variables")
+        if (told != np.round(told))[:, :3].any() or (told[:, 1:3] < 0.0).any():
+            raise ValueError("sequences are of no whole numbers of rows and episodes")
         if told[:, 0].sum() != len(rows) or (told[:, 0] < 3.0).any():
             raise ValueError(f"sequences have {len(rows)} rows, not those that they say")
         self._begin(arrays["origin"])
@@ -670,6 +722,10 @@ class Dynamics:
         self.recent = Recent(**{name: arrays[f"recent_{name}"] for name in Recent._fields})
         for name in _OWN:
             setattr(self, name, arrays[name])
+        places = Places(arrays["places_events"], arrays["places_exposure"], numbers["exposed"])
+        if not places.fit(m, a) or not np.isin(told[:, 3], np.arange(-1, m)).all():
+            raise ValueError("places are of variables that there are not, or of other numbers")
+        self.places = places
         self.ready, self.doubt_of_lags = bool(numbers["ready"]), float(numbers["doubt_of_lags"])
         self.thresholds = [(int(j), sign, at) for j, sign, at in arrays["thresholds"].tolist()]
         self.drifts = [Drift(*map(int, row)) for row in arrays["drifts"]]
@@ -681,8 +737,10 @@ class Dynamics:
                 part[:-1, m : m + a].copy(),
                 int(episode),
                 part[: -2 if of_then else 0, m + a :].copy(),
+                (int(j), sign, at),
             )
-            for part, (_, episode, of_then) in zip(parts if len(told) else (), told, strict=True)
+            for part, row in zip(parts if len(told) else (), told.tolist(), strict=True)
+            for _, episode, of_then, j, sign, at in [row]
         ]
         self.rebuild()
 
@@ -724,8 +782,10 @@ ARRAYS: dict[str, Numbers] = {
     "thresholds": Numbers(("thresholds", 3)),
     "drifts": COUNT.of("drifts", 3),
     "jumps": _OBSERVED.of("jumps", "jump"),
-    "sequences": COUNT.of("sequences", 3),
+    "sequences": Numbers(("sequences", 6), -1e30, 1e30),
     "sequence_rows": Numbers(("rows", "row")),
+    "places_events": _OBSERVED.of("events", "event"),
+    "places_exposure": _OBSERVED.of("exposure", "m"),
 }
 
 

@@ -281,7 +281,12 @@ class LearntRisk:
         inside = regions.inside(dynamics.regions, dynamics.failures).sum(1).tolist()
         rows = zip(dynamics.regions.tolist(), inside, strict=True)
         there = [words.region(called, row, count) for row, count in rows]
-        told = words.experience(*known, dynamics.difference, self._no_threshold, there)
+        places = [one.place for one in dynamics.sequences if one.place[0] >= 0]
+        begin = [
+            (called[j], sign < 0.0, [place[2] for place in places if place[:2] == (j, sign)])
+            for j, sign in sorted({place[:2] for place in places})
+        ]
+        told = words.experience(*known, dynamics.difference, self._no_threshold, there, begin)
         return told + words.harm(self.harm, tests=self.shadow, learning=self.learning)
 
     @property
@@ -570,10 +575,11 @@ class LearntRisk:
         if moved or self._is_worse():
             self._begin_anew()
         episode = dynamics.latest
-        if episode is None or not dynamics.ready:
+        if not dynamics.ready or (episode is None and self.disturbances is None):
             return
         random = np.random.default_rng([self.seed, dynamics.n_episodes])
         if self.backups is None:
+            assert episode is not None
             self.backups = Backups.of(
                 episode.observations,
                 episode.actions,
@@ -584,25 +590,31 @@ class LearntRisk:
         # From where it went on for the horizon although nothing seemed to help.
         refuted = np.flatnonzero([dead_end for _, dead_end in self._notes[: -self.horizon]])
         tight = [refused for refused, _ in self._notes]
-        situations = library.noted(self.situations, episode, tight, self.horizon, random)
-        self.situations, knows = situations, dynamics.fails
+        if episode is not None:  # or it was too short for more than to try again
+            given = self.situations, episode, tight, self.horizon, random
+            self.situations = library.noted(*given)
+        situations, knows = self.situations, dynamics.fails
         yield
         if "stretches" not in dynamics.without and knows and len(situations) > _ENOUGH:
-            yield from library.scan(dynamics, situations, self.horizon, best[:1], random)
+            if episode is not None:
+                yield from library.scan(dynamics, situations, self.horizon, best[:1], random)
             self.n_scanned += 1
-        dynamics.refute(refuted, self.horizon)
+        if episode is not None:
+            dynamics.refute(refuted, self.horizon)
         yield
-        if self.given_horizon is None and self.disturbances is not None and knows:
+        free = self.given_horizon is None and episode is not None
+        if free and self.disturbances is not None and knows:
             after = yield from library.failing_after(
                 dynamics.model, situations, best[:_ASKED], self.disturbances
             )
-            self._look_ahead(after, refuted=len(refuted) > 0, failed=episode.failed)
+            failed = episode is not None and episode.failed
+            self._look_ahead(after, refuted=len(refuted) > 0, failed=failed)
             yield
-        if "memory" in dynamics.without:
+        if "memory" in dynamics.without and episode is not None:
             self.disturbances, self._pool = library.shuffled(
                 dynamics, self._pool, self.horizon, random
             )
-        else:
+        elif "memory" not in dynamics.without:
             self.disturbances = yield from library.choose(
                 dynamics, situations, self.horizon, best[:2], self.disturbance_scale
             )
@@ -783,6 +795,7 @@ KIND = Kind(
         "dynamics": {
             **dict.fromkeys(("n_episodes", "quiet"), COUNT),
             "doubt_of_lags": Numbers(least=0.0),
+            "exposed": COUNT,
             "ready": FLAG,
         },
     },

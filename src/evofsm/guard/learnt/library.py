@@ -39,6 +39,8 @@ _BEFORE_FAILURE = 3
 _MOST_STARTS, _APART = 160, 3
 # What is lost in so few steps, whatever one does, is no argument; nor is what is survived by more.
 _AT_ONCE, _BY_FAR = 3, 100.0
+# What is lost in more than this share of situations that nothing else disturbs begins in its place.
+_HOPELESS = 0.5
 # Residuals that disturbances without memory are drawn from.
 _POOL = 3000
 # Linear policies; mutants that are tried an episode, and of those how many of the best one.
@@ -165,6 +167,11 @@ def scan(
     rest = np.vstack([episode.residuals, np.zeros((horizon, m))])
     begun = Disturbances.none(len(steps), horizon, m)
     begun.residuals[:] = rest[np.arange(horizon)[:, None] + steps].transpose(0, 2, 1)
+    ends = np.zeros((len(steps), horizon, m))
+    for k, t in enumerate(steps.tolist()):
+        L = min(n - t, horizon)
+        ends[k, :L] = (episode.observations[2:] - episode.residuals)[t : t + L]
+    begun = yield from placed(dynamics, situations, policies, begun, ends)
     found = yield from _harm_in_parts(model, situations[safe], policies, begun, 1.0)
     taken = dynamics.onsets(episode.residuals)
     known = len(taken)
@@ -179,9 +186,16 @@ def choose(
 ) -> Parts[Disturbances]:
     """Keep the most harmful sequences of all that are remembered; return what is kept."""
     found, most, n = dynamics.disturbances(horizon), dynamics.remembered, len(dynamics.sequences)
-    if n <= most:
-        return found
+    if dynamics.fails and len(situations):
+        ends = np.zeros((1 + n, horizon, dynamics.n_variables))
+        for k, one in enumerate(dynamics.sequences, 1):
+            L = min(len(one.actions) - 1, horizon)
+            ends[k, :L] = one.observations[2 : 2 + L] - found.residuals[:L, :, k]
+        found = yield from placed(dynamics, situations, policies, found, ends)
     keep = np.arange(n)
+    if n <= most:
+        dynamics.keep(keep.tolist(), found)
+        return found
     if dynamics.fails and len(situations):
         asked = dynamics.model, situations, policies, found, scale
         ends = (yield from _harm_in_parts(*asked))[1:]
@@ -193,8 +207,36 @@ def choose(
             keep = keep[keep != free[value[free].argmax()]]
     else:
         keep = keep[-most:]
-    dynamics.keep(keep.tolist())
+    dynamics.keep(keep.tolist(), found)
     return found.of(np.append(0, 1 + keep))
+
+
+def placed(
+    dynamics: Dynamics, situations: Floats, policies: Floats, found: Disturbances, ends: Floats
+) -> Parts[Disturbances]:
+    """With where they begin, if they could be survived almost nowhere beginning anywhere.
+
+    What can be survived is prepared for wherever one is.
+    """
+    place = dynamics.where(found, ends)
+    some = np.flatnonzero(place[:, 0] >= 0.0)
+    nowhere = found.place.copy()
+    nowhere[:, 0] = -1.0
+    found = found._replace(place=nowhere)
+    if not len(some):
+        return found
+    calm = Disturbances.none(1, len(found.residuals), dynamics.n_variables)
+    safe = harm(dynamics.model, situations, policies, calm)[0] > 0.0
+    if not safe.any():
+        return found
+    asked = dynamics.model, situations[safe], policies, found.of(some)
+    ends = yield from _harm_in_parts(*asked, 1.0)
+    hopeless = (ends < 0.0).sum(1) > _HOPELESS * safe.sum()
+    lost = {tuple(row) for row in place[some[hopeless], :2].tolist()}
+    for k in some:
+        if tuple(place[k, :2].tolist()) in lost:
+            nowhere[k] = place[k]
+    return found
 
 
 def shuffled(

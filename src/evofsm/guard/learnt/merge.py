@@ -17,6 +17,7 @@ from evofsm.guard.harm import Harm
 from evofsm.guard.learnt import library
 from evofsm.guard.learnt.dynamics import MOST, MOST_SURVIVED, Dynamics
 from evofsm.guard.learnt.judge import LearntRisk
+from evofsm.guard.learnt.places import Places
 from evofsm.guard.learnt.regression import Drift, Recent
 from evofsm.guard.learnt.replay import Floats, Sums, crossed, n_products, pairs
 
@@ -132,6 +133,8 @@ def _merged(parts: Sequence[Dynamics]) -> Dynamics:
     merged.survived = survived[:: -(-len(survived) // MOST_SURVIVED) or 1]
     jumps = zip(*(part.jumps for part in parts), strict=True)
     merged.jumps = [np.concatenate([rows[-each:] for rows in seen]) for seen in jumps]
+    offsets = [merged.n_episodes - part.n_episodes for part in parts]
+    merged.places = Places.merged([part.places for part in parts], offsets)
     merged.recent, merged.latest = Recent.none(p, m, merged.n_episodes), None
     merged.settle(failed=True)
     return merged

@@ -175,18 +175,22 @@ def compared(
     model: Model,
     sums: Sums,
     close: Floats,
+    elsewhere: NDArray[np.bool_],
     z: Floats,
     u: Floats,
     episode: int,
     young: bool,
 ) -> Recent:
-    """Take in an episode; rows at an end, or that change more than ordinarily, say nothing."""
+    """Take in an episode; rows at an end, or that change more than ordinarily, say nothing.
+
+    Neither do those that are ``elsewhere`` (T,), where something else begins.
+    """
     found = features(model, z[1:-1], np.diff(z[:-1], axis=0), u[:-1], u[1:])
     move = found @ model.weights
     after, change = z[2:], np.diff(z[1:], axis=0)
     says = (after > model.lowest + close) & (after < model.highest - close)
     says &= (change >= sums.least) & (change <= sums.most)
-    rows = says.all(1)
+    rows = says.all(1) & ~elsewhere
     found, change = found[rows], change[rows]
     missed = change - move[rows]
     size = np.maximum(np.maximum(sums.scale, _MATTERS * sums.unit), 1e-300)

@@ -91,14 +91,18 @@ class Disturbances(NamedTuple):
     jump_slope: Floats  #: (K, m, m) and so much of where each variable was
     jump_from: Floats  #: (K, m, m, 2) least and most from which such jumps were seen
     landing: Floats  #: (K, m, 2) least and most to which such jumps led
+    #: (K, 5) where it begins: variable (-1: anywhere), sign and threshold; at which step, and with
+    #: which it is over
+    place: Floats
 
     @classmethod
     def none(cls, count: int, steps: int, m: int) -> Disturbances:
         """So many that are none, of m variables."""
         still = np.zeros((count, m))
         slopes, ranges = np.zeros((count, m, m)), np.zeros((count, m, m, 2))
-        residuals = np.zeros((steps, m, count))
-        return cls(residuals, still - 1.0, still, slopes, ranges, np.zeros((count, m, 2)))
+        residuals, place = np.zeros((steps, m, count)), np.zeros((count, 5))
+        place[:, 0] = -1.0
+        return cls(residuals, still - 1.0, still, slopes, ranges, np.zeros((count, m, 2)), place)
 
     def of(self, which: Ints) -> Disturbances:
         """Some of them."""
@@ -184,15 +188,29 @@ def residuals(
     ended. Where nothing moves at all, what was expected is the model's own error.
     """
     z, x, change = observations[1:-1], observations[2:], np.diff(observations[:-1], axis=0)
-    expected = z + features(model, z, change, actions[:-1], actions[1:]) @ model.weights
-    low, high = x <= model.lowest + close, x >= model.highest - close
-    beyond = ((expected < model.lowest) & low) | ((expected > model.highest) & high)
-    found = np.where(beyond | (x == z).all(1, keepdims=True), 0.0, x - expected)
+    found = unforeseen(model, z, change, actions[:-1], actions[1:], x, close)
     if carried:
+        low, high = x <= model.lowest + close, x >= model.highest - close
         for t in np.flatnonzero((low | high)[1:].any(1)) + 1:
             ends = np.where(low[t], np.minimum(found[t], found[t - 1]), found[t])
             found[t] = np.where(high[t] & ~low[t], np.maximum(found[t], found[t - 1]), ends)
     return found
+
+
+def unforeseen(
+    model: Model,
+    z: Floats,
+    change: Floats,
+    before: Floats,
+    action: Floats,
+    x: Floats,
+    close: Floats | float = 0.0,
+) -> Floats:
+    """(T, m) what was not expected of transitions from ``z`` to ``x``, as `residuals` has it."""
+    expected = z + features(model, z, change, before, action) @ model.weights
+    low, high = x <= model.lowest + close, x >= model.highest - close
+    beyond = ((expected < model.lowest) & low) | ((expected > model.highest) & high)
+    return np.where(beyond | (x == z).all(1, keepdims=True), 0.0, x - expected)
 
 
 def limited(model: Model, move: Floats) -> Floats:
@@ -442,6 +460,25 @@ def _distances(model: Model, z: Floats, far: Floats) -> None:
             far[l] = left if left < far[l] else far[l]
 
 
+@spliced_kernel
+def _wait(place: Floats, which: Ints, z: Floats, move: Floats, clock: Ints, at: Ints) -> None:
+    """Steps of disturbances to play now, into ``at``, of those that begin only somewhere; -1: none.
+
+    Each waits at its onset until it is there, and begins again when it is there again.
+    """
+    for l in range(len(which)):
+        k = which[l]
+        if place[k, 0] >= 0.0:
+            i = int(place[k, 0])
+            begins, over = int(place[k, 3]), int(place[k, 4])
+            there = place[k, 1] * (z[i, l] + move[i, l] - place[k, 2]) >= 0.0
+            if clock[l] >= over and there:
+                clock[l] = begins
+            plays = clock[l] < over and (clock[l] != begins or there)
+            at[l] = clock[l] if plays else -1
+            clock[l] += 1 if plays else 0
+
+
 @compiled
 def _replay(
     model: Model,
@@ -470,7 +507,8 @@ def _replay(
     before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
     which, survived = np.empty(n, np.int64), np.empty(n, np.int64)
     near, far = np.empty(n), np.empty(n)
-    jumps = False
+    at, clock, rest = np.empty(n, np.int64), np.zeros(n, np.int64), np.empty((m, n))
+    jumps, placed = False, False
     for l in range(n):
         start = l // each if l < count else 0
         for j in range(m):
@@ -481,6 +519,7 @@ def _replay(
         which[l] = l % each if l < count else 0
         for j in range(m):
             jumps |= disturbances.jump_at[which[l], j] >= 0.0
+        placed |= disturbances.place[which[l], 0] >= 0.0
     lost, end, took = 0, 1.0 - _RESERVE * enough, 0
     for t in range(steps):
         took += 1
@@ -494,6 +533,13 @@ def _replay(
             z, change, before, action, model.origin, model.reach, harder, model.choices == 0, found
         )
         expect(model.weights, found, move)
+        for l in range(n):
+            at[l] = t
+        if placed:
+            _wait(disturbances.place, which, z, move, clock, at)
+        for j in range(m):
+            for l in range(n):
+                rest[j, l] = disturbances.residuals[at[l], j, which[l]] if at[l] >= 0 else 0.0
         for j in range(m):
             least, most = model.least[j], model.most[j]
             if model.drifted[j] > 0.0:  # little was seen of it: no more is foreseen than there was
@@ -503,17 +549,17 @@ def _replay(
                 for l in range(n):
                     low = min(harder * least, max(move[j, l], _FARTHER * least))
                     high = max(harder * most, min(move[j, l], _FARTHER * most))
-                    y = move[j, l] + harder * disturbances.residuals[t, j, which[l]]
+                    y = move[j, l] + harder * rest[j, l]
                     after[j, l] = z[j, l] + min(max(y, low), high)
             else:
                 for l in range(n):
-                    y = move[j, l] + harder * disturbances.residuals[t, j, which[l]]
+                    y = move[j, l] + harder * rest[j, l]
                     after[j, l] = z[j, l] + min(max(y, harder * least), harder * most)
         if jumps:
             for l in range(count):
                 k = which[l]
                 for j in range(m):
-                    if disturbances.jump_at[k, j] == t:
+                    if disturbances.jump_at[k, j] >= 0.0 and disturbances.jump_at[k, j] == at[l]:
                         y = disturbances.jump_to[k, j]
                         for i in range(m):
                             low = disturbances.jump_from[k, j, i, 0]

@@ -117,11 +117,13 @@ def experience(
     differs: float = 0.0,
     nothing: str = NO_FAILURE,
     regions: Sequence[str] = (),
+    begin: Sequence[tuple[str, bool, Sequence[float]]] = (),
 ) -> str:
     """What was learnt so far: variables that fail, whether below a threshold, and which.
 
     Since which episode, from 1, variables move otherwise and disturbances are worse (0: none are).
-    In which share of the states around a given function says otherwise than the thresholds.
+    In which share of the states around a given function says otherwise than the thresholds. Beyond
+    which thresholds alone disturbances begin.
     """
     since = "".join(f"; since episode {first} {name} moves otherwise" for name, first in drifts)
     if worse:
@@ -138,6 +140,10 @@ def experience(
     where = " or ".join(
         f"{name} is {'below' if low else 'above'} {at:.4g}" for name, low, at in fails
     )
+    for name, low, ats in begin:
+        side, at = ("below", max(ats)) if low else ("above", min(ats))
+        verb = "was" if len(ats) == 1 else "were"
+        since += f"; {len(ats)} of them {verb} seen to begin only where {name} is {side} {at:.4g}"
     fails_there = " or ".join([*([f"where {where}"] if where else []), *regions])
     return f"fails {fails_there}; {remembered}, to be survived by {changes(margin)}{since}"
 
