@@ -7,9 +7,10 @@ import pytest
 
 from evofsm import store
 from evofsm.guard import LearntRisk, merge_judges
+from evofsm.guard.learnt.dynamics import Dynamics
 from evofsm.guard.learnt.judge import KIND
 from evofsm.guard.learnt.places import ANYWHERE, Places, onsets
-from evofsm.guard.learnt.replay import Model, n_features
+from evofsm.guard.learnt.replay import Model, features, n_features
 
 ONE, STOP = np.ones(2), np.array([0.0, 3.0])
 #: Two variables that stay as they are, as far as is known.
@@ -111,3 +112,25 @@ def test_forged_places_are_refused(placed, name, change):
     store.write(bad := BytesIO(), KIND, settings, arrays | {name: change(arrays[name])})
     with pytest.raises(ValueError, match="places are of"):
         LearntRisk.load(BytesIO(bad.getvalue()))
+
+
+def test_an_episode_that_is_over_at_once_teaches_what_the_action_did_in_it():
+    dynamics, draw = Dynamics(-1.0, 1.0), np.random.default_rng(0)
+
+    def episode(pushes, failed):
+        z = np.zeros(2)
+        for push in pushes:
+            dynamics.observe(z)
+            dynamics.act(np.array([push]))
+            z = np.array([z[0] + z[1], 0.9 * z[1] + 0.1 * push * (1.0 + 4.0 * (abs(push) > 0.5))])
+        dynamics.observe(z)
+        dynamics.end(failed=failed)
+
+    episode(0.02 * draw.normal(size=200), failed=False)
+    for _ in range(3):
+        episode(np.ones(4), failed=True)
+    model = dynamics.model
+    row = features(model, np.zeros((1, 2)), np.zeros((1, 2)), np.ones((1, 1)), np.ones((1, 1)))
+    assert 0.25 < (row @ model.weights)[0, 1] < 0.6
+    assert dynamics.latest is not None
+    assert len(dynamics.latest.actions) == 3

@@ -23,6 +23,7 @@ from evofsm.guard.learnt.replay import (
     Ints,
     Model,
     Sums,
+    features,
     lags,
     learn_transition,
     n_features,
@@ -365,6 +366,8 @@ class Dynamics:
         if failed:
             self.failures = np.vstack([self.failures[1 - MOST :], z[-1]])
             self.brinks = np.vstack([self.brinks[1 - MOST :], safe[-1:]])
+        if len(safe) <= _STUDIED and self.sums.scale[0] > 0.0:
+            self._learn_fully(safe, u)
         self.settle(failed=failed)
         self.sums.squares[:] *= _KEPT
         self.sums.products[:] *= _KEPT
@@ -393,6 +396,17 @@ class Dynamics:
             if "stretches" not in self.without:
                 self.remember(self.onsets(found))
         self.n_episodes += 1
+
+    def _learn_fully(self, z: Floats, u: Floats) -> None:
+        """Learn the transitions of an episode that is over at once as no outliers.
+
+        It is one's own actions that end it, of which the model is wrong: else for ever.
+        """
+        if len(z) > _LEAST:
+            change, T = np.diff(z, axis=0), len(z) - 1
+            rows = features(self.model, z[1:-1], change[:-1], u[: T - 1], u[1:T])
+            self.sums.squares[:] += rows.T @ rows
+            self.sums.products[:] += rows.T @ change[1:]
 
     def settle(self, *, failed: bool = False) -> None:
         """Make of all sums what is known: weights, and where it fails, if it ``failed`` anew."""
