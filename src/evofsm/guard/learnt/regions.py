@@ -120,8 +120,8 @@ def explain(
     left = failures[by[strong].sum(0) == 0]
     found, _ = _learnt(left, survived, unit, spread)
     if strong.any():
-        alone, whole = _learnt(failures, survived, unit, spread)
-        if whole and len(alone) < len(found) + strong.sum():
+        alone, whole = _learnt(failures, survived, unit, spread, len(found) + int(strong.sum()))
+        if whole:
             found, strong = alone, np.zeros(len(strong), bool)
     within: Flags = np.asarray(inside(found, failures).any(0))
     keep = [bool(s or not within[mine].all()) for s, mine in zip(strong, by, strict=True)]
@@ -129,13 +129,16 @@ def explain(
 
 
 def _learnt(
-    failures: Floats, survived: Floats, unit: Floats, spread: Floats
+    failures: Floats, survived: Floats, unit: Floats, spread: Floats, fewer: float = np.inf
 ) -> tuple[Floats, bool]:
-    """Regions that explain failures, and whether they explain all of them."""
+    """Regions that explain failures, and whether these are ``fewer`` and explain all of them."""
     asked = _asked(failures, survived, spread)
     found: list[Floats] = []
     groups, whole = [np.arange(len(failures))], True
     while groups and len(found) < _MOST:
+        if len(found) + len(groups) >= fewer:  # each takes a region at least
+            whole = False
+            break
         groups.sort(key=len, reverse=True)
         group = groups.pop(0)
         F, k = failures[group], len(group)
@@ -266,7 +269,8 @@ def _near(survived: Floats, F: Floats, scale: Floats) -> Ints:
     if n <= _NEAR:
         return np.arange(n)
     each = -(-half // len(F))
-    far = (((survived[None] - F[:, None]) / scale) ** 2).sum(2)
+    x, y = ((survived[:, k] - F[:, [k]]) / scale[k] for k in (0, 1))
+    far = x * x + y * y
     near = np.argpartition(far, each, 1)[:, :each].ravel()[:half]
     return np.append(near, np.linspace(0, n - 1, _NEAR - half).astype(int))
 
