@@ -27,15 +27,7 @@ from evofsm.guard.harm import OUTCOMES, SETTINGS, Harm
 from evofsm.guard.learnt import library, regions, words
 from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics
 from evofsm.guard.learnt.library import Backups, Parts, Violations
-from evofsm.guard.learnt.replay import (
-    CUT_SHORT,
-    KEPT,
-    Disturbances,
-    Floats,
-    Ints,
-    pairs,
-    search,
-)
+from evofsm.guard.learnt.replay import CUT_SHORT, KEPT, Disturbances, Floats, Ints, pairs, search
 from evofsm.guard.learnt.words import Remembered
 from evofsm.store import COUNT, FLAG, FROM_1, SHARE, SIZE, Kind, Numbers, Place
 
@@ -665,7 +657,7 @@ class LearntRisk:
                 self.believed = max(self.believed, longest)
             self.time_to_failure = max(min(float(after), self.believed), longest)
         each = self.dynamics.model.weights.size * (1 + self.dynamics.remembered)
-        farthest = min(_FARTHEST, _WORK / each / _ASKED_OF_MANY)  # less where a replay costs more
+        farthest = min(_FARTHEST, _WORK / each / _ASKED)  # less where a replay costs more
         self.horizon = int(max(min(_AHEAD * self.time_to_failure, farthest), _SHORTEST))
 
     def evolved(self, random: np.random.Generator) -> Parts[Backups]:
