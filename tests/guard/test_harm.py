@@ -74,6 +74,17 @@ def test_frozen_it_stays_back_and_warns(wrong):
     assert drive(guard)[0] == (1, "")
 
 
+def test_frozen_early_it_does_not_act_where_it_failed_sooner_so_far(wrong):
+    guard = make()
+    drive(guard, 3)  # once alone, twice guarded
+    with pytest.warns(UserWarning, match="this guard may do harm: frozen so, proposals pass"):
+        guard.freeze()
+    assert {why for _, why in drive(guard, 3)} == {"may do harm"}
+    assert "it may do harm: guarded episodes failed after 1 steps in the median (2 of 2)" in str(
+        guard
+    )
+
+
 def test_it_is_tried_again_and_acts_once_that_lasts(wrong):
     guard = make()
     drive(guard, 12)
@@ -122,8 +133,8 @@ def test_where_someone_else_acts_the_controller_is_alone(wrong):
     drive(guard, 5)
     assert [one.guarded for one in guard.judge.harm.outcomes] == [False] * 5
     guard.reviser.mode = Mode.ACT
-    drive(guard, 4)  # two of three kinds of seven: one in 21; of four one in 126
-    assert guard.judge.harm.seems_worse or guard.judge.harm.since
+    assert drive(guard, 2) == [(1, ""), (20, "shadow")]
+    assert guard.judge.harm.chance == 1.0 / 7.0  # one of seven ways to choose one
 
 
 def test_merged_it_is_said_of_all_episodes(wrong):

@@ -17,6 +17,7 @@ that a shadow episode is not expected to cost anything. In doubt every second ep
 From a chance of one in a hundred on the guard *steps back*: proposals pass, and now and then an
 episode is tried guarded, after 2, 4, 8 and then 10 of the controller alone. One that lasts no
 shorter than half of those has the next one tried, too; two such in succession, and it acts again.
+Frozen it acts only if guarded episodes of late did not fail sooner, by chance or not.
 """
 
 from __future__ import annotations
@@ -34,8 +35,9 @@ from evofsm.store import COUNT, SHARE, Numbers
 _KEPT = 20
 # So many are known of the controller alone, or there is doubt once that many guarded ones failed.
 _KNOWN, _ALL_FAILED = 3, 5
-# Chances of so much sooner failures, from which on there is doubt, and it steps back.
-_DOUBT, _SURE = 0.25, 0.01
+# Chances of so much sooner failures, below which it is not frozen to act; from which on there is
+# doubt; and it steps back.
+_EVEN, _DOUBT, _SURE = 0.5, 0.25, 0.01
 # Most episodes of the controller alone between two that are tried; so many that last bring it back.
 _RARELY, _LASTING = 10, 2
 # Decisions over which the share of proposals that are kept is counted, and at least for a word.
@@ -82,14 +84,13 @@ class Harm(NamedTuple):
         """Of the guard that acts; while it steps back, those that were tried since."""
         return [one for one in self.outcomes if one.guarded and one.episode >= self.since]
 
-    @property
-    def seems_worse(self) -> bool:
-        """Whether guarded episodes fail sooner, if perhaps by chance."""
-        return not self.since and self.chance <= _DOUBT
+    def in_doubt(self, *, learning: bool) -> bool:
+        """Whether guarded episodes fail sooner, perhaps by chance.
 
-    @property
-    def is_unproven(self) -> bool:
-        """Whether guarded episodes fail, all of them, and little is known of the controller."""
+        While it learns, also if all of them fail, and little is known of the controller alone.
+        """
+        if self.since or not learning or self.chance <= _DOUBT:
+            return not self.since and self.chance < _EVEN
         latest, alone = self.guarded[-_ALL_FAILED:], self.alone
         fails = len(latest) == _ALL_FAILED and all(one.failed for one in latest)
         long_ago = len(alone) < _KNOWN or self.n_episodes - alone[-1].episode >= _RARELY - 1
@@ -127,9 +128,9 @@ class Harm(NamedTuple):
             is_tried = again or alone >= min(_RARELY, 2 ** (1 + len(tried)))
             return "" if learning and is_tried else f"steps back since episode {self.since}"
         if not learning:
-            return "may do harm" if self.seems_worse else ""
+            return "may do harm" if self.in_doubt(learning=False) else ""
         is_next = bool(self.outcomes) and self.outcomes[-1].guarded
-        return "shadow" if is_next and (self.seems_worse or self.is_unproven) else ""
+        return "shadow" if is_next and self.in_doubt(learning=True) else ""
 
     def _lasted(self, one: Outcome) -> bool:
         """Whether an episode failed no sooner than half of those of the controller alone."""

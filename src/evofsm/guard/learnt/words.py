@@ -197,7 +197,7 @@ def harm(known: Harm, *, tests: bool, learning: bool) -> str:
     said = ""
     if not tests:
         said = "; no episode is driven in shadow, so that harm would not be noticed"
-    elif known.since or known.seems_worse or (learning and known.is_unproven):
+    elif known.since or known.in_doubt(learning=learning):
         before = [one for one in known.outcomes if one.guarded and one.episode < known.since]
         how, what = "it may do harm", "some are driven in shadow" if learning else "proposals pass"
         if known.since:
