@@ -95,6 +95,13 @@ def test_it_is_tried_again_and_acts_once_that_lasts(wrong):
     assert "steps back" not in str(guard)
 
 
+def test_what_goes_on_failing_is_tried_ever_more_rarely(wrong):
+    guard = make()
+    rows = drive(guard, 45)
+    tried = [n for n, (steps, _) in enumerate(rows, 1) if steps == 1][-4:]
+    assert np.diff([guard.judge.harm.since - 1, *tried]).tolist() == [3, 5, 9, 11]
+
+
 def test_without_shadow_it_is_never_told_to_pass_which_is_said(wrong):
     guard = make(shadow=False)
     assert {why for _, why in drive(guard, 30)} == {""}

@@ -174,10 +174,9 @@ def earlier(some: Sequence[Outcome], others: Sequence[Outcome]) -> int:
 
 
 def _before(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.bool_]:
-    """(s, o) whether each of some failed while the other went on."""
+    """(s, o) whether each of some failed while the other went on; of a tie both, which cancels."""
     fails = np.array([one.steps if one.failed else math.inf for one in some])
-    goes_on = np.array([one.steps - 0.5 * one.failed for one in others])
-    return fails[:, None] <= goes_on
+    return fails[:, None] <= np.array([one.steps for one in others])
 
 
 def chance_of(guarded: Sequence[Outcome], alone: Sequence[Outcome]) -> float:
