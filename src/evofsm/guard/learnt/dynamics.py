@@ -368,7 +368,7 @@ class Dynamics:
             self.brinks = np.vstack([self.brinks[1 - MOST :], safe[-1:]])
         if len(safe) <= _STUDIED and self.sums.scale[0] > 0.0:
             self._learn_fully(safe, u)
-        self.settle(failed=failed)
+        self.settle(failed=failed, waits=len(z) == _LONGEST)
         self.sums.squares[:] *= _KEPT
         self.sums.products[:] *= _KEPT
         self.latest = None
@@ -408,8 +408,11 @@ class Dynamics:
             self.sums.squares[:] += rows.T @ rows
             self.sums.products[:] += rows.T @ change[1:]
 
-    def settle(self, *, failed: bool = False) -> None:
-        """Make of all sums what is known: weights, and where it fails, if it ``failed`` anew."""
+    def settle(self, *, failed: bool = False, waits: bool = False) -> None:
+        """Make of all sums what is known: weights, and where it fails, if it ``failed`` anew.
+
+        Where a decision ``waits``, regions only shrink.
+        """
         self._solve()
         if self.failed is None:
             sums = self.sums
@@ -419,16 +422,16 @@ class Dynamics:
             if "regions" in self.without:
                 self.thresholds = found
             else:
-                self._explain(found, anew=failed)
+                self._explain(found, anew=failed, waits=waits)
         self.rebuild()
 
-    def _explain(self, found: list[tuple[int, float, float]], *, anew: bool) -> None:
+    def _explain(self, found: list[tuple[int, float, float]], *, anew: bool, waits: bool) -> None:
         """Explain failures by thresholds that were found, and by regions where these do not."""
         survived = np.concatenate([self.survived, self.brinks])
         self.regions = regions.without_survived(self.regions, survived)
         kept = {(j, sign) for j, sign, _ in self.thresholds}
         stay = [one for one in found if one[:2] in kept] if len(self.regions) else found
-        if anew or not regions.are_explained(self.failures, stay, self.regions):
+        if anew or not (waits or regions.are_explained(self.failures, stay, self.regions)):
             sums = self.sums
             spread = np.sqrt(sums.scatter / max(1.0, sums.counts[0] - 1.0))
             unit = 1.25 * np.maximum(sums.unit, 1e-3 * spread + 1e-300)
