@@ -233,6 +233,7 @@ def placed(
     ends = yield from _harm_in_parts(*asked, 1.0)
     hopeless = (ends < 0.0).sum(1) > _HOPELESS * safe.sum()
     lost = {tuple(row) for row in place[some[hopeless], :2].tolist()}
+    lost |= {one.place[:2] for one in dynamics.sequences}  # what has a place keeps it
     for k in some:
         if tuple(place[k, :2].tolist()) in lost:
             nowhere[k] = place[k]
