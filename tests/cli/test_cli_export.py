@@ -65,6 +65,19 @@ def test_folder_machine_and_log_give_the_same_states(evofsm, driven, to, begins,
     assert (tmp_path / "graph").read_bytes().decode() == printed[out]
 
 
+def test_a_guard_is_written_in_c_and_for_cpp_to_a_folder(evofsm, refused, driven, tmp_path):
+    out, _ = driven
+    for file in (out, out / "guard.evofsm"):
+        assert evofsm("export", file, "--to", "c99", "--out", tmp_path / "c").exit_code == 0
+    assert {path.name for path in (tmp_path / "c").iterdir()} == {
+        *("evofsm.h", "evofsm.c", "evofsm.hpp"),
+    }
+    header = (tmp_path / "c" / "evofsm.h").read_text()
+    assert "gap" in header
+    assert "#define EVOFSM_VARIABLES 3\n" in header
+    assert "name a folder by --out" in refused("export", out, "--to", "c99")
+
+
 def test_options_choose_what_is_drawn(evofsm, driven):
     out, _ = driven
     whole = evofsm("export", out, "--to", "dot", "--least", 0, "--evidence", 0).stdout

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from evofsm.cli.inspect import load_model
 from evofsm.cli.options import Saved, option
-
-if TYPE_CHECKING:
-    from evofsm.fsm.model import FSMModel
 
 # How logs of runs begin.
 _MCAP = b"\x89MCAP"
@@ -19,9 +16,10 @@ _MCAP = b"\x89MCAP"
 def export(
     file: Saved,
     to: Annotated[
-        Literal["dot", "prism"], option("Graph for Graphviz (dot), or process for PRISM and Storm.")
+        Literal["dot", "prism", "c99"],
+        option("Graph for Graphviz (dot), process for PRISM and Storm, or the guard in C."),
     ],
-    out: Annotated[Path | None, option("File to write; else it is printed.")] = None,
+    out: Annotated[Path | None, option("File to write, else printed; of c99 a folder.")] = None,
     least: Annotated[
         float | None,
         option("Leave out what is less probable. [default: dot 0.001]", min=0.0, max=1.0),
@@ -31,23 +29,29 @@ def export(
     ] = None,
 ) -> None:
     """Write what was learnt, or driven, in the formats of other tools."""
+    if to == "c99":
+        from evofsm.guard import Guard
+        from evofsm.guard.export import write_c99
+
+        if out is None:
+            raise ValueError("--to c99 writes three files: name a folder by --out")
+        place = file / "guard.evofsm" if file.is_dir() else file
+        return write_c99(Guard.load(place, failed=lambda seen: False), out)
     _refuse_learnt(out)
     from evofsm import store
     from evofsm.fsm.naming import visible
     from evofsm.io import graphs
 
     model, dead_ends = _learnt(file)
-    bounds = {"least": least, "evidence": evidence}
-    given = {name: bound for name, bound in bounds.items() if bound is not None}
-    if to == "prism":
-        text = graphs.to_prism(model, **given)
-    else:
-        text = graphs.to_dot(model, **given, dead_ends=dead_ends)
+    bounds = ("least", least), ("evidence", evidence)
+    given = {name: bound for name, bound in bounds if bound is not None}
+    drawn = {} if to == "prism" else {"dead_ends": dead_ends}
+    text = visible(getattr(graphs, f"to_{to}")(model, **given, **drawn))
     if out is None:
-        sys.stdout.write(visible(text))
+        sys.stdout.write(text)
         return
-    with store.replacing(out) as place:
-        place.write(visible(text).encode())
+    with store.replacing(out) as written:
+        written.write(text.encode())
 
 
 def _refuse_learnt(out: Path | None) -> None:
@@ -64,7 +68,7 @@ def _refuse_learnt(out: Path | None) -> None:
     raise ValueError(f"--out {out}: what was learnt or driven is kept there; it was left alone")
 
 
-def _learnt(file: Path) -> tuple[FSMModel, list[int] | None]:
+def _learnt(file: Path) -> tuple[Any, list[int] | None]:
     """The model, and its dead ends where the risk that was learnt with it is known."""
     from evofsm.cli.driving import GUARD
     from evofsm.driving import LatentRisk, assess_states

@@ -13,12 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
+from evofsm.driving import perception, rehearsal
 from evofsm.driving.brakes import OwnBrakes, hardest_seen
 from evofsm.driving.leaders import BrakeWatch, LeaderBrakes, Manoeuvres
 from evofsm.driving.naming import LABELS
@@ -31,7 +33,7 @@ from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
-from evofsm.guard.actions import Action
+from evofsm.guard.actions import Action, nearest_bounds
 from evofsm.guard.api import Trial
 from evofsm.store import (
     COUNT,
@@ -44,12 +46,18 @@ from evofsm.store import (
     Place,
 )
 
+if TYPE_CHECKING:
+    from evofsm.guard import ActionReviser
+    from evofsm.guard.export import Part
+
 # Slower than this a car stands, though a sensor may show that it moves [m/s].
 _STANDS = 0.1
 # States of a smaller belief are left out.
 _LEAST_BELIEF = 1e-3
 # Where a situation is not sure, it may be worse by so many standard deviations.
 _CAUTION = 2.5
+# In C rehearsals are bounded, and long enough for such a speed [m/s].
+_FASTEST = 150.0
 
 
 # -- What a file may hold -------------------------------------------------------------------------
@@ -369,6 +377,32 @@ class LatentRisk:
         rows = np.asarray(observations, dtype=np.float64)
         critical = [self.critical(row, [self.lowest], margin=0.0)[0] for row in rows]
         return self.manoeuvres.exceeded_by(tolerance) - np.array(critical)
+
+    def in_c99(self, reviser: ActionReviser) -> Part:
+        """What it decides by, frozen, for `evofsm.guard.export`."""
+        from evofsm.guard.export import Part
+
+        lowest, highest = nearest_bounds(reviser.actions)
+        decel, quickest = self.brakes.decel, max(float(highest[0]), 0.0)
+        fastest = _FASTEST + 2.0 * quickest * self.dt
+        constants = {
+            **{"DECEL": decel, "LAG": self.brakes.lag, "LIKELY": self.brakes._likely},
+            **{"KNOWN": self.brakes.known, "LOWEST": self.lowest, "CLEARANCE": self.margin},
+            "STEPS": math.ceil(fastest / (decel * self.dt)) + 4,
+            **{"HARDEST": HARDEST, "HALVINGS": rehearsal._HALVINGS, "STANDS": _STANDS},
+            **{"LEADER": perception._LEADER, "UNEVEN": perception._UNEVEN, "CAUTION": _CAUTION},
+            "DOUBT": perception._OWN if self.brakes.known else perception._OWN_UNKNOWN,
+            **{"ANOTHER": perception._ANOTHER_LEADER, "EXACT": not any(self.perception.noise)},
+            "EVIDENCE": float(len(self.manoeuvres)),
+            **{"TABLE": self.manoeuvres.table.shape[1], "harder": self.manoeuvres.table},
+            **{"noise": self.perception.noise, "option_low": lowest, "option_high": highest},
+        }
+        about = (
+            f"{self.told_by_experience}\na decision: at most {len(lowest)} options times "
+            f"{rehearsal._HALVINGS + 2} rehearsals of {constants['STEPS']} steps, enough for "
+            f"{_FASTEST:g} m/s; what would take more is taken for a collision\n"
+        )
+        return Part(Path(__file__).with_suffix(".c"), 3, {"OPTIONS": len(lowest)}, constants, about)
 
     # -- Keeping it -----------------------------------------------------------------------------
 

@@ -288,6 +288,14 @@ class LearntRisk:
         was_asked = bool(dynamics.n_variables) and dynamics.sums.counts[1] >= 1.0
         return words.no_threshold(self.n_failed, is_given=was_asked and dynamics.failed is not None)
 
+    @property
+    def effort(self) -> tuple[int, float]:
+        """Backups that a search asks, and steps of replays after which it is cut short."""
+        few = _ASKED if len(pairs(self.dynamics.n_variables)[0]) else _ASKED_OF_MANY
+        count = 1 if self.disturbances is None else self.disturbances.residuals.shape[2]
+        each = self.dynamics.model.weights.size * count
+        return few, max(min(_WORK, _WORK_RATE * self.dt) / each, few * self.horizon)
+
     def search(
         self, situation: Situation, wanted: Any, *, tolerance: float, revising: bool
     ) -> Search:
@@ -304,12 +312,10 @@ class LearntRisk:
         if not dynamics.fails:
             return Search(one, _unjudged(1), 0, self._no_threshold)
         model, proposal, scale = dynamics.model, dynamics.encode(wanted), self.disturbance_scale
-        few = _ASKED if len(pairs(dynamics.n_variables)[0]) else _ASKED_OF_MANY
+        few, most = self.effort
         remembered, ranks = self.remembered, self._ranks[:few]
         allowed = self._allowed(tolerance, remembered)
         asked = model, here, backups.policies, ranks, disturbances, scale
-        each = model.weights.size * disturbances.residuals.shape[2]
-        most = max(min(_WORK, _WORK_RATE * self.dt) / each, few * self.horizon)
         how, action, which, left = search(*asked, proposal, self.margin, allowed, most)
         tried = None
         if which != ranks[0]:  # what passed now is asked first the next time

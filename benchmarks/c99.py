@@ -1,0 +1,442 @@
+"""Does exported C decide as Python does? A million situations, NaN and infinities among them.
+
+Usage: python benchmarks/c99.py [--decisions 1e6] [--systems wall,disc,cartpole,emergency,cars]
+
+A guard learns, is frozen and exported, and drives; both are asked the same. Of some observations a
+part is not seen, infinite, late or anywhere; some proposals are no numbers, or beyond the range.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm import Guard
+from evofsm.driving import CarFollowing, LatentRisk, guard_for_family
+from evofsm.guard import Proposal, make_usable
+from evofsm.guard.actions import BoxActions, limits, no_action
+from evofsm.guard.export import write_c99
+from evofsm.guard.learnt import words
+from evofsm.guard.reviser import unseen_text
+
+Floats = NDArray[np.float64]
+
+FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off")
+SANITIZERS = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+# Numbers of a decision, in the order in which the program below writes them.
+NUMBERS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen", "left")
+CODES = ("reason", "remark", "intake", "is_new", "state", "backup", "unsurvived")
+_MAIN = """#define _POSIX_C_SOURCE 199309L
+#include "evofsm.h"
+#include <stdio.h>
+#include <time.h>
+#define ROW (2 + EVOFSM_VARIABLES + EVOFSM_ACTIONS)
+static evofsm_state state;
+int main(void) {
+  double row[ROW];
+  evofsm_reset(&state);
+  while (fread(row, sizeof row[0], ROW, stdin) == ROW) {
+    double numbers[9 + 7 + 2 * EVOFSM_ACTIONS] = {0.0};
+    evofsm_decision d = {0};
+    struct timespec begin, end;
+    int i;
+    if (row[0] > 0.0) {
+      evofsm_reset(&state);
+    }
+    clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &begin);
+    numbers[0] = evofsm_decide_at(&state, row + 2, row + 2 + EVOFSM_VARIABLES, row[1], &d);
+    clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &end);
+    numbers[1] = (double)(end.tv_sec - begin.tv_sec) + 1e-9 * (double)(end.tv_nsec - begin.tv_nsec);
+    numbers[2] = d.risk_proposed, numbers[3] = d.risk_executed, numbers[4] = d.risk_low;
+    numbers[5] = d.risk_high, numbers[6] = d.evidence, numbers[7] = d.seen, numbers[8] = d.left;
+    numbers[9] = d.reason, numbers[10] = d.remark, numbers[11] = d.intake, numbers[12] = d.is_new;
+    numbers[13] = d.state, numbers[14] = d.backup, numbers[15] = d.unsurvived;
+    for (i = 0; i < EVOFSM_ACTIONS; i++) {
+      numbers[16 + i] = d.executed[i];
+      numbers[16 + EVOFSM_ACTIONS + i] = d.advised[i];
+    }
+    fwrite(numbers, sizeof numbers[0], sizeof numbers / sizeof numbers[0], stdout);
+  }
+  return (int)(sizeof state == 0);
+}
+"""
+
+
+# -- Systems --------------------------------------------------------------------------------------
+
+
+class Wall:
+    """The point of the README, pushed to a wall."""
+
+    actions: ClassVar[dict[str, Any]] = {"low": -1.0, "high": 1.0, "interval": 0.1}
+    noise = np.zeros(2)
+
+    def reset(self, seed: int) -> Floats:
+        self.chance, self.at, self.steps = np.random.default_rng(seed), np.zeros(2), 0
+        return self.seen()
+
+    def seen(self) -> Floats:
+        return self.at + self.noise * self.chance.normal(size=2)
+
+    def propose(self) -> Any:
+        return self.chance.uniform(-0.2, 1.0)
+
+    def step(self, action: Any) -> tuple[Floats, bool, bool]:
+        speed = 0.9 * self.at[1] + 0.02 * float(action) + 0.001 * self.chance.normal()
+        self.at, self.steps = np.array([self.at[0] + speed, speed]), self.steps + 1
+        failed = bool(self.at[0] >= 1.0)
+        return self.seen(), failed, failed or self.steps >= 60
+
+
+class NoisyWall(Wall):
+    """The same with a noisy sensor, so that there is an observer."""
+
+    noise = np.array([0.01, 0.004])
+
+
+class Disc(Wall):
+    """A point in the plane that is not to come into a disc: its action is a vector."""
+
+    actions: ClassVar[dict[str, Any]] = {"low": [-1.0, -1.0], "high": [1.0, 1.0], "interval": 0.1}
+
+    def reset(self, seed: int) -> Floats:
+        self.chance, self.steps = np.random.default_rng(seed), 0
+        corner = self.chance.choice([-1.0, 1.0], 2)
+        self.at = np.append(corner * self.chance.uniform(1.0, 2.6, 2), [0.0, 0.0])
+        self.to = self.chance.uniform(-2.6, 2.6, 2)
+        return self.at
+
+    def propose(self) -> Any:
+        if self.chance.random() < 0.05:
+            self.to = self.chance.uniform(-2.6, 2.6, 2)
+        wanted = self.to - self.at[:2] - 1.2 * self.at[2:] + 0.1 * self.chance.normal(size=2)
+        return np.clip(wanted, -1.0, 1.0)
+
+    def step(self, action: Any) -> tuple[Floats, bool, bool]:
+        speed = self.at[2:] + 0.1 * action + 0.004 * self.chance.normal(size=2)
+        self.at, self.steps = np.append(self.at[:2] + 0.1 * speed, speed), self.steps + 1
+        failed = bool(np.hypot(*self.at[:2]) < 0.8)
+        return self.at, failed, failed or self.steps >= 120
+
+
+class CartPole(Wall):
+    """Gymnasium's, under a random policy."""
+
+    actions: ClassVar[dict[str, Any]] = {"n_actions": 2, "interval": 0.02}
+
+    def __init__(self) -> None:
+        import gymnasium
+
+        self.env = gymnasium.make("CartPole-v1")
+
+    def reset(self, seed: int) -> Floats:
+        self.chance = np.random.default_rng(seed)
+        return np.asarray(self.env.reset(seed=seed)[0], np.float64)
+
+    def propose(self) -> Any:
+        return float(self.chance.integers(2))
+
+    def step(self, action: Any) -> tuple[Floats, bool, bool]:
+        seen, _, failed, over, _ = self.env.step(int(action))
+        return np.asarray(seen, np.float64), bool(failed), bool(failed or over)
+
+
+class Emergency(Wall):
+    """Cars of the family of the README; whoever drives accelerates."""
+
+    family = "emergency"
+
+    def __init__(self) -> None:
+        self.env = CarFollowing(self.family)
+
+    def reset(self, seed: int) -> Floats:
+        self.chance = np.random.default_rng(seed)
+        return np.asarray(self.env.reset(seed=seed)[0], np.float64)
+
+    def propose(self) -> Any:
+        return self.chance.uniform(-0.5, 2.5)
+
+    def step(self, action: Any) -> tuple[Floats, bool, bool]:
+        seen, _, failed, over, _ = self.env.step(action)
+        return np.asarray(seen, np.float64), bool(failed), bool(failed or over)
+
+
+class CutIn(Emergency):
+    """Another car cuts in: gap and leader's speed jump."""
+
+    family = "cut_in"
+
+
+class Learnt(NamedTuple):
+    """A system, and a guard that learnt of it and is frozen."""
+
+    system: Any
+    guard: Guard
+
+
+def learnt(name: str, episodes: int | None = None) -> Learnt:
+    """A guard that learnt so many episodes of a system by its name."""
+    kind, most = SYSTEMS[name]
+    system: Any = kind()
+    if isinstance(system, Emergency):
+        judge = "kinematic" if name == "cars" else "learnt"
+        guard = guard_for_family(system.env.family, judge=judge)
+    else:
+        guard = Guard(**system.actions)
+    for seed in range(most if episodes is None else episodes):
+        seen, failed, over = system.reset(seed), False, False
+        while not over:
+            seen, failed, over = system.step(guard.decide(seen, system.propose()).executed)
+        guard.end(failed, seen)
+    guard.freeze()
+    return Learnt(system, guard)
+
+
+SYSTEMS: dict[str, tuple[Any, int]] = {
+    "wall": (Wall, 10),
+    "noisy": (NoisyWall, 30),
+    "disc": (Disc, 30),
+    "cartpole": (CartPole, 25),
+    "emergency": (Emergency, 40),
+    "cut_in": (CutIn, 40),
+    "cars": (Emergency, 20),
+}
+
+
+# -- Asking both ----------------------------------------------------------------------------------
+
+
+def build(guard: Guard, folder: Path, *flags: str) -> Path:
+    """Export and compile a guard with a program that reads situations and writes decisions."""
+    write_c99(guard, folder)
+    (folder / "main.c").write_text(_MAIN)
+    program = folder / "decide"
+    sources = [str(folder / name) for name in ("evofsm.c", "main.c")]
+    subprocess.run(["cc", *FLAGS, *flags, "-o", str(program), *sources, "-lm"], check=True)
+    return program
+
+
+class Asked(NamedTuple):
+    """What was asked, and what Python decided; one row each."""
+
+    rows: Floats  #: whether an episode begins, time, observation, proposal
+    codes: Floats  #: what `evofsm_decide` is to return, the intake, and the state
+    numbers: Floats  #: as `NUMBERS`, but what is left
+    actions: Floats  #: executed, advised
+    said: list[tuple[str, str]]  #: reason, and what was said of what was not seen
+
+
+def ask(learnt: Learnt, decisions: int, seed: int = 1) -> Asked:
+    """Drive held-out episodes, in which senses and controllers fail now and then."""
+    found = list(_asked(learnt, decisions, np.random.default_rng(seed)))
+    rows, codes, numbers, actions, said = zip(*found, strict=True)
+    return Asked(np.array(rows), np.array(codes), np.array(numbers), np.array(actions), list(said))
+
+
+def _asked(learnt: Learnt, decisions: int, chance: np.random.Generator) -> Iterator[Any]:
+    system, guard = learnt
+    names = guard.reviser.risk.labels.names  # type: ignore[attr-defined]
+    nothing = np.atleast_1d(no_action(guard.actions))
+    low, high = (np.atleast_1d(end) for end in limits(guard.actions))
+    episode, over, time, spread = 0, True, 0.0, np.zeros(1)
+    for _ in range(decisions):
+        if begins := over:
+            episode, time = episode + 1, -guard.interval
+            seen, over = system.reset(1_000_000 + episode), False
+            guard.end()
+        spread = np.maximum(spread, np.abs(seen))
+        z, wanted = seen.copy(), np.atleast_1d(np.asarray(system.propose(), np.float64))
+        kind = chance.integers(40)
+        if kind == 0:
+            z[chance.random(len(z)) < 0.5] = math.nan
+        elif kind == 1:
+            z[chance.integers(len(z))] = chance.choice([math.inf, -math.inf, 1e31])
+        elif kind == 2:
+            z = chance.normal(size=len(z)) * spread
+        elif kind == 3:
+            wanted = wanted + chance.choice([math.nan, math.inf, -math.inf], len(wanted))
+        elif kind == 4:
+            wanted = chance.uniform(low - (high - low), high + (high - low))
+        time += guard.interval * (chance.choice([-1.0, 0.0, 3.0]) if kind == 5 else 1.0)
+        proposal: Any = wanted if isinstance(guard.actions, BoxActions) else float(wanted[0])
+        row = np.concatenate([[begins, time], z, wanted])
+        try:
+            situation = guard.recognise(z, time)
+        except ValueError as error:
+            code = 2.0 if "are missing" in str(error) else 1.0
+            none = np.full(len(NUMBERS) - 1, math.nan), np.concatenate([nothing, nothing])
+            yield row, (code, 0.0, 0.0), *none, ("", "")
+            continue
+        revision = guard.revise(situation, Proposal(proposal))
+        state = -1 if situation.state is None else situation.state
+        risks = revision.risk_proposed, revision.risk_executed, *revision.interval
+        done = [np.atleast_1d(each) for each in (revision.executed, revision.advised)]
+        unseen = unseen_text(situation, names) if situation.intake else ""
+        yield (
+            row,
+            (0.0, float(situation.intake), float(state)),
+            np.array([*risks, revision.evidence, revision.seen]),
+            np.concatenate(done),
+            (revision.reason, unseen),
+        )
+        seen, _, over = system.step(revision.executed)
+
+
+class Compared(NamedTuple):
+    """How C decided, compared with Python."""
+
+    decisions: int
+    refused: int  #: observations that both refused
+    changed: int  #: proposals that were not kept
+    others: int  #: decisions in which the code that is returned, the action or a code differs
+    said: int  #: and those of which the reason, in words, does
+    off: float  #: largest difference of a number
+    microseconds: Floats  #: that a decision took
+
+    @property
+    def agrees(self) -> bool:
+        """Whether both decide the same."""
+        return not (self.others or self.said) and self.off <= 1e-12
+
+
+def compare(guard: Guard, program: Path, asked: Asked) -> Compared:
+    """Ask a compiled program the same."""
+    told = subprocess.run([program], input=asked.rows.tobytes(), capture_output=True, check=True)
+    found = np.frombuffer(told.stdout).reshape(len(asked.rows), -1)
+    rc, seconds, numbers, codes = (
+        found[:, 0],
+        found[:, 1],
+        found[:, 2:9],
+        found[:, 9:16].astype(int),
+    )
+    actions, taken = found[:, 16:], asked.codes[:, 0] == 0.0
+    other = (rc != asked.codes[:, 0]) | (
+        taken & ((codes[:, 2] != asked.codes[:, 1]) | (codes[:, 4] != asked.codes[:, 2]))
+    )
+    off = np.hstack([numbers[:, :6] - asked.numbers, actions - asked.actions])
+    unknown = np.isnan(np.hstack([asked.numbers, asked.actions]))
+    other |= taken & (unknown != np.isnan(np.hstack([numbers[:, :6], actions]))).any(1)
+    off = np.abs(np.where(unknown, 0.0, off))[taken]
+    said = [
+        _said(guard, dict(zip(CODES, code, strict=True)), number, row, unseen, done) != reason
+        for code, number, row, (reason, unseen), done, is_taken in zip(
+            codes.tolist(), numbers, asked.rows, asked.said, actions, taken, strict=True
+        )
+        if is_taken
+    ]
+    return Compared(
+        len(rc),
+        int((~taken).sum()),
+        int((codes[taken, 0] != 0).sum()),
+        int(other.sum()),
+        sum(said),
+        float(off.max(initial=0.0)),
+        1e6 * seconds[taken],
+    )
+
+
+def _said(
+    guard: Guard, code: dict[str, int], number: Floats, row: Floats, unseen: str, done: Floats
+) -> str:
+    """The reason that Python would give for what C says in codes."""
+    reviser: Any = guard.reviser
+    wanted = row[len(row) - len(np.atleast_1d(no_action(guard.actions))) :]
+    proposal: Any = wanted if isinstance(guard.actions, BoxActions) else float(wanted[0])
+    remark = make_usable(Proposal(proposal), guard.actions, reviser.risk.fallback).remark
+    is_told = code["remark"] == bool(remark) + remark.startswith("no ")
+    is_kinematic = isinstance(reviser.risk, LatentRisk)
+    tell = _kinematic if is_kinematic else _learnt
+    reason = tell(guard, code, dict(zip(NUMBERS, number.tolist(), strict=True)))
+    is_other = done[0] != done[1] if is_kinematic else code["reason"] in (1, 2, 3)
+    if is_other and not reviser.acts:
+        reason = f"{reviser.passing or reviser.mode.value}: {reason}"
+    new = "never seen before" if code["is_new"] else ""
+    return "; ".join(filter(None, (remark if is_told else "?", unseen, new, reason)))
+
+
+def _learnt(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str:
+    reviser: Any = guard.reviser
+    judge, kind = reviser.risk, code["reason"]
+    if kind == 4:
+        return words.NOTHING_SEEN
+    remembered, backup = judge.remembered, judge._backup_text(code["backup"])
+    allowed = judge._allowed(reviser.tolerance, remembered)
+    if kind == 0:
+        return words.kept(backup, remembered, number["left"], allowed)
+    why = words.refused(
+        code["unsurvived"], remembered, judge.margin, judge.disturbance_scale, allowed
+    )
+    if kind == 1:
+        return f"{why}; {words.changed(backup, remembered, judge.margin, allowed)}"
+    return f"{why}; {words.lasting(backup, cut=kind == 2)}"
+
+
+def _kinematic(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str:
+    reviser: Any = guard.reviser
+    trial = reviser.risk.trial()
+    if code["reason"] == 0:
+        return "risk is within the tolerance"
+    if code["reason"] == 6:
+        return f"{trial.unknown}: {trial.doing}"
+    why = (
+        f"could not survive a leader braking harder than {number['left']:.1f} m/s² "
+        f"(risk {number['risk_proposed']:.1%})"
+    )
+    if trial is not None:
+        why += f"; {trial.unknown}, {f'so {trial.how}' if reviser.acts else trial.assumed}"
+    least = "the closest that can" if code["reason"] == 1 else "nothing can, the least risky"
+    return why if code["reason"] == 5 else f"{why}; {least}"
+
+
+def sizes(folder: Path, flags: Sequence[str]) -> str:
+    """Bytes of the state, of constants and code, and all frames of functions at once."""
+    command = ["cc", *FLAGS, *flags, "-fstack-usage", "-c", "evofsm.c"]
+    subprocess.run(command, cwd=folder, check=True)
+    frames = sum(int(line.split()[-2]) for line in (folder / "evofsm.su").read_text().splitlines())
+    text = subprocess.run(["size", "evofsm.o"], cwd=folder, capture_output=True, text=True).stdout
+    symbols = subprocess.run(["nm", "-S", "decide"], cwd=folder, capture_output=True, text=True)
+    (state,) = (line.split()[1] for line in symbols.stdout.splitlines() if line.endswith(" state"))
+    return f"state {int(state, 16):,}, constants and code {text.split()[6]}, stack {frames}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare, print counts and times, and fail where something differs."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--decisions", type=lambda text: int(float(text)), default=1_000_000)
+    parser.add_argument("--systems", default=",".join(SYSTEMS))
+    parser.add_argument("--flags", default="-O3")
+    given = parser.parse_args(arguments)
+    names, agree = given.systems.split(","), True
+    for name in names:
+        one = learnt(name)
+        with tempfile.TemporaryDirectory() as place:
+            folder, flags = Path(place), given.flags.split()
+            program = build(one.guard, folder, *flags)
+            begin = perf_counter()
+            asked = ask(one, given.decisions // len(names))
+            python = 1e6 * (perf_counter() - begin) / len(asked.rows)
+            found, size = compare(one.guard, program, asked), sizes(folder, flags)
+        half, most, all_of_them = np.quantile(found.microseconds, [0.5, 0.99, 1.0]).tolist()
+        print(
+            f"{name}: {found.decisions:,} decisions, {found.refused:,} refused, {found.changed:,} "
+            f"changed; {found.others} differ, {found.said} reasons, numbers by {found.off:.1e}\n"
+            f"  {given.flags}: {half:.1f} us, 99 % {most:.1f}, all {all_of_them:.1f} (Python, with "
+            f"what it decides on: mean {python:.0f}); bytes: {size}",
+            flush=True,
+        )
+        agree &= found.agrees
+    return not agree
+
+
+if __name__ == "__main__":
+    sys.exit(main())

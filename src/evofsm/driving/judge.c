@@ -1,0 +1,303 @@
+/* The kinematic judge for cars in C: judge.py, rehearsal.py and perception.py as a frozen guard asks
+   them, and of ActionReviser what decides by risks. An observation is gap [m], own speed and the
+   leader's [m/s]; an action an acceleration [m/s²]. */
+/* ==== state ==== */
+  double before, commanded;              /* the latest two commands [m/s²] */
+  double mean[3], spread[3][3];          /* where one most likely was, and how sure that is */
+  double here[3], around[3][3];          /* the same now */
+  int is_located, is_located_now;        /* whether that is known */
+  int revising, tries;
+  double options[EVOFSM_OPTIONS], risk[EVOFSM_OPTIONS], critical[EVOFSM_OPTIONS];
+/* ==== source ==== */
+/* -- Perception: estimate and _filtered ---------------------------------------------------------- */
+
+static int is_whole(const double three[3]) { return !isnan(three[0] + three[1] + three[2]); }
+
+/* What the latest command brings until the next decision, most likely [m/s²]. */
+static double expected(const evofsm_state *s) {
+  const double last = greater(s->before, -LIKELY), asked = greater(s->commanded, -LIKELY);
+  return LAG * last + (1.0 - LAG) * asked;
+}
+
+/* One step of the Kalman filter, from s->mean and s->spread. */
+static void filter(evofsm_state *s, const double now[3]) {
+  const double gap = s->mean[0], own = s->mean[1], leader = s->mean[2], dt = EVOFSM_INTERVAL;
+  const double reached = greater(own + expected(s) * dt, 0.0), half = 0.5 * dt;
+  const double vv = s->spread[1][1], vu = s->spread[1][2], uu = s->spread[2][2];
+  const double v = (DOUBT * dt) * (DOUBT * dt), u = (LEADER * dt) * (LEADER * dt);
+  double gv = s->spread[0][1], gu = s->spread[0][2], gg = s->spread[0][0], to_v, to_u;
+  double *at = s->here, row[3];
+  int i, j, k;
+  to_v = gv + (vu - vv) * dt;
+  to_u = gu + (uu - vu) * dt;
+  gg += 2.0 * (gu - gv) * dt + (uu - 2.0 * vu + vv) * dt * dt;
+  gg += half * half * (v + u) + UNEVEN * UNEVEN;
+  gv = to_v - half * v;
+  gu = to_u + half * u;
+  at[0] = gap + (leader - 0.5 * (own + reached)) * dt;
+  at[1] = reached;
+  at[2] = leader;
+  s->around[0][0] = gg;
+  s->around[0][1] = s->around[1][0] = gv;
+  s->around[0][2] = s->around[2][0] = gu;
+  s->around[1][1] = vv + v;
+  s->around[1][2] = s->around[2][1] = vu;
+  s->around[2][2] = uu + u;
+  for (i = 0; i < 3; i += 2) { /* it belongs to another leader */
+    const double off = now[i] - at[i], variance = s->around[i][i] + noise[i] * noise[i];
+    if (is_whole(now) && off * off > ANOTHER * ANOTHER * variance) {
+      for (j = 0; j < 3; j++) {
+        at[j] = now[j];
+        for (k = 0; k < 3; k++) {
+          s->around[j][k] = j == k ? noise[j] * noise[j] : 0.0;
+        }
+      }
+      return;
+    }
+  }
+  for (i = 0; i < 3; i++) {
+    if (!isnan(now[i])) {
+      double total, off;
+      for (j = 0; j < 3; j++) {
+        row[j] = s->around[i][j];
+      }
+      total = row[i] + noise[i] * noise[i];
+      off = (now[i] - at[i]) / total;
+      for (j = 0; j < 3; j++) {
+        const double gain = row[j] / total;
+        at[j] += row[j] * off;
+        for (k = 0; k < 3; k++) {
+          s->around[j][k] -= gain * row[k];
+        }
+      }
+    }
+  }
+  at[1] = greater(at[1], 0.0);
+  at[2] = greater(at[2], 0.0);
+}
+
+static void locate(evofsm_state *s, const double now[3]) {
+  int j, k;
+  if (s->is_located && !(EXACT && is_whole(now))) {
+    filter(s, now);
+  } else {
+    for (j = 0; j < 3; j++) {
+      s->here[j] = now[j];
+      for (k = 0; k < 3; k++) {
+        s->around[j][k] = j == k && !(EXACT && is_whole(now)) ? noise[j] * noise[j] : 0.0;
+      }
+    }
+  }
+  s->is_located_now = is_whole(s->here);
+}
+
+/* LatentRisk._cautious: closer by what is not sure about it. */
+static void be_cautious(const evofsm_state *s, double cautious[3]) {
+  double weights[3], variance = 0.0;
+  int i, j;
+  weights[0] = 1.0;
+  weights[1] = -s->here[1] / DECEL;
+  weights[2] = s->here[2] / DECEL;
+  for (i = 0; i < 3; i++) {
+    cautious[i] = s->here[i];
+    for (j = 0; j < 3; j++) {
+      variance += weights[i] * weights[j] * s->around[i][j];
+    }
+  }
+  cautious[0] -= CAUTION * sqrt(greater(variance, 0.0));
+}
+
+/* -- Rehearsal: survives and critical_decelerations ---------------------------------------------- */
+
+/* Distance covered in an interval; the speed is changed. No one drives backwards. */
+static double drive_on(double *speed, double acceleration) {
+  const double was = *speed, reached = was + acceleration * EVOFSM_INTERVAL;
+  *speed = reached >= 0.0 ? reached : 0.0;
+  return reached >= 0.0 ? 0.5 * (was + reached) * EVOFSM_INTERVAL : -0.5 * was * was / acceleration;
+}
+
+/* Whether no collision comes of an acceleration and full braking after it. At most STEPS steps: a
+   car of 150 m/s stands by then. Of what is faster nothing is believed. */
+static int survives(const double here[3], double acceleration, double before, double leader_decel) {
+  const double caution = -DECEL;
+  double gap = here[0] - CLEARANCE, speed = greater(here[1], 0.0), leader = greater(here[2], 0.0);
+  double asked = greater(acceleration, caution), last = greater(before, caution);
+  int t;
+  if (speed <= 0.0 && greater(asked, last) <= 0.0) {
+    return here[0] > 0.0;
+  }
+  for (t = 0; t < STEPS && gap > 0.0; t++) {
+    const double realised = LAG * last + (1.0 - LAG) * asked;
+    double driven, driven_by_leader;
+    if (speed <= 0.0 && realised <= 0.0 && asked == caution) {
+      return 1;
+    }
+    driven = drive_on(&speed, realised);
+    driven_by_leader = drive_on(&leader, -leader_decel);
+    gap += driven_by_leader - driven;
+    if (asked == caution && last == caution) { /* both brake until they stand */
+      if (leader_decel > DECEL) {
+        const double rest = 0.5 * leader * leader / leader_decel;
+        const double left = gap + rest - 0.5 * speed * speed / DECEL;
+        return lesser(gap, left) > 0.0;
+      }
+      if (speed <= leader) {
+        return gap > 0.0;
+      }
+    }
+    last = asked;
+    asked = caution;
+  }
+  return 0;
+}
+
+/* The hardest braking of the leader that is survived [m/s²]. */
+static double critical_of(const double here[3], double acceleration, double before) {
+  double low = 0.0, high = HARDEST;
+  int i;
+  if (survives(here, acceleration, before, high)) {
+    return HARDEST;
+  }
+  if (!survives(here, acceleration, before, low)) {
+    return 0.0;
+  }
+  for (i = 0; i < HALVINGS; i++) {
+    const double between = 0.5 * (low + high);
+    if (survives(here, acceleration, before, between)) {
+      low = between;
+    } else {
+      high = between;
+    }
+  }
+  return low;
+}
+
+/* _interpolated: how likely a leader brakes harder, by the table. At most TABLE halvings. */
+static double harder_than(double x) {
+  int low = 0, high = TABLE - 1;
+  if (x <= harder[0][low]) {
+    return harder[1][low];
+  }
+  if (x >= harder[0][high]) {
+    return harder[1][high];
+  }
+  while (high - low > 1) {
+    const int between = (low + high) / 2;
+    if (harder[0][between] <= x) {
+      low = between;
+    } else {
+      high = between;
+    }
+  }
+  return (harder[1][high] - harder[1][low]) / (harder[0][high] - harder[0][low]) *
+             (x - harder[0][low]) + harder[1][low];
+}
+
+/* wilson_bounds */
+static void bounds(double share, double *low, double *high) {
+  const double spread = 1.645 * 1.645 / (EVIDENCE + 1.0);
+  const double centre = (share + 0.5 * spread) / (1.0 + spread);
+  const double reach = sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread);
+  *low = greater(centre - reach, 0.0);
+  *high = lesser(centre + reach, 1.0);
+}
+
+/* -- The reviser: ActionReviser._decide ---------------------------------------------------------- */
+
+/* Of options whose risk is tolerated the closest to an action, of equals the first; -1: none is. */
+static int closest(const evofsm_state *s, double action, double tolerated) {
+  int i, best = -1;
+  for (i = 0; i < EVOFSM_OPTIONS; i++) {
+    const double off = fabs(s->options[i] - action);
+    if (s->risk[i] <= tolerated && (best < 0 || off < fabs(s->options[best] - action))) {
+      best = i;
+    }
+  }
+  return best;
+}
+
+static int decide_by_risk(evofsm_state *s, int *reason) {
+  const double limit = TOLERANCE * (s->revising ? RELEASE : 1.0);
+  int i, least = 0, best;
+  *reason = EVOFSM_TRIED;
+  if (s->tries > 0 && !KNOWN) {
+    s->tries--;
+    *reason = EVOFSM_TRYING;
+    return closest(s, LOWEST, INFINITY);
+  }
+  if (s->risk[0] <= limit) {
+    s->revising = 0;
+    *reason = EVOFSM_KEPT;
+    return 0;
+  }
+  s->revising = 1;
+  if (!KNOWN && ACTS) {
+    s->tries = TRIAL;
+    return closest(s, LOWEST, INFINITY);
+  }
+  *reason = EVOFSM_CHANGED;
+  best = closest(s, s->options[0], limit);
+  best = best < 0 ? closest(s, s->options[0], TOLERANCE) : best;
+  if (best >= 0) {
+    return best;
+  }
+  for (i = 1; i < EVOFSM_OPTIONS; i++) {
+    const int is_lower = s->risk[i] == s->risk[least] && s->options[i] < s->options[least];
+    least = s->risk[i] < s->risk[least] || is_lower ? i : least;
+  }
+  *reason = EVOFSM_NOTHING_PASSES;
+  return least;
+}
+
+static void forget(evofsm_state *s) {
+  s->before = s->commanded = 0.0;
+  s->is_located = 0;
+}
+
+static void start_revising(evofsm_state *s) { s->revising = s->tries = 0; }
+
+/* What to execute of s->proposal, into s->best, and how risky that is. */
+static void revise(evofsm_state *s, evofsm_decision *out) {
+  const int stands = !ACTS && s->observation[1] < STANDS;
+  double here[3], stay;
+  int i, best;
+  locate(s, s->observation);
+  be_cautious(s, here);
+  s->tries = ACTS ? s->tries : 0;
+  for (i = 0; i < EVOFSM_OPTIONS; i++) {
+    s->options[i] = lesser(greater(s->proposal[0], option_low[i]), option_high[i]);
+  }
+  stay = lesser(s->options[0], 0.0);
+  for (i = 0; i < EVOFSM_OPTIONS; i++) {
+    s->options[i] = stands ? greater(s->options[i], stay) : s->options[i];
+    s->critical[i] = is_whole(here) ? critical_of(here, s->options[i], s->commanded) : 0.0;
+    s->risk[i] = is_whole(here) ? harder_than(s->critical[i]) : 1.0;
+  }
+  best = decide_by_risk(s, &out->reason);
+  s->best[0] = s->options[best];
+  out->evidence = EVIDENCE;
+  out->risk_proposed = s->risk[0];
+  best = ACTS ? best : 0;
+  out->risk_executed = s->risk[best];
+  out->left = s->critical[0];
+  out->risk_low = 0.0;
+  out->risk_high = 1.0;
+  if (is_whole(here)) {
+    bounds(s->risk[best], &out->risk_low, &out->risk_high);
+  }
+}
+
+static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
+  int j, k;
+  if (s->is_located_now) {
+    s->is_located = 1;
+    for (j = 0; j < 3; j++) {
+      s->mean[j] = s->here[j];
+      for (k = 0; k < 3; k++) {
+        s->spread[j][k] = s->around[j][k];
+      }
+    }
+  }
+  s->before = s->commanded;
+  s->commanded = executed[0];
+}

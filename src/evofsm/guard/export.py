@@ -1,0 +1,215 @@
+"""A frozen guard in C99: no heap, no recursion, every loop bounded; it decides as it does here.
+
+The C stands beside the Python that it mirrors: ``guard.c`` is the loop, ``learnt/replay.c`` and
+``driving/judge.c`` are judges. What was learnt comes before it, as constants.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evofsm import __version__, store
+from evofsm.fsm.rules import weights_of
+from evofsm.guard import guard as looping
+from evofsm.guard import reviser as revising
+from evofsm.guard.actions import Choices, limits, put_into
+from evofsm.guard.guard import Guard
+from evofsm.guard.learnt import replay
+from evofsm.guard.learnt.judge import LearntRisk
+from evofsm.guard.reviser import ActionReviser, Mode
+
+# Replays of disturbances lie side by side by so many; NumPy sums so many numbers as the C does.
+_LANES, _MOST_DISTURBANCES = 4, 128
+_BANNER = f"/* Exported by evofsm {__version__}, no certified safety function.\n   "
+# Bytes of the stack, but for what numbers of actions and lanes add; a test holds it to compilers.
+_STACK = 2048
+# In place of 1 / width of recognition where that would overflow.
+_SHARPEST = 1e300
+
+
+class Part(NamedTuple):
+    """A judge in C."""
+
+    template: Path
+    variables: int  #: that an observation has
+    sizes: Mapping[str, int]  #: of its state, for the header
+    constants: Mapping[str, Any]  #: numbers and arrays; an empty array is left out
+    about: str  #: for people, in the header
+
+
+def write_c99(guard: Guard, folder: Path) -> None:
+    """Write ``evofsm.h``, ``evofsm.c``, and ``evofsm.hpp``, a class around them for C++17.
+
+    A ValueError if its reviser or judge is of someone's own class, it judges nothing (mode off), or
+    nothing was learnt yet by which it could decide.
+    """
+    frozen = guard.copy()
+    frozen.freeze()
+    reviser, asked = frozen.reviser, type(getattr(frozen.reviser, "risk", None))
+    if type(reviser) is not ActionReviser or reviser.mode is Mode.OFF:
+        raise ValueError(
+            "only a guard with an ActionReviser whose mode is not off is exported, not one of "
+            f"{type(reviser).__name__}{' in mode off' * hasattr(reviser, 'mode')}"
+        )
+    if asked is not LearntRisk and "in_c99" not in vars(asked):
+        raise ValueError(f"a LearntRisk or a LatentRisk is exported, but no {asked.__name__}")
+    frozen.begin()
+    part: Part = _learnt(reviser) if asked is LearntRisk else reviser.risk.in_c99(reviser)  # type: ignore[attr-defined]
+    common, judge = _sections(Path(__file__).with_name("guard.c")), _sections(part.template)
+    sizes, constants = _common(frozen, reviser, part.variables)
+    sizes = {f"EVOFSM_{name}": value for name, value in {**sizes, **part.sizes}.items()}
+    sizes["EVOFSM_STACK"] = (
+        _STACK + 64 * part.sizes.get("NUMBERS", 0) + 32 * part.sizes.get("LANES", 0)
+    )
+    header = common["evofsm.h"].replace("  EVOFSM_JUDGE\n", judge["state"])
+    named = ", ".join(reviser.risk.labels.names) or "variables in their order"
+    about = f"{frozen}\nan observation: {named}\n{part.about}".replace("*/", "* /").replace(
+        "\n", "\n   "
+    )
+    texts = {
+        "evofsm.h": f"{_BANNER}{about} */\n#ifndef EVOFSM_H\n#define EVOFSM_H\n\n"
+        f"{_written(sizes)}\n{header}\n#endif\n",
+        "evofsm.hpp": common["evofsm.hpp"],
+        "evofsm.c": '#include "evofsm.h"\n\n#include <math.h>\n#include <stddef.h>\n\n'
+        f"{_written({**constants, **part.constants})}\n"
+        f"{common['helpers']}{judge['source']}\n{common['loop']}",
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        with store.replacing(folder / name) as place:
+            place.write(text.encode())
+
+
+def _sections(template: Path) -> dict[str, str]:
+    """The parts of a template by their names."""
+    _, *parts = re.split(r"^/\* ==== (\S+) ==== \*/\n", template.read_text("utf-8"), flags=re.M)
+    return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
+def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Sizes and constants of the loop: states, input, actions."""
+    actions, model = guard.actions, guard._frozen
+    low, high = (np.atleast_1d(end) for end in limits(actions))
+    sizes = {
+        "VARIABLES": m,
+        "ACTIONS": len(low),
+        "CHOICES": actions.n_actions if isinstance(actions, Choices) else 0,
+        "STATES": 0 if model is None else model.n_states,
+        "INTERVAL": guard.interval,
+    }
+    constants: dict[str, Any] = {
+        "ACTS": reviser.acts,
+        "LACKING": int(looping._LACKING.get(guard.missing, 0)),
+        "LONGEST_GAP": looping._GAP * guard.interval,
+        "NEW": revising._NEW,
+        "TOLERANCE": reviser.tolerance,
+        "RELEASE": revising._RELEASE,
+        "TRIAL": revising._TRIAL,
+        "action_low": low,
+        "action_high": high,
+        "fallback": np.atleast_1d(put_into(actions, reviser.fallback.action)),
+    }
+    if model is not None and model.n_states:
+        sharp = model.width * _SHARPEST > 1.0
+        constants |= {
+            "SHARPNESS": 1.0 / model.width if sharp else _SHARPEST,
+            "centers": model.centers.T,
+            "centre_weights": weights_of(model.rule, m),
+            "time_seen": model.visits * guard.interval,
+        }
+    return sizes, constants
+
+
+def _learnt(reviser: ActionReviser) -> Part:
+    """What a learnt judge decides by."""
+    risk: Any = reviser.risk
+    dynamics, disturbances, backups = risk.dynamics, risk.disturbances, risk.backups
+    dynamics.failed = None  # what it said stands in the thresholds
+    if disturbances is None or backups is None or not dynamics.fails:
+        raise ValueError(f"there is nothing to export yet: {risk.told_by_experience}")
+    model = dynamics.model
+    (steps, m, count), (p, _), a = disturbances.residuals.shape, model.weights.shape, dynamics.size
+    if count > _MOST_DISTURBANCES:
+        raise ValueError(f"at most {_MOST_DISTURBANCES} disturbances are exported, not {count}")
+    lanes = -(-count // _LANES) * _LANES
+    residuals = np.pad(disturbances.residuals, [(0, 0), (0, 0), (0, lanes - count)])
+    remembered, soon = risk.remembered, risk._soon(risk.remembered.seconds)
+    (few, most), jumps = risk.effort, bool((disturbances.jump_at >= 0.0).any())
+    names = [f"{q}: {risk._backup_text(q)}" for q in range(len(backups.policies))]
+    placed = bool((disturbances.place[:, 0] >= 0.0).any())
+    constants: dict[str, Any] = {
+        "DISTURBANCES": count,
+        "STEPS": steps,
+        "CROSSED": replay.crossed(m, a),
+        "PAIRED": m if len(replay.pairs(m)[0]) else 0,
+        "THRESHOLDS": len(model.thresholds),
+        "REGIONS": len(model.regions),
+        "JUMPS": jumps,
+        "NOISY": dynamics.is_noisy,
+        "SCALE": risk.disturbance_scale,
+        "MARGIN": risk.margin,
+        "ALLOWED": risk._allowed(reviser.tolerance, remembered),
+        "ASKED": min(few, len(names)),
+        "JUDGED": 1 if most < 2 * few * risk.horizon else min(few, len(names)),
+        "MOST_DONE": math.ceil(most),
+        "EVIDENCE": float(remembered.number),
+        **{name.strip("_"): getattr(replay, name) for name in _OF_REPLAYS},
+        **{name: getattr(model, name) for name in _OF_MODEL},
+        **{name: getattr(disturbances, name) for name in _OF_JUMPS if jumps},
+        "place": disturbances.place if placed else (),
+        "residuals": residuals,
+        "policies": backups.policies,
+        "backup_ranks": backups.ranks,
+        "risks": [risk._risk(one, soon) for one in (math.inf, *range(count))],
+        "middle": dynamics._middle,
+        "half": dynamics._half,
+        "gains": dynamics.gains[: None if dynamics.is_noisy else 0],
+        "jump_of": replay.JUMP * dynamics.sums.unit[: None if dynamics.is_noisy else 0],
+    }
+    about = (
+        f"backups: {'; '.join(names)}\n"
+        f"a decision: at most {2 * constants['ASKED'] + max(few, replay._HALVINGS) + 2 * few} "
+        f"replays of {steps} steps, each of {p} x {m} products in {lanes} lanes\n"
+    )
+    sizes = {"NUMBERS": a, "FEATURES": p, "LANES": lanes, "BACKUPS": len(names), "PLACED": placed}
+    return Part(Path(replay.__file__).with_suffix(".c"), m, sizes, constants, about)
+
+
+# Constants of replays, and arrays of a model, that C has, too.
+_OF_REPLAYS = (
+    *("_FARTHER", "_RESERVE", "_DISTANCE", "_FAR", "_HALVINGS", "_EQUAL", "FLAT", "GROWN"),
+)
+_OF_JUMPS = ("jump_at", "jump_to", "jump_slope", "jump_from", "landing")
+_OF_MODEL = (
+    *("weights", "origin", "reach", "lowest", "highest", "least", "most", "thresholds", "regions"),
+    *("drifted", "mean", "inverse"),
+)
+
+
+def _written(constants: Mapping[str, Any]) -> str:
+    """Numbers as macros, arrays as constants."""
+    numbers, arrays = "", ""
+    for name, value in constants.items():
+        if np.ndim(value) == 0:
+            numbers += f"#define {name} {_number(value)}\n"
+        elif np.size(value):
+            kind = "int" if np.asarray(value).dtype.kind == "i" else "double"
+            sides = "".join(f"[{size}]" for size in np.shape(value))
+            arrays += f"\nstatic const {kind} {name}{sides} = {_number(value)};\n"
+    return numbers + arrays
+
+
+def _number(value: Any) -> str:
+    """The shortest text that is this very number; of an array in braces."""
+    if np.ndim(value):
+        return "{" + (", " if np.ndim(value) == 1 else ",\n ").join(map(_number, value)) + "}"
+    if isinstance(value, bool | int | np.integer):
+        return str(int(value))
+    named = {math.inf: "INFINITY", -math.inf: "(-INFINITY)"}
+    return named.get(float(value), f"({float(value)!r})" if value < 0.0 else repr(float(value)))

@@ -1,0 +1,628 @@
+/* The learnt judge: replay.py, and of judge.py what a frozen guard asks of it, in C.
+
+   Replays of all disturbances lie side by side: loops over them (l) have EVOFSM_LANES turns. Sums
+   are in the order of Python, so that a compiler that contracts nothing comes to the same bits. */
+/* ==== state ==== */
+  /* Observation, its change, and the action before: of the decision before, and now. */
+  double at[2 * EVOFSM_VARIABLES + EVOFSM_NUMBERS], here[2 * EVOFSM_VARIABLES + EVOFSM_NUMBERS];
+  double action[EVOFSM_NUMBERS]; /* what was done there */
+  int has_past, is_placed;       /* whether there is such a decision; and whether one is now */
+  int ranks[EVOFSM_BACKUPS];     /* backups, those first that passed last */
+  int done;                      /* steps of replays in this search */
+  /* Room of a replay. */
+  double z[EVOFSM_VARIABLES][EVOFSM_LANES], change[EVOFSM_VARIABLES][EVOFSM_LANES];
+  double move[EVOFSM_VARIABLES][EVOFSM_LANES], after[EVOFSM_VARIABLES][EVOFSM_LANES];
+  double before[EVOFSM_NUMBERS][EVOFSM_LANES], now[EVOFSM_NUMBERS][EVOFSM_LANES];
+  double found[EVOFSM_FEATURES][EVOFSM_LANES];
+  double near[EVOFSM_LANES], far[EVOFSM_LANES], value[EVOFSM_LANES], worth[EVOFSM_LANES];
+  int survived[EVOFSM_LANES];
+#if EVOFSM_PLACED
+  double rest[EVOFSM_VARIABLES][EVOFSM_LANES];
+  int clock[EVOFSM_LANES];
+#endif
+  int playing[EVOFSM_LANES]; /* the step of each disturbance; -1: it waits */
+/* ==== source ==== */
+#define M EVOFSM_VARIABLES
+#define A EVOFSM_NUMBERS
+#define P EVOFSM_FEATURES
+#define L EVOFSM_LANES
+#define K DISTURBANCES
+
+/* -- Actions: encode and decode of dynamics.py ------------------------------------------------- */
+
+static void encode(const double action[EVOFSM_ACTIONS], double inner[A]) {
+  int i;
+  for (i = 0; i < A; i++) {
+#if EVOFSM_CHOICES > 0
+    inner[i] = action[0] == (double)i ? 1.0 : 0.0;
+#else
+    inner[i] = (action[i] - middle[i]) / half[i];
+#endif
+  }
+}
+
+static void decode(const double inner[A], double action[EVOFSM_ACTIONS]) {
+  int i;
+#if EVOFSM_CHOICES > 0
+  int best = 0;
+  for (i = 1; i < A; i++) {
+    best = inner[i] > inner[best] ? i : best;
+  }
+  action[0] = best;
+#else
+  for (i = 0; i < A; i++) {
+    action[i] = lesser(greater(middle[i] + half[i] * inner[i], action_low[i]), action_high[i]);
+  }
+#endif
+}
+
+/* -- A replay ----------------------------------------------------------------------------------- */
+
+/* fill_features: those of situations and actions side by side, into s->found. */
+static void fill_features(evofsm_state *s, double harder) {
+  static const double knots[3] = {-0.5, 0.0, 0.5};
+  int i, j, k, l;
+  for (l = 0; l < L; l++) {
+    s->found[0][l] = 1.0;
+  }
+  for (j = 0; j < M; j++) {
+    const double most = harder * reach[j];
+    for (l = 0; l < L; l++) {
+      s->found[1 + j][l] = s->z[j][l] - origin[j];
+      s->found[1 + M + j][l] = fabs(s->change[j][l]) <= most ? s->change[j][l] : 0.0;
+    }
+  }
+  k = 1 + 2 * M;
+  for (i = 0; i < A; i++) {
+    for (l = 0; l < L; l++) {
+      s->found[k + i][l] = s->now[i][l];
+      s->found[k + A + i][l] = s->before[i][l];
+    }
+  }
+  k += 2 * A;
+  for (i = 0; i < (EVOFSM_CHOICES > 0 ? 0 : A); i++) {
+    for (j = 0; j < 3; j++) {
+      for (l = 0; l < L; l++) {
+        s->found[k][l] = fabs(s->now[i][l] - knots[j]);
+      }
+      k++;
+    }
+  }
+  for (i = 0; i < CROSSED; i++) {
+    for (j = 0; j < M; j++) {
+      for (l = 0; l < L; l++) {
+        s->found[k][l] = s->now[i][l] * s->found[1 + j][l];
+      }
+      k++;
+    }
+  }
+  for (i = 0; i < PAIRED; i++) {
+    for (j = i; j < M; j++) {
+      for (l = 0; l < L; l++) {
+        s->found[k][l] = s->found[1 + i][l] * s->found[1 + j][l];
+      }
+      k++;
+    }
+  }
+}
+
+/* expect: the changes that are expected of features, into s->move. The sums stay in registers. */
+static void expect(evofsm_state *s) {
+  int j, k, l;
+  for (j = 0; j < M; j++) {
+    double sums[L];
+    for (l = 0; l < L; l++) {
+      sums[l] = 0.0;
+    }
+    for (k = 0; k < P; k++) {
+      for (l = 0; l < L; l++) {
+        sums[l] += s->found[k][l] * weights[k][j];
+      }
+    }
+    for (l = 0; l < L; l++) {
+      s->move[j][l] = sums[l];
+    }
+  }
+}
+
+/* _follow_policy: actions of a linear policy, saturated at end, or the largest of few. */
+static void follow_policy(evofsm_state *s, const double policy[A][1 + M], double end) {
+  int i, j, l;
+  for (i = 0; i < A; i++) {
+    double *now = s->now[i];
+    for (l = 0; l < L; l++) {
+      now[l] = policy[i][0];
+    }
+    for (j = 0; j < M; j++) {
+      const double slope = policy[i][1 + j], middle_of = mean[j], over = inverse[j];
+      for (l = 0; l < L; l++) {
+        now[l] += slope * (s->z[j][l] - middle_of) * over;
+      }
+    }
+    if (EVOFSM_CHOICES == 0) {
+      for (l = 0; l < L; l++) {
+        now[l] = lesser(end, greater(-end, now[l]));
+      }
+    }
+  }
+  if (EVOFSM_CHOICES > 0) {
+    for (l = 0; l < L; l++) {
+      int best = 0;
+      for (i = 1; i < A; i++) {
+        best = s->now[i][l] > s->now[best][l] ? i : best;
+      }
+      for (i = 0; i < A; i++) {
+        s->now[i][l] = i == best ? 1.0 : 0.0;
+      }
+    }
+  }
+}
+
+/* _distances: to the nearest failure, into s->far. */
+static void measure(evofsm_state *s) {
+  int f, l;
+  for (l = 0; l < L; l++) {
+    s->far[l] = INFINITY;
+  }
+#if THRESHOLDS > 0
+  for (f = 0; f < THRESHOLDS; f++) {
+    const double sign = thresholds[f][1], threshold = thresholds[f][2], worth = thresholds[f][3];
+    const double *z = s->z[(int)thresholds[f][0]];
+    for (l = 0; l < L; l++) {
+      const double left = sign * (threshold - z[l]) * worth;
+      s->far[l] = left < s->far[l] ? left : s->far[l];
+    }
+  }
+#endif
+#if REGIONS > 0
+  for (f = 0; f < REGIONS; f++) {
+    const double *one = s->z[(int)regions[f][0]], *other = s->z[(int)regions[f][1]];
+    const double c = regions[f][6], b = regions[f][7], d = regions[f][8];
+    const double p = regions[f][9], q = regions[f][10], r = regions[f][11];
+    for (l = 0; l < L; l++) {
+      const double x = (one[l] - regions[f][2]) * regions[f][4];
+      const double y = (other[l] - regions[f][3]) * regions[f][5];
+      const double form = c + x * (b + p * x + q * y) + y * (d + r * y);
+      const double u = b + 2.0 * p * x + q * y, v = d + 2.0 * r * y + q * x;
+      const double left = -form / sqrt(u * u + v * v + FLAT) - GROWN;
+      s->far[l] = left < s->far[l] ? left : s->far[l];
+    }
+  }
+#endif
+}
+
+#if EVOFSM_PLACED
+/* _wait: disturbances that begin only somewhere; and what is not expected now, into s->rest. */
+static void wait(evofsm_state *s) {
+  int j, l;
+  for (l = 0; l < K; l++) {
+    if (place[l][0] >= 0.0) {
+      const int i = (int)place[l][0], begins = (int)place[l][3], over = (int)place[l][4];
+      const int there = place[l][1] * (s->z[i][l] + s->move[i][l] - place[l][2]) >= 0.0;
+      int plays;
+      if (s->clock[l] >= over && there) {
+        s->clock[l] = begins;
+      }
+      plays = s->clock[l] < over && (s->clock[l] != begins || there);
+      s->playing[l] = plays ? s->clock[l] : -1;
+      s->clock[l] += plays;
+    }
+  }
+  for (j = 0; j < M; j++) {
+    for (l = 0; l < L; l++) {
+      s->rest[j][l] = s->playing[l] >= 0 ? residuals[s->playing[l]][j][l] : 0.0;
+    }
+  }
+}
+#endif
+
+#if JUMPS
+/* Where variables that jump now land, into s->after. */
+static void jump(evofsm_state *s) {
+  int i, j, l;
+  for (l = 0; l < K; l++) {
+    for (j = 0; j < M; j++) {
+      if (jump_at[l][j] >= 0.0 && jump_at[l][j] == (double)s->playing[l]) {
+        double y = jump_to[l][j];
+        for (i = 0; i < M; i++) {
+          const double low = jump_from[l][j][i][0], high = jump_from[l][j][i][1];
+          y += jump_slope[l][j][i] * lesser(greater(s->z[i][l], low), high);
+        }
+        s->after[j][l] = lesser(greater(y, landing[l][j][0]), landing[l][j][1]);
+      }
+    }
+  }
+}
+#endif
+
+/* A step of a replay: what is expected, what disturbs it, and where that leads. */
+static void step(evofsm_state *s, int t, double harder) {
+  int i, j, l;
+  fill_features(s, harder);
+  expect(s);
+  for (l = 0; l < L; l++) {
+    s->playing[l] = t;
+  }
+#if EVOFSM_PLACED
+  wait(s);
+#endif
+  for (j = 0; j < M; j++) {
+    const double low = least[j], high = most[j], small = harder * low, large = harder * high;
+    const double *z = s->z[j];
+    double *move = s->move[j], *after = s->after[j];
+#if EVOFSM_PLACED
+    const double *rest = s->rest[j];
+#else
+    const double *rest = residuals[t][j];
+#endif
+    if (drifted[j] > 0.0) {
+      for (l = 0; l < L; l++) {
+        move[l] = lesser(greater(move[l], low), high);
+      }
+    }
+    if (drifted[j] < 0.0) {
+      for (l = 0; l < L; l++) {
+        const double down = lesser(small, greater(move[l], FARTHER * low));
+        const double up = greater(large, lesser(move[l], FARTHER * high));
+        const double y = move[l] + harder * rest[l];
+        after[l] = z[l] + lesser(greater(y, down), up);
+      }
+    } else {
+      for (l = 0; l < L; l++) {
+        const double y = move[l] + harder * rest[l];
+        after[l] = z[l] + lesser(greater(y, small), large);
+      }
+    }
+  }
+#if JUMPS
+  jump(s);
+#endif
+  for (j = 0; j < M; j++) {
+    for (l = 0; l < L; l++) {
+      const double y = lesser(greater(s->after[j][l], lowest[j]), highest[j]);
+      s->change[j][l] = y - s->z[j][l];
+      s->z[j][l] = y;
+    }
+  }
+  for (i = 0; i < A; i++) {
+    for (l = 0; l < L; l++) {
+      s->before[i][l] = s->now[i][l];
+    }
+  }
+}
+
+/* _replay, of one situation: an action first, if there is one, then a policy. Returns how many
+   disturbances are not survived; into left the least distance of the others. At most STEPS steps. */
+static int replay(evofsm_state *s, const double *action, const double policy[A][1 + M],
+                  double harder, double enough, int allowed, double *left) {
+  const double end = 1.0 - RESERVE * enough;
+  int i, j, l, t, lost = 0;
+  for (l = 0; l < L; l++) {
+    for (j = 0; j < M; j++) {
+      s->z[j][l] = s->here[j];
+      s->change[j][l] = s->here[M + j];
+    }
+    for (i = 0; i < A; i++) {
+      s->before[i][l] = s->here[2 * M + i];
+    }
+    s->near[l] = INFINITY;
+    s->survived[l] = l < K ? STEPS : -1;
+#if EVOFSM_PLACED
+    s->clock[l] = 0;
+#endif
+  }
+  for (t = 0; t < STEPS; t++) {
+    int fails = 0;
+    s->done++;
+    if (t == 0 && action != NULL) {
+      for (i = 0; i < A; i++) {
+        for (l = 0; l < L; l++) {
+          s->now[i][l] = action[i];
+        }
+      }
+    } else {
+      follow_policy(s, policy, end);
+    }
+    step(s, t, harder);
+    measure(s);
+    for (l = 0; l < L; l++) {
+      const double nearer = s->far[l] < s->near[l] ? s->far[l] : s->near[l];
+      s->near[l] = s->survived[l] == STEPS ? nearer : s->near[l];
+      fails += (s->survived[l] == STEPS) & (s->near[l] < enough);
+    }
+    if (fails == 0) {
+      continue;
+    }
+    for (l = 0; l < K; l++) {
+      if (s->survived[l] == STEPS && s->near[l] < enough) {
+        s->survived[l] = t;
+        lost++;
+        if (allowed < K && l == 0) {
+          lost = K;
+        }
+      }
+    }
+    if (lost >= K || lost > allowed) {
+      break;
+    }
+  }
+  *left = INFINITY;
+  for (l = 0; l < K; l++) {
+    const double share = (double)s->survived[l] / (double)STEPS;
+    double distance = s->near[l];
+    if (s->near[l] >= enough) {
+      *left = lesser(*left, s->near[l]);
+    }
+    s->value[l] = s->near[l];
+    if (s->survived[l] == STEPS) {
+      distance = 0.5 * (s->near[l] + s->far[l]);
+    } else {
+      s->value[l] = (double)(s->survived[l] - STEPS) - 1.0;
+    }
+    s->worth[l] = share + DISTANCE * lesser(1.0, greater(-1.0, FAR * distance));
+  }
+  return lost;
+}
+
+/* -- What decides: search ----------------------------------------------------------------------- */
+
+/* Whether a backup survives after an action, by the margin. */
+static int passes(evofsm_state *s, const double action[A], int backup, double *left) {
+  const int lost = replay(s, action, policies[backup], SCALE, MARGIN, ALLOWED, left);
+  return lost <= ALLOWED && *left >= MARGIN;
+}
+
+/* _action_of: what a backup does here. */
+static void action_of(const evofsm_state *s, int backup, double action[A]) {
+  int i, j;
+  for (i = 0; i < A; i++) {
+    action[i] = policies[backup][i][0];
+    for (j = 0; j < M; j++) {
+      action[i] += policies[backup][i][1 + j] * (s->here[j] - mean[j]) * inverse[j];
+    }
+    if (EVOFSM_CHOICES == 0) {
+      action[i] = lesser(greater(action[i], -1.0), 1.0);
+    }
+  }
+  if (EVOFSM_CHOICES > 0) {
+    int best = 0;
+    for (i = 1; i < A; i++) {
+      best = action[i] > action[best] ? i : best;
+    }
+    for (i = 0; i < A; i++) {
+      action[i] = i == best ? 1.0 : 0.0;
+    }
+  }
+}
+
+static int are_same(const double one[A], const double other[A]) {
+  int i, same = 1;
+  for (i = 0; i < A; i++) {
+    same &= one[i] == other[i];
+  }
+  return same;
+}
+
+/* Mean of how well a replay ended, summed as NumPy sums up to 128 numbers. */
+static double mean_worth(const evofsm_state *s) {
+  double sums[8], total = 0.0;
+  int k = 0, l;
+  if (K >= 8) {
+    for (l = 0; l < 8; l++) {
+      sums[l] = s->worth[l];
+    }
+    for (k = 8; k + 7 < K; k += 8) {
+      for (l = 0; l < 8; l++) {
+        sums[l] += s->worth[k + l];
+      }
+    }
+    total = ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]));
+  }
+  for (; k < K; k++) {
+    total += s->worth[k];
+  }
+  return total / (double)K;
+}
+
+/* From the proposal (inner) to the action: at most 2 ASKED + HALVINGS replays, or 3 ASKED. */
+static int search(evofsm_state *s, const double proposal[A], double action[A], int *backup,
+                  double *left) {
+  double own[A], closer[A], refused = 0.0, share = 1.0, longest = -INFINITY, distance;
+  int i, r, step_of;
+  s->done = 0;
+  for (i = 0; i < A; i++) {
+    action[i] = proposal[i];
+  }
+  for (r = 0; r < ASKED && s->done < MOST_DONE; r++) {
+    *backup = s->ranks[r];
+    if (passes(s, proposal, *backup, left)) {
+      return EVOFSM_KEPT;
+    }
+  }
+  for (r = 0; r < ASKED; r++) {
+    *backup = s->ranks[r];
+    action_of(s, *backup, own);
+    if (s->done >= MOST_DONE) {
+      *backup = s->ranks[0];
+      action_of(s, *backup, action);
+      *left = INFINITY;
+      return EVOFSM_CUT_SHORT;
+    }
+    if (are_same(own, proposal) || !passes(s, own, *backup, left)) {
+      continue;
+    }
+    for (i = 0; i < A; i++) {
+      action[i] = own[i];
+    }
+    for (step_of = 0; step_of < (EVOFSM_CHOICES > 0 ? 0 : HALVINGS); step_of++) {
+      const double part = 0.5 * (refused + share);
+      for (i = 0; i < A; i++) {
+        closer[i] = proposal[i] + part * (own[i] - proposal[i]);
+      }
+      if (passes(s, closer, *backup, &distance)) {
+        share = part;
+        *left = distance;
+        for (i = 0; i < A; i++) {
+          action[i] = closer[i];
+        }
+      } else {
+        refused = part;
+      }
+    }
+    return EVOFSM_CHANGED;
+  }
+  *backup = s->ranks[0];
+  for (r = 0; r < ASKED; r++) {
+    replay(s, NULL, policies[s->ranks[r]], SCALE, 0.0, K, &distance);
+    distance = mean_worth(s);
+    if (distance > longest + EQUAL) {
+      *backup = s->ranks[r];
+      longest = distance;
+    }
+  }
+  action_of(s, *backup, action);
+  *left = INFINITY;
+  return EVOFSM_NOTHING_PASSES;
+}
+
+/* -- The judge: LearntRisk ---------------------------------------------------------------------- */
+
+/* _foresee: disturbances not survived after an action, under the best of some backups; -1: it fails
+   without any. At most JUDGED replays. */
+static int foresee(evofsm_state *s, const double action[A]) {
+  double best[L], left;
+  int l, r, count = 0, all = 0;
+  for (l = 0; l < K; l++) {
+    best[l] = -INFINITY;
+  }
+  for (r = 0; r < JUDGED && !all; r++) {
+    replay(s, action, policies[s->ranks[r]], 1.0, 0.0, K, &left);
+    all = 1;
+    count = 0;
+    for (l = 0; l < K; l++) {
+      best[l] = greater(best[l], s->value[l]);
+      all &= best[l] >= 0.0;
+      count += best[l] < 0.0;
+    }
+  }
+  return best[0] < 0.0 ? -1 : count;
+}
+
+/* _here: where one is; what was not seen is taken to have gone on as before. */
+static void situate(evofsm_state *s) {
+  int i, j;
+#if NOISY
+  int k;
+#endif
+  s->is_placed = 1;
+  for (j = 0; j < M; j++) {
+    s->is_placed &= s->has_past || !isnan(s->observation[j]);
+    s->here[j] = s->observation[j];
+    s->here[M + j] = 0.0;
+  }
+  for (i = 0; i < A; i++) {
+    s->here[2 * M + i] = s->has_past ? s->action[i] : 0.0;
+  }
+  if (!s->has_past) {
+    return;
+  }
+  for (j = 0; j < M; j++) {
+    s->here[j] = isnan(s->here[j]) ? s->at[j] + s->at[M + j] : s->here[j];
+  }
+#if NOISY
+  for (j = 0; j < M; j++) { /* corrected of regression.py */
+    s->z[j][0] = s->at[j];
+    s->change[j][0] = s->at[M + j];
+  }
+  for (i = 0; i < A; i++) {
+    s->before[i][0] = s->at[2 * M + i];
+    s->now[i][0] = s->action[i];
+  }
+  for (j = 0; j < M; j++) { /* the other lanes are not looked at, but hold numbers */
+    for (i = 1; i < L; i++) {
+      s->z[j][i] = s->z[j][0];
+      s->change[j][i] = s->change[j][0];
+    }
+  }
+  for (k = 0; k < A; k++) {
+    for (i = 1; i < L; i++) {
+      s->before[k][i] = s->before[k][0];
+      s->now[k][i] = s->now[k][0];
+    }
+  }
+  fill_features(s, 1.0);
+  expect(s);
+  for (j = 0; j < M; j++) {
+    const double expected = s->at[j] + s->move[j][0];
+    const double missed = s->here[j] - lesser(greater(expected, lowest[j]), highest[j]);
+    const double gain = fabs(missed) > jump_of[j] ? 1.0 : gains[j];
+    s->here[j] += (gain - 1.0) * missed;
+  }
+#endif
+  for (j = 0; j < M; j++) {
+    s->here[M + j] = s->here[j] - s->at[j];
+  }
+}
+
+static void forget(evofsm_state *s) {
+  int i;
+  s->has_past = 0;
+  s->is_placed = 0;
+  for (i = 0; i < EVOFSM_BACKUPS; i++) {
+    s->ranks[i] = backup_ranks[i];
+  }
+}
+
+static void start_revising(evofsm_state *s) { (void)s; }
+
+/* LearntRisk.search: what to execute of s->proposal, into s->best, and how risky that is. */
+static void revise(evofsm_state *s, evofsm_decision *out) {
+  double proposal[A], action[A];
+  int i, r, unsurvived = 0;
+  for (i = 0; i < EVOFSM_ACTIONS; i++) {
+    s->best[i] = s->proposal[i];
+  }
+  situate(s);
+  if (!s->is_placed) {
+    out->reason = EVOFSM_NOTHING_SEEN;
+    out->risk_proposed = out->risk_executed = out->risk_low = out->risk_high = out->seen = NAN;
+    out->evidence = 0.0;
+    return;
+  }
+  encode(s->proposal, proposal);
+  out->reason = search(s, proposal, action, &out->backup, &out->left);
+  for (r = 0; s->ranks[r] != out->backup; r++) { /* at most EVOFSM_BACKUPS: it is one of them */
+  }
+  for (; r > 0; r--) { /* what passed now is asked first the next time */
+    s->ranks[r] = s->ranks[r - 1];
+  }
+  s->ranks[0] = out->backup;
+  out->evidence = EVIDENCE;
+  if (out->reason != EVOFSM_KEPT) {
+    out->unsurvived = foresee(s, proposal);
+    if (out->reason > EVOFSM_CHANGED || ALLOWED > 0) {
+      unsurvived = foresee(s, action);
+    }
+    decode(action, s->best);
+  } else if (ALLOWED > 0) {
+    out->unsurvived = unsurvived = foresee(s, proposal);
+  }
+  unsurvived = ACTS ? unsurvived : out->unsurvived;
+  out->risk_proposed = risks[1 + out->unsurvived][0];
+  out->risk_executed = risks[1 + unsurvived][0];
+  out->risk_low = risks[1 + unsurvived][1];
+  out->risk_high = risks[1 + unsurvived][2];
+}
+
+/* LearntRisk.follow: keep up with what is executed. */
+static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
+  int i;
+  if (!s->is_placed) {
+    return;
+  }
+  for (i = 0; i < 2 * M + A; i++) {
+    s->at[i] = s->here[i];
+  }
+  encode(executed, s->action);
+  s->has_past = 1;
+}
