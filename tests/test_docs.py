@@ -5,7 +5,6 @@ All others are doctests. A block that is not run says why, in a comment before i
 """
 
 import doctest
-import fcntl
 import os
 import re
 import shlex
@@ -188,6 +187,7 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """All pages of the site, built with warnings as errors, once for all processes of pytest."""
+    fcntl = pytest.importorskip("fcntl")
     run = tmp_path_factory.getbasetemp()
     shared = run.parent if "PYTEST_XDIST_WORKER" in os.environ else run
     folder, built = shared / "site", shared / "site-is-built"

@@ -1,7 +1,6 @@
 import io
 import json
 import os
-import resource
 import signal
 import stat
 import threading
@@ -240,6 +239,7 @@ def test_a_forged_file_is_refused_before_anything_is_allocated(change, words, fo
 @pytest.fixture
 def full_disk():
     """No file may grow beyond 100 bytes, which the system reports like a full disk."""
+    resource = pytest.importorskip("resource")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
