@@ -5,7 +5,7 @@ BIN := .venv/bin
 INSTALL = $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check install --quiet
 
 .PHONY: paper watch closed-loop evidence docs test test-all check house \
-    bench fuzz torture soak lock lowest supply \
+    bench fuzz torture soak lock lowest supply dist \
     clean
 
 paper: .venv/installed          ## reproduce every claim of the paper in SUMO
@@ -56,9 +56,13 @@ lowest: .venv/installed         ## test the core with the lowest versions that a
 	@$(BIN)/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct \
 	    --editable '.[tables,study]' 'pytest>=8.3' 'hypothesis>=6.100'
 	@$(LOWEST) -m pytest -q -p no:cacheprovider tests/fsm
-supply: .venv/installed         ## known holes in what is pinned, and a bill of materials: sbom.json
-	@$(BIN)/uv tool run pip-audit --disable-pip --require-hashes --requirement requirements.lock
+supply: .venv/installed         ## a bill of materials: sbom.json; holes in the workflows; known ones in what is pinned
 	@$(BIN)/uv tool run --from cyclonedx-bom cyclonedx-py requirements requirements.lock -o sbom.json
+	@$(BIN)/uv tool run zizmor --offline --persona pedantic --quiet .github
+	@$(BIN)/uv tool run pip-audit --strict --disable-pip --require-hashes --requirement requirements.lock
+
+dist: .venv/installed           ## sdist and wheel; the quick tests of the one against the other
+	@$(BIN)/python tools/dist.py
 
 torture: .venv/installed        ## kill -9, full disks, damaged files, forged logs: is anything lost or wrong?
 	@$(BIN)/python benchmarks/torture.py
