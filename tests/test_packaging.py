@@ -1,8 +1,11 @@
 import email
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from importlib.metadata import distribution
 from pathlib import Path
@@ -61,6 +64,60 @@ def test_the_version_is_that_of_the_distribution():
     assert evofsm.__version__ == distribution("evofsm").version
 
 
+# -- What is told of it ------------------------------------------------------------------------
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        ("CITATION.cff", r"^version: (.+)$"),
+        ("recipe/recipe.yaml", r'^  version: "(.+)"$'),
+        ("src/evofsm/__init__.py", r'^__version__ = "(.+)"$'),
+    ],
+    ids=lambda told: told[0],
+)
+def test_the_version_is_told_alike(told):
+    file, pattern = told
+    if not (ROOT / file).exists():
+        pytest.skip("no part of the sdist")
+    assert re.findall(pattern, (ROOT / file).read_text("utf-8"), re.M) == [PROJECT["version"]]
+
+
+def test_the_recipe_asks_for_what_the_wheel_asks_for():
+    if not (ROOT / "recipe").exists():
+        pytest.skip("no part of the sdist")
+    [run] = re.findall(
+        r"  run:\n((?:    - .+\n)+)", (ROOT / "recipe/recipe.yaml").read_text("utf-8")
+    )
+    asked = {line.strip("- ").replace(" ", "") for line in run.splitlines()}
+    assert asked == {*PROJECT["dependencies"], "python>=${{python_min}}"}
+
+
+def test_workflows_run_on_the_versions_claimed_and_take_no_action_by_a_name_that_can_move():
+    workflows = sorted((ROOT / ".github").rglob("*.yml"))
+    if not workflows:
+        pytest.skip("no part of the sdist")
+    texts = "".join(workflow.read_text("utf-8") for workflow in workflows)
+    claimed = [line.rpartition(" ")[2] for line in PROJECT["classifiers"] if " 3." in line]
+    assert f"python: {json.dumps(claimed)}" in texts
+    assert all(re.match(r"\S+@[0-9a-f]{40} # v", used) for used in re.findall(r"uses: (.*)", texts))
+
+
+@pytest.mark.parametrize("home", [None, "https://example.org/evofsm"])
+def test_on_an_index_the_readme_has_no_link_that_leads_nowhere(home, monkeypatch):
+    pytest.importorskip("hatchling")
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    from readme import as_on_an_index
+
+    shown = as_on_an_index((ROOT / "README.md").read_text("utf-8"), home)
+    targets = re.findall(r"\]\(([^)]+)\)", shown)
+    assert all(target.startswith(("https://", "#")) for target in targets)
+    assert f"{home}/raw/HEAD/docs/images/case-1.png" in targets or home is None
+    assert "LICENSE" in shown
+
+
 # -- The wheel ---------------------------------------------------------------------------------
 
 
@@ -72,6 +129,18 @@ def wheel(tmp_path_factory):
     run(*build, cwd=folder)
     (built,) = folder.glob("*.whl")
     return built
+
+
+@pytest.mark.slow
+def test_a_wheel_that_is_built_elsewhere_and_later_has_the_same_bytes(wheel, tmp_path):
+    copy = tmp_path / "elsewhere"
+    unlike = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(ROOT / "src", copy / "src", ignore=unlike, copy_function=shutil.copyfile)
+    for name in ("pyproject.toml", "README.md", "LICENSE", "tools/readme.py"):
+        (copy / name).parent.mkdir(exist_ok=True)
+        (copy / name).write_bytes((ROOT / name).read_bytes())
+    run(sys.executable, "-m", "build", "--no-isolation", "--wheel", copy, cwd=tmp_path)
+    assert (copy / "dist" / wheel.name).read_bytes() == wheel.read_bytes()
 
 
 def core_dependencies(wheel):
@@ -165,3 +234,33 @@ def test_without_the_cli_extra_the_command_names_it_in_one_line(fresh):
     assert finished.returncode != 0
     (line,) = (finished.stdout + finished.stderr).strip().splitlines()
     assert "pip install '.[cli]'" in line
+
+
+@pytest.mark.slow
+def test_an_editor_sees_through_the_faces_of_the_wheel(fresh, tmp_path):
+    """Mypy stands for it: of names that load on first use it knows the types."""
+    program = """
+from evofsm import EvolvingFSM, Guard
+from evofsm.driving import guard_for_cars
+from evofsm import Gaurd
+reveal_type(EvolvingFSM(2).observe([0.0]))
+reveal_type(guard_for_cars(low=-1.0, high=1.0, interval=0.1))
+Guard(low=-1.0, high=1.0, interval="often")
+"""
+    (tmp_path / "mine.py").write_text(program, "utf-8")
+    environment = {name: value for name, value in os.environ.items() if "PYPATH" not in name}
+    command = [sys.executable, "-m", "mypy", "--strict", "--python-executable", fresh / "python"]
+    # Of what examples need beside the core, the new environment has nothing.
+    options = ["--disable-error-code=import-not-found", "--allow-untyped-decorators"]
+    examples = [ROOT / "examples" / name for name in ("car_following.py", "verify_with_storm.py")]
+    finished = subprocess.run(
+        [*command, *options, "--config-file=", "mine.py", *examples],
+        **{"cwd": tmp_path, "env": environment, "capture_output": True, "text": True},
+    )
+    lines = [line for line in finished.stdout.splitlines() if line.startswith("mine.py")]
+    told = [re.sub(r"^mine.py:\d+: ", "", line) for line in lines]
+    assert 'attribute "Gaurd"' in told[0], finished.stdout
+    assert "evofsm.fsm.step.Step]" in told[1]
+    assert told[2].startswith('note: Revealed type is "evofsm.guard.')
+    assert '"interval" to "Guard" has incompatible type "str"' in told[3]
+    assert "Found 2 errors in 1 file" in finished.stdout, finished.stdout
