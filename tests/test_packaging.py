@@ -233,7 +233,7 @@ def test_without_the_cli_extra_the_command_names_it_in_one_line(fresh):
     )
     assert finished.returncode != 0
     (line,) = (finished.stdout + finished.stderr).strip().splitlines()
-    assert "pip install '.[cli]'" in line
+    assert "pip install 'evofsm[cli]'" in line
 
 
 @pytest.mark.slow

@@ -23,17 +23,20 @@ def needs(package: str, extra: str, purpose: str) -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f"{purpose} needs {package}: {install(extra)}") from error
+    except ImportError as error:  # it is there, and a library of the system that it needs is not
+        told = f"{purpose} needs {package}, which is installed but cannot be loaded: {error}"
+        raise ImportError(told) from error
 
 
 def install(*extras: str) -> str:
-    """The command that installs extras; evofsm is in no package index.
+    """The command that installs extras, of what is installed; it asks no index for evofsm.
 
     Examples
     --------
     >>> install("cli", "plot")
-    "pip install '.[cli,plot]' in a clone of evofsm"
+    "pip install 'evofsm[cli,plot]'"
     """
-    return f"pip install '.[{','.join(extras)}]' in a clone of evofsm"
+    return f"pip install 'evofsm[{','.join(extras)}]'"
 
 
 def refuse_without_command_line() -> None:

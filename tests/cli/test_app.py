@@ -26,18 +26,15 @@ def test_without_the_extra_one_line_says_what_to_install(missing):
     )
     assert result.returncode == 2
     assert result.stderr == (
-        "evofsm: the command line needs typer and rich: pip install '.[cli,plot,sumo,tables]' in a "
-        "clone of evofsm\n"
+        "evofsm: the command line needs typer and rich: "
+        "pip install 'evofsm[cli,plot,sumo,tables]'\n"
     )
 
 
 def test_all_that_a_command_lacks_is_named_at_once(evofsm, monkeypatch):
     monkeypatch.setattr(options, "find_spec", lambda name: None)
     told = evofsm("drive", "paper", "--world", "sumo").stderr
-    assert told == (
-        "evofsm: this needs scipy and libsumo: pip install '.[cli,study,sumo]' in a clone of "
-        "evofsm\n"
-    )
+    assert told == ("evofsm: this needs scipy and libsumo: pip install 'evofsm[cli,study,sumo]'\n")
 
 
 def test_extras_of_commands_exist():

@@ -56,6 +56,15 @@ def test_sumo_itself_reports_the_collision_at_the_last_step(tmp_path, in_both):
     assert float(collisions[0].get("time")) == episode.time[-1]
 
 
+def test_where_a_library_of_the_system_is_missing_sumo_says_which(monkeypatch):
+    def without_x11(name):
+        raise ImportError("libX11.so.6: cannot open shared object file")
+
+    monkeypatch.setattr("evofsm.driving.sumo.import_module", without_x11)
+    with pytest.raises(ImportError, match=r"'sumo' needs libsumo, .* cannot be loaded: libX11"):
+        SumoWorld()
+
+
 def test_a_second_simulation_in_the_process_is_refused():
     with SumoWorld() as first:
         first.run(replace(SETTINGS.scenario, duration=0.1), SETTINGS.drivers[2])

@@ -116,5 +116,5 @@ def test_a_missing_library_is_named(library, monkeypatch):
     for name in (library, f"{library}.base"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.delitem(sys.modules, f"evofsm.fsm.{library}", raising=False)
-    with pytest.raises(ModuleNotFoundError, match=rf"pip install '.\[{library}\]'"):
+    with pytest.raises(ModuleNotFoundError, match=rf"pip install 'evofsm\[{library}\]'"):
         import_module(f"evofsm.fsm.{library}")

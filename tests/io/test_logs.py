@@ -344,7 +344,7 @@ def test_parquet_with_holes_texts_or_half_a_file_is_refused(tmp_path, monkeypatc
     path.write_bytes(path.read_bytes()[:-50])
     assert "cannot be read as Parquet" in refusal(str(path))
     monkeypatch.setitem(sys.modules, "polars", None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install '.\[tables\]'"):
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'evofsm\[tables\]'"):
         read(str(tmp_path / "a.csv"))
 
 

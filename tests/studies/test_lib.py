@@ -78,7 +78,7 @@ def test_what_a_user_can_mend_is_one_line_and_status_2():
 
     done = invoke(kind=Lacking)
     assert done.exit_code == 2
-    assert "needs no_such_package: pip install '.[gym]'" in done.stderr
+    assert "needs no_such_package: pip install 'evofsm[gym]'" in done.stderr
 
 
 @pytest.mark.parametrize("name", STUDIES)

@@ -41,7 +41,7 @@ class Commands(TyperGroup):
             command = error.ctx.command_path if getattr(error, "ctx", None) else "evofsm"
             warn(f"{error.format_message()} ({command} --help)")
             status = 2
-        except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
+        except (ValueError, TypeError, OSError, ImportError) as error:
             warn(message(error))
             status = 2
         if status:
