@@ -3,7 +3,7 @@
 The wheel is installed with what development needs into a new environment, the sdist unpacked where
 no checkout is. Its sources are spoilt, so that no test can import them in place of the wheel.
 
-    python tools/dist.py [--only-build] [--lowest] [ARGUMENTS OF PYTEST]
+    python tools/dist.py [--only-build] [ARGUMENTS OF PYTEST]
 """
 
 from __future__ import annotations
@@ -18,7 +18,11 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-SPOILT = '\n\nraise ImportError("the sources of the sdist were imported, not the wheel")\n'
+# A test may still copy them, and change and run the copy.
+SPOILT = """
+if __file__ == {file!r}:
+    raise ImportError("the sources of the sdist were imported, not the wheel")
+"""
 
 
 def run(*command: str | Path, cwd: Path = ROOT) -> None:
@@ -53,12 +57,13 @@ def main() -> int:
     if arguments.only_build:
         return 0
     with tempfile.TemporaryDirectory() as name:
-        python = environment(Path(name) / "venv", wheel)
+        folder = Path(name).resolve()
+        python = environment(folder / "venv", wheel)
         with tarfile.open(sdist) as archive:
-            archive.extractall(name, filter="data")
-        tests = Path(name) / sdist.name.removesuffix(".tar.gz")
+            archive.extractall(folder, filter="data")
+        tests = folder / sdist.name.removesuffix(".tar.gz")
         face = tests / "src" / "evofsm" / "__init__.py"
-        face.write_text(face.read_text("utf-8") + SPOILT, "utf-8")
+        face.write_text(face.read_text("utf-8") + SPOILT.format(file=str(face)), "utf-8")
         where = of_pytest or ["studies", "tests", "README.md", "docs", "--pyargs", "evofsm"]
         try:
             run(python, "-m", "pytest", "-q", "-m", "not slow", "-n", "2", *where, cwd=tests)
