@@ -1,4 +1,5 @@
-# `make paper` and `make test` need nothing but python3 (3.11 or newer), pip, make and git.
+# `make paper` and `make test` need nothing but python3 (3.11 or newer), pip, make and git;
+# SUMO, of a system without a screen: libgl1, libxrender1 and libatomic1.
 
 PYTHON ?= python3
 BIN := .venv/bin
