@@ -619,7 +619,19 @@ class Guard:
         else:
             nearest = self._frozen.nearest(self._monitor.held)
             text = explain(self._frozen, situation.belief, action, self._labels, nearest).text
+        if told := self._told_here(situation.observation):
+            text = f"{text} {told}"
         return revision._replace(explanation=text)
+
+    def _told_here(self, z: NDArray[np.float64]) -> str:
+        """What the judge knows of dead ends near an observation, and in which state they are."""
+        if self._observing is None or self.machine is None:
+            return ""
+        told, centre = self._observing.told_here(z)
+        if centre is None:
+            return told
+        state = (self._frozen or self.machine.model()).nearest(centre).state
+        return f"{told} Its centre is in #{state + 1}."
 
     @alone
     def end(self, failed: bool = False, observation: ArrayLike | None = None) -> None:

@@ -39,6 +39,7 @@ def mover(choices=0, **others):
         most=9.0 * one,
         thresholds=np.array([[0.0, 1.0, WALL, 1.0]]),
         regions=np.empty((0, 12)),
+        dead_ends=np.empty((0, 3)),
         drifted=none,
         mean=none,
         inverse=one,
@@ -60,6 +61,7 @@ def random_model(draw, m, a, choices):
         most=0.3 * one,
         thresholds=np.array([[0.0, 1.0, 0.7, 2.0], [m - 1.0, -1.0, -1.5, 0.5]]),
         regions=np.array([[1.0, m - 1.0, 1.5, -0.2, 2.0, 0.5, 1.0, 0.3, 0.1, -0.9, 0.4, -1.2]]),
+        dead_ends=np.column_stack([draw.normal(size=(2, m)), [0.4, 1.1], [9.0, 9.0]]),
         drifted=np.resize([1.0, -1.0, 0.0], m),
         mean=draw.normal(size=m),
         inverse=1.0 + draw.random(m),
@@ -81,12 +83,19 @@ def nearest(region, z):
     return -(c + b * x + d * y + p * x * x + q * x * y + r * y * y) / np.sqrt(slope @ slope) - GROWN
 
 
+def from_dead_end(model, row, z):
+    """How far an observation is from a dead end."""
+    *centre, radius, worth = row
+    return (np.linalg.norm((z - centre) * model.inverse) - radius) * worth
+
+
 def plainly(model, situation, plan, policy, disturbances, k, scale, enough):
     """One replay, step by step in NumPy: steps survived, least distance, and that at its end."""
     m = len(model.origin)
     z, change, before = situation[:m], situation[m : 2 * m], situation[2 * m :]
     (steps, _, _), near, clock = disturbances.residuals.shape, np.inf, 0
     i, sign, threshold, begins, over = disturbances.place[k]
+    dead_ends = [row for row in model.dead_ends if from_dead_end(model, row, z) >= 0.0]
     for t in range(steps):
         u = plan[t] if t < len(plan) else acts(model, policy, z)
         if t >= len(plan) and not model.choices:
@@ -114,6 +123,7 @@ def plainly(model, situation, plan, policy, disturbances, k, scale, enough):
         z, change, before = after, after - z, u
         left = [s * (at - z[int(j)]) * worth for j, s, at, worth in model.thresholds]
         near = min(near, *left, *(nearest(row, z) for row in model.regions))
+        near = min([near, *(from_dead_end(model, row, z) for row in dead_ends)])
         if near < enough:
             return t, near
     return steps, near

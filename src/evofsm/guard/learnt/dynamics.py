@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.fsm.validation import real_array, refuse_unusable, whole
-from evofsm.guard.learnt import regions, regression
+from evofsm.guard.learnt import dead_ends, regions, regression
+from evofsm.guard.learnt.dead_ends import DeadEnds
 from evofsm.guard.learnt.failures import difference, explain_failures, probe
 from evofsm.guard.learnt.places import ANYWHERE, Place, Places, onset
 from evofsm.guard.learnt.regression import Drift, Recent
@@ -196,6 +197,7 @@ class Dynamics:
         self.survived = np.empty((0, m))
         self.regions = np.empty((0, regions.SIZE))  #: (r, 12) where it fails beyond no threshold
         self.jumps = [np.empty((0, m + 1)) for _ in range(m)]  #: from where, and to where
+        self.dead_ends = DeadEnds.none(m)  #: from where certified episodes failed
         self.recent = Recent.none(p, m, self.n_episodes)  #: what the last episodes say of the model
         self.missed = regression.untried(m)  #: by gains of the observer
         self.doubt_of_lags = 0.0
@@ -319,6 +321,7 @@ class Dynamics:
             most=sums.most.copy(),
             thresholds=np.array(thresholds, np.float64).reshape(-1, 4),
             regions=regions.in_units(self.regions, 1.25 * sums.unit + 1e-300),
+            dead_ends=self.dead_ends.rows(inverse, sums.unit),
             drifted=drifted,
             mean=self.origin + sums.mean,
             inverse=inverse,
@@ -354,6 +357,11 @@ class Dynamics:
             self.doubt_of_lags = max(0.0, self.doubt_of_lags + worse)
         if regression.are_misleading(self.doubt_of_lags) != was:
             self._solve()
+
+    def keep_dead_ends(self, known: DeadEnds) -> None:
+        """From now on those are the dead ends."""
+        self.dead_ends = known
+        self.rebuild()
 
     # -- A whole episode ------------------------------------------------------------------------
 
@@ -672,6 +680,7 @@ class Dynamics:
             "doubt_of_lags": self.doubt_of_lags if known else 0.0,
             "exposed": self.places.exposed if known else 0,
             "ready": int(known and self.ready),
+            "dead_ends": self.dead_ends.created if known else 0,
         }
 
     def arrays(self) -> dict[str, Floats]:
@@ -696,6 +705,7 @@ class Dynamics:
             **{f"sums_{name}": array for name, array in self.sums._asdict().items()},
             **{f"recent_{name}": array for name, array in self.recent._asdict().items()},
             **{name: getattr(self, name) for name in _OWN},
+            **{f"dead_ends_{name}": getattr(self.dead_ends, name) for name in dead_ends.ARRAYS},
             "thresholds": np.array(self.thresholds, np.float64).reshape(-1, 3),
             "drifts": np.array(self.drifts, np.float64).reshape(-1, 3),
             "jumps": np.vstack(jumps),
@@ -743,6 +753,11 @@ class Dynamics:
         if not places.fit(m, a) or not np.isin(told[:, 3], np.arange(-1, m)).all():
             raise ValueError("places are of variables that there are not, or of other numbers")
         self.places = places
+        self.dead_ends = DeadEnds(
+            **{name: arrays[f"dead_ends_{name}"] for name in dead_ends.ARRAYS},
+            created=int(numbers["dead_ends"]),
+        )
+        self.dead_ends.refuse_forged(self.n_episodes)
         self.ready, self.doubt_of_lags = bool(numbers["ready"]), float(numbers["doubt_of_lags"])
         self.thresholds = [(int(j), sign, at) for j, sign, at in arrays["thresholds"].tolist()]
         self.drifts = [Drift(*map(int, row)) for row in arrays["drifts"]]
@@ -792,6 +807,7 @@ _OF_SUMS: dict[str, Numbers] = {
 ARRAYS: dict[str, Numbers] = {
     **_OWN,
     **{f"sums_{name}": _OF_SUMS[name] for name in Sums._fields},
+    **{f"dead_ends_{name}": numbers for name, numbers in dead_ends.ARRAYS.items()},
     "recent_squares": Numbers(("p", "p")),
     "recent_products": Numbers(("p", "m")),
     "recent_doubt": _NOT_NEGATIVE.of("m"),

@@ -25,7 +25,8 @@ from evofsm.fsm.validation import action_name, positive
 from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.harm import OUTCOMES, SETTINGS, Harm
 from evofsm.guard.learnt import library, regions, words
-from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics
+from evofsm.guard.learnt.dead_ends import distances_to, which_refuses
+from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics, Episode
 from evofsm.guard.learnt.library import Backups, Parts, Violations
 from evofsm.guard.learnt.replay import CUT_SHORT, KEPT, Disturbances, Floats, Ints, pairs, search
 from evofsm.guard.learnt.words import Remembered
@@ -35,7 +36,7 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 #: Parts that can be left out, to see what each is worth.
-JUDGE_PARTS: tuple[str, ...] = ("margin", "backups", "breaks", *DYNAMICS_PARTS)
+JUDGE_PARTS: tuple[str, ...] = ("margin", "backups", "breaks", "dead-ends", *DYNAMICS_PARTS)
 
 # Disturbances that are remembered.
 _REMEMBERED = 10
@@ -154,7 +155,8 @@ class LearntRisk:
     _violated: bool  # whether a certificate was violated
     _refused: bool  # whether the latest proposal was
     _dead_end: bool  # whether nothing helped, even without any disturbance
-    _notes: list[tuple[bool, bool]]  # both, of each observation that is to be studied
+    # of each observation that is to be studied both, and whether there it was certified
+    _notes: list[tuple[bool, bool, bool]]
     _fails_after: float  # steps after which what was refused fails, at the latest
     _unsurvived: int
     _asked: int  # number of backups under which it is judged
@@ -278,8 +280,24 @@ class LearntRisk:
             (called[j], sign < 0.0, [place[2] for place in places if place[:2] == (j, sign)])
             for j, sign in sorted({place[:2] for place in places})
         ]
-        told = words.experience(*known, dynamics.difference, self._no_threshold, there, begin)
+        ends = dynamics.dead_ends.counts.astype(int).tolist()
+        known = *known, dynamics.difference, self._no_threshold, there, begin, ends
+        told = words.experience(*known)
         return told + words.harm(self.harm, tests=self.shadow, learning=self.learning)
+
+    def told_here(self, observation: Floats) -> tuple[str, Floats | None]:
+        """What was learnt of an observation, in words, and the centre of the dead end it is near.
+
+        Empty, and None, where it is in and near none.
+        """
+        if math.isnan(observation.dot(observation)) or not self.dynamics.n_variables:
+            return "", None
+        far, ends = distances_to(self.dynamics.model, observation), self.dynamics.dead_ends
+        if far.min(initial=np.inf) > _LARGEST:
+            return "", None
+        k = int(far.argmin())
+        told = words.is_near(int(ends.numbers[k]), int(ends.counts[k]), float(far[k]))
+        return told, ends.centres[k]
 
     @property
     def _no_threshold(self) -> str:
@@ -293,7 +311,8 @@ class LearntRisk:
         """Backups that a search asks, and steps of replays after which it is cut short."""
         few = _ASKED if len(pairs(self.dynamics.n_variables)[0]) else _ASKED_OF_MANY
         count = 1 if self.disturbances is None else self.disturbances.residuals.shape[2]
-        each = self.dynamics.model.weights.size * count
+        model = self.dynamics.model
+        each = (model.weights.size + model.dead_ends.size) * count
         return few, max(min(_WORK, _WORK_RATE * self.dt) / each, few * self.horizon)
 
     def search(
@@ -341,6 +360,12 @@ class LearntRisk:
         if not self._refused:
             return Search(one, judged, 0, words.kept(backup, remembered, left, allowed))
         why = words.refused(self._unsurvived, remembered, self.margin, scale, allowed)
+        if not cut and len(model.dead_ends):
+            k, after = which_refuses(*asked, proposal, self.margin, allowed)
+            if k >= 0:
+                ends = dynamics.dead_ends
+                number, count = int(ends.numbers[k]), int(ends.counts[k])
+                why = words.comes_near(self._backup_text(after), number, count)
         if passes:
             instead = words.changed(backup, remembered, self.margin, allowed)
         else:
@@ -504,7 +529,7 @@ class LearntRisk:
 
     def _take_in(self, observation: ArrayLike, action: Any) -> None:
         self.follow(observation, action)
-        self._notes.append((self._refused, self._dead_end))
+        self._notes.append((self._refused, self._dead_end, self._certified))
         if self.dynamics.n_episodes != self.n_studied:  # it goes on, but was long enough to study
             self._rest = self._study()
         if self._rest is not None:
@@ -586,12 +611,14 @@ class LearntRisk:
             )
         best = self.backups.policies[self.backups.ranks]
         # From where it went on for the horizon although nothing seemed to help.
-        refuted = np.flatnonzero([dead_end for _, dead_end in self._notes[: -self.horizon]])
-        tight = [refused for refused, _ in self._notes]
+        refuted = np.flatnonzero([dead_end for _, dead_end, _ in self._notes[: -self.horizon]])
+        tight = [refused for refused, _, _ in self._notes]
         if episode is not None:  # or it was too short for more than to try again
             given = self.situations, episode, tight, self.horizon, random
             self.situations = library.noted(*given)
         situations, knows = self.situations, dynamics.fails
+        if "dead-ends" not in self.without and knows and episode is not None:
+            self._learn_dead_ends(episode)
         yield
         if "stretches" not in dynamics.without and knows and len(situations) > _ENOUGH:
             if episode is not None:
@@ -620,6 +647,13 @@ class LearntRisk:
             yield
             self.backups = yield from self.evolved(random)
         self._ranks = self.backups.ranks
+
+    def _learn_dead_ends(self, episode: Episode) -> None:
+        """From what was survived, and from where it failed although it was certified not to."""
+        dynamics, certified = self.dynamics, [held for _, _, held in self._notes]
+        known = dynamics.model.inverse, dynamics.sums.unit
+        given = episode.observations, certified, self.horizon, *known
+        dynamics.keep_dead_ends(dynamics.dead_ends.after(*given, failed=episode.failed))
 
     def _is_worse(self) -> bool:
         """Whether disturbances got worse than those that are remembered."""
@@ -795,6 +829,7 @@ KIND = Kind(
             "doubt_of_lags": Numbers(least=0.0),
             "exposed": COUNT,
             "ready": FLAG,
+            "dead_ends": COUNT,
         },
     },
 )

@@ -15,6 +15,7 @@ import numpy as np
 
 from evofsm.guard.harm import Harm
 from evofsm.guard.learnt import library
+from evofsm.guard.learnt.dead_ends import DeadEnds
 from evofsm.guard.learnt.dynamics import MOST, MOST_SURVIVED, Dynamics
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.places import Places
@@ -137,6 +138,8 @@ def _merged(parts: Sequence[Dynamics]) -> Dynamics:
     merged.places = Places.merged([part.places for part in parts], offsets)
     merged.recent, merged.latest = Recent.none(p, m, merged.n_episodes), None
     merged.settle(failed=True)
+    known = merged.model.inverse, merged.sums.unit
+    merged.keep_dead_ends(DeadEnds.merged([part.dead_ends for part in parts], *known))
     return merged
 
 

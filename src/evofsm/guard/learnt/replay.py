@@ -76,6 +76,8 @@ class Model(NamedTuple):
     #: large a unit (its inverse), and a quadratic form in those, above 0 where it fails:
     #: 1, x, y, x x, x y, y y
     regions: Floats
+    #: (k, m + 2) dead ends: centre, radius in spreads, and ordinary changes in a spread
+    dead_ends: Floats
     drifted: Floats  #: (m,) 1 of a variable that moves otherwise than it did, -1 of others then
     mean: Floats  #: (m,) of what policies take for their middle
     inverse: Floats  #: (m,) and one over their spread
@@ -431,11 +433,26 @@ def _follow_policy(model: Model, policy: Floats, z: Floats, end: float, action: 
 
 
 @spliced_kernel
-def _distances(model: Model, z: Floats, far: Floats) -> None:
+def _from_centre(model: Model, s: int, z: Floats, square: Floats) -> None:
+    """Squared distances of n observations (m, n) from the centre of a dead end, in spreads."""
+    m, n = z.shape
+    for l in range(n):
+        square[l] = 0.0
+    for j in range(m):
+        centre, inverse = model.dead_ends[s, j], model.inverse[j]
+        for l in range(n):
+            x = (z[j, l] - centre) * inverse
+            square[l] += x * x
+
+
+@spliced_kernel
+def _distances(model: Model, z: Floats, aside: Floats, square: Floats, far: Floats) -> None:
     """The distance of each of n observations (m, n) to the nearest failure, into ``far`` (n,).
 
     To a region to first order: its form over the length of its gradient; a boundary that touches
-    what was survived in one place lies beyond the truth elsewhere, so regions are `GROWN`.
+    what was survived in one place lies beyond the truth elsewhere, so regions are `GROWN`. To dead
+    ends as well, but for those of (k, n) that are set ``aside``, infinitely far. ``square`` (n,) is
+    overwritten.
     """
     n = len(far)
     for l in range(n):
@@ -457,6 +474,12 @@ def _distances(model: Model, z: Floats, far: Floats) -> None:
             form = c + x * (b + p * x + q * y) + y * (d + r * y)
             u, v = b + 2.0 * p * x + q * y, d + 2.0 * r * y + q * x
             left = -form / np.sqrt(u * u + v * v + FLAT) - GROWN
+            far[l] = left if left < far[l] else far[l]
+    for s in range(len(model.dead_ends)):
+        _from_centre(model, s, z, square)
+        radius, worth = model.dead_ends[s, -2], model.dead_ends[s, -1]
+        for l in range(n):
+            left = (np.sqrt(square[l]) - radius) * worth + aside[s, l]
             far[l] = left if left < far[l] else far[l]
 
 
@@ -494,7 +517,8 @@ def _replay(
     """`replay` into ``ends``; how many are not survived, the least distance of others, and steps.
 
     All end as soon as more than ``allowed`` did, or number 0 did, that is no disturbance at all; if
-    all are allowed, each goes on as far as it can.
+    all are allowed, each goes on as far as it can, and dead ends in which it begins do not count:
+    who is there has to leave.
 
     Replays lie side by side, so that loops over them (``l``) are vector instructions. No slice is
     assigned: that takes a second of compiling each.
@@ -506,8 +530,9 @@ def _replay(
     z, change, move, after = np.empty((m, n)), np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
     before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
     which, survived = np.empty(n, np.int64), np.empty(n, np.int64)
-    near, far = np.empty(n), np.empty(n)
+    near, far, square = np.empty(n), np.empty(n), np.empty(n)
     at, clock, rest = np.empty(n, np.int64), np.zeros(n, np.int64), np.empty((m, n))
+    aside = np.empty((len(model.dead_ends), n))
     jumps, placed = False, False
     for l in range(n):
         start = l // each if l < count else 0
@@ -520,6 +545,12 @@ def _replay(
         for j in range(m):
             jumps |= disturbances.jump_at[which[l], j] >= 0.0
         placed |= disturbances.place[which[l], 0] >= 0.0
+    for s in range(len(aside)):
+        _from_centre(model, s, z, square)
+        radius = model.dead_ends[s, -2]
+        for l in range(n):
+            within = (square[l] < radius * radius) & (allowed >= count)
+            aside[s, l] = np.inf if within else 0.0
     lost, end, took = 0, 1.0 - _RESERVE * enough, 0
     for t in range(steps):
         took += 1
@@ -576,7 +607,7 @@ def _replay(
         for i in range(a):
             for l in range(n):
                 before[i, l] = action[i, l]
-        _distances(model, z, far)
+        _distances(model, z, aside, square, far)
         fails = 0
         for l in range(n):
             nearer = far[l] if far[l] < near[l] else near[l]
@@ -632,6 +663,25 @@ def replay(
 
 
 # -- What decides ---------------------------------------------------------------------------------
+
+
+def survives(
+    model: Model,
+    situation: Floats,
+    policy: Floats,
+    disturbances: Disturbances,
+    scale: float,
+    action: Floats,
+    margin: float,
+    allowed: int,
+) -> bool:
+    """Whether after an action a backup policy survives by the margin, as `search` asks."""
+    count = disturbances.residuals.shape[2]
+    ends = Ends(np.empty(count), np.empty(count))
+    given = situation[None], action[None], policy, disturbances, scale, margin, allowed, ends
+    lost, left, _ = _enter.call(model, *given)
+    return bool(lost <= allowed and left >= margin)
+
 
 #: What a search finds: the proposal passes, another action passes, none did in time, or none does.
 KEPT, CHANGED, CUT_SHORT, NOTHING_PASSES = 0, 1, 2, 3

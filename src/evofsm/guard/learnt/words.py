@@ -17,6 +17,8 @@ Examples
 >>> refused(0, Remembered(1, 12.3), 1.0, 1.3)
 'no backup survives the 1 disturbance remembered from 12 s by the margin of 1 ordinary change, \
 were they 1.3 times as hard'
+>>> comes_near("always -2.5", 2, 3)
+'then always -2.5 would come near dead end 2, from where 3 episodes that had been certified failed'
 >>> experience([("gap", True, 0.05)], Remembered(0, 4.25), 3.0, [("speed", 101)])
 'fails where gap is below 0.05; what 4.2 s brought, to be survived by 3 ordinary changes; since \
 episode 101 speed moves otherwise'
@@ -40,6 +42,8 @@ TRIED = "no action passes; what this one does is hardly known, so it is tried"
 
 # Disturbances that are taken to be harder by a smaller factor are taken as they were.
 _HARDER = 1.05
+# Of more dead ends, those from where most failed are counted.
+_SHOWN = 3
 
 
 class Remembered(NamedTuple):
@@ -82,6 +86,34 @@ def refused(
     return f"no backup survives {'any of ' if unsurvived > 1 else ''}the {remembered}"
 
 
+def comes_near(backup: str, dead_end: int, count: int) -> str:
+    """Why an action is dangerous that passes but for a dead end, by number and failures."""
+    return f"then {backup} would come near dead end {dead_end}, {failed_from([count])}"
+
+
+def is_near(dead_end: int, count: int, distance: float) -> str:
+    """What is said of a situation in or near a dead end, which is so far [ordinary changes]."""
+    where = "in" if distance < 0.0 else f"{changes(distance)} from"
+    return f"This is {where} dead end {dead_end}, {failed_from([count])}."
+
+
+def dead_ends(counts: Sequence[int]) -> str:
+    """How many there are, those first from where most failed; empty without any."""
+    if not counts:
+        return ""
+    several = "s" * (len(counts) > 1)
+    return f"; {len(counts)} dead-end state{several}, {failed_from(sorted(counts, reverse=True))}"
+
+
+def failed_from(counts: Sequence[int]) -> str:
+    """Of dead ends, from how many episodes they are known."""
+    shown = [f"{count:,}" for count in counts[:_SHOWN]]
+    if len(counts) > _SHOWN:
+        shown.append("fewer")
+    several = f"{', '.join(shown[:-1])} and {shown[-1]}" if len(shown) > 1 else shown[0]
+    return f"from where {several} episode{'s' * (shown != ['1'])} that had been certified failed"
+
+
 def changed(backup: str, remembered: Remembered, margin: float, spared: int = 0) -> str:
     """What is done instead, where another action passes."""
     them = "all of them" if remembered.number > 1 else "it"
@@ -118,12 +150,13 @@ def experience(
     nothing: str = NO_FAILURE,
     regions: Sequence[str] = (),
     begin: Sequence[tuple[str, bool, Sequence[float]]] = (),
+    ends: Sequence[int] = (),
 ) -> str:
     """What was learnt so far: variables that fail, whether below a threshold, and which.
 
     Since which episode, from 1, variables move otherwise and disturbances are worse (0: none are).
     In which share of the states around a given function says otherwise than the thresholds. Beyond
-    which thresholds alone disturbances begin.
+    which thresholds alone disturbances begin. From how many episodes each dead end is known.
     """
     since = "".join(f"; since episode {first} {name} moves otherwise" for name, first in drifts)
     if worse:
@@ -145,7 +178,8 @@ def experience(
         verb = "was" if len(ats) == 1 else "were"
         since += f"; {len(ats)} of them {verb} seen to begin only where {name} is {side} {at:.4g}"
     fails_there = " or ".join([*([f"where {where}"] if where else []), *regions])
-    return f"fails {fails_there}; {remembered}, to be survived by {changes(margin)}{since}"
+    them = f"{remembered}, to be survived by {changes(margin)}"
+    return f"fails {fails_there}; {them}{since}{dead_ends(ends)}"
 
 
 def region(names: Sequence[str], row: Sequence[float], failures: int) -> str:
