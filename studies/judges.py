@@ -53,7 +53,6 @@ PARTS: dict[str, str] = {
     "margin": "no margin",
     "backups": "constant backups alone",
     "breaks": "it is not noticed where disturbances get worse",
-    "dead-ends": "no dead-end states where certificates were refuted",
     "states": "one state only: nothing may change",
     "regions": "failure by thresholds of single variables alone",
     "dead-ends": "no dead ends from certificates that were refuted",

@@ -19,6 +19,8 @@ Examples
 were they 1.3 times as hard'
 >>> comes_near("always -2.5", 2, 3)
 'then always -2.5 would come near dead end 2, from where 3 episodes that had been certified failed'
+>>> dead_ends([1, 3])
+'; 2 dead-end states: 3 and 1 episodes that had been certified failed from there'
 >>> experience([("gap", True, 0.05)], Remembered(0, 4.25), 3.0, [("speed", 101)])
 'fails where gap is below 0.05; what 4.2 s brought, to be survived by 3 ordinary changes; since \
 episode 101 speed moves otherwise'
@@ -88,30 +90,29 @@ def refused(
 
 def comes_near(backup: str, dead_end: int, count: int) -> str:
     """Why an action is dangerous that passes but for a dead end, by number and failures."""
-    return f"then {backup} would come near dead end {dead_end}, {failed_from([count])}"
+    return f"then {backup} would come near dead end {dead_end}, from where {failed([count])}"
 
 
 def is_near(dead_end: int, count: int, distance: float) -> str:
     """What is said of a situation in or near a dead end, which is so far [ordinary changes]."""
     where = "in" if distance < 0.0 else f"{changes(distance)} from"
-    return f"This is {where} dead end {dead_end}, {failed_from([count])}."
+    return f"This is {where} dead end {dead_end}, from where {failed([count])}."
 
 
 def dead_ends(counts: Sequence[int]) -> str:
     """How many there are, those first from where most failed; empty without any."""
     if not counts:
         return ""
-    several = "s" * (len(counts) > 1)
-    return f"; {len(counts)} dead-end state{several}, {failed_from(sorted(counts, reverse=True))}"
+    several, most_first = "s" * (len(counts) > 1), sorted(counts, reverse=True)
+    return f"; {len(counts)} dead-end state{several}: {failed(most_first)} from there"
 
 
-def failed_from(counts: Sequence[int]) -> str:
-    """Of dead ends, from how many episodes they are known."""
-    shown = [f"{count:,}" for count in counts[:_SHOWN]]
-    if len(counts) > _SHOWN:
-        shown.append("fewer")
-    several = f"{', '.join(shown[:-1])} and {shown[-1]}" if len(shown) > 1 else shown[0]
-    return f"from where {several} episode{'s' * (shown != ['1'])} that had been certified failed"
+def failed(counts: Sequence[int]) -> str:
+    """How many episodes failed from each of some dead ends."""
+    shown = [f"{count:,}" for count in counts[:_SHOWN]] + ["..."] * (len(counts) > _SHOWN)
+    comma = ", " if len(counts) > _SHOWN else " and "
+    several = comma.join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]
+    return f"{several} episode{'s' * (shown != ['1'])} that had been certified failed"
 
 
 def changed(backup: str, remembered: Remembered, margin: float, spared: int = 0) -> str:
