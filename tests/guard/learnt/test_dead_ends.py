@@ -28,7 +28,7 @@ def play(guard, road, episode, see=lambda z: z):
     return said, place >= fails
 
 
-def taught(on_ice=2, see=lambda z: z, without=()):
+def taught(on_ice=2, see=lambda z: z, without=("regions",)):
     """A guard that knows the wall, and met the trap so often."""
     judge = LearntRisk(0.1, -1.0, 1.0, without=without)
     guard = Guard(low=-1.0, high=1.0, interval=0.1, judge=judge, explaining=True)
@@ -65,7 +65,7 @@ def test_where_a_certificate_was_refuted_is_a_dead_end_that_is_named_and_kept_aw
 
 
 def test_without_them_nothing_was_learnt_from_it():
-    guard = taught(without=["dead-ends"])
+    guard = taught(without=["regions", "dead-ends"])
     assert not len(guard.judge.dynamics.dead_ends.survived)
     assert "dead-end" not in str(guard)
     assert play(guard, ICE, 30)[1]

@@ -61,12 +61,9 @@ class DeadEnds(NamedTuple):
 
         Of one that failed, what was survived ended a ``horizon`` before.
         """
-        last = horizon if failed else _LAST
-        kept = observations[: max(0, len(observations) - last)]
-        kept = kept[:: max(1, len(kept) // _EACH)]
-        found = self._replace(
-            survived=np.vstack([self.survived, kept])[-most_survived(len(unit)) :]
-        )
+        kept = observations[: max(0, len(observations) - (horizon if failed else _LAST))]
+        survived = np.vstack([self.survived, kept[:: max(1, len(kept) // _EACH)]])
+        found = self._replace(survived=survived[-most_survived(len(unit)) :])
         held = np.flatnonzero(certified[: len(observations) - 1])
         if failed and len(held):
             found = found._refuted(observations[held[-1] + 1 :], inverse)
@@ -74,24 +71,22 @@ class DeadEnds(NamedTuple):
 
     def _refuted(self, failed_from: Floats, inverse: Floats) -> DeadEnds:
         """With those (k, m) from where a certified episode failed."""
-        far = _distances(failed_from, self.centres, inverse)
-        counts = self.counts + (far.min(0) < _NEAR)
-        centres, more = list(self.centres), list(counts)
-        for z, to in zip(failed_from, far, strict=True):
-            if (
-                _distances(z[None], np.array(centres).reshape(-1, len(z)), inverse).min(
-                    initial=np.inf
-                )
-                >= _APART
-            ):
-                centres.append(z)
-                more.append(counts[to < _NEAR].max(initial=1.0))
-        new = len(centres) - len(counts)
+        nearest = _distances(failed_from, self.centres, inverse).min(0)
+        found = self._replace(counts=self.counts + (nearest < _NEAR))
+        for z in failed_from:
+            far = _distances(z[None], found.centres, inverse)[0]
+            if far.min(initial=np.inf) >= _APART:
+                about = found.counts[: len(nearest)][far[: len(nearest)] < _NEAR]
+                found = found._with(z, about.max(initial=1.0))
+        return found
+
+    def _with(self, z: Floats, count: float) -> DeadEnds:
+        """And one more."""
         return self._replace(
-            centres=np.array(centres),
-            counts=np.array(more),
-            numbers=np.append(self.numbers, self.created + 1.0 + np.arange(new)),
-            created=self.created + new,
+            centres=np.vstack([self.centres, z]),
+            counts=np.append(self.counts, count),
+            numbers=np.append(self.numbers, self.created + 1.0),
+            created=self.created + 1,
         )
 
     def _settled(self, inverse: Floats, unit: Floats) -> DeadEnds:
@@ -111,21 +106,17 @@ class DeadEnds(NamedTuple):
     @classmethod
     def merged(cls, parts: Sequence[DeadEnds], inverse: Floats, unit: Floats) -> DeadEnds:
         """All that several learnt; of those that are alike the first, with the counts of all."""
-        each, found = most_survived(len(unit)) // len(parts), cls.none(len(unit))
-        centres: list[Floats] = []
-        counts: list[float] = []
-        for z, n in zip(*(np.concatenate([one[k] for one in parts]) for k in (0, 2)), strict=True):
-            far = _distances(z[None], np.array(centres).reshape(-1, len(z)), inverse)[0]
-            if far.min(initial=np.inf) < _APART:
-                counts[int(far.argmin())] += n
-            else:
-                centres.append(z)
-                counts.append(n)
-        if centres:
-            numbers = np.arange(1.0, 1.0 + len(centres))
-            found = found._replace(centres=np.array(centres), numbers=numbers)
+        each = most_survived(len(unit)) // len(parts)
         survived = np.vstack([one.survived[-each:] for one in parts])
-        found = found._replace(counts=np.array(counts), survived=survived, created=len(centres))
+        found = cls.none(len(unit))._replace(survived=survived)
+        for one in parts:
+            for z, count in zip(one.centres, one.counts, strict=True):
+                far = _distances(z[None], found.centres, inverse)[0]
+                if far.min(initial=np.inf) < _APART:
+                    more = count * (np.arange(len(far)) == far.argmin())
+                    found = found._replace(counts=found.counts + more)
+                else:
+                    found = found._with(z, count)
         return found._settled(inverse, unit)
 
     def refuse_forged(self, n_episodes: int) -> None:
@@ -145,7 +136,7 @@ ARRAYS: dict[str, Numbers] = {
     "radii": Numbers(("dead_ends",), 0.0, _NEAR),
     "counts": FROM_1.of("dead_ends"),
     "numbers": FROM_1.of("dead_ends"),
-    "survived": Numbers(("survived", "m"), -1e30, 1e30),
+    "survived": Numbers(("passed", "m"), -1e30, 1e30),
 }
 
 
