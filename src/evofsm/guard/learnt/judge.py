@@ -281,8 +281,8 @@ class LearntRisk:
             for j, sign in sorted({place[:2] for place in places})
         ]
         ends = dynamics.dead_ends.counts.astype(int).tolist()
-        known = *known, dynamics.difference, self._no_threshold, there, begin, ends
-        told = words.experience(*known)
+        more = dynamics.difference, self._no_threshold, there, begin, ends
+        told = words.experience(*known, *more)
         return told + words.harm(self.harm, tests=self.shadow, learning=self.learning)
 
     def told_here(self, observation: Floats) -> tuple[str, Floats | None]:
