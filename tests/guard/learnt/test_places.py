@@ -23,6 +23,7 @@ RAIL = Model(
     highest=np.inf * ONE,
     thresholds=np.empty((0, 4)),
     regions=np.empty((0, 12)),
+    dead_ends=np.empty((0, 4)),
     choices=0,
 )
 
