@@ -2,8 +2,7 @@
 
 The wheel is installed with what development needs into a new environment, the sdist unpacked where
 no checkout is. Its sources are spoilt, so that no test can import them in place of the wheel.
-
-    python tools/dist.py [--only-build] [ARGUMENTS OF PYTEST]
+Arguments that are not known here are pytest's: what to run, in place of all quick tests.
 """
 
 from __future__ import annotations
