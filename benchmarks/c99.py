@@ -35,7 +35,10 @@ FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contra
 SANITIZERS = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 # Numbers of a decision, in the order in which the program below writes them.
 NUMBERS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen", "left")
-CODES = ("reason", "remark", "intake", "is_new", "state", "backup", "unsurvived")
+CODES = (
+    *("reason", "remark", "intake", "is_new", "state", "backup", "unsurvived"),
+    *("dead_end", "backup_near"),
+)
 _MAIN = """#define _POSIX_C_SOURCE 199309L
 #include "evofsm.h"
 #include <stdio.h>
@@ -46,7 +49,7 @@ int main(void) {
   double row[ROW];
   evofsm_reset(&state);
   while (fread(row, sizeof row[0], ROW, stdin) == ROW) {
-    double numbers[9 + 7 + 2 * EVOFSM_ACTIONS] = {0.0};
+    double numbers[18 + 2 * EVOFSM_ACTIONS] = {0.0};
     evofsm_decision d = {0};
     struct timespec begin, end;
     int i;
@@ -61,9 +64,10 @@ int main(void) {
     numbers[5] = d.risk_high, numbers[6] = d.evidence, numbers[7] = d.seen, numbers[8] = d.left;
     numbers[9] = d.reason, numbers[10] = d.remark, numbers[11] = d.intake, numbers[12] = d.is_new;
     numbers[13] = d.state, numbers[14] = d.backup, numbers[15] = d.unsurvived;
+    numbers[16] = d.dead_end, numbers[17] = d.backup_near;
     for (i = 0; i < EVOFSM_ACTIONS; i++) {
-      numbers[16 + i] = d.executed[i];
-      numbers[16 + EVOFSM_ACTIONS + i] = d.advised[i];
+      numbers[18 + i] = d.executed[i];
+      numbers[18 + EVOFSM_ACTIONS + i] = d.advised[i];
     }
     fwrite(numbers, sizeof numbers[0], sizeof numbers / sizeof numbers[0], stdout);
   }
@@ -317,9 +321,9 @@ def compare(guard: Guard, program: Path, asked: Asked) -> Compared:
         found[:, 0],
         found[:, 1],
         found[:, 2:9],
-        found[:, 9:16].astype(int),
+        found[:, 9:18].astype(int),
     )
-    actions, taken = found[:, 16:], asked.codes[:, 0] == 0.0
+    actions, taken = found[:, 18:], asked.codes[:, 0] == 0.0
     other = (rc != asked.codes[:, 0]) | (
         taken & ((codes[:, 2] != asked.codes[:, 1]) | (codes[:, 4] != asked.codes[:, 2]))
     )
@@ -376,6 +380,10 @@ def _learnt(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str
     why = words.refused(
         code["unsurvived"], remembered, judge.margin, judge.disturbance_scale, allowed
     )
+    if (end := code["dead_end"]) >= 0:
+        ends = judge.dynamics.dead_ends
+        near = judge._backup_text(code["backup_near"])
+        why = words.comes_near(near, int(ends.numbers[end]), int(ends.counts[end]))
     if kind == 1:
         return f"{why}; {words.changed(backup, remembered, judge.margin, allowed)}"
     return f"{why}; {words.lasting(backup, cut=kind == 2)}"

@@ -118,7 +118,7 @@ def test_settings_of_a_guard_are_those_in_c(name, change, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["disc", "cut_in"])
 def test_whatever_may_be_learnt_is_replayed_alike(name, tmp_path):
-    """Places, drifts, jumps, regions: not each system teaches each of them."""
+    """Places, drifts, jumps, regions, dead ends: not each system teaches each of them."""
     compiler()
     learnt = c99.learnt(name)
     judge, chance = learnt.guard.judge, np.random.default_rng(0)
@@ -140,8 +140,18 @@ def test_whatever_may_be_learnt_is_replayed_alike(name, tmp_path):
     drifted = np.where(np.arange(m) == m - 1, 1.0, -1.0)
     unit, low = judge.dynamics.sums.unit, seen.min(0)
     region = [0, m - 1, low[0], low[m - 1], 1 / unit[0], 1 / unit[m - 1], 1, 0.1, 0.2, -1, 0.3, -2]
-    judge.dynamics.model = model._replace(drifted=drifted, regions=np.array([region]))
-    found = agrees(learnt, tmp_path, "-O1")
+    centres = seen[chance.integers(len(seen), size=3)]
+    ends = np.column_stack([centres, np.full(3, 0.4), np.full(3, 4.0)])
+    judge.dynamics.model = model._replace(
+        drifted=drifted, regions=np.array([region]), dead_ends=ends
+    )
+    counted = {name: np.arange(1.0, 4.0) for name in ("numbers", "counts")}
+    judge.dynamics.dead_ends = judge.dynamics.dead_ends._replace(**counted)
+    asked = c99.ask(learnt, 1500)
+    near = sum("near dead end" in reason for reason, _ in asked.said)
+    assert near > 20 or name == "cut_in"  # where nothing passes anyway
+    found = c99.compare(learnt.guard, c99.build(learnt.guard, tmp_path, *c99.SANITIZERS), asked)
+    assert found.agrees, found[:6]
     assert constant(tmp_path, "EVOFSM_PLACED", "evofsm.h") == 1
     assert found.changed > 20
 

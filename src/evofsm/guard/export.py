@@ -178,6 +178,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         f"replays of {steps} steps, each of {p} x {m} products in {lanes} lanes\n"
     )
     sizes = {"NUMBERS": a, "FEATURES": p, "LANES": lanes, "BACKUPS": len(names), "PLACED": placed}
+    sizes["DEAD_ENDS"] = len(model.dead_ends)
     return Part(Path(replay.__file__).with_suffix(".c"), m, sizes, constants, about)
 
 
@@ -188,7 +189,7 @@ _OF_REPLAYS = (
 _OF_JUMPS = ("jump_at", "jump_to", "jump_slope", "jump_from", "landing")
 _OF_MODEL = (
     *("weights", "origin", "reach", "lowest", "highest", "least", "most", "thresholds", "regions"),
-    *("drifted", "mean", "inverse"),
+    *("dead_ends", "drifted", "mean", "inverse"),
 )
 
 

@@ -50,6 +50,8 @@ typedef struct {
   int state;                           /* from 0; -1: none is known */
   int backup;                          /* learnt: after which it passes, or lasts; -1: none */
   int unsurvived; /* learnt: disturbances not survived after the proposal; -1: not even none */
+  int dead_end, backup_near; /* learnt: the dead end, from 0, to which it would come too near, and
+                                after which backup, where the proposal would else pass; -1: none */
 } evofsm_decision;
 
 /* Of one stream of observations. Whoever calls owns it, and leaves what is in it alone; its size is
@@ -261,7 +263,7 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
   out->state = state->state;
   out->seen = state->seen;
   out->left = NAN;
-  out->backup = -1;
+  out->backup = out->dead_end = out->backup_near = -1;
   out->unsurvived = 0;
   revise(state, out);
   out->is_new = out->seen < NEW;

@@ -20,6 +20,11 @@
   double rest[EVOFSM_VARIABLES][EVOFSM_LANES];
   int clock[EVOFSM_LANES];
 #endif
+#if EVOFSM_DEAD_ENDS > 0
+  double aside[EVOFSM_DEAD_ENDS][EVOFSM_LANES], square[EVOFSM_LANES];
+  double away[EVOFSM_DEAD_ENDS]; /* how far each is from here */
+  int is_left_out[EVOFSM_DEAD_ENDS], order[EVOFSM_DEAD_ENDS];
+#endif
   int playing[EVOFSM_LANES]; /* the step of each disturbance; -1: it waits */
 /* ==== source ==== */
 #define M EVOFSM_VARIABLES
@@ -106,21 +111,20 @@ static void fill_features(evofsm_state *s, double harder) {
   }
 }
 
-/* expect: the changes that are expected of features, into s->move. The sums stay in registers. */
+/* expect: the changes that are expected of features, into s->move. */
 static void expect(evofsm_state *s) {
   int j, k, l;
   for (j = 0; j < M; j++) {
-    double sums[L];
     for (l = 0; l < L; l++) {
-      sums[l] = 0.0;
+      s->move[j][l] = 0.0;
     }
-    for (k = 0; k < P; k++) {
+  }
+  for (k = 0; k < P; k++) {
+    for (j = 0; j < M; j++) {
+      const double weight = weights[k][j];
       for (l = 0; l < L; l++) {
-        sums[l] += s->found[k][l] * weights[k][j];
+        s->move[j][l] += s->found[k][l] * weight;
       }
-    }
-    for (l = 0; l < L; l++) {
-      s->move[j][l] = sums[l];
     }
   }
 }
@@ -158,6 +162,22 @@ static void follow_policy(evofsm_state *s, const double policy[A][1 + M], double
   }
 }
 
+#if EVOFSM_DEAD_ENDS > 0
+/* _from_centre: squared distances from the centre of a dead end, in spreads, into s->square. */
+static void from_centre(evofsm_state *s, int end) {
+  int j, l;
+  for (l = 0; l < L; l++) {
+    s->square[l] = 0.0;
+  }
+  for (j = 0; j < M; j++) {
+    for (l = 0; l < L; l++) {
+      const double x = (s->z[j][l] - dead_ends[end][j]) * inverse[j];
+      s->square[l] += x * x;
+    }
+  }
+}
+#endif
+
 /* _distances: to the nearest failure, into s->far. */
 static void measure(evofsm_state *s) {
   int f, l;
@@ -186,6 +206,18 @@ static void measure(evofsm_state *s) {
       const double u = b + 2.0 * p * x + q * y, v = d + 2.0 * r * y + q * x;
       const double left = -form / sqrt(u * u + v * v + FLAT) - GROWN;
       s->far[l] = left < s->far[l] ? left : s->far[l];
+    }
+  }
+#endif
+#if EVOFSM_DEAD_ENDS > 0
+  for (f = 0; f < EVOFSM_DEAD_ENDS; f++) {
+    if (!s->is_left_out[f]) {
+      from_centre(s, f);
+      for (l = 0; l < L; l++) {
+        const double off = sqrt(s->square[l]) - dead_ends[f][M];
+        const double left = off * dead_ends[f][M + 1] + s->aside[f][l];
+        s->far[l] = left < s->far[l] ? left : s->far[l];
+      }
     }
   }
 #endif
@@ -311,6 +343,15 @@ static int replay(evofsm_state *s, const double *action, const double policy[A][
     s->clock[l] = 0;
 #endif
   }
+#if EVOFSM_DEAD_ENDS > 0
+  for (i = 0; i < EVOFSM_DEAD_ENDS; i++) { /* those in which it begins may not count */
+    from_centre(s, i);
+    for (l = 0; l < L; l++) {
+      const int within = s->square[l] < dead_ends[i][M] * dead_ends[i][M];
+      s->aside[i][l] = within && allowed >= K ? INFINITY : 0.0;
+    }
+  }
+#endif
   for (t = 0; t < STEPS; t++) {
     int fails = 0;
     s->done++;
@@ -485,6 +526,54 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
   return EVOFSM_NOTHING_PASSES;
 }
 
+#if EVOFSM_DEAD_ENDS > 0
+/* Whether a backup survives after an action with so many of the nearest dead ends alone. */
+static int passes_amid(evofsm_state *s, const double action[A], int backup, int nearest) {
+  double left;
+  int k;
+  for (k = 0; k < EVOFSM_DEAD_ENDS; k++) {
+    s->is_left_out[s->order[k]] = k >= nearest;
+  }
+  return passes(s, action, backup, &left);
+}
+
+/* which_refuses: the dead end for which a proposal does not pass that would else, and after which
+   backup; -1: none. At most ASKED replays, and log2 of the number of dead ends. */
+static void find_dead_end(evofsm_state *s, const double proposal[A], evofsm_decision *out) {
+  int f, j, k, r;
+  for (f = 0; f < EVOFSM_DEAD_ENDS; f++) {
+    double square = 0.0;
+    for (j = 0; j < M; j++) {
+      const double x = (s->here[j] - dead_ends[f][j]) * inverse[j];
+      square += x * x;
+    }
+    s->away[f] = (sqrt(square) - dead_ends[f][M]) * dead_ends[f][M + 1];
+    for (k = f; k > 0 && s->away[s->order[k - 1]] > s->away[f]; k--) {
+      s->order[k] = s->order[k - 1];
+    }
+    s->order[k] = f;
+  }
+  for (r = 0; r < ASKED && out->dead_end < 0; r++) {
+    if (passes_amid(s, proposal, s->ranks[r], 0)) {
+      int low = 0, high = EVOFSM_DEAD_ENDS;
+      while (high - low > 1) {
+        const int between = (low + high) / 2;
+        if (passes_amid(s, proposal, s->ranks[r], between)) {
+          low = between;
+        } else {
+          high = between;
+        }
+      }
+      out->dead_end = s->order[high - 1];
+      out->backup_near = s->ranks[r];
+    }
+  }
+  for (f = 0; f < EVOFSM_DEAD_ENDS; f++) {
+    s->is_left_out[f] = 0;
+  }
+}
+#endif
+
 /* -- The judge: LearntRisk ---------------------------------------------------------------------- */
 
 /* _foresee: disturbances not survived after an action, under the best of some backups; -1: it fails
@@ -571,6 +660,11 @@ static void forget(evofsm_state *s) {
   for (i = 0; i < EVOFSM_BACKUPS; i++) {
     s->ranks[i] = backup_ranks[i];
   }
+#if EVOFSM_DEAD_ENDS > 0
+  for (i = 0; i < EVOFSM_DEAD_ENDS; i++) {
+    s->is_left_out[i] = 0;
+  }
+#endif
 }
 
 static void start_revising(evofsm_state *s) { (void)s; }
@@ -591,6 +685,11 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   }
   encode(s->proposal, proposal);
   out->reason = search(s, proposal, action, &out->backup, &out->left);
+#if EVOFSM_DEAD_ENDS > 0
+  if (out->reason == EVOFSM_CHANGED || out->reason == EVOFSM_NOTHING_PASSES) {
+    find_dead_end(s, proposal, out);
+  }
+#endif
   for (r = 0; s->ranks[r] != out->backup; r++) { /* at most EVOFSM_BACKUPS: it is one of them */
   }
   for (; r > 0; r--) { /* what passed now is asked first the next time */
