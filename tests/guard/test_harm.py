@@ -9,6 +9,7 @@ import pytest
 
 from evofsm.guard import AuditLog, Guard, LearntRisk, Mode, audit, merge_judges
 from evofsm.guard.api import Search
+from evofsm.guard.export import write_c99
 from evofsm.guard.harm import Harm, Outcome, chance_of, earlier
 from evofsm.guard.learnt.judge import _unjudged
 
@@ -60,7 +61,7 @@ def test_it_steps_back_within_fifteen_episodes_and_says_so(wrong):
     assert "it must" in guard.decide([0.0], _ALONE).reason
 
 
-def test_frozen_it_stays_back_and_warns(wrong):
+def test_frozen_it_stays_back_and_warns(wrong, tmp_path):
     guard = make()
     drive(guard, 15)
     with pytest.warns(UserWarning, match="steps back since episode"):
@@ -70,6 +71,11 @@ def test_frozen_it_stays_back_and_warns(wrong):
     guard.save(file)
     again = Guard.load(BytesIO(file.getvalue()))
     assert drive(again, 3) == drive(guard, 3)
+    with (
+        pytest.warns(UserWarning, match="steps back"),
+        pytest.raises(ValueError, match="but C would act"),
+    ):
+        write_c99(guard, tmp_path)
     guard.shadow = False
     assert drive(guard)[0] == (1, "")
 

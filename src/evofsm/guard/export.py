@@ -46,8 +46,8 @@ class Part(NamedTuple):
 def write_c99(guard: Guard, folder: Path) -> None:
     """Write ``evofsm.h``, ``evofsm.c``, and ``evofsm.hpp``, a class around them for C++17.
 
-    A ValueError if its reviser or judge is of someone's own class, it judges nothing (mode off), or
-    nothing was learnt yet by which it could decide.
+    A ValueError if its reviser or judge is of someone's own class, it judges nothing (mode off),
+    nothing was learnt yet by which it could decide, or it steps back or may do harm.
     """
     frozen = guard.copy()
     frozen.freeze()
@@ -56,6 +56,12 @@ def write_c99(guard: Guard, folder: Path) -> None:
         raise ValueError(
             "only a guard with an ActionReviser whose mode is not off is exported, not one of "
             f"{type(reviser).__name__}{' in mode off' * hasattr(reviser, 'mode')}"
+        )
+    frozen.begin()
+    if reviser.passing:
+        raise ValueError(
+            f"this guard {reviser.passing}, so that proposals pass, but C would act: let it learn "
+            "on, or set guard.shadow = False"
         )
     if asked is not LearntRisk and "in_c99" not in vars(asked):
         raise ValueError(f"a LearntRisk or a LatentRisk is exported, but no {asked.__name__}")
