@@ -31,7 +31,16 @@ from evofsm.guard.reviser import unseen_text
 
 Floats = NDArray[np.float64]
 
-FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off")
+FLAGS = (
+    "-std=c99",
+    "-Wall",
+    "-Wextra",
+    "-Wconversion",
+    "-Wshadow",
+    "-pedantic",
+    "-Werror",
+    "-ffp-contract=off",
+)
 SANITIZERS = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 # Numbers of a decision, in the order in which the program below writes them.
 NUMBERS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen", "left")
@@ -175,6 +184,14 @@ class Emergency(Wall):
         return np.asarray(seen, np.float64), bool(failed), bool(failed or over)
 
 
+class NoisyCars(Emergency):
+    """The same with noisy sensors, which are filtered."""
+
+    def step(self, action: Any) -> tuple[Floats, bool, bool]:
+        seen, failed, over = super().step(action)
+        return seen + self.chance.normal(size=3) * [0.5, 0.2, 0.2], failed, over
+
+
 class CutIn(Emergency):
     """Another car cuts in: gap and leader's speed jump."""
 
@@ -193,7 +210,7 @@ def learnt(name: str, episodes: int | None = None) -> Learnt:
     kind, most = SYSTEMS[name]
     system: Any = kind()
     if isinstance(system, Emergency):
-        judge = "kinematic" if name == "cars" else "learnt"
+        judge = "kinematic" if name.endswith("cars") else "learnt"
         guard = guard_for_family(system.env.family, judge=judge)
     else:
         guard = Guard(**system.actions)
@@ -214,6 +231,7 @@ SYSTEMS: dict[str, tuple[Any, int]] = {
     "emergency": (Emergency, 40),
     "cut_in": (CutIn, 40),
     "cars": (Emergency, 20),
+    "noisy_cars": (NoisyCars, 20),
 }
 
 

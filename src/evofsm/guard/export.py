@@ -178,9 +178,11 @@ def _learnt(reviser: ActionReviser) -> Part:
         "gains": dynamics.gains[: None if dynamics.is_noisy else 0],
         "jump_of": replay.JUMP * dynamics.sums.unit[: None if dynamics.is_noisy else 0],
     }
+    replays = 2 * constants["ASKED"] + max(few, replay._HALVINGS) + 2 * few
+    replays += (few + len(model.dead_ends).bit_length()) * (len(model.dead_ends) > 0)
     about = (
         f"backups: {'; '.join(names)}\n"
-        f"a decision: at most {2 * constants['ASKED'] + max(few, replay._HALVINGS) + 2 * few} "
+        f"a decision: at most {replays} "
         f"replays of {steps} steps, each of {p} x {m} products in {lanes} lanes\n"
     )
     sizes = {"NUMBERS": a, "FEATURES": p, "LANES": lanes, "BACKUPS": len(names), "PLACED": placed}

@@ -71,10 +71,10 @@ static void fill_features(evofsm_state *s, double harder) {
     s->found[0][l] = 1.0;
   }
   for (j = 0; j < M; j++) {
-    const double most = harder * reach[j];
+    const double largest = harder * reach[j];
     for (l = 0; l < L; l++) {
       s->found[1 + j][l] = s->z[j][l] - origin[j];
-      s->found[1 + M + j][l] = fabs(s->change[j][l]) <= most ? s->change[j][l] : 0.0;
+      s->found[1 + M + j][l] = fabs(s->change[j][l]) <= largest ? s->change[j][l] : 0.0;
     }
   }
   k = 1 + 2 * M;
