@@ -60,12 +60,11 @@ def write_c99(guard: Guard, folder: Path) -> None:
     frozen.begin()
     if reviser.passing:
         raise ValueError(
-            f"this guard {reviser.passing}, so that proposals pass, but C would act: let it learn "
+            f"this guard {reviser.passing}: exported it would let all proposals pass; let it learn "
             "on, or set guard.shadow = False"
         )
     if asked is not LearntRisk and "in_c99" not in vars(asked):
         raise ValueError(f"a LearntRisk or a LatentRisk is exported, but no {asked.__name__}")
-    frozen.begin()
     part: Part = _learnt(reviser) if asked is LearntRisk else reviser.risk.in_c99(reviser)  # type: ignore[attr-defined]
     common, judge = _sections(Path(__file__).with_name("guard.c")), _sections(part.template)
     sizes, constants = _common(frozen, reviser, part.variables)
