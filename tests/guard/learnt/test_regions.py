@@ -109,6 +109,35 @@ def test_a_disc_is_learnt_said_and_no_threshold(taught):
     assert sum(failed for _, failed in held) <= 1
 
 
+def test_thresholds_that_one_failure_tells_are_doubted_where_nearly_all_is_refused_for_long():
+    guard = Guard(-np.ones(1), np.ones(1), interval=0.1, horizon=2.0)
+    rng, dynamics = np.random.default_rng(0), guard.judge.dynamics
+
+    def play(to, failed):
+        z = np.zeros(2)
+        while z[0] < to:
+            guard.decide(z, np.ones(1))
+            z = z + 0.02 + 0.002 * rng.normal(size=2)
+        guard.end(failed, z)
+
+    for k in range(4):
+        play(1.0 if k == 3 else 0.5, k == 3)
+    assert len(dynamics.thresholds) == 2  # of one failure it may be either
+    play(0.5, failed=False)
+    for _ in range(8):
+        assert len(dynamics.daring.thresholds) == 2
+        dynamics.challenge(60)
+    assert not len(dynamics.daring.thresholds)
+    assert len(dynamics.model.thresholds) == 2
+    assert "so it is doubted" in guard.decide(np.zeros(2), np.ones(1)).reason
+    guard.freeze()
+    guard.decide(np.zeros(2), np.ones(1))
+    assert "is doubted" not in guard.decide(np.zeros(2), np.ones(1)).reason
+    guard.learn = True
+    play(1.0, failed=True)
+    assert len(dynamics.daring.thresholds) >= 1
+
+
 def test_without_regions_it_is_as_it_was(taught):
     judge = LearntRisk(0.1, -np.ones(2), np.ones(2), horizon=2.0, without=["regions"])
     guard = Guard(-np.ones(2), np.ones(2), interval=0.1, judge=judge)

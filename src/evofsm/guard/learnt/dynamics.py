@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.fsm.validation import real_array, refuse_unusable, whole
 from evofsm.guard.learnt import dead_ends, regions, regression
 from evofsm.guard.learnt.dead_ends import DeadEnds
-from evofsm.guard.learnt.failures import difference, explain_failures, probe
+from evofsm.guard.learnt.failures import ask, explain_failures
 from evofsm.guard.learnt.places import ANYWHERE, Place, Places, onset
 from evofsm.guard.learnt.regression import Drift, Recent
 from evofsm.guard.learnt.replay import (
@@ -39,7 +39,7 @@ from evofsm.store import COUNT, SHARE, Numbers
 #: Parts that can be left out, to see what each is worth.
 DYNAMICS_PARTS: tuple[str, ...] = (
     *("stretches", "memory", "products", "lags", "doubt", "jumps", "carried", "drift"),
-    *("observer", "regions", "places"),
+    *("observer", "regions", "places", "rivals"),
 )
 
 # Observations before anything is expected: an episode may fail after so few.
@@ -64,6 +64,11 @@ _STUDIED, _LEAST = 5, 2
 _REACHED = 2
 # Failures, and jumps of each variable, that are remembered.
 MOST = 200
+# Directions in which failure is looked for where it is given as a function.
+_RAYS = 64
+# After so many episodes in which more than this share was refused and none failed, what hardly any
+# failure tells is doubted; sooner where some failure is known to be no threshold.
+_PATIENCE, _REFUSED, _SOONER, _LESS = 8, 0.75, 4, 0.33
 #: Survived observations that are remembered, as many as fill some hundred kilobytes.
 MOST_SURVIVED = 8000
 # Choices that actions are told apart by, each of which has features of its own.
@@ -149,6 +154,8 @@ class Dynamics:
         self.latest: Episode | None = None
         #: (a, 2) how often each number of an action was near an end of its range.
         self.used = np.zeros((self.size, 2))
+        #: Share of the states around in which a given function says otherwise than what is known.
+        self.differs = 0.0
         self.quiet = 0  #: observations since one that was not expected
         self.is_noisy = False  #: whether some variables are not taken as they are seen
         self.forget_episode()
@@ -196,6 +203,8 @@ class Dynamics:
         #: (n, m) what was survived, and what is between two such observations
         self.survived = np.empty((0, m))
         self.regions = np.empty((0, regions.SIZE))  #: (r, 12) where it fails beyond no threshold
+        #: For how many episodes little passed; below 0 while it is tried what else may be true.
+        self.held = 0
         self.jumps = [np.empty((0, m + 1)) for _ in range(m)]  #: from where, and to where
         self.dead_ends = DeadEnds.none(m)  #: from where certified episodes failed
         self.recent = Recent.none(p, m, self.n_episodes)  #: what the last episodes say of the model
@@ -224,9 +233,6 @@ class Dynamics:
         sums.mean[:] += off / sums.counts[0]
         sums.scatter[:] += off * (z - self.origin - sums.mean)
         self._surprised = False
-        if self.failed is not None and not self.thresholds and sums.counts[1] >= 1.0:
-            self.thresholds = probe(self.failed, z, np.where(sums.unit > 0.0, sums.unit, 1e-9))
-            self.rebuild()
         if n > 1:
             self._learn(n - 1)
         seen = float(sums.counts[0])
@@ -320,13 +326,20 @@ class Dynamics:
             least=sums.least.copy(),
             most=sums.most.copy(),
             thresholds=np.array(thresholds, np.float64).reshape(-1, 4),
-            regions=regions.in_units(self.regions, 1.25 * sums.unit + 1e-300),
+            regions=self.regions,
             dead_ends=self.dead_ends.rows(inverse, sums.unit),
             drifted=drifted,
             mean=self.origin + sums.mean,
             inverse=inverse,
             choices=self.choices,
         )
+        #: What is expected while it is tried which explanation of failure is true.
+        self.daring = self.model
+        if self.held < 0:
+            weak, few = regions.are_weak(self.thresholds, self.regions, self.failures)
+            self.daring = self.model._replace(
+                thresholds=self.model.thresholds[~weak], regions=self.model.regions[~few]
+            )
         #: (m,) gains of the observer, and how far from where it saturates one that is there is seen
         self.gains = regression.best_gains(self.missed)
         self.is_noisy = bool((self.gains < 1.0).any())
@@ -422,6 +435,7 @@ class Dynamics:
         Where a decision ``waits``, regions only shrink.
         """
         self._solve()
+        before = [one[:2] for one in self.thresholds], len(self.regions)
         if self.failed is None:
             sums = self.sums
             blur = np.where(self.reached < _REACHED, sums.scale[:, None], 0.0)
@@ -431,6 +445,11 @@ class Dynamics:
                 self.thresholds = found
             else:
                 self._explain(found, anew=failed, waits=waits)
+        elif not waits:
+            self._ask(self.failed)
+        now = [one[:2] for one in self.thresholds], len(self.regions)
+        if failed or now != before:  # one of two explanations is refuted
+            self.held = 0
         self.rebuild()
 
     def _explain(self, found: list[tuple[int, float, float]], *, anew: bool, waits: bool) -> None:
@@ -439,13 +458,33 @@ class Dynamics:
         self.regions = regions.without_survived(self.regions, survived)
         kept = {(j, sign) for j, sign, _ in self.thresholds}
         stay = [one for one in found if one[:2] in kept] if len(self.regions) else found
-        if anew or not (waits or regions.are_explained(self.failures, stay, self.regions)):
-            sums = self.sums
-            spread = np.sqrt(sums.scatter / max(1.0, sums.counts[0] - 1.0))
-            unit = 1.25 * np.maximum(sums.unit, 1e-3 * spread + 1e-300)
-            given = self.failures, survived, unit, spread
+        if anew or not (waits or regions.explained(self.failures, stay, self.regions).all()):
+            given = self.failures, survived, *self._sizes
             stay, self.regions = regions.explain(found, *given)
         self.thresholds = stay
+
+    @property
+    def _sizes(self) -> tuple[Floats, Floats]:
+        """(m,) what a distance of 1 is for each variable, and its standard deviation."""
+        spread = np.sqrt(self.sums.scatter / max(1.0, self.sums.counts[0] - 1.0))
+        return 1.25 * np.maximum(self.sums.unit, 1e-3 * spread + 1e-300), spread
+
+    def challenge(self, refused: int) -> None:
+        """Doubt what hardly any failure tells, if it refuses nearly all for long.
+
+        Of the latest episode so many were ``refused``. While learning, what is doubted is left out
+        then, until it or what is left is refuted.
+        """
+        assert self.latest is not None
+        if "rivals" in self.without or self.failed is not None or self.held < 0:
+            return
+        known = len(self.regions) > 0
+        most, patience = (_LESS, _SOONER) if known else (_REFUSED, _PATIENCE)
+        little = refused > most * len(self.latest.actions) and not self.latest.failed
+        self.held = self.held + 1 if little else 0
+        if self.held >= patience:
+            self.held = -1
+            self.rebuild()
 
     @property
     def fails(self) -> bool:
@@ -454,27 +493,45 @@ class Dynamics:
 
     def _survive(self, safe: Floats) -> None:
         """Remember what was survived; where that is too much, every second one."""
-        if "regions" in self.without or not len(safe):
+        if ("regions" in self.without and self.failed is None) or not len(safe):
             return
         change = np.diff(safe, axis=0)
         jumped = regression.jumps(change, self.sums.unit).any(1)
         between = (safe[:-1] + 0.5 * change)[~jumped]
-        survived = np.concatenate([self.survived, safe, between])
+        new = np.concatenate([safe, between])
+        if self.failed is not None:
+            new = new[[not self.failed(z) for z in new]]
+        survived = np.concatenate([self.survived, new])
         while len(survived) > MOST_SURVIVED:
             survived = survived[::2]
         self.survived = survived
 
-    @property
-    def difference(self) -> float:
-        """Share of the states around in which a given function says otherwise than thresholds."""
-        if self.failed is None or not self.thresholds:
-            return 0.0
-        return difference(self.failed, self.thresholds, self.lowest, self.highest)
+    def _ask(self, failed: Callable[[Floats], bool]) -> None:
+        """Explain what a function says around what was survived, unless that is explained."""
+        (unit, spread), survived = self._sizes, self.survived
+        if not len(survived) or not spread.any():
+            return
+        pace = np.abs(np.diff(survived, axis=0)).mean(0) / np.where(spread > 0.0, spread, np.inf)
+        drawn = np.random.default_rng(self.n_episodes).normal(size=(_RAYS, self.n_variables))
+        towards = np.empty_like(drawn)
+        towards[:, np.argsort(pace, kind="stable")] = drawn
+        flips = np.where(((survived - survived.mean(0)) ** 3).sum(0) < 0.0, -1.0, 1.0)
+        lost, kept = ask(failed, survived, towards * flips * spread)
+        around = np.concatenate([kept, survived])
 
-    @property
-    def is_no_box(self) -> bool:
-        """Whether a function of failures is given that its thresholds do not say as well."""
-        return self.failed is not None and (not self.thresholds or self.difference > 0.0)
+        def differs() -> float:
+            wrong = ~regions.explained(lost, self.thresholds, self.regions)
+            inside = regions.explained(kept, self.thresholds, self.regions, 0.0)
+            return float(np.concatenate([wrong, inside]).mean()) if len(lost) else 0.0
+
+        if len(lost) and differs() > 0.0:
+            ends = around.min(0), around.max(0)
+            found = explain_failures(lost, *ends, unit, np.zeros((len(unit), 2)))
+            if "regions" in self.without:
+                self.thresholds = found
+            else:
+                self.thresholds, self.regions = regions.explain(found, lost, around, unit, spread)
+        self.differs = differs()
 
     def _extend(self, safe: Floats) -> None:
         """How far variables went, and in how many episodes they came to those ends by moving."""
@@ -681,6 +738,8 @@ class Dynamics:
             "exposed": self.places.exposed if known else 0,
             "ready": int(known and self.ready),
             "dead_ends": self.dead_ends.created if known else 0,
+            "held": self.held if known else 0,
+            "differs": self.differs,
         }
 
     def arrays(self) -> dict[str, Floats]:
@@ -721,6 +780,7 @@ class Dynamics:
         A ValueError if they contradict each other, or the actions: kernels trust their sizes.
         """
         m, a, p = len(arrays["origin"]), self.size, len(arrays["sums_squares"])
+        self.differs = float(numbers["differs"])
         self.n_episodes, self.quiet = int(numbers["n_episodes"]), int(numbers["quiet"])
         if len(arrays["used"]) != a:
             raise ValueError(f"used has {len(arrays['used'])} rows, but an action has {a} numbers")
@@ -758,6 +818,7 @@ class Dynamics:
             created=int(numbers["dead_ends"]),
         )
         self.dead_ends.refuse_forged(self.n_episodes)
+        self.held = int(numbers["held"])
         self.ready, self.doubt_of_lags = bool(numbers["ready"]), float(numbers["doubt_of_lags"])
         self.thresholds = [(int(j), sign, at) for j, sign, at in arrays["thresholds"].tolist()]
         self.drifts = [Drift(*map(int, row)) for row in arrays["drifts"]]

@@ -8,21 +8,19 @@ such failures was seen.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 _Floats = NDArray[np.float64]
 
-# How far from a safe observation a failure is looked for, in halvings and doublings.
-_FARTHEST, _HALVINGS = 40, 60
+# How far from what was survived failure is looked for, halvings between the two, and how far in.
+_RADII, _HALVINGS, _DEEP = tuple(0.1 * 1.3**k for k in range(20)), 40, 0.05
 # So many failures may leave two sides undecided.
 _FIRST = 2
 # Beyond an end is what is so many ordinary changes beyond; blurred ends are so wide.
 _BEYOND, _BLUR = 1e-12, 5.0
-# States in which a function is compared with its thresholds, and how far beyond them.
-_COMPARED, _AROUND = 256, 0.25
 
 
 def explain_failures(
@@ -73,46 +71,27 @@ def _most_telling(
     return tied, best
 
 
-def probe(
-    failed: Callable[[_Floats], bool], safe: _Floats, unit: _Floats
-) -> list[tuple[int, float, float]]:
-    """Thresholds of a failure set that is a function, along each variable from ``safe``."""
-    found: list[tuple[int, float, float]] = []
-    for j in range(len(safe)):
-        for sign in (-1.0, 1.0):
-            z, far = safe.copy(), unit[j]
-            for _ in range(_FARTHEST):
-                z[j] = safe[j] + sign * far
-                if failed(z):
-                    break
-                far *= 2.0
-            else:
-                continue
-            near = 0.0
-            for _ in range(_HALVINGS):
-                half = 0.5 * (near + far)
-                z[j] = safe[j] + sign * half
-                near, far = (near, half) if failed(z) else (half, far)
-            found.append((j, sign, float(safe[j] + sign * near)))
-    return found
+def ask(
+    failed: Callable[[_Floats], bool], survived: _Floats, towards: _Floats
+) -> tuple[_Floats, _Floats]:
+    """Observations that a function says are failures, each at the edge of them, and others.
 
-
-def difference(
-    failed: Callable[[_Floats], bool],
-    thresholds: Sequence[tuple[int, float, float]],
-    lowest: _Floats,
-    highest: _Floats,
-) -> float:
-    """Share of the states around in which a function says otherwise than its thresholds.
-
-    Around is what was survived, from ``lowest`` to ``highest`` (m,), and some way past thresholds.
+    Looked for from some that were ``survived`` (n, m) in the directions ``towards`` (r, m).
     """
-    low, high = lowest.copy(), highest.copy()
-    for j, sign, at in thresholds:
-        past = at + sign * _AROUND * max(abs(at - lowest[j]), abs(at - highest[j]))
-        low[j], high[j] = min(low[j], past), max(high[j], past)
-    if not np.isfinite(high - low).all():  # nothing was survived yet
-        return 0.0
-    z = np.random.default_rng(0).uniform(low, high, (_COMPARED, len(low)))
-    beyond = np.any([sign * (z[:, j] - at) > 0.0 for j, sign, at in thresholds], 0)
-    return float(np.mean([bool(failed(one)) for one in z] != beyond))
+    lost, kept = [], []
+    starts = survived[np.linspace(0, len(survived) - 1, len(towards)).astype(int)]
+    for z, off in zip(starts, towards, strict=True):
+        near = 0.0
+        for far in _RADII:
+            if failed(z + far * off):
+                for _ in range(_HALVINGS):
+                    half = 0.5 * (near + far)
+                    near, far = (near, half) if failed(z + half * off) else (half, far)
+                deep = far + _DEEP
+                lost.append(z + (deep if failed(z + deep * off) else far) * off)
+                kept.append(z + near * off)
+                break
+            kept.append(z + far * off)
+            near = far
+    m = survived.shape[1]
+    return np.array(lost).reshape(-1, m), np.array(kept).reshape(-1, m)

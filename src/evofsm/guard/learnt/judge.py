@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import operator
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
 from typing import Any, ParamSpec, Self, TypeVar
@@ -281,7 +280,7 @@ class LearntRisk:
             for j, sign in sorted({place[:2] for place in places})
         ]
         ends = dynamics.dead_ends.counts.astype(int).tolist()
-        more = dynamics.difference, self._no_threshold, there, begin, ends
+        more = dynamics.differs, self._no_threshold, there, begin, ends
         told = words.experience(*known, *more)
         return told + words.harm(self.harm, tests=self.shadow, learning=self.learning)
 
@@ -330,7 +329,10 @@ class LearntRisk:
             return Search(one, _unjudged(1), 0, words.NOTHING_SEEN)
         if not dynamics.fails:
             return Search(one, _unjudged(1), 0, self._no_threshold)
-        model, proposal, scale = dynamics.model, dynamics.encode(wanted), self.disturbance_scale
+        model = dynamics.daring if self.learning else dynamics.model
+        if not len(model.thresholds) + len(model.regions):
+            return Search(one, _unjudged(1), 0, words.DOUBTED)
+        proposal, scale = dynamics.encode(wanted), self.disturbance_scale
         few, most = self.effort
         remembered, ranks = self.remembered, self._ranks[:few]
         allowed = self._allowed(tolerance, remembered)
@@ -561,8 +563,6 @@ class LearntRisk:
         if self.dynamics.n_episodes != self.n_studied:
             self._rest = self._study()
             self._finish()
-            if self.n_studied == 1 and self.dynamics.is_no_box:
-                warnings.warn(self.told_by_experience, stacklevel=5)
         self._forget()
 
     def _forget(self) -> None:
@@ -616,6 +616,7 @@ class LearntRisk:
         if episode is not None:  # or it was too short for more than to try again
             given = self.situations, episode, tight, self.horizon, random
             self.situations = library.noted(*given)
+            dynamics.challenge(sum(tight))
         situations, knows = self.situations, dynamics.fails
         if "dead-ends" not in self.without and knows and episode is not None:
             self._learn_dead_ends(episode)
@@ -826,6 +827,8 @@ KIND = Kind(
         "harm": SETTINGS,
         "dynamics": {
             **dict.fromkeys(("n_episodes", "quiet"), COUNT),
+            "held": COUNT._replace(least=-1.0),
+            "differs": SHARE,
             "doubt_of_lags": Numbers(least=0.0),
             "exposed": COUNT,
             "ready": FLAG,

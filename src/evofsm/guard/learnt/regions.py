@@ -30,10 +30,15 @@ SIZE = 12
 _MOST, _BLUR = 8, 0.5
 # A threshold that explains fewer failures, or a smaller share of them, may be challenged.
 _FEW, _SHARE = 3, 0.25
+# What explains fewer failures may be doubted.
+_DOUBTED = 6
 # Survived observations of a fit; steps of Newton, and the ridge for each of them.
 _NEAR, _NEWTON, _RIDGE = 400, 40, 1e-9
-# Variables of which all pairs are tried, and rounds of splitting failures between two regions.
-_SCREENED, _ROUNDS = 6, 3
+# Fits of what explains failures with more likelihood than this each; how many survived ones that
+# are wrongly inside are added.
+_FITS, _UNLIKELY, _WORST = 3, 2.0, 100
+# Variables of which all pairs are tried.
+_SCREENED = 6
 # Which of x, y, x x, x y, y y a form of one variable has, a line, and a form of two variables.
 _KINDS = np.array([[1, 0, 1, 0, 0], [1, 1, 0, 0, 0], [1, 1, 1, 1, 1]], np.float64)
 
@@ -56,32 +61,19 @@ def distances(regions: Floats, z: Floats) -> Floats:
     return -form / slope
 
 
-def in_units(regions: Floats, unit: Floats) -> Floats:
-    """Regions as they are, with variables in units (m,)."""
-    new = regions.copy()
-    if len(regions):
-        times = regions[:, 4:6] * unit[regions[:, :2].astype(int)]
-        new[:, 4:6] = regions[:, 4:6] / times
-        new[:, 7:9] *= times
-        new[:, 9], new[:, 11] = regions[:, 9] * times[:, 0] ** 2, regions[:, 11] * times[:, 1] ** 2
-        new[:, 10] *= times[:, 0] * times[:, 1]
-    return new
-
-
 def without_survived(regions: Floats, survived: Floats) -> Floats:
     """Regions so small that nothing that was survived (n, m) is inside."""
-    new = regions.copy()
-    if len(regions) and len(survived):
-        most = forms(new, survived)[0].max(1)
-        size = np.abs(new[:, 6]) + np.abs(most)
-        new[:, 6] -= np.where(most > 0.0, most + 1e-12 * size, 0.0)
+    new, most = regions.copy(), forms(regions, survived)[0].max(1, initial=0.0)
+    new[:, 6] -= np.where(most > 0.0, most + 1e-12 * (np.abs(new[:, 6]) + most), 0.0)
     return new
 
 
-def are_explained(failures: Floats, thresholds: Sequence[Threshold], regions: Floats) -> bool:
-    """Whether each failure is beyond a threshold or in a region."""
-    each = _beyond(thresholds, failures), inside(regions, failures)
-    return bool(np.concatenate(each).any(0).all())
+def explained(
+    failures: Floats, thresholds: Sequence[Threshold], regions: Floats, blur: float = _BLUR
+) -> Flags:
+    """(k,) which observations are beyond a threshold or in a region."""
+    each = _beyond(thresholds, failures), distances(regions, failures) < blur
+    return np.asarray(np.concatenate(each).any(0))
 
 
 def _beyond(thresholds: Sequence[Threshold], z: Floats) -> Flags:
@@ -99,33 +91,42 @@ def inside(regions: Floats, z: Floats) -> Flags:
 
 
 def explain(
-    thresholds: Sequence[Threshold],
-    failures: Floats,
-    survived: Floats,
-    unit: Floats,
-    spread: Floats,
+    found: Sequence[Threshold], failures: Floats, survived: Floats, unit: Floats, spread: Floats
 ) -> tuple[list[Threshold], Floats]:
-    """Thresholds that stay, and regions (r, 12) for failures that they do not explain.
+    """Thresholds that stay, and regions (r, 12) for failures that these do not explain.
 
     Of ``failures`` (k, m) amid what was ``survived`` (n, m). ``unit`` (m,) is what a distance of 1
     is for each variable, ``spread`` (m,) its standard deviation. As long as thresholds explain all,
     there is no region. Thresholds that explain few may go if regions explain the same failures; and
     all of them, if regions alone explain all and are fewer.
     """
-    stay, k = list(thresholds), len(failures)
+    stay, k = list(found), len(failures)
     by = _beyond(stay, failures)
     if by.any(0).all() or not len(survived) or not k:
         return stay, np.empty((0, SIZE))
     strong = by.sum(1) >= max(_FEW, _SHARE * k)
     left = failures[by[strong].sum(0) == 0]
-    found, _ = _learnt(left, survived, unit, spread)
+    there, _ = _learnt(left, survived, unit, spread)
     if strong.any():
-        alone, whole = _learnt(failures, survived, unit, spread, len(found) + int(strong.sum()))
+        alone, whole = _learnt(failures, survived, unit, spread, len(there) + int(strong.sum()))
         if whole:
-            found, strong = alone, np.zeros(len(strong), bool)
-    within: Flags = np.asarray(inside(found, failures).any(0))
+            there, strong = alone, np.zeros(len(strong), bool)
+    within: Flags = np.asarray(inside(there, failures).any(0))
     keep = [bool(s or not within[mine].all()) for s, mine in zip(strong, by, strict=True)]
-    return [one for one, stays in zip(stay, keep, strict=True) if stays], found
+    return [one for one, stays in zip(stay, keep, strict=True) if stays], there
+
+
+def are_weak(
+    thresholds: Sequence[Threshold], regions: Floats, failures: Floats
+) -> tuple[Flags, Flags]:
+    """(t,) and (r,) which thresholds and regions hardly any failure tells.
+
+    As long as there is no region, of thresholds those that explain nothing that another does not.
+    """
+    by = _beyond(thresholds, failures)
+    alone = (by & (by.sum(0) < 2)).any(1) & (len(regions) == 0)
+    few = (by.sum(1) < _DOUBTED) & ~alone
+    return np.asarray(few), np.asarray(inside(regions, failures).sum(1) < _DOUBTED)
 
 
 def _learnt(
@@ -141,30 +142,18 @@ def _learnt(
             break
         groups.sort(key=len, reverse=True)
         group = groups.pop(0)
-        F, k = failures[group], len(group)
-        every = np.ones((len(asked), k), bool)
-        rows, within, score = _fitted(F, every, asked, survived, unit, spread)
+        F = failures[group]
+        rows, within, score = _fitted(F, asked, survived, unit, spread)
         count = within.sum(1)
         best = max(range(len(asked)), key=lambda n: (count[n], score[n]))
-        if count[best] == k:
+        if count[best] >= min(max(2, 0.5 * len(group)), len(group)):
             found.append(rows[best])
+            groups += [group[~within[best]]] if count[best] < len(group) else []
             continue
-        if k == 1:
-            whole = False
-            continue
-        halves = _in_two(F, asked, survived, unit, spread) if k > 2 else None
-        if halves is not None and halves[0] > count[best]:
-            groups += [group[halves[1]], group[~halves[1]]]
-        elif count[best] >= max(2, 0.5 * k):
-            found.append(rows[best])
-            groups.append(group[~within[best]])
-        else:
-            likeliest = asked[int(score.argmax())][:2]
-            mine = _split(F[:, likeliest] / spread[likeliest])
-            if mine.all():
-                whole = False
-                continue
-            groups += [group[mine], group[~mine]]
+        likeliest = asked[int(score.argmax())][:2]
+        mine = _split(F[:, likeliest] / spread[likeliest])
+        whole &= not mine.all()
+        groups += [] if mine.all() else [group[mine], group[~mine]]
     return np.array(found).reshape(-1, SIZE), whole and not groups
 
 
@@ -175,39 +164,13 @@ def _asked(failures: Floats, survived: Floats, spread: Floats) -> Ints:
     """
     moving = np.flatnonzero(spread > 0.0)
     if len(moving) > _SCREENED:
-        y = (survived[:, moving].mean(0) - failures[:, moving]) / spread[moving]
-        ratio = np.maximum((y**2).mean(0), 1e-12) / (
-            survived[:, moving].var(0) / spread[moving] ** 2 + 1e-12
-        )
+        seen = survived[:, moving]
+        square = ((failures[:, moving] - seen.mean(0)) ** 2).mean(0) / spread[moving] ** 2
+        ratio = np.maximum(square, 1e-12) / (seen.var(0) / spread[moving] ** 2 + 1e-12)
         tells = 0.5 * (ratio - 1.0 - np.log(ratio))
         moving = np.sort(moving[np.argsort(-tells, kind="stable")[:_SCREENED]])
     alone = [(j, j, 0) for j in moving]
     return np.array(alone + [(i, j, kind) for i, j in combinations(moving, 2) for kind in (1, 2)])
-
-
-def _in_two(
-    F: Floats, asked: Ints, survived: Floats, unit: Floats, spread: Floats
-) -> tuple[int, Flags] | None:
-    """Two forms of the same variables that together explain most: how many, and which half."""
-    pairs = asked[asked[:, 2] == 2]
-    mine = np.array([_split(F[:, one] / spread[one]) for one in pairs[:, :2]]).reshape(-1, len(F))
-    best: tuple[int, float, Flags] | None = None
-    for _ in range(_ROUNDS):
-        two = mine.any(1) & ~mine.all(1)
-        pairs, mine = pairs[two], mine[two]
-        if not len(pairs):
-            break
-        each = np.concatenate([mine, ~mine]), np.concatenate([pairs, pairs])
-        rows, _, score = _fitted(F, *each, survived, unit, spread)
-        far = distances(rows, F).reshape(2, len(pairs), -1)
-        explained, together = (far.min(0) <= _BLUR).sum(1), score.reshape(2, -1).sum(0)
-        for n in range(len(pairs)):
-            if best is None or (explained[n], together[n]) > best[:2]:
-                best = int(explained[n]), float(together[n]), mine[n]
-        new = far[0] <= far[1]
-        changed = (new != mine).any(1)
-        pairs, mine = pairs[changed], new[changed]
-    return None if best is None else (best[0], best[2])
 
 
 def _split(x: Floats) -> Flags:
@@ -227,39 +190,45 @@ def _split(x: Floats) -> Flags:
 
 
 def _fitted(
-    F: Floats, mine: Flags, asked: Ints, survived: Floats, unit: Floats, spread: Floats
+    F: Floats, asked: Ints, survived: Floats, unit: Floats, spread: Floats
 ) -> tuple[Floats, Flags, Floats]:
-    """(c, 12) the forms that are asked of failures ``mine`` (c, k); which are inside; scores."""
-    (count, k), n = mine.shape, min(_NEAR, len(survived))
-    one, other = asked[:, 0], asked[:, 1]
-    scale = spread[asked[:, :2]]
-    at = np.stack([(mine * F.T[which]).sum(1) for which in (one, other)], 1) / mine.sum(1)[:, None]
-    seen = np.empty((count, n, 2))
-    known: dict[tuple[object, ...], Ints] = {}
-    for c, (i, j, _) in enumerate(asked.tolist()):
-        key = i, j, mine[c].tobytes()
-        if key not in known:
-            known[key] = _near(survived[:, [i, j]], F[mine[c]][:, [i, j]], scale[c])
-        seen[c] = survived[known[key]][:, [i, j]]
-    x = (np.concatenate([F[:, asked[:, :2]].transpose(1, 0, 2), seen], 1) - at[:, None]) / scale[
-        :, None
-    ]
-    u, v = x[..., 0], x[..., 1]
-    phi = np.stack([u, v, u * u, u * v, v * v], 2) * _KINDS[asked[:, 2]][:, None]
-    y = np.append(np.ones(k), np.zeros(n))
-    weight = np.concatenate([mine.astype(float), np.ones((count, n))], 1)
-    w, likelihood = _logistic(phi, y, weight)
-    times = unit[asked[:, :2]] / scale
-    rows = np.empty((count, SIZE))
-    rows[:, :2], rows[:, 2:4], rows[:, 4:6] = asked[:, :2], at, 1.0 / unit[asked[:, :2]]
-    rows[:, 6], rows[:, 7:9] = w[:, 5], w[:, :2] * times
-    rows[:, 9], rows[:, 11] = w[:, 2] * times[:, 0] ** 2, w[:, 4] * times[:, 1] ** 2
-    rows[:, 10] = w[:, 3] * times[:, 0] * times[:, 1]
-    most = forms(rows, survived)[0].max(1)  # as large as it may be with none of them inside
-    rows[:, 6] -= most + 1e-12 * (np.abs(rows[:, 6]) + np.abs(most))
-    within = inside(rows, F) & mine
+    """(c, 12) the forms that are asked of failures (k, m); which are inside; and scores."""
+    scale, those = spread[asked[:, :2]], F[:, asked[:, :2]].transpose(1, 0, 2)
+    at, k = those.mean(1), len(F)
+    near: dict[tuple[int, int], Ints] = {}
+    for i, j, _ in asked.tolist():
+        if (i, j) not in near:
+            near[i, j] = _near(survived[:, [i, j]], F[:, [i, j]], spread[[i, j]])
+    which = np.array([near[i, j] for i, j, _ in asked.tolist()])
+    rows, likelihood = np.zeros((len(asked), SIZE)), np.zeros(len(asked))
+    again = np.arange(len(asked))
+    for _ in range(_FITS):  # with what the fit before has wrongly inside
+        asked_now, scale_now, at_now = asked[again], scale[again], at[again]
+        seen = survived[which[..., None], asked_now[:, None, :2]]
+        x = np.concatenate([those[again], seen], 1) - at_now[:, None]
+        u, v = (x / scale_now[:, None]).transpose(2, 0, 1)
+        phi = np.stack([u, v, u * u, u * v, v * v], 2) * _KINDS[asked_now[:, 2]][:, None]
+        y = np.append(np.ones(k), np.zeros(which.shape[1]))
+        w, likelihood[again] = _logistic(phi, y)
+        times = unit[asked_now[:, :2]] / scale_now
+        found = np.zeros((len(again), SIZE))
+        found[:, :2], found[:, 2:4] = asked_now[:, :2], at_now
+        found[:, 4:6] = 1.0 / unit[asked_now[:, :2]]
+        found[:, 6], found[:, 7:9] = w[:, 5], w[:, :2] * times
+        found[:, 9], found[:, 11] = w[:, 2] * times[:, 0] ** 2, w[:, 4] * times[:, 1] ** 2
+        found[:, 10] = w[:, 3] * times[:, 0] * times[:, 1]
+        form = forms(found, survived)[0]
+        most = form.max(1)  # as large as it may be with none of them inside
+        wrong = (most > 0.0) & (likelihood[again] > -_UNLIKELY * k)
+        found[:, 6] -= most + 1e-12 * (np.abs(found[:, 6]) + np.abs(most))
+        rows[again] = found
+        again, form, which = again[wrong], form[wrong], which[wrong]
+        if not len(again) or len(survived) <= _NEAR:
+            break
+        which = np.hstack([which, np.argpartition(-form, _WORST, 1)[:, :_WORST]])
+    within = inside(rows, F)
     within[2 * (within & (distances(rows, F) < 0.0)).sum(1) < within.sum(1)] = False
-    score = likelihood - 0.5 * _KINDS[asked[:, 2]].sum(1) * np.log(mine.sum(1) + 1.0)
+    score = likelihood - 0.5 * _KINDS[asked[:, 2]].sum(1) * np.log(k + 1.0)
     return rows, within, score
 
 
@@ -275,33 +244,30 @@ def _near(survived: Floats, F: Floats, scale: Floats) -> Ints:
     return np.append(near, np.linspace(0, n - 1, _NEAR - half).astype(int))
 
 
-def _logistic(phi: Floats, y: Floats, weight: Floats) -> tuple[Floats, Floats]:
+def _logistic(phi: Floats, y: Floats) -> tuple[Floats, Floats]:
     """(c, p + 1) weights of c ridge logistic regressions, the constant last, and likelihoods.
 
-    Of features ``phi`` (c, n, p), standardised, and ``weight`` (c, n), by Newton's method. The
-    ridge is so small that what can be told apart is, and only keeps weights finite.
+    Of features ``phi`` (c, n, p), standardised, by Newton's method. The ridge is so small that what
+    can be told apart is, and only keeps weights finite.
     """
-    (count, n, p), total = phi.shape, weight.sum(1)
-    mean = np.einsum("cn,cnp->cp", weight, phi) / total[:, None]
-    off = phi - mean[:, None]
-    size = np.sqrt(np.einsum("cn,cnp->cp", weight, off**2) / total[:, None])
+    (count, n, p), mean, size = phi.shape, phi.mean(1), phi.std(1)
     size = np.where(size > 0.0, size, 1.0)
-    X = np.concatenate([off / size[:, None], np.ones((count, n, 1))], 2)
-    hold = np.full((count, p + 1), _RIDGE) * total[:, None]
+    X = np.concatenate([(phi - mean[:, None]) / size[:, None], np.ones((count, n, 1))], 2)
+    hold = np.full((count, p + 1), _RIDGE * n)
     hold[:, :p][~(phi != 0.0).any(1)] = 1.0  # features that it has not
     w, to = np.zeros((count, p + 1)), np.where(y > 0.0, -1.0, 1.0)
 
     def cost(which: Ints, w: Floats) -> Floats:
         t = np.einsum("cnp,cp->cn", X[which], w) * to
         lost = np.maximum(t, 0.0) + np.log1p(np.exp(-np.abs(t)))
-        return np.asarray((weight[which] * lost).sum(1) + 0.5 * (hold[which] * w**2).sum(1))
+        return np.asarray(lost.sum(1) + 0.5 * (hold[which] * w**2).sum(1))
 
     going, now = np.arange(count), cost(np.arange(count), w)
     for _ in range(_NEWTON):
-        A, g = X[going], weight[going]
+        A = X[going]
         q = 0.5 * (1.0 + np.tanh(0.5 * np.einsum("cnp,cp->cn", A, w[going])))
-        down = np.einsum("cnp,cn->cp", A, g * (q - y)) + hold[going] * w[going]
-        curved = (A * (g * np.maximum(q * (1.0 - q), 1e-12))[..., None]).transpose(0, 2, 1) @ A
+        down = np.einsum("cnp,cn->cp", A, q - y) + hold[going] * w[going]
+        curved = (A * np.maximum(q * (1.0 - q), 1e-12)[..., None]).transpose(0, 2, 1) @ A
         curved += hold[going][:, :, None] * np.eye(p + 1)
         step = np.linalg.solve(curved, down[..., None])[..., 0]
         rate = np.ones(len(going))

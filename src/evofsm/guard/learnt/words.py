@@ -39,6 +39,10 @@ from evofsm.guard.harm import Harm, Outcome
 NOTHING_LEARNT = "nothing was learnt yet"
 NOTHING_SEEN = "nothing of this episode was observed yet"
 NO_FAILURE = "no failure is known yet, so nothing is refused"
+#: Said while it is tried whether what one or two failures tell is true.
+DOUBTED = (
+    "what few failures tell refused nearly all for long, so it is doubted until it fails again"
+)
 #: What is done where all backups look alike and another action was hardly used.
 TRIED = "no action passes; what this one does is hardly known, so it is tried"
 
@@ -133,7 +137,7 @@ def lasting(backup: str, *, cut: bool) -> str:
 def no_threshold(n_failed: int, *, is_given: bool) -> str:
     """Why nothing is refused where no threshold is known."""
     if is_given:
-        return "failed= is true along no variable alone, so nothing is refused"
+        return "failed= is true nowhere around what was survived, so nothing is refused"
     if not n_failed:
         return NO_FAILURE
     seen = "1 failure" if n_failed == 1 else f"{n_failed:,} failures"
@@ -156,8 +160,8 @@ def experience(
     """What was learnt so far: variables that fail, whether below a threshold, and which.
 
     Since which episode, from 1, variables move otherwise and disturbances are worse (0: none are).
-    In which share of the states around a given function says otherwise than the thresholds. Beyond
-    which thresholds alone disturbances begin. From how many episodes each dead end is known.
+    In which share of the states around a given function says otherwise. Beyond which thresholds
+    alone disturbances begin. From how many episodes each dead end is known.
     """
     since = "".join(f"; since episode {first} {name} moves otherwise" for name, first in drifts)
     if worse:
@@ -168,8 +172,7 @@ def experience(
         return nothing + since
     if differs:
         since += (
-            "; failed= is not of these thresholds alone, for it says otherwise in "
-            f"{differs:.0%} of the states around: what decides are the thresholds"
+            f"; failed= says otherwise in {differs:.1%} of the states around, where this decides"
         )
     where = " or ".join(
         f"{name} is {'below' if low else 'above'} {at:.4g}" for name, low, at in fails
@@ -192,8 +195,6 @@ def region(names: Sequence[str], row: Sequence[float], failures: int) -> str:
     'inside an ellipse of x and y around (1, 2), 4 wide and 8 high (3 failures)'
     >>> region(["x", "y"], [0, 1, 0.0, 0.0, 1.0, 1.0, -5.0, 3.0, 4.0, 0.0, 0.0, 0.0], 1)
     'where 0.6 x + 0.8 y is above 1 (1 failure)'
-    >>> region(["x"], [0, 0, 3.0, 3.0, 1.0, 1.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0], 2)
-    'where x is between 2 and 4 (2 failures)'
     """
     seen = f"({failures:,} failure{'s' * (failures != 1)})"
     i, j, at, to, one, other, c, b, d, p, q, r = row
