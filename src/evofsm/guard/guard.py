@@ -147,8 +147,8 @@ class Guard:
         move.
     failed : callable, optional
         From an observation to whether it is a failure; asked as an episode ends. A learnt judge
-        also asks it beforehand, along each variable: so it knows of failures before the first. It
-        decides by these thresholds alone, and warns where the function is of another shape.
+        also asks it around what was survived: so it knows of failures before the first. It decides
+        by how it explains them, and `told_by_experience` says where the function says otherwise.
     horizon : float, optional
         How far ahead a learnt judge looks, and what the machine's explanations call soon [s].
         Without it a learnt judge looks as far as it finds that it has to.
