@@ -20,7 +20,7 @@ from evofsm.guard import guard as looping
 from evofsm.guard import reviser as revising
 from evofsm.guard.actions import Choices, limits, put_into
 from evofsm.guard.guard import Guard
-from evofsm.guard.learnt import replay, words
+from evofsm.guard.learnt import replay
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.reviser import ActionReviser, Mode
 
@@ -136,11 +136,9 @@ def _learnt(reviser: ActionReviser) -> Part:
     risk: Any = reviser.risk
     dynamics, disturbances, backups = risk.dynamics, risk.disturbances, risk.backups
     dynamics.failed = None  # what it said stands in the thresholds
-    model = dynamics.model if dynamics.fails else None
-    if disturbances is None or backups is None or not model:
+    if disturbances is None or backups is None or not dynamics.fails:
         raise ValueError(f"there is nothing to export yet: {risk.told_by_experience}")
-    if not len(model.thresholds) + len(model.regions):
-        raise ValueError(f"there is nothing to export: {words.DOUBTED}")
+    model = dynamics.model  # frozen, it doubts nothing
     (steps, m, count), (p, _), a = disturbances.residuals.shape, model.weights.shape, dynamics.size
     if count > _MOST_DISTURBANCES:
         raise ValueError(f"at most {_MOST_DISTURBANCES} disturbances are exported, not {count}")
