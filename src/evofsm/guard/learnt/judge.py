@@ -625,6 +625,7 @@ class LearntRisk:
             if episode is not None:
                 yield from library.scan(dynamics, situations, self.horizon, best[:1], random)
             self.n_scanned += 1
+        yield
         if episode is not None:
             dynamics.refute(refuted, self.horizon)
         yield
