@@ -105,14 +105,16 @@ class Places(NamedTuple):
         """
         m, n = len(own), len(np.unique(episodes))
         best, place = (-1.0, 0.0), ANYWHERE
-        for j in range(m if n else 0):
-            for sign in (-1.0, 1.0):
-                at = (sign * to[:, j]).min()
-                p = (1.0 + (sign * self.exposure[:, j] >= at).sum()) / (1.0 + len(self.exposure))
-                if sign * own[j] >= at and 2 * m * p**n < _CHANCE:
-                    found = -p, float((sign * to[:, j] - at).mean() / unit[j])
-                    if found > best:
-                        best, place = found, (j, sign, float(sign * at))
+        if not n:
+            return place
+        least = np.array([(-to).min(0), to.min(0)])
+        for j, side in np.argwhere((np.array([-own, own]) >= least).T).tolist():
+            sign, at = (-1.0, 1.0)[side], least[side, j]
+            p = (1.0 + (sign * self.exposure[:, j] >= at).sum()) / (1.0 + len(self.exposure))
+            if 2 * m * p**n < _CHANCE:
+                found = -p, float((sign * to[:, j] - at).mean() / unit[j])
+                if found > best:
+                    best, place = found, (j, sign, float(sign * at))
         return place
 
 
