@@ -35,6 +35,7 @@ from evofsm.guard.learnt.replay import (
     lags,
     limited,
     n_products,
+    pairs,
 )
 
 # From more on, large ones count in the ordinary change.
@@ -48,7 +49,8 @@ _PRIOR, _SHY_PRIOR, _CLEAREST = 0.01, 20.0, 1e-3
 # more than rounding, so that features that did not vary yet always share what they explain alike.
 _LEAST, _ALL_ALIKE = 1e-6, 1e-10
 # From so many features on BLAS would call threads for a matrix, which wait for a second where other
-# processes are busy, and variables are solved for together whose noise is as large to a third.
+# processes are busy; from so many on, and of many variables, those are solved for together whose
+# noise is as large to a third.
 _LARGE, _THIRD = 100, 3.0
 # From so many products on it would for features of all rows, too, and for so many rows it does not.
 _THREADS, _ROWS = 7e5, 16
@@ -91,7 +93,7 @@ def solve(sums: Sums, a: int, without: Floats) -> Floats:
     noisy = np.where(known, sums.noise / np.where(known, sums.variance, 1.0), 1.0)
     weights, shares = np.empty_like(sums.products), noisy.clip(_CLEAREST, 1.0)
     groups: Sequence[Any] = range(m)
-    if len(size) >= _LARGE:
+    if len(size) >= _LARGE or not len(pairs(m)[0]):
         shares = _THIRD ** np.round(np.log(shares) / np.log(_THIRD))
         groups = [np.flatnonzero(shares == share) for share in np.unique(shares)]
     for j in groups:
