@@ -630,6 +630,8 @@ class Dynamics:
 
     def onsets(self, found: Floats) -> list[int]:
         """Steps of an episode at which something large began, of what was not expected (T, m)."""
+        if not self.sums.scale[0] > 0.0:  # what is ordinary is not known yet
+            return []
         size = np.abs(found / self.sums.scale).max(1)
         starts: list[int] = []
         while len(starts) < _ONSETS and size.max() >= ONSET:
