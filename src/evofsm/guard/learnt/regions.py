@@ -37,8 +37,9 @@ _NEAR, _NEWTON, _RIDGE = 400, 40, 1e-9
 # Fits of what explains failures with more likelihood than this each; how many survived ones that
 # are wrongly inside are added.
 _FITS, _UNLIKELY, _WORST = 3, 2.0, 100
-# Variables of which all pairs are tried.
-_SCREENED = 6
+# Variables of which all pairs are tried; pairs of which two forms are, and rounds of dealing
+# failures out between two.
+_SCREENED, _IN_TWO, _ROUNDS = 6, 3, 3
 # Which of x, y, x x, x y, y y a form of one variable has, a line, and a form of two variables.
 _KINDS = np.array([[1, 0, 1, 0, 0], [1, 1, 0, 0, 0], [1, 1, 1, 1, 1]], np.float64)
 
@@ -146,6 +147,11 @@ def _learnt(
         rows, within, score = _fitted(F, asked, survived, unit, spread)
         count = within.sum(1)
         best = max(range(len(asked)), key=lambda n: (count[n], score[n]))
+        if 2 < len(group) and count[best] < len(group):
+            both, mine = _in_two(F, asked, score, survived, unit, spread)
+            if both > count[best]:
+                groups += [group[mine], group[~mine]]
+                continue
         if count[best] >= min(max(2, 0.5 * len(group)), len(group)):
             found.append(rows[best])
             groups += [group[~within[best]]] if count[best] < len(group) else []
@@ -155,6 +161,27 @@ def _learnt(
         whole &= not mine.all()
         groups += [] if mine.all() else [group[mine], group[~mine]]
     return np.array(found).reshape(-1, SIZE), whole and not groups
+
+
+def _in_two(
+    F: Floats, asked: Ints, score: Floats, survived: Floats, unit: Floats, spread: Floats
+) -> tuple[int, Flags]:
+    """How many failures two forms of the likeliest pairs of variables explain, and which half."""
+    found = 0, np.ones(len(F), bool)
+    pairs = np.flatnonzero(asked[:, 2] == 2)
+    for n in pairs[np.argsort(-score[pairs], kind="stable")[:_IN_TWO]]:
+        mine = _split(F[:, asked[n, :2]] / spread[asked[n, :2]])
+        for _ in range(_ROUNDS):
+            if mine.all() or not mine.any():
+                break
+            each = [_fitted(F[half], asked[[n]], survived, unit, spread) for half in (mine, ~mine)]
+            far = np.concatenate([distances(rows, F) for rows, _, _ in each])
+            explained = int((far.min(0) <= _BLUR).sum())
+            found = (explained, mine) if explained > found[0] else found
+            if (mine == (far[0] <= far[1])).all():
+                break
+            mine = far[0] <= far[1]
+    return found
 
 
 def _asked(failures: Floats, survived: Floats, spread: Floats) -> Ints:
