@@ -8,11 +8,11 @@ survived. Distances are in y = (z - mean) / spread, each variable in its own spr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from evofsm.guard.learnt.replay import Disturbances, Floats, Ints, Model, survives
+from evofsm.guard.learnt.replay import KEPT, Floats, Ints, Model, search
 from evofsm.store import FROM_1, Numbers
 
 # Where it failed nearer than this, an old dead end counts for one more; its largest radius, too.
@@ -25,6 +25,8 @@ _SHARE = 0.9
 _LEAST, _MOST = 0.5, 40
 # Observations that were survived: that are kept, of an episode, and the last ones that may not be.
 _SURVIVED, _EACH, _LAST = 1500, 60, 10
+# Steps of replays after which nothing is asked but the proposal.
+_ONCE = 1.0
 
 
 class DeadEnds(NamedTuple):
@@ -163,27 +165,20 @@ def distances_to(model: Model, z: Floats) -> Floats:
 
 
 def which_refuses(
-    model: Model,
-    situation: Floats,
-    policies: Floats,
-    ranks: Ints,
-    disturbances: Disturbances,
-    scale: float,
-    proposal: Floats,
-    margin: float,
-    allowed: int,
+    model: Model, situation: Floats, policies: Floats, ranks: Ints, *given: Any
 ) -> tuple[int, int]:
     """Which dead end refuses a proposal that would else pass, and after which backup; -1: none.
 
-    Of several the farthest of the nearest ones that have to be left out for it to pass.
+    Of several the farthest of the nearest ones that have to be left out for it to pass. What is
+    ``given`` besides is what `search` takes.
     """
     order = np.argsort(distances_to(model, situation[: len(model.origin)]), kind="stable")
 
     def passes(count: int, backup: int) -> bool:
         """Whether the backup survives after it with so many of the nearest dead ends alone."""
         some = model._replace(dead_ends=model.dead_ends[order[:count]])
-        given = situation, policies[backup], disturbances, scale, proposal, margin, allowed
-        return survives(some, *given)
+        asked: tuple[Any, ...] = (situation, policies, np.array([backup]), *given, _ONCE)
+        return search(some, *asked)[0] == KEPT
 
     for q in ranks if len(order) else ():
         if not passes(0, q):

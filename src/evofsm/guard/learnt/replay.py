@@ -664,25 +664,6 @@ def replay(
 
 # -- What decides ---------------------------------------------------------------------------------
 
-
-def survives(
-    model: Model,
-    situation: Floats,
-    policy: Floats,
-    disturbances: Disturbances,
-    scale: float,
-    action: Floats,
-    margin: float,
-    allowed: int,
-) -> bool:
-    """Whether after an action a backup policy survives by the margin, as `search` asks."""
-    count = disturbances.residuals.shape[2]
-    ends = Ends(np.empty(count), np.empty(count))
-    given = situation[None], action[None], policy, disturbances, scale, margin, allowed, ends
-    lost, left, _ = _enter.call(model, *given)
-    return bool(lost <= allowed and left >= margin)
-
-
 #: What a search finds: the proposal passes, another action passes, none did in time, or none does.
 KEPT, CHANGED, CUT_SHORT, NOTHING_PASSES = 0, 1, 2, 3
 
