@@ -610,45 +610,54 @@ class LearntRisk:
                 evolving="backups" not in self.without,
             )
         best = self.backups.policies[self.backups.ranks]
-        # From where it went on for the horizon although nothing seemed to help.
-        refuted = np.flatnonzero([dead_end for _, dead_end, _ in self._notes[: -self.horizon]])
-        tight = [refused for refused, _, _ in self._notes]
-        if episode is not None:  # or it was too short for more than to try again
-            given = self.situations, episode, tight, self.horizon, random
-            self.situations = library.noted(*given)
-            dynamics.challenge(sum(tight))
-        situations, knows = self.situations, dynamics.fails
-        if "dead-ends" not in self.without and knows and episode is not None:
-            self._learn_dead_ends(episode)
-        yield
-        if "stretches" not in dynamics.without and knows and len(situations) > _ENOUGH:
-            if episode is not None:
-                yield from library.scan(dynamics, situations, self.horizon, best[:1], random)
-            self.n_scanned += 1
-        yield
         if episode is not None:
-            dynamics.refute(refuted, self.horizon)
-        yield
-        free = self.given_horizon is None and episode is not None
-        if free and self.disturbances is not None and knows:
-            after = yield from library.failing_after(
-                dynamics.model, situations, best[:_ASKED], self.disturbances
-            )
-            failed = episode is not None and episode.failed
-            self._look_ahead(after, refuted=len(refuted) > 0, failed=failed)
-            yield
+            yield from self._study_whole(episode, best, random)
+        elif self._scans:  # it was too short for more than to try again
+            self.n_scanned += 1
         if "memory" in dynamics.without and episode is not None:
             self.disturbances, self._pool = library.shuffled(
                 dynamics, self._pool, self.horizon, random
             )
         elif "memory" not in dynamics.without:
             self.disturbances = yield from library.choose(
-                dynamics, situations, self.horizon, best[:2], self.disturbance_scale
+                dynamics, self.situations, self.horizon, best[:2], self.disturbance_scale
             )
-        if knows and len(situations) >= _ENOUGH:
+        if dynamics.fails and len(self.situations) >= _ENOUGH:
             yield
             self.backups = yield from self.evolved(random)
         self._ranks = self.backups.ranks
+
+    @property
+    def _scans(self) -> bool:
+        """Whether disturbances are looked for."""
+        knows = self.dynamics.fails and len(self.situations) > _ENOUGH
+        return knows and "stretches" not in self.dynamics.without
+
+    def _study_whole(
+        self, episode: Episode, best: Floats, random: np.random.Generator
+    ) -> Iterator[None]:
+        """What an episode of some length teaches; ``best`` are backups, in their order."""
+        dynamics = self.dynamics
+        # From where it went on for the horizon although nothing seemed to help.
+        refuted = np.flatnonzero([dead_end for _, dead_end, _ in self._notes[: -self.horizon]])
+        tight = [refused for refused, _, _ in self._notes]
+        self.situations = library.noted(self.situations, episode, tight, self.horizon, random)
+        dynamics.challenge(sum(tight))
+        if "dead-ends" not in self.without and dynamics.fails:
+            self._learn_dead_ends(episode)
+        yield
+        if self._scans:
+            yield from library.scan(dynamics, self.situations, self.horizon, best[:1], random)
+            self.n_scanned += 1
+        yield
+        dynamics.refute(refuted, self.horizon)
+        yield
+        if self.given_horizon is None and self.disturbances is not None and dynamics.fails:
+            after = yield from library.failing_after(
+                dynamics.model, self.situations, best[:_ASKED], self.disturbances
+            )
+            self._look_ahead(after, refuted=len(refuted) > 0, failed=episode.failed)
+            yield
 
     def _learn_dead_ends(self, episode: Episode) -> None:
         """From what was survived, and from where it failed although it was certified not to."""
