@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text()
+README = (ROOT / "README.md").read_text("utf-8")
+CLOSED_LOOP = (ROOT / "docs" / "closed-loop.md").read_text("utf-8")
 
 
 # -- The closed loop -----------------------------------------------------------------------------
@@ -30,8 +31,8 @@ def cells_of(page):
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if "|" in line]
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/closed-loop.md"])
-def test_the_closed_loop_table_is_what_the_study_printed(page):
+@pytest.mark.parametrize(("page", "least"), [("README.md", 4), ("docs/closed-loop.md", 7)])
+def test_the_closed_loop_table_is_what_the_study_printed(page, least):
     checked = 0
     for cells in cells_of(page):
         name = re.match(r"`([\w-]+)`", cells[0])
@@ -40,13 +41,13 @@ def test_the_closed_loop_table_is_what_the_study_printed(page):
             numbers = shown(rows)
             assert all(number in cells for number in numbers), (name[1], numbers)
             checked += 1
-    assert checked >= 7
+    assert checked >= least
 
 
 def test_the_bold_row_is_rebuilt_in_ten_lines():
     from studies.closed_loop import OURS, ClosedLoop, _test_learner
 
-    blocks = re.findall(r"```pycon\n(.*?)```", README, re.DOTALL)
+    blocks = re.findall(r"```pycon\n(.*?)```", CLOSED_LOOP, re.DOTALL)
     (block,) = [block for block in blocks if "try_out(" in block]
     lines = [line[4:] for line in block.splitlines() if line.startswith(">>> ")]
     assert len(lines) <= 10
@@ -65,12 +66,14 @@ def test_our_own_lines_are_the_median_and_the_worst_of_the_seeds():
     ours = [row for row in RESULTS if row["policy"] == "evofsm" and row["train_episodes"] == 100]
     assert len(ours) == 20
     worst = max(ours, key=lambda row: (row["collision_rate"], -row["mobility"]))
-    lines = [cells for cells in cells_of("README.md") if "evofsm" in cells[0] and "100" in cells[0]]
-    median_line, worst_line = lines
+    (worst_line,) = [cells for cells in cells_of("README.md") if "100 episodes" in cells[0]]
+    median_line, worst_there = (
+        cells for cells in cells_of("docs/closed-loop.md") if "100 episodes" in cells[0]
+    )
     assert all(number in median_line for number in shown(ours, statistics.median))
-    assert all(number in worst_line for number in shown([worst]))
+    assert all(number in line for number in shown([worst]) for line in (worst_line, worst_there))
     changed = statistics.median(row["intervention_rate"] for row in ours)
-    assert f"changing {100 * changed:.1f} %" in README
+    assert f"({100 * changed:.0f} % of decisions" in README
     assert sum(row["train_collisions"] for row in RESULTS) == 0  # as the text says
 
 
