@@ -13,7 +13,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evofsm.driving.family import Draw, Family
 from evofsm.driving.revisers import Unrevised
@@ -36,7 +36,7 @@ from evofsm.driving.world import (
 )
 from evofsm.extras import needs
 from evofsm.fsm.proportions import FailureRecord
-from evofsm.guard import TOLERANCE, BoxActions, Guard, Mode, Proposal, run_episode
+from evofsm.guard import TOLERANCE, BoxActions, Decision, Guard, Mode, run_episode
 
 
 def drive(
@@ -110,45 +110,24 @@ def shadow_drive(
     mode = getattr(guard.reviser, "mode", Mode.ACT)
     if mode not in (Mode.SHADOW, Mode.OFF):
         raise ValueError(f"the guard's mode is {mode.value}; what was recorded needs shadow or off")
-    recording = _Recording(times, observations, accelerations, failed)
-    decisions = tuple(run_episode(recording, guard, recording))
-    return Episode(recording.time, recording.record, decisions)
-
-
-class _Recording:
-    """A recorded episode, as an environment that goes on whatever is done, and as its driver."""
-
-    def __init__(
-        self, times: ArrayLike, observations: ArrayLike, accelerations: ArrayLike, failed: bool
-    ) -> None:
-        self.time, seen = np.asarray(times, np.float64), np.asarray(observations, np.float64)
-        did = np.asarray(accelerations, np.float64)
-        if len(self.time) < 2 or seen.shape != (len(self.time), 3) or did.shape != self.time.shape:
-            raise ValueError(
-                f"times, observations and accelerations have the shapes {self.time.shape}, "
-                f"{seen.shape} and {did.shape}; they must be (T,), (T, 3) and (T,), with T of 2 or "
-                "more"
-            )
-        self.record = np.zeros((len(self.time), len(RUN_COLUMNS)))
-        self.record[:, [GAP, SPEED, LEADER_SPEED]] = self._seen = seen
-        self.record[:, GAP_BEHIND] = np.inf
-        self.record[:-1, COMMANDED] = did[:-1]
-        for column, speed in ((REALISED, seen[:, 1]), (LEADER_ACCELERATION, seen[:, 2])):
-            self.record[:-1, column] = np.diff(speed) / np.diff(self.time)
-        self._failed, self._row = failed or bool(seen[-1, 0] <= 0.0), 0
-
-    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
-        return Proposal(float(self.record[self._row, COMMANDED]))
-
-    def reset(self, **_: Any) -> tuple[NDArray[np.float64], dict[str, Any]]:
-        return self._seen[0], {"time": float(self.time[0])}
-
-    def step(self, _: Any, /) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
-        came = {"realised": self.record[self._row, REALISED]}
-        self._row += 1
-        over = self._row == len(self.time) - 1
-        came |= {"time": float(self.time[self._row]), "failed": over and self._failed}
-        return self._seen[self._row], 0.0, False, over, came
+    time, seen, did = (np.asarray(x, np.float64) for x in (times, observations, accelerations))
+    if len(time) < 2 or seen.shape != (len(time), 3) or did.shape != time.shape:
+        raise ValueError(
+            f"times, observations and accelerations have the shapes {time.shape}, {seen.shape} and "
+            f"{did.shape}; they must be (T,), (T, 3) and (T,), with T of 2 or more"
+        )
+    record = np.zeros((len(time), len(RUN_COLUMNS)))
+    record[:, [GAP, SPEED, LEADER_SPEED]], record[:, GAP_BEHIND] = seen, np.inf
+    record[:-1, COMMANDED] = did[:-1]
+    for column, speed in ((REALISED, SPEED), (LEADER_ACCELERATION, LEADER_SPEED)):
+        record[:-1, column] = np.diff(record[:, speed]) / np.diff(time)
+    guard.begin()
+    decisions = list[Decision]()
+    for row, wanted, at, realised in zip(seen[:-1], did, time, record[:, REALISED], strict=False):
+        revision = guard.decide(row, wanted, float(at))
+        decisions.append(Decision(guard.situation, revision, float(realised)))
+    guard.end(failed or bool(seen[-1, 0] <= 0.0), seen[-1])
+    return Episode(time, record, tuple(decisions))
 
 
 # -- What came of an episode ----------------------------------------------------------------------
