@@ -35,7 +35,6 @@ from evofsm.driving import (
     KinematicWorld,
     LatentRisk,
     Outcome,
-    RiskByState,
     SumoWorld,
     drive,
     guard_for_family,
@@ -56,7 +55,7 @@ from evofsm.guard import TOLERANCE, ActionReviser, Guard, Mode, Reviser, RiskMea
 from evofsm.paper import Figure, Page, Table
 from studies import lib
 from studies.lib import Frames, Study, Target, at_least, at_most, frame_of
-from studies.policies import TUNED_MEASURES, Group, fixed_policies
+from studies.policies import TUNED_MEASURES, Group, RiskByState, fixed_policies
 
 #: Ours that is told how cars follow each other, and ours that is told nothing but failures.
 OURS, MACHINE = "evofsm", "evofsm-machine"

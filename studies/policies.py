@@ -6,6 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from evofsm.driving import (
     AlwaysBrake,
     Draw,
@@ -15,7 +18,11 @@ from evofsm.driving import (
     Unrevised,
     measures,
 )
-from evofsm.guard import ActionReviser, Reviser, RiskMeasure
+from evofsm.fsm import EvolvingFSM, wilson_bounds
+from evofsm.guard import ActionReviser, Judgement, Reviser, RiskMeasure, Situation
+
+# States of a smaller belief are left out.
+_LEAST_BELIEF = 1e-3
 
 
 class Group(StrEnum):
@@ -53,6 +60,36 @@ def _told(family: Family, leader_decel: float) -> Reviser:
     """Ours, told limits instead of learning them."""
     risk = LatentRisk.given(family.actions.low, family.decel, leader_decel, family.interval)
     return ActionReviser(risk, family.actions)
+
+
+class RiskByState:
+    """Judges actions by the states that a situation is recognised as, weighed by the belief.
+
+    Where states disagree, their standard deviation is added to their mean risk.
+    """
+
+    labels, fallback = LatentRisk.labels, LatentRisk.fallback
+
+    def __init__(self, risk: LatentRisk, machine: EvolvingFSM) -> None:
+        self.risk, self.machine = risk, machine
+        self.why, self.trial = risk.why, risk.trial
+        self.effective, self.refuse_unfit = risk.effective, risk.refuse_unfit
+
+    def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
+        """Latent risk of each acceleration."""
+        taking_part = np.flatnonzero(situation.belief >= _LEAST_BELIEF)
+        if len(taking_part) == 0 or self.machine.n_states == 0:
+            return self.risk.judge(situation, accelerations)
+        weights, centers = situation.belief[taking_part], self.machine.centers[taking_part]
+        critical = np.stack([self.risk.critical(center, accelerations) for center in centers])
+        weights = weights / weights.sum()
+        risks = self.risk.manoeuvres.harder(critical)
+        risk = weights @ risks
+        cautious = np.minimum(risk + np.sqrt(weights @ (risks - risk) ** 2), 1.0)
+        evidence = float(len(self.risk.manoeuvres))
+        bounds = [wilson_bounds(each, evidence + 1.0) for each in cautious.tolist()]
+        low, high = np.transpose(bounds)
+        return Judgement(cautious, low, high, weights @ critical, evidence, situation.seen)
 
 
 def fixed_policies(family: Family) -> list[Policy]:

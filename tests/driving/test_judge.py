@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from evofsm.driving.judge import LatentRisk, RiskByState, assess_states
+from evofsm.driving.judge import LatentRisk, assess_states
 from evofsm.driving.leaders import REAL_DRIVES
 from evofsm.driving.measures import is_dead_end
 from evofsm.driving.rehearsal import HARDEST, critical_decelerations
@@ -290,19 +290,10 @@ def test_a_risk_that_saw_jumps_and_odd_numbers_is_kept_and_read_again(tmp_path):
 # -- By state ---------------------------------------------------------------------------------
 
 
-def test_states_are_judged_at_their_centres_weighed_by_the_belief():
+def test_states_are_judged_at_their_centres():
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)))
     machine.learn_many([[80.0, 5.0, 5.0], [3.0, 25.0, 25.0]], [0, 0])
-    assert machine.n_states == 2
     risk = LatentRisk.given(-4.0, 4.0, 8.0)
-    by_state = RiskByState(risk, machine, caution=0.0)
-    judged = [
-        by_state.judge(situation(20.0, 10.0, 10.0, belief), [-4.0]).risk[0]
-        for belief in ([1.0, 0.0], [0.5, 0.5], [0.0, 1.0])
-    ]
-    assert judged == pytest.approx([0.0, 0.5, 1.0])
-    cautious = RiskByState(risk, machine, caution=1.0)
-    assert cautious.judge(situation(20.0, 10.0, 10.0, [0.5, 0.5]), [-4.0]).risk[0] == 1.0
     assert [state.is_dead_end for state in assess_states(machine.model(), risk)] == [False, True]
     brink = EvolvingFSM(n_actions=1)
     brink.observe([7.0, 10.0, 10.0])  # full braking saves, keeping the speed does not

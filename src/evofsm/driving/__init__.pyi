@@ -16,7 +16,6 @@ from .family import Numbers as Numbers
 from .family import held_out as held_out
 from .family import training as training
 from .judge import LatentRisk as LatentRisk
-from .judge import RiskByState as RiskByState
 from .judge import assess_states as assess_states
 from .leaders import REAL_DRIVES as REAL_DRIVES
 from .leaders import BrakeWatch as BrakeWatch

@@ -52,8 +52,6 @@ if TYPE_CHECKING:
 
 # Slower than this a car stands, though a sensor may show that it moves [m/s].
 _STANDS = 0.1
-# States of a smaller belief are left out.
-_LEAST_BELIEF = 1e-3
 # Where a situation is not sure, it may be worse by so many standard deviations.
 _CAUTION = 2.5
 # In C rehearsals are bounded, and long enough for such a speed [m/s].
@@ -449,38 +447,6 @@ class LatentRisk:
 
 
 # -- Of states ----------------------------------------------------------------------------------
-
-
-class RiskByState:
-    """Judges actions by the states that a situation is recognised as.
-
-    The ``risk`` answers all but how dangerous actions are. Where states disagree, ``caution``
-    standard deviations are added to their mean risk.
-    """
-
-    labels, fallback = LatentRisk.labels, LatentRisk.fallback
-
-    def __init__(self, risk: LatentRisk, machine: EvolvingFSM, caution: float = 1.0) -> None:
-        self.risk, self.machine, self.caution = risk, machine, caution
-        self.why, self.trial = risk.why, risk.trial
-        self.effective, self.refuse_unfit = risk.effective, risk.refuse_unfit
-
-    def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
-        """Latent risk of each acceleration: of the states, weighed by the belief."""
-        taking_part = np.flatnonzero(situation.belief >= _LEAST_BELIEF)
-        if len(taking_part) == 0 or self.machine.n_states == 0:
-            return self.risk.judge(situation, accelerations)
-        belief, centers = situation.belief[taking_part], self.machine.centers[taking_part]
-        critical = np.stack([self.risk.critical(center, accelerations) for center in centers])
-        weights = belief / belief.sum()
-        risks = self.risk.manoeuvres.harder(critical)
-        risk = weights @ risks
-        disagreement = np.sqrt(weights @ (risks - risk) ** 2)
-        cautious = np.minimum(risk + self.caution * disagreement, 1.0)
-        evidence = float(len(self.risk.manoeuvres))
-        bounds = [wilson_bounds(each, evidence + 1.0) for each in cautious.tolist()]
-        low, high = np.transpose(bounds)
-        return Judgement(cautious, low, high, weights @ critical, evidence, situation.seen)
 
 
 class StateRisk(NamedTuple):
