@@ -45,7 +45,6 @@ from evofsm.driving import (
     Numbers,
     Scenario,
     drive,
-    fixed_family,
     guard_for_family,
     load_family,
     teach,
@@ -232,6 +231,25 @@ class Toy:
         return math.inf if total >= _NORMAL.inv_cdf(1.0 - self.probability) else total
 
 
+class Chosen(Numbers):
+    """The numbers of a draw that given chances make; an even one is as a draw's own."""
+
+    def __init__(self, chance: Chance) -> None:
+        super().__init__(seed=0, index=0)
+        self._chance = chance
+        self.drawn: dict[str, float] = {}  #: by place: of a range the number, of several its index
+
+    def between(self, place: str, low: float, high: float) -> float:
+        """So far into a range."""
+        self.drawn[place] = number = float(low + (high - low) * self._chance(place))
+        return number
+
+    def below(self, place: str, n: int) -> int:
+        """So far into 0 to n - 1."""
+        self.drawn[place] = number = int(n * self._chance(place))
+        return number
+
+
 @dataclass(frozen=True)
 class Cars:
     """A family's own controller in the closed-form world, under a frozen guard or none."""
@@ -244,7 +262,7 @@ class Cars:
 
     def score(self, chance: Chance) -> float:
         """The braking that was needed at the worst moment [m/s²]."""
-        return needed_braking(self.play(load(self.family).draw_by(chance)))
+        return needed_braking(self.play(load(self.family).draw_by(Chosen(chance))))
 
     def play(self, draw: Draw) -> Episode:
         """Drive one draw."""
@@ -461,13 +479,14 @@ class Falsification(Study):
             return
         for (name, judge), some in found["cases"].group_by("family", "judge", maintain_order=True):
             family = load(str(name))
-            draws = {
-                f"found {number}": family.draw_by(dict(one.select("place", "below").rows()).get)  # type: ignore[arg-type]
+            chances = {
+                f"found {number}": dict(one.select("place", "below").rows())
                 for (number,), one in some.group_by("case", maintain_order=True)
             }
+            draws = {of: family.draw_by(Chosen(by.__getitem__)) for of, by in chances.items()}
             about = f"Collisions of {name} that were found (judge: {judge}): {lib.command_line()}"
             file = folder / f"found-{Path(str(name)).stem}-{judge}.py"
-            file.write_text(fixed_family(family, draws, about), encoding="utf-8")
+            file.write_text(kept(family, draws, about), encoding="utf-8")
 
     def page(self, found: Frames) -> Page:
         """What is found, how likely it is, and where it loses."""
@@ -567,11 +586,11 @@ def row_of(family: str, judge: str, splits: Sequence[Split], n: int, failed: int
 
 def numbers_of(family: str, judge: str, number: int, case: Case) -> Iterator[dict[str, Any]]:
     """What there is to say about a case that failed: a row for each number that was drawn."""
-    drawn: dict[str, float] = {}
-    load(family).draw_by(case.chance, drawn)
-    degrees = max(1, len(drawn.keys() - {_NOISE}))
+    numbers = Chosen(case.chance)
+    load(family).draw_by(numbers)
+    degrees = max(1, len(numbers.drawn.keys() - {_NOISE}))
     as_far = float(chi2.sf(_distance(case), degrees))
-    for place, value in drawn.items():
+    for place, value in numbers.drawn.items():
         yield {
             "family": family,
             "judge": judge,
@@ -586,6 +605,33 @@ def numbers_of(family: str, judge: str, number: int, case: Case) -> Iterator[dic
 def _distance(case: Case) -> float:
     """Squared, of its normal numbers from the middle of all."""
     return math.fsum(z * z for place, z in case.latent.items() if place != _NOISE)
+
+
+def kept(family: Family, cases: Mapping[str, Draw], about: str) -> str:
+    """Draws of a family as a file that defines them as one, in which nothing is left to chance."""
+    names = ("low", "high", "decel", "leader_decel", "interval", "width")
+    settings = "".join(f"    {name}={float(getattr(family, name))!r},\n" for name in names)
+    draws = "".join(f"    {name!r}: {draw!r},\n" for name, draw in cases.items())
+    return f"""# fmt: off
+# ruff: noqa
+from math import inf
+from pathlib import Path
+
+from evofsm.driving.drivers import IDM, ChangingIDM
+from evofsm.driving.family import Draw, Family
+from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sensors
+
+cases = {{
+{draws}}}
+family = Family(
+    Path(__file__).stem,
+    {about!r},
+    lambda numbers: [*cases.values()][numbers.variant][:2],
+{settings}    variants=tuple(cases),
+    in_turn=True,
+    fixed=True,
+)
+"""
 
 
 # -- The page -------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from evofsm.driving.families import FAMILIES, fixed_family, load_family
+from evofsm.driving.families import FAMILIES, load_family
 from evofsm.driving.family import SWITCHES
 from evofsm.driving.measures import is_dead_end
 from evofsm.driving.trials import drive, unrevised_guard
@@ -61,12 +61,6 @@ def mine(tmp_path):
         return path
 
     return write
-
-
-def chances(seed):
-    """A number for each place, the same whenever it is asked for."""
-    rng, known = np.random.default_rng(seed), {}
-    return lambda place: known.setdefault(place, rng.random())
 
 
 # -- What every family is held to -----------------------------------------------------------------
@@ -135,19 +129,6 @@ def test_draws_stay_what_they_were(name, digest):
 def test_a_draw_that_is_none_is_refused(which, message):
     with pytest.raises(ValueError, match=message):
         LOADED["emergency"].draw(*which)
-
-
-def test_given_chances_are_places_in_ranges_and_what_was_drawn_is_told():
-    family, drawn = LOADED["emergency"], {}
-    least = family.draw_by(lambda place: 0.0, drawn)
-    assert least.scenario.initial_gap == drawn["scenario.initial_gap"] == 2.0
-    assert 29.999 < family.draw_by(lambda place: np.nextafter(1.0, 0.0)).scenario.initial_gap <= 30
-    drawn, ncap = {}, LOADED["ncap"]
-    assert ncap.draw_by(lambda place: 0.999, drawn).variant == ncap.variants[-1]
-    assert drawn["variant"] == 2
-    for chance in (-0.1, 1.0, np.nan):
-        with pytest.raises(ValueError, match=r"the chance of .* must be from 0 up to 1"):
-            family.draw_by(lambda place, chance=chance: chance)
 
 
 # -- Variants, shifts, switches -------------------------------------------------------------------
@@ -235,21 +216,3 @@ def test_a_family_that_is_none_is_refused(tmp_path):
         load_family("emergncy")
     with pytest.raises(ValueError, match=r"no family .*none\.py"):
         load_family(tmp_path / "none.py")
-
-
-@pytest.mark.parametrize("name", [*FAMILIES, "cut_in+noise+delay+actuator+jerk+third_car"])
-def test_what_is_kept_is_what_was_drawn_to_the_last_bit(name, tmp_path):
-    family = load_family(name).shifted or load_family(name)
-    cases = {f"case {k}": family.draw_by(chances(k)) for k in range(4)}
-    path = tmp_path / "kept.py"
-    path.write_text(fixed_family(family, cases, "All of them."), encoding="utf-8")
-    again = load_family(path)
-    for k, (case, drawn) in enumerate(cases.items()):
-        for split in ("train", "test"):
-            draw = again.draw(seed=5, index=k, split=split)
-            assert draw == drawn._replace(variant=case)
-    for name in ("interval", "actions", "decel", "leader_decel"):
-        assert getattr(again, name) == getattr(family, name)
-    assert (again.name, again.about) == ("kept", "All of them.")
-    with pytest.raises(ValueError, match="there are no cases"):
-        fixed_family(family, {}, "Nothing.")

@@ -1,10 +1,10 @@
 # fmt: off
 # ruff: noqa
 from math import inf
+from pathlib import Path
 
 from evofsm.driving.drivers import IDM, ChangingIDM
-from evofsm.driving.families import family_of_cases
-from evofsm.driving.family import Draw
+from evofsm.driving.family import Draw, Family
 from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sensors
 
 cases = {
@@ -19,14 +19,17 @@ cases = {
     'found 9': Draw(scenario=Scenario(leader=Leader(driver=IDM(accel=1.2, desired_speed=25.0, min_gap=1.0, time_headway=1.0, decel=2.5, exponent=4.0, lowest=-inf, highest=inf), brake_decel=3.992749890546154, brake_speed=inf, brake_time=3.9570378263736936, initial_speed=17.787105349939587, waves=(), cut_in=None), initial_gap=41.09329671713538, duration=12.0, dt=0.01, initial_speed=17.787105349939587, body=Body(lowest=-4.0, highest=2.5, delay=0.0, jerk=inf), sensors=Sensors(gap_noise=0.0, speed_noise=0.0, delay=0.0, seed=608554765), behind=None), controller=ChangingIDM(first=IDM(accel=1.25, desired_speed=25.0, min_gap=2.0, time_headway=1.5, decel=2.0, exponent=4.0, lowest=-4.0, highest=2.5), changes=((6.233961442797797, IDM(accel=2.25, desired_speed=28.0, min_gap=0.8, time_headway=0.3, decel=2.0, exponent=4.0, lowest=-4.0, highest=2.5)), (7.593378953730865, IDM(accel=1.25, desired_speed=25.0, min_gap=2.0, time_headway=1.5, decel=2.0, exponent=4.0, lowest=-4.0, highest=2.5)))), variant='found 9'),
     'found 10': Draw(scenario=Scenario(leader=Leader(driver=IDM(accel=1.2, desired_speed=25.0, min_gap=1.0, time_headway=1.0, decel=2.5, exponent=4.0, lowest=-inf, highest=inf), brake_decel=3.917587639075318, brake_speed=inf, brake_time=2.1958925887835568, initial_speed=19.18384270582586, waves=(), cut_in=None), initial_gap=46.21558191948889, duration=12.0, dt=0.01, initial_speed=19.18384270582586, body=Body(lowest=-4.0, highest=2.5, delay=0.0, jerk=inf), sensors=Sensors(gap_noise=0.0, speed_noise=0.0, delay=0.0, seed=2574429845), behind=None), controller=ChangingIDM(first=IDM(accel=1.25, desired_speed=25.0, min_gap=2.0, time_headway=1.5, decel=2.0, exponent=4.0, lowest=-4.0, highest=2.5), changes=((4.480963166701623, IDM(accel=2.25, desired_speed=28.0, min_gap=0.8, time_headway=0.3, decel=2.0, exponent=4.0, lowest=-4.0, highest=2.5)), (5.762339899860265, IDM(accel=1.25, desired_speed=25.0, min_gap=2.0, time_headway=1.5, decel=2.0, exponent=4.0, lowest=-4.0, highest=2.5)))), variant='found 10'),
 }
-family = family_of_cases(
-    __file__,
+family = Family(
+    Path(__file__).stem,
     'Collisions of seldom that were found (judge: none) by: evofsm bench break toy,seldom --judge none --short',
-    cases,
+    lambda numbers: [*cases.values()][numbers.variant][:2],
     low=-4.0,
     high=2.5,
     decel=4.0,
     leader_decel=4.2,
     interval=0.25,
     width=0.3,
+    variants=tuple(cases),
+    in_turn=True,
+    fixed=True,
 )

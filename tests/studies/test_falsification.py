@@ -10,8 +10,10 @@ import polars as pl
 import pytest
 from studies.falsification import (
     Cars,
+    Chosen,
     Falsification,
     Toy,
+    kept,
     load,
     needed_braking,
     plain,
@@ -107,13 +109,26 @@ def test_cases_are_written_as_a_family_that_fails_as_often(found, tmp_path):
     for k in range(3):
         draw = family.draw(seed=7, index=k)
         chances = dict(cases.filter(case=k + 1).select("place", "below").rows())
-        assert draw[:2] == load("emergency").draw_by(chances.__getitem__)[:2]
+        assert draw[:2] == load("emergency").draw_by(Chosen(chances.__getitem__))[:2]
         assert drive(unrevised_guard(family), draw).collided
     gap, *_ = cases.filter(place="scenario.initial_gap").to_dicts()
     assert gap["value"] == pytest.approx(2.0 + 28.0 * gap["below"])
     far = cases["as_far"].to_list()
     assert far == sorted(far, reverse=True)  # the most ordinary first
     assert 0.0 < far[-1] <= far[0] <= 1.0
+
+
+@pytest.mark.parametrize("name", [*FAMILIES, "cut_in+noise+delay+actuator+jerk+third_car"])
+def test_what_is_kept_is_what_was_drawn_to_the_last_bit(name, tmp_path):
+    family = load_family(name).shifted or load_family(name)
+    cases = {f"case {k}": family.draw(0, k) for k in range(4)}
+    (tmp_path / "kept.py").write_text(kept(family, cases, "All of them."), encoding="utf-8")
+    again = load_family(tmp_path / "kept.py")
+    for k, (case, drawn) in enumerate(cases.items()):
+        assert again.draw(seed=5, index=k, split="test") == drawn._replace(variant=case)
+    for name in ("interval", "actions", "decel", "leader_decel"):
+        assert getattr(again, name) == getattr(family, name)
+    assert (again.name, again.about) == ("kept", "All of them.")
 
 
 def test_failures_under_a_guard_and_runs_that_disagree_are_among_the_losses(

@@ -8,7 +8,6 @@ from .drivers import IDM as IDM
 from .drivers import ChangingIDM as ChangingIDM
 from .env import CarFollowing as CarFollowing
 from .families import FAMILIES as FAMILIES
-from .families import fixed_family as fixed_family
 from .families import load_family as load_family
 from .family import Draw as Draw
 from .family import Family as Family

@@ -7,7 +7,7 @@ seed 1.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from evofsm.driving.drivers import IDM, ChangingIDM
-from evofsm.driving.family import Draw, Family, Make, Numbers, read_family
+from evofsm.driving.family import Family, Make, Numbers, read_family
 from evofsm.driving.scenarios import Body, CutIn, Leader, Scenario
 
 MakeFamily = Callable[..., Family]
@@ -313,57 +313,3 @@ def load_family(name: str | PathLike[str]) -> Family:
             "Python that exists"
         )
     return read_family(path, switches)
-
-
-def fixed_family(family: Family, cases: Mapping[str, Draw], about: str) -> str:
-    """Draws of a family as a family of their own, in which nothing is left to chance.
-
-    The text is Python, to be written to a file that ends in ``.py``. `load_family` reads it, and
-    draw k is case k, counted from 0, with exactly its numbers; ``about`` says in a sentence what
-    they have in common.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> family = load_family("emergency")
-    >>> nearest = family.draw_by(lambda place: 0.0)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     file = Path(folder) / "near.py"
-    ...     _ = file.write_text(fixed_family(family, {"the smallest gap": nearest}, "One case."))
-    ...     kept = load_family(file).draw(seed=5, index=0)
-    >>> kept.scenario == nearest.scenario, kept.variant
-    (True, 'the smallest gap')
-    """
-    if not cases:
-        raise ValueError("there are no cases, but a family has one at least")
-    names = ("low", "high", "decel", "leader_decel", "interval", "width")
-    settings = "".join(f"    {name}={float(getattr(family, name))!r},\n" for name in names)
-    kept = "".join(f"    {name!r}: {draw!r},\n" for name, draw in cases.items())
-    return f"""# fmt: off
-# ruff: noqa
-from math import inf
-
-from evofsm.driving.drivers import IDM, ChangingIDM
-from evofsm.driving.families import family_of_cases
-from evofsm.driving.family import Draw
-from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sensors
-
-cases = {{
-{kept}}}
-family = family_of_cases(
-    __file__,
-    {about!r},
-    cases,
-{settings})
-"""
-
-
-def family_of_cases(file: str, about: str, cases: Mapping[str, Draw], **settings: Any) -> Family:
-    """The family that `fixed_family` has written to a file."""
-    make = partial(_case, tuple(cases.values()))
-    family = Family(Path(file).stem, about, make, **settings)
-    return replace(family, variants=tuple(cases), in_turn=True, fixed=True)
-
-
-def _case(cases: Sequence[Draw], numbers: Numbers) -> tuple[Scenario, IDM | ChangingIDM]:
-    return cases[numbers.variant][:2]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import operator
 import runpy
-from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -27,10 +27,6 @@ from evofsm.fsm.naming import Labels
 
 #: Where draws come from. What is learnt on one is scored on the other; they never meet.
 SPLITS = ("train", "test")
-
-#: Says by what chance a number falls as it does: for a place, a number from 0 up to 1, the same
-#: whenever the same place is asked for.
-Chance = Callable[[str], float]
 
 # Numbers that are equal but for rounding.
 _ROUNDING = 1e-9
@@ -50,8 +46,7 @@ class Draw(NamedTuple):
 class Numbers:
     """The numbers of one draw, each by the place that it is for.
 
-    They are those of a draw's ``seed``, ``index`` and ``split``; or those that a ``chance`` of each
-    place makes, from 0 up to 1, where they are put into ``drawn``.
+    Whoever searches among all draws there are derives from it, and says `between` and `below`.
 
     Examples
     --------
@@ -61,15 +56,7 @@ class Numbers:
     (True, True)
     """
 
-    def __init__(
-        self,
-        seed: int,
-        index: int,
-        split: str = "train",
-        *,
-        chance: Chance | None = None,
-        drawn: MutableMapping[str, float] | None = None,
-    ) -> None:
+    def __init__(self, seed: int, index: int, split: str = "train") -> None:
         if split not in SPLITS:
             raise ValueError(f"split is {split!r}; it must be one of {', '.join(SPLITS)}")
         for name, number in (("seed", seed), ("index", index)):
@@ -78,21 +65,14 @@ class Numbers:
         #: Index of the variant; 0 where the family has none.
         self.variant = 0
         self._key = [SPLITS.index(split), int(seed), int(index)]
-        self._chance, self._drawn = chance, {} if drawn is None else drawn
 
     def between(self, place: str, low: float, high: float) -> float:
         """A number from a range, evenly distributed."""
-        if self._chance is None:
-            return float(self._stream(place).uniform(low, high))
-        number = self._drawn[place] = float(low + (high - low) * self._checked(place))
-        return number
+        return float(self._stream(place).uniform(low, high))
 
     def below(self, place: str, n: int) -> int:
         """An integer from 0 to n - 1, each as likely."""
-        if self._chance is None:
-            return int(self._stream(place).integers(n))
-        number = self._drawn[place] = int(n * self._checked(place))
-        return number
+        return int(self._stream(place).integers(n))
 
     def one_of(self, place: str, choices: Sequence[Any]) -> Any:
         """One of several, each as likely."""
@@ -101,12 +81,6 @@ class Numbers:
     def _stream(self, place: str) -> np.random.Generator:
         """The random numbers that belong to a place."""
         return np.random.default_rng([*self._key, crc32(place.encode())])
-
-    def _checked(self, place: str) -> float:
-        chance = self._chance(place)  # type: ignore[misc]
-        if not 0.0 <= chance < 1.0:
-            raise ValueError(f"the chance of {place} is {chance}; it must be from 0 up to 1")
-        return chance
 
 
 #: What makes a draw: a scenario and who drives the follower.
@@ -188,26 +162,10 @@ class Family:
         ``"train"`` and ``"test"`` never are the same.
         """
         numbers = Numbers(seed, index, split)
-        return self._draw(numbers, index % self.cases if self.cases > 1 else None)
+        return self.draw_by(numbers, index % self.cases if self.cases > 1 else None)
 
-    def draw_by(self, chance: Chance, drawn: MutableMapping[str, float] | None = None) -> Draw:
-        """The scenario that given chances make, for whoever searches among all there are.
-
-        ``chance`` says for each place that is drawn for, such as ``scenario.initial_gap`` or
-        ``variant``, a number from 0 up to 1: 0 is the lower end of a range, 0.5 its middle. Evenly
-        distributed ones make draws as `draw` does. What was drawn is put into ``drawn`` by its
-        place: of a range the number itself, of several its index, from 0.
-
-        Examples
-        --------
-        >>> from evofsm.driving import load_family
-        >>> draw = load_family("emergency").draw_by(lambda place: 0.5)
-        >>> draw.scenario.initial_gap, draw.scenario.leader.brake_decel
-        (16.0, 3.5)
-        """
-        return self._draw(Numbers(0, 0, chance=chance, drawn=drawn))
-
-    def _draw(self, numbers: Numbers, variant: int | None = None) -> Draw:
+    def draw_by(self, numbers: Numbers, variant: int | None = None) -> Draw:
+        """The scenario that given numbers make; without a variant they say which."""
         if variant is None and self.variants:
             variant = numbers.below("variant", len(self.variants))
         numbers.variant = variant or 0
@@ -256,7 +214,7 @@ def read_family(path: str | Path, switches: Iterable[str] = ()) -> Family:
         family = replace(found, source=str(path)).with_switches(switches)
         for one in filter(None, (family, family.shifted)):
             for variant in range(max(1, len(one.variants))):
-                one._draw(Numbers(0, 0), variant)  # so that a mistake shows at once
+                one.draw_by(Numbers(0, 0), variant)  # so that a mistake shows at once
     except Exception as error:
         text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
         where = "" if text.startswith(f"{path}: ") else f"{path}: "
