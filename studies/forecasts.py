@@ -186,21 +186,17 @@ def _read(path: str) -> Iterator[Episode]:
 
 # -- Who forecasts states -------------------------------------------------------------------------
 
-OURS, BLEND, BATCH, STAYS = "evofsm", "blend", "batch", "persistence"
+OURS, BATCH, STAYS = "evofsm", "batch", "persistence"
 #: The paper's machine, matrices and powers; and the references in its states.
 PAPER, PAPER_BATCH, PAPER_STAYS = "evofsm-paper", "batch-paper", "persistence-paper"
 #: For each method, whom it is compared with, in the same states.
 REFERENCES = {
-    **dict.fromkeys((OURS, BLEND, BATCH, STAYS), (STAYS, BATCH)),
+    **dict.fromkeys((OURS, BATCH, STAYS), (STAYS, BATCH)),
     **dict.fromkeys((PAPER, PAPER_BATCH, PAPER_STAYS), (PAPER_STAYS, PAPER_BATCH)),
 }
 
 #: Makes forecasts: of (T, n) beliefs and (T,) actions, (T, n) of what comes.
 Forecaster = Callable[[Floats, NDArray[np.int64]], Floats]
-
-# The blend is tuned on so many training episodes, over these shares of the mean belief.
-_FOR_TUNING = 40
-_BLENDS = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.7, 1.0])
 
 
 class Taught(NamedTuple):
@@ -267,24 +263,6 @@ def batch(taught: Taught, lag: int) -> Forecaster:
     return of_matrix(np.where(totals > 0.0, counts / np.maximum(totals, 1.0), np.eye(n)))
 
 
-def blend(taught: Taught, steps: int) -> Forecaster:
-    """A share of the mean belief of training rows, the best for them in log score."""
-    beliefs = taught.train[:: -(-len(taught.train) // _FOR_TUNING)]
-    mean = np.concatenate(beliefs).mean(axis=0)
-    pairs = [(rows[:-steps], rows[steps:]) for rows in beliefs if len(rows) > steps]
-    if not pairs:
-        return stays
-    costs = [
-        -sum(
-            float((after * np.log(np.maximum((1.0 - w) * before + w * mean, 1e-12))).sum())
-            for before, after in pairs
-        )
-        for w in _BLENDS
-    ]
-    best = _BLENDS[int(np.argmin(costs))]
-    return lambda beliefs, actions: (1.0 - best) * beliefs + best * mean
-
-
 # -- How forecasts of states are scored -----------------------------------------------------------
 # The divergence of Jensen and Shannon between the forecast q and the belief gamma that came, and
 # the log score -sum gamma log2 q [bit], which none gets below the entropy of gamma. The skill of
@@ -345,7 +323,6 @@ def compare(source: Source, learning_seed: int) -> list[dict[str, Any]]:
         steps = pace.steps(seconds)
         in_safe: dict[str, Forecaster] = {
             OURS: partial(own.predict, steps=steps),
-            BLEND: blend(safe, steps),
             BATCH: batch(safe, steps),
             STAYS: stays,
         }
@@ -856,7 +833,7 @@ class ForecastStudy(Study):
         rows, failures = found["rows"], found["failures"]
         is_ours, key = pl.col("method") == OURS, ["source", "horizon"]
         ours = rows.filter(is_ours)
-        for name in (BLEND, BATCH, PAPER):
+        for name in (BATCH, PAPER):
             rival = rows.filter(method=name).select(
                 *key, pl.col("skill", "log_skill").name.suffix(f"_{name}")
             )
@@ -867,9 +844,7 @@ class ForecastStudy(Study):
             "log score (95 %)": "{log_skill:.2f} ({log_low:.2f}–{log_high:.2f})",
         }
         asked = ours.filter(pl.col("horizon") >= _ASKED)
-        rivals = lib.compared(rows, is_ours, key).filter(
-            pl.col("method").is_in([BLEND, BATCH, STAYS])
-        )
+        rivals = lib.compared(rows, is_ours, key).filter(pl.col("method").is_in([BATCH, STAYS]))
         better = (pl.col("skill") > pl.col("skill_ours")) | (
             pl.col("log_skill") > pl.col("log_skill_ours")
         )
@@ -885,11 +860,7 @@ class ForecastStudy(Study):
                     where
                     | skills
                     | {"over batch": "{over_batch:.2f}", "worst": "{worst:.2f}"}
-                    | {"blend": f"{{skill_{BLEND}:.2f}}", "batch": f"{{skill_{BATCH}:.2f}}"}
-                    | {
-                        "paper": f"{{skill_{PAPER}:.2f}}",
-                        "log blend": f"{{log_skill_{BLEND}:.2f}}",
-                    },
+                    | {"batch": f"{{skill_{BATCH}:.2f}}", "paper": f"{{skill_{PAPER}:.2f}}"},
                     "By divergence, where nothing else is said. Over batch: ours against the batch "
                     "fit; the paper's machine is held against persistence in its own states. "
                     "Worst: of a learning seed, or of a part of the runs.",
@@ -945,11 +916,11 @@ _ABOUT = """How far ahead are states and failures foreseen?
 
 States: forecasts of the distribution over states, on drives that nothing was learnt from; logs are
 split by run, and every run is held out once. A skill is 1 for a perfect forecast and 0 for one as
-good as persistence, the belief that stays as it is. blend is persistence with the best share of the
-mean belief; batch is deeptime's count of transitions between the most probable states at the lag of
-the horizon; paper is the paper's machine, its matrices raised to a power. Up to 0.1 s machines of
-simulated drives observe every 0.01 s, else every 0.25 s. How useful a forecast is depends on how
-fine the states are, and finer ones are harder to foresee.
+good as persistence, the belief that stays as it is. batch is deeptime's count of transitions
+between the most probable states at the lag of the horizon; paper is the paper's machine, its
+matrices raised to a power. Up to 0.1 s machines of simulated drives observe every 0.01 s, else
+every 0.25 s. How useful a forecast is depends on how fine the states are, and finer ones are harder
+to foresee.
 
 Failures: each task is run by a mixture of its controllers, of random actions, of random ones that
 are held for a while, and on cartpole and pendulum of feedback that would hold them. All learn the

@@ -22,7 +22,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 import numpy as np
 import polars as pl
 from matplotlib.figure import Figure as Drawn
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.stats import qmc
 from typer import Option
 
@@ -395,15 +395,13 @@ class Sensitivity(Study):
         return {"rows": lib.frame_of([*rows, *(row for some in edges for row in some)])}
 
     def page(self, found: Frames) -> Page:
-        """Shares of settings, how far each parameter may move, and what decides."""
+        """Shares of settings, and how far each parameter may move."""
         rows = found["rows"]
         shares = shares_of(rows)
         cells = {
             space: f"{{{space}:%}} ({{{space}_low:p}}–{{{space}_high:p}})" for space in _COLUMNS
         }
-        open_ = rows.filter(design="left open")
         reaches = lib.frame_of(reach(rows, one) for one in PARAMETERS.values())
-        decided = lib.frame_of(decisions(open_))
         return Page(
             name=self.name,
             about=_ABOUT,
@@ -433,13 +431,6 @@ class Sensitivity(Study):
                     "recovered; ≤ and ≥: to the end of the range. Ranges: "
                     + "; ".join(f"{one.label}: {one.why}" for one in PARAMETERS.values())
                     + ".",
-                ),
-                Table(
-                    "What decides most where all that the paper leaves open is drawn",
-                    decided,
-                    {"claim": "{claim}", "parameter": "{parameter}", "explains": "{value:%}"},
-                    "Share of the variance of the verdict, or of the number of claims that hold, "
-                    "that the parameter explains alone; only what is more than chance.",
                 ),
             ],
             command=lib.command_line(),
@@ -520,62 +511,6 @@ def reach(rows: pl.DataFrame, one: Parameter) -> dict[str, Any]:
     at_low, at_high = all_hold[0] and ends[0] > 0.0, all_hold[1]
     text = f"{'≤' * at_low}{ends[0]:.4g} to {'≥' * at_high}{ends[1]:.4g}"
     return told | {"all_hold": text}
-
-
-# -- What decides ---------------------------------------------------------------------------------
-
-# Into so many parts of equal size a range is cut, where there are points enough for it.
-_BINS, _FEWEST_IN_BIN = 16, 8
-
-
-def decisions(rows: pl.DataFrame) -> Iterator[dict[str, Any]]:
-    """The parameter that explains most of a claim's variance, and of how many hold."""
-    for column, claim in {**CLAIMS, "held": "how many hold"}.items():
-        found = [(first_order(rows, rows[column], one), one) for one in SPACES["left open"][1]]
-        value, one = max(found, key=lambda pair: pair[0])
-        yield {"claim": claim, "parameter": one.label if value else None, "value": value}
-
-
-def first_order(rows: pl.DataFrame, of: ArrayLike, parameter: Parameter) -> float:
-    """Share of the variance of a verdict or number that one parameter alone explains.
-
-    Estimated from the points themselves by the means within parts of the range (E. Plischke,
-    E. Borgonovo, C. Smith 2013, doi:10.1016/j.ejor.2012.11.047), less what so many parts explain
-    of pure chance. 0 where it is no more than chance, there is nothing to explain, or there are too
-    few rows.
-
-    Parameters
-    ----------
-    rows : polars.DataFrame
-        That fill a space in which the parameter is varied.
-    of : (n,) array_like
-        What is explained: a verdict or a number of each row.
-    parameter : Parameter
-    """
-    values = np.asarray(of, dtype=np.float64)
-    places = np.array([parameter.place_of(value) for value in rows[parameter.name]])
-    parts = _parts(places, len(parameter.choices))
-    n, bins = len(values), len(np.unique(parts))
-    if n <= bins or bins < 2 or not np.var(values) > 0.0:
-        return 0.0
-    means = np.zeros(n)
-    for part in np.unique(parts):
-        means[parts == part] = values[parts == part].mean()
-    unexplained = np.mean((values - means) ** 2) / np.var(values)
-    spare = (n - 1) / (n - bins)
-    # Of pure chance the explained share has a beta distribution with this standard deviation.
-    deviation = math.sqrt(2.0 * (bins - 1) * (n - bins) / (n + 1)) / (n - 1)
-    value = float(1.0 - unexplained * spare)
-    return value if value > 3.0 * deviation * spare else 0.0
-
-
-def _parts(places: NDArray[np.float64], choices: int) -> NDArray[np.int64]:
-    """Which part of the range each place is in: a choice each, or parts of equal size."""
-    bins = choices or max(1, min(_BINS, len(places) // _FEWEST_IN_BIN))
-    if choices:
-        return np.minimum((places * bins).astype(np.int64), bins - 1)
-    ranks = np.argsort(np.argsort(places, kind="stable"), kind="stable")
-    return (ranks * bins) // max(len(places), 1)
 
 
 # -- Figures --------------------------------------------------------------------------------------

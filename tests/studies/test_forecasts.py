@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 import pytest
 from studies.forecasts import (
-    BLEND,
+    BATCH,
     DECISIONS,
     OURS,
     PAPER,
@@ -147,8 +147,8 @@ def test_a_page_says_where_others_are_better(logs, monkeypatch):
     tiny = ForecastStudy(tasks="acc", seeds=1, train=3, test=2, fine_train=1, fine_test=1, parts=2)
     tiny = replace(tiny, data=logs, task_train=6, task_test=6, calibration=6, rounds=10)
     one = tiny.run(workers=2)
-    rows = one["rows"].with_columns(skill=pl.when(method=BLEND).then(0.9).otherwise("skill"))
+    rows = one["rows"].with_columns(skill=pl.when(method=BATCH).then(0.9).otherwise("skill"))
     page = tiny.page(one | {"rows": rows})
     better = next(table for table in page.lost if "References" in table.title).frame
-    assert set(better.filter(source="track")["method"]) >= {BLEND}
+    assert set(better.filter(source="track")["method"]) >= {BATCH}
     assert all(table.cells or table.frame.is_empty() for table in [*page.tables, *page.lost])

@@ -15,7 +15,6 @@ from studies.sensitivity import (
     evaluate,
     filling,
     find_edges,
-    first_order,
     reach,
     recovered,
     shares_of,
@@ -82,18 +81,6 @@ def test_a_hypercube_fills_each_range_evenly_and_varies_what_its_name_says():
     for trial in filling("near", 6, seed=0):
         assert trial.setting.radius != recovered().radius
         assert trial.setting.radius == pytest.approx(recovered().radius, rel=NEAR)
-
-
-def test_what_decides_is_found_and_chance_is_hardly_ever_taken_for_it():
-    rng, places = np.random.default_rng(0), np.random.default_rng(0).random((400, 3))
-    bound, spread, order = (PARAMETERS[name] for name in ("bound", "spread", "order"))
-    pairs = zip((bound, spread, order), places.T, strict=True)
-    rows = pl.DataFrame({one.name: [one.value_at(at) for at in column] for one, column in pairs})
-    assert first_order(rows, places[:, 0] > 0.5, bound) > 0.9
-    assert first_order(rows, places[:, 0] > 0.5, spread) == 0.0
-    assert first_order(rows, np.ones(400), bound) == 0.0
-    by_chance = [first_order(rows, rng.random(400) < 0.3, order) for _ in range(100)]
-    assert np.count_nonzero(by_chance) <= 3
 
 
 @pytest.mark.slow
