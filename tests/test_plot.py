@@ -1,18 +1,21 @@
 """The plots show what models, beliefs and drives hold, on any axes, and set no style."""
 
-from dataclasses import replace
+import importlib
+from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from studies.judges import run
+from studies.systems import Start, make_system
 
 from evofsm import EvolvingFSM, IntervalActions, Novelty, plot
 from evofsm.driving import drive, guard_for_family, load_family
-from evofsm.guard import Mode
+from evofsm.guard import Guard, LearntRisk, Mode
 
-OF_A_MODEL = (plot.states, plot.graph, plot.transitions)
+OF_A_MODEL = (plot.states, plot.graph)
 
 
 def new():
@@ -50,7 +53,7 @@ def saved():
 def test_they_answer_with_the_axes_they_were_given_and_leave_the_style(machine, model, saved):
     before = dict(matplotlib.rcParams)
     given = [*((draw, model) for draw in OF_A_MODEL), (plot.belief, [machine.belief])]
-    for draw, what in (*given, (plot.risk, saved), (plot.accelerations, saved)):
+    for draw, what in (*given, (plot.risk, saved)):
         ax = new()
         assert draw(what, ax) is ax
     assert dict(matplotlib.rcParams) == before
@@ -98,28 +101,14 @@ def test_the_two_likeliest_ways_out_of_each_state_are_dark():
     assert sum(arrow.get_zorder() == 2.0 for arrow in arrows) == 4 * 2 < len(arrows)
 
 
-@pytest.mark.parametrize("action", [None, 0, 1])
-def test_transitions_are_those_of_the_action_or_of_all(model, action):
-    ax = plot.transitions(model, new(), action=action, dead_ends=[2])
-    matrix = model.averaged_matrix() if action is None else model.transition_matrices[action]
-    assert np.array_equal(ax.images[0].get_array(), matrix)
-    assert texts(ax) == [f"{100 * value:.0f} %" for value in matrix.ravel()]
-    assert ax.get_title().startswith("all actions" if action is None else f"a({action + 1})  ")
-    bold = [tick.get_fontweight() == "bold" for tick in ax.get_xticklabels()]
-    assert bold == [False, False, True]
-    assert ax.get_xlabel() == "to state (bold: dead end)"
-
-
 def test_what_a_model_does_not_have_is_named(model):
     for draw in OF_A_MODEL:
         with pytest.raises(ValueError, match="dead_ends name state 3, but there are states 0 to 2"):
             draw(model, new(), dead_ends=[3])
         with pytest.raises(ValueError, match="no states: its machine had observed nothing"):
             draw(EvolvingFSM(n_actions=1).model(), new())
-    with pytest.raises(ValueError, match="no variable 2: the model has 2"):
+    with pytest.raises(ValueError, match="no variable 2: there are 2"):
         plot.states(model, new(), variables=(0, 2))
-    with pytest.raises(ValueError, match="no action 2: the model has 2"):
-        plot.transitions(model, new(), action=2)
 
 
 def test_many_states_can_be_drawn():
@@ -165,24 +154,64 @@ def test_risk_is_that_of_the_decisions_and_holds_until_the_end(saved):
     assert ax.collections[0].get_paths()[0].vertices[:, 1].max() == highest
 
 
-def test_accelerations_are_what_was_proposed_and_executed(saved):
-    ax = plot.accelerations(saved, new())
-    drawn = lines(ax)
-    assert saved.changed.any()
-    assert np.array_equal(drawn["proposed"].get_ydata()[:-1], saved.proposed)
-    assert np.array_equal(drawn["executed"].get_ydata()[:-1], saved.executed)
-
-
-@pytest.mark.parametrize("draw", [plot.risk, plot.accelerations])
-def test_a_collision_is_marked_where_there_was_one(draw, saved):
+def test_a_collision_is_marked_where_there_was_one(saved):
     lost = driven(Mode.SHADOW)
     assert (saved.collided, lost.collided) == (False, True)
-    assert lines(draw(lost, new()))["collision"].get_xdata()[0] == lost.time[-1]
-    assert "collision" not in lines(draw(saved, new()))
+    assert lines(plot.risk(lost, new()))["collision"].get_xdata()[0] == lost.time[-1]
+    assert "collision" not in lines(plot.risk(saved, new()))
 
 
 def test_a_drive_that_nobody_judged_is_refused(saved):
     with pytest.raises(ValueError, match="no decision of this drive was judged"):
         plot.risk(driven(Mode.OFF), new())
-    with pytest.raises(ValueError, match="nothing was decided"):
-        plot.accelerations(replace(saved, decisions=()), new())
+
+
+@pytest.fixture(scope="module")
+def guard():
+    """It has learnt where the disc is, and dead ends."""
+    system = make_system("disc", "curious")
+    told = {"names": system.variables, "units": ["m", "m", "m/s", "m/s"]}
+    judge = LearntRisk(system.interval, **system.actions.settings, **told)
+    guard = Guard(**system.actions.settings, interval=system.interval, judge=judge)
+    for episode in range(20):
+        run(system, guard, Start.training(0, 0, episode))
+    return guard
+
+
+def test_what_failed_is_tinted_and_what_was_survived_is_not(guard):
+    ax, known = plot.experience(guard, new()), guard.judge.dynamics
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
+    survived, failed = (line.get_xydata() for line in ax.lines[:2])
+    assert np.array_equal(failed, known.failures[:, :2])
+    tinted = ax.collections[0].get_paths()[0]
+    assert tinted.contains_points([[0.0, 0.0], [-3.0, 0.0]]).tolist() == [True, False]
+    assert not tinted.contains_points(survived).any()
+    for ring, centre in zip(ax.patches, known.dead_ends.centres, strict=True):
+        assert ring.center == pytest.approx(centre[:2])
+    assert f"{known.dead_ends.numbers[0]:.0f}" in texts(ax)
+
+
+def test_what_other_variables_tell_of_failure_is_said(guard):
+    ax = plot.experience(guard, new(), variables=(0, 2))
+    said = [text.get_text() for text in ax.get_legend().texts]
+    assert said[0] == "survived (blank: nothing was seen)"
+    assert said[-1] == "not in view: failure by y [m]"
+    assert not ax.collections
+
+
+def test_a_guard_that_has_not_learnt_where_it_fails_is_refused(guard):
+    told, fresh = guard_for_family(load_family("emergency")), Guard(n_actions=2, interval=0.1)
+    for one in (told, fresh):
+        with pytest.raises(ValueError, match="has not learnt where it fails"):
+            plot.experience(one, new())
+    with pytest.raises(ValueError, match="no variable 4: there are 4"):
+        plot.experience(guard, new(), variables=(0, 4))
+
+
+@pytest.mark.slow
+def test_in_the_example_another_controller_is_kept_out(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "examples")
+    tried = importlib.import_module("disc").main(tmp_path / "disc.png")
+    assert tried[0].failed > 20
+    assert (tried[40].failed, tried[40].arrived >= 40) == (0, True)
+    assert (tmp_path / "disc.png").exists()

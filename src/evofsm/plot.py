@@ -1,4 +1,4 @@
-"""Plots of a model, of beliefs and of a drive, on axes that are given or new, which they return.
+"""Plots of a model, a guard, beliefs and a drive, on axes given or new, which they return.
 
 They set no style. Data on the axes count states and actions from 0, labels from 1. Nothing rests on
 colour alone. The same colours stand in ``io/graphs.py`` and ``cli/watch/live/page.css``.
@@ -7,7 +7,7 @@ colour alone. The same colours stand in ``io/graphs.py`` and ``cli/watch/live/pa
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,11 +17,14 @@ from evofsm.driving import Episode
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel, Policy
 from evofsm.fsm.step import Trace
+from evofsm.guard import Guard, LearntRisk
+from evofsm.guard.learnt.regions import forms
 
 with needs("matplotlib", "plot", "plotting"):
     import matplotlib
     from matplotlib.colors import Normalize, to_hex, to_rgb
-    from matplotlib.patches import FancyArrowPatch
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Ellipse, FancyArrowPatch
     from matplotlib.patheffects import withStroke
 
 if TYPE_CHECKING:
@@ -29,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.text import Annotation
 
-__all__ = ["COLORS", "accelerations", "belief", "graph", "risk", "states", "transitions"]
+__all__ = ["COLORS", "belief", "experience", "graph", "risk", "states"]
 
 Look = dict[str, Any]  # how something is drawn, as matplotlib is told
 States = Collection[int]  # indices
@@ -40,11 +43,13 @@ COLORS = {
     **{"ink": "#222222", "soft": "#777777", "third": "#CC79A7"},
     **{"follower": "#0072B2", "leader": "#009E73", "dead end": "#D55E00"},
 }
-# Up to so many states are drawn as discs with numbers, a matrix has room for its values, and each
-# state has its number on an axis.
-_DISCS, _VALUES, _TICKS = 20, 8, 12
+# Up to so many states are drawn as discs with numbers, and each has its number on an axis.
+_DISCS, _TICKS = 20, 12
 # Of the arrows between states so many of each are dark; the widest of all [points].
 _DARK, _WIDEST = 2, 1.6
+# Points on each side of the grid on which it is asked where a guard fails.
+_GRID = 300
+
 # -- Of a model -----------------------------------------------------------------------------------
 
 
@@ -85,8 +90,7 @@ def states(
     'gap [m]'
     """
     _refuse_unknown(model.n_states, dead_ends)
-    if wrong := [one for one in variables if not 0 <= one < model.n_variables]:
-        raise ValueError(f"there is no variable {wrong[0]}: the model has {model.n_variables}")
+    _refuse_other(variables, model.n_variables)
     ax = _given_or_new(ax)
     centers = model.centers[:, list(variables)]
     ax.update_datalim(centers)
@@ -152,46 +156,90 @@ def graph(
     return ax
 
 
-def transitions(
-    model: FSMModel, ax: Axes | None = None, *, action: int | None = None, dead_ends: States = ()
+def experience(
+    guard: Guard, ax: Axes | None = None, *, variables: tuple[int, int] | None = None
 ) -> Axes:
-    """Transition probabilities as a heat map, from state (row) to state (column).
+    """What a guard has learnt of failure, over what was survived, in the plane of two variables.
 
-    Axes, result and errors are as in `states`; a colour bar takes some of the axes' place. Without
-    an ``action`` (from 0) all count as often as each was used. Dead ends have bold numbers.
+    Dots were survived: where there are none nothing was seen, and where it fails is a guess. Discs
+    are the machine's states, hexagons dead ends, and around each is how far it reaches where all
+    other variables are as in its centre; elsewhere it reaches less far.
+
+    Parameters
+    ----------
+    guard : Guard
+        Its judge learns from which episodes failed (`LearntRisk`).
+    ax : matplotlib.axes.Axes, optional
+        As in `states`; its legend is above.
+    variables : (int, int), optional
+        As in `states`; without them the first of those that tell where it fails.
+
+    Raises
+    ------
+    ValueError
+        If the judge is another one, nothing was observed, or there is no such variable.
 
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> from evofsm import EvolvingFSM, plot
-    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-    >>> ax = plot.transitions(machine.model(), Figure().subplots(), action=0)
-    >>> [text.get_text() for text in ax.texts]
-    ['77 %', '23 %', '50 %', '50 %']
+    >>> from evofsm import Guard, plot
+    >>> guard = Guard(low=-1.0, high=1.0, interval=0.1)
+    >>> for speed in (0.0, 0.1, 0.3):
+    ...     revision = guard.decide([5.0, speed], proposal=1.0)
+    >>> guard.end(failed=True, observation=[5.0, 0.6])
+    >>> plot.experience(guard, Figure().subplots(), variables=(1, 0)).get_xlabel()
+    'variable 1'
     """
-    _refuse_unknown(model.n_states, dead_ends)
-    if action is not None and not 0 <= action < model.n_actions:
-        raise ValueError(f"there is no action {action}: the model has {model.n_actions}")
-    ax = _given_or_new(ax)
-    matrix = model.averaged_matrix() if action is None else model.transition_matrices[action]
-    scale = Normalize(0.0, float(matrix.max()))
-    image = ax.imshow(matrix, cmap="Blues", norm=scale, interpolation="nearest")
-    ax.grid(False)
-    ax.spines[:].set_visible(False)
-    for i, j in np.ndindex(matrix.shape) if len(matrix) <= _VALUES else ():
-        color = "white" if scale(matrix[i, j]) > 0.68 else COLORS["ink"]
-        look: Look = {"ha": "center", "va": "center_baseline", "fontsize": points(7.0)}
-        ax.text(j, i, f"{100 * matrix[i, j]:.0f} %", color=color, **look)
-    title = "all actions, as used"
-    if action is not None:
-        interval = "" if model.actions is None else f"  {model.actions.label(action)}"
-        title = f"a({action + 1}){interval}\n{model.uses[action]:,.0f} transitions"
-    ax.set_title(title)
-    for axis, way in ((ax.xaxis, "to"), (ax.yaxis, "from")):
-        label_states(axis, model.n_states, dead_ends)
-        axis.set_label_text(f"{way} state" + (" (bold: dead end)" if dead_ends else ""))
-    ax.figure.colorbar(image, ax=ax, label="probability of the next state")
+    judge = guard.judge
+    if not isinstance(judge, LearntRisk) or not judge.dynamics.n_variables:
+        raise ValueError("the judge of this guard has not learnt where it fails")
+    known, m, ends = judge.dynamics, judge.dynamics.n_variables, judge.dynamics.dead_ends
+    tell = [*known.regions[:, :2].ravel().astype(int), *(j for j, _, _ in known.thresholds)]
+    pair = list(variables or dict.fromkeys([*tell, *range(m)]))[:2]
+    _refuse_other(pair, m)
+    ax, called, red = _given_or_new(ax), judge.labels.variable, COLORS["dead end"]
+    dots: Look = {"linestyle": "none", "marker": ".", "markersize": 1.5, "color": ink(0.4)}
+    crosses: Look = {"linestyle": "none", "marker": "x", "markersize": 5.0, "color": ink()}
+    survived = np.concatenate([known.survived, known.brinks])
+    for seen, look in ((survived, dots), (known.failures, crosses)):
+        ax.plot(*seen[:, pair].T, **look)
+    sizes = 2.0 * ends.radii[:, None] / known.model.inverse[pair]
+    for centre, (wide, high) in zip(ends.centres[:, pair], sizes, strict=True):
+        ax.add_patch(Ellipse(centre, wide, high, fill=False, edgecolor=red, zorder=3.0))
+    ax.autoscale_view()
+    limits = ax.axis()
+    x, y = np.meshgrid(np.linspace(*limits[:2], _GRID), np.linspace(*limits[2:], _GRID))
+    z = np.zeros((x.size, m))
+    z[:, pair] = np.column_stack([x.ravel(), y.ravel()])
+    here = np.isin(known.regions[:, :2], pair).all(1)
+    fails = [sign * (z[:, j] - at) for j, sign, at in known.thresholds if j in pair]
+    if fails := [*fails, *forms(known.regions[here], z)[0]]:
+        form = np.max(fails, axis=0).reshape(x.shape)
+        ax.contourf(x, y, form, [0.0, np.inf], colors=[red], alpha=0.15, zorder=0.5)
+        ax.contour(x, y, form, [0.0], colors=[red], linewidths=1.2, zorder=2.0)
+    if guard.machine is not None:
+        draw_centers(ax, guard.machine.centers[:, pair], (), 10.0)
+    told, spans = list[Point](), np.ptp(np.reshape(limits, (2, 2)), axis=1)
+    for number, (to_right, upward) in zip(ends.numbers, ends.centres[:, pair], strict=True):
+        spot = to_right / spans[0], upward / spans[1]
+        if all(math.dist(spot, other) > 0.06 for other in told):  # else they would overlap
+            look = {"color": red, "fontweight": "bold", "zorder": 6.0}
+            look["path_effects"] = [withStroke(linewidth=2.0, foreground="white")]
+            write(ax, f"{number:.0f}", (to_right, upward), (5.0, 5.0), **look)
+            told.append(spot)
+    ax.axis(limits)
+    looks: dict[str, Look] = {
+        "survived (blank: nothing was seen)": {**dots, "markersize": 5.0},
+        "failed": crosses,
+        "fails, as learnt": {"marker": "s", "markersize": 8.0, "color": red, "alpha": 0.3},
+        "dead end" + ", all else as in its centre" * (m > 2): {"marker": "$1$", "color": red},
+        "state": {"marker": "o", "fillstyle": "none", "color": ink()},
+    }
+    if elsewhere := sorted({*tell} - {*pair}):
+        looks[f"not in view: failure by {', '.join(map(called, elsewhere))}"] = {"marker": ""}
+    look = {"linestyle": "none"}
+    _explain(ax, [Line2D([], [], label=name, **{**look, **one}) for name, one in looks.items()])
+    ax.set(xlabel=called(pair[0]), ylabel=called(pair[1]))
     return ax
 
 
@@ -274,76 +322,34 @@ def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = No
         why = "was there a reviser, and was its mode not OFF?"
         raise ValueError(f"no decision of this drive was judged ({why})")
     ax = _given_or_new(ax)
-    between = np.array([revision.interval for revision in revisions]).T
-    _draw_decisions(ax, drive, (proposed, executed), between, "follower", "90 % interval")
-    if tolerance is not None:
-        look: Look = {"linestyle": ":", "linewidth": 1.0, "label": f"tolerance, {tolerance:g}"}
-        ax.axhline(tolerance, color=ink(), **look)
-    ax.set(ylim=(-0.03, 1.03), ylabel="latent risk")
-    return _finished(ax, drive, 0.0)
-
-
-def accelerations(drive: Episode, ax: Axes | None = None) -> Axes:
-    """What was proposed and what was executed, over time; where they differ it is shaded.
-
-    Raises
-    ------
-    ValueError
-        If nothing was decided in the drive.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from evofsm import plot
-    >>> from evofsm.driving import drive, guard_for_family, load_family
-    >>> family = load_family("emergency")
-    >>> driven = drive(guard_for_family(family), family.draw(0, 0))
-    >>> plot.accelerations(driven, Figure().subplots()).get_ylabel()
-    'acceleration [m/s²]'
-    >>> plot.risk(driven, Figure().subplots(), tolerance=0.02).get_ylabel()
-    'latent risk'
-    """
-    if not drive.decisions:
-        raise ValueError("nothing was decided in this drive")
-    ax = _given_or_new(ax)
-    ax.axhline(0.0, color=COLORS["soft"], linewidth=0.6)
-    both = drive.proposed, drive.executed
-    _draw_decisions(ax, drive, both, both, "dead end", "revised")
-    ax.set_ylabel("acceleration [m/s²]")
-    return _finished(ax, drive, float(drive.executed[-1]))
-
-
-def _draw_decisions(
-    ax: Axes, drive: Episode, values: ArrayLike, between: ArrayLike, color: str, label: str
-) -> None:
-    """Draw what was proposed and executed (2, D), and a band (2, D), until the end of the drive."""
     times = [decision.situation.time for decision in drive.decisions]
     when = np.array([*times, float(drive.time[-1])])
-    (proposed, executed), (low, high) = (
-        np.pad(np.asarray(rows, dtype=np.float64), ((0, 0), (0, 1)), mode="edge")
-        for rows in (values, between)
+    bounds = np.array([revision.interval for revision in revisions]).T
+    low, high, proposed, executed = (
+        np.append(row, row[-1])
+        for row in (*bounds, proposed, executed)  # until the end
     )
-    fill: Look = {"step": "post", "color": COLORS[color], "alpha": 0.25, "linewidth": 0.0}
-    ax.fill_between(when, low, high, label=label, **fill)
+    band: Look = {"step": "post", "alpha": 0.25, "linewidth": 0.0, "label": "90 % interval"}
+    ax.fill_between(when, low, high, color=COLORS["follower"], **band)
     dashed: Look = {"color": COLORS["dead end"], "linestyle": "--", "label": "proposed"}
     ax.step(when, proposed, where="post", **dashed)
     ax.step(when, executed, where="post", color=COLORS["follower"], label="executed")
-
-
-def _finished(ax: Axes, drive: Episode, y: float) -> Axes:
-    """With a collision marked at height ``y``, and explained."""
+    if tolerance is not None:
+        look: Look = {"linestyle": ":", "linewidth": 1.0, "label": f"tolerance, {tolerance:g}"}
+        ax.axhline(tolerance, color=ink(), **look)
     if drive.collided:
-        draw_collision(ax, float(drive.time[-1]), y)
+        draw_collision(ax, when[-1], 0.0)
         ax.lines[-1].set_label("collision")
-    ax.set_xlabel("time [s]")
+    ax.set(ylim=(-0.03, 1.03), xlabel="time [s]", ylabel="latent risk")
     _explain(ax)
     return ax
 
 
-def _explain(ax: Axes) -> None:
+def _explain(ax: Axes, handles: Sequence[Line2D] | None = None) -> None:
     """Put the legend above, where it hides nothing."""
     look: Look = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2}
-    ax.legend(fontsize=points(7.5), frameon=False, ncols=3, **look)
+    look |= {"fontsize": points(7.5), "frameon": False, "ncols": 3}
+    ax.legend(handles=handles or ax.get_legend_handles_labels()[0], **look)
 
 
 def _given_or_new(ax: Axes | None) -> Axes:
@@ -352,6 +358,11 @@ def _given_or_new(ax: Axes | None) -> Axes:
     from matplotlib import pyplot  # late: whoever gives axes needs none of it
 
     return pyplot.subplots(layout="constrained")[1]
+
+
+def _refuse_other(variables: Sequence[int], m: int) -> None:
+    if wrong := [one for one in variables if not 0 <= one < m]:
+        raise ValueError(f"there is no variable {wrong[0]}: there are {m}")
 
 
 def _refuse_unknown(n: int, dead_ends: States) -> None:
