@@ -14,7 +14,14 @@ from evofsm import __version__  # noqa: E402
 project = "evofsm"
 author = "The evofsm developers"
 version = release = __version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "extension"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+    "extension",
+]
 exclude_patterns = ["results"]
 
 # Markdown.
@@ -32,6 +39,10 @@ napoleon_use_param = False
 napoleon_use_rtype = False
 add_module_names = False
 toc_object_entries_show_parents = "hide"
+
+# A button copies what is typed, without prompts and answers.
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
 
 html_theme = "furo"
 html_title = "evofsm"

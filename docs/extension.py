@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import re
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -224,12 +225,22 @@ class Sources:
                 inside = file.relative_to(SOURCE)
                 module = ".".join(inside.with_suffix("").parts).removesuffix(".__init__")
                 _write_page(app, page_of(module), inside.as_posix(), body)
+        folder = ROOT / "examples"
         examples = "".join(
             f'<h2 id="{file.name}">{file.name}</h2>'
-            + highlight(file.read_text("utf-8"), PythonLexer(), HtmlFormatter())
-            for file in sorted((ROOT / "examples").glob("*.py"))
+            + highlight(_code_of(file), PythonLexer(), HtmlFormatter())
+            for file in sorted([*folder.rglob("*.py"), *folder.glob("*.ipynb")])
         )
         _write_page(app, page_of("examples"), "Examples", examples)
+
+
+def _code_of(file: Path) -> str:
+    """The Python in a file, or in the cells of a notebook."""
+    text = file.read_text("utf-8")
+    if file.suffix == ".py":
+        return text
+    cells = json.loads(text)["cells"]
+    return "\n\n".join("".join(one["source"]) for one in cells if one["cell_type"] == "code")
 
 
 def _write_page(app: Sphinx, name: str, title: str, body: str) -> None:
@@ -268,8 +279,22 @@ def _chapter(module: str) -> str:
     return f"{title}\n{'-' * len(title)}\n\n{directive}\n"
 
 
+def _named(room: str) -> str:
+    """All that a room offers, a line each: name, and what it is in the words of its docstring."""
+    face = ast.parse(SOURCE.joinpath(*room.split("."), "__init__.pyi").read_text("utf-8"))
+    names = [a.name for node in face.body if isinstance(node, ast.ImportFrom) for a in node.names]
+    lines = "".join(f"\n   ~{meaning_of(name, room)}" for name in sorted(names, key=str.lower))
+    return f".. autosummary::\n   :nosignatures:\n{lines}\n"
+
+
 def _open_rooms(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Put a chapter for each module in the place of ``room::``, a line in that of ``list::``."""
+    """Put a chapter for each module in the place of ``room::``, a line in that of ``list::``.
+
+    In that of ``names::`` comes a table of what a room offers.
+    """
+    source[0] = re.sub(
+        r"^\.\. names:: (.*)$", lambda line: _named(line[1]), source[0], flags=re.MULTILINE
+    )
     for word, write in (("room", _chapter), ("list", _listed)):
 
         def modules(line: re.Match[str], write: Callable[[str], str] = write) -> str:

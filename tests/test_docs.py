@@ -5,11 +5,13 @@ All others are doctests. A block that is not run says why, in a comment before i
 """
 
 import doctest
+import json
 import os
 import re
 import shlex
 import subprocess
 import sys
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import NamedTuple
@@ -92,10 +94,6 @@ def run_command(command):
     return done.stdout + done.stderr, done.returncode
 
 
-def as_printed(shown, got):
-    return doctest.OutputChecker().check_output(shown, got, FLAGS | doctest.ELLIPSIS)
-
-
 @pytest.fixture
 def reader(tmp_path, monkeypatch):
     """Someone in an empty folder, with a terminal of 80 columns."""
@@ -111,6 +109,7 @@ def reader(tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", RUN, ids=name_of)
 def test_a_page_does_what_it_shows(page, reader):
     names, parser = {}, doctest.DocTestParser()
+    as_printed = partial(doctest.OutputChecker().check_output, optionflags=FLAGS | doctest.ELLIPSIS)
     for block in blocks(page):
         if block.reason is not None:
             continue
@@ -138,6 +137,17 @@ def test_every_block_is_run_or_says_why_not(page):
         is_code = block.kind in {"python", "pycon", "console", "toml", "sh", "bash"}
         where = f"{name_of(page)}, line {block.line}"
         assert bool(runs) or block.reason is not None or not is_code, where
+
+
+@pytest.mark.slow
+def test_the_notebook_prints_what_it_shows(capsys):
+    pytest.importorskip("matplotlib").use("agg")
+    names = {}
+    for cell in json.loads((ROOT / "examples" / "first-guard.ipynb").read_text("utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+            shown = [line for one in cell["outputs"] for line in one.get("text", ())]
+            assert capsys.readouterr().out == "".join(shown)
 
 
 def test_commands_that_are_not_run_would_be_understood():
@@ -236,16 +246,11 @@ def test_the_site_loads_nothing_from_elsewhere(site):
 
 
 @pytest.mark.slow
-def test_formulas_are_there_without_a_script(site):
-    folder, _ = site
+def test_formulas_need_no_script_and_links_to_lines_of_code_lead_to_them(site):
+    folder, pages = site
     text = (folder / "equations" / "states.html").read_text()
     assert len(re.findall(r'<math [^>]*display="block"', text)) == 3
     assert "\\frac" not in text
-
-
-@pytest.mark.slow
-def test_a_line_of_code_is_where_its_link_leads(site):
-    folder, pages = site
     links = pages[folder / "equations" / "states.html"].links
     found = {int(one.rpartition("L-")[2]) for one in links if "fsm/clusters.html#" in one}
     source = (ROOT / "src/evofsm/fsm/clusters.py").read_text().splitlines()
@@ -260,10 +265,8 @@ def test_every_public_module_is_in_the_reference(site):
     for file in (ROOT / "src" / "evofsm").rglob("*.py"):
         parts = file.relative_to(ROOT / "src").with_suffix("").parts
         if not any(part.startswith("_") for part in parts):
-            described, listed = (
-                f'id="module-{".".join(parts)}"',
-                f"source/{'/'.join(parts)}.html#L-1",
-            )
+            listed = f"source/{'/'.join(parts)}.html#L-1"
+            described = f'id="module-{".".join(parts)}"'
             assert described in reference or listed in reference, file
 
 
