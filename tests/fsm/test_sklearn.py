@@ -27,7 +27,6 @@ def walk(rows=120, variables=3):
 @parametrize_with_checks(
     [EvolvingClusterer(), EvolvingClusterer(rule=Edges()), EvolvingClusterer(rule=Novelty(1.0))],
     expected_failed_checks=_exceptions,
-    xfail_strict=True,
 )
 def test_scikit_learns_checks_pass(estimator, check):
     check(estimator)
