@@ -18,7 +18,7 @@ import numpy as np
 from comparison import Result, compare, settings
 from numpy.typing import NDArray
 
-from evofsm.driving import guard_for_family
+from evofsm.driving import CarFollowing, guard_for_family
 from evofsm.guard import RevisedActions
 
 
@@ -27,8 +27,10 @@ def main(argv: Sequence[str] | None = None) -> tuple[Result, Result]:
     chosen = settings("An aggressive driver, revised.", argv, episodes=100, train=40)
     env = gymnasium.make("evofsm.driving.env:evofsm/CarFollowing-v0", seed=chosen.seed)
     car = env.unwrapped
+    assert isinstance(car, CarFollowing)
 
     def aggressive(observation: NDArray[np.float64], info: dict[str, Any]) -> NDArray[np.float64]:
+        assert car.draw is not None  # within an episode
         return np.array([car.draw.controller.propose(observation, info["time"]).action])
 
     guard = guard_for_family(car.family)

@@ -24,7 +24,7 @@ from evofsm.guard import RevisedAgents
 LOW, HIGH = np.array([-10.0, 0.0, 0.0]), np.array([2000.0, 100.0, 100.0])
 
 
-class Platoon(ParallelEnv[str, NDArray[np.float64], NDArray[np.float64]]):  # type: ignore[misc]
+class Platoon(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
     """Cars in a row, each of which observes ``[gap [m], v [m/s], v ahead [m/s]]``.
 
     An action is an acceleration [m/s²]. A collision ends the run: who ran into the one ahead is

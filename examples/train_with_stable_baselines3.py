@@ -69,6 +69,7 @@ agent = PPO(
     "MlpPolicy", env, n_steps=1024, gamma=0.98, seed=0, device="cpu", tensorboard_log="runs"
 )
 agent.learn(16_384, callback=GuardBoard())
+assert guard.machine is not None
 print(
     f"while training: {guard.machine.endings.sum():.0f} of {len(env.get_episode_rewards())} collide"
 )
