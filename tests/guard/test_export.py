@@ -204,6 +204,34 @@ def test_it_asks_for_no_memory_and_little_of_the_stack(name, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_node_for_ros_2_compiles_and_decides(wall, tmp_path):
+    """Against a stand-in: ROS 2 itself was not at hand."""
+    cc, cpp, here = compiler(), compiler("c++"), Path(__file__).parent
+    write_c99(wall.guard, tmp_path)
+    subprocess.run([cc, *c99.FLAGS, "-c", "evofsm.c"], cwd=tmp_path, check=True)
+    node = here.parents[1] / "examples" / "ros2" / "guard_node.cpp"
+    for header in re.findall("#include <(.+)/(.+hpp)>", node.read_text()):
+        (tmp_path / header[0]).mkdir(parents=True, exist_ok=True)
+        (tmp_path / "/".join(header)).write_text(f'#include "{here / "ros2.hpp"}"')
+    flags = ("-std=c++17", "-Wall", "-Wextra", "-Werror", "-I.", "-o", "node")
+    subprocess.run([cpp, *flags, node, "evofsm.o", "-lm"], cwd=tmp_path, check=True)
+    script = ""
+    told = [((0.9, 0.1), 1.0), ((0.95, 0.05), math.nan), ((0.0, 0.0), 0.5)]
+    for (place, speed), wanted in told:
+        script += f"observation {place} {speed}\nproposal {wanted}\ntick\n"
+    script += "observation 1.0\nobservation inf 0\ntick\n"
+    said = subprocess.run(["./node"], cwd=tmp_path, input=script, capture_output=True, text=True)
+    lines = [line.split() for line in said.stdout.splitlines()]
+    wall.guard.begin()
+    expected = [wall.guard.decide(seen, wanted).executed for seen, wanted in told]
+    assert [float(line[1]) for line in lines if line[0] == "executed"] == expected
+    assert [line[1:3] for line in lines if line[0] == "error"] == [
+        ["1", "numbers"],
+        ["no", "decision:"],
+    ]
+
+
+@pytest.mark.slow
 def test_the_program_of_the_page_runs(wall, tmp_path):
     compile_with = compiler("c++")
     cc = compiler()
