@@ -256,12 +256,11 @@ def listening(tmp_path):
 
 @posix
 @pytest.mark.slow
-def test_the_client_of_the_page_in_cpp_gets_its_alarm_by_udp(tmp_path):
+def test_the_client_in_cpp_gets_its_alarm_by_udp(tmp_path):
     if (compiler := shutil.which("g++")) is None:
         pytest.skip("there is no C++ compiler")
     source, client = tmp_path / "client.cpp", tmp_path / "client"
-    page = (EXAMPLES.parents[1] / "docs" / "monitor.md").read_text("utf-8")
-    code = page.partition("```cpp\n")[2].partition("```")[0]
+    code = (EXAMPLES / "client.cpp").read_text("utf-8")
     with started("--warm", "--udp", 0) as process:
         said = iter(process.stderr.readline, b"")
         port = next(one for one in said if b"listens" in one).decode().split()[-1]
