@@ -57,9 +57,8 @@ lowest: .venv/installed         ## test the core with the lowest versions that a
 	@$(BIN)/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct \
 	    --editable '.[tables,study,river,sklearn]' 'pytest>=8.3' 'hypothesis>=6.100'
 	@$(LOWEST) -m pytest -q -p no:cacheprovider tests/fsm
-supply: .venv/installed         ## a bill of materials: sbom.json; holes in the workflows; known ones in what is pinned
+supply: .venv/installed         ## a bill of materials: sbom.json; known holes in what is pinned
 	@$(BIN)/uv tool run --from cyclonedx-bom cyclonedx-py requirements requirements.lock -o sbom.json
-	@$(BIN)/uv tool run zizmor --offline --persona pedantic --quiet .github
 	@$(BIN)/uv tool run pip-audit --strict --disable-pip --require-hashes --requirement requirements.lock
 
 dist: .venv/installed           ## sdist and wheel; the quick tests of the one against the other

@@ -105,6 +105,13 @@ def test_workflows_run_on_the_versions_claimed_and_take_no_action_by_a_name_that
     assert all(re.match(r"\S+@[0-9a-f]{40} # v", used) for used in re.findall(r"uses: (.*)", texts))
 
 
+def test_a_linter_of_workflows_has_nothing_to_say():
+    if not (ROOT / ".github").exists():
+        pytest.skip("no part of the sdist")
+    options = ("--offline", "--strict-collection", "--persona", "pedantic", "--quiet")
+    run(Path(sys.executable).with_name("zizmor"), *options, ROOT / ".github")
+
+
 @pytest.mark.parametrize("home", [None, "https://example.org/evofsm"])
 def test_on_an_index_the_readme_has_no_link_that_leads_nowhere(home, monkeypatch):
     pytest.importorskip("hatchling")
