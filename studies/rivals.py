@@ -525,39 +525,15 @@ class CarFollower(OnTheRoad):
         return self.index["slower" if wanted < -half else "faster" if wanted > half else "idle"]
 
 
-class TimeToCollision(OnTheRoad):
-    """The environment's own grid of times to collision, solved by value iteration.
+class Rss(OnTheRoad):
+    """Responsibility-sensitive safety (Shalev-Shwartz et al. 2017), on each lane concerned.
 
-    A proposal is kept where the least that it costs is as little as that of any other action.
+    A proposal whose gaps are long enough is kept; else it is slower.
     """
 
-    told = "road, all cars, at constant speed"
-
-    def chosen(self, proposal: int) -> int:
-        """The proposal, or an action that costs least."""
-        from highway_env.envs.common.finite_mdp import compute_ttc_grid
-
-        grid = compute_ttc_grid(self.system.env, 1.0, 10.0)
-        speeds, lanes, times = grid.shape
-        speed, lane = np.meshgrid(np.arange(speeds), np.arange(lanes), indexing="ij")
-        moves = [
-            (
-                np.clip(speed + (name == "faster") - (name == "slower"), 0, speeds - 1),
-                np.clip(lane + (name == "right") - (name == "left"), 0, lanes - 1),
-            )
-            for name in self.system.names
-        ]
-        cost = grid[:, :, -1]
-        for t in range(times - 2, -1, -1):
-            later = np.array([cost[move] for move in moves])
-            cost = grid[:, :, t] + later.min(0)
-        here = min(self.car.speed_index, speeds - 1), min(self.car.lane_index[2], lanes - 1)
-        costs = later[(slice(None), *here)]
-        return proposal if costs[proposal] <= costs.min() else int(costs.argmin())
-
-
-class Mask(OnTheRoad):
-    """Keeps a proposal whose gaps are long enough; else slower."""
+    told = "lanes, all cars, brakes"
+    # What cars of highway-env keep to: brakes of both, and throttle while reacting [m/s²].
+    _BRAKES, _THROTTLE = 5.0, 3.0
 
     def chosen(self, proposal: int) -> int:
         """The proposal, or slower."""
@@ -577,22 +553,10 @@ class Mask(OnTheRoad):
                 return self.index["slower"]
         return proposal
 
-    @abstractmethod
-    def is_enough(self, behind: Any, leader: Any, speed: float) -> bool:
-        """Whether the gap is, if the one behind goes at this speed after a decision."""
-
     def gap(self, behind: Any, leader: Any) -> float:
         """From bumper to bumper [m]."""
         middle = float(behind.lane_distance_to(leader))
         return middle - 0.5 * float(behind.LENGTH + leader.LENGTH)
-
-
-class Rss(Mask):
-    """Responsibility-sensitive safety (Shalev-Shwartz et al. 2017), on each lane concerned."""
-
-    told = "lanes, all cars, brakes"
-    # What cars of highway-env keep to: brakes of both, and throttle while reacting [m/s²].
-    _BRAKES, _THROTTLE = 5.0, 3.0
 
     def is_enough(self, behind: Any, leader: Any, speed: float) -> bool:
         """Whether who follows can stop behind a leader that brakes in full."""
@@ -602,22 +566,6 @@ class Rss(Mask):
         least = now * react + then**2 / (2.0 * self._BRAKES)
         least -= max(float(leader.speed), 0.0) ** 2 / (2.0 * self._BRAKES)
         return bool(self.gap(behind, leader) >= max(least, 0.0))
-
-
-class HeadwayBarrier(Mask):
-    """A discrete-time control barrier: what is left of a time headway shrinks slowly enough."""
-
-    told = "lanes, all cars"
-    # Time headway [s], and the share of what is left of it that may be used in a step.
-    _HEADWAY, _USED = 1.0, 0.5
-
-    def is_enough(self, behind: Any, leader: Any, speed: float) -> bool:
-        """Whether h(next) >= (1 - share) h(now), with h = gap - headway * speed."""
-        gap, now = self.gap(behind, leader), float(behind.speed)
-        closing = 0.5 * (now + speed) - float(leader.speed)
-        here = gap - self._HEADWAY * now
-        then = gap - closing * self.system.interval - self._HEADWAY * speed
-        return bool(then >= (1.0 - self._USED) * min(here, gap))
 
 
 class Simulated(OnTheRoad):
@@ -653,9 +601,7 @@ class Simulated(OnTheRoad):
 _ON_THE_ROAD: dict[str, type[OnTheRoad]] = {
     "slower": Slower,
     "idm-mobil": CarFollower,
-    "ttc-grid": TimeToCollision,
     "rss": Rss,
-    "barrier": HeadwayBarrier,
     "simulated": Simulated,
 }
 
