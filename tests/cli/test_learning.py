@@ -9,7 +9,7 @@ import pytest
 from evofsm import EvolvingFSM, IntervalActions, Novelty, jensen_shannon
 from evofsm.cli import learning as module
 from evofsm.cli.inspect import passages
-from evofsm.cli.learning import Checkpoint, learn_traces, teach
+from evofsm.cli.learning import Checkpoint, learn_traces
 from evofsm.io import Chunk
 
 ACTIONS = IntervalActions(-1.0, 1.0, 0.5, outside="clip")
@@ -51,26 +51,6 @@ def by_hand(Z, actions):
         if not math.isnan(actions[t]):
             fsm.act(ACTIONS.encode(actions[t]))
     return fsm
-
-
-def test_a_guard_is_taught_each_row_with_the_action_that_was_taken_after_it(trace):
-    told, shown = [], []
-
-    class Pupil:
-        def decide(self, observation, proposal, time):
-            told.append((*observation, proposal, time))
-
-        def end(self, failed, observation):
-            told.append((*observation, failed))
-
-    Z, actions = trace
-    teach(Pupil(), chunks(Z, actions, size=25), shown.append)
-    assert len(told) == len(Z)
-    assert told[3] == (*Z[3], actions[3], pytest.approx(0.3))
-    assert told[36] == (*Z[36], False)
-    assert told[38] == (*Z[38], actions[38], 0.0)
-    assert told[149] == (*Z[149], False)
-    assert shown[-1] == 200
 
 
 @pytest.mark.parametrize("size", [1, 7, 64, 1000])

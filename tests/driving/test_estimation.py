@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from evofsm.driving.brakes import Latest, OwnBrakes
+from evofsm.driving.brakes import OwnBrakes
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.leaders import BrakeWatch, Manoeuvres
 from evofsm.driving.perception import Perception
@@ -88,24 +88,6 @@ def test_it_learns_how_late_commands_take_effect(late, lag):
     drive(brakes, 2.5, rounds=6, late=late)
     assert brakes.lag == pytest.approx(lag, abs=0.05)
     assert brakes.decel == pytest.approx(2.5)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_what_brakes_bring_is_what_all_samples_in_full_precision_say(seed):
-    rng = np.random.default_rng(seed)
-    latest, given = Latest(30), []
-    for _ in range(70):
-        given.append((round(rng.normal(3.0, 0.5), seed), bool(rng.random() < 0.2)))
-        latest.add(*given[-1])
-        values = [value for value, _ in given[-30:]]
-        assert latest.rows.tolist() == [list(one) for one in given[-30:]]
-        mean, bound = latest.mean_and_bound(2.0) if len(values) > 1 else (values[0], values[0])
-        assert mean == math.fsum(values) / len(values)
-        if len(values) > 1:
-            stretches = max(1, sum(begins for _, begins in given[-30:]))
-            error = np.sqrt(np.var(values, ddof=1) * stretches) / len(values)
-            few = 1.0 + 1.2 / (len(values) - 1)
-            assert bound == pytest.approx(mean - few * 2.0 * error, abs=1e-9)
 
 
 # -- How hard leaders brake -------------------------------------------------------------------

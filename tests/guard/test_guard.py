@@ -508,15 +508,6 @@ def test_what_is_refused_leaves_it_as_it_was(make, observation, proposal, snapsh
     assert guard.judge.gust == twin.judge.gust
 
 
-def test_a_decision_takes_no_snapshot_of_the_machine(monkeypatch):
-    """One would cost more than the decision itself."""
-    guard = Guard(low=-1.0, high=1.0, interval=0.1)
-    monkeypatch.setattr(EvolvingFSM, "model", None)
-    for z in np.random.default_rng(0).normal(size=(20, 2)):
-        guard.decide(z, 0.5)
-    assert guard.situation.seen > 0.0
-
-
 @pytest.mark.parametrize(
     ("guard", "row", "says"),
     [
