@@ -70,3 +70,11 @@ def test_a_far_observation_is_never_seen_and_silence_about_failures_is_said(evof
     machine.save(tmp_path / "machine")
     told = evofsm("explain", tmp_path / "machine", "--state", "all").stdout
     assert "tells nothing of failures" not in told
+
+
+def test_a_table_that_is_wider_than_the_terminal_loses_no_column(evofsm, monkeypatch, capsys):
+    from evofsm.cli.show import show, table
+
+    monkeypatch.setenv("COLUMNS", "40")
+    show(table("Wide", ["speed"] * 20, [["12345.2"] * 20]))
+    assert capsys.readouterr().out.count("12345.2") == 20

@@ -59,6 +59,11 @@ def test_a_page_holds_all_that_it_shows(written, tmp_path):
     assert '<tr class="ours"><th scope="row"><span data-mark>▸ </span>ours' in read.html
 
 
+def test_a_figure_that_is_the_first_is_shown_first(written):
+    html = written(replace(PAGE, parts=PAGE.parts[::-1])).html
+    assert html.index("<img") < html.index("Asked of") < html.index("<table")
+
+
 def test_many_pages_on_one_are_summed_up_and_numbered_through(written):
     good, bad = TARGETS.with_columns(met=True), TARGETS.with_columns(met=pl.Series([True, False]))
     pages = [
@@ -68,10 +73,8 @@ def test_many_pages_on_one_are_summed_up_and_numbered_through(written):
     ]
     read = written(*pages, title="Evidence", about="All of it.")
     read.is_sound()
-    assert re.findall(r'class="(\w+)"><th scope="row"><span data-mark>(.)', read.html)[:2] == [
-        ("holds", "✓"),
-        ("fails", "✗"),
-    ]
+    marks = re.findall(r'class="(\w+)"><th scope="row"><span data-mark>(.)', read.html)
+    assert marks[:2] == [("holds", "✓"), ("fails", "✗")]
     assert "2 of 2 targets are met" in read.text
     assert "1 of 2 targets are met" in read.text
     assert read.html.count('class="verdict') == 2  # nothing was asked of the third
@@ -80,11 +83,8 @@ def test_many_pages_on_one_are_summed_up_and_numbered_through(written):
 
 def test_what_is_told_is_text_and_never_markup(written):
     frame = pl.DataFrame({EVIL: [EVIL]})
-    read = written(
-        replace(
-            PAGE, about=f"{EVIL}?\n\n{EVIL}", command=EVIL, parts=[Table(EVIL, frame, note=EVIL)]
-        )
-    )
+    parts = [Table(EVIL, frame, note=EVIL)]
+    read = written(replace(PAGE, about=f"{EVIL}?\n\n{EVIL}", command=EVIL, parts=parts))
     read.is_sound()
     assert EVIL not in read.html
     assert read.text.count(EVIL) >= 6
@@ -93,8 +93,7 @@ def test_what_is_told_is_text_and_never_markup(written):
 @pytest.mark.parametrize("width", [40, 80, 200])
 def test_the_terminal_says_the_same_and_cuts_no_number(width, capsys):
     wide = pl.DataFrame({"name": ["[bold]row"], **{f"column {k}": [12345.25] for k in range(20)}})
-    empty = Table("Empty", AREAS[:0], {"who": "{who}", "x": "{area:.1f}"})
-    parts = [Table("Wide", wide), empty]
+    parts = [Table("Wide", wide), Table("Empty", AREAS[:0], {"who": "{who}"})]
     page = replace(PAGE, parts=parts, targets=TARGETS.with_columns(met=False))
     print_page(page, out=Console(width=width, markup=False, highlight=False))
     said = capsys.readouterr().out
@@ -115,6 +114,7 @@ def test_the_terminal_says_the_same_and_cuts_no_number(width, capsys):
         ("{x}", {"x": [1, 2]}, "1, 2"),
         ("{x}", {"x": float("inf")}, "∞"),
         ("{x:.1e}", {"x": -4e-3}, "-4.0e-03"),
+        ("{x:.3f}", {"x": -4e-6}, "> −0.001"),
     ],
 )
 def test_cells_are_written_as_people_read_them(template, row, text):

@@ -21,8 +21,8 @@ MEASURED = {
     "states_final": "7",
     "dead_end_state": "#4",
     "dead_end_share": "40 of 40",
-    "case3_leaves_dead_end": "#4 at 15 s, #5 from 16.18 s; so in 20 of 20 rounds",
-    "case4_enters_dead_end": "#6 at 10 s, #4 from 30.25 s; so in 20 of 20 rounds",
+    "case3_leaves_dead_end": "#4 at 15 s, #5 from 16.2 s; so in 20 of 20 rounds",
+    "case4_enters_dead_end": "#6 at 10 s, #4 from 30.2 s; so in 20 of 20 rounds",
     "jsd_max_by_case": "0.051, 0.081, 0.138, 0.074 bit",
 }
 

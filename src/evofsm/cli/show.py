@@ -24,21 +24,19 @@ def screen() -> Console:
 
 
 def show(*parts: RenderableType) -> None:
-    """Print texts and tables; in a pipe without the spaces that fill lines up.
+    """Print texts and tables, without the spaces that fill lines up.
 
     A table may be wider than the terminal: no number is ever cut in two.
     """
     from rich.measure import Measurement
 
-    out = screen()
     for part in parts:
-        width = max(out.width, Measurement.get(out, out.options, part).minimum)
-        if out.is_terminal:
-            out.print(part, width=width, crop=False)
-        else:
-            with out.capture() as printed:
-                out.print(part, width=width, crop=False)
-            print("\n".join(line.rstrip() for line in printed.get().splitlines()))
+        out = screen()
+        any_width = out.options.update(max_width=10_000)
+        out.width = max(out.width, Measurement.get(out, any_width, part).minimum)
+        with out.capture() as printed:
+            out.print(part, crop=False)
+        print("\n".join(line.rstrip() for line in printed.get().splitlines()))
 
 
 def say(text: object) -> None:

@@ -127,7 +127,7 @@ def _change(study: PaperStudy, case: int, *, leaves: bool) -> tuple[str, bool]:
         as_in_paper += bool(inside[row] == leaves and inside[changed] != leaves != inside[-1])
     text = f"{_name(run.state[row])} at {switch:g} s"
     if changed > row:
-        text += f", {_name(run.state[changed])} from {run.episode.time[changed]:.2f} s"
+        text += f", {_name(run.state[changed])} from {run.episode.time[changed]:.1f} s"
     return f"{text}; so in {as_in_paper} of {len(runs)} rounds", as_in_paper == len(runs)
 
 

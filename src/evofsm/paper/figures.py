@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -39,8 +39,9 @@ def figures(study: PaperStudy) -> Iterator[Figure]:
             f"Result of {run.name}",
             "Last round. Tinted: a dead end, by an oracle who knows how both can brake; until the "
             "leader brakes it can still be left, as in case 3. Vertical lines: the driver changes "
-            "(dashed), the leader's full brake (dotted), collision (solid). Action a(r) is the "
-            "interval in which the acceleration lies, from the lowest to the highest.",
+            "(dashed), the leader's full brake (dotted), collision (solid). c, e: of the follower; "
+            "action a(r) is the interval in which its acceleration lies, from the lowest to the "
+            "highest.",
             partial(draw_case, study, run),
         )
     yield Figure(
@@ -77,14 +78,21 @@ def _panels(rows: int, columns: int, height: float, **others: bool) -> tuple[Dra
     return figure, figure.subplots(rows, columns, **shared)
 
 
+def _letter(panels: Iterable[Axes], offset: plot.Point = (-14.0, 9.0)) -> None:
+    """Name panels a, b, ... so many points from their upper left corners."""
+    for name, axes in zip("abcdefgh", panels, strict=False):
+        look: Look = {"xycoords": "axes fraction", "fontweight": "bold"}
+        plot.write(axes, name, (0.0, 1.0), offset, size=8.5, **look)
+
+
 # -- Over time ------------------------------------------------------------------------------------
 
 
 def draw_case(study: PaperStudy, run: Run) -> Drawn:
     """Gap, speeds, acceleration, recognised state and action of one run, over time."""
-    figure = Drawn(figsize=(WIDTH, 7.4))
-    panels = figure.subplots(5, 1, sharex=True, height_ratios=(1.2, 1.2, 1.0, 1.2, 1.0))
-    figure.subplots_adjust(left=0.105, right=0.91, top=0.915, bottom=0.06, hspace=0.13)
+    figure = Drawn(figsize=(WIDTH, 6.7))
+    panels = figure.subplots(5, 1, sharex=True, height_ratios=(1.2, 1.2, 1.1, 1.3, 1.0))
+    figure.subplots_adjust(left=0.105, right=0.91, top=0.88, bottom=0.07, hspace=0.16)
     gap, speeds, acceleration, state, action = panels
     episode, settings = run.episode, study.settings
     time, (gaps, own, leaders) = episode.time, episode.observations.T
@@ -99,7 +107,7 @@ def draw_case(study: PaperStudy, run: Run) -> Drawn:
     speeds.legend(loc="upper left")
     acceleration.axhline(0.0, color=COLORS["soft"], linewidth=0.6)
     acceleration.plot(time, episode.accelerations, **_FOLLOWER)
-    acceleration.set_ylabel("follower's\nacceleration [m/s²]")
+    acceleration.set_ylabel("acceleration\n[m/s²]")
     state.step(time, run.state, where="post", color=COLORS["ink"])
     plot.label_states(state.yaxis, study.model.n_states, study.dead_ends, called="collisions")
     state.set_ylabel("recognised\nstate")
@@ -107,7 +115,7 @@ def draw_case(study: PaperStudy, run: Run) -> Drawn:
     n_actions = settings.actions.n_actions
     ticks = range(0, n_actions, max(1, round((n_actions - 1) / 4)))
     action.set_yticks(ticks, [f"a({tick + 1})" for tick in ticks])
-    action.set(ylim=(-1.0, n_actions), ylabel="follower's\naction", xlabel="time [s]")
+    action.set(ylim=(-1.0, n_actions), ylabel="action", xlabel="time [s]")
     action.set_xlim(0.0, settings.scenario.duration)
     _tint(figure, panels, study, run)
     moments = _moments(study, run)
@@ -121,6 +129,7 @@ def draw_case(study: PaperStudy, run: Run) -> Drawn:
         look["fontweight"] = "bold" if text.startswith("collision") else "normal"
         plot.write(gap, text, (at, 1.0), (-3.0 if before else 3.0, height), size=7.5, **look)
     figure.align_ylabels(panels)
+    _letter(panels, (-51.0, 3.0))
     figure.text(0.105, 0.985, _title_of(study, run), va="top", fontsize=9.0, fontweight="bold")
     return figure
 
@@ -174,7 +183,7 @@ def _draw_moments(axes: Axes, moments: Sequence[tuple[float, str, str]]) -> None
 
 def draw_divergence(study: PaperStudy) -> Drawn:
     """Divergence of forecast and recognised state over time, a panel for each case."""
-    figure, grid = _panels(2, 2, 4.5, sharey=True)
+    figure, grid = _panels(2, 2, 4.2, sharey=True)
     bound: Look = {"color": COLORS["ink"], "linestyle": "--", "linewidth": 0.8}
     first: Look = {"marker": "D", "markersize": 5, "markerfacecolor": COLORS["third"], "zorder": 4}
     for axes, run in zip(grid.flat, study.last_round, strict=True):
@@ -189,8 +198,11 @@ def draw_divergence(study: PaperStudy) -> Drawn:
         axes.set_title(_title_of(study, run))
     highest = [float(np.nanmax(run.surprise)) for run in study.last_round]
     grid[0, 0].set_ylim(0.0, 1.12 * max(LARGEST_DIVERGENCE, *highest))
-    figure.supylabel("divergence [bit]", fontsize=8.0)
-    figure.supxlabel("time [s]", fontsize=8.0)
+    grid[0, 0].set_xlim(0.0, study.settings.scenario.duration)
+    for left, below in zip(grid[:, 0], grid[1], strict=True):
+        left.set_ylabel("divergence [bit]")
+        below.set_xlabel("time [s]")
+    _letter(grid.flat)
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return figure
 
@@ -221,6 +233,7 @@ def draw_space(study: PaperStudy) -> Drawn:
         Line2D([], [], label=name, **{"linestyle": "", **one}) for name, one in looks.items()
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=4)
+    _letter(grid.flat)
     figure.draw_without_rendering()  # discs need to know where everything is
     for variable, (row, look) in enumerate(zip(grid, (_FOLLOWER, _LEADER), strict=True), 1):
         for axes, run in zip(row, study.last_round, strict=True):

@@ -38,7 +38,10 @@ _WIDEST = 200
 
 
 class _Cell(Formatter):
-    """``str.format`` for cells: `NONE` for missing numbers, shares in percent, true minus signs."""
+    """``str.format`` for cells: `NONE` for missing numbers, shares in percent, true minus signs.
+
+    What is small, but not 0, is not shown as 0.
+    """
 
     def get_field(self, name: str, args: Any, row: Any) -> Any:
         return row[name], name  # names may hold dots and brackets
@@ -54,10 +57,13 @@ class _Cell(Formatter):
             return str(value)
         if math.isinf(value):
             return "∞" if value > 0 else "−∞"
-        if spec in ("%", "p"):  # what is small, but not 0, is not shown as 0
+        if spec in ("%", "p"):
             text = f"{100 * value:.{2 if 0 < abs(value) < 5e-4 else 1}f}"
             return _minus(text) + (" %" if spec == "%" else "")
-        return _minus(format(value, spec or ("," if isinstance(value, int) else "g")))
+        text = format(value, spec or ("," if isinstance(value, int) else "g"))
+        if value and not text.strip("-0."):
+            text = f"{'<' if value > 0 else '>'} {text[:-1]}1"
+        return _minus(text)
 
 
 def _minus(number: str) -> str:
@@ -74,8 +80,8 @@ def cell(template: str, row: Mapping[str, Any]) -> str:
     --------
     >>> cell("{rate:%} ({low:p}–{high:p})", {"rate": 0.0, "low": 0.0, "high": 0.0037})
     '0.0 % (0.0–0.4)'
-    >>> cell("{skill:.2f}", {"skill": -0.5}), cell("{skill:.2f}", {"skill": None})
-    ('−0.50', '–')
+    >>> [cell("{skill:.2f}", {"skill": skill}) for skill in (-0.5, 0.001, None)]
+    ['−0.50', '< 0.01', '–']
     """
     names = [name for _, name, _, _ in Formatter().parse(template) if name]
     if names and all(_Cell().format_field(row[name], "") == NONE for name in names):
@@ -151,7 +157,7 @@ class Page:
 
     name: str  #: in addresses, such as ``"closed-loop"``
     about: str  #: the question, an empty line, and what was done; a docstring
-    parts: Sequence[Table | Figure]
+    parts: Sequence[Table | Figure]  #: of a page by itself a figure that is the first is on top
     command: str  #: that makes it
     lost: Sequence[Table] = ()  #: rows that go against us
     #: what was asked and measured, and last whether it is met; empty where nothing was asked for
@@ -186,7 +192,7 @@ class Page:
     @property
     def tables(self) -> list[Table]:
         """All tables but those of what is lost, the targets first."""
-        mark = pl.when(~pl.nth(-1)).then(pl.lit("fails"))
+        mark = pl.when(pl.nth(-1)).then(pl.lit("holds")).otherwise(pl.lit("fails"))
         name = "" if self.targets.is_empty() else f"{self.targets.columns[0].capitalize()}s"
         asked = [Table(name, self.targets, mark=mark)] if name else []
         return [*asked, *(part for part in self.parts if isinstance(part, Table))]
@@ -298,42 +304,27 @@ def print_page(*pages: Page, out: Console | None = None) -> None:
 def print_table(table: Table, out: Console) -> None:
     """Print a table; rows that are ours begin with ``>``, those that fail with ``!``.
 
-    One of numbers that is too wide comes in parts, each with the names of the rows.
+    It may be wider than the terminal: no number is ever cut in two.
     """
     from rich.box import SIMPLE_HEAD
     from rich.table import Table as Grid
 
     signs = {"ours": "> ", "fails": "! "}
     styles = {"ours": "bold", "fails": "bold red"}
-    marks = [mark or "" for mark in table.marks]
-    rows = [
-        (signs.get(mark, "") + row[0], *row[1:])
-        for row, mark in zip(table.cells, marks, strict=True)
-    ]
+    grid, least = Grid(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0)), 0
+    for k, (name, is_number) in enumerate(zip(table.header, table.numeric, strict=True)):
+        column = [name, *(row[k] for row in table.cells)]
+        longest = max(map(len, column if is_number else " ".join(column).split()), default=0)
+        given: Any = {"justify": "right" if is_number else "left", "vertical": "bottom"}
+        grid.add_column(name, min_width=longest, **given)
+        least += longest + 2
+    for row, mark in zip(table.cells, table.marks, strict=True):
+        grid.add_row(signs.get(mark or "", "") + row[0], *row[1:], style=styles.get(mark or ""))
     out.print(f"\n{table.title}", style="bold")
-    for part in _parts(table, rows, out.width):
-        grid = Grid(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-        for column in part:
-            justify = "right" if table.numeric[column] else "left"
-            grid.add_column(table.header[column], justify=justify, vertical="bottom")  # type: ignore[arg-type]
-        for row, mark in zip(rows, marks, strict=True):
-            grid.add_row(*(row[column] for column in part), style=styles.get(mark))
-        out.print(grid)
+    grid.width = least if least > out.width else None
+    out.print(grid, crop=False)
     if table.note:
         out.print(table.note, style="dim")
-
-
-def _parts(table: Table, rows: Sequence[Sequence[str]], room: int) -> list[list[int]]:
-    """Columns that stand beside one another, the first in each part."""
-    widths = [max(map(len, column)) + 2 for column in zip(table.header, *rows, strict=True)]
-    if table.is_wordy or sum(widths) <= room:
-        return [list(range(len(widths)))]
-    parts: list[list[int]] = []
-    for column in range(1, len(widths)):
-        if not parts or sum(widths[one] for one in parts[-1]) + widths[column] > room:
-            parts.append([0])
-        parts[-1].append(column)
-    return parts
 
 
 def _console() -> Console:

@@ -69,7 +69,10 @@ class Reproduction:
             targets=targets,
             facts={
                 "world": world,
-                "runs": f"{len(study.runs)}, and {len(study.extra_runs)} extra ones",
+                "runs": f"{len(study.runs)}: the four cases, round by round",
+                "extra runs": f"{len(study.extra_runs)}: case 1, but the leader brakes in full at "
+                f"{' or '.join(map('{:g} s'.format, study.settings.brake_at))}, where the dead end "
+                "is recognised, to see whether a collision follows, as in the paper",
             },
             packages=("libsumo",) if study.world == "sumo" else (),
             sources={_SOURCE: "https://arxiv.org/abs/1908.10823"},
@@ -137,7 +140,7 @@ def _tables(study: PaperStudy) -> Iterator[Table]:
         {
             "forecast": "{forecast}",
             **{f"case {case}": f"{{case {case}:.3f}}" for case in CASES},
-            "mean": "{mean:.1e}",
+            "mean": "{mean:.3f}",
         },
         "In the last round, save where the row says all. Persistence: the belief stays as it is. "
         f"Constant: the mean belief of these runs. The paper's bound is {LARGEST_DIVERGENCE:g} "
@@ -188,8 +191,8 @@ def _table_of_losses(study: PaperStudy) -> Table:
         {
             "forecast": "{forecast}",
             "where": "{where}",
-            "divergence [bit]": "{value:.1e}",
-            "e-FSM": "{ours:.1e}",
+            "divergence [bit]": "{value:.3f}",
+            "e-FSM": "{ours:.3f}",
         },
         "The largest divergence in a case of the last round, or the mean of all.",
     )
@@ -239,7 +242,8 @@ def _table_of_lead_times(study: PaperStudy) -> Table:
         off = np.flatnonzero(ttc >= _ALARM)
         lasting = min(int(off[-1]) + 1, len(ttc) - 1) if len(off) else 0
         warned = end - run.episode.time[lasting]
-        rows.append((run.name, end, time, end - time, ttc[row], warned))
+        name = run.name if run.round else f"extra: case {run.case}, {run.name}"
+        rows.append((name, end, time, end - time, ttc[row], warned))
     names = ("run", "collision", "recognised", "before it", "TTC then", f"TTC < {_ALARM:g} s")
     return Table(
         f"How early #{study.dead_end + 1} is recognised, in the last round and the extra runs [s]",
