@@ -1,4 +1,4 @@
-"""Online recognition of latent risk with an evolving finite state machine.
+"""A safety filter that learns, from an evolving finite state machine.
 
 The public names load on first use, so that ``import evofsm`` itself costs next to nothing.
 """

@@ -62,14 +62,14 @@ def test_a_far_observation_is_never_seen_and_silence_about_failures_is_said(evof
     machine.learn_many([[0.0], [5.0]] * 20, [0] * 40, range(0, 40, 2))
     machine.save(tmp_path / "machine")
     answer = evofsm("explain", tmp_path / "machine", "--observation", "500")
-    assert "tells nothing of failures: none was ever told" in answer.stdout
+    assert "Which episodes failed is not known" in answer.stdout
     assert "Never seen" in answer.stdout
     told = evofsm("explain", tmp_path / "machine", "--observation", "500", "--json").stdout
     assert json.loads(told)["situations"][0]["never_seen"] is True
     machine.tell_of_failures()
     machine.save(tmp_path / "machine")
     told = evofsm("explain", tmp_path / "machine", "--state", "all").stdout
-    assert "tells nothing of failures" not in told
+    assert "Which episodes failed is not known" not in told
 
 
 def test_a_table_that_is_wider_than_the_terminal_loses_no_column(evofsm, monkeypatch, capsys):

@@ -177,7 +177,7 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
 
 def test_a_guard_that_could_not_be_taught_is_refused_before_the_work(refused, own, tmp_path):
     options = ("learn", own, *OWN, "--guard", tmp_path / "car.evofsm")
-    assert "nothing tells of them: --failed" in refused(*options)
+    assert "which there were is not known: --failed" in refused(*options)
     two = ("--observe", "dist [m],ego_kmh", "--judge", "kinematic", "--unit", "ego_kmh=km/h")
     assert "--observe has to name the three columns" in refused(*options[:2], *two, *options[-2:])
     discrete = ("--observe", "dist [m],hit=0/1", "--failed", "hit")
@@ -267,14 +267,14 @@ def test_failures_are_learnt_from_a_column_or_a_comparison(evofsm, crashes, tmp_
 def test_a_log_that_tells_nothing_of_failures_is_said_to(evofsm, crashes, tmp_path):
     path = tmp_path / "model"
     learnt = evofsm("learn", crashes, "--out", path)
-    assert "failures not told; --failed" in " ".join(learnt.stdout.split())
+    assert "failures not known; --failed" in " ".join(learnt.stdout.split())
     text = " ".join(evofsm("explain", path, "--state", "all").stdout.split())
-    assert "tells nothing of failures" in text
+    assert "Which episodes failed is not known" in text
     assert "0 of" not in text
     safe = tmp_path / "safe"
     assert evofsm("learn", crashes, "--failed", "gap<-9", "--out", safe).exit_code == 0
     text = " ".join(evofsm("explain", safe, "--state", "all").stdout.split())
-    assert "tells nothing of failures" not in text
+    assert "Which episodes failed is not known" not in text
     assert "0 of 3 (at most 48 %) failed later on" in text
 
 

@@ -79,7 +79,7 @@ def _options(
         ),
     ] = False,
 ) -> None:
-    """Online recognition of latent risk with an evolving finite state machine."""
+    """A safety filter that learns, from an evolving finite state machine."""
 
 
 def application() -> typer.Typer:

@@ -27,7 +27,7 @@ def audit(
     ] = None,
     replay: Annotated[bool, option("Whether to drive again, and compare every decision.")] = True,
     failed: Annotated[
-        str | None, option("MODULE:FUNCTION that told the guard where it fails, if one did.")
+        str | None, option("MODULE:FUNCTION that the guard was given as failed=, if it was.")
     ] = None,
     as_json: Json = False,
 ) -> int:

@@ -44,7 +44,7 @@ def drive(
     episodes: Annotated[int, option("How many are driven.", min=1, max=2**32)] = 100,
     world: InWorld = "kinematic",
     reviser: Annotated[
-        str, option("Who revises: least-risk (ours), none, rss, aeb, or another measure.")
+        str, option("Which filter: least-risk (ours), none, rss, aeb, or another measure.")
     ] = "least-risk",
     judge: ByJudge = "kinematic",
     mode: Annotated[ModeName, option("How far least-risk goes.")] = "act",
@@ -77,7 +77,7 @@ def drive(
     ] = None,
     as_json: Json = False,
 ) -> int | None:
-    """Drive scenarios under a reviser; learn on the way.
+    """Drive scenarios under a safety filter, which learns on the way.
 
     A machine and its judge learn from every episode, from the first on, unless --frozen, --workers
     or --cluster is given: then draws are held out, and thousands of episodes are driven on all

@@ -27,8 +27,8 @@ _MOST_FILES = 3
 # So many states are listed, those with most of the time.
 _MOST_STATES = 20
 _UNTOLD = (
-    "What was learnt tells nothing of failures: none was ever told. From a log, evofsm learn "
-    "--failed COLUMN or --failed 'gap<=0' tells of them."
+    "Which episodes failed is not known: nothing said so. From a log, evofsm learn "
+    "--failed COLUMN or --failed 'gap<=0' says it."
 )
 
 
@@ -205,7 +205,7 @@ def _model_facts(model: FSMModel) -> list[tuple[str, str]]:
         ("transitions", f"{model.uses.sum():,.0f}, under {model.n_actions} actions"),
         ("states", f"{model.n_states}, of {model.n_variables} variables"),
         ("settings", settings or "not known"),
-        ("failures", failures if model.failures_told else "none was ever told"),
+        ("failures", failures if model.failures_told else "which there were is not known"),
     ]
 
 

@@ -120,7 +120,7 @@ def learn(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Learn a machine from logs of your own, of any size, row by row.
+    """Learn a state machine from logs of your own, of any size, row by row.
 
     A log holds a row per time step. A step longer than 1.5 times the usual one (the median in the
     first rows of a file) is a hole in time: it begins a new episode.
@@ -128,10 +128,10 @@ def learn(
     In FCD output of SUMO, a vehicle and the next one ahead of it on the same lane are a pair (a
     leader beyond the end of the lane is not seen). A pair is observed by gap (bumper to bumper),
     v_follower and v_leader; its action a_follower is what the follower did until the next time
-    step. SUMO rounds to 2 decimals unless told --precision 6. So are tables of objects (id, t, x,
+    step. SUMO rounds to 2 decimals unless given --precision 6. So are tables of objects (id, t, x,
     y, vx, vy, length, lane) and traces of ASAM OSI read.
 
-    The time may be seconds, or dates of ISO 8601. Without --failed a log tells nothing of failures,
+    The time may be seconds, or dates of ISO 8601. Without --failed nobody knows what failed,
     and evofsm explain says so.
 
     With --guard, a guard in shadow mode then goes through all rows and learns from them too.
@@ -317,8 +317,8 @@ def _judge_of(judge: Judge | None, columns: LogColumns) -> Judge:
         )
     if judge == "learnt" and columns.failed is None:
         raise ValueError(
-            "--guard learns from failures, and nothing tells of them: --failed COLUMN or --failed "
-            "'gap<=0' does; of cars that follow each other, --judge kinematic needs none"
+            "--guard learns from failures, and which there were is not known: --failed COLUMN or "
+            "--failed 'gap<=0' says it; of cars in pairs --judge kinematic needs none"
         )
     return judge
 
@@ -461,7 +461,7 @@ def _read_otherwise(
     from evofsm.io.tables import UNITS
 
     if failed is None:
-        yield "failures", "not told; --failed COLUMN or --failed 'gap<=0' tells of them"
+        yield "failures", "not known; --failed COLUMN or --failed 'gap<=0' says them"
     else:
         several = "" if learning.read.failures == 1 else "s"
         text = f"{learning.read.failures:,} episode{several} ended with {failed}"

@@ -87,7 +87,7 @@ Step = Annotated[float | None, option("From a row to the next [s], without a clo
 Failed = Annotated[
     str | None,
     option(
-        "What tells of failures: a column of truth values, or a comparison such as 'gap<=0'. "
+        "What failed: a column of truth values, or a comparison such as 'gap<=0'. "
         "The row with which it becomes true ends the episode in failure.",
         "--failed",
     ),

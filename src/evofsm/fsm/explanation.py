@@ -157,7 +157,7 @@ def _of_episodes(here: Tally, visits: int, soon: str, asked: Tally | None, actio
     came = f"{counted(here.episodes, 'episode')} came here{observations}"
     if not here.is_told:
         took = "" if asked is None else f", {asked.episodes:,} of which took {action}"
-        return f"{came}{took}; how many failed is not known, for no failure was ever told"
+        return f"{came}{took}; how many failed is not known"
     text = f"{came}; {here} failed {soon}"
     if asked is None:
         return text

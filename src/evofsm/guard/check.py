@@ -304,7 +304,7 @@ def a_file_keeps_it(make: Make) -> None:
 def is_frozen(make: Make) -> None:
     """It is a frozen dataclass of settings: equal where they are, and none can be changed."""
     rule = make()
-    _insist(is_dataclass(rule), "it is no dataclass: files could not tell its settings")
+    _insist(is_dataclass(rule), "it is no dataclass: files could not store its settings")
     _insist(rule == make(), "two rules of the same settings are not equal")
     _insist(dict(rule.table) == dict(rule.table), "its table is another one the second time")
     for one in fields(rule):
@@ -320,7 +320,7 @@ def a_machine_takes_it(make: Make) -> None:
     rule = make()
     for name in ("radius", "spread"):
         value = dict(rule.table).get(name, 1.0)
-        _insist(0.0 < value < np.inf, f"it tells a {name} of {value}; it must be positive")
+        _insist(0.0 < value < np.inf, f"its {name} is {value}; it must be positive")
     Z = np.cumsum(np.random.default_rng(0).normal(size=(60, len(rule.scales) or 3)), axis=0)
     try:
         machine, batch = EvolvingFSM(2, rule=rule), EvolvingFSM(2, rule=make())

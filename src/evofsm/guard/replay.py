@@ -44,8 +44,8 @@ from evofsm.guard.reviser import is_spoken
 # What a record that someone made up may run into.
 _NONSENSE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 _NO_FUNCTION = (
-    "a function told the guard where it fails, and no log holds code; give it as failed "
-    "(--failed MODULE:FUNCTION)"
+    "the guard was given a function that says where it fails, and no log holds code; give it as "
+    "failed (--failed MODULE:FUNCTION)"
 )
 # Where there is a decision logger, decisions that speak are explained.
 _DEAF: Any = SimpleNamespace(

@@ -214,7 +214,7 @@ def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> Ite
     yield f"// {few.sum():,} that rest on fewer than {evidence:g} decisions ({lost:.2%} of all);"
     yield f"// transitions below {least:g}. States without any action, labelled unknown: {unknown}."
     if not model.failures.any():
-        yield "// NO DECISION FAILED, or nothing told of failures: a probability of failure that is"
+        yield "// NO DECISION FAILED, or which did is not known: a probability of failure that is"
         yield "// computed from this process is 0 for want of knowledge."
     if model.dt is not None:
         yield f"// A step is {model.dt:g} s."

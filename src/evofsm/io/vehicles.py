@@ -226,7 +226,7 @@ class _FcdReader:
             self._parser.Parse(data, last)
         except expat.ExpatError as error:
             raise ValueError(
-                f"{self._path}, line {error.lineno}: this is not whole XML: "
+                f"{self._path}, line {error.lineno}: this XML is cut off or damaged: "
                 f"{expat.ErrorString(error.code)} (was SUMO or a copy interrupted?)"
             ) from error
         self._fed += len(data)

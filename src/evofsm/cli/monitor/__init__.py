@@ -84,7 +84,7 @@ def monitor(
         str | None, option("Rows under KEY/row, decisions under KEY/decision.")
     ] = None,
     heartbeat: Annotated[
-        float | None, option("Say that it is there where so long nothing came [s].")
+        float | None, option("Send a heartbeat after so long without a row [s].")
     ] = None,
     warm: Annotated[bool, option("Compile before the first row comes.", "--warm")] = False,
     summary: Annotated[
@@ -106,7 +106,7 @@ def monitor(
     no_leader: NoLeader = None,
     vehicle_length: Lengths = None,
 ) -> int | None:
-    """Decide beside a stack of your own: rows in, decisions out, a JSON line each.
+    """Decide alongside a stack of your own: rows in, decisions out, a JSON line each.
 
     A row: {"time": 0.1, "gap": 32, "v_follower": 20, "v_leader": 18, "proposal": 0.5}, in s, m,
     m/s and m/s²; or a scene of objects; or the variables of the guard. docs/monitor.md describes

@@ -41,7 +41,7 @@ NOTHING_SEEN = "nothing of this episode was observed yet"
 NO_FAILURE = "no failure is known yet, so nothing is refused"
 #: Said while it is tried whether what one or two failures tell is true.
 DOUBTED = (
-    "what few failures tell refused nearly all for long, so it is doubted until it fails again"
+    "what few failures taught refused nearly all for long, so it is doubted until it fails again"
 )
 #: What is done where all backups look alike and another action was hardly used.
 TRIED = "no action passes; what this one does is hardly known, so it is tried"
