@@ -1,6 +1,7 @@
 """Does exported C decide as Python does? A million situations, NaN and infinities among them.
 
 Usage: python benchmarks/c99.py [--decisions 1e6] [--systems wall,disc,cartpole,emergency,cars]
+       python benchmarks/c99.py --fmu 100 --systems cars  # FMUs drive so many held-out episodes
 
 A guard learns, is frozen and exported, and drives; both are asked the same. Of some observations a
 part is not seen, infinite, late or anywhere; some proposals are no numbers, or beyond the range.
@@ -24,8 +25,8 @@ from numpy.typing import NDArray
 from evofsm import Guard
 from evofsm.driving import CarFollowing, LatentRisk, guard_for_family
 from evofsm.guard import Proposal, make_usable
-from evofsm.guard.actions import BoxActions, limits, no_action
-from evofsm.guard.export import write_c99
+from evofsm.guard.actions import BoxActions, Choices, limits, no_action, same_action
+from evofsm.guard.export import write_c99, write_fmu
 from evofsm.guard.learnt import words
 from evofsm.guard.reviser import unseen_text
 
@@ -207,7 +208,7 @@ class Learnt(NamedTuple):
 
 def learnt(name: str, episodes: int | None = None) -> Learnt:
     """A guard that learnt so many episodes of a system by its name."""
-    kind, most = SYSTEMS[name]
+    (kind, most), parts = SYSTEMS[name], name.endswith("+parts")
     system: Any = kind()
     if isinstance(system, Emergency):
         judge = "kinematic" if name.endswith("cars") else "learnt"
@@ -220,7 +221,39 @@ def learnt(name: str, episodes: int | None = None) -> Learnt:
             seen, failed, over = system.step(guard.decide(seen, system.propose()).executed)
         guard.end(failed, seen)
     guard.freeze()
+    if parts:
+        _add_parts(guard.judge)
     return Learnt(system, guard)
+
+
+def _add_parts(judge: Any) -> None:
+    """Places, drifts, jumps, regions, dead ends: not each system teaches each of them."""
+    chance = np.random.default_rng(0)
+    model, found = judge.dynamics.model, judge.disturbances
+    m, count = found.residuals.shape[1:]
+    seen = judge.situations[:, :m]
+    place = found.place.copy()
+    for k in range(1, count, 2):
+        j = int(chance.integers(m))
+        place[k] = j, chance.choice([-1.0, 1.0]), np.median(seen[:, j]), k % 4, 6 + k
+    jump_at = found.jump_at.copy()
+    jump_at[2::3, 0] = 5.0
+    slope = chance.normal(size=found.jump_slope.shape)
+    ranges = np.sort(chance.normal(size=found.jump_from.shape), -1)
+    landing = np.stack([np.tile(end, (count, 1)) for end in (seen.min(0), seen.max(0))], -1)
+    judge.disturbances = found._replace(
+        place=place, jump_at=jump_at, jump_slope=slope, jump_from=ranges, landing=landing
+    )
+    drifted = np.where(np.arange(m) == m - 1, 1.0, -1.0)
+    unit, low = judge.dynamics.sums.unit, seen.min(0)
+    region = [0, m - 1, low[0], low[m - 1], 1 / unit[0], 1 / unit[m - 1], 1, 0.1, 0.2, -1, 0.3, -2]
+    centres = seen[chance.integers(len(seen), size=3)]
+    ends = np.column_stack([centres, np.full(3, 0.4), np.full(3, 4.0)])
+    judge.dynamics.model = model._replace(
+        drifted=drifted, regions=np.array([region]), dead_ends=ends
+    )
+    counted = {name: np.arange(1.0, 4.0) for name in ("numbers", "counts")}
+    judge.dynamics.dead_ends = judge.dynamics.dead_ends._replace(**counted)
 
 
 SYSTEMS: dict[str, tuple[Any, int]] = {
@@ -230,6 +263,8 @@ SYSTEMS: dict[str, tuple[Any, int]] = {
     "cartpole": (CartPole, 25),
     "emergency": (Emergency, 40),
     "cut_in": (CutIn, 40),
+    "disc+parts": (Disc, 30),
+    "cut_in+parts": (CutIn, 40),
     "cars": (Emergency, 20),
     "noisy_cars": (NoisyCars, 20),
 }
@@ -424,6 +459,71 @@ def _kinematic(guard: Guard, code: dict[str, int], number: dict[str, float]) -> 
     return why if code["reason"] == 5 else f"{why}; {least}"
 
 
+class Driven(NamedTuple):
+    """Held-out episodes, each driven twice: by a guard in Python, and by it as an FMU."""
+
+    episodes: int
+    decisions: int
+    failed: int  #: episodes, in Python
+    others: int  #: of which an action, a risk, whether it was revised, or the end differs
+
+
+def drive_fmu(learnt: Learnt, folder: Path, episodes: int) -> Driven:
+    """Drive with an FMU in FMPy as with the guard."""
+    import fmpy
+
+    system, guard = learnt
+    write_fmu(guard, folder / "guard.fmu")
+    told = fmpy.read_model_description(folder / "guard.fmu")
+    place = fmpy.extract(folder / "guard.fmu", folder / "unit")
+    unit = fmpy.instantiate_fmu(place, told, "CoSimulation")
+    of = {one.name: one.valueReference for one in told.modelVariables}
+    kind: Any = float
+    put, get = unit.setReal, unit.getReal
+    if isinstance(guard.actions, Choices):
+        kind, put, get = int, unit.setInteger, unit.getInteger
+    proposal, executed = (
+        [of[name] for name in of if name.startswith(f"{what}[")]
+        for what in ("proposal", "executed")
+    )
+
+    def in_python(seen: Floats, wanted: Any) -> tuple[Any, float, bool]:
+        done = guard.decide(seen, wanted)
+        return done.executed, done.risk_executed, not same_action(done.executed, wanted)
+
+    def in_unit(seen: Floats, wanted: Any) -> tuple[Any, float, bool]:
+        unit.setReal(list(range(len(seen))), seen.tolist())
+        put(proposal, list(map(kind, np.ravel(wanted))))
+        unit.doStep(0.0, guard.interval)
+        done = np.array(get(executed)) if len(executed) > 1 else get(executed)[0]
+        return done, unit.getReal([of["risk"]])[0], bool(unit.getBoolean([of["revised"]])[0])
+
+    failed = others = decisions = 0
+    for seed in range(2_000_000, 2_000_000 + episodes):
+        guard.end()
+        unit.reset()
+        unit.setupExperiment()
+        unit.enterInitializationMode()
+        unit.exitInitializationMode()
+        found, again = (_driven(system, seed, decide) for decide in (in_python, in_unit))
+        decisions, failed = decisions + len(found), failed + int(found[-1, -1])
+        alike = found.shape == again.shape and np.allclose(found, again, 0.0, 1e-12, equal_nan=True)
+        others += not alike
+    unit.terminate()
+    unit.freeInstance()
+    return Driven(episodes, decisions, failed, others)
+
+
+def _driven(system: Any, seed: int, decide: Any) -> Floats:
+    """Of each decision what was executed, its risk, whether it was revised, whether it failed."""
+    seen, over, rows = system.reset(seed), False, []
+    while not over:
+        executed, *said = decide(seen, system.propose())
+        seen, failed, over = system.step(executed)
+        rows.append([*np.ravel(executed), *said, failed])
+    return np.array(rows, np.float64)
+
+
 def sizes(folder: Path, flags: Sequence[str]) -> str:
     """Bytes of the state, of constants and code, and all frames of functions at once."""
     command = ["cc", *FLAGS, *flags, "-fstack-usage", "-c", "evofsm.c"]
@@ -441,10 +541,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--decisions", type=lambda text: int(float(text)), default=1_000_000)
     parser.add_argument("--systems", default=",".join(SYSTEMS))
     parser.add_argument("--flags", default="-O3")
+    parser.add_argument("--fmu", type=int, default=0, metavar="EPISODES")
     given = parser.parse_args(arguments)
     names, agree = given.systems.split(","), True
     for name in names:
         one = learnt(name)
+        if given.fmu:
+            with tempfile.TemporaryDirectory() as place:
+                driven = drive_fmu(one, Path(place), given.fmu)
+            print(
+                f"{name}, FMU: {driven.episodes} episodes, {driven.decisions:,} decisions, "
+                f"{driven.failed} failed in Python; {driven.others} differ",
+                flush=True,
+            )
+            agree &= driven.others == 0
+            continue
         with tempfile.TemporaryDirectory() as place:
             folder, flags = Path(place), given.flags.split()
             program = build(one.guard, folder, *flags)

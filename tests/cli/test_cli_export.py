@@ -1,5 +1,6 @@
 import json
 import os
+from zipfile import is_zipfile
 
 import pytest
 
@@ -75,7 +76,11 @@ def test_a_guard_is_written_in_c_and_for_cpp_to_a_folder(evofsm, refused, driven
     header = (tmp_path / "c" / "evofsm.h").read_text()
     assert "gap" in header
     assert "#define EVOFSM_VARIABLES 3\n" in header
-    assert "name a folder by --out" in refused("export", out, "--to", "c99")
+    assert "name a file, of c99 a folder, by --out" in refused("export", out, "--to", "c99")
+    named = evofsm("export", out, "--to", "c99", "--prefix", "cars", "--out", tmp_path / "c")
+    assert "int cars_decide(" in (tmp_path / "c" / "cars.h").read_text(), named.stderr
+    evofsm("export", out, "--to", "fmu", "--out", tmp_path / "cars.fmu")
+    assert is_zipfile(tmp_path / "cars.fmu")
 
 
 def test_options_choose_what_is_drawn(evofsm, driven):

@@ -6,21 +6,20 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import c99
 from evofsm import Guard, Missing
 from evofsm.driving import LatentRisk, guard_for_cars
 from evofsm.guard import LearntRisk, Mode
-from evofsm.guard.export import write_c99
+from evofsm.guard.export import write_c99, write_fmu
 
 PAGE = Path(__file__).parents[2] / "docs" / "on-your-target.md"
 
 
-def compiler(name="cc"):
-    """A compiler, or the test is skipped."""
-    return shutil.which(name) or pytest.skip(f"there is no {name} to compile with")
+pytestmark = pytest.mark.skipif(
+    not (shutil.which("cc") and shutil.which("c++")), reason="there is nothing to compile with"
+)
 
 
 @pytest.fixture(scope="module")
@@ -44,16 +43,15 @@ def constant(folder, name, file="evofsm.c"):
 def run_cpp(folder, source, *prefixes, told=""):
     """What a program of C++ around exported C prints."""
     for prefix in prefixes:
-        subprocess.run([compiler(), *c99.FLAGS, "-c", f"{prefix}.c"], cwd=folder, check=True)
+        subprocess.run(["cc", *c99.FLAGS, "-c", f"{prefix}.c"], cwd=folder, check=True)
     flags = ("-std=c++17", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-I.", "-o", "main")
-    command = [compiler("c++"), *flags, source, *(f"{prefix}.o" for prefix in prefixes), "-lm"]
+    command = ["c++", *flags, source, *(f"{prefix}.o" for prefix in prefixes), "-lm"]
     subprocess.run(command, cwd=folder, check=True)
     run = {"input": told, "capture_output": True, "text": True, "check": True}
     return subprocess.run(["./main"], cwd=folder, **run).stdout.splitlines()
 
 
 def test_a_guard_in_c_decides_as_in_python(wall, tmp_path):
-    compiler()
     found = agrees(wall, tmp_path, "-O1", decisions=800)
     assert found.changed > 100
     assert found.refused > 5
@@ -81,14 +79,17 @@ def test_what_cannot_be_exported_is_refused_and_nothing_is_written(guard, why, t
 @pytest.mark.slow
 @pytest.mark.parametrize("name", c99.SYSTEMS)
 def test_decisions_are_the_same_and_sanitizers_silent(name, tmp_path):
-    compiler()
     learnt = c99.learnt(name)
     for flags in (("-O2",), c99.SANITIZERS):
         found = agrees(learnt, tmp_path / flags[0], *flags)
         assert found.changed > 50
     has = {"noisy": ("NOISY", 1), "noisy_cars": ("EXACT", 0), "cut_in": ("JUMPS", 1)}
-    macro, is_on = (has | {"disc": ("REGIONS", 1)}).get(name, ("ACTS", 1))
+    has |= {"disc": ("REGIONS", 1), "disc+parts": ("JUMPS", 1)}
+    macro, is_on = has.get(name, ("ACTS", 1))
     assert bool(constant(tmp_path / "-O2", macro)) == is_on
+    if name == "disc+parts":
+        reasons = [reason for reason, _ in c99.ask(learnt, 1500).said]
+        assert sum("near dead end" in reason for reason in reasons) > 20
 
 
 SETTINGS = {
@@ -103,56 +104,13 @@ SETTINGS = {
 @pytest.mark.parametrize("change", SETTINGS)
 @pytest.mark.parametrize("name", ["wall", "cars"])
 def test_settings_of_a_guard_are_those_in_c(name, change, tmp_path):
-    compiler()
     learnt = c99.learnt(name)
     SETTINGS[change](learnt.guard)
     agrees(learnt, tmp_path, "-O1")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["disc", "cut_in"])
-def test_whatever_may_be_learnt_is_replayed_alike(name, tmp_path):
-    """Places, drifts, jumps, regions, dead ends: not each system teaches each of them."""
-    compiler()
-    learnt = c99.learnt(name)
-    judge, chance = learnt.guard.judge, np.random.default_rng(0)
-    model, found = judge.dynamics.model, judge.disturbances
-    m, count = found.residuals.shape[1:]
-    seen = judge.situations[:, :m]
-    place = found.place.copy()
-    for k in range(1, count, 2):
-        j = int(chance.integers(m))
-        place[k] = j, chance.choice([-1.0, 1.0]), np.median(seen[:, j]), k % 4, 6 + k
-    jump_at = found.jump_at.copy()
-    jump_at[2::3, 0] = 5.0
-    slope = chance.normal(size=found.jump_slope.shape)
-    ranges = np.sort(chance.normal(size=found.jump_from.shape), -1)
-    landing = np.stack([np.tile(end, (count, 1)) for end in (seen.min(0), seen.max(0))], -1)
-    judge.disturbances = found._replace(
-        place=place, jump_at=jump_at, jump_slope=slope, jump_from=ranges, landing=landing
-    )
-    drifted = np.where(np.arange(m) == m - 1, 1.0, -1.0)
-    unit, low = judge.dynamics.sums.unit, seen.min(0)
-    region = [0, m - 1, low[0], low[m - 1], 1 / unit[0], 1 / unit[m - 1], 1, 0.1, 0.2, -1, 0.3, -2]
-    centres = seen[chance.integers(len(seen), size=3)]
-    ends = np.column_stack([centres, np.full(3, 0.4), np.full(3, 4.0)])
-    judge.dynamics.model = model._replace(
-        drifted=drifted, regions=np.array([region]), dead_ends=ends
-    )
-    counted = {name: np.arange(1.0, 4.0) for name in ("numbers", "counts")}
-    judge.dynamics.dead_ends = judge.dynamics.dead_ends._replace(**counted)
-    asked = c99.ask(learnt, 1500)
-    near = sum("near dead end" in reason for reason, _ in asked.said)
-    assert near > 20 or name == "cut_in"  # where nothing passes anyway
-    found = c99.compare(learnt.guard, c99.build(learnt.guard, tmp_path, *c99.SANITIZERS), asked)
-    assert found.agrees, found[:6]
-    assert constant(tmp_path, "EVOFSM_PLACED", "evofsm.h") == 1
-    assert found.changed > 20
-
-
-@pytest.mark.slow
 def test_a_search_that_is_cut_short_is_so_in_c(wall, monkeypatch, tmp_path):
-    compiler()
     monkeypatch.setattr(LearntRisk, "effort", property(lambda self: (3, 1.0)))
     asked = c99.ask(wall, 1500)
     assert sum("the search was cut short" in reason for reason, _ in asked.said) > 20
@@ -161,7 +119,6 @@ def test_a_search_that_is_cut_short_is_so_in_c(wall, monkeypatch, tmp_path):
 
 @pytest.mark.slow
 def test_brakes_that_are_not_known_are_tried_in_c_too(tmp_path):
-    compiler()
     learnt = c99.learnt("cars", episodes=0)
     found = agrees(learnt, tmp_path, "-O1")
     assert constant(tmp_path, "KNOWN") == 0
@@ -171,10 +128,9 @@ def test_brakes_that_are_not_known_are_tried_in_c_too(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["disc", "cars"])
 def test_it_asks_for_no_memory_and_little_of_the_stack(name, tmp_path):
-    cc = compiler()
     write_c99(c99.learnt(name).guard, tmp_path)
     for optimised in ("-O0", "-O2"):
-        command = [cc, *c99.FLAGS, optimised, "-fstack-usage", "-c", "evofsm.c"]
+        command = ["cc", *c99.FLAGS, optimised, "-fstack-usage", "-c", "evofsm.c"]
         subprocess.run(command, cwd=tmp_path, check=True)
         # All frames at once: more than any chain of calls, as nothing calls itself.
         frames = (tmp_path / "evofsm.su").read_text().splitlines()
@@ -207,6 +163,55 @@ def test_the_node_for_ros_2_compiles_and_decides(wall, tmp_path):
     expected = [wall.guard.decide(*each).executed for each in asked]
     assert [float(line[1]) for line in said if line[0] == "executed"] == expected
     assert [line[1] for line in said if line[0] == "error"] == ["1", "no"]
+
+
+def test_tools_load_an_fmu_and_step_it(wall, monkeypatch, tmp_path, caplog, capsys):
+    import fmpy
+    from fmpy.fmi1 import FMICallException
+    from fmpy.validation import validate_fmu
+
+    file = tmp_path / "my wall-2.fmu"
+    write_fmu(wall.guard, file)
+    assert validate_fmu(str(file)) == []
+    told, place = fmpy.read_model_description(file), fmpy.extract(file, tmp_path / "unit")
+    unit = fmpy.instantiate_fmu(place, told, "CoSimulation")
+    unit.setReal([0, 1, 2], [0.9, 0.1, 1.0])
+    for _ in range(3):  # it decides at the first of them
+        unit.doStep(0.0, wall.guard.interval / 3)
+        assert unit.getBoolean([6]) == [True]
+        unit.setReal([2], [0.0])
+    for value, step, why in ((0.0, 0.07, "a step has to be"), (math.inf, 0.1, "is infinite")):
+        unit.setReal([0], [value])
+        with pytest.raises(FMICallException):
+            unit.doStep(0.0, step)
+        assert why in capsys.readouterr().out
+    unit.freeInstance()
+    monkeypatch.setenv("CC", "no-such-compiler")
+    write_fmu(wall.guard, file)
+    assert fmpy.supported_platforms(file) == ["c-code"]
+    assert "holds sources alone" in caplog.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "episodes"), [("cars", 100), ("cartpole", 2), ("disc", 5)])
+def test_an_fmu_drives_as_python_does(name, episodes, tmp_path):
+    driven = c99.drive_fmu(c99.learnt(name), tmp_path, episodes)
+    assert driven.decisions > 100 * episodes
+    assert driven.others == 0
+
+
+@pytest.mark.slow
+def test_two_guards_are_linked_into_one_program(wall, tmp_path):
+    write_c99(wall.guard, tmp_path, "wall")
+    write_c99(c99.learnt("cars", episodes=0).guard, tmp_path, "cars")
+    (tmp_path / "main.cpp").write_text(
+        '#include <cmath>\n#include <cstdio>\n#include "wall.hpp"\n#include "cars.hpp"\n'
+        'int main() { std::printf("%d %d\\n", wall::Guard().decide({NAN, 0.0}, {1.0})->reason,'
+        " cars::Guard().decide({9.0, 30.0, 1.0}, {1.0})->reason - CARS_TRIED); }"
+    )
+    assert run_cpp(tmp_path, "main.cpp", "wall", "cars") == ["4 0"]
+    with pytest.raises(ValueError, match="'2nd' begins no name in C"):
+        write_c99(wall.guard, tmp_path, "2nd")
 
 
 @pytest.mark.slow

@@ -9,17 +9,15 @@ from typing import Annotated, Any, Literal
 from evofsm.cli.inspect import load_model
 from evofsm.cli.options import Saved, option
 
-# How logs of runs begin.
-_MCAP = b"\x89MCAP"
-
 
 def export(
     file: Saved,
     to: Annotated[
-        Literal["dot", "prism", "c99"],
-        option("Graph for Graphviz (dot), process for PRISM and Storm, or the guard in C."),
+        Literal["dot", "prism", "c99", "fmu"],
+        option("Graph for Graphviz, process for PRISM and Storm; the guard in C, or as an FMU."),
     ],
     out: Annotated[Path | None, option("File to write, else printed; of c99 a folder.")] = None,
+    prefix: Annotated[str, option("Of c99: how all names in it begin.")] = "evofsm",
     least: Annotated[
         float | None,
         option("Leave out what is less probable. [default: dot 0.001]", min=0.0, max=1.0),
@@ -29,24 +27,24 @@ def export(
     ] = None,
 ) -> None:
     """Write what was learnt, or driven, in the formats of other tools."""
-    if to == "c99":
+    _refuse_learnt(out)
+    if to in ("c99", "fmu"):
         from evofsm.guard import Guard
-        from evofsm.guard.export import write_c99
+        from evofsm.guard.export import write_c99, write_fmu
 
         if out is None:
-            raise ValueError("--to c99 writes three files: name a folder by --out")
-        place = file / "guard.evofsm" if file.is_dir() else file
-        return write_c99(Guard.load(place, failed=lambda seen: False), out)
-    _refuse_learnt(out)
+            raise ValueError(f"--to {to} prints nothing: name a file, of c99 a folder, by --out")
+        saved = file / "guard.evofsm" if file.is_dir() else file
+        guard = Guard.load(saved, failed=lambda seen: False)
+        return write_c99(guard, out, prefix) if to == "c99" else write_fmu(guard, out)
     from evofsm import store
     from evofsm.fsm.naming import visible
     from evofsm.io import graphs
 
     model, dead_ends = _learnt(file)
-    bounds = ("least", least), ("evidence", evidence)
-    given = {name: bound for name, bound in bounds if bound is not None}
-    drawn = {} if to == "prism" else {"dead_ends": dead_ends}
-    text = visible(getattr(graphs, f"to_{to}")(model, **given, **drawn))
+    drawn = {"least": least, "evidence": evidence, "dead_ends": dead_ends if to == "dot" else None}
+    given = {name: one for name, one in drawn.items() if one is not None}
+    text = visible(getattr(graphs, f"to_{to}")(model, **given))
     if out is None:
         sys.stdout.write(text)
         return
@@ -60,7 +58,7 @@ def _refuse_learnt(out: Path | None) -> None:
 
     if out is None or not out.is_file():
         return
-    if not out.read_bytes().startswith(_MCAP):
+    if not out.read_bytes().startswith(b"\x89MCAP"):  # as logs of runs do
         try:
             read_header(out)
         except ValueError:

@@ -1,20 +1,32 @@
 """A frozen guard in C99: no heap, no recursion, every loop bounded; it decides as it does here.
 
+An FMU is the same C, compiled where a compiler is, with ``fmi2.c`` around it.
+
 The C stands beside the Python that it mirrors: ``guard.c`` is the loop, ``learnt/replay.c`` and
 ``driving/judge.c`` are judges. What was learnt comes before it, as constants.
 """
 
 from __future__ import annotations
 
+import hashlib
+import logging
 import math
+import os
 import re
-from collections.abc import Mapping
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from evofsm import __version__, store
+from evofsm.fsm.naming import visible
 from evofsm.fsm.rules import weights_of
 from evofsm.guard import guard as looping
 from evofsm.guard import reviser as revising
@@ -26,11 +38,13 @@ from evofsm.guard.reviser import ActionReviser, Mode
 
 # Replays of disturbances lie side by side by so many; NumPy sums so many numbers as the C does.
 _LANES, _MOST_DISTURBANCES = 4, 128
-_BANNER = f"/* Exported by evofsm {__version__}, no certified safety function.\n   "
 # Bytes of the stack, but for what numbers of actions and lanes add; a test holds it to compilers.
 _STACK = 2048
 # In place of 1 / width of recognition where that would overflow.
 _SHARPEST = 1e300
+# How libraries in an FMU end, by system; and how they are compiled here.
+_LIBRARIES = {"darwin": "dylib", "win32": "dll"}
+_FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-fvisibility=hidden", "-shared")
 
 
 class Part(NamedTuple):
@@ -43,12 +57,52 @@ class Part(NamedTuple):
     about: str  #: for people, in the header
 
 
-def write_c99(guard: Guard, folder: Path) -> None:
+def write_c99(guard: Guard, folder: Path, prefix: str = "evofsm") -> None:
     """Write ``evofsm.h``, ``evofsm.c``, and ``evofsm.hpp``, a class around them for C++17.
 
-    A ValueError if its reviser or judge is of someone's own class, it judges nothing (mode off),
-    nothing was learnt yet by which it could decide, or it steps back or may do harm.
+    With another prefix, files and all names in them begin with that: two guards in one program need
+    two. A ValueError if its reviser or judge is of someone's own class, it judges nothing (mode
+    off), nothing was learnt yet by which it could decide, or it steps back or may do harm.
     """
+    if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", prefix):
+        raise ValueError(f"the prefix {prefix!r} begins no name in C: take letters, digits and _")
+    texts = _texts(guard)
+    folder.mkdir(parents=True, exist_ok=True)
+    for ending in ("h", "hpp", "c"):
+        text = re.sub(r"evofsm(?! \d)", prefix, texts[f"evofsm.{ending}"])
+        with store.replacing(folder / f"{prefix}.{ending}") as place:
+            place.write(text.replace("EVOFSM", prefix.upper()).encode())
+
+
+def write_fmu(guard: Guard, file: Path) -> None:
+    """Write an FMU (FMI 2.0, co-simulation), compiled where a C compiler is at hand.
+
+    Its sources are in it, so that it can be built for others. A ValueError as of `write_c99`.
+    """
+    name = re.sub(r"^(?=\d)|\W", "_", file.stem, flags=re.ASCII)
+    texts, library = _texts(guard, name), f"{name}.{_LIBRARIES.get(sys.platform, 'so')}"
+    with tempfile.TemporaryDirectory() as place, store.replacing(file) as written:
+        folder = Path(place)
+        for each, text in texts.items():
+            (folder / each).write_text(text, "utf-8")
+        with suppress(OSError):  # there is no compiler
+            command = (os.environ.get("CC") or "cc", *_FLAGS, "-o", library)
+            subprocess.run([*command, "evofsm.c", "fmi2.c", "-lm"], cwd=place, check=False)
+        with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as unit:
+            unit.write(folder / "modelDescription.xml", "modelDescription.xml")
+            for each in ("evofsm.h", "evofsm.c", "fmi2.c"):
+                unit.write(folder / each, f"sources/{each}")
+            if (folder / library).exists():
+                unit.write(
+                    folder / library, f"binaries/{sys.platform.removesuffix('32')}64/{library}"
+                )
+            else:
+                said = "%s holds sources alone: no C compiler built it here (cc, CC)"
+                logging.getLogger(__name__).warning(said, file)
+
+
+def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
+    """All files by their names; and of an FMU by its own."""
     frozen = guard.copy()
     frozen.freeze()
     reviser, asked = frozen.reviser, type(getattr(frozen.reviser, "risk", None))
@@ -68,27 +122,43 @@ def write_c99(guard: Guard, folder: Path) -> None:
     part: Part = _learnt(reviser) if asked is LearntRisk else reviser.risk.in_c99(reviser)  # type: ignore[attr-defined]
     common, judge = _sections(Path(__file__).with_name("guard.c")), _sections(part.template)
     sizes, constants = _common(frozen, reviser, part.variables)
-    sizes = {f"EVOFSM_{name}": value for name, value in {**sizes, **part.sizes}.items()}
-    sizes["EVOFSM_STACK"] = (
-        _STACK + 64 * part.sizes.get("NUMBERS", 0) + 32 * part.sizes.get("LANES", 0)
-    )
-    header = common["evofsm.h"].replace("  EVOFSM_JUDGE\n", judge["state"])
-    named = ", ".join(reviser.risk.labels.names) or "variables in their order"
-    about = f"{frozen}\nan observation: {named}\n{part.about}".replace("*/", "* /").replace(
-        "\n", "\n   "
-    )
+    sizes |= part.sizes
+    sizes["STACK"] = _STACK + 64 * sizes.get("NUMBERS", 0) + 32 * sizes.get("LANES", 0)
+    m, a, names = sizes["VARIABLES"], sizes["ACTIONS"], reviser.risk.labels.names
+    seen = ", ".join(names) or "variables in their order"
+    told = f"{frozen}\nan observation: {seen}\n{part.about}"
+    learnt = _written({**constants, **part.constants})
     texts = {
-        "evofsm.h": f"{_BANNER}{about} */\n#ifndef EVOFSM_H\n#define EVOFSM_H\n\n"
-        f"{_written(sizes)}\n{header}\n#endif\n",
-        "evofsm.hpp": common["evofsm.hpp"],
-        "evofsm.c": '#include "evofsm.h"\n\n#include <math.h>\n#include <stddef.h>\n\n'
-        f"{_written({**constants, **part.constants})}\n"
-        f"{common['helpers']}{judge['source']}\n{common['loop']}",
+        "TOOL": f"evofsm {__version__}",
+        "ABOUT": told.replace("*/", "* /").replace("\n", "\n   "),
+        "SIZES": _written({f"EVOFSM_{name}": value for name, value in sizes.items()}),
+        "STATE": judge["state"],
+        "CONSTANTS": learnt,
+        "SOURCE": judge["source"],
+        "NAME": unit,
+        "GUID": hashlib.sha256(learnt.encode()).hexdigest(),
+        "STEP": repr(guard.interval),
+        "VARIABLES": _variables(names or range(m), a, whole=sizes["CHOICES"] > 0),
+        "OUTPUTS": "".join(f'<Unknown index="{m + a + k}"/>' for k in range(1, a + 4)),
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        with store.replacing(folder / name) as place:
-            place.write(text.encode())
+    pattern = re.compile("UNIT_([A-Z]+)")
+    return {of: pattern.sub(lambda found: texts[found[1]], text) for of, text in common.items()}
+
+
+def _variables(names: Sequence[object], a: int, *, whole: bool) -> str:
+    """Variables of an FMU for its description, in the order of ``fmi2.c``."""
+    m, seen = len(names), [f"observation[{name}]" for name in names]
+    acts = [f"{what}[{i}]" for what in ("proposal", "executed") for i in range(a)]
+    kinds = (
+        ["Real"] * m + ["Integer" if whole else "Real"] * (2 * a) + ["Real", "Integer", "Boolean"]
+    )
+    how = ['"input"'] * (m + a) + ['"output" initial="exact"'] * (a + 3)
+    every = zip([*seen, *acts, "risk", "reason", "revised"], kinds, how, strict=True)
+    return "".join(
+        f'    <ScalarVariable name={quoteattr(visible(name))} valueReference="{k}" '
+        f'causality={causality} variability="discrete"><{kind} start="0"/></ScalarVariable>\n'
+        for k, (name, kind, causality) in enumerate(every)
+    )
 
 
 def _sections(template: Path) -> dict[str, str]:
@@ -112,10 +182,8 @@ def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any
         "ACTS": reviser.acts,
         "LACKING": int(looping._LACKING.get(guard.missing, 0)),
         "LONGEST_GAP": looping._GAP * guard.interval,
-        "NEW": revising._NEW,
         "TOLERANCE": reviser.tolerance,
-        "RELEASE": revising._RELEASE,
-        "TRIAL": revising._TRIAL,
+        **{name: getattr(revising, f"_{name}") for name in ("NEW", "RELEASE", "TRIAL")},
         "action_low": low,
         "action_high": high,
         "fallback": np.atleast_1d(put_into(actions, reviser.fallback.action)),
@@ -190,9 +258,7 @@ def _learnt(reviser: ActionReviser) -> Part:
 
 
 # Constants of replays, and arrays of a model, that C has, too.
-_OF_REPLAYS = (
-    *("_FARTHER", "_RESERVE", "_DISTANCE", "_FAR", "_HALVINGS", "_EQUAL", "FLAT", "GROWN"),
-)
+_OF_REPLAYS = ["_FARTHER", "_RESERVE", "_DISTANCE", "_FAR", "_HALVINGS", "_EQUAL", "FLAT", "GROWN"]
 _OF_JUMPS = ("jump_at", "jump_to", "jump_slope", "jump_from", "landing")
 _OF_MODEL = (
     *("weights", "origin", "reach", "lowest", "highest", "least", "most", "thresholds", "regions"),

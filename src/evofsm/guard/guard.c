@@ -1,8 +1,14 @@
-/* What is the same for every judge: guard.py and reviser.py in C, in three files.
+/* What is the same for every judge: guard.py and reviser.py in C, in three files; and an FMU.
 
    `evofsm export` (export.py) puts what was learnt before it. Whoever changes a rule in Python
    changes it here; tests/guard/test_export.py holds the two together. */
 /* ==== evofsm.h ==== */
+/* Exported by UNIT_TOOL, no certified safety function.
+   UNIT_ABOUT */
+#ifndef EVOFSM_H
+#define EVOFSM_H
+
+UNIT_SIZES
 #ifdef __cplusplus
 extern "C" {
 #endif
@@ -62,8 +68,7 @@ typedef struct {
   double belief[EVOFSM_STATES > 0 ? EVOFSM_STATES : 1]; /* distribution over states */
   double proposal[EVOFSM_ACTIONS], best[EVOFSM_ACTIONS];
   int state;
-  EVOFSM_JUDGE
-} evofsm_state;
+UNIT_STATE} evofsm_state;
 
 /* An episode begins with the next decision. To be called before the first one, too. */
 void evofsm_reset(evofsm_state *state);
@@ -78,6 +83,8 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
 
 #ifdef __cplusplus
 }
+#endif
+
 #endif
 /* ==== evofsm.hpp ==== */
 #ifndef EVOFSM_HPP
@@ -124,12 +131,18 @@ class Guard {
 }  // namespace evofsm
 
 #endif
-/* ==== helpers ==== */
+/* ==== evofsm.c ==== */
+#include "evofsm.h"
+
+#include <math.h>
+#include <stddef.h>
+
+UNIT_CONSTANTS
 /* As Python has them: of equals, and beside NaN, the first. */
 static double lesser(double one, double other) { return other < one ? other : one; }
 static double greater(double one, double other) { return other > one ? other : one; }
 
-/* ==== loop ==== */
+UNIT_SOURCE
 /* -- States: recognise of clusters.py --------------------------------------------------------- */
 
 /* Where it is by all that is held, if that is whole. At most EVOFSM_STATES exponentials. */
@@ -277,3 +290,247 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
   }
   return EVOFSM_OK;
 }
+/* ==== modelDescription.xml ==== */
+<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="2.0" modelName="UNIT_NAME" guid="UNIT_GUID"
+    description="A frozen guard, no certified safety function. In: observation, proposal. Out: what is
+executed, its risk of failure (NaN: not judged), the reason (0: the proposal passes; else as in
+sources/evofsm.h), whether it was revised." generationTool="UNIT_TOOL">
+  <CoSimulation modelIdentifier="UNIT_NAME" canNotUseMemoryManagementFunctions="true">
+    <SourceFiles>
+      <File name="evofsm.c"/>
+      <File name="fmi2.c"/>
+    </SourceFiles>
+  </CoSimulation>
+  <LogCategories>
+    <Category name="logStatusError"/>
+  </LogCategories>
+  <DefaultExperiment stepSize="UNIT_STEP"/>
+  <ModelVariables>
+UNIT_VARIABLES  </ModelVariables>
+  <ModelStructure>
+    <Outputs>UNIT_OUTPUTS</Outputs>
+  </ModelStructure>
+</fmiModelDescription>
+/* ==== fmi2.c ==== */
+/* The guard as a unit of FMI 2.0 for co-simulation. Types and functions are those of the standard
+   (fmi2TypesPlatform.h "default", fmi2FunctionTypes.h); what does not apply here is an error. */
+#include <math.h>
+#include <stddef.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "evofsm.h"
+
+#if defined _WIN32
+#define EXPORT __declspec(dllexport)
+#elif defined __GNUC__
+#define EXPORT __attribute__((visibility("default")))
+#else
+#define EXPORT
+#endif
+
+typedef enum { fmi2OK, fmi2Warning, fmi2Discard, fmi2Error, fmi2Fatal, fmi2Pending } fmi2Status;
+typedef struct {
+  void (*logger)(void *environment, const char *instance, fmi2Status status, const char *category,
+                 const char *message, ...);
+  void *(*allocate)(size_t count, size_t size);
+  void (*release)(void *memory);
+  void (*finished)(void *environment, fmi2Status status);
+  void *environment;
+} fmi2CallbackFunctions;
+
+/* Value references: an observation, a proposal; what is executed, risk, reason, whether revised. */
+enum {
+  PROPOSAL = EVOFSM_VARIABLES,
+  EXECUTED = PROPOSAL + EVOFSM_ACTIONS,
+  RISK = EXECUTED + EVOFSM_ACTIONS,
+  REASON,
+  REVISED,
+  VALUES
+};
+
+typedef struct {
+  evofsm_state state;
+  double values[VALUES];
+  double wait; /* steps until the next decision */
+  fmi2CallbackFunctions callbacks;
+  char name[128];
+} unit;
+
+static fmi2Status fail(const unit *of, const char *message) {
+  if (of->callbacks.logger != NULL) {
+    of->callbacks.logger(of->callbacks.environment, of->name, fmi2Error, "logStatusError", "%s",
+                         message);
+  }
+  return fmi2Error;
+}
+
+static fmi2Status lacks(int count, ...) {
+  (void)count;
+  return fmi2Error;
+}
+
+static fmi2Status fine(int count, ...) {
+  (void)count;
+  return fmi2OK;
+}
+
+EXPORT const char *fmi2GetTypesPlatform(void) { return "default"; }
+
+EXPORT const char *fmi2GetVersion(void) { return "2.0"; }
+
+EXPORT fmi2Status fmi2SetDebugLogging(void *c, int on, size_t count, const char *const names[]) {
+  return fine(4, c, on, count, names); /* errors alone are told, and always */
+}
+
+EXPORT fmi2Status fmi2Reset(void *c) {
+  unit *of = c;
+  evofsm_reset(&of->state);
+  memset(of->values, 0, sizeof of->values);
+  of->wait = 0.0;
+  return fmi2OK;
+}
+
+EXPORT void *fmi2Instantiate(const char *name, int kind, const char *guid, const char *resources,
+                             const fmi2CallbackFunctions *callbacks, int visible, int logging) {
+  unit *of = calloc(1, sizeof *of);
+  fine(3, resources, visible, logging);
+  if (of == NULL) {
+    return NULL;
+  }
+  of->callbacks = *callbacks;
+  snprintf(of->name, sizeof of->name, "%s", name);
+  if (kind != 1 || strcmp(guid, "UNIT_GUID") != 0) {
+    fail(of, kind != 1 ? "this unit is for co-simulation" : "modelDescription.xml is of another one");
+    free(of);
+    return NULL;
+  }
+  fmi2Reset(of);
+  return of;
+}
+
+EXPORT void fmi2FreeInstance(void *c) { free(c); }
+
+EXPORT fmi2Status fmi2SetupExperiment(void *c, int bounded, double tolerance, double start,
+                                      int ends, double stop) {
+  return fine(6, c, bounded, tolerance, start, ends, stop);
+}
+
+EXPORT fmi2Status fmi2EnterInitializationMode(void *c) { return fine(1, c); }
+
+EXPORT fmi2Status fmi2ExitInitializationMode(void *c) { return fine(1, c); }
+
+EXPORT fmi2Status fmi2Terminate(void *c) { return fine(1, c); }
+
+/* Decide on the inputs as they stand. Steps are as long as the guard's interval, or a whole part of
+   it: then it decides at the first of them. */
+EXPORT fmi2Status fmi2DoStep(void *c, double time, double step, int no_return) {
+  unit *of = c;
+  const double *proposal = of->values + PROPOSAL, steps = floor(EVOFSM_INTERVAL / step + 0.5);
+  evofsm_decision decision;
+  int i, rc;
+  fine(2, time, no_return);
+  if (!(steps >= 1.0) || !(fabs(steps * step / EVOFSM_INTERVAL - 1.0) <= 1e-6)) {
+    return fail(of, "a step has to be as long as stepSize in modelDescription.xml, or a whole part");
+  }
+  if (of->wait >= 1.0) {
+    of->wait -= 1.0;
+    return fmi2OK;
+  }
+  rc = evofsm_decide(&of->state, of->values, proposal, &decision);
+  if (rc != EVOFSM_OK) {
+    return fail(of, rc == EVOFSM_MISSING ? "an observation is NaN, which this guard rejects"
+                                         : "an observation is infinite; NaN says not seen");
+  }
+  of->wait = steps - 1.0;
+  of->values[RISK] = decision.risk_executed;
+  of->values[REASON] = decision.reason;
+  of->values[REVISED] = 0.0;
+  for (i = 0; i < EVOFSM_ACTIONS; i++) {
+    of->values[EXECUTED + i] = decision.executed[i];
+    of->values[REVISED] = decision.executed[i] == proposal[i] ? of->values[REVISED] : 1.0;
+  }
+  return fmi2OK;
+}
+
+#define GET(Type, type)                                                                       \
+  EXPORT fmi2Status fmi2Get##Type(void *c, const unsigned at[], size_t count, type values[]) { \
+    size_t i;                                                                                 \
+    for (i = 0; i < count; i++) {                                                             \
+      if (at[i] >= VALUES) {                                                                  \
+        return fail(c, "there is no variable with this value reference");                     \
+      }                                                                                       \
+      values[i] = (type)((unit *)c)->values[at[i]];                                           \
+    }                                                                                         \
+    return fmi2OK;                                                                            \
+  }
+#define SET(Type, type)                                                                             \
+  EXPORT fmi2Status fmi2Set##Type(void *c, const unsigned at[], size_t count, const type values[]) { \
+    size_t i;                                                                                       \
+    for (i = 0; i < count; i++) {                                                                   \
+      if (at[i] >= EXECUTED) {                                                                      \
+        return fail(c, "there is no input with this value reference");                              \
+      }                                                                                             \
+      ((unit *)c)->values[at[i]] = values[i];                                                       \
+    }                                                                                               \
+    return fmi2OK;                                                                                  \
+  }
+GET(Real, double)
+GET(Integer, int)
+GET(Boolean, int)
+SET(Real, double)
+SET(Integer, int)
+
+/* -- What does not apply -------------------------------------------------------------------------- */
+
+#define REFUSE(Name, type)                                                                \
+  EXPORT fmi2Status fmi2##Name(void *c, const unsigned at[], size_t count, type values) { \
+    return lacks(4, c, at, count, values);                                                \
+  }
+REFUSE(SetBoolean, const int *)
+REFUSE(SetString, const char *const *)
+REFUSE(GetString, const char **)
+#define OF_STATE(Name, type) \
+  EXPORT fmi2Status fmi2##Name(void *c, type state) { return lacks(2, c, state); }
+OF_STATE(GetFMUstate, void **)
+OF_STATE(SetFMUstate, void *)
+OF_STATE(FreeFMUstate, void **)
+#define STATUS(Name, type) \
+  EXPORT fmi2Status fmi2Get##Name(void *c, int kind, type *value) { return lacks(3, c, kind, value); }
+STATUS(Status, fmi2Status)
+STATUS(RealStatus, double)
+STATUS(IntegerStatus, int)
+STATUS(BooleanStatus, int)
+STATUS(StringStatus, const char *)
+
+EXPORT fmi2Status fmi2SerializedFMUstateSize(void *c, void *state, size_t *size) {
+  return lacks(3, c, state, size);
+}
+
+EXPORT fmi2Status fmi2SerializeFMUstate(void *c, void *state, char bytes[], size_t size) {
+  return lacks(4, c, state, bytes, size);
+}
+
+EXPORT fmi2Status fmi2DeSerializeFMUstate(void *c, const char bytes[], size_t size, void **state) {
+  return lacks(4, c, bytes, size, state);
+}
+
+EXPORT fmi2Status fmi2GetDirectionalDerivative(void *c, const unsigned of[], size_t count,
+                                               const unsigned by[], size_t others,
+                                               const double along[], double found[]) {
+  return lacks(7, c, of, count, by, others, along, found);
+}
+
+EXPORT fmi2Status fmi2SetRealInputDerivatives(void *c, const unsigned at[], size_t count,
+                                              const int order[], const double values[]) {
+  return lacks(5, c, at, count, order, values);
+}
+
+EXPORT fmi2Status fmi2GetRealOutputDerivatives(void *c, const unsigned at[], size_t count,
+                                               const int order[], double values[]) {
+  return lacks(5, c, at, count, order, values);
+}
+
+EXPORT fmi2Status fmi2CancelStep(void *c) { return lacks(1, c); }
