@@ -188,7 +188,7 @@ def experience(
     ...     revision = guard.decide([5.0, speed], proposal=1.0)
     >>> guard.end(failed=True, observation=[5.0, 0.6])
     >>> plot.experience(guard, Figure().subplots(), variables=(1, 0)).get_xlabel()
-    'variable 1'
+    'variable 2'
     """
     judge = guard.judge
     if not isinstance(judge, LearntRisk) or not judge.dynamics.n_variables:
@@ -236,7 +236,7 @@ def experience(
         "state": {"marker": "o", "fillstyle": "none", "color": ink()},
     }
     if elsewhere := sorted({*tell} - {*pair}):
-        looks[f"not in view: failure by {', '.join(map(called, elsewhere))}"] = {"marker": ""}
+        looks[f"not in view: fails by {', '.join(map(called, elsewhere))}"] = {"marker": ""}
     look = {"linestyle": "none"}
     _explain(ax, [Line2D([], [], label=name, **{**look, **one}) for name, one in looks.items()])
     ax.set(xlabel=called(pair[0]), ylabel=called(pair[1]))
@@ -348,7 +348,7 @@ def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = No
 def _explain(ax: Axes, handles: Sequence[Line2D] | None = None) -> None:
     """Put the legend above, where it hides nothing."""
     look: Look = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2}
-    look |= {"fontsize": points(7.5), "frameon": False, "ncols": 3}
+    look |= {"fontsize": points(7.5), "frameon": False, "ncols": 2 if handles else 3}
     ax.legend(handles=handles or ax.get_legend_handles_labels()[0], **look)
 
 

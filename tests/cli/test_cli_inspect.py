@@ -78,3 +78,14 @@ def test_a_table_that_is_wider_than_the_terminal_loses_no_column(evofsm, monkeyp
     monkeypatch.setenv("COLUMNS", "40")
     show(table("Wide", ["speed"] * 20, [["12345.2"] * 20]))
     assert capsys.readouterr().out.count("12345.2") == 20
+
+
+def test_what_a_guard_has_learnt_is_said_and_drawn(evofsm, refused, tmp_path):
+    guard, file, drawn = Guard(-1.0, 1.0, interval=0.1), tmp_path / "guard", tmp_path / "x.svg"
+    guard.decide([5.0, 0.3], proposal=1.0)
+    guard.end(failed=True, observation=[5.0, 0.6])
+    guard.save(file)
+    said = evofsm("inspect", file, "--plot", drawn, "--axes", "variable 2,variable 1").stdout
+    assert "experience    fails where variable 2 is above 0.3" in said
+    assert "<svg" in drawn.read_text()
+    assert "name two of variable 1" in refused("inspect", file, "--plot", drawn, "--axes", "x")

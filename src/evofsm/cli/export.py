@@ -68,12 +68,10 @@ def _refuse_learnt(out: Path | None) -> None:
 
 def _learnt(file: Path) -> tuple[Any, list[int] | None]:
     """The model, and its dead ends where the risk that was learnt with it is known."""
-    from evofsm.cli.driving import GUARD
     from evofsm.driving import LatentRisk, assess_states
-    from evofsm.guard import Guard
 
-    model, _ = load_model(file)
-    judge = Guard.load(file / GUARD).judge if (file / GUARD).exists() else None
+    model, _, guard = load_model(file)
+    judge = guard and guard.judge
     if not isinstance(judge, LatentRisk):
         return model, None
     return model, [one.state for one in assess_states(model, judge) if one.is_dead_end]

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from evofsm.cli.options import Json, Saved, option, require
+from evofsm.cli.options import Json, Saved, option, require, split_names
 from evofsm.cli.show import facts, print_json, say, show, table
 
 if TYPE_CHECKING:
@@ -18,12 +18,11 @@ if TYPE_CHECKING:
 
     from evofsm.fsm.explanation import Explanation
     from evofsm.fsm.model import FSMModel
+    from evofsm.guard import Guard
     from evofsm.store import Header
 
 # What folders of results hold, in the order in which it is looked for.
 _MODELS = ("guard.evofsm", "model.evofsm")
-# So many files that something was learnt from are named.
-_MOST_FILES = 3
 # So many states are listed, those with most of the time.
 _MOST_STATES = 20
 _UNTOLD = (
@@ -32,34 +31,40 @@ _UNTOLD = (
 )
 
 
-def inspect(file: Saved, as_json: Json = False) -> None:
-    """Print what was learnt: states, the transitions that matter, actions.
+def inspect(
+    file: Saved,
+    plot: Annotated[Path | None, option("File for a picture: PNG, PDF, SVG.")] = None,
+    axes: Annotated[str | None, option("Two variables, of --plot.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Print what was learnt: states, the transitions that matter, where a guard's system fails.
 
     evofsm explain says what came of one situation.
     """
-    model, header = load_model(file)
+    model, header, guard = load_model(file)
+    if plot is not None:
+        _draw(model, guard, plot, axes)
     provenance = {} if header is None else header.provenance
+    told = getattr(guard and guard.judge, "told_by_experience", None)
+    known = [] if told is None else [("experience", str(told))]
     if as_json:
-        print_json({"file": file, **model_document(model), "provenance": provenance})
+        own = {"file": file, "provenance": provenance, **dict(known)}
+        print_json({**own, **model_document(model)})
         return
     of_file = [("file", str(file))]
     if header is not None:
-        goes_on = ", a machine that can go on learning" if header.kind == "machine" else ""
-        of_file = [("file", f"{file}{goes_on}"), ("written by", f"evofsm {header.library}")]
-    of_file += _learnt_from(provenance)
-    show(facts("Model", [*of_file, *_model_facts(model)]), *tables_of(model))
-    show("", _actions(model))
+        of_file.append(("holds", f"a {header.kind}, written by evofsm {header.library}"))
+    of_file += [*_learnt_from(provenance), *_model_facts(model), *known]
+    show(facts("Model", of_file), *tables_of(model))
 
 
-def load_model(place: Path) -> tuple[FSMModel, Header | None]:
-    """A model from wherever one was left, and what its file says of itself, if there is one.
-
-    A machine that drove a family of scenarios is labelled as that family is.
-    """
+def load_model(place: Path) -> tuple[FSMModel, Header | None, Guard | None]:
+    """A model from wherever one was left, what its file says of itself, and the guard it is of."""
     from evofsm import store
     from evofsm.driving import FAMILIES, load_family
     from evofsm.fsm.machine import EvolvingFSM
     from evofsm.fsm.model import FSMModel
+    from evofsm.fsm.naming import Labels
     from evofsm.guard import Guard
 
     if place.is_dir():
@@ -74,19 +79,44 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None]:
         model = read_run(place).model
         if model is None:
             raise ValueError(f"{place}: no model is attached to this log")
-        return model, None
-    header = store.read_header(place)
+        return model, None, None
+    header, guard = store.read_header(place), None
     if header.kind == "guard":
-        machine = Guard.load(place, failed=lambda seen: False).machine
+        guard = Guard.load(place, failed=lambda seen: False)
+        machine = guard.machine
         if machine is None:
             raise ValueError(f"{place}: this guard has no machine")
     elif header.kind == "machine":
         machine = EvolvingFSM.load(place)
     else:
-        return FSMModel.load(place), header
+        return FSMModel.load(place), header, None
     family = str(header.provenance.get("family"))
-    labels = load_family(family).labels._asdict() if family in FAMILIES else {}
-    return machine.model(**labels), header
+    labels = getattr(guard and guard.judge, "labels", Labels())
+    if family in FAMILIES:
+        labels = load_family(family).labels
+    return machine.model(**labels._asdict()), header, guard
+
+
+def _draw(model: FSMModel, guard: Guard | None, out: Path, axes: str | None) -> None:
+    """States in the plane of two variables, and what a guard has learnt of failure."""
+    require(matplotlib="plot")
+    from matplotlib.figure import Figure
+    from matplotlib.style import context
+
+    from evofsm import plot
+    from evofsm.guard import LearntRisk
+
+    names = [model.labels.variable(k).split(" [")[0] for k in range(model.n_variables)]
+    pair: Any = [names.index(one) for one in split_names(axes or "") if one in names]
+    if len(pair) != 2 * (axes is not None):
+        raise ValueError(f"--axes is {axes}; name two of {', '.join(names)}")
+    with context(["default", "evofsm.paper.house"]):
+        figure = Figure((7.2, 5.0), layout="constrained")
+        if guard is not None and isinstance(guard.judge, LearntRisk):
+            plot.experience(guard, figure.subplots(), variables=pair or None)
+        else:
+            plot.states(model, figure.subplots(), variables=pair or (0, 1))
+        figure.savefig(out)
 
 
 # -- As a whole -----------------------------------------------------------------------------------
@@ -150,9 +180,7 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
 
     total = max(float(model.visits.sum()), 1.0)
     stays = np.diag(model.changes) / np.maximum(model.changes.sum(axis=1), 1.0)
-    names = model.names or [f"variable {j + 1}" for j in range(model.n_variables)]
-    units = model.units or [""] * model.n_variables
-    heads = map(with_unit, names, units)
+    heads = map(model.labels.variable, range(model.n_variables))
     centers = zip(*map(_aligned, model.centers.T), strict=True)
     states = [
         (f"#{i + 1}", *center, f"{visits / total:.1%}", f"{stays[i]:.3f}", f"{created:,.0f}")
@@ -163,11 +191,8 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
     title = "States (stays: share of its steps; first seen: at which row)"
     most = sorted(np.argsort(-model.visits, kind="stable")[:_MOST_STATES].tolist())
     yield ""
-    yield table(
-        title,
-        ("", *heads, "share of time", "stays", "first seen"),
-        [states[k] for k in most],
-    )
+    header = ("", *heads, "share of time", "stays", "first seen")
+    yield table(title, header, [states[k] for k in most])
     if (others := model.n_states - len(most)) > 0:
         share = 1.0 - float(model.visits[most].sum()) / total
         yield (
@@ -191,18 +216,14 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
     )
 
 
-def with_unit(name: str, unit: str) -> str:
-    """A name, and in brackets its unit where that is known."""
-    return f"{name} [{unit}]" if unit else name
-
-
 def _model_facts(model: FSMModel) -> list[tuple[str, str]]:
     settings = ", ".join(f"{name} {value:g}" for name, value in model.settings.items())
     step = "the step is not known" if model.dt is None else f"one every {model.dt:g} s"
     failures = f"{model.endings.sum():,.0f} episodes ended in one"
+    actions = f"{model.labels.action(0)} to {model.labels.action(model.n_actions - 1)}"
     return [
         ("observations", f"{model.visits.sum():,.0f}, {step}"),
-        ("transitions", f"{model.uses.sum():,.0f}, under {model.n_actions} actions"),
+        ("transitions", f"{model.uses.sum():,.0f}, under actions {actions}"),
         ("states", f"{model.n_states}, of {model.n_variables} variables"),
         ("settings", settings or "not known"),
         ("failures", failures if model.failures_told else "which there were is not known"),
@@ -216,25 +237,10 @@ def _learnt_from(provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             continue
         text = f"{value:,}" if isinstance(value, int) else str(value)
         if name == "files":
-            shown = [f"{file['name']} ({file['bytes']:,} bytes)" for file in value[:_MOST_FILES]]
-            more = len(value) - _MOST_FILES
-            text = ", ".join(shown) + (f" and {more:,} more" if more > 0 else "")
+            more = f" and {len(value) - 3:,} more" if len(value) > 3 else ""
+            text = ", ".join(file["name"] for file in value[:3]) + more
         is_amount = name in ("files", "rows", "episodes", "transitions")
         yield f"learnt from {name}" if is_amount else name, text
-
-
-def _actions(model: FSMModel) -> RenderableType:
-    total = max(float(model.uses.sum()), 1.0)
-    rows = [
-        (_action(model, r), f"{uses:,.0f}", f"{uses / total:.1%}")
-        for r, uses in enumerate(model.uses.tolist())
-    ]
-    return table("Actions", ("action", "used", "share"), rows)
-
-
-def _action(model: FSMModel, r: int) -> str:
-    number = f"a({r + 1})"
-    return f"{number:6}{model.actions.label(r)}" if model.actions else number
 
 
 def _aligned(values: NDArray[np.float64]) -> list[str]:
@@ -263,7 +269,7 @@ def explain(
     """
     if (observation is None) == (state is None):
         raise ValueError("name one situation, by --observation or by --state")
-    model, _ = load_model(file)
+    model, *_ = load_model(file)
     done = None if action is None else _index("--action", action, model.n_actions)
     if observation is not None:
         found = [model.explain(action=done, observation=_values(observation))]
@@ -282,13 +288,10 @@ def explain(
 
 def _index(option: str, number: object, count: int) -> int:
     """From what people count from 1."""
-    try:
-        index = int(str(number).removeprefix("#")) - 1
-    except ValueError:
-        index = -1
-    if not 0 <= index < count:
+    digits = str(number).removeprefix("#")
+    if not (digits.isdecimal() and 1 <= int(digits) <= count):
         raise ValueError(f"{option} is {number}; there are 1 to {count}")
-    return index
+    return int(digits) - 1
 
 
 def _values(text: str) -> list[float]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
-from evofsm.cli.inspect import model_document, tables_of, with_unit
+from evofsm.cli.inspect import model_document, tables_of
 from evofsm.cli.options import (
     BRAKES,
     TOLERANCE,
@@ -372,8 +372,8 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     from evofsm.guard import LearntRisk
 
     assert guard.judge is not None
-    units = guard.judge.labels.units
-    keys = ", ".join(map(with_unit, ("time", *guard.variables), ("s", *units)))
+    names = map(guard.judge.labels.variable, range(len(guard.variables)))
+    keys = ", ".join(["time [s]", *names])
     takes = f"evofsm monitor --guard {path} takes rows of {keys}, and proposal, the action."
     yield f"The guard was saved to {path}. {takes}"
     if not isinstance(guard.judge, LearntRisk):

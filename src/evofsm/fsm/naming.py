@@ -70,7 +70,7 @@ class Labels(NamedTuple):
     def variable(self, index: int) -> str:
         """Name and unit of a variable (from 0), as far as they are known."""
         if not self.names:
-            return f"variable {index}"
+            return f"variable {index + 1}"
         unit = self.units[index] if self.units else ""
         return f"{self.names[index]} [{unit}]" if unit else self.names[index]
 
