@@ -528,9 +528,15 @@ PLAIN: Look = {"color": SOFT, "marker": "X"}
 
 
 def panels(rows: int, columns: int, height: float, **shared: Any) -> tuple[Drawn, Any]:
-    """A figure as wide as a page, ``height`` inches high, and its (rows, columns) axes."""
+    """A figure as wide as a page, ``height`` inches high, and its (rows, columns) axes.
+
+    Several have letters.
+    """
     figure = Drawn(figsize=(7.2, height), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False, **shared)
+    grid = figure.subplots(rows, columns, squeeze=False, **shared)
+    for letter, axes in zip("abcdef" if grid.size > 1 else "", grid.flat, strict=False):
+        axes.set_title(letter, fontweight="bold")
+    return figure, grid
 
 
 def legend(figure: Drawn, looks: Mapping[str, Look], columns: int | None = None) -> None:
