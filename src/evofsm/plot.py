@@ -195,7 +195,7 @@ def experience(
         raise ValueError("the judge of this guard has not learnt where it fails")
     known, m, ends = judge.dynamics, judge.dynamics.n_variables, judge.dynamics.dead_ends
     tell = [*known.regions[:, :2].ravel().astype(int), *(j for j, _, _ in known.thresholds)]
-    pair = list(variables or dict.fromkeys([*tell, *range(m)]))[:2]
+    pair = list(variables or dict.fromkeys([*tell, *range(max(m, 2))]))[:2]
     _refuse_other(pair, m)
     ax, called, red = _given_or_new(ax), judge.labels.variable, COLORS["dead end"]
     dots: Look = {"linestyle": "none", "marker": ".", "markersize": 1.5, "color": ink(0.4)}
