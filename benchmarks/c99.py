@@ -247,10 +247,16 @@ def _add_parts(judge: Any) -> None:
     drifted = np.where(np.arange(m) == m - 1, 1.0, -1.0)
     unit, low = judge.dynamics.sums.unit, seen.min(0)
     region = [0, m - 1, low[0], low[m - 1], 1 / unit[0], 1 / unit[m - 1], 1, 0.1, 0.2, -1, 0.3, -2]
+    ending = [0, 0, seen[:, 0].max(), 0.0, 1 / unit[0], 1.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0]
+    crash = [m - 1, m - 1, *[seen[:, -1].max()] * 2, 1 / unit[-1], 1.0, 0.0, 1.0, 0, 0, 0, 0]
     centres = seen[chance.integers(len(seen), size=3)]
     ends = np.column_stack([centres, np.full(3, 0.4), np.full(3, 4.0)])
     judge.dynamics.model = model._replace(
-        drifted=drifted, regions=np.array([region]), dead_ends=ends
+        drifted=drifted,
+        regions=np.array([region]),
+        endings=np.array([ending]),
+        crashes=np.array([crash]),
+        dead_ends=ends,
     )
     counted = {name: np.arange(1.0, 4.0) for name in ("numbers", "counts")}
     judge.dynamics.dead_ends = judge.dynamics.dead_ends._replace(**counted)

@@ -42,17 +42,13 @@ from studies.systems import SYSTEMS, TASKS, Cars, Start, System, Vector, lacking
 #: Parts of the learnt judge that can be taken away, each with what is left then.
 PARTS: dict[str, str] = {
     "stretches": "no disturbances at all",
-    "memory": "independent residuals in place of remembered stretches",
-    "products": "no products of variables and actions",
     "lags": "no latest change and previous action",
     "doubt": "lags are used even where they foresaw failure that never came",
     "jumps": "jumps are learnt like all else",
+    "products": "no products of variables and actions",
     "carried": "no residual is carried on where a variable saturates",
-    "drift": "the model is not corrected where the system has changed",
-    "observer": "variables are taken as they are seen, however noisy sensors are",
     "margin": "no margin",
     "backups": "constant backups alone",
-    "breaks": "it is not noticed where disturbances get worse",
     "states": "one state only: nothing may change",
     "regions": "failure by thresholds of single variables alone",
     "dead-ends": "no dead ends from certificates that were refuted",

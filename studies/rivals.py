@@ -55,7 +55,7 @@ class Rival(ABC):
         return Executed(self.action(observation, wanted))
 
     def end(  # noqa: B027
-        self, failed: bool = False, observation: Vector | None = None
+        self, failed: bool = False, observation: Vector | None = None, *, terminated: bool = False
     ) -> None:
         """End the episode."""
 
@@ -406,7 +406,9 @@ class Counted(Rival):
         self._done.append(action)
         return executed
 
-    def end(self, failed: bool = False, observation: Vector | None = None) -> None:
+    def end(
+        self, failed: bool = False, observation: Vector | None = None, *, terminated: bool = False
+    ) -> None:
         """Count the episode, and what it says of all others."""
         if not (self._learn and self._done):
             return

@@ -428,7 +428,7 @@ def test_a_judge_is_told_all_that_happens_and_the_machine_counts_what_began():
         def learn(self, observation, action, belief):
             self.told += ("learnt",)
 
-        def end(self, observation, *, failed):
+        def end(self, observation, *, failed, terminated):
             self.told += (("failed" if failed else "ended", observation is not None),)
 
     guard = continuous(judge=Observing(DT, -4.0, 4.0), failed=lambda z: abs(z[0]) > 0.8)

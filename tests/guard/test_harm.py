@@ -111,7 +111,7 @@ def test_what_goes_on_failing_is_tried_ever_more_rarely(wrong):
 def test_without_shadow_it_is_never_told_to_pass_which_is_said(wrong):
     guard = make(shadow=False)
     assert {why for _, why in drive(guard, 30)} == {""}
-    assert "no episode is driven in shadow, so that harm would not be noticed" in str(guard)
+    assert "mode act, harm is not noticed)" in str(guard)
     assert not guard.copy().shadow
 
 
@@ -193,13 +193,13 @@ def test_what_fails_later_or_not_at_all_is_no_harm(guarded, alone):
 def test_it_seldom_steps_back_without_harm(better, most):
     chance, stepped = np.random.default_rng(0), 0
     for _ in range(40):
-        harm = Harm().after(30, 0, 30, failed=True)
+        harm = Harm().after((30, 0, 30), failed=True)
         for _ in range(30):
             passes = bool(harm.passing(learning=True))
             after = chance.exponential(100.0 if passes else 100.0 * better)
             steps = 1 + int(min(after, 299.0))
             driven = (0, steps, 0) if passes else (steps, 0, 0)
-            harm = harm.after(*driven, failed=after < 299.0)
+            harm = harm.after(driven, failed=after < 299.0)
             stepped += bool(harm.since)
             if harm.since:
                 break

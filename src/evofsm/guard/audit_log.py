@@ -56,7 +56,7 @@ FIELDS: Mapping[str, set[str]] = {
     "decision": {"before", "belief", "interval", "observation", "time", *_TOLD},
     "quiet": {"before"},
     "settings": {"settings"},
-    "end": {"before", "failed", "learnt", "observation"},
+    "end": {"before", "failed", "learnt", "observation", "terminated"},
 }
 
 
@@ -390,7 +390,7 @@ class AuditLog:
                 self._flush()
         self._busy = False
 
-    def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+    def ended(self, observation: Any, *, failed: bool, terminated: bool) -> None:
         """The episode ended; an OSError if something could not be written since it began."""
         if self._busy or self._guard is None:
             return
@@ -399,9 +399,8 @@ class AuditLog:
         self._learnt = sums_of(self._guard)
         last = None if observation is None else observation.tolist()
         before = self._take_before()
-        self._write(
-            "end", before=before, failed=bool(failed), learnt=self._learnt, observation=last
-        )
+        how = {"failed": bool(failed), "terminated": terminated}
+        self._write("end", before=before, learnt=self._learnt, observation=last, **how)
         self._force()
         self._guard, self._busy = None, False
         self._raise()

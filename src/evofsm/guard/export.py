@@ -222,7 +222,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "CROSSED": replay.crossed(m, a),
         "PAIRED": m if len(replay.pairs(m)[0]) else 0,
         "THRESHOLDS": len(model.thresholds),
-        "REGIONS": len(model.regions),
+        **{name.upper(): len(getattr(model, name)) for name in ("regions", "endings", "crashes")},
         "JUMPS": jumps,
         "NOISY": dynamics.is_noisy,
         "SCALE": risk.disturbance_scale,
@@ -259,10 +259,11 @@ def _learnt(reviser: ActionReviser) -> Part:
 
 # Constants of replays, and arrays of a model, that C has, too.
 _OF_REPLAYS = ["_FARTHER", "_RESERVE", "_DISTANCE", "_FAR", "_HALVINGS", "_EQUAL", "FLAT", "GROWN"]
+_OF_REPLAYS += ["SHRUNK"]
 _OF_JUMPS = ("jump_at", "jump_to", "jump_slope", "jump_from", "landing")
 _OF_MODEL = (
     *("weights", "origin", "reach", "lowest", "highest", "least", "most", "thresholds", "regions"),
-    *("dead_ends", "drifted", "mean", "inverse"),
+    *("endings", "crashes", "dead_ends", "drifted", "mean", "inverse"),
 )
 
 

@@ -101,7 +101,7 @@ class DecisionLogger(Protocol):
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
         """A decision was made."""
 
-    def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+    def ended(self, observation: Any, *, failed: bool, terminated: bool) -> None:
         """The episode ended."""
 
 
@@ -353,7 +353,8 @@ class Guard:
         self._monitor = InputMonitor(missing, interval)
         self._latest: Situation | None = None
         self._under_way, self._passing = False, ""
-        self.shadow = shadow
+        #: Whether episodes may be driven in shadow, or it may step back, where it may do harm.
+        self.shadow = bool(shadow)
         self.learn = learn
 
     # -- An episode -----------------------------------------------------------------------------
@@ -387,21 +388,9 @@ class Guard:
         if why:
             warnings.warn(f"this guard {why}: frozen so, proposals pass", stacklevel=2)
 
-    @property
-    def shadow(self) -> bool:
-        """Whether episodes may be driven in shadow, or it may step back, where it may do harm."""
-        return self._shadow
-
-    @shadow.setter
-    @alone
-    def shadow(self, shadow: bool) -> None:
-        self._shadow = bool(shadow)
-        if self._observing is not None:
-            self._observing.shadow = self._shadow
-
     def _why_passing(self) -> str:
         """Why proposals pass in the episode to come; empty where they need not."""
-        if self._observing is None or not self._shadow:
+        if self._observing is None or not self.shadow:
             return ""
         return self._observing.harm.passing(learning=self._learn)
 
@@ -634,7 +623,13 @@ class Guard:
         return f"{told} Its centre is in #{state + 1}."
 
     @alone
-    def end(self, failed: bool = False, observation: ArrayLike | None = None) -> None:
+    def end(
+        self,
+        failed: bool = False,
+        observation: ArrayLike | None = None,
+        *,
+        terminated: bool = False,
+    ) -> None:
         """End the episode, and learn from how it ended.
 
         Parameters
@@ -644,6 +639,9 @@ class Guard:
             observation.
         observation : (m,) array_like, optional
             The last one, on which nothing was decided any more.
+        terminated : bool
+            Whether it ended by itself, as where a goal is reached, and was not cut off: a learnt
+            judge learns where, and looks no further. As in Gymnasium; what failed has failed.
         """
         z = None if observation is None else self._checked(observation)
         if not self._under_way:
@@ -651,6 +649,7 @@ class Guard:
         last = self._latest.observation if z is None and self._latest is not None else z
         if self.failed is not None and last is not None:
             failed = failed or bool(self.failed(last))
+        terminated = bool(terminated) and not failed
         machine = self.machine if self._learn else None
         if machine is not None:
             has_gaps = z is not None and math.isnan(z.dot(z))
@@ -668,18 +667,19 @@ class Guard:
             machine.start_episode()
         if self.judge is not None:
             if self._learn:
-                self.judge.end(z, failed=failed)
+                also = {"terminated": terminated} if self._observing is not None else {}
+                self.judge.end(z, failed=failed, **also)
             else:
                 self.judge.start_episode(learn=False)
         self._under_way = False
         if self._learn:
             if (judge := self._observing) is not None:
-                driven = self._acted, self._watched, self._kept
-                judge.harm = judge.harm.after(*driven, failed=failed, tests=self._shadow)
+                driven, how = (self._acted, self._watched, self._kept), {"tests": self.shadow}
+                judge.harm = judge.harm.after(driven, failed=failed, ended=terminated, **how)
             self.n_episodes += 1
             self.n_failed += bool(failed)
         if self.audit is not None:
-            self.audit.ended(z, failed=failed)
+            self.audit.ended(z, failed=failed, terminated=terminated)
 
     @alone
     def __str__(self) -> str:
@@ -693,8 +693,8 @@ class Guard:
         how = type(self.reviser).__name__
         if isinstance(self.reviser, ActionReviser):
             how += f", tolerance {self.reviser.tolerance:g}, mode {self.reviser.mode.value}"
-            if self.reviser.risk is self._observing and self._shadow and self._learn:
-                how += ", in shadow where in doubt"
+            if self.reviser.risk is self._observing and (self._learn or not self.shadow):
+                how += ", in shadow where in doubt" if self.shadow else ", harm is not noticed"
         lines = [
             f"{type(self).__name__} of {span}, each {self.interval:g} s",
             f"judge: {'none' if judge is None else type(judge).__name__} ({how})",

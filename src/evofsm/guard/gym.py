@@ -345,11 +345,11 @@ class Lane:
         self._seen = self.terms.look(step.observation)
         over = step.terminated or step.truncated
         if failed or over or self._seen is None:
-            self.end(failed=failed)
+            self.end(failed=failed, terminated=step.terminated)
         if over:
             self.is_open = False
 
-    def end(self, *, failed: bool) -> None:
+    def end(self, *, failed: bool, terminated: bool = False) -> None:
         """The guard's episode ends, if one is under way."""
         decider, self._guard = self._guard, None
         past, self._past = self._past, []
@@ -361,7 +361,7 @@ class Lane:
             for step, (seen, proposal, executed) in enumerate(past):
                 situation = guard.recognise(seen, step * guard.interval)
                 guard.take_in(situation, proposal, executed)
-        guard.end(failed, self._seen)
+        guard.end(failed, self._seen, terminated=terminated)
 
 
 _SUCH_AS = {

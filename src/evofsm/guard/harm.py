@@ -42,6 +42,8 @@ _EVEN, _DOUBT, _SURE = 0.5, 0.25, 0.01
 _RARELY, _LASTING = 10, 2
 # Decisions over which the share of proposals that are kept is counted, and at least for a word.
 _DECISIONS, _SOME = 500, 100
+# Steps of who never fails.
+_FOREVER = 1 << 52
 
 
 class Outcome(NamedTuple):
@@ -137,20 +139,23 @@ class Harm(NamedTuple):
         return earlier([one], self.alone) <= 0
 
     def after(
-        self, acted: int, watched: int, kept: int, *, failed: bool, tests: bool = True
+        self, driven: tuple[int, int, int], *, failed: bool, ended: bool = False, tests: bool = True
     ) -> Harm:
         """What it is after an episode.
 
-        It had so many decisions in which proposals could be refused (``acted``), of which ``kept``
-        were not, or could not (``watched``). With both it is of neither kind, and is left out.
+        Of its decisions there were so many in which proposals could be refused (``driven``), in
+        which they could not, and of the first in which they were kept. With both it is of neither
+        kind, and is left out. One that ``ended`` by itself without failing never fails.
         """
+        acted, watched, kept = driven
         refuses, n = self.refuses or kept < acted, self.n_episodes + 1
         now, fades = self._replace(n_episodes=n, refuses=refuses), math.exp(-acted / _DECISIONS)
         if refuses:
             now = now._replace(decided=fades * self.decided + acted, kept=fades * self.kept + kept)
         if bool(acted) == bool(watched):
             return now
-        new = Outcome(n, acted + watched, failed, refuses and acted > 0)
+        steps = _FOREVER if ended else acted + watched
+        new = Outcome(n, steps, failed, refuses and acted > 0)
         alike = [one for one in self.outcomes if one.guarded == new.guarded]
         gone = alike[: max(0, len(alike) - _KEPT + 1)]
         now = now._replace(outcomes=(*(one for one in self.outcomes if one not in gone), new))
@@ -191,7 +196,7 @@ def chance_of(guarded: Sequence[Outcome], alone: Sequence[Outcome]) -> float:
     >>> chance_of(guarded, alone)  # one of the ten ways to choose two of five
     0.1
     """
-    alone = alone or [Outcome(0, 1 << 52, False, False)]
+    alone = alone or [Outcome(0, _FOREVER, False, False)]
     found = earlier(guarded, alone)
     if found <= 0:
         return 1.0

@@ -99,7 +99,7 @@ def run_episode(
         held, count = _whole(observation, held), count + 1
         over, failed = bool(terminated or truncated), bool(info.get("failed", terminated))
         if over:
-            guard.end(failed, np.ravel(observation))
+            guard.end(failed, np.ravel(observation), terminated=bool(terminated))
         realised = float(info.get("realised", math.nan))
         yield Decision(situation, revision, realised, float(reward), failed, seconds)
 

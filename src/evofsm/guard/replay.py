@@ -283,10 +283,12 @@ class _Player:
         return f"the decision at {situation.time:g} s", told, is_spoken(guard.reviser, revision)
 
     def _end(self, guard: Guard, content: Mapping[str, Any]) -> None:
-        last, failed = content["observation"], content["failed"]
-        if not isinstance(failed, bool):
-            raise ValueError(f"failed is {failed!r}")
-        guard.end(failed, None if last is None else _floats(last))
+        last = content["observation"]
+        how = {name: content[name] for name in ("failed", "terminated")}
+        for name, said in how.items():
+            if not isinstance(said, bool):
+                raise ValueError(f"{name} is {said!r}")
+        guard.end(observation=None if last is None else _floats(last), **how)
         self._is_under_way = False
         if fields := _differing(content["learnt"], sums_of(guard)):
             raise _DiffersError("something else was learnt until its end", fields)

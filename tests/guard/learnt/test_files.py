@@ -63,6 +63,11 @@ def with_first(value):
         ({}, {"sequence_rows": lambda one: one[1:]}, "not those that they say"),
         ({}, {"sequence_rows": lambda one: one[:, 1:]}, "another number of variables"),
         ({}, {"jumps": lambda one: np.zeros((1, 9))}, "another number of variables"),
+        ({}, {"events": lambda one: one[:, 1:]}, "places are of"),
+        ({}, {"sequences": lambda one: one + np.eye(6)[3] * 9}, "places are of"),
+        ({}, {"regions": lambda one: np.full((1, 12), 9.0)}, "regions are of variables"),
+        ({}, {"crashes": lambda one: np.zeros((1, 12))}, "crashes have units that are not"),
+        ({}, {"dead_ends_survived": lambda one: np.zeros((9999, 2))}, "at most 40 dead ends"),
     ],
 )
 def test_a_file_that_contradicts_itself_is_refused(judge, settings, arrays, why):

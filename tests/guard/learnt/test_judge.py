@@ -365,9 +365,9 @@ def test_after_a_change_the_margin_begins_anew(point, monkeypatch):
     guard, study = point.taught(4), Dynamics._study
     guard.judge.margin = 0.1
 
-    def drifting(dynamics, *, failed):
+    def drifting(dynamics, **how):
         dynamics.drifts = [Drift(0, dynamics.n_episodes, dynamics.n_episodes)]
-        study(dynamics, failed=failed)
+        study(dynamics, **how)
 
     monkeypatch.setattr(Dynamics, "_study", drifting)
     point.play(guard, 40)

@@ -5,9 +5,7 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from evofsm import Guard, store
-from evofsm.guard import LearntRisk, merge_judges
-from evofsm.guard.learnt.judge import KIND
+from evofsm import Guard
 from evofsm.guard.learnt.regions import distances, explain, inside
 
 SHAPES = {
@@ -138,47 +136,6 @@ def test_thresholds_that_one_failure_tells_are_doubted_where_nearly_all_is_refus
     assert len(dynamics.daring.thresholds) >= 1
 
 
-def test_without_regions_it_is_as_it_was(taught):
-    judge = LearntRisk(0.1, -np.ones(2), np.ones(2), horizon=2.0, without=["regions"])
-    guard = Guard(-np.ones(2), np.ones(2), interval=0.1, judge=judge)
-    for episode in range(5):
-        play(guard, episode)
-    assert not len(judge.dynamics.regions)
-    assert not len(judge.dynamics.survived)
-
-
-def test_merged_judges_know_the_regions_of_all(taught):
-    other = Guard(-np.ones(2), np.ones(2), interval=0.1, horizon=2.0)
-    for episode in range(20, 26):
-        play(other, episode)
-    merged = merge_judges([taught.judge, other.judge]).dynamics
-    assert len(merged.failures) == sum(len(one.judge.dynamics.failures) for one in (taught, other))
-    assert inside(merged.regions, merged.failures).any()
-    assert (distances(merged.regions, merged.survived) > 0.0).all()
-
-
 def saved(guard):
     guard.save(file := BytesIO())
     return file.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "why"),
-    [
-        ("regions", lambda one: one + np.eye(12)[0] * 9, "regions are of variables that there are"),
-        ("regions", lambda one: one * (1.0 - np.eye(12)[4]), "regions have units"),
-        ("regions", lambda one: one[:, 1:], "regions"),
-        ("survived", lambda one: one[:, 1:], "survived"),
-        ("brinks", lambda one: one[:, 1:], "brinks"),
-    ],
-)
-def test_forged_regions_are_refused(taught, name, change, why):
-    taught.judge.save(file := BytesIO())
-    settings, arrays = store.read(BytesIO(file.getvalue()), KIND)
-
-    def load(forged):
-        store.write(bad := BytesIO(), KIND, settings, arrays | {name: forged})
-        LearntRisk.load(BytesIO(bad.getvalue()))
-
-    with pytest.raises(ValueError, match=why):
-        load(change(arrays[name]))

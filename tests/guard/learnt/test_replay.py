@@ -10,6 +10,7 @@ from evofsm.guard.learnt.replay import (
     GROWN,
     KEPT,
     NOTHING_PASSES,
+    SHRUNK,
     Disturbances,
     Model,
     features,
@@ -38,7 +39,7 @@ def mover(choices=0, **others):
         least=-9.0 * one,
         most=9.0 * one,
         thresholds=np.array([[0.0, 1.0, WALL, 1.0]]),
-        regions=np.empty((0, 12)),
+        **dict.fromkeys(("regions", "endings", "crashes"), np.empty((0, 12))),
         dead_ends=np.empty((0, 3)),
         drifted=none,
         mean=none,
@@ -49,7 +50,7 @@ def mover(choices=0, **others):
 
 
 def random_model(draw, m, a, choices):
-    """Something that moves, saturates, drifted in part and fails on two sides and in an ellipse."""
+    """Something that moves, saturates, drifted in part, ends, and fails there or elsewhere."""
     one = np.ones(m)
     return Model(
         weights=0.05 * draw.normal(size=(n_features(m, a, box=not choices), m)),
@@ -61,6 +62,8 @@ def random_model(draw, m, a, choices):
         most=0.3 * one,
         thresholds=np.array([[0.0, 1.0, 0.7, 2.0], [m - 1.0, -1.0, -1.5, 0.5]]),
         regions=np.array([[1.0, m - 1.0, 1.5, -0.2, 2.0, 0.5, 1.0, 0.3, 0.1, -0.9, 0.4, -1.2]]),
+        endings=np.array([[0.0, 2.0, -0.2, 0.3, 2.0, 0.5, 0.0, -0.9, 0.3, 0.1, 0.0, 0.0]]),
+        crashes=np.array([[1.0, 1.0, 0.9, 0.0, 3.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]]),
         dead_ends=np.column_stack([draw.normal(size=(2, m)), [0.4, 1.1], [9.0, 9.0]]),
         drifted=np.resize([1.0, -1.0, 0.0], m),
         mean=draw.normal(size=m),
@@ -80,7 +83,7 @@ def nearest(region, z):
     i, j, *at, one, other, c, b, d, p, q, r = region
     x, y = (z[int(i)] - at[0]) * one, (z[int(j)] - at[1]) * other
     slope = np.array([b + 2.0 * p * x + q * y, d + q * x + 2.0 * r * y])
-    return -(c + b * x + d * y + p * x * x + q * x * y + r * y * y) / np.sqrt(slope @ slope) - GROWN
+    return -(c + b * x + d * y + p * x * x + q * x * y + r * y * y) / np.sqrt(slope @ slope)
 
 
 def from_dead_end(model, row, z):
@@ -122,10 +125,14 @@ def plainly(model, situation, plan, policy, disturbances, k, scale, enough):
         after = np.clip(after, model.lowest, model.highest)
         z, change, before = after, after - z, u
         left = [s * (at - z[int(j)]) * worth for j, s, at, worth in model.thresholds]
-        near = min(near, *left, *(nearest(row, z) for row in model.regions))
+        near = min([near, *left, *(nearest(row, z) - GROWN for row in model.regions)])
+        end = min((nearest(row, z) for row in model.endings), default=np.inf)
+        near = min([near, *(max(end - GROWN, nearest(row, z)) for row in model.crashes)])
         near = min([near, *(from_dead_end(model, row, z) for row in dead_ends)])
         if near < enough:
             return t, near
+        if end <= -SHRUNK:  # it ends by itself
+            return steps + 1, near
     return steps, near
 
 
@@ -141,15 +148,19 @@ def test_the_kernel_replays_as_a_plain_loop_does(choices, planned):
     disturbances.landing[2, 1] = -0.2, 0.4
     disturbances.place[2:4] = [[0.0, 1.0, 0.1, 2.0, 9.0], [1.0, -1.0, 0.2, 0.0, 3.0]]
     situations = 0.3 * draw.normal(size=(4, 2 * m + a))
+    situations[2:, :m] = [[-0.7, 0.1, 0.3], [-0.6, -0.2, 0.5]]
     plan, policy = draw.uniform(-1.0, 1.0, (planned, a)), draw.normal(size=(a, 1 + m))
-    ends, found = replay(model, situations, plan, policy, disturbances, 1.3, 0.2), []
-    for s in range(4):
-        for k in range(K):
-            found.append(plainly(model, situations[s], plan, policy, disturbances, k, 1.3, 0.2))
-    survived, least = np.array(found).T
-    fails = survived < STEPS
-    np.testing.assert_allclose(ends.value, np.where(fails, survived - STEPS - 1.0, least))
-    assert fails.any()
+    fails, happened = ("thresholds", "regions", "crashes", "dead_ends"), []
+    harmless = model._replace(**{name: getattr(model, name)[:0] for name in fails})
+    for one in (model, harmless):
+        ends = replay(one, situations, plan, policy, disturbances, 1.3, 0.2)
+        pairs = ((situation, k) for situation in situations for k in range(K))
+        found = [plainly(one, z, plan, policy, disturbances, k, 1.3, 0.2) for z, k in pairs]
+        survived, least = np.array(found).T
+        value = np.where(survived < STEPS, survived - STEPS - 1.0, least)
+        np.testing.assert_allclose(ends.value, value)
+        happened += survived.tolist()
+    assert min(happened) < STEPS < max(happened)  # some fail, and some end
     move = np.array([[5.0, 5.0, 5.0], [-5.0, -5.0, -5.0], [0.1, 0.1, 0.1]])
     expected = [[0.3, 0.9, 0.3], [-0.2, -0.6, -0.2], [0.1, 0.1, 0.1]]
     np.testing.assert_allclose(limited(model, move), expected)

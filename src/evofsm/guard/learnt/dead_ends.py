@@ -23,8 +23,10 @@ _APART = 0.15
 _SHARE = 0.9
 # One of less than so many ordinary changes is forgotten; so many there may be.
 _LEAST, _MOST = 0.5, 40
-# Observations that were survived: that are kept, of an episode, and the last ones that may not be.
-_SURVIVED, _EACH, _LAST = 1500, 60, 10
+# Observations that were survived: that are kept, and of an episode.
+_SURVIVED, _EACH = 1500, 60
+#: Of an episode that was cut off the last ones, of which it is not known that they were survived.
+LAST = 10
 # Steps of replays after which nothing is asked but the proposal.
 _ONCE = 1.0
 
@@ -50,25 +52,19 @@ class DeadEnds(NamedTuple):
         return np.column_stack([self.centres, self.radii, worth])
 
     def after(
-        self,
-        observations: Floats,
-        certified: Sequence[bool],
-        horizon: int,
-        inverse: Floats,
-        unit: Floats,
-        *,
-        failed: bool,
+        self, z: Floats, certified: Sequence[bool], unproven: int, inverse: Floats, unit: Floats
     ) -> DeadEnds:
-        """What they are after an episode, without the observation that failed.
+        """What they are after an episode (T, m), without the observation that failed.
 
-        Of one that failed, what was survived ended a ``horizon`` before.
+        Where it failed, ``certified`` says in which decisions it was not to; else it is empty.
+        It is not known of so many last ones (``unproven``) that they were survived.
         """
-        kept = observations[: max(0, len(observations) - (horizon if failed else _LAST))]
+        kept = z[: max(0, len(z) - unproven)]
         survived = np.vstack([self.survived, kept[:: max(1, len(kept) // _EACH)]])
         found = self._replace(survived=survived[-most_survived(len(unit)) :])
-        held = np.flatnonzero(certified[: len(observations) - 1])
-        if failed and len(held):
-            found = found._refuted(observations[held[-1] + 1 :], inverse)
+        held = np.flatnonzero(certified[: len(z) - 1])
+        if len(held):
+            found = found._refuted(z[held[-1] + 1 :], inverse)
         return found._settled(inverse, unit)
 
     def _refuted(self, failed_from: Floats, inverse: Floats) -> DeadEnds:

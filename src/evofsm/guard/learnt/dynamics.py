@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.fsm.validation import real_array, refuse_unusable, whole
-from evofsm.guard.learnt import dead_ends, regions, regression
+from evofsm.guard.learnt import dead_ends, places, regions, regression
 from evofsm.guard.learnt.dead_ends import DeadEnds
 from evofsm.guard.learnt.failures import ask, explain_failures
-from evofsm.guard.learnt.places import ANYWHERE, Place, Places, onset
+from evofsm.guard.learnt.places import ANYWHERE, Place, onset
 from evofsm.guard.learnt.regression import Drift, Recent
 from evofsm.guard.learnt.replay import (
     EARLY,
@@ -38,8 +38,7 @@ from evofsm.store import COUNT, SHARE, Numbers
 
 #: Parts that can be left out, to see what each is worth.
 DYNAMICS_PARTS: tuple[str, ...] = (
-    *("stretches", "memory", "products", "lags", "doubt", "jumps", "carried", "drift"),
-    *("observer", "regions", "places", "rivals"),
+    *("stretches", "products", "lags", "doubt", "jumps", "carried", "regions", "places", "rivals"),
 )
 
 # Observations before anything is expected: an episode may fail after so few.
@@ -49,7 +48,7 @@ _KEPT = 0.999
 # Weights are solved for after every so many observations, more often among the first ones once they
 # could be, and in the end only between episodes.
 _SELDOM, _OFTEN, _FIRST_ONES, _NEVER = 20, 5, 300, 1500
-# Onsets of sequences in an episode, at most, and so far apart.
+# Onsets of sequences in an episode, at most; after so many steps without a surprise another counts.
 _ONSETS, _APART = 3, 3
 # A sequence has at least so many steps.
 _SHORTEST = 4
@@ -69,6 +68,9 @@ _RAYS = 64
 # After so many episodes in which more than this share was refused and none failed, what hardly any
 # failure tells is doubted; sooner where some failure is known to be no threshold.
 _PATIENCE, _REFUSED, _SOONER, _LESS = 8, 0.75, 4, 0.33
+# So many endings tell where there are any; observations so near the last one [ordinary changes]
+# cannot be told from it.
+_ENDED, _SAME = 3, 0.5
 #: Survived observations that are remembered, as many as fill some hundred kilobytes.
 MOST_SURVIVED = 8000
 # Choices that actions are told apart by, each of which has features of its own.
@@ -90,6 +92,7 @@ class Episode(NamedTuple):
     actions: Floats  #: (T, a)
     residuals: Floats  #: (T - 1, m) what was not expected, from the second observation on
     failed: bool
+    terminated: bool  #: whether it ended by itself, without failing
 
 
 class DisturbanceSequence(NamedTuple):
@@ -157,6 +160,9 @@ class Dynamics:
         #: Share of the states around in which a given function says otherwise than what is known.
         self.differs = 0.0
         self.quiet = 0  #: observations since one that was not expected
+        #: For how many episodes little passed; below 0 while it is tried what else may be true.
+        self.held = 0
+        self.ready, self.doubt_of_lags = False, 0.0
         self.is_noisy = False  #: whether some variables are not taken as they are seen
         self.forget_episode()
 
@@ -194,7 +200,7 @@ class Dynamics:
         if not len(pairs(m)[0]):
             self.remembered = min(self.remembered, _REMEMBERED_OF_MANY)
         self.n_variables, self.origin = m, z.copy()
-        self.sums, self.weights, self.ready = Sums.none(z, p), np.zeros((p, m)), False
+        self.sums, self.weights = Sums.none(z, p), np.zeros((p, m))
         #: (m,) of all that was survived, and (m, 2) in how many episodes those ends were reached.
         self.lowest, self.highest = np.full(m, np.inf), np.full(m, -np.inf)
         self.reached = np.zeros((m, 2))
@@ -203,14 +209,15 @@ class Dynamics:
         #: (n, m) what was survived, and what is between two such observations
         self.survived = np.empty((0, m))
         self.regions = np.empty((0, regions.SIZE))  #: (r, 12) where it fails beyond no threshold
-        #: For how many episodes little passed; below 0 while it is tried what else may be true.
-        self.held = 0
+        self.ended = np.empty((0, m))  #: (k, m) observations in which it ended without failing
+        #: (e, 12) where it ends by itself, and (c, 12) where it fails if it does.
+        self.endings = self.crashes = np.empty((0, regions.SIZE))
         self.jumps = [np.empty((0, m + 1)) for _ in range(m)]  #: from where, and to where
         self.dead_ends = DeadEnds.none(m)  #: from where certified episodes failed
         self.recent = Recent.none(p, m, self.n_episodes)  #: what the last episodes say of the model
         self.missed = regression.untried(m)  #: by gains of the observer
-        self.doubt_of_lags = 0.0
-        self.places = Places.none(m, self.size)
+        #: (k, 3m + 2a + 1) where something unforeseen began, as `places.after` has it
+        self.events = np.empty((0, 3 * m + 2 * self.size + 1))
         self.rebuild()
         self.forget_episode()
 
@@ -262,10 +269,10 @@ class Dynamics:
         lowest = -1.0 if self.choices else -0.6
         return np.array([action < lowest, action > 0.6]).T
 
-    def end(self, *, failed: bool) -> None:
-        """The episode is over, ``failed`` or not, or what comes does not follow from what was."""
+    def end(self, *, failed: bool, terminated: bool = False) -> None:
+        """The episode is over, or what comes does not follow from what was (it was cut off)."""
         if self.n_under_way > 2 or (failed and self.n_under_way):
-            self._study(failed=failed)
+            self._study(failed=failed, terminated=terminated and not failed)
         self.forget_episode()
 
     # -- The model ------------------------------------------------------------------------------
@@ -327,6 +334,8 @@ class Dynamics:
             most=sums.most.copy(),
             thresholds=np.array(thresholds, np.float64).reshape(-1, 4),
             regions=self.regions,
+            endings=self.endings,
+            crashes=self.crashes,
             dead_ends=self.dead_ends.rows(inverse, sums.unit),
             drifted=drifted,
             mean=self.origin + sums.mean,
@@ -335,9 +344,12 @@ class Dynamics:
         )
         #: What is expected while it is tried which explanation of failure is true.
         self.daring = self.model
+        if len(self.crashes):
+            halfway = regions.halfway(self.crashes, self.failures)
+            self.daring = self.model._replace(crashes=halfway)
         if self.held < 0:
             weak, few = regions.are_weak(self.thresholds, self.regions, self.failures)
-            self.daring = self.model._replace(
+            self.daring = self.daring._replace(
                 thresholds=self.model.thresholds[~weak], regions=self.model.regions[~few]
             )
         #: (m,) gains of the observer, and how far from where it saturates one that is there is seen
@@ -371,24 +383,25 @@ class Dynamics:
         if regression.are_misleading(self.doubt_of_lags) != was:
             self._solve()
 
-    def keep_dead_ends(self, known: DeadEnds) -> None:
-        """From now on those are the dead ends."""
-        self.dead_ends = known
-        self.rebuild()
-
     # -- A whole episode ------------------------------------------------------------------------
 
-    def _study(self, *, failed: bool) -> None:
+    def _study(self, *, failed: bool, terminated: bool = False) -> None:
         """Learn from an episode as a whole."""
         z, u = self._z[: self.n_under_way].copy(), self._u[: self.n_under_way].copy()
         safe = z[:-1] if failed else z
         self._extend(safe)
-        self._survive(safe)
+        went_on = safe
+        if terminated:
+            far = (np.abs(safe - safe[-1]) > _SAME * self._sizes[0]).any(1)
+            went_on = safe[: int(np.flatnonzero(far).max(initial=-1)) + 1]
+            self.ended = np.vstack([self.ended[1 - MOST :], safe[-1]])
+        self._survive(went_on)
         if failed:
             self.failures = np.vstack([self.failures[1 - MOST :], z[-1]])
             self.brinks = np.vstack([self.brinks[1 - MOST :], safe[-1:]])
         if len(safe) <= _STUDIED and self.sums.scale[0] > 0.0:
             self._learn_fully(safe, u)
+        self.endings = regions.without_survived(self.endings, went_on)
         self.settle(failed=failed, waits=len(z) == _LONGEST)
         self.sums.squares[:] *= _KEPT
         self.sums.products[:] *= _KEPT
@@ -397,23 +410,20 @@ class Dynamics:
         known, long = self.sums.scale[0] > 0.0, T >= _STUDIED
         if self.ready and (long or (known and T >= _LEAST)):
             if known and long:
-                if "drift" not in self.without:
-                    self._follow_drift(safe, u[:T])
-                if "observer" not in self.without:
-                    first = T - _LATEST if len(z) == _LONGEST else 0
-                    self.missed = regression.tried(
-                        self.missed, self.model, safe[first:], u[first:T], self.sums.unit
-                    )
-                    self.rebuild()
+                self._follow_drift(safe, u[:T])
+                first = T - _LATEST if len(z) == _LONGEST else 0
+                late = safe[first:], u[first:T], self.sums.unit
+                self.missed = regression.tried(self.missed, self.model, *late)
+                self.rebuild()
             found = residuals(self.model, self.close, safe, u[:T])
             if long:
                 self._saturate(found, safe)
                 self._rescale(found, safe)
-            self.latest = Episode(safe, u[:T], found, failed)
+            self.latest = Episode(safe, u[:T], found, failed, terminated)
             self.rebuild()
             if "places" not in self.without:
                 seen = safe, u[:T], found, self._ordinary
-                self.places = self.places.after(*seen, self.n_episodes, self.model)
+                self.events = places.after(self.events, *seen, self.n_episodes, self.model)
             if "stretches" not in self.without:
                 self.remember(self.onsets(found))
         self.n_episodes += 1
@@ -435,33 +445,57 @@ class Dynamics:
         Where a decision ``waits``, regions only shrink.
         """
         self._solve()
-        before = [one[:2] for one in self.thresholds], len(self.regions)
+        before, crashed = [one[:2] for one in self.thresholds], self._crashed
+        count = len(self.regions)
+        if len(self.ended) >= _ENDED and not waits:
+            self._find_endings()
         if self.failed is None:
-            sums = self.sums
+            sums, failures = self.sums, self.failures[~self._crashed]
             blur = np.where(self.reached < _REACHED, sums.scale[:, None], 0.0)
             unit = np.maximum(sums.unit, 1e-300)
-            found = explain_failures(self.failures, self.lowest, self.highest, unit, blur)
-            if "regions" in self.without:
-                self.thresholds = found
-            else:
-                self._explain(found, anew=failed, waits=waits)
+            found = explain_failures(failures, self.lowest, self.highest, unit, blur)
+            self.thresholds = stay = found
+            if "regions" not in self.without:
+                survived = np.concatenate([self.survived, self.brinks, self.ended])
+                self.regions = regions.without_survived(self.regions, survived)
+                if count:
+                    self.thresholds = stay = [one for one in found if one[:2] in before]
+                known = waits or regions.explained(failures, stay, self.regions).all()
+                if failed or not known or (crashed != self._crashed).any():
+                    given = failures, survived, *self._sizes
+                    self.thresholds, self.regions = regions.explain(found, *given)
         elif not waits:
             self._ask(self.failed)
         now = [one[:2] for one in self.thresholds], len(self.regions)
-        if failed or now != before:  # one of two explanations is refuted
+        if failed or now != (before, count):  # one of two explanations is refuted
             self.held = 0
         self.rebuild()
 
-    def _explain(self, found: list[tuple[int, float, float]], *, anew: bool, waits: bool) -> None:
-        """Explain failures by thresholds that were found, and by regions where these do not."""
-        survived = np.concatenate([self.survived, self.brinks])
-        self.regions = regions.without_survived(self.regions, survived)
-        kept = {(j, sign) for j, sign, _ in self.thresholds}
-        stay = [one for one in found if one[:2] in kept] if len(self.regions) else found
-        if anew or not (waits or regions.explained(self.failures, stay, self.regions).all()):
-            given = self.failures, survived, *self._sizes
-            stay, self.regions = regions.explain(found, *given)
-        self.thresholds = stay
+    def _find_endings(self) -> None:
+        """Where it ends by itself: nowhere where it went on, nor where it failed like that."""
+        rows, ended = self.endings, self.ended
+        went_on = np.concatenate([self.survived, self.brinks])
+        rows = regions.without_survived(rows, went_on)
+        if len(went_on) and not regions.inside(rows, ended).any(0).all():
+            rows = self._told_apart(ended, went_on)
+        rows = rows[regions.inside(rows, ended).sum(1) >= _ENDED]
+        failed = self.failures[regions.inside(rows, self.failures).any(0)]
+        self.crashes = self._told_apart(failed, ended)
+        unlike = failed[~regions.explained(failed, (), self.crashes, 0.0)]
+        self.endings = regions.without_survived(rows, unlike)
+
+    @property
+    def _crashed(self) -> NDArray[np.bool_]:
+        """(k,) which failures are where it ends, and explained by how it does."""
+        ends = regions.explained(self.failures, (), self.endings)
+        return np.asarray(ends & regions.explained(self.failures, (), self.crashes, 0.0))
+
+    def _told_apart(self, some: Floats, others: Floats) -> Floats:
+        """Regions (r, 12) of some observations in which no others are; thresholds where they do."""
+        unit, spread = self._sizes
+        found = explain_failures(some, others.min(0), others.max(0), unit, 0.0 * self.reached)
+        sides, rows = regions.explain(found, some, others, unit, spread)
+        return np.concatenate([regions.of_thresholds(sides, unit), rows])
 
     @property
     def _sizes(self) -> tuple[Floats, Floats]:
@@ -489,11 +523,12 @@ class Dynamics:
     @property
     def fails(self) -> bool:
         """Whether it is known of anything that it is failure."""
-        return bool(self.thresholds) or (self.n_variables > 0 and len(self.regions) > 0)
+        known = self.n_variables > 0 and len(self.regions) + len(self.crashes) > 0
+        return bool(self.thresholds) or known
 
     def _survive(self, safe: Floats) -> None:
         """Remember what was survived; where that is too much, every second one."""
-        if ("regions" in self.without and self.failed is None) or not len(safe):
+        if not len(safe):
             return
         change = np.diff(safe, axis=0)
         jumped = regression.jumps(change, self.sums.unit).any(1)
@@ -632,13 +667,7 @@ class Dynamics:
         """Steps of an episode at which something large began, of what was not expected (T, m)."""
         if not self.sums.scale[0] > 0.0:  # what is ordinary is not known yet
             return []
-        size = np.abs(found / self.sums.scale).max(1)
-        starts: list[int] = []
-        while len(starts) < _ONSETS and size.max() >= ONSET:
-            t = int(size.argmax())
-            starts.append(t)
-            size[max(0, t - _APART) : t + _APART + 1] = 0.0
-        return starts
+        return places.onsets(found / self.sums.scale, _ONSETS, ONSET)
 
     def remember(self, starts: Sequence[int]) -> None:
         """Keep the sequences of the latest episode that begin at these steps of its residuals."""
@@ -664,9 +693,10 @@ class Dynamics:
         """(K, 5) as `Disturbances.place` has it, of what began on the way to ``ends`` (K, L, m)."""
         place, rest = found.place.copy(), found.residuals.transpose(2, 0, 1)
         place[:, 0] = -1.0
-        if "places" in self.without or not len(self.places.events):
+        if "places" in self.without or not len(self.events):
             return place
-        where = self.places.of(rest, ends, self._ordinary, self.model, self.size)
+        seen = self.events, self.survived, self._ordinary
+        where = places.places_of(rest, ends, *seen, self.model, self.size)
         for k, one in enumerate(where):
             place[k] = *one, *self._span(rest[k])
         return place
@@ -732,17 +762,8 @@ class Dynamics:
 
     def numbers(self) -> dict[str, Any]:
         """What it goes on with, besides `arrays`."""
-        known = self.n_variables > 0
-        return {
-            "n_episodes": self.n_episodes,
-            "quiet": self.quiet,
-            "doubt_of_lags": self.doubt_of_lags if known else 0.0,
-            "exposed": self.places.exposed if known else 0,
-            "ready": int(known and self.ready),
-            "dead_ends": self.dead_ends.created if known else 0,
-            "held": self.held if known else 0,
-            "differs": self.differs,
-        }
+        created = self.dead_ends.created if self.n_variables else 0
+        return {name: getattr(self, name) for name in _COUNTED} | {"dead_ends": created}
 
     def arrays(self) -> dict[str, Floats]:
         """All arrays that it goes on with, but for the episode under way (`restore`)."""
@@ -771,8 +792,6 @@ class Dynamics:
             "drifts": np.array(self.drifts, np.float64).reshape(-1, 3),
             "jumps": np.vstack(jumps),
             "sequences": np.array(told, np.float64).reshape(-1, 6),
-            "places_events": self.places.events,
-            "places_exposure": self.places.exposure,
             "sequence_rows": np.vstack(rows),
         }
 
@@ -782,8 +801,8 @@ class Dynamics:
         A ValueError if they contradict each other, or the actions: kernels trust their sizes.
         """
         m, a, p = len(arrays["origin"]), self.size, len(arrays["sums_squares"])
-        self.differs = float(numbers["differs"])
-        self.n_episodes, self.quiet = int(numbers["n_episodes"]), int(numbers["quiet"])
+        for name, kind in _COUNTED.items():
+            setattr(self, name, kind(numbers[name]))
         if len(arrays["used"]) != a:
             raise ValueError(f"used has {len(arrays['used'])} rows, but an action has {a} numbers")
         if not m:
@@ -793,13 +812,12 @@ class Dynamics:
         refuse_too_many(m, a, box=not self.choices)
         if p != n_features(m, a, box=not self.choices):
             raise ValueError(f"sums of {p} features are not of {m} variables and {a} numbers")
-        for name in ("thresholds", "drifts", "jumps"):
-            if not np.isin(arrays[name][:, 0], np.arange(m)).all():
+        shapes = ("regions", "endings", "crashes")
+        for name in ("thresholds", "drifts", "jumps", *shapes):
+            if not np.isin(arrays[name][:, : 1 + (name in shapes)], np.arange(m)).all():
                 raise ValueError(f"{name} are of variables that there are not")
-        if not np.isin(arrays["regions"][:, :2], np.arange(m)).all():
-            raise ValueError("regions are of variables that there are not")
-        if (arrays["regions"][:, 4:6] <= 0.0).any():
-            raise ValueError("regions have units that are not positive")
+            if name in shapes and (arrays[name][:, 4:6] <= 0.0).any():
+                raise ValueError(f"{name} have units that are not positive")
         if jumps.shape[1] != m + 2 or rows.shape[1] != 2 * m + a:
             raise ValueError("jumps or sequences are of another number of variables")
         if (told != np.round(told))[:, :3].any() or (told[:, 1:3] < 0.0).any():
@@ -811,17 +829,14 @@ class Dynamics:
         self.recent = Recent(**{name: arrays[f"recent_{name}"] for name in Recent._fields})
         for name in _OWN:
             setattr(self, name, arrays[name])
-        places = Places(arrays["places_events"], arrays["places_exposure"], numbers["exposed"])
-        if not places.fit(m, a) or not np.isin(told[:, 3], np.arange(-1, m)).all():
+        fits = self.events.shape[1] == 3 * m + 2 * a + 1
+        if not fits or not np.isin(told[:, 3], np.arange(-1, m)).all():
             raise ValueError("places are of variables that there are not, or of other numbers")
-        self.places = places
         self.dead_ends = DeadEnds(
             **{name: arrays[f"dead_ends_{name}"] for name in dead_ends.ARRAYS},
             created=int(numbers["dead_ends"]),
         )
         self.dead_ends.refuse_forged(self.n_episodes)
-        self.held = int(numbers["held"])
-        self.ready, self.doubt_of_lags = bool(numbers["ready"]), float(numbers["doubt_of_lags"])
         self.thresholds = [(int(j), sign, at) for j, sign, at in arrays["thresholds"].tolist()]
         self.drifts = [Drift(*map(int, row)) for row in arrays["drifts"]]
         self.jumps = [jumps[jumps[:, 0] == j, 1:] for j in range(m)]
@@ -840,6 +855,12 @@ class Dynamics:
         self.rebuild()
 
 
+# Numbers that files hold, and their types.
+_COUNTED: dict[str, type] = {
+    **dict.fromkeys(("n_episodes", "quiet", "held"), int),
+    **dict.fromkeys(("differs", "doubt_of_lags"), float),
+    "ready": bool,
+}
 # What files hold, by name; an array of each kind that dynamics have under their own names.
 _OBSERVED, _NOT_NEGATIVE = Numbers(least=-1e30, most=1e30), Numbers(least=0.0)
 _EXTREME = Numbers(least=-np.inf, most=np.inf)  # the first ones to come are infinitely far out
@@ -852,7 +873,11 @@ _OWN: dict[str, Numbers] = {
     "failures": _OBSERVED.of("failed", "m"),
     "brinks": _OBSERVED.of("brinks", "m"),
     "survived": _OBSERVED.of("survived", "m"),
+    "events": _OBSERVED.of("events", "event"),
     "regions": Numbers(("regions", regions.SIZE)),
+    "ended": _OBSERVED.of("ended", "m"),
+    "endings": Numbers(("endings", regions.SIZE)),
+    "crashes": Numbers(("crashes", regions.SIZE)),
     "missed": _NOT_NEGATIVE.of("m", len(regression.GAINS)),
     "used": COUNT.of("a", 2),
 }
@@ -880,8 +905,6 @@ ARRAYS: dict[str, Numbers] = {
     "jumps": _OBSERVED.of("jumps", "jump"),
     "sequences": Numbers(("sequences", 6), -1e30, 1e30),
     "sequence_rows": Numbers(("rows", "row")),
-    "places_events": _OBSERVED.of("events", "event"),
-    "places_exposure": _OBSERVED.of("exposure", "m"),
 }
 
 

@@ -21,21 +21,21 @@ from evofsm import store
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.validation import action_name, positive
-from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
+from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import OUTCOMES, SETTINGS, Harm
 from evofsm.guard.learnt import library, regions, words
-from evofsm.guard.learnt.dead_ends import distances_to, which_refuses
+from evofsm.guard.learnt.dead_ends import LAST, distances_to, which_refuses
 from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics, Episode
 from evofsm.guard.learnt.library import Backups, Parts, Violations
 from evofsm.guard.learnt.replay import CUT_SHORT, KEPT, Disturbances, Floats, Ints, pairs, search
 from evofsm.guard.learnt.words import Remembered
-from evofsm.store import COUNT, FLAG, FROM_1, SHARE, SIZE, Kind, Numbers, Place
+from evofsm.store import COUNT, FROM_1, SHARE, SIZE, Kind, Numbers, Place
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 #: Parts that can be left out, to see what each is worth.
-JUDGE_PARTS: tuple[str, ...] = ("margin", "backups", "breaks", "dead-ends", *DYNAMICS_PARTS)
+JUDGE_PARTS: tuple[str, ...] = ("margin", "backups", "dead-ends", *DYNAMICS_PARTS)
 
 # Disturbances that are remembered.
 _REMEMBERED = 10
@@ -87,7 +87,7 @@ def _atomic(learn: Callable[_P, _T]) -> Callable[_P, _T]:
     return wrapped
 
 
-class LearntRisk:
+class LearntRisk(ActionJudge):
     """Judges actions by what it has learnt of how the system moves and fails.
 
     It is told neither what variables mean nor how they move. Before the first failure of an episode
@@ -177,7 +177,12 @@ class LearntRisk:
         self.dt = positive("dt", dt)
         self.given_horizon = None if horizon is None else positive("horizon", horizon)
         #: Steps that it looks ahead.
-        self.horizon = _HORIZON if horizon is None else _steps(horizon, self.dt)
+        self.horizon = _HORIZON if horizon is None else max(1, round(horizon / self.dt))
+        if self.horizon > _MOST_STEPS:
+            raise ValueError(
+                f"horizon is {horizon:g} s, {self.horizon:,} decisions of {dt:g} s; a learnt judge "
+                f"looks at most {_MOST_STEPS:,} ahead (is it in seconds?)"
+            )
         self.seed = operator.index(seed)
         if unknown := set(without) - set(JUDGE_PARTS):
             raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(JUDGE_PARTS)}")
@@ -192,8 +197,6 @@ class LearntRisk:
             remembered=_REMEMBERED,
             without=without,
         )
-        #: What is done without a usable proposal, and then revised like any.
-        self.fallback = _fallback(self.dynamics)
         #: Whether it may try actions to learn what they do.
         self.learning = True
         #: What has to be left of the distance to failure [ordinary changes]; for each of them
@@ -203,8 +206,7 @@ class LearntRisk:
         self.n_violated, self.violations = 0, Violations()
         self.n_studied = self.n_scanned = 0
         self.n_failed = 0  #: episodes that it was told of that failed
-        #: How episodes ended, guarded and alone; and whether a guard may act on that.
-        self.harm, self.shadow = Harm(), True
+        self.harm = Harm()  #: how episodes ended, guarded and alone
         #: Steps that it takes to fail at the latest, where that cannot be avoided.
         self.time_to_failure = _HORIZON / _AHEAD
         #: Steps in which a dead end is believed to fail, at most: the model was refuted beyond.
@@ -214,34 +216,26 @@ class LearntRisk:
         self.situations = np.empty((0, 0))
         self.backups: Backups | None = None
         self.disturbances: Disturbances | None = None
-        self._pool = np.empty((0, 0))  # residuals, only for disturbances without memory
         self._rest: Iterator[None] | None = None  # of the study of an episode that goes on
         self._forget()
 
-    def trial(self) -> Trial | None:
-        """None: what it has to try, its search tries."""
-        return None
-
-    def effective(self, situation: Situation, actions: Floats) -> Floats:
-        """All actions as they are."""
-        return actions
+    @property
+    def fallback(self) -> Fallback:
+        """What is done without a usable proposal, and then revised like any."""
+        if self.dynamics.choices:
+            return Fallback(0.0, "the first action")
+        middle = self.dynamics.decode(np.zeros(self.dynamics.size))
+        return Fallback(middle if len(middle) > 1 else float(middle[0]), "the middle of the range")
 
     def refuse_unfit(self, low: Any, high: Any) -> None:
         """Raise for another range of actions than it learns of."""
-        own = self.range
+        learnt = self.dynamics
+        own = (0, learnt.choices - 1) if learnt.choices else (learnt.low, learnt.high)
         if not all(map(np.array_equal, map(np.atleast_1d, own), map(np.atleast_1d, (low, high)))):
             raise ValueError(
                 f"the judge was made for actions from {own[0]} to {own[1]}, not from {low} to "
                 f"{high}: give it low and high, or n_actions, of the guard"
             )
-
-    @property
-    def range(self) -> tuple[Any, Any]:
-        """The lowest and the highest action; the first and the last index of choices."""
-        dynamics = self.dynamics
-        if dynamics.choices:
-            return 0, dynamics.choices - 1
-        return dynamics.low, dynamics.high
 
     # -- Deciding -------------------------------------------------------------------------------
 
@@ -271,18 +265,25 @@ class LearntRisk:
         drifts = [(called[j], since) for j, since in latest.items()]
         noisy = [name for name, gain in zip(called, dynamics.gains, strict=True) if gain < 1.0]
         known = fails, self.remembered, self.margin, drifts, self.violations.worse + 1, noisy
-        inside = regions.inside(dynamics.regions, dynamics.failures).sum(1).tolist()
-        rows = zip(dynamics.regions.tolist(), inside, strict=True)
-        there = [words.region(called, row, count) for row, count in rows]
-        places = [one.place for one in dynamics.sequences if one.place[0] >= 0]
+
+        def places(found: Floats, seen: Floats, what: str = "failure") -> list[str]:
+            inside = regions.inside(found, seen).sum(1).tolist()
+            rows = zip(found.tolist(), inside, strict=True)
+            return [words.region(called, row, count, what) for row, count in rows]
+
+        failures = dynamics.failures
+        there = places(dynamics.regions, failures)
+        there += [f"if it ends {one}" for one in places(dynamics.crashes, failures)]
+        over = places(dynamics.endings, dynamics.ended, "ending")
+        only = [one.place for one in dynamics.sequences if one.place[0] >= 0]
         begin = [
-            (called[j], sign < 0.0, [place[2] for place in places if place[:2] == (j, sign)])
-            for j, sign in sorted({place[:2] for place in places})
+            (called[j], sign < 0.0, [place[2] for place in only if place[:2] == (j, sign)])
+            for j, sign in sorted({place[:2] for place in only})
         ]
         ends = dynamics.dead_ends.counts.astype(int).tolist()
-        more = dynamics.differs, self._no_threshold, there, begin, ends
+        more = dynamics.differs, self._no_threshold, there, begin, ends, over
         told = words.experience(*known, *more)
-        return told + words.harm(self.harm, tests=self.shadow, learning=self.learning)
+        return told + words.harm(self.harm, learning=self.learning)
 
     def told_here(self, observation: Floats) -> tuple[str, Floats | None]:
         """What was learnt of an observation, in words, and the centre of the dead end it is near.
@@ -330,7 +331,7 @@ class LearntRisk:
         if not dynamics.fails:
             return Search(one, _unjudged(1), 0, self._no_threshold)
         model = dynamics.daring if self.learning else dynamics.model
-        if not len(model.thresholds) + len(model.regions):
+        if not len(model.thresholds) + len(model.regions) + len(model.crashes):
             return Search(one, _unjudged(1), 0, words.DOUBTED)
         proposal, scale = dynamics.encode(wanted), self.disturbance_scale
         few, most = self.effort
@@ -554,12 +555,12 @@ class LearntRisk:
             self._forget()
 
     @_atomic
-    def end(self, observation: Floats | None, *, failed: bool) -> None:
+    def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
         """Learn from an episode; its last observation was taken in (`observe`)."""
         self.n_failed += int(failed)
         seen_whole = observation is None or not math.isnan(observation.dot(observation))
         self._finish()
-        self.dynamics.end(failed=failed and seen_whole)
+        self.dynamics.end(failed=failed and seen_whole, terminated=terminated and seen_whole)
         if self.dynamics.n_episodes != self.n_studied:
             self._rest = self._study()
             self._finish()
@@ -614,14 +615,9 @@ class LearntRisk:
             yield from self._study_whole(episode, best, random)
         elif self._scans:  # it was too short for more than to try again
             self.n_scanned += 1
-        if "memory" in dynamics.without and episode is not None:
-            self.disturbances, self._pool = library.shuffled(
-                dynamics, self._pool, self.horizon, random
-            )
-        elif "memory" not in dynamics.without:
-            self.disturbances = yield from library.choose(
-                dynamics, self.situations, self.horizon, best[:2], self.disturbance_scale
-            )
+        self.disturbances = yield from library.choose(
+            dynamics, self.situations, self.horizon, best[:2], self.disturbance_scale
+        )
         if dynamics.fails and len(self.situations) >= _ENOUGH:
             yield
             self.backups = yield from self.evolved(random)
@@ -644,7 +640,11 @@ class LearntRisk:
         self.situations = library.noted(self.situations, episode, tight, self.horizon, random)
         dynamics.challenge(sum(tight))
         if "dead-ends" not in self.without and dynamics.fails:
-            self._learn_dead_ends(episode)
+            certified = [held for _, _, held in self._notes] if episode.failed else []
+            unproven = self.horizon if episode.failed else 0 if episode.terminated else LAST
+            given = episode.observations, certified, unproven, dynamics.model.inverse
+            dynamics.dead_ends = dynamics.dead_ends.after(*given, dynamics.sums.unit)
+            dynamics.rebuild()
         yield
         if self._scans:
             yield from library.scan(dynamics, self.situations, self.horizon, best[:1], random)
@@ -659,17 +659,8 @@ class LearntRisk:
             self._look_ahead(after, refuted=len(refuted) > 0, failed=episode.failed)
             yield
 
-    def _learn_dead_ends(self, episode: Episode) -> None:
-        """From what was survived, and from where it failed although it was certified not to."""
-        dynamics, certified = self.dynamics, [held for _, _, held in self._notes]
-        known = dynamics.model.inverse, dynamics.sums.unit
-        given = episode.observations, certified, self.horizon, *known
-        dynamics.keep_dead_ends(dynamics.dead_ends.after(*given, failed=episode.failed))
-
     def _is_worse(self) -> bool:
         """Whether disturbances got worse than those that are remembered."""
-        if "breaks" in self.without:
-            return False
         before, violated, latest = self.violations, self._violated, self.dynamics.latest
         failed = violated and latest is not None and latest.failed
         self.violations = before.after(self.n_studied - 1, violated=violated, failed=failed)
@@ -840,30 +831,11 @@ KIND = Kind(
             "held": COUNT._replace(least=-1.0),
             "differs": SHARE,
             "doubt_of_lags": Numbers(least=0.0),
-            "exposed": COUNT,
-            "ready": FLAG,
+            "ready": bool,
             "dead_ends": COUNT,
         },
     },
 )
-
-
-def _steps(horizon: float, dt: float) -> int:
-    """The steps of a horizon that is given, if they are not too many."""
-    if horizon / dt > _MOST_STEPS:
-        raise ValueError(
-            f"horizon is {horizon:g} s, {horizon / dt:,.0f} decisions of {dt:g} s; a learnt judge "
-            f"looks at most {_MOST_STEPS:,} ahead (is it in seconds?)"
-        )
-    return max(1, round(horizon / dt))
-
-
-def _fallback(dynamics: Dynamics) -> Fallback:
-    """The first of some actions, or the middle of a range."""
-    if dynamics.choices:
-        return Fallback(0.0, "the first action")
-    middle = dynamics.decode(np.zeros(dynamics.size))
-    return Fallback(middle if len(middle) > 1 else float(middle[0]), "the middle of the range")
 
 
 def _unjudged(count: int) -> Judgement:

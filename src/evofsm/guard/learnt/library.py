@@ -41,8 +41,6 @@ _MOST_STARTS, _APART = 160, 3
 _AT_ONCE, _BY_FAR = 3, 100.0
 # What is lost in more than this share of situations that nothing else disturbs begins in its place.
 _HOPELESS = 0.5
-# Residuals that disturbances without memory are drawn from.
-_POOL = 3000
 # Linear policies; mutants that are tried an episode, and of those how many of the best one.
 _LINEAR, _MUTANTS, _OF_BEST = 3, 40, 0.8
 # Products in the replays that a decision may wait for: some 10 ms.
@@ -238,18 +236,6 @@ def placed(
         if tuple(place[k, :2].tolist()) in lost:
             nowhere[k] = place[k]
     return found
-
-
-def shuffled(
-    dynamics: Dynamics, pool: Floats, horizon: int, random: np.random.Generator
-) -> tuple[Disturbances, Floats]:
-    """As many disturbances whose steps have nothing to do with each other, and what they are of."""
-    assert dynamics.latest is not None
-    pool = np.vstack([pool.reshape(-1, dynamics.n_variables), dynamics.latest.residuals])[-_POOL:]
-    made = Disturbances.none(1 + dynamics.remembered, horizon, dynamics.n_variables)
-    for k in range(dynamics.remembered):
-        made.residuals[:, :, 1 + k] = pool[random.integers(len(pool), size=horizon)]
-    return made, pool
 
 
 def failing_after(

@@ -18,7 +18,6 @@ from evofsm.guard.learnt import library
 from evofsm.guard.learnt.dead_ends import DeadEnds
 from evofsm.guard.learnt.dynamics import MOST, MOST_SURVIVED, Dynamics
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.learnt.places import Places
 from evofsm.guard.learnt.regression import Drift, Recent
 from evofsm.guard.learnt.replay import Floats, Sums, crossed, n_products, pairs
 
@@ -56,7 +55,8 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     if not judges:
         raise ValueError("judges is empty; there must be at least one to merge")
     for one in judges[1:]:
-        judges[0].refuse_unfit(*one.range)
+        if not one.dynamics.choices:
+            judges[0].refuse_unfit(one.dynamics.low, one.dynamics.high)
     if len({(one.dt, one.dynamics.choices) for one in judges}) > 1:
         raise ValueError("judges to merge must be of the same actions and interval")
     told = [one for one in judges if one.dynamics.n_variables]
@@ -123,23 +123,25 @@ def _merged(parts: Sequence[Dynamics]) -> Dynamics:
     there = np.stack([lowest, highest], 2), np.stack([merged.lowest, merged.highest], 1)
     merged.reached = np.where(np.isclose(*there, 1e-9, 0.0), of("reached"), 0.0).sum(0)
     merged.n_episodes, merged.sequences, drifts = int(of("n_episodes").sum()), [], []
+    events = []
     for part in parts:  # the latest episode of each is the latest of all
         later, newest = merged.n_episodes - part.n_episodes, part.sequences[-merged.remembered :]
         merged.sequences += [one._replace(episode=one.episode + later) for one in newest]
+        events.append(part.events + later * (np.arange(part.events.shape[1]) == 3 * m + 2 * a))
         drifts += [Drift(j, since + later, noticed + later) for j, since, noticed in part.drifts]
     merged.drifts = sorted(drifts)
-    for name in ("failures", "brinks"):
+    for name in ("failures", "brinks", "ended"):
         setattr(merged, name, np.concatenate([getattr(part, name)[-each:] for part in parts]))
     survived = np.concatenate([part.survived for part in parts])
     merged.survived = survived[:: -(-len(survived) // MOST_SURVIVED) or 1]
     jumps = zip(*(part.jumps for part in parts), strict=True)
     merged.jumps = [np.concatenate([rows[-each:] for rows in seen]) for seen in jumps]
-    offsets = [merged.n_episodes - part.n_episodes for part in parts]
-    merged.places = Places.merged([part.places for part in parts], offsets)
+    merged.events = np.concatenate(events)
     merged.recent, merged.latest = Recent.none(p, m, merged.n_episodes), None
     merged.settle(failed=True)
     known = merged.model.inverse, merged.sums.unit
-    merged.keep_dead_ends(DeadEnds.merged([part.dead_ends for part in parts], *known))
+    merged.dead_ends = DeadEnds.merged([part.dead_ends for part in parts], *known)
+    merged.rebuild()
     return merged
 
 

@@ -19,7 +19,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.guard.learnt.replay import FLAT, Floats, Ints
+from evofsm.guard.learnt.replay import FLAT, GROWN, Floats, Ints
 
 Flags = NDArray[np.bool_]
 Threshold = tuple[int, float, float]
@@ -67,6 +67,22 @@ def without_survived(regions: Floats, survived: Floats) -> Floats:
     new, most = regions.copy(), forms(regions, survived)[0].max(1, initial=0.0)
     new[:, 6] -= np.where(most > 0.0, most + 1e-12 * (np.abs(new[:, 6]) + most), 0.0)
     return new
+
+
+def halfway(regions: Floats, failures: Floats) -> Floats:
+    """Regions half as far from the innermost of the failures in each as they reached beyond."""
+    new, form = regions.copy(), forms(regions, failures)[0]
+    new[:, 6] -= 0.5 * np.where(form > 0.0, form, np.inf).min(1, initial=2.0 * GROWN)
+    return new
+
+
+def of_thresholds(found: Sequence[Threshold], unit: Floats) -> Floats:
+    """Regions (t, 12) beyond thresholds; ``unit`` (m,) is what a distance of 1 is."""
+    rows = [
+        [j, j, at, at, 1.0 / unit[j], 1.0 / unit[j], 0.0, sign, 0.0, 0.0, 0.0, 0.0]
+        for j, sign, at in found
+    ]
+    return np.array(rows, np.float64).reshape(-1, SIZE)
 
 
 def explained(

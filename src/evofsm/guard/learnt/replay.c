@@ -15,13 +15,14 @@
   double before[EVOFSM_NUMBERS][EVOFSM_LANES], now[EVOFSM_NUMBERS][EVOFSM_LANES];
   double found[EVOFSM_FEATURES][EVOFSM_LANES];
   double near[EVOFSM_LANES], far[EVOFSM_LANES], value[EVOFSM_LANES], worth[EVOFSM_LANES];
+  double over[EVOFSM_LANES], square[EVOFSM_LANES];
   int survived[EVOFSM_LANES];
 #if EVOFSM_PLACED
   double rest[EVOFSM_VARIABLES][EVOFSM_LANES];
   int clock[EVOFSM_LANES];
 #endif
 #if EVOFSM_DEAD_ENDS > 0
-  double aside[EVOFSM_DEAD_ENDS][EVOFSM_LANES], square[EVOFSM_LANES];
+  double aside[EVOFSM_DEAD_ENDS][EVOFSM_LANES];
   double away[EVOFSM_DEAD_ENDS]; /* how far each is from here */
   int is_left_out[EVOFSM_DEAD_ENDS], order[EVOFSM_DEAD_ENDS];
 #endif
@@ -178,12 +179,44 @@ static void from_centre(evofsm_state *s, int end) {
 }
 #endif
 
-/* _distances: to the nearest failure, into s->far. */
+#if REGIONS + ENDINGS > 0
+/* _to_region: distances to a region, into s->square. */
+static void to_region(evofsm_state *s, const double row[12]) {
+  const double *one = s->z[(int)row[0]], *other = s->z[(int)row[1]];
+  const double c = row[6], b = row[7], d = row[8], p = row[9], q = row[10], r = row[11];
+  int l;
+  for (l = 0; l < L; l++) {
+    const double x = (one[l] - row[2]) * row[4], y = (other[l] - row[3]) * row[5];
+    const double form = c + x * (b + p * x + q * y) + y * (d + r * y);
+    const double u = b + 2.0 * p * x + q * y, v = d + 2.0 * r * y + q * x;
+    s->square[l] = -form / sqrt(u * u + v * v + FLAT);
+  }
+}
+#endif
+
+/* _distances: to the nearest failure, into s->far, and to where it ends by itself, into s->over. */
 static void measure(evofsm_state *s) {
   int f, l;
   for (l = 0; l < L; l++) {
-    s->far[l] = INFINITY;
+    s->far[l] = s->over[l] = INFINITY;
   }
+#if ENDINGS > 0
+  for (f = 0; f < ENDINGS; f++) {
+    to_region(s, endings[f]);
+    for (l = 0; l < L; l++) {
+      s->over[l] = s->square[l] < s->over[l] ? s->square[l] : s->over[l];
+    }
+  }
+#endif
+#if CRASHES > 0
+  for (f = 0; f < CRASHES; f++) {
+    to_region(s, crashes[f]);
+    for (l = 0; l < L; l++) {
+      const double left = greater(s->over[l] - GROWN, s->square[l]);
+      s->far[l] = left < s->far[l] ? left : s->far[l];
+    }
+  }
+#endif
 #if THRESHOLDS > 0
   for (f = 0; f < THRESHOLDS; f++) {
     const double sign = thresholds[f][1], threshold = thresholds[f][2], worth = thresholds[f][3];
@@ -196,15 +229,9 @@ static void measure(evofsm_state *s) {
 #endif
 #if REGIONS > 0
   for (f = 0; f < REGIONS; f++) {
-    const double *one = s->z[(int)regions[f][0]], *other = s->z[(int)regions[f][1]];
-    const double c = regions[f][6], b = regions[f][7], d = regions[f][8];
-    const double p = regions[f][9], q = regions[f][10], r = regions[f][11];
+    to_region(s, regions[f]);
     for (l = 0; l < L; l++) {
-      const double x = (one[l] - regions[f][2]) * regions[f][4];
-      const double y = (other[l] - regions[f][3]) * regions[f][5];
-      const double form = c + x * (b + p * x + q * y) + y * (d + r * y);
-      const double u = b + 2.0 * p * x + q * y, v = d + 2.0 * r * y + q * x;
-      const double left = -form / sqrt(u * u + v * v + FLAT) - GROWN;
+      const double left = s->square[l] - GROWN;
       s->far[l] = left < s->far[l] ? left : s->far[l];
     }
   }
@@ -328,7 +355,7 @@ static void step(evofsm_state *s, int t, double harder) {
 static int replay(evofsm_state *s, const double *action, const double policy[A][1 + M],
                   double harder, double enough, int allowed, double *left) {
   const double end = 1.0 - RESERVE * enough;
-  int i, j, l, t, lost = 0;
+  int i, j, l, t, lost = 0, ended = 0;
   for (l = 0; l < L; l++) {
     for (j = 0; j < M; j++) {
       s->z[j][l] = s->here[j];
@@ -371,10 +398,7 @@ static int replay(evofsm_state *s, const double *action, const double policy[A][
       s->near[l] = s->survived[l] == STEPS ? nearer : s->near[l];
       fails += (s->survived[l] == STEPS) & (s->near[l] < enough);
     }
-    if (fails == 0) {
-      continue;
-    }
-    for (l = 0; l < K; l++) {
+    for (l = 0; l < K && fails > 0; l++) {
       if (s->survived[l] == STEPS && s->near[l] < enough) {
         s->survived[l] = t;
         lost++;
@@ -383,13 +407,22 @@ static int replay(evofsm_state *s, const double *action, const double policy[A][
         }
       }
     }
-    if (lost >= K || lost > allowed) {
+    if (fails > 0 && (lost >= K || lost > allowed)) {
+      break;
+    }
+    for (l = 0; l < K; l++) {
+      if (s->survived[l] == STEPS && s->over[l] <= -SHRUNK) {
+        s->survived[l] = STEPS + 1;
+        ended++;
+      }
+    }
+    if (ended > 0 && lost + ended >= K) {
       break;
     }
   }
   *left = INFINITY;
   for (l = 0; l < K; l++) {
-    const double share = (double)s->survived[l] / (double)STEPS;
+    const double share = (double)(s->survived[l] < STEPS ? s->survived[l] : STEPS) / (double)STEPS;
     double distance = s->near[l];
     if (s->near[l] >= enough) {
       *left = lesser(*left, s->near[l]);
@@ -397,7 +430,7 @@ static int replay(evofsm_state *s, const double *action, const double policy[A][
     s->value[l] = s->near[l];
     if (s->survived[l] == STEPS) {
       distance = 0.5 * (s->near[l] + s->far[l]);
-    } else {
+    } else if (s->survived[l] < STEPS) {
       s->value[l] = (double)(s->survived[l] - STEPS) - 1.0;
     }
     s->worth[l] = share + DISTANCE * lesser(1.0, greater(-1.0, FAR * distance));

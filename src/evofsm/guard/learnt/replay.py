@@ -56,8 +56,9 @@ ONSET = 4.0
 _OUTLIER = 4.0
 #: The square of a gradient that is none: a form that does not change is far from 0.
 FLAT = 1e-300
-#: So much larger than they were learnt to be regions are taken [ordinary changes].
-GROWN = 1.0
+#: So much larger than they were learnt to be regions are taken, and smaller where endings are
+#: [ordinary changes].
+GROWN, SHRUNK = 1.0, 0.5
 
 
 class Model(NamedTuple):
@@ -76,6 +77,8 @@ class Model(NamedTuple):
     #: large a unit (its inverse), and a quadratic form in those, above 0 where it fails:
     #: 1, x, y, x x, x y, y y
     regions: Floats
+    endings: Floats  #: (e, 12) where it ends by itself, as regions are
+    crashes: Floats  #: (c, 12) where it fails if it ends, as regions are
     #: (k, m + 2) dead ends: centre, radius in spreads, and ordinary changes in a spread
     dead_ends: Floats
     drifted: Floats  #: (m,) 1 of a variable that moves otherwise than it did, -1 of others then
@@ -446,17 +449,42 @@ def _from_centre(model: Model, s: int, z: Floats, square: Floats) -> None:
 
 
 @spliced_kernel
-def _distances(model: Model, z: Floats, aside: Floats, square: Floats, far: Floats) -> None:
+def _to_region(regions: Floats, s: int, z: Floats, far: Floats) -> None:
+    """Distances of n observations (m, n) to a region: its form over the length of its gradient."""
+    i, j = int(regions[s, 0]), int(regions[s, 1])
+    at, to, one, other = regions[s, 2], regions[s, 3], regions[s, 4], regions[s, 5]
+    c, b, d = regions[s, 6], regions[s, 7], regions[s, 8]
+    p, q, r = regions[s, 9], regions[s, 10], regions[s, 11]
+    for l in range(len(far)):
+        x, y = (z[i, l] - at) * one, (z[j, l] - to) * other
+        form = c + x * (b + p * x + q * y) + y * (d + r * y)
+        u, v = b + 2.0 * p * x + q * y, d + 2.0 * r * y + q * x
+        far[l] = -form / np.sqrt(u * u + v * v + FLAT)
+
+
+@spliced_kernel
+def _distances(
+    model: Model, z: Floats, aside: Floats, square: Floats, far: Floats, over: Floats
+) -> None:
     """The distance of each of n observations (m, n) to the nearest failure, into ``far`` (n,).
 
-    To a region to first order: its form over the length of its gradient; a boundary that touches
-    what was survived in one place lies beyond the truth elsewhere, so regions are `GROWN`. To dead
-    ends as well, but for those of (k, n) that are set ``aside``, infinitely far. ``square`` (n,) is
-    overwritten.
+    And to where it ends by itself, into ``over`` (n,): there it also fails if it crashes. Distances
+    to regions are of first order; a boundary that touches what was survived in one place lies
+    beyond the truth elsewhere, so they are `GROWN`. To dead ends as well, but for those of (k, n)
+    that are set ``aside``, infinitely far. ``square`` (n,) is overwritten.
     """
     n = len(far)
     for l in range(n):
-        far[l] = np.inf
+        far[l] = over[l] = np.inf
+    for s in range(len(model.endings)):
+        _to_region(model.endings, s, z, square)
+        for l in range(n):
+            over[l] = square[l] if square[l] < over[l] else over[l]
+    for s in range(len(model.crashes)):
+        _to_region(model.crashes, s, z, square)
+        for l in range(n):
+            left = max(over[l] - GROWN, square[l])
+            far[l] = left if left < far[l] else far[l]
     for s in range(len(model.thresholds)):
         j, sign = int(model.thresholds[s, 0]), model.thresholds[s, 1]
         threshold, worth = model.thresholds[s, 2], model.thresholds[s, 3]
@@ -464,16 +492,9 @@ def _distances(model: Model, z: Floats, aside: Floats, square: Floats, far: Floa
             left = sign * (threshold - z[j, l]) * worth
             far[l] = left if left < far[l] else far[l]
     for s in range(len(model.regions)):
-        i, j = int(model.regions[s, 0]), int(model.regions[s, 1])
-        at, to = model.regions[s, 2], model.regions[s, 3]
-        one, other = model.regions[s, 4], model.regions[s, 5]
-        c, b, d = model.regions[s, 6], model.regions[s, 7], model.regions[s, 8]
-        p, q, r = model.regions[s, 9], model.regions[s, 10], model.regions[s, 11]
+        _to_region(model.regions, s, z, square)
         for l in range(n):
-            x, y = (z[i, l] - at) * one, (z[j, l] - to) * other
-            form = c + x * (b + p * x + q * y) + y * (d + r * y)
-            u, v = b + 2.0 * p * x + q * y, d + 2.0 * r * y + q * x
-            left = -form / np.sqrt(u * u + v * v + FLAT) - GROWN
+            left = square[l] - GROWN
             far[l] = left if left < far[l] else far[l]
     for s in range(len(model.dead_ends)):
         _from_centre(model, s, z, square)
@@ -530,7 +551,7 @@ def _replay(
     z, change, move, after = np.empty((m, n)), np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
     before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
     which, survived = np.empty(n, np.int64), np.empty(n, np.int64)
-    near, far, square = np.empty(n), np.empty(n), np.empty(n)
+    near, far, square, over = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     at, clock, rest = np.empty(n, np.int64), np.zeros(n, np.int64), np.empty((m, n))
     aside = np.empty((len(model.dead_ends), n))
     jumps, placed = False, False
@@ -551,7 +572,7 @@ def _replay(
         for l in range(n):
             within = (square[l] < radius * radius) & (allowed >= count)
             aside[s, l] = np.inf if within else 0.0
-    lost, end, took = 0, 1.0 - _RESERVE * enough, 0
+    lost, ended, end, took = 0, 0, 1.0 - _RESERVE * enough, 0
     for t in range(steps):
         took += 1
         if t < len(plan):
@@ -607,29 +628,35 @@ def _replay(
         for i in range(a):
             for l in range(n):
                 before[i, l] = action[i, l]
-        _distances(model, z, aside, square, far)
+        _distances(model, z, aside, square, far, over)
         fails = 0
         for l in range(n):
             nearer = far[l] if far[l] < near[l] else near[l]
             near[l] = nearer if survived[l] == steps else near[l]
         for l in range(n):
             fails += 1 if (survived[l] == steps) & (near[l] < enough) else 0
-        if fails == 0:
-            continue
-        for l in range(count):
-            if survived[l] == steps and near[l] < enough:
-                survived[l] = t
-                lost += 1
-                if allowed < count and which[l] == 0:
-                    lost = count
-        if lost >= count or lost > allowed:
-            break
+        if fails > 0:
+            for l in range(count):
+                if survived[l] == steps and near[l] < enough:
+                    survived[l] = t
+                    lost += 1
+                    if allowed < count and which[l] == 0:
+                        lost = count
+            if lost >= count or lost > allowed:
+                break
+        if len(model.endings) > 0:  # what fails at once has failed
+            for l in range(count):
+                if survived[l] == steps and over[l] <= -SHRUNK:
+                    survived[l] = steps + 1
+                    ended += 1
+            if ended > 0 and lost + ended >= count:
+                break
     left = np.inf
     for l in range(count):
-        share, distance = survived[l] / steps, near[l]
+        share, distance = min(survived[l], steps) / steps, near[l]
         if near[l] >= enough:
             left = min(left, near[l])
-        ends.value[l] = near[l] if survived[l] == steps else survived[l] - steps - 1.0
+        ends.value[l] = near[l] if survived[l] >= steps else survived[l] - steps - 1.0
         if survived[l] == steps:
             distance = 0.5 * (near[l] + far[l])  # those in the end
         ends.worth[l] = share + _DISTANCE * min(1.0, max(-1.0, _FAR * distance))
@@ -652,9 +679,9 @@ def replay(
 
     A situation is an observation, its change, and the action before (2m + a). First the actions of
     the ``plan`` (T, a) are taken, if it has any, then what the ``policy`` (a, 1 + m) says. A replay
-    ends where the distance to failure falls below ``enough``, and the larger that is, the more of
-    the range of actions the policy leaves unused: where full action just holds, no distance says
-    how near the point of no return is.
+    ends where the distance to failure falls below ``enough``, or, survived, where the system ends
+    by itself. The larger ``enough`` is, the more of the range of actions the policy leaves unused:
+    where full action just holds, no distance says how near the point of no return is.
     """
     count = len(situations) * disturbances.residuals.shape[2]
     ends = Ends(np.empty(count), np.empty(count))

@@ -156,18 +156,21 @@ def experience(
     regions: Sequence[str] = (),
     begin: Sequence[tuple[str, bool, Sequence[float]]] = (),
     ends: Sequence[int] = (),
+    over: Sequence[str] = (),
 ) -> str:
     """What was learnt so far: variables that fail, whether below a threshold, and which.
 
     Since which episode, from 1, variables move otherwise and disturbances are worse (0: none are).
     In which share of the states around a given function says otherwise. Beyond which thresholds
-    alone disturbances begin. From how many episodes each dead end is known.
+    alone disturbances begin. From how many episodes each dead end is known. Where it ends.
     """
     since = "".join(f"; since episode {first} {name} moves otherwise" for name, first in drifts)
     if worse:
         since += f"; since episode {worse} disturbances are worse than those of before"
     if noisy:
         since += f"; sensors are noisy: {', '.join(noisy)}"
+    if over:
+        since += f"; ends by itself {' or '.join(over)}"
     if not fails and not regions:
         return nothing + since
     if differs:
@@ -186,7 +189,7 @@ def experience(
     return f"fails {fails_there}; {them}{since}{dead_ends(ends)}"
 
 
-def region(names: Sequence[str], row: Sequence[float], failures: int) -> str:
+def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "failure") -> str:
     """Where a region is (a row as in `regions`), in which so many failures were seen.
 
     Examples
@@ -196,10 +199,12 @@ def region(names: Sequence[str], row: Sequence[float], failures: int) -> str:
     >>> region(["x", "y"], [0, 1, 0.0, 0.0, 1.0, 1.0, -5.0, 3.0, 4.0, 0.0, 0.0, 0.0], 1)
     'where 0.6 x + 0.8 y is above 1 (1 failure)'
     """
-    seen = f"({failures:,} failure{'s' * (failures != 1)})"
+    seen = f"({count:,} {what}{'s' * (count != 1)})"
     i, j, at, to, one, other, c, b, d, p, q, r = row
     x, y = names[int(i)], names[int(j)]
     if i == j:
+        if p == 0.0 and b != 0.0:
+            return f"where {x} is {'above' if b > 0.0 else 'below'} {at - c / (b * one):.4g} {seen}"
         spare = b * b - 4.0 * p * c
         if p == 0.0 or spare < 0.0:
             return f"where {x} is near {at:.3g} {seen}"
@@ -228,12 +233,10 @@ def region(names: Sequence[str], row: Sequence[float], failures: int) -> str:
     return f"beyond a curve of {x} and {y}, as at ({at:.3g}, {to:.3g}) {seen}"
 
 
-def harm(known: Harm, *, tests: bool, learning: bool) -> str:
+def harm(known: Harm, *, learning: bool) -> str:
     """What is said of a guard that may do harm, or that is none any more."""
     said = ""
-    if not tests:
-        said = "; no episode is driven in shadow, so that harm would not be noticed"
-    elif known.since or known.in_doubt(learning=learning):
+    if known.since or known.in_doubt(learning=learning):
         before = [one for one in known.outcomes if one.guarded and one.episode < known.since]
         how, what = "it may do harm", "some are driven in shadow" if learning else "proposals pass"
         if known.since:

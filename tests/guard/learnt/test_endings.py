@@ -1,0 +1,96 @@
+"""Endings that are no failure end a replay: who may land, lands."""
+
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+
+from evofsm import Guard  # noqa: E402
+from evofsm.guard import LearntRisk, RevisedActions, merge_judges  # noqa: E402
+from evofsm.guard.learnt.dynamics import Dynamics  # noqa: E402
+from evofsm.guard.learnt.regions import distances  # noqa: E402
+
+
+class Descent(gymnasium.Env):
+    """Thrust brings it down, and it lands; faster than 1 that is a failure."""
+
+    observation_space = gymnasium.spaces.Box(-100.0, 100.0, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(0.0, 2.0, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at = self.np_random.uniform((2.0, -0.5), (4.0, 0.0))
+        self.sinks, self.steps = self.np_random.uniform(0.4, 1.6), 0
+        return self.at, {}
+
+    def step(self, action):
+        push = 0.1 * (float(action[0]) - 1.0) + 0.005 * self.np_random.normal()
+        self.at, self.steps = self.at + np.array([0.1 * self.at[1], push]), self.steps + 1
+        down = bool(self.at[0] <= 0.0)
+        return self.at, 0.0, down, self.steps >= 80, {"failed": down and self.at[1] < -1.0}
+
+
+def flown(guard, seeds):
+    """How many failed, and how many landed; the controller sinks at a pace of its own."""
+    env, outcomes = Descent(), np.zeros(2, int)
+    if guard is not None:
+        env = RevisedActions(env, guard, failed=lambda step: step.info["failed"])
+    for seed in seeds:
+        (seen, _), over = env.reset(seed=seed), False
+        while not over:
+            wanted = np.clip([1.0 - env.unwrapped.sinks - seen[1]], 0.0, 2.0)
+            seen, _, landed, late, info = env.step(wanted)
+            over = landed or late
+        outcomes += info["failed"], landed and not info["failed"]
+    return outcomes.tolist()
+
+
+@pytest.fixture(scope="module")
+def lander():
+    judge = LearntRisk(0.1, 0.0, 2.0, names=("height", "speed"))
+    guard = Guard(low=0.0, high=2.0, interval=0.1, judge=judge)
+    assert flown(guard, range(200, 220))[1] >= 10
+    return guard
+
+
+def test_who_lands_is_let_land_and_what_lands_too_fast_is_not(lander):
+    assert "if it ends where speed is below -0.9" in str(lander)
+    assert "; ends by itself where height is below 0.0" in str(lander)
+    twin = lander.copy()
+    twin.freeze()
+    (failed, landed), alone = flown(twin, range(900, 920)), flown(None, range(900, 920))
+    assert failed == 0 < 4 < alone[0] < 16 <= landed
+
+
+def test_a_file_holds_them_and_a_merged_judge_knows_those_of_both(lander):
+    lander.judge.save(file := BytesIO())
+    again = LearntRisk.load(BytesIO(file.getvalue()))
+    assert again.told_by_experience == lander.judge.told_by_experience
+    merged = merge_judges([lander.judge, again])
+    assert len(merged.dynamics.ended) == 2 * len(again.dynamics.ended)
+    assert "ends by itself" in merged.told_by_experience
+
+
+def walk(dynamics, place, **how):
+    for part in np.linspace(0.0, 1.0, 1 + round(np.abs(place).max() / 0.1)):
+        dynamics.observe(part * np.array(place))
+        dynamics.act(np.zeros(1))
+    dynamics.end(**{"failed": False} | how)
+
+
+def test_where_something_went_on_or_failed_there_is_none():
+    dynamics, ends = Dynamics(-1.0, 1.0), np.array([[1.05, -0.4], [1.05, 0.0], [1.05, 0.3]])
+    for y in np.linspace(-1.0, 1.0, 9):
+        walk(dynamics, [0.9, y])
+    for z in ends:
+        assert len(dynamics.endings) == 0  # three are needed
+        walk(dynamics, z, terminated=True)
+    assert (distances(dynamics.endings, ends) < 0.0).all()
+    walk(dynamics, [1.05, 0.9], failed=True)  # it fails if it ends so far out
+    crashes = distances(dynamics.crashes, np.array([*ends, [1.05, 0.9]])).min(0) < 0.0
+    assert crashes.tolist() == [False, False, False, True]
+    assert not dynamics.thresholds
+    walk(dynamics, [3.0, 0.0])
+    assert (distances(dynamics.endings, np.array([[1.2, 0.0], [3.0, 0.0]])) > 0.0).all()
