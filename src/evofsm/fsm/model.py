@@ -31,7 +31,7 @@ from evofsm.fsm.validation import (
 )
 from evofsm.store import Place
 
-#: Which actions are taken: each alike, the first one again, or each as often as it was used.
+#: Which actions are taken, each alike, the first one again, or each as often as it was used.
 Policy = Literal["marginal", "hold", "observed"]
 
 # In place of counts that are not given.

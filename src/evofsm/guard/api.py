@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # whoever asks for a number here waits for no compiler
 
 #: The highest risk, a probability of failure, that a reviser lets pass.
 TOLERANCE: Final = 0.02
-#: Share of a belief that a machine may leave out: saves most of the time with many states.
+#: Share of a belief that a machine may leave out, which saves most of the time with many states.
 BELIEF_TOLERANCE: Final = 1e-6
 
 
