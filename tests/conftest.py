@@ -51,13 +51,13 @@ def sumo_road():
 @pytest.fixture(scope="session")
 def compiled():
     """All that a watched run needs is compiled, for tests that wait for some seconds only."""
-    from evofsm.cli.watch.session import Session, learn_first, watched_guard
+    from evofsm.cli.watch.session import OnRoads, Session, learn_first, watched_guard
     from evofsm.driving import KinematicWorld, load_family
 
     family = load_family("paper")
-    guard = watched_guard(family)
-    learn_first(guard, family, 2)
-    with Session(family, guard, KinematicWorld()) as session:
+    guard, roads = watched_guard(family), OnRoads(family, KinematicWorld())
+    learn_first(guard, roads, 2)
+    with Session(roads, guard) as session:
         while not session.step().over:
             session.graph()
 

@@ -35,8 +35,8 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c():
     ("arguments", "error"),
     [
         (["paper", "--case", "5"], "case is 5; paper has 1 to 4"),
-        (["paper", "--learn", "nowhere"], "nowhere/guard.evofsm: no such file or directory"),
         (["paper", "--unit", "v=km/h"], "options of columns are for a log, and paper is none"),
+        (["CartPole-v9"], "CartPole-v9: Environment version `v9` for environment `CartPole`"),
         (["missing.mcap"], "missing.mcap: no such file or directory"),
     ],
 )

@@ -3,34 +3,43 @@
 import asyncio
 import math
 
+import numpy as np
 import pytest
 
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.recorded import Recording, record_log
-from evofsm.cli.watch.session import Session, learn_first, watched_guard
-from evofsm.cli.watch.shown import Chronicle, Judged
+from evofsm.cli.watch.session import (
+    OnRoads,
+    Session,
+    learn_first,
+    read_simulated,
+    watched_guard,
+)
+from evofsm.cli.watch.shown import Chronicle, Judged, known_of
 from evofsm.cli.watch.words import tell
 from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.fsm.observations import ObservationEncoder
 from evofsm.guard import Mode
+from evofsm.guard.harm import Harm, Outcome
 from evofsm.io import LogColumns, read_run, recording
 from monitor_rows import line, traffic
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
 PAPER = load_family("paper")
+ROADS = OnRoads(PAPER, KinematicWorld())
 
 
 def learnt(episodes=6):
     guard = watched_guard(PAPER)
-    learn_first(guard, PAPER, episodes)
+    learn_first(guard, ROADS, episodes)
     return guard
 
 
 def opened(family=PAPER, guard=None, **settings):
-    return Session(family, guard or learnt(), KinematicWorld(), **settings)
+    return Session(OnRoads(family, KinematicWorld()), guard or learnt(), **settings)
 
 
 def drive(session):
@@ -47,7 +56,7 @@ def test_danger_shows_long_before_time_to_collision_notices_and_is_told_from_whe
     story = frames[-1].story
     risky = next(frame for frame in frames if frame.proposed_risk.risk > 0.02)
     assert story.first == story.danger.began.time == risky.time
-    assert risky.critical < risky.brakes_to
+    assert risky.proposed_risk.critical < risky.needed
     assert story.first < story.danger.dead_end < story.leader_brakes
     assert story.time_to_collision - story.first > 20.0
     assert story.leader_decel == 9.0
@@ -65,26 +74,26 @@ def test_the_same_run_is_shown_the_same_and_restarting_begins_anew():
     frames = drive(session)
     assert session.start.case == 3
     assert [frame.number for frame in frames] == list(range(len(frames)))
-    assert frames[0].x_follower == 0.0
+    assert frames[0].cars.x_follower == 0.0
     assert frames[0].story.danger is None
     with pytest.raises(ValueError, match="case is 5; paper has 1 to 4"):
         session.restart(4)
 
 
 def test_danger_is_over_two_seconds_after_the_last_wish_that_was_not_tolerable():
-    calm, chronicle = Session(PAPER, learnt(), KinematicWorld()).step(), Chronicle(0.02)
+    calm, chronicle = opened().step(), Chronicle(0.02)
     risks = {0.0: 0.5, 1.0: 0.01, 1.9: 0.01, 2.0: 0.01, 3.0: 0.03, 4.0: math.nan}
     told = []
     for time, risk in risks.items():
-        frame = calm._replace(time=time, proposed_risk=Judged(risk), proposed=2.0, executed=1.0)
+        frame = calm._replace(time=time, proposed_risk=Judged(risk), revised=True)
         told.append(chronicle.tell(frame))
     assert [story.in_danger for story in told] == [True, True, True, False, True, True]
     assert (told[-1].first, told[-1].danger.began.time, told[-1].danger.last) == (0.0, 3.0, 3.0)
-    assert (told[-1].revised, told[-1].danger.revised, told[-1].danger.change) == (6, 2, 2.0)
+    assert (told[-1].revised, told[-1].danger.revised) == (6, 2)
 
 
 def test_states_grow_from_empty_and_keep_their_numbers():
-    session = Session(PAPER, watched_guard(PAPER), KinematicWorld())
+    session = opened(guard=watched_guard(PAPER))
     assert session.graph().states == ()
     created = [frame for frame in drive(session) if frame.event == "created"]
     graph = session.graph()
@@ -93,6 +102,57 @@ def test_states_grow_from_empty_and_keep_their_numbers():
     origins = {origin for origin, _, _ in graph.transitions}
     assert all(origin != target for origin, target, _ in graph.transitions)
     assert origins <= set(range(len(graph.states)))
+
+
+def test_any_environment_is_watched_by_a_guard_that_is_given_nothing_but_which_episodes_failed():
+    system = read_simulated("CartPole-v1")
+    learn_first(system.guard, system, 12)
+    with Session(system, system.guard, on=False) as session:
+        *_, alone = drive(session)
+        assert alone.failed
+        assert alone.time == pytest.approx(alone.story.alone)
+        session.revising = True
+        session.restart()
+        *frames, last = drive(session)
+        known, start = session.known(), session.start
+    assert last.time > alone.time
+    assert any(frame.revised for frame in frames)
+    assert {frame.executed for frame in frames} == {(0.0,), (1.0,)}
+    assert max(frame.proposed_risk.risk for frame in frames) > 0.5
+    assert (start.names[2], start.discrete, start.high) == ("variable 3", True, (1.0,))
+    assert known.plane[0] in {variable for variable, _, _ in known.thresholds}
+    assert len(known.failed) == 13 + last.failed
+    assert "The controller alone would have failed at" in tell(last, start).alone
+
+
+def test_a_guard_that_is_no_better_than_the_controller_alone_says_so():
+    judge = read_simulated("CartPole-v1").guard.judge
+    judge.dynamics.observe(np.zeros(4))
+    for steps, said in ((30, ""), (10, "no better than the controller alone: 5 of 5 guarded")):
+        ends = [(20, False)] * 5 + [(steps, True)] * 5
+        outcomes = [Outcome(k + 1, n, True, guarded) for k, (n, guarded) in enumerate(ends)]
+        judge.harm = Harm(tuple(outcomes), len(ends))
+        assert known_of(judge).harm.startswith(said)
+        assert bool(known_of(judge).harm) == bool(said)
+
+
+def test_a_file_holds_an_environment_of_ones_own(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text(
+        "import gymnasium\n"
+        "def environment():\n    return gymnasium.make('Pendulum-v1')\n"
+        "def controller(seen, random):\n    return [2.0 * random.random()]\n"
+        "def failed(step):\n    return step.observation[0] < -0.9\n"
+        "variables = ('cos', 'sin', 'speed')\n"
+    )
+    system = read_simulated(str(path))
+    with Session(system, system.guard) as session:
+        assert (session.start.system, session.start.names) == ("own", ("cos", "sin", "speed"))
+        for frame in drive(session)[:-1]:
+            assert 0.0 <= frame.proposed[0] <= 2.0
+    path.write_text("def environment():\n    return 1 / 0\n")
+    with pytest.raises(ValueError, match=r"own\.py: ZeroDivisionError: division by zero"):
+        read_simulated(str(path))
 
 
 # -- A recording ----------------------------------------------------------------------------------
@@ -123,8 +183,8 @@ def test_a_recording_shows_what_was_decided(recorded):
     for case, drive_ in enumerate(drives):
         shown.restart(case)
         frames = drive(shown)
-        assert [frame.executed for frame in frames[:-1]] == drive_.executed.tolist()
-        assert frames[-1].collided == drive_.collided == bool(case)
+        assert [frame.executed[0] for frame in frames[:-1]] == drive_.executed.tolist()
+        assert frames[-1].failed == drive_.collided == bool(case)
         assert frames[-1].time == drive_.time[-1]
         risks = [decision.revision.risk_proposed for decision in drive_.decisions]
         assert frames[-1].story.first == next(
@@ -165,8 +225,9 @@ def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
     assert shown.start.about == "recorded in objects.csv"
     assert not shown.revising
     first, *_, last = drive(shown)
-    assert first.v_follower == pytest.approx(20.0)
-    assert [last.a_follower, last.a_leader, last.x_follower] == pytest.approx([0.0, -5.0, 158.0])
+    assert first.cars.v_follower == pytest.approx(20.0)
+    found = last.cars.a_follower, last.cars.a_leader, last.cars.x_follower
+    assert found == pytest.approx((0.0, -5.0, 158.0))
 
 
 def test_episodes_of_a_log_are_sorted_by_what_came_of_them_and_begin_where_it_is_worth_a_look(
@@ -187,7 +248,7 @@ def test_episodes_of_a_log_are_sorted_by_what_came_of_them_and_begin_where_it_is
     assert second.startswith("episode 3 (risk ")
     assert third == "episode 1 (risk 0.0%)"
     frames = drive(shown)
-    assert frames[-1].collided
+    assert frames[-1].failed
     assert shown.start.begins == pytest.approx(frames[-1].time - 10.0)
     told = tell(frames[-1], shown.start)
     assert "it only watched, in shadow mode" in told.done
@@ -276,7 +337,7 @@ LEADERS = ("leader brake", "leaders", "latent risk", "braking in full")
 def told_over(episodes, *, on=True):
     """Frames of a run under a learnt judge, each with its story in words."""
     guard = watched_guard(EMERGENCY, judge="learnt")
-    learn_first(guard, EMERGENCY, episodes)
+    learn_first(guard, OnRoads(EMERGENCY, KinematicWorld()), episodes)
     with opened(EMERGENCY, guard, case=1, on=on) as session:
         return [(frame, tell(frame, session.start)) for frame in drive(session)]
 
@@ -292,13 +353,11 @@ def test_before_the_first_failure_nothing_is_called_safe():
 @pytest.mark.slow
 def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
     frames = [*told_over(12), *told_over(12, on=False)]
-    for frame, told in frames:
-        assert math.isnan(frame.brakes_to)
-        assert math.isnan(frame.critical)
+    for _, told in frames:
         said = " ".join((told.headline, told.when, told.why, told.done)).lower()
         assert not any(words in said for words in LEADERS), said
     assert any("disturbances remembered from" in told.why for _, told in frames)
-    assert {"dead end", "collision"} <= {told.status for _, told in frames}
+    assert {"dead end", "failure"} <= {told.status for _, told in frames}
     for frame, told in frames:  # what it changes where it sees no danger, it changes for the margin
         story = frame.story
         assert ("by a margin" in told.done) == (story.danger is None and story.revised > 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import webbrowser
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from evofsm.cli.options import Reading
     from evofsm.cli.watch.player import Watched
     from evofsm.cli.watch.session import Session
-    from evofsm.driving import Family
-    from evofsm.guard import Guard
 
 # Of a simulation of somebody else's that are watched [s], and positions of cars in them.
 _SECONDS, _ENOUGH = 600.0, 100_000
@@ -54,10 +52,11 @@ def watch(
     what: Annotated[
         str,
         argument(
-            "Family of scenarios: paper, emergency, ..., or a Python file with one of your own; a "
-            "run that drive --mcap recorded; a log, as evofsm learn reads them, or what a SUMO "
-            "configuration drives (.sumocfg), watched in shadow mode.",
-            metavar="FAMILY|FILE",
+            "Family of scenarios for cars: paper, emergency, ...; an environment of Gymnasium: "
+            "CartPole-v1, ...; or a Python file with one of your own. A run that drive --mcap "
+            "recorded; a log, as evofsm learn reads them, or what a SUMO configuration drives "
+            "(.sumocfg), watched in shadow mode.",
+            metavar="FAMILY|ENVIRONMENT|FILE",
         ),
     ] = "paper",
     case: Annotated[
@@ -74,7 +73,6 @@ def watch(
     switches: Switches = "",
     seed: Seed = 0,
     learn_first: Annotated[int, option("Episodes to learn from before.", min=0)] = 60,
-    learn: Annotated[Path | None, option("Begin with what a folder of drive --out holds.")] = None,
     brakes: Brakes = BRAKES,
     observe: Observed = "gap,v_follower,v_leader",
     action: ActionColumn = "a_follower",
@@ -91,10 +89,15 @@ def watch(
 ) -> None:
     """Watch a run in the browser while it is driven, and act on it; or one that was recorded.
 
+    A Python file defines a family of scenarios, called family, or a function environment(), which
+    returns an environment of Gymnasium, and if it likes controller(observation, random) (else
+    actions are random), failed(step) (else an episode that is terminated has failed), and
+    variables, their names. The guard of an environment is given nothing but which episodes failed.
+
     A log is read with the options of evofsm learn, from --observe to --vehicle-length; its gap,
     own speed and leader's speed are named in this order.
 
-    The page shows the cars, what the machine believes, risk and time to collision, and what was
+    The page shows what happens, what is known of failure, how risky each action is, and what was
     done about it. It is served to this computer only, at the address that is printed, and the run
     begins when the page is first opened. Ctrl-C ends it.
     """
@@ -104,19 +107,14 @@ def watch(
     if not is_log and any((episode, dt, failed, unit, topics, no_leader, vehicle_length)):
         raise ValueError(f"options of columns are for a log, and {what} is none")
     is_recorded = is_log or what.endswith(".mcap")
-    if is_recorded:
-        require(scipy="study", mcap="mcap")
-    else:
-        require_world(world)
     opened: AbstractContextManager[Watched]
     if is_recorded:
+        require(scipy="study", mcap="mcap")
         asked = observe, action, time, episode, dt, failed, unit, topics, no_leader, vehicle_length
         reading = reading_of(*asked) if is_log else None
         opened = _recorded(what, case, judge, tolerance, brakes, reading)
     else:
-        family = family_of(what, switches)
-        guard, learnt = _guard(family, judge, tolerance, seed, learn_first, learn)
-        opened = _driven(family, guard, world, case or 1, seed, learnt)
+        opened = _driven(what, case or 1, world, judge, tolerance, switches, seed, learn_first)
     with suppress(KeyboardInterrupt), opened as watched:
         asyncio.run(_serve(watched, port, live=not is_recorded, browse=not no_browser))
     say("\nThe page is closed.")
@@ -185,35 +183,38 @@ def _recorded(
     return nullcontext(recording)
 
 
-def _guard(
-    family: Family, judge: Judge, tolerance: float, seed: int, episodes: int, learn: Path | None
-) -> tuple[Guard, int]:
-    """One that has learnt something, and from how many episodes."""
-    from evofsm.cli.driving import load_guard
-    from evofsm.cli.watch.session import learn_first, watched_guard
-    from evofsm.driving import guard_for_family, learners_of
-
-    if learn is not None:
-        before, reached = load_guard(learn)
-        machine, known = learners_of(before)
-        guard = guard_for_family(family, machine=machine, judge=known, tolerance=tolerance)
-        return guard, reached
-    guard = watched_guard(family, judge=judge, tolerance=tolerance)
-    with progress("Learning first", episodes) as move:
-        learn_first(guard, family, episodes, seed, move)
-    return guard, episodes
-
-
 @contextmanager
 def _driven(
-    family: Family, guard: Guard, world: World, case: int, seed: int, learnt: int
+    what: str,
+    case: int,
+    world: World,
+    judge: Judge,
+    tolerance: float,
+    switches: str,
+    seed: int,
+    episodes: int,
 ) -> Iterator[Session]:
-    """A session in a world of its own."""
-    from evofsm.cli.watch.session import Session
-    from evofsm.driving.sumo import open_world
+    """A session of cars in a world of their own, or of an environment."""
+    from evofsm.cli.watch.session import (
+        OnRoads,
+        Session,
+        System,
+        learn_first,
+        read_simulated,
+        watched_guard,
+    )
 
-    with (
-        open_world(world) as place,
-        Session(family, guard, place, case=case - 1, seed=seed, learnt=learnt) as opened,
-    ):
-        yield opened
+    with ExitStack() as stack:
+        simulated = read_simulated(what, seed=seed, tolerance=tolerance)
+        if simulated is None:
+            require_world(world)
+            from evofsm.driving.sumo import open_world
+
+            family = family_of(what, switches)
+            system: System = OnRoads(family, stack.enter_context(open_world(world)), seed)
+            guard = watched_guard(family, judge=judge, tolerance=tolerance)
+        else:
+            system, guard = simulated, simulated.guard
+        with progress("Learning first", episodes) as move:
+            learn_first(guard, system, episodes, move)
+        yield stack.enter_context(Session(system, guard, case=case - 1))

@@ -9,13 +9,15 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, NamedTuple, Protocol
 
-from evofsm.cli.watch.shown import Frame, Graph, Start
+from evofsm.cli.watch.shown import Frame, Graph, Known, Start
 
 #: Speeds that can be chosen, as multiples of real time.
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
 # Between two graphs, unless a state was created [decisions].
 _GRAPH_EVERY = 8
+# Decisions in a second that can be followed.
+_FOLLOWED = 12.5
 # Who is late by more does not hurry to make up for it [s].
 _LATE = 0.1
 
@@ -35,6 +37,9 @@ class Watched(Protocol):
     def graph(self) -> Graph:
         """The states at the latest frame."""
 
+    def known(self) -> Known:
+        """What is known of failure."""
+
 
 class Clock(NamedTuple):
     """How the run is being played."""
@@ -49,8 +54,8 @@ class Player:
     """Plays what is watched at a pace, and does as it is told before the next decision.
 
     ``audience`` is told what happens: "start" with a `Start`, "frame" with a `Frame`, "graph" with
-    a `Graph`, "clock" with a `Clock`, and "failed" with why it broke off. With ``awaits`` it waits
-    until someone attends.
+    a `Graph`, "known" with what is `Known`, "clock" with a `Clock`, and "failed" with why it broke
+    off. With ``awaits`` it waits until someone attends.
     """
 
     def __init__(
@@ -59,9 +64,12 @@ class Player:
         audience: Callable[[str, Any], object],
         *,
         paused: bool = False,
-        speed: float = 1.0,
+        speed: float | None = None,
         awaits: bool = False,
     ) -> None:
+        if speed is None:  # real time, but no more decisions in a second than can be followed
+            pace = min(1.0, _FOLLOWED * watched.start.interval)
+            speed = max((one for one in SPEEDS if one <= pace), default=SPEEDS[0])
         self._watched, self._audience, self._awaits = watched, audience, awaits
         self._paused, self._speed, self._over = paused, speed, False
         self._steps = False  # once, although it is paused
@@ -146,6 +154,7 @@ class Player:
         self._audience("start", self._watched.start)
         self._audience("clock", self._clock())
         self._audience("graph", self._watched.graph())
+        self._audience("known", self._watched.known())
 
     def _show(self, frame: Frame) -> None:
         self._audience("frame", frame)
@@ -155,6 +164,7 @@ class Player:
             self._since = 0
         if frame.over:
             self._over = True
+            self._audience("known", self._watched.known())
             self._audience("clock", self._clock())
 
     def _clock(self) -> Clock:

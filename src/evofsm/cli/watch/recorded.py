@@ -15,22 +15,24 @@ from evofsm.cli.learning import warnings_of
 from evofsm.cli.options import BRAKES
 from evofsm.cli.show import warn
 from evofsm.cli.watch.shown import (
-    RECORDED,
+    Cars,
     Chronicle,
     Frame,
     Graph,
     Judged,
+    Known,
     Start,
     graph_of,
     most_believed,
+    numbers,
 )
 from evofsm.driving import guard_for_cars
 from evofsm.driving.assumed import HIGHEST, Given, assumptions, guard_of_monitor
 from evofsm.driving.measures import time_headway, time_to_collision
-from evofsm.driving.naming import VARIABLES
+from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.driving.trials import shadow_drive
+from evofsm.fsm.naming import Labels
 from evofsm.guard import TOLERANCE, Guard, Mode
-from evofsm.guard.record import RECORD
 from evofsm.io.foxglove import recording
 from evofsm.io.logs import Chunk, LogColumns, Noted, episodes_of, read_traces
 from evofsm.io.rosbag import Topics
@@ -40,9 +42,12 @@ from evofsm.io.vehicles import VehicleLengths
 #: More rows of a log are not watched.
 MOST_ROWS = 20_000
 
+_LABELS = Labels(names=VARIABLES, units=UNITS)
 # So many of a log's episodes can be chosen among.
 _MOST_EPISODES = 500
 _NONE = -1
+# Accelerations that differ by less are the same [m/s²].
+_SAME = 0.05
 # So much is played before what an episode of a log is worth a look for [s].
 _BEFORE = 10.0
 # Whoever wants to see something needs as many.
@@ -103,27 +108,37 @@ class Recording:
             frame = frame._replace(**_decided(self._episode.columns, number))
         else:
             collided, rear_ended = self._episode.collided, self._episode.rear_ended
-            frame = frame._replace(over=True, collided=collided, rear_ended=rear_ended)
+            assert frame.cars is not None
+            cars = frame.cars._replace(rear_ended=rear_ended)
+            frame = frame._replace(over=True, failed=collided, cars=cars)
         self._number += 1
         return frame._replace(story=self._chronicle.tell(frame))
 
     def graph(self) -> Graph:
         """The states as they were after the last episode."""
         model = self._run.model
-        return Graph(self._number) if model is None else graph_of(model, None, self._number)
+        if model is None:
+            return Graph(self._number)
+        return graph_of(model, _LABELS.place, number=self._number)
+
+    def known(self) -> Known:
+        """Nothing: a log holds no judge."""
+        return Known()
 
     def _begun(self, case: int) -> Start:
         about, columns = self._run.about, self._episode.columns
         times = np.append(columns["time"], self._episode.end_time)
         commands = np.concatenate([columns["proposed"], columns["executed"], [0.0]])
         return Start(
-            family=about.get("family", self._name),
+            system=about.get("family", self._name),
             about=f"recorded in {self._name}",
             cases=tuple(self._names[k] for k in self._order[:_MOST_EPISODES]),
             case=case,
             tolerance=self._tolerance,
             interval=float(np.median(np.diff(times))),
-            actions=(float(np.nanmin(commands)), float(np.nanmax(commands))),
+            names=tuple(_LABELS.variable(k) for k in range(len(VARIABLES))),
+            low=(float(np.nanmin(commands)),),
+            high=(float(np.nanmax(commands)),),
             learnt=0,
             judge=about.get("judge", "kinematic"),
             shadow=not self.revising,
@@ -147,8 +162,11 @@ def _decided(columns: Any, number: int) -> dict[str, Any]:
     proposed = float(columns["risk_proposed"][number])
     # The log has the interval of what was executed only.
     is_kept = proposed == executed.risk
+    actions = {name: numbers(columns[name][number]) for name in ("proposed", "executed", "advised")}
     return {
-        **{name: RECORD[name].kind(columns[name][number]) for name in RECORDED},
+        **actions,
+        "revised": abs(actions["executed"][0] - actions["proposed"][0]) > _SAME,
+        **{name: str(columns[name][number]) for name in ("reason", "explanation")},
         "belief": most_believed(columns["belief"][number]),
         "state": None if state == _NONE else state,
         "event": "moved" if state != before else "",
@@ -172,16 +190,19 @@ def _frames(episode: RecordedEpisode, *, revising: bool) -> Iterator[Frame]:
         yield Frame(
             number=number,
             time=float(time[number]),
-            gap=gap,
-            v_follower=speed,
-            v_leader=leader_speed,
-            a_follower=float(accelerations[number, 0]),
-            a_leader=float(accelerations[number, 1]),
-            x_follower=float(positions[number]),
             observation=(gap, speed, leader_speed),
-            time_to_collision=float(time_to_collision(observed[number])),
-            time_headway=float(time_headway(observed[number])),
+            here=_LABELS.place(observed[number]),
             revising=revising,
+            cars=Cars(
+                gap=gap,
+                v_follower=speed,
+                v_leader=leader_speed,
+                a_follower=float(accelerations[number, 0]),
+                a_leader=float(accelerations[number, 1]),
+                x_follower=float(positions[number]),
+                time_to_collision=float(time_to_collision(observed[number])),
+                time_headway=float(time_headway(observed[number])),
+            ),
         )
 
 

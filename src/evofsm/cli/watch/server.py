@@ -19,9 +19,8 @@ from typing import Any, Self
 import msgspec
 
 from evofsm.cli.watch.player import SPEEDS, Player
-from evofsm.cli.watch.shown import Frame, Graph, Start
+from evofsm.cli.watch.shown import Frame, Start
 from evofsm.cli.watch.words import tell
-from evofsm.driving.naming import name_state
 from evofsm.extras import needs
 
 with needs("websockets", "watch", "the live page"):
@@ -39,7 +38,7 @@ _WELCOME = {
     "page.html": "text/html",
     "page.css": "text/css",
     **dict.fromkeys(
-        ("page.js", "run.js", "road.js", "plots.js", "states.js", "paint.js"), "text/javascript"
+        ("page.js", "run.js", "road.js", "plots.js", "plane.js", "paint.js"), "text/javascript"
     ),
 }
 # Close codes (RFC 6455).
@@ -58,29 +57,23 @@ def message(kind: str, what: Any, start: Start | None = None, *, live: bool = Tr
     told: dict[str, Any] = what._asdict() if hasattr(what, "_asdict") else {"text": what}
     if isinstance(what, Start):
         told |= {"live": live, "speeds": SPEEDS}
-    elif isinstance(what, Graph):
-        told["states"] = [
-            {**one._asdict(), "name": name_state(one.center, 1)} for one in what.states
-        ]
     elif isinstance(what, Frame):
         assert start is not None
         story, danger = what.story, what.story.danger
-        told["proposed_risk"] = what.proposed_risk._asdict()
-        told["executed_risk"] = what.executed_risk._asdict()
-        told["here"] = name_state(what.observation)
         told["danger"] = None
         dead_end = None if danger is None else danger.dead_end  # since when no braking helps [s]
         if danger is not None and story.in_danger:
             told["danger"] = {"since": danger.began.time, "last": danger.last, "dead_end": dead_end}
         told["story"] = {**story._asdict(), "danger": None, "dead_end": dead_end}
-        told["told"] = tell(what, start)._asdict()
+        told["told"] = tell(what, start)
     return msgspec.json.encode(_rounded({"kind": kind, **told})).decode()
 
 
 def _rounded(value: Any) -> Any:
-    """With five decimals."""
+    """With five decimals, and names of what has some."""
     if isinstance(value, float):
         return round(value, 5)
+    value = value._asdict() if hasattr(value, "_asdict") else value
     if isinstance(value, dict):
         return {name: _rounded(part) for name, part in value.items()}
     return [_rounded(part) for part in value] if isinstance(value, list | tuple) else value

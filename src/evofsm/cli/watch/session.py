@@ -1,23 +1,35 @@
-"""Drives a family decision by decision and shows every one; the guard goes on learning."""
+"""Drives a system decision by decision and shows every one; the guard goes on learning.
+
+A system is a family of scenarios for cars, or any environment of Gymnasium with a controller.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import ExitStack
+import re
+import runpy
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evofsm.cli.watch.shown import (
-    RECORDED,
+    CALM,
+    Cars,
     Chronicle,
     Frame,
     Graph,
     Judged,
+    Known,
     Start,
     graph_of,
+    known_of,
     most_believed,
+    numbers,
 )
 from evofsm.driving import (
     Family,
@@ -31,65 +43,325 @@ from evofsm.driving import (
 from evofsm.driving.cars import name_judge
 from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.driving.world import GAP, GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
+from evofsm.extras import needs
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.naming import Labels
 from evofsm.fsm.rules import Novelty
-from evofsm.guard import Decision, Guard, Judgement, Mode
-from evofsm.guard.record import RECORD
+from evofsm.guard import (
+    BELIEF_TOLERANCE,
+    TOLERANCE,
+    Guard,
+    Judgement,
+    LearntRisk,
+    Mode,
+    Proposal,
+    Revision,
+    Situation,
+)
+from evofsm.guard.actions import Action, Choices, change, is_usable, limits, put_into
 
 #: The state rule for looking on: coarse enough that each state can be told from the others.
 WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
 
-# So many draws can be chosen among where a family has no cases.
+# So many draws can be chosen among where there are no cases.
 _DRAWS = 12
 # After a leader's full brake there is nothing left to see once all have stood for so long [s].
 _STANDING = 3.0
+# Steps of an environment in a second where it does not say; wishes that are tolerable for so many
+# decisions are no danger any more.
+_STEPS_PER_SECOND, _CALM = 10.0, 8
+# A change of an action by less is none [half ranges].
+_SAME = 0.02
+# An environment that does not end by itself is left after so many decisions, where nobody looks on.
+_MOST_DECISIONS = 2000
+# Seeds of episodes that are learnt from are so far from those that are watched.
+_APART = 1_000_000
+# Episodes from which is known how far variables spread; states are so many spreads apart, times the
+# root of the number of variables, and there are at most so many.
+_LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
+# What a file may define besides its environment.
+_PARTS = ("controller", "failed", "variables")
+# Of more variables only those of the plane are named.
+_FEW = 4
 
 
 def watched_guard(family: Family, **settings: Any) -> Guard:
-    """A guard that has seen nothing, with few enough states to look at."""
+    """A guard for cars that has seen nothing, with few enough states to look at."""
     return guard_for_family(family, rule=WATCHED_RULE, **settings)
 
 
 def learn_first(
     guard: Guard,
-    family: Family,
+    system: System,
     episodes: int,
-    seed: int = 0,
     show: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Drive the family for a while, in closed form and draws that are not watched, to learn."""
+    """Drive a system for a while, in draws that are not watched, to learn.
+
+    An environment's controller drives alone then: it fails more often, which is what is learnt.
+    """
+    if isinstance(system, Simulated):
+        guard.reviser.mode = Mode.SHADOW  # type: ignore[attr-defined]
     for index in range(episodes):
-        teach(guard, [family.draw(seed + 1, index)])
+        system.teach(guard, index)
         show(index + 1)
 
 
-def cases_of(family: Family) -> tuple[str, ...]:
-    """Names of what can be driven."""
-    if family.cases > 1:
-        return family.variants
-    return tuple(f"draw {number}" for number in range(1, _DRAWS + 1))
+# -- Cars -----------------------------------------------------------------------------------------
 
 
-class Session:
-    """One run after another, each driven decision by decision."""
+class OnRoads:
+    """A family of scenarios for cars in some world; what is learnt first is in closed form."""
+
+    def __init__(self, family: Family, world: World, seed: int = 0) -> None:
+        self.family, self.world, self.seed = family, world, seed
+        self.name, self.about, self.interval = family.name, family.about, family.interval
+        self.labels = family.labels
+        self.cases = family.variants if family.cases > 1 else _draws()
+        self._closing = ExitStack()
+
+    def teach(self, guard: Guard, index: int) -> None:
+        """Let a guard learn from a draw that nobody watches."""
+        teach(guard, [self.family.draw(self.seed + 1, index)])
+
+    def begin(self, case: int) -> None:
+        """Put the cars on the road."""
+        self.close()
+        draw = self.family.draw(self.seed, case)
+        self._controller = draw.controller
+        self._road = self._closing.enter_context(self.world.open(draw.scenario))
+        self._steps = draw.scenario.steps(self.interval)
+        alone = drive(unrevised_guard(self.family), draw)
+        self.alone = float(alone.time[-1]) if alone.collided else math.inf
+        self._row, self._position, self._stood = 0, 0.0, 0.0
+        self._held = np.full(3, np.nan)
+        self._look()
+
+    def _look(self) -> None:
+        road = self._road
+        self.observation, self.time, self.failed = road.observation, road.time, road.collided
+        self.over = road.over or self._stood >= _STANDING
+        self.terminated = road.collided or road.rear_ended
+
+    def propose(self) -> Action:
+        """What the driver wants, by what was seen last of each variable."""
+        seen = self.observation
+        self._held = np.where(np.isnan(seen), self._held, seen)
+        return self._controller.propose(self._held, self.time).action
+
+    def advance(self, revision: Revision) -> None:
+        """Drive on."""
+        self._road.advance(float(revision.executed), self._steps)
+        self._look()
+
+    def cars(self) -> Cars:
+        """Where they are."""
+        road = self._road
+        record = road.episode(self._row).record
+        speeds, now = record[:, SPEED], record[-1]
+        self._position += float(0.5 * (speeds[1:] + speeds[:-1]).sum() * road.scenario.dt)
+        self._row = road.row
+        a_leader = float(record[-2, LEADER_ACCELERATION]) if len(record) > 1 else math.nan
+        stands = now[SPEED] == now[LEADER_SPEED] == 0.0 and a_leader < 0.0
+        self._stood = self._stood + self.interval if stands else 0.0
+        seen = self.observation
+        return Cars(
+            gap=float(now[GAP]),
+            v_follower=float(speeds[-1]),
+            v_leader=float(now[LEADER_SPEED]),
+            a_follower=float(road.episode(max(0, road.row - 1)).realised[0]),
+            a_leader=a_leader,
+            x_follower=self._position,
+            time_to_collision=float(time_to_collision(seen)),
+            time_headway=float(time_headway(seen)),
+            gap_behind=float(now[GAP_BEHIND]),
+            rear_ended=road.rear_ended,
+        )
+
+    def close(self) -> None:
+        """Leave the road."""
+        self._closing.close()
+
+
+# -- Any environment ------------------------------------------------------------------------------
+
+
+class Simulated:
+    """An environment of Gymnasium and a controller, which acts at random where none is given.
+
+    Its guard is given nothing but which episodes failed: those that are terminated, or of which
+    ``failed`` says so after a step, as in `evofsm.guard.RevisedActions`.
+    """
 
     def __init__(
         self,
-        family: Family,
-        guard: Guard,
-        world: World,
+        name: str,
+        env: Any,
+        controller: Callable[[Any, np.random.Generator], Any] | None = None,
+        failed: Callable[[Any], bool] | None = None,
+        variables: Sequence[str] = (),
         *,
-        case: int = 0,
         seed: int = 0,
-        on: bool = True,
-        learnt: int = 0,
+        tolerance: float = TOLERANCE,
     ) -> None:
-        self.family, self.world, self.case, self.learnt = family, world, case, learnt
+        with needs("gymnasium", "gym", "an environment of Gymnasium"):
+            from evofsm.guard import gym
+        self.name, self.seed, self.cases = name, seed, _draws()
+        self._gym, self._env, self._controller, self._failed = gym, env, controller, failed
+        self.interval = 1.0 / float(env.metadata.get("render_fps") or _STEPS_PER_SECOND)
+        acts = "Its own controller" if controller else "A controller that acts at random"
+        fails = "what its file says" if failed else "an episode that is terminated"
+        self.about = f"{acts} drives it; failure is {fails}."
+        ends = _ends(name, env.action_space)
+        judge = LearntRisk(self.interval, **ends, names=variables, seed=seed)
+        made = Guard(**ends, interval=self.interval, judge=judge, tolerance=tolerance)
+        spaces = env.observation_space, env.action_space
+        self._terms = gym.Terms(made, *spaces, None, failed, 0.0)
+        seen = np.array([z for k in range(_LOOKED_AT) for z in self._run(env, -1 - k)])
+        machine = EvolvingFSM(
+            made.actions.n_actions,
+            rule=Novelty(_STATES_APART * math.sqrt(seen.shape[1]), _scales(seen)),
+            max_states=_MOST_STATES,
+            belief_tolerance=BELIEF_TOLERANCE,
+        )
+        self.guard = Guard.of(made.reviser, interval=self.interval, machine=machine)
+        names = variables or [f"variable {k + 1}" for k in range(seen.shape[1])]
+        self.labels = Labels(names=tuple(names), dt=self.interval)
+
+    def _reset(self, env: Any, index: int) -> None:
+        seed = (1000 * self.seed + index) % 2**31
+        self._random = np.random.default_rng(seed)
+        env.action_space.seed(seed)
+        self._seen, _ = env.reset(seed=seed)
+        self.time, self.over, self.failed, self.terminated = 0.0, False, False, False
+
+    def _step(self, env: Any, action: Any) -> None:
+        self._seen, reward, terminated, truncated, info = env.step(action)
+        step = self._gym.StepResult(self._seen, reward, bool(terminated), bool(truncated), info)
+        self.failed, self.terminated = self._terms.failed(step), step.terminated
+        self.over = self.failed or step.terminated or step.truncated
+        self.time += self.interval
+
+    def _wish(self) -> Any:
+        """What the controller wants, as the environment takes it."""
+        if self._controller is None:
+            return self._env.action_space.sample()
+        return self._controller(self._seen, self._random)
+
+    def _run(self, env: Any, index: int) -> list[NDArray[np.float64]]:
+        """An episode that nobody watches: what was observed."""
+        self._reset(env, index)
+        seen = [self.observation]
+        while not self.over and len(seen) <= _MOST_DECISIONS:
+            self._step(env, self._wish())
+            seen.append(self.observation)
+        return seen
+
+    def teach(self, guard: Guard, index: int) -> None:
+        """Let a guard learn from an episode that nobody watches, by looking on."""
+        env = self._gym.RevisedActions(self._env, guard, failed=self._failed)
+        self._run(env, _APART + index)
+        env.reset()  # which ends what did not end by itself
+
+    def begin(self, case: int) -> None:
+        """Begin an episode of its own seed, which is first driven without a guard."""
+        self._run(self._env, case)
+        self.alone = self.time if self.failed else math.inf
+        self._reset(self._env, case)
+
+    @property
+    def observation(self) -> NDArray[np.float64]:
+        """The latest one, as a vector."""
+        return np.asarray(self._terms.look(self._seen))
+
+    def propose(self) -> Action:
+        """What the controller wants."""
+        self._wanted = self._wish()
+        wanted: Action = self._terms.to_guard(self._wanted)
+        return wanted
+
+    def advance(self, revision: Revision) -> None:
+        """Take a step."""
+        self._step(self._env, self._terms.decided(self._wanted, revision).executed)
+
+    def cars(self) -> None:
+        """It is none that it knows of."""
+
+    def close(self) -> None:
+        """Leave it."""
+        self._env.close()
+
+
+def _ends(name: str, space: Any) -> dict[str, Any]:
+    """Of actions, as a guard takes them."""
+    if hasattr(space, "n") and not space.shape:
+        return {"n_actions": int(space.n)}
+    low, high = (np.ravel(getattr(space, end, math.nan)).astype(float) for end in ("low", "high"))
+    if not np.isfinite([low, high]).all():
+        raise ValueError(
+            f"{name}: its actions are {space}, neither Discrete nor a Box with finite ends; wrap "
+            "it first (gymnasium.wrappers.RescaleAction, FlattenObservation, ...)"
+        )
+    return {"low": low, "high": high} if len(low) > 1 else {"low": low[0], "high": high[0]}
+
+
+def _scales(seen: NDArray[np.float64]) -> list[float]:
+    """How far variables spread; 1 of one that did not."""
+    return [spread or 1.0 for spread in seen.std(0).tolist()]
+
+
+def read_simulated(what: str, **settings: Any) -> Simulated | None:
+    """An environment by its id, or what a file of Python defines; None where it is none.
+
+    The file has a function ``environment()``, and may have ``controller(observation, random)``,
+    which returns an action (``random`` is a NumPy generator), ``failed(step)``, as
+    `evofsm.guard.RevisedActions` takes it, and ``variables``, their names.
+    """
+    if what.endswith(".py"):
+        with _of_file(what):
+            found = runpy.run_path(what)
+            if "environment" not in found:
+                return None
+            own = {name: found[name] for name in _PARTS if name in found}
+            return Simulated(Path(what).stem, found["environment"](), **own, **settings)
+    if not re.search(r"-v\d+$", what):
+        return None
+    with needs("gymnasium", "gym", "an environment of Gymnasium"):
+        import gymnasium
+    try:
+        return Simulated(what, gymnasium.make(what), **settings)
+    except gymnasium.error.Error as error:
+        raise ValueError(f"{what}: {error}") from error
+
+
+@contextmanager
+def _of_file(path: str) -> Iterator[None]:
+    """Errors of a file of somebody's own tell which file it is."""
+    try:
+        yield
+    except Exception as error:
+        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+
+
+System = OnRoads | Simulated
+
+
+# -- A run ----------------------------------------------------------------------------------------
+
+
+class Session:
+    """One run of a system after another, each driven decision by decision."""
+
+    def __init__(self, system: System, guard: Guard, *, case: int = 0, on: bool = True) -> None:
+        self.system, self.case = system, case
         self.machine, self.judge = learners_of(guard)
-        self._guard, self._reviser, self._seed = guard, guard.reviser, seed
+        self._guard, self._reviser = guard, guard.reviser
         self._tolerance = float(self._reviser.tolerance)  # type: ignore[attr-defined]
         guard.explaining = True
+        # As a decision logger it is told of each before anything is learnt from it.
+        told: Any = SimpleNamespace(begin=_ignore, seen=_ignore, decided=self._ask, ended=_ignore)
+        guard.audit = told
         self.revising = on
-        self._closing = ExitStack()
         self.start = self.restart()
 
     @property
@@ -103,125 +375,136 @@ class Session:
 
     def restart(self, case: int | None = None) -> Start:
         """Begin a run anew, or another one; one that is under way is broken off."""
-        case, cases = self.case if case is None else case, cases_of(self.family)
-        if not 0 <= case < len(cases):
-            raise ValueError(f"case is {case + 1}; {self.family.name} has 1 to {len(cases)}")
-        self._closing.close()
+        case, system = self.case if case is None else case, self.system
+        if not 0 <= case < len(system.cases):
+            raise ValueError(f"case is {case + 1}; {system.name} has 1 to {len(system.cases)}")
         self.case = case
-        draw = self.family.draw(self._seed, case)
-        self._controller = draw.controller
-        self._road = self._closing.enter_context(self.world.open(draw.scenario))
-        self._steps = draw.scenario.steps(self.family.interval)
+        system.begin(case)
         self._guard.begin()
-        alone = drive(unrevised_guard(self.family), draw)
-        hits = float(alone.time[-1]) if alone.collided else math.inf
-        self._chronicle = Chronicle(self._tolerance, hits)
-        self._number, self._row, self._position, self._stood = 0, 0, 0.0, 0.0
+        calm = min(CALM, _CALM * system.interval)
+        self._chronicle = Chronicle(self._tolerance, system.alone, calm)
+        self._number = 0
         self._state: int | None = None
-        self._held = np.full(3, np.nan)
         self.start = self._begun()
         return self.start
 
     def step(self) -> Frame:
         """One decision, and what came of the one before."""
-        ends = self._road.over or self._stood >= _STANDING
-        frame = self._end() if ends else self._decide()
-        frame = frame._replace(story=self._chronicle.tell(frame))
+        seen, cars = self.system.observation, self.system.cars()
+        if cars is not None and isinstance(self.judge, LatentRisk):
+            cars = cars._replace(decel=self.judge.brakes.decel)
+        frame = Frame(
+            number=self._number,
+            time=self.system.time,
+            observation=tuple(seen.tolist()),
+            here=self._place(seen),
+            revising=self.revising,
+            cars=cars,
+        )
+        frame = self._end(frame) if self.system.over else self._decide(frame)
         self._number += 1
-        if not frame.over:
-            stands = max(frame.v_follower, frame.v_leader) == 0.0 and frame.a_leader < 0.0
-            self._stood = self._stood + self.family.interval if stands else 0.0
-            self._road.advance(frame.executed, self._steps)
-        return frame
+        return frame._replace(story=self._chronicle.tell(frame))
 
     def graph(self) -> Graph:
         """The states found so far."""
-        return graph_of(self.machine, self.judge, self._number)
+        return graph_of(self.machine, self._place, self.judge, self._number)
+
+    def known(self) -> Known:
+        """What is known of failure."""
+        return known_of(self.judge)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._closing.close()
+        self.system.close()
+
+    def _place(self, center: NDArray[np.float64]) -> str:
+        """Where an observation lies, in words; of many variables by two."""
+        labels = self.system.labels
+        if len(center) > _FEW:
+            two = list(self.known().plane)
+            labels = Labels(names=tuple(labels.names[k] for k in two), dt=labels.dt)
+            center = center[two]
+        return labels.place(center)
 
     def _begun(self) -> Start:
-        family = self.family
+        system, actions = self.system, self._guard.actions
+        low, high = limits(actions)
+        count = len(system.observation)
         return Start(
-            family=family.name,
-            about=family.about,
-            cases=cases_of(family),
+            system=system.name,
+            about=system.about,
+            cases=system.cases,
             case=self.case,
             tolerance=self._tolerance,
-            interval=family.interval,
-            actions=(family.actions.low, family.actions.high),
-            learnt=self.learnt,
+            interval=system.interval,
+            names=tuple(system.labels.variable(k) for k in range(count)),
+            low=numbers(low),
+            high=numbers(high),
+            discrete=isinstance(actions, Choices),
+            cars=isinstance(system, OnRoads),
+            learnt=self._guard.n_episodes,
             judge=name_judge(self.judge),
         )
 
-    def _decide(self) -> Frame:
-        road, guard, known = self._road, self._guard, self.machine.n_states
-        seen = road.observation
-        self._held = np.where(np.isnan(seen), self._held, seen)
-        revision = guard.decide(seen, self._controller.propose(self._held, road.time), road.time)
-        situation = guard.situation
-        by_leaders, actions = isinstance(self.judge, LatentRisk), self.family.actions
-        wanted = np.clip(revision.proposed, actions.low, actions.high)
-        safest = actions.low if by_leaders else revision.advised
-        judged = self.judge.judge(situation, np.array([wanted, revision.executed, safest]))
+    def _decide(self, frame: Frame) -> Frame:
+        guard, known = self._guard, self.machine.n_states
+        revision = guard.decide(self.system.observation, self.system.propose(), frame.time)
+        situation, judged = guard.situation, self._judged
+        self.system.advance(revision)
         created = self.machine.n_states > known
         moved = self._state is not None and situation.state != self._state
         self._state = situation.state
-        if by_leaders:
-            said: dict[str, Any] = {"critical": float(judged.critical[0])}
-        else:
-            said = {"why": self.judge.why(judged) if judged.risk[0] > self._tolerance else ""}
-        return self._seen()._replace(
-            **{name: RECORD[name].read(Decision(situation, revision)) for name in RECORDED},
+        return frame._replace(
             belief=most_believed(situation.belief),
+            state=situation.state,
             event="created" if created else "moved" if moved else "",
             proposed_risk=_judged(judged, 0),
             executed_risk=_judged(judged, 1),
-            braking_risk=float(judged.risk[2]),
-            **said,
+            least_risk=float(judged.risk[2]),
+            proposed=numbers(revision.proposed),
+            executed=numbers(revision.executed),
+            advised=numbers(revision.advised),
+            revised=change(guard.actions, self._wanted, revision.executed) > _SAME,
+            reason=revision.reason,
+            explanation=revision.explanation,
+            **self._needed(judged),
         )
 
-    def _end(self) -> Frame:
-        self._guard.end(self._road.collided, self._road.observation)
-        self.learnt += 1
-        return self._seen()._replace(
-            over=True, collided=self._road.collided, rear_ended=self._road.rear_ended
-        )
+    def _ask(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
+        """Ask the judge about what is proposed, what is executed, and the best that can be done."""
+        actions, self._wanted = self._guard.actions, revision.executed
+        if is_usable(actions, revision.proposed):
+            self._wanted = put_into(actions, revision.proposed)
+        safest = actions.low if isinstance(self.judge, LatentRisk) else revision.advised
+        asked = np.array([self._wanted, revision.executed, safest], np.float64)
+        self._judged = self.judge.judge(situation, asked)
 
-    def _seen(self) -> Frame:
-        """Where the cars are; nothing is recognised or decided yet."""
-        road = self._road
-        record = road.episode(self._row).record
-        dt, first = road.scenario.dt, self._number == 0
-        speeds, now = record[:, SPEED], record[-1]
-        self._position += float(0.5 * (speeds[1:] + speeds[:-1]).sum() * dt)
-        self._row = road.row
-        seen = road.observation
-        leaders: dict[str, Any] = {}
-        if isinstance(self.judge, LatentRisk):
-            expected = self.judge.manoeuvres.exceeded_by(self._tolerance)
-            leaders = {"decel": self.judge.brakes.decel, "brakes_to": expected}
-        return Frame(
-            number=self._number,
-            time=road.time,
-            gap=float(now[GAP]),
-            v_follower=float(speeds[-1]),
-            v_leader=float(now[LEADER_SPEED]),
-            a_follower=float(road.episode(max(0, road.row - 1)).realised[0]),
-            a_leader=math.nan if first else float(record[-2, LEADER_ACCELERATION]),
-            x_follower=self._position,
-            gap_behind=float(now[GAP_BEHIND]),
-            observation=tuple(seen.tolist()),
-            time_to_collision=float(time_to_collision(seen)),
-            time_headway=float(time_headway(seen)),
-            revising=self.revising,
-            **leaders,
-        )
+    def _needed(self, judged: Judgement) -> dict[str, Any]:
+        """What has to be survived, and why that is not."""
+        judge = self.judge
+        if isinstance(judge, LatentRisk):
+            expected = judge.manoeuvres.exceeded_by
+            return {"needed": expected(self._tolerance), "usual": expected(0.5)}
+        assert isinstance(judge, LearntRisk)
+        why = judge.why(judged) if judged.risk[0] > self._tolerance else ""
+        return {"needed": judge.margin, "why": why}
+
+    def _end(self, frame: Frame) -> Frame:
+        system = self.system
+        self._guard.end(system.failed, system.observation, terminated=system.terminated)
+        return frame._replace(over=True, failed=system.failed)
+
+
+def _ignore(*told: Any, **named: Any) -> None:
+    """What need not be known."""
+
+
+def _draws() -> tuple[str, ...]:
+    return tuple(f"draw {number}" for number in range(1, _DRAWS + 1))
 
 
 def _judged(judged: Judgement, option: int) -> Judged:
-    return Judged(float(judged.risk[option]), float(judged.low[option]), float(judged.high[option]))
+    each = judged.risk, judged.low, judged.high, judged.critical
+    return Judged(*(float(values[option]) for values in each))

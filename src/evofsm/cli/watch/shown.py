@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,10 @@ from evofsm.driving import LatentRisk, assess_states
 from evofsm.driving.measures import TimeHeadway, TimeToCollision
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.guard import LearningJudge
+from evofsm.guard import LearningJudge, LearntRisk
+from evofsm.guard.harm import Harm
+from evofsm.guard.learnt.dynamics import Dynamics
+from evofsm.guard.learnt.words import harm
 
 # The classic measures that are shown beside, with their thresholds.
 _TTC, _HEADWAY = TimeToCollision(), TimeHeadway()
@@ -22,25 +26,27 @@ _MOST_BELIEVED, _LEAST_BELIEF = 12, 0.002
 # Of each state so many ways out are shown, and none that is rarer.
 _MOST_WAYS, _LEAST_SHARE = 3, 0.02
 
-# Danger is over once the driver's wishes were tolerable for so long [s].
-_CALM = 2.0
-# A dead end: if the leader braked hard now, full braking would as likely as not be too late.
+# Observations of what was survived that are shown; of fewer failures nothing is said.
+_MOST_SURVIVED, _FEW = 500, 4
+
+#: Danger is over once wishes were tolerable for so long [s].
+CALM = 2.0
+# A dead end: the best that can be done would as likely as not be too late.
 _DEAD_END = 0.5
-# Actions that differ by less are the same, and softer braking is no full brake [m/s²].
-_SAME, _LEADER_BRAKES = 0.05, -2.5
+# Softer braking is no full brake [m/s²].
+_LEADER_BRAKES = -2.5
 
 
 class Danger(NamedTuple):
-    """A stretch of time in which the driver's wishes were not tolerable."""
+    """A stretch of time in which the controller's wishes were not tolerable."""
 
     began: Frame
     last: float  #: time of the latest decision that was not tolerable [s]
     stepped_in: Frame | None = None  #: in which the reviser first changed something
     revised: int = 0  #: decisions that the reviser changed
-    change: float = 0.0  #: by how much, all of them together [m/s²]
     decisions: int = 0
-    hardest: float = math.inf  #: lowest acceleration that the reviser put through [m/s²]
-    dead_end: float = math.nan  #: since when full braking was too late as well [s]
+    hardest: float = math.inf  #: lowest acceleration of a car that was put through [m/s²]
+    dead_end: float = math.nan  #: since when nothing would have been enough [s]
 
 
 class Story(NamedTuple):
@@ -48,15 +54,15 @@ class Story(NamedTuple):
 
     danger: Danger | None = None  #: the present or the latest one
     in_danger: bool = False
-    judged: bool = False  #: whether any wish of the driver was judged
+    judged: bool = False  #: whether any wish of the controller was judged
     first: float = math.nan  #: when danger began for the first time [s]
     time_to_collision: float = math.nan  #: when it first fell below its threshold [s]
     time_headway: float = math.nan  #: the same of time headway [s]
     leader_brakes: float = math.nan  #: when the leader first braked hard [s]
     leader_decel: float = 0.0  #: how hard it has braked since, at most [m/s²]
     revised: int = 0  #: decisions that the reviser changed, in danger or not
-    alone: float = math.nan  #: when the driver left alone collides [s]; infinite if it does not
-    collision: float = math.nan  #: [s]
+    alone: float = math.nan  #: when the controller alone fails [s]; infinite if it does not
+    failure: float = math.nan  #: [s]
 
 
 class Judged(NamedTuple):
@@ -65,20 +71,27 @@ class Judged(NamedTuple):
     risk: float = math.nan
     low: float = math.nan
     high: float = math.nan
+    #: Hardest disturbance that is survived: braking of the leader [m/s²]; of a learnt judge what
+    #: the best backup leaves of the distance to failure [ordinary changes].
+    critical: float = math.nan
 
 
 class Start(NamedTuple):
     """What is known as a run begins."""
 
-    family: str
-    about: str  #: what happens in the family, in a sentence
+    system: str
+    about: str  #: what happens in it, in a sentence
     cases: tuple[str, ...]  #: that can be chosen
     case: int  #: the one that is driven
     tolerance: float  #: highest risk that is accepted
     interval: float  #: time between decisions [s]
-    actions: tuple[float, float]  #: lowest and highest acceleration [m/s²]
+    names: tuple[str, ...]  #: of the variables, with their units
+    low: tuple[float, ...]  #: of the components of an action
+    high: tuple[float, ...]
     learnt: int  #: episodes learnt from before
     judge: str  #: by what it was told, a name of `evofsm.driving.cars.TOLD`
+    discrete: bool = False  #: whether an action is an index
+    cars: bool = True  #: whether they are cars
     car_length: float = 5.0  #: as it is drawn; worlds need none [m]
     ttc_threshold: float = _TTC.threshold  #: time to collision below which it warns [s]
     headway_threshold: float = _HEADWAY.threshold  #: the same of time headway [s]
@@ -86,66 +99,65 @@ class Start(NamedTuple):
     begins: float = 0.0  #: what was before is shown at once [s]
 
 
-class Frame(NamedTuple):
-    """One decision: where the cars are, what was recognised, judged, proposed and executed.
+class Cars(NamedTuple):
+    """Where a car and its leader are."""
 
-    The last frame of a run shows how it ended: nothing is decided in it, and what was not is NaN.
-    """
-
-    number: int  #: in this run, from 0
-    time: float  #: [s]
     gap: float  #: bumper to bumper, as it truly is [m]
     v_follower: float  #: [m/s]
     v_leader: float  #: [m/s]
     a_follower: float  #: what the body did until now [m/s²]; NaN at first
     a_leader: float  #: [m/s²]; NaN at first
     x_follower: float  #: front bumper, from where it started [m]
-    observation: tuple[float, ...]  #: gap, v_follower, v_leader, as they were seen
     time_to_collision: float  #: [s]; infinite where the gap does not close
     time_headway: float  #: [s]
-    revising: bool  #: whether the reviser may act
     gap_behind: float = math.inf  #: to the car behind [m]; infinite where there is none
-    story: Story = Story()  #: what has happened so far
+    rear_ended: bool = False  #: by the car behind
     decel: float = math.nan  #: of the follower if it brakes in full, as far as is known [m/s²]
-    #: all but a tolerated share of leaders' hard brakes are softer [m/s²]
-    brakes_to: float = math.nan
+
+
+class Frame(NamedTuple):
+    """One decision: what was seen, recognised, judged, proposed and executed.
+
+    The last frame of a run shows how it ended: nothing is decided in it, and what was not is NaN.
+    """
+
+    number: int  #: in this run, from 0
+    time: float  #: [s]
+    observation: tuple[float, ...]
+    here: str  #: the same in words
+    revising: bool  #: whether the reviser may act
+    cars: Cars | None = None  #: where they are, if it is cars
+    story: Story = Story()  #: what has happened so far
     #: the most probable states, and how probable they are
     belief: tuple[tuple[int, float], ...] = ()
     state: int | None = None  #: the most probable one
     event: str = ""  #: ``created``, ``moved``, or nothing
-    proposed_risk: Judged = Judged()  #: of what the driver wants
+    proposed_risk: Judged = Judged()  #: of what the controller wants
     executed_risk: Judged = Judged()  #: of what is executed
     #: of full braking at once, or of the best that a learnt judge knows: high in a dead end
-    braking_risk: float = math.nan
-    #: hardest braking of the leader that is survived if the driver has its way [m/s²]
-    critical: float = math.nan
-    why: str = ""  #: why a learnt judge finds dangerous what the driver wants; empty of another
-    proposed: float = math.nan  #: [m/s²]
-    executed: float = math.nan  #: [m/s²]
-    advised: float = math.nan  #: what the reviser would execute, on or off [m/s²]
+    least_risk: float = math.nan
+    #: what `Judged.critical` has to be; of leaders' hard brakes but a tolerated share are softer
+    needed: float = math.nan
+    usual: float = math.nan  #: and half of them [m/s²]
+    why: str = ""  #: why a learnt judge finds dangerous what is proposed; empty of another
+    proposed: tuple[float, ...] = ()
+    executed: tuple[float, ...] = ()
+    advised: tuple[float, ...] = ()  #: what the reviser would execute, on or off
+    revised: bool = False  #: whether the reviser changed what was proposed
     reason: str = ""  #: the reviser's
     explanation: str = ""  #: what the machine has seen of such situations
-    collided: bool = False  #: with the leader
-    rear_ended: bool = False  #: by the car behind
-    over: bool = False  #: whether the run ended here
-
-    @property
-    def is_revised(self) -> bool:
-        """Whether the reviser changed what the driver wanted."""
-        return abs(self.executed - self.proposed) > _SAME
-
-
-#: What a frame takes over from the record of a decision (`evofsm.guard.RECORD`), as it is.
-RECORDED = ("state", "proposed", "executed", "advised", "reason", "explanation")
+    failed: bool = False  #: whether the run ended here in failure
+    over: bool = False  #: whether it ended here
 
 
 class StateShown(NamedTuple):
     """A state, as it is drawn."""
 
     state: int
-    center: tuple[float, ...]  #: gap [m], v_follower [m/s], v_leader [m/s]
+    name: str
+    center: tuple[float, ...]
     visits: float
-    is_dead_end: bool  #: or where that is not known, whether a collision ended in it
+    is_dead_end: bool  #: or where that is not known, whether a failure ended in it
 
 
 class Graph(NamedTuple):
@@ -158,17 +170,21 @@ class Graph(NamedTuple):
 
 
 def graph_of(
-    known: EvolvingFSM | FSMModel, judge: LearningJudge | None = None, number: int = 0
+    known: EvolvingFSM | FSMModel,
+    place: Callable[[NDArray[np.float64]], str],
+    judge: LearningJudge | None = None,
+    number: int = 0,
 ) -> Graph:
-    """The states, and their usual ways out, from a frame on.
+    """The states, with their places in words, and their usual ways out, from a frame on.
 
-    Only a `LatentRisk` says which are dead ends; else those are marked in which a collision ended.
+    Only a `LatentRisk` says which are dead ends; else those are marked in which a failure ended.
     """
-    marked = [ended > 0.0 for ended in known.endings.tolist()]
+    marked = [ended > 0.5 for ended in known.endings.tolist()]
     if isinstance(judge, LatentRisk):
         marked = [one.is_dead_end for one in assess_states(known, judge)]
-    places = map(tuple, known.centers.tolist())
-    states = map(StateShown, range(known.n_states), places, known.visits.tolist(), marked)
+    centers = known.centers
+    where = map(place, centers), map(tuple, centers.tolist())
+    states = map(StateShown, range(known.n_states), *where, known.visits.tolist(), marked)
     changes = known.changes * ~np.eye(known.n_states, dtype=bool)
     shares = changes / np.maximum(changes.sum(axis=1, keepdims=True), 1.0)
     usual = np.argsort(-shares, axis=1, kind="stable")[:, :_MOST_WAYS]
@@ -182,38 +198,95 @@ def most_believed(belief: NDArray[np.float64]) -> tuple[tuple[int, float], ...]:
     return tuple((k, float(belief[k])) for k in most if belief[k] >= _LEAST_BELIEF)
 
 
+def numbers(action: Any) -> tuple[float, ...]:
+    """An action's components; one where it is a number."""
+    return tuple(np.atleast_1d(np.asarray(action, np.float64)).tolist())
+
+
+# -- What is known of failure ---------------------------------------------------------------------
+
+
+class Known(NamedTuple):
+    """What a judge has learnt of failure, for a plane of two variables; rows of numbers."""
+
+    plane: tuple[int, int] = (0, 1)  #: the two that matter
+    survived: Any = ()  #: (n, m) observations, a few of them
+    failed: Any = ()  #: (k, m)
+    thresholds: Any = ()  #: variable, sign, and where it fails
+    regions: Any = ()  #: (r, 12) as in `evofsm.guard.learnt.regions`
+    dead_ends: Any = ()  #: (d, m) centres
+    radii: Any = ()  #: (d, m) in each variable
+    told: str = ""  #: in words
+    harm: str = ""  #: whether it does harm, in words; empty where it does not
+
+
+def known_of(judge: LearningJudge) -> Known:
+    """What a judge knows that learns of failure; nothing of another."""
+    if not isinstance(judge, LearntRisk) or not judge.dynamics.n_variables:
+        return Known()
+    learnt = judge.dynamics
+    ends, survived = learnt.dead_ends, learnt.survived
+    said = harm(judge.harm, learning=judge.learning).removeprefix("; ")
+    said = said or _no_better(judge.harm)
+    return Known(
+        _plane(learnt),
+        survived[:: 1 + len(survived) // _MOST_SURVIVED].tolist(),
+        learnt.failures.tolist(),
+        learnt.thresholds,
+        learnt.regions.tolist(),
+        ends.centres.tolist(),
+        (ends.radii[:, None] / learnt.model.inverse).tolist(),
+        judge.told_by_experience,
+        said,
+    )
+
+
+def _no_better(known: Harm) -> str:
+    """Where guarded episodes fail as often as those of the controller alone, and as soon."""
+    each = [[one.steps for one in some if one.failed] for some in (known.guarded, known.alone)]
+    (guarded, alone), n, of = each, len(known.guarded), len(known.alone)
+    if not alone or len(guarded) < _FEW or len(guarded) * of < len(alone) * n:
+        return ""
+    if np.median(guarded) > np.median(alone):
+        return ""
+    return f"no better than the controller alone: {len(guarded)} of {n} guarded episodes failed"
+
+
+def _plane(learnt: Dynamics) -> tuple[int, int]:
+    """Variables of the first region, then of thresholds, then those that tell failures most."""
+    named = [*learnt.regions[:, :2].astype(int).ravel().tolist()]
+    named += [j for j, _, _ in learnt.thresholds]
+    if len(learnt.failures) and len(learnt.survived):
+        apart = np.abs(learnt.failures.mean(0) - learnt.survived.mean(0))
+        named += np.argsort(-apart / (learnt.survived.std(0) + 1e-9), kind="stable").tolist()
+    first, second, *_ = [*dict.fromkeys([*named, *range(learnt.n_variables)]), 0]
+    return first, second
+
+
 # -- The story ------------------------------------------------------------------------------------
 
 
 class Chronicle:
     """Writes the story of a run, frame by frame: when danger began, and what was done about it.
 
-    ``alone`` is when the driver collides if left to itself [s].
+    ``alone`` is when the controller fails if left to itself; danger is over once wishes were
+    tolerable for a ``calm`` [s].
     """
 
-    def __init__(self, tolerance: float, alone: float = math.nan) -> None:
-        self.tolerance = tolerance
+    def __init__(self, tolerance: float, alone: float = math.nan, calm: float = CALM) -> None:
+        self.tolerance, self.calm = tolerance, calm
         self.story = Story(alone=alone)
 
     def tell(self, frame: Frame) -> Story:
         """The story with one more frame."""
-        story, moves = self.story, frame.v_follower > 0.0  # who stands hits nobody
-        brakes = frame.a_leader <= _LEADER_BRAKES
-
-        def first(at: float, holds: bool) -> float:
-            return frame.time if math.isnan(at) and holds else at
-
-        warns, near = frame.time_to_collision < _TTC.threshold, _HEADWAY.threshold
-        story = story._replace(
+        story = self.story if frame.cars is None else _on_the_road(self.story, frame, frame.cars)
+        self.story = story = story._replace(
             judged=story.judged or not math.isnan(frame.proposed_risk.risk),
-            time_to_collision=first(story.time_to_collision, moves and warns),
-            time_headway=first(story.time_headway, moves and frame.time_headway < near),
-            leader_brakes=first(story.leader_brakes, brakes),
-            leader_decel=max(story.leader_decel, -frame.a_leader if brakes else 0.0),
-            revised=story.revised + frame.is_revised,
-            collision=first(story.collision, frame.collided),
+            revised=story.revised + frame.revised,
+            failure=frame.time if frame.failed else math.nan,
         )
-        self.story = story if frame.over else self._danger(frame, story)
+        if not frame.over:
+            self.story = self._danger(frame, story)
         return self.story
 
     def _danger(self, frame: Frame, story: Story) -> Story:
@@ -225,21 +298,37 @@ class Chronicle:
             danger = Danger(frame, frame.time)
             first = frame.time if math.isnan(story.first) else story.first
             story = story._replace(in_danger=True, first=first)
-        elif is_tolerable and frame.time - danger.last >= _CALM:
+        elif is_tolerable and frame.time - danger.last >= self.calm:
             return story._replace(in_danger=False)
         return story._replace(danger=_went_on(danger, frame, is_tolerable))
 
 
+def _on_the_road(story: Story, frame: Frame, cars: Cars) -> Story:
+    """What classic measures noticed, and what the leader did."""
+    moves = cars.v_follower > 0.0  # who stands hits nobody
+    brakes, near = cars.a_leader <= _LEADER_BRAKES, _HEADWAY.threshold
+
+    def first(at: float, holds: bool) -> float:
+        return frame.time if math.isnan(at) and holds else at
+
+    warns = cars.time_to_collision < _TTC.threshold
+    return story._replace(
+        time_to_collision=first(story.time_to_collision, moves and warns),
+        time_headway=first(story.time_headway, moves and cars.time_headway < near),
+        leader_brakes=first(story.leader_brakes, brakes),
+        leader_decel=max(story.leader_decel, -cars.a_leader if brakes else 0.0),
+    )
+
+
 def _went_on(danger: Danger, frame: Frame, is_tolerable: bool) -> Danger:
-    if frame.is_revised:
+    if frame.revised:
         danger = danger._replace(
             stepped_in=danger.stepped_in or frame,
             revised=danger.revised + 1,
-            change=danger.change + abs(frame.executed - frame.proposed),
-            hardest=min(danger.hardest, frame.executed),
+            hardest=min(danger.hardest, frame.executed[0]),
         )
     dead_end = math.nan  # where it is over, or not known
-    if frame.braking_risk > _DEAD_END:
+    if frame.least_risk > _DEAD_END:
         dead_end = frame.time if math.isnan(danger.dead_end) else danger.dead_end
     return danger._replace(
         last=danger.last if is_tolerable else frame.time,

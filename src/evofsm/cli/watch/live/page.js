@@ -1,10 +1,10 @@
 // The page: what comes from the run is shown, what is asked for is sent.
 
-import { readColours } from "./paint.js";
+import { readColours, seconds } from "./paint.js";
 import { drawPlots, placeOf, span, timeAt } from "./plots.js";
 import { drawRoad } from "./road.js";
 import { Run } from "./run.js";
-import { drawBelief, drawMap, placeHere } from "./states.js";
+import { drawBelief, drawPlane, placeHere } from "./plane.js";
 
 const at = (id) => document.getElementById(id);
 const run = new Run();
@@ -29,6 +29,7 @@ function take(message) {
   else run.take(message);
   if (message.kind === "start") showStart(message);
   if (message.kind === "clock") showControls();
+  if (message.kind === "known") showKnown(message);
   changed = true;
 }
 
@@ -45,20 +46,39 @@ const send = (what, value) => {
 // -- What is shown as words and controls ------------------------------------------------------------
 
 function showStart(start) {
-  at("about").textContent = `Here ${start.cases[start.case] ?? "a run"} of “${start.family}”: ${start.about}`;
+  at("about").textContent = `Here ${start.cases[start.case] ?? "a run"} of “${start.system}”: ${start.about}`;
   at("of-cases").textContent = start.live ? "Case" : "Episode";
   at("case").replaceChildren(...start.cases.map((name, k) => new Option(name, k, false, k === start.case)));
   at("speed").replaceChildren(...start.speeds.map((speed) => new Option(`${speed} ×`, speed)));
+  for (const id of ["across", "up"]) at(id).replaceChildren(...start.names.map((name, k) => new Option(name, k)));
   for (const element of document.querySelectorAll("[data-live]")) element.hidden = !start.live;
   for (const element of document.querySelectorAll("[data-judge]")) element.hidden = element.dataset.judge !== start.judge;
-  at("learnt").textContent = learnt(start);
+  for (const element of document.querySelectorAll("[data-cars]")) element.hidden = !start.cars;
+  document.body.classList.toggle("cars", start.cars);
+  at("experience").textContent = "";
 }
 
-function learnt(start) {
-  if (!start.live) return "Recorded: the states as they were at its end. ⬢ a collision ended there, + the car now, blue: its way.";
-  const before = start.learnt ? `It had learnt from ${start.learnt} episodes before this run` : "It began from empty";
-  const marked = start.judge === "learnt" ? "a collision ended there" : "dead end";
-  return `${before}, and goes on learning. ⬢ ${marked}, + the car now, blue: its way.`;
+let chosen = null; // the plane that whoever looks on has chosen
+
+function showKnown(known) {
+  const plane = chosen && chosen.every((one) => one < run.start.names.length) ? chosen : known.plane;
+  ["across", "up"].forEach((id, k) => { at(id).value = plane[k]; });
+  at("harm").hidden = !known.harm;
+  write("harm", known.harm && `${known.harm[0].toUpperCase()}${known.harm.slice(1)}.`);
+  write("failure", known.told);
+  at("learnt").textContent = learnt(run.start, known);
+}
+
+/** How much it knew, and what the plane shows. */
+function learnt(start, known) {
+  const before = start.learnt ? `Learnt from ${start.learnt} episodes before, and goes on.` : "Began from empty, and goes on learning.";
+  const signs = ["+ now, blue: its way", "○ state"];
+  if (known.survived.length) signs.push("· survived");
+  if (known.failed.length) signs.push("✕ failed");
+  if (known.regions.length + known.thresholds.length) signs.push("shaded: expected to fail");
+  if (known.dead_ends.length) signs.push("dashed: dead end");
+  signs.push(start.live && start.judge !== "learnt" ? "⬢ dead end" : "⬢ state in which it failed");
+  return `${start.live ? before : "Recorded: the states as they were at its end."} ${signs.join(", ")}.`;
 }
 
 function showControls() {
@@ -75,7 +95,7 @@ function showMode() {
   const recorded = !run.start || run.start.live ? "live" : run.start.shadow ? "shadow" : "recorded";
   const mode = !run.isLive ? "past" : run.clock.over ? "ended" : run.clock.paused ? "paused" : recorded;
   if (socket.readyState === WebSocket.OPEN) at("mode").textContent = mode;
-  at("time").textContent = `${run.shown.toFixed(1)} s`;
+  at("time").textContent = seconds(run.shown);
   const scrub = at("scrub");
   scrub.max = span(run);
   scrub.value = run.shown;
@@ -89,7 +109,7 @@ function showStory() {
   told = frame;
   at("status").dataset.status = frame.told.status;
   write("headline", frame.told.headline);
-  for (const part of ["when", "why", "done", "others", "outcome", "alone"]) write(part, frame.told[part]);
+  for (const part of ["when", "why", "done", "outcome", "alone"]) write(part, frame.told[part]);
   const decision = run.decision;
   write("decision", `${decision.here}; ${decision.reason}`);
   write("experience", decision.explanation || "nothing yet");
@@ -116,8 +136,12 @@ for (const [id, action] of Object.entries(actions)) {
 }
 at("speed").addEventListener("change", () => send("speed", Number(at("speed").value)));
 at("case").addEventListener("change", () => send("case", Number(at("case").value)));
+for (const id of ["across", "up"]) {
+  at(id).addEventListener("change", () => { chosen = plane(); changed = true; });
+}
 at("scrub").addEventListener("input", () => { run.see(Number(at("scrub").value)); changed = true; });
 
+const plane = () => [Number(at("across").value), Number(at("up").value)];
 const plots = at("plots-canvas");
 const drag = (event) => {
   run.see(timeAt(plots, run, event.offsetX));
@@ -156,7 +180,7 @@ const keys = {
 document.addEventListener("keydown", (event) => {
   const { target, key } = event;
   if (!run.start || at("helping").open || event.ctrlKey || event.metaKey || event.altKey) return;
-  if (target.tagName === "SELECT" || (target.tagName === "BUTTON" && key === " ")) return;
+  if (target.tagName === "SELECT" || (["BUTTON", "SUMMARY"].includes(target.tagName) && key === " ")) return;
   const action = keys[key] ?? keys[key.toLowerCase()];
   if (!action) return;
   event.preventDefault();
@@ -190,14 +214,15 @@ function draw(now) {
     if (changed || run.frame !== drawn) {
       at("playhead").style.top = `${drawPlots(plots, run)}px`;
       drawBelief(at("belief"), run);
-      drawMap(at("map-canvas"), run);
+      drawPlane(at("map-canvas"), run, plane());
       showStory();
     }
     [changed, drawn] = [false, run.frame];
-    drawRoad(at("road-canvas"), run);
+    if (run.start.cars) drawRoad(at("road-canvas"), run);
     showMode();
     put("playhead", placeOf(plots, run, run.shown), 0);
-    if (placeHere(run)) put("here", ...placeHere(run));
+    const here = placeHere(run);
+    if (here) put("here", ...here);
   }
   requestAnimationFrame(draw);
 }

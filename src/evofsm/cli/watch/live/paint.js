@@ -53,3 +53,14 @@ export function hexagon(pen, x, y, radius) {
   }
   pen.closePath();
 }
+
+/** A round number, about as large: 1, 2 or 5 times a power of ten. */
+export function niceStep(about) {
+  const power = 10 ** Math.floor(Math.log10(about));
+  return [1, 2, 5, 10].find((step) => step * power >= about * 0.999) * power;
+}
+
+export const shown = (value) => `${Number(value.toPrecision(6))}`.replace("-", "−");
+
+/** A time in seconds, as the story tells it. */
+export const seconds = (time) => `${time > 0 && time < 1 ? Number(time.toPrecision(2)) : time.toFixed(1)} s`;

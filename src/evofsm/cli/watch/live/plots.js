@@ -1,54 +1,69 @@
 // Risk, the classic warnings and accelerations, one above the other on one time axis.
 
-import { colour, fresh, line, text } from "./paint.js";
+import { colour, fresh, line, niceStep, seconds, shown, text } from "./paint.js";
 
 const LEFT = 40, RIGHT = 12;
 const MOST_BAND = 0.3; // a wider interval says little, and would fill the panel
+const MOST_COMPONENTS = 4; // of an action
+const LEAST_HEIGHT = 104; // of a panel [px]
 
-/** What is drawn in each panel; `name` answers a frame's value, null where there is none. */
-function panels(start) {
+/** What is drawn in each panel; `value` answers a frame's value, null where there is none. */
+function panels(run) {
+  const { start } = run, cars = start.cars;
   const percent = (value) => `${Math.round(100 * value)} %`;
-  const plain = (value) => `${value}`.replace("-", "−");
   const { follower, leader, danger, third, soft } = colour;
-  return [
-    {
-      title: "Risk", about: start.judge === "learnt" ? "that something begins which nothing it knows survives" : "of collision if the leader brakes now",
-      low: 0, high: 1, ticks: [0, 0.5, 1], show: percent,
-      lines: [
-        { label: "driver's wish", ink: danger, width: 2.5, dash: [], value: (f) => f.proposed_risk.risk, band: (f) => f.proposed_risk },
-        { label: "executed", ink: follower, width: 2, dash: [5, 3], value: (f) => f.executed_risk.risk },
-      ],
-      limits: [{ at: start.tolerance, label: `accepted ${percent(start.tolerance)}`, ink: soft }],
-    },
-    {
-      title: "Classic warnings", about: "seconds; they warn below their dotted line",
-      low: 0, high: 6, ticks: [0, 2, 4, 6], show: (value) => (value === 6 ? "≥ 6" : plain(value)),
-      lines: [
-        { label: "time to collision", ink: leader, width: 2, dash: [8, 3], value: (f) => f.time_to_collision ?? Infinity },
-        { label: "time headway", ink: third, width: 2, dash: [2, 2], value: (f) => f.time_headway ?? Infinity },
-      ],
-      limits: [
-        { at: start.ttc_threshold, ink: leader },
-        { at: start.headway_threshold, ink: third },
-      ],
-    },
-    {
-      title: "Acceleration", about: "m/s²",
-      low: Math.floor(start.actions[0] - 0.5), high: Math.ceil(start.actions[1] + 0.5),
-      ticks: [Math.ceil(start.actions[0]), 0, Math.floor(start.actions[1])], show: plain,
-      lines: [
-        { label: "driver's wish", ink: danger, width: 2, dash: [], value: (f) => f.proposed },
-        { label: "executed", ink: follower, width: 2.5, dash: [5, 3], value: (f) => f.executed },
-      ],
-      limits: [{ at: 0, ink: soft }],
-    },
-  ];
+  const wish = (value) => ({ label: cars ? "driver's wish" : "proposed", ink: danger, width: 2.5, dash: [], value });
+  const executed = (value) => ({ label: "executed", ink: follower, width: 2, dash: [5, 3], value });
+  const changed = (k) => ({ ...wish((f) => (f.revised ? f.proposed[k] : null)), label: "proposed, where changed", dots: true });
+  const byLeaders = start.judge !== "learnt", fails = cars ? "collision" : "failure";
+  const risk = {
+    title: "Risk", about: `${byLeaders ? "of collision if the leader brakes now" : `that ${fails} can't be avoided any more`}; ${percent(start.tolerance)} is accepted`,
+    low: 0, high: 1, ticks: [0, 0.5, 1], show: percent,
+    lines: [wish((f) => f.proposed_risk.risk), executed((f) => f.executed_risk.risk)],
+    bands: [{ ink: colour.band, ends: ({ proposed_risk: { low, high } }) => (high === null || high - low > MOST_BAND ? null : [low, high]) }],
+    limits: [{ at: start.tolerance, ink: soft }],
+  };
+  const most = byLeaders ? 12 : 10;
+  const margin = {
+    title: byLeaders ? "Braking of the leader that is survived" : "Margin of the best backup",
+    about: byLeaders ? "m/s²; shaded: what leaders are expected to do" : "ordinary changes; shaded: what has to be left",
+    low: byLeaders ? 0 : -2, high: most, ticks: byLeaders ? [0, 4, 8, 12] : [0, 5, 10], show: (value) => (value === most ? `≥ ${most}` : shown(value)),
+    lines: [wish((f) => f.proposed_risk.critical), executed((f) => f.executed_risk.critical)],
+    bands: [{ ink: colour.grid, ends: ({ needed, usual }) => (needed === null ? null : [usual ?? 0, needed]) }],
+    limits: byLeaders ? [] : [{ at: 0, ink: soft }],
+  };
+  const classic = {
+    title: "Classic warnings", about: "seconds; they warn below their dotted line",
+    low: 0, high: 6, ticks: [0, 2, 4, 6], show: (value) => (value === 6 ? "≥ 6" : shown(value)),
+    lines: [
+      { label: "time to collision", ink: leader, width: 2, dash: [8, 3], value: (f) => f.cars.time_to_collision ?? Infinity },
+      { label: "time headway", ink: third, width: 2, dash: [2, 2], value: (f) => f.cars.time_headway ?? Infinity },
+    ],
+    bands: [], limits: [{ at: start.ttc_threshold, ink: leader }, { at: start.headway_threshold, ink: third }],
+  };
+  const actions = start.low.slice(0, MOST_COMPONENTS).map((low, k) => {
+    const high = start.high[k], pad = 0.1 * (high - low), several = start.low.length;
+    const step = start.discrete ? Math.ceil((high + 1) / 5) : niceStep((high - low) / 4);
+    const ticks = [];
+    for (let n = Math.ceil(low / step - 1e-9); n * step <= high + 1e-9; n++) ticks.push(n * step);
+    return {
+      title: cars ? "Acceleration" : several > 1 ? `Action ${k + 1} of ${several}` : "Action", about: cars ? "m/s²" : "",
+      low: low - pad, high: high + pad, ticks, show: start.discrete ? (value) => `a(${value + 1})` : shown,
+      lines: cars ? [wish((f) => f.proposed[k]), executed((f) => f.executed[k])] : [{ ...executed((f) => f.executed[k]), width: 1.4, dash: [] }, changed(k)],
+      steps: !cars,
+      bands: [], limits: low < 0 && high > 0 ? [{ at: 0, ink: soft }] : [],
+    };
+  });
+  const hasMargin = run.frames.some((frame) => frame.proposed_risk.critical !== null);
+  return [risk, ...(hasMargin ? [margin] : []), ...(cars ? [classic] : []), ...actions];
 }
 
 /** Seconds on the axis: a round number that leaves some room. */
 export function span(run) {
   const latest = run.latest ? run.latest.time : 0;
-  return Math.max(20, Math.ceil((latest + 1) / 10) * 10);
+  const least = Math.max(1.04 * latest, Math.min(20, 60 * run.start.interval));
+  const unit = niceStep(least) / 10;
+  return Math.ceil(least / unit) * unit;
 }
 
 export function timeAt(canvas, run, x) {
@@ -61,14 +76,16 @@ export function placeOf(canvas, run, time) {
 
 /** Draw all panels; answers where they begin, below the marks' labels. */
 export function drawPlots(canvas, run) {
-  const { pen, width, height } = fresh(canvas);
   if (!run.latest) return 0;
+  const all = panels(run);
+  canvas.parentElement.style.minHeight = `${LEAST_HEIGHT * all.length + 80}px`;
+  const { pen, width, height } = fresh(canvas);
   const most = span(run);
   const x = (time) => placeOf(canvas, run, time);
   const visible = run.frames.slice(0, run.index(run.shown + 1e-6) + 1);
   const marks = marksOf(run.frame);
   const top = 4 + 16 * place(pen, marks, x, width), bottom = height - 32;
-  const all = panels(run.start), heading = width < 480 ? 33 : 20;
+  const heading = width < 560 ? 33 : 20;
   const each = (bottom - top) / all.length;
 
   all.forEach((panel, number) => {
@@ -79,8 +96,8 @@ export function drawPlots(canvas, run) {
     };
     drawDanger(pen, visible, x, box);
     drawFrame(pen, panel, box, y, width);
-    for (const one of panel.lines) if (one.band) drawBand(pen, visible, one.band, x, y);
-    for (const one of panel.lines) drawLine(pen, visible, one, x, y);
+    for (const band of panel.bands) drawBand(pen, visible, band, x, y);
+    for (const one of panel.lines) drawLine(pen, visible, one, x, y, panel.steps);
   });
   drawTimes(pen, x, most, bottom);
   drawMarks(pen, marks, x, top, bottom);
@@ -99,8 +116,8 @@ function marksOf(frame) {
     { at: story.dead_end, label: "⬢ dead end", ink: colour.danger },
     { at: story.leader_brakes, label: "leader brakes", ink: colour.ink },
     { at: story.time_to_collision, label: "time to collision warns", ink: colour.leader },
-    { at: story.collision, label: "✕ collision", ink: colour.danger },
-  ].filter((mark) => mark.at !== null).map((mark) => ({ ...mark, label: `${mark.label} ${mark.at.toFixed(1)} s` }));
+    { at: story.failure, label: frame.cars ? "✕ collision" : "✕ failure", ink: colour.danger },
+  ].filter((mark) => mark.at !== null).map((mark) => ({ ...mark, label: `${mark.label} ${seconds(mark.at)}` }));
 }
 
 /** Give each mark a row in which its label meets no other; answers how many rows there are. */
@@ -141,9 +158,6 @@ function drawFrame(pen, panel, box, y, width) {
   }
   for (const limit of panel.limits) {
     line(pen, LEFT, y(limit.at), width - RIGHT, y(limit.at), { ink: limit.ink, dash: [1, 3], width: 1.4 });
-    if (limit.label) {
-      text(pen, limit.label, width - RIGHT, y(limit.at) - 7, { size: 10.5, align: "right", ink: limit.ink });
-    }
   }
   line(pen, LEFT, box.top, LEFT, box.bottom, { ink: colour.line });
 }
@@ -200,50 +214,56 @@ function drawDanger(pen, frames, x, box) {
   });
 }
 
-function drawBand(pen, frames, band, x, y) {
-  pen.fillStyle = colour.band;
+function drawBand(pen, frames, { ink, ends }, x, y) {
+  pen.fillStyle = ink;
   let stretch = [];
   const fill = () => {
     pen.beginPath();
-    for (const frame of stretch) pen.lineTo(x(frame.time), y(band(frame).high));
-    for (const frame of stretch.reverse()) pen.lineTo(x(frame.time), y(band(frame).low));
+    for (const [time, [, high]] of stretch) pen.lineTo(x(time), y(high));
+    for (const [time, [low]] of stretch.reverse()) pen.lineTo(x(time), y(low));
     pen.fill();
     stretch = [];
   };
   for (const frame of frames) {
-    const { low, high } = band(frame);
-    if (high === null || high - low > MOST_BAND) fill();
-    else stretch.push(frame);
+    const found = ends(frame);
+    if (found === null) fill();
+    else stretch.push([frame.time, found]);
   }
   fill();
 }
 
-function drawLine(pen, frames, one, x, y) {
+function drawLine(pen, frames, one, x, y, steps) {
+  if (one.dots) {
+    for (const frame of frames) {
+      const value = one.value(frame) ?? null;
+      if (value !== null) line(pen, x(frame.time), y(value) - 3, x(frame.time), y(value) + 3, { ink: one.ink, width: 2 });
+    }
+    return;
+  }
   pen.strokeStyle = one.ink;
   pen.lineWidth = one.width;
   pen.lineJoin = "round";
   pen.setLineDash(one.dash);
   pen.beginPath();
-  let isDown = false;
+  let before = null;
   for (const frame of frames) {
-    const value = one.value(frame);
-    if (value === null || value === undefined) {
-      isDown = false;
-      continue;
+    const value = one.value(frame) ?? null;
+    if (before === null && value !== null) pen.moveTo(x(frame.time), y(value));
+    else if (before !== null) {
+      if (steps) pen.lineTo(x(frame.time), y(before)); // an action is held until the next
+      if (value !== null) pen.lineTo(x(frame.time), y(value));
     }
-    if (isDown) pen.lineTo(x(frame.time), y(value));
-    else pen.moveTo(x(frame.time), y(value));
-    isDown = true;
+    before = value;
   }
   pen.stroke();
   pen.setLineDash([]);
 }
 
 function drawTimes(pen, x, most, bottom) {
-  const step = most > 60 ? 20 : most > 30 ? 10 : 5;
-  for (let time = 0; time <= most; time += step) {
-    line(pen, x(time), bottom, x(time), bottom + 4, { ink: colour.soft });
-    text(pen, `${time}`, x(time), bottom + 12, { size: 11, align: "center", ink: colour.soft });
+  const step = niceStep(most / 6);
+  for (let k = 0; k * step <= most * 1.001; k++) {
+    line(pen, x(k * step), bottom, x(k * step), bottom + 4, { ink: colour.soft });
+    text(pen, shown(k * step), x(k * step), bottom + 12, { size: 11, align: "center", ink: colour.soft });
   }
   text(pen, "time [s]", x(most), bottom + 25, { size: 11, align: "right", ink: colour.soft });
 }

@@ -6,6 +6,7 @@ export class Run {
     this.clock = { paused: false, speed: 1, revising: true, over: false };
     this.frames = [];
     this.graphs = [];
+    this.known = { plane: [0, 1], survived: [], failed: [], thresholds: [], regions: [], dead_ends: [], radii: [], told: "", harm: "" };
     this.shown = 0; // the time that is shown [s]
     this.isLive = true; // or what is shown is the past
   }
@@ -21,6 +22,7 @@ export class Run {
         break;
       case "frame": this.frames.push(message); break;
       case "graph": this.graphs.push(message); break;
+      case "known": this.known = message; break;
       case "clock": this.clock = message; break;
     }
   }
@@ -85,25 +87,37 @@ export class Run {
     return found;
   }
 
-  /** Where the cars are at the time that is shown, between two frames as a constant acceleration. */
-  get motion() {
+  /** The frames before and after the time that is shown, and how much of the way is done. */
+  get between() {
     const at = this.index(this.shown + 1e-6);
-    const [from, to] = [this.frames[at], this.frames[at + 1]];
-    if (!to) return from;
+    const [from, to] = [this.frames[at], this.frames[at + 1] ?? this.frames[at]];
     const span = to.time - from.time;
-    const part = span > 0 ? Math.min(1, Math.max(0, (this.shown - from.time) / span)) : 0;
-    const between = (name) => from[name] + part * (to[name] - from[name]);
+    return { from, to, span, part: span > 0 ? Math.min(1, Math.max(0, (this.shown - from.time) / span)) : 0 };
+  }
+
+  /** What is observed at that time. */
+  get observation() {
+    const { from, to, part } = this.between;
+    return from.observation.map((value, k) => (value === null ? null : value + part * (to.observation[k] - value)));
+  }
+
+  /** Where cars are at that time, between two frames as a constant acceleration. */
+  get motion() {
+    const { from, to, span, part } = this.between;
+    const [old, next] = [from.cars, to.cars];
+    if (!old || from === to) return old;
+    const between = (name) => old[name] + part * (next[name] - old[name]);
     const bend = 0.5 * part * (1 - part) * span; // of a position whose speed changes evenly
-    const own = to.v_follower - from.v_follower, others = to.v_leader - from.v_leader;
+    const own = next.v_follower - old.v_follower, others = next.v_leader - old.v_leader;
     return {
-      ...from,
+      ...old,
       v_follower: between("v_follower"),
       v_leader: between("v_leader"),
       x_follower: between("x_follower") - bend * own,
       gap: between("gap") - bend * (others - own),
-      gap_behind: from.gap_behind === null ? null : between("gap_behind"),
-      a_follower: to.a_follower,
-      a_leader: to.a_leader,
+      gap_behind: old.gap_behind === null ? null : between("gap_behind"),
+      a_follower: next.a_follower,
+      a_leader: next.a_leader,
     };
   }
 }
