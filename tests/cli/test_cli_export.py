@@ -66,7 +66,9 @@ def test_folder_machine_and_log_give_the_same_states(evofsm, driven, to, begins,
     assert (tmp_path / "graph").read_bytes().decode() == printed[out]
 
 
-def test_a_guard_is_written_in_c_and_for_cpp_to_a_folder(evofsm, refused, driven, tmp_path):
+def test_a_guard_is_written_in_c_and_for_cpp_to_a_folder(
+    evofsm, refused, driven, tmp_path, caplog
+):
     out, _ = driven
     for file in (out, out / "guard.evofsm"):
         assert evofsm("export", file, "--to", "c99", "--out", tmp_path / "c").exit_code == 0
@@ -79,8 +81,15 @@ def test_a_guard_is_written_in_c_and_for_cpp_to_a_folder(evofsm, refused, driven
     assert "name a file, of c99 a folder, by --out" in refused("export", out, "--to", "c99")
     named = evofsm("export", out, "--to", "c99", "--prefix", "cars", "--out", tmp_path / "c")
     assert "int cars_decide(" in (tmp_path / "c" / "cars.h").read_text(), named.stderr
-    evofsm("export", out, "--to", "fmu", "--out", tmp_path / "cars.fmu")
+    assert "\n#define ACTS 0\n" in (tmp_path / "c" / "cars.c").read_text()
+    assert "in mode shadow it watches: executed is always the proposal" in caplog.text
+    caplog.clear()  # it was driven in shadow
+    act = "--mode", "act", "--out"
+    assert evofsm("export", out, "--to", "c99", *act, tmp_path / "c").exit_code == 0
+    assert "\n#define ACTS 1\n" in (tmp_path / "c" / "evofsm.c").read_text()
+    evofsm("export", out, "--to", "fmu", *act, tmp_path / "cars.fmu")
     assert is_zipfile(tmp_path / "cars.fmu")
+    assert "it watches" not in caplog.text
 
 
 def test_options_choose_what_is_drawn(evofsm, driven):

@@ -18,6 +18,10 @@ def export(
     ],
     out: Annotated[Path | None, option("File to write, else printed; of c99 a folder.")] = None,
     prefix: Annotated[str, option("Of c99: how all names in it begin.")] = "evofsm",
+    mode: Annotated[
+        Literal["act", "shadow"] | None,
+        option("Of c99 and fmu: whether it filters, or only watches. [default: as saved]"),
+    ] = None,
     least: Annotated[
         float | None,
         option("Leave out what is less probable. [default: dot 0.001]", min=0.0, max=1.0),
@@ -29,13 +33,15 @@ def export(
     """Write what was learnt, or driven, in the formats of other tools."""
     _refuse_learnt(out)
     if to in ("c99", "fmu"):
-        from evofsm.guard import Guard
+        from evofsm.guard import Guard, Mode
         from evofsm.guard.export import write_c99, write_fmu
 
         if out is None:
             raise ValueError(f"--to {to} prints nothing: name a file, of c99 a folder, by --out")
         saved = file / "guard.evofsm" if file.is_dir() else file
         guard = Guard.load(saved, failed=lambda seen: False)
+        if mode and hasattr(guard.reviser, "mode"):
+            guard.reviser.mode = Mode(mode)
         return write_c99(guard, out, prefix) if to == "c99" else write_fmu(guard, out)
     from evofsm import store
     from evofsm.fsm.naming import visible

@@ -117,6 +117,9 @@ def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
             f"this guard {reviser.passing}: exported it would let all proposals pass; let it learn "
             "on, or set guard.shadow = False"
         )
+    if not reviser.acts:
+        said = "exported in mode %s it watches: executed is always the proposal; --mode act filters"
+        logging.getLogger(__name__).warning(said, reviser.mode.value)
     if asked is not LearntRisk and "in_c99" not in vars(asked):
         raise ValueError(f"a LearntRisk or a LatentRisk is exported, but no {asked.__name__}")
     part: Part = _learnt(reviser) if asked is LearntRisk else reviser.risk.in_c99(reviser)  # type: ignore[attr-defined]
