@@ -66,9 +66,7 @@ def test_folder_machine_and_log_give_the_same_states(evofsm, driven, to, begins,
     assert (tmp_path / "graph").read_bytes().decode() == printed[out]
 
 
-def test_a_guard_is_written_in_c_and_for_cpp_to_a_folder(
-    evofsm, refused, driven, tmp_path, caplog
-):
+def test_a_guard_is_written_in_c_and_for_cpp_to_a_folder(evofsm, refused, driven, tmp_path, caplog):
     out, _ = driven
     for file in (out, out / "guard.evofsm"):
         assert evofsm("export", file, "--to", "c99", "--out", tmp_path / "c").exit_code == 0

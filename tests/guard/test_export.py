@@ -55,6 +55,7 @@ def test_a_guard_in_c_decides_as_in_python(wall, tmp_path):
     found = agrees(wall, tmp_path, "-O1", decisions=800)
     assert found.changed > 100
     assert found.refused > 5
+    assert "-0.0," not in (tmp_path / "evofsm.c").read_text()  # no risk prints as -0
 
 
 class Own(LatentRisk):

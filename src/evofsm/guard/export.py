@@ -242,7 +242,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "residuals": residuals,
         "policies": backups.policies,
         "backup_ranks": backups.ranks,
-        "risks": [risk._risk(one, soon) for one in (math.inf, *range(count))],
+        "risks": [risk._risk(one, soon) for one in (math.inf, *map(float, range(count)))],
         "middle": dynamics._middle,
         "half": dynamics._half,
         "gains": dynamics.gains[: None if dynamics.is_noisy else 0],
