@@ -470,11 +470,13 @@ ZONED += [f"2026-03-29T03:00:00.{k}+02:00" for k in range(3)]  # summer time beg
 
 
 @pytest.mark.parametrize("texts", [ZONED, [f"2026-03-14 09:26:53.{k}" for k in range(5)]])
-def test_times_may_be_dates(tmp_path, texts):
-    path = write(tmp_path / "a.csv", dated(texts), SHORT)
+@pytest.mark.parametrize("point", ".,")
+def test_times_may_be_dates(tmp_path, texts, point):
+    lines = dated(f'"{text.replace(".", point)}"' for text in texts)
+    path = write(tmp_path / "a.csv", lines, SHORT)
     frame, time = polars.read_csv(path), polars.col("time")
     frame.write_parquet(tmp_path / "text.parquet")
-    zoned = time.str.to_datetime(time_zone="UTC" if texts is ZONED else None)
+    zoned = time.str.replace(",", ".").str.to_datetime(time_zone="UTC" if texts is ZONED else None)
     frame.with_columns(zoned.dt.cast_time_unit("ms")).write_parquet(tmp_path / "typed.parquet")
     for one in (path, str(tmp_path / "text.parquet"), str(tmp_path / "typed.parquet")):
         (chunk,) = read(one)
@@ -489,10 +491,13 @@ def test_times_may_be_dates(tmp_path, texts):
         (["2026-03-14T09:26:53", "2026-03-14T09:26:54Z"], "line 3.*have a zone, or none"),
         (["2026-03-14T09:26:53", "2026-03-14T09:26:52"], "must run forward"),
         (["09:26:53", "09:26:54"], "line 2, column 'time': '09:26:53' is no number"),
+        (["10.03.2025 06:00:00,000"], "'10.03.2025 06:00:00,000' is no number.*in ISO 8601"),
+        (["2026-03-14 09:26:53 CET"], "line 2.*'2026-03-14 09:26:53 CET' is not read as a date"),
     ],
 )
 def test_dates_that_are_none_are_refused(tmp_path, texts, says):
-    assert re.search(says, refusal(write(tmp_path / "a.csv", dated(texts), SHORT)))
+    lines = dated(f'"{text}"' for text in texts)
+    assert re.search(says, refusal(write(tmp_path / "a.csv", lines, SHORT)))
 
 
 def test_units_are_converted_before_anything_is_learnt(tmp_path):

@@ -74,7 +74,9 @@ Observed = Annotated[
 ActionColumn = Annotated[
     str, option("Column of the action taken from a row to the next.", "--action")
 ]
-TimeColumn = Annotated[str, option("Column of the time, in seconds.", "--time")]
+TimeColumn = Annotated[
+    str, option("Column of the time, in seconds or as dates of ISO 8601.", "--time")
+]
 EpisodeColumns = Annotated[
     str | None,
     option(

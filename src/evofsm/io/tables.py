@@ -77,6 +77,9 @@ _NOTHING = ("", "na", "n/a", "null", "none")
 # What no text holds.
 _CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
+# Dates and times of day, however they are written; and how they have to be.
+_DATE_LIKE = re.compile(r"\s*\d{1,4}([.:/-])\d\d?\1\d")
+_ISO = "in ISO 8601, such as 2026-03-14T09:26:53.5+01:00"
 
 
 def unit_of(text: str) -> str:
@@ -467,7 +470,8 @@ class ParquetTable(Table):
         for name in wanted.numbers:
             if not self._types[name].is_numeric():
                 raise ValueError(
-                    f"{self.path}: column {name!r} holds {self._types[name]}, not numbers"
+                    f"{self.path}: column {name!r} holds {self._types[name]}, not numbers "
+                    f"(a date has to be {_ISO})"
                 )
         part = self._scan.select(wanted.all)
         # Not collect_batches: it reads ahead of a slow consumer without bound (polars #28569).
@@ -514,6 +518,8 @@ def explained(text: str) -> str:
         )
     if _is_number(text.replace(",", ".")):
         return f"{text[:40]!r} is no number (a decimal comma? write 1.5)"
+    if _DATE_LIKE.match(text):
+        return f"{text[:40]!r} is no number (a date? it has to be {_ISO})"
     return f"{text[:40]!r} is no number (a text, a date, or a unit behind the number?)"
 
 
@@ -529,12 +535,13 @@ def _microseconds(piece: Piece, name: str, dates: polars.Series) -> NDArray[np.f
     """Microseconds since 1970, exactly; without a zone a date is taken as UTC."""
     import polars
 
+    why = f"{{!r}} is not read as a date; all must be {_ISO}, and all have a zone, or none"
     if dates.dtype == polars.String:
-        dates = dates.str.strip_chars().str.to_datetime(strict=False)
+        texts = dates.str.strip_chars().str.replace(",", ".", literal=True)
+        try:
+            dates = texts.str.to_datetime(strict=False)
+        except polars.exceptions.ComputeError:
+            piece.refuse(0, name, why)
     if dates.null_count():
-        why = (
-            "{!r} is no date as the first row has one; all must be in ISO 8601, such as "
-            "2026-03-14T09:26:53.5+01:00, and have a zone, or none"
-        )
         piece.refuse(int(dates.is_null().arg_max() or 0), name, why)
     return dates.dt.epoch("us").cast(polars.Float64).to_numpy()
