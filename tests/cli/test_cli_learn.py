@@ -278,6 +278,19 @@ def test_a_log_that_tells_nothing_of_failures_is_said_to(evofsm, crashes, tmp_pa
     assert "0 of 3 (at most 48 %) failed later on" in text
 
 
+def test_a_failure_that_no_row_meets_is_said_with_the_range_of_its_column(evofsm, tmp_path):
+    path, level = tmp_path / "tank.csv", "level [mm]"
+    rows = [f"{k},{500 + 50 * k},0.1,{k == 20}" for k in range(9)]
+    path.write_text("\n".join([f"time,{level},u,spilt", *rows, ""]))
+    asked = "learn", path, "--observe", level, "--action", "u", "--failed"
+    told = evofsm(*asked, f"{level}>=900")
+    assert f"compares it, which then has to be '{level}>=0.9' (--unit" in told.stderr
+    assert "1 episode ended with" in told.stdout
+    told = evofsm(*asked, f"{level}>=900", "--unit", f"{level}=mm").stderr
+    assert f"'{level}>=900': {level}, as compared, goes from 0.5 to 0.9 m\n" in told
+    assert "no row meets --failed spilt\n" in evofsm(*asked, "spilt").stderr
+
+
 def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, refused, tmp_path):
     path = tmp_path / "log.csv"
     rows = [f"p,{100 * k},{'' if k == 9 else 20},54,54,0.1" for k in range(30)]

@@ -508,7 +508,7 @@ def test_units_are_converted_before_anything_is_learnt(tmp_path):
     assert chunk.observations[1] == pytest.approx([10.0, 10.0, 72.0])
     assert chunk.dt == 0.1
     read(path, noted=noted)
-    speed, step = warnings_of(noted, "time")
+    speed, step = warnings_of(noted)
     assert re.search("v_leader reaches 72 m/s.*--unit v_leader=km/h", speed)
     assert re.search("a row every 100 s.*--unit time=ms", step)
 

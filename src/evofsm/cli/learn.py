@@ -190,7 +190,7 @@ def learn(
         )
     noted = Noted(**learning.read.notes["noted"])
     provenance = _provenance(learning, known, action, failed, unit)
-    warnings = warnings_of(noted, time)
+    warnings = warnings_of(noted, columns)
     for warning in warnings:
         warn(f"warning: {warning}")
     if out is not None:

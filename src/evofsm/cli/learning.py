@@ -32,7 +32,7 @@ from evofsm.fsm.step import Trace
 from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
 from evofsm.guard.journal import differences
 from evofsm.io import Chunk, episodes_of
-from evofsm.io.logs import Noted
+from evofsm.io.logs import Condition, LogColumns, Noted
 from evofsm.io.tables import SI, TIMES, UNITS
 
 _log = logging.getLogger(__name__)
@@ -189,8 +189,10 @@ def _called(name: str, *, is_time: bool) -> str:
     return {"feet": "ft", "knots": "kn"}.get(word) or (word if word in UNITS else "km/h")
 
 
-def warnings_of(noted: Noted, time: str = "time") -> list[str]:
+def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
     """What is most likely a mistake, and what would mend it."""
+    columns = columns or LogColumns()
+    time, failed = columns.time, columns.failed and Condition.parse(columns.failed)
     called = {name: unit for name in noted.untold if (unit := _called(name, is_time=name == time))}
     found = [
         f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
@@ -198,11 +200,23 @@ def warnings_of(noted: Noted, time: str = "time") -> list[str]:
         for name, fastest in noted.fastest.items()
         if name not in called
     ]
-    found += [
-        f"{name} is called as if it were in {unit}, and was read as one of the SI: --unit "
-        f"{quote(f'{name}={unit}')} converts it (--unit {quote(f'{name}={SI[unit]}')}: it is right)"
-        for name, unit in called.items()
-    ]
+    for name, unit in called.items():
+        then = ""
+        if failed and failed.sign and failed.column == name:
+            number = f"{name}{failed.sign}{failed.number * UNITS[unit]:g}"
+            then = f", before --failed compares it, which then has to be {quote(number)}"
+        found.append(
+            f"{name} is called as if it were in {unit}, and was read as one of the SI: --unit "
+            f"{quote(f'{name}={unit}')} converts it{then} "
+            f"(--unit {quote(f'{name}={SI[unit]}')}: it is right)"
+        )
+    if failed and not noted.failing:
+        goes = ""
+        if noted.compared:
+            unit = SI.get(noted.units.get(failed.column, ""), "")
+            low, high = noted.compared
+            goes = f": {failed.column}, as compared, goes from {low:.6g} to {high:.6g} {unit}"
+        found.append(f"no row meets --failed {quote(columns.failed or '')}{goes}".rstrip())
     if (step := noted.longest_step) > 0.0 and time not in called:
         unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
         cause = f"is the time in {unit}? --unit {time}={unit} converts it"

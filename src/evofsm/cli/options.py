@@ -89,7 +89,8 @@ Step = Annotated[float | None, option("From a row to the next [s], without a clo
 Failed = Annotated[
     str | None,
     option(
-        "What failed: a column of truth values, or a comparison such as 'gap<=0'. "
+        "What failed: a column of truth values, or a comparison such as 'gap<=0', in units of the "
+        "SI, after --unit. "
         "The row with which it becomes true ends the episode in failure.",
         "--failed",
     ),

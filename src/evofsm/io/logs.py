@@ -91,6 +91,9 @@ class Noted:
     leaderless: int = 0  #: rows without a leader, left out
     after_failure: int = 0  #: rows left out because the failure before them still held
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
+    failing: int = 0  #: rows that meet what tells of failures
+    #: From where to where the column goes that is compared for that, in its unit of the SI.
+    compared: tuple[float, float] | None = None
     fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
     longest_step: float = 0.0  #: the usual one, beyond belief [s]
     #: By variable, the number that it is below 0 (0 where there are several), and in how many rows.
@@ -646,6 +649,11 @@ class _Reader:
         kept = ~lacking
         if self._failed is not None:
             holds = self._failed.holds(piece) & ~np.asarray(nobody)
+            self._noted.failing += int(holds.sum())
+            if self._failed.sign:
+                values = piece.numbers[self._failed.column]
+                seen = [*values[np.isfinite(values)].tolist(), *(self._noted.compared or ())]
+                self._noted.compared = (min(seen), max(seen)) if seen else None
             before = np.concatenate([[self._held], holds[:-1]]) & ~anew
             self._held = bool(holds[-1])
             fails, still = holds & ~before, holds & before

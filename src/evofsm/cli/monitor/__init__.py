@@ -219,7 +219,7 @@ def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
 
     def all_of_them() -> Iterator[Chunk]:
         yield from chain([first], episodes)
-        for warning in warnings_of(noted, columns.time):
+        for warning in warnings_of(noted, columns):
             warn(f"warning: {warning}")
 
     return all_of_them(), first.dt

@@ -270,7 +270,7 @@ def record_log(
             raise ValueError(f"{path}: nobody follows anybody for {_FEWEST_ROWS} rows")
         if guard.machine is not None:
             log.attach(guard.machine.model(names=VARIABLES))
-    for warning in warnings_of(noted, "time" if columns is None else columns.time):
+    for warning in warnings_of(noted, columns):
         warn(f"warning: {warning}")
     if judge == "kinematic":
         warn(assumptions(brakes, tolerance))
