@@ -2,6 +2,8 @@
 
 import json
 import math
+import random
+import re
 
 import pytest
 
@@ -175,6 +177,29 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
     assert "3 episodes ended in one" in text
 
 
+def test_a_guard_that_refuses_most_of_the_time_is_said_to(evofsm, tmp_path):
+    """A tank whose inlet, which nobody sees, opens and closes as it likes."""
+    path, guard, chance = tmp_path / "tank.csv", tmp_path / "tank.evofsm", random.Random(3)
+    rows = ["run,time,level,pump"]
+    for run in range(30):
+        level, inlet = chance.uniform(0.2, 0.6), False
+        for k in range(200):
+            pump, inlet = chance.random(), inlet != (chance.random() < 0.03)
+            rows.append(f"{run},{k / 2},{level:.4f},{pump:.3f}")
+            if level >= 0.9:
+                break
+            level = max(0.0, level + 0.03 * inlet - 0.02 * pump)
+    path.write_text("\n".join([*rows, ""]))
+    read = "--action", "pump", "--failed", "level>=0.9"
+    to = "--action-range", "0:1:0.1", "--guard", guard
+    why = "perhaps what moves the system is not observed (a valve, a set point, a load"
+    told = evofsm("learn", path, "--observe", "level", *read, *to)
+    assert re.search(rf"the guard refuses \d\d+% of the time: {re.escape(why)}", told.stderr)
+    summed = evofsm("monitor", path, "--guard", guard, *read, "--summary").stdout
+    assert why in " ".join(summed.split())
+    assert "(--tolerance tells of others)" in " ".join(summed.split())
+
+
 def test_a_guard_that_could_not_be_taught_is_refused_before_the_work(refused, own, tmp_path):
     options = ("learn", own, *OWN, "--guard", tmp_path / "car.evofsm")
     assert "which there were is not known: --failed" in refused(*options)
@@ -284,7 +309,7 @@ def test_a_failure_that_no_row_meets_is_said_with_the_range_of_its_column(evofsm
     path.write_text("\n".join([f"time,{level},u,spilt", *rows, ""]))
     asked = "learn", path, "--observe", level, "--action", "u", "--failed"
     told = evofsm(*asked, f"{level}>=900")
-    assert f"compares it, which then has to be '{level}>=0.9' (--unit" in told.stderr
+    assert "converts it, before --failed compares it (--unit" in told.stderr
     assert "1 episode ended with" in told.stdout
     told = evofsm(*asked, f"{level}>=900", "--unit", f"{level}=mm").stderr
     assert f"'{level}>=900': {level}, as compared, goes from 0.5 to 0.9 m\n" in told
@@ -302,7 +327,7 @@ def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, refused, tmp_
         *("--out", tmp_path / "model"),
     )
     text = " ".join(told.stdout.split())
-    assert "no leader in 1 rows, left out" in text
+    assert "left out 1 rows: a number is missing; there" in text
     assert "converted v_follower from km/h, v_leader from km/h, time from ms" in text
     assert "rows 29, one every 0.1 s" in text
     assert told.stderr == ""

@@ -407,12 +407,12 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, monkeypatch, nothing, at
     assert "column 'gap'" in refusal(path)
     lines = [f"p,0,{nothing},10,11,1,1", "p,0.1,2,10,11,,0"]
     path, noted = write(tmp_path / "b.csv", lines[:1], SHORT), Noted()
-    assert "no row has a leader" in refusal(path, no_leader="end")
+    assert "no row is left" in refusal(path, no_leader="end")
     path = write(tmp_path / "c.csv", lines, SHORT)
     assert "line 3, column 'a_follower'" in refusal(path, no_leader="end")
     path = write(tmp_path / "d.csv", [lines[0], lines[1].replace(",,", ",1,")], SHORT)
     read(path, noted=noted, no_leader="end", failed="crash")
-    assert "1 failures lie in rows without a leader" in " ".join(warnings_of(noted))
+    assert "1 failures lie in rows that --no-leader leaves out" in " ".join(warnings_of(noted))
 
 
 def test_a_number_may_stand_for_no_leader(tmp_path):

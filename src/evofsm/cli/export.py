@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from evofsm.cli.inspect import load_model
-from evofsm.cli.options import Saved, option
+from evofsm.cli.options import ModeName, Saved, option
 
 
 def export(
@@ -18,10 +18,7 @@ def export(
     ],
     out: Annotated[Path | None, option("File to write, else printed; of c99 a folder.")] = None,
     prefix: Annotated[str, option("Of c99: how all names in it begin.")] = "evofsm",
-    mode: Annotated[
-        Literal["act", "shadow"] | None,
-        option("Of c99 and fmu: whether it filters, or only watches. [default: as saved]"),
-    ] = None,
+    mode: Annotated[ModeName | None, option("Of c99, fmu: act filters. [default: saved]")] = None,
     least: Annotated[
         float | None,
         option("Leave out what is less probable. [default: dot 0.001]", min=0.0, max=1.0),

@@ -131,15 +131,21 @@ def learn(
     step. SUMO rounds to 2 decimals unless given --precision 6. So are tables of objects (id, t, x,
     y, vx, vy, length, lane) and traces of ASAM OSI read.
 
-    The time may be seconds, or dates of ISO 8601. Without --failed nobody knows what failed,
-    and evofsm explain says so.
+    Without --failed nobody knows what failed, and evofsm explain says so.
 
     With --guard, a guard in shadow mode then goes through all rows and learns from them too.
 
     With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
     to the same result. The file stays at the end: run again, the command prints it at once.
     """
-    from evofsm.cli.learning import Checkpoint, guard_of_log, learn_traces, teach, warnings_of
+    from evofsm.cli.learning import (
+        Checkpoint,
+        guard_of_log,
+        learn_traces,
+        refusing,
+        teach,
+        warnings_of,
+    )
     from evofsm.driving.naming import UNITS, VARIABLES
     from evofsm.io import read_traces
     from evofsm.io.logs import Noted
@@ -203,13 +209,15 @@ def learn(
         taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
         with progress("Teaching the guard", learning.read.rows) as move:
             rows = read_traces(files, columns, lengths, topics=known_topics)
-            teach(taught, rows, lambda count: move(count))
+            share = teach(taught, rows, lambda count: move(count))
+        if refused := refusing(share):
+            warn(f"warning: in the later half of the log the guard {refused}")
         taught.save(guard, provenance)
     if as_json:
         told = {"files": files, "saved": out, "guard": guard, **_document(learning, provenance)}
         print_json({**told, "noted": noted, "warnings": warnings})
         return
-    read = [*_read(learning, action), *_read_otherwise(noted, failed, learning)]
+    read = [*_read(learning, action), *_read_otherwise(noted, columns, learning)]
     if assumed := learning.read.notes["lengths"]:
         read.append(("vehicle lengths", f"assumed, for FCD has none: {assumed}"))
     show(facts("What was read", read), *tables_of(learning.model))
@@ -455,20 +463,21 @@ def _hardly_told_apart(model: FSMModel, certainty: float, rule: str) -> str:
 
 
 def _read_otherwise(
-    noted: Noted, failed: str | None, learning: Learning
+    noted: Noted, columns: LogColumns, learning: Learning
 ) -> Iterator[tuple[str, str]]:
     """What was not learnt as it stands in the files."""
     from evofsm.io.tables import UNITS
 
-    if failed is None:
+    if columns.failed is None:
         yield "failures", "not known; --failed COLUMN or --failed 'gap<=0' says them"
     else:
         several = "" if learning.read.failures == 1 else "s"
-        text = f"{learning.read.failures:,} episode{several} ended with {failed}"
+        text = f"{learning.read.failures:,} episode{several} ended with {columns.failed}"
         left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
         yield "failures", text + (left_out if noted.after_failure else "")
     if noted.leaderless:
-        yield "no leader", f"in {noted.leaderless:,} rows, left out; there an episode ends"
+        why = "a number is missing" + f", or {columns.no_leader}" * (columns.no_leader != "end")
+        yield "left out", f"{noted.leaderless:,} rows: {why}; there an episode ends"
     told = {name: unit for name, unit in noted.units.items() if UNITS.get(unit, 1.0) != 1.0}
     if told:
         given = (f"{name} from {one}" for name, one in told.items())
@@ -490,5 +499,3 @@ def _skills(skills: Sequence[Skill]) -> Iterator[RenderableType]:
         "Persistence: the belief stays as it is. Skill: 1 is perfect, 0 as good as persistence, "
         "below 0 worse."
     )
-    if len(skills) == 1:
-        yield "The step is too long for a separate forecast of 1 s ahead."

@@ -158,7 +158,7 @@ def learn_traces(
         machine, read = checkpoint.begin(machine)
     if not read.finished:
         coming = _ahead(chunks)
-        _pass_over(coming, read, checkpoint)
+        _pass_over(coming, read)
         for chunk in coming:
             _learn(machine, actions, chunk, read)
             if checkpoint is not None:
@@ -192,7 +192,7 @@ def _called(name: str, *, is_time: bool) -> str:
 def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
     """What is most likely a mistake, and what would mend it."""
     columns = columns or LogColumns()
-    time, failed = columns.time, columns.failed and Condition.parse(columns.failed)
+    time = columns.time
     called = {name: unit for name in noted.untold if (unit := _called(name, is_time=name == time))}
     found = [
         f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
@@ -200,23 +200,18 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         for name, fastest in noted.fastest.items()
         if name not in called
     ]
-    for name, unit in called.items():
-        then = ""
-        if failed and failed.sign and failed.column == name:
-            number = f"{name}{failed.sign}{failed.number * UNITS[unit]:g}"
-            then = f", before --failed compares it, which then has to be {quote(number)}"
-        found.append(
-            f"{name} is called as if it were in {unit}, and was read as one of the SI: --unit "
-            f"{quote(f'{name}={unit}')} converts it{then} "
-            f"(--unit {quote(f'{name}={SI[unit]}')}: it is right)"
-        )
-    if failed and not noted.failing:
-        goes = ""
+    found += [
+        f"{name} is called as if it were in {unit}, and was read as one of the SI: --unit "
+        f"{quote(f'{name}={unit}')} converts it, before --failed compares it "
+        f"(--unit {quote(f'{name}={SI[unit]}')}: it is right)"
+        for name, unit in called.items()
+    ]
+    if columns.failed and not noted.failing:
+        column, goes = Condition.parse(columns.failed).column, ""
         if noted.compared:
-            unit = SI.get(noted.units.get(failed.column, ""), "")
-            low, high = noted.compared
-            goes = f": {failed.column}, as compared, goes from {low:.6g} to {high:.6g} {unit}"
-        found.append(f"no row meets --failed {quote(columns.failed or '')}{goes}".rstrip())
+            (low, high), unit = noted.compared, SI.get(noted.units.get(column, ""), "")
+            goes = f": {column}, as compared, goes from {low:.6g} to {high:.6g} {unit}".rstrip()
+        found.append(f"no row meets --failed {quote(columns.failed)}{goes}")
     if (step := noted.longest_step) > 0.0 and time not in called:
         unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
         cause = f"is the time in {unit}? --unit {time}={unit} converts it"
@@ -226,17 +221,17 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         name, value = min(same, key=lambda one: one[1] not in _NOBODY)
         found.append(
             f"{noted.failed_at_once:,} of {noted.failed:,} failed episodes fail with their first "
-            f"row, and {name} is {value:g} there each time: does that stand for no leader? "
-            f"--no-leader '{name}=={value:g}' leaves such rows out"
+            f"row, and {name} is {value:g} there each time: does that stand for a missing "
+            f"value (no leader)? --no-leader '{name}=={value:g}' leaves such rows out"
         )
     if alone := [(name, *one) for name, one in noted.below.items() if one[0] and one[1] > 2]:
         name, value, rows = min(alone, key=lambda one: one[1] not in _NOBODY)
         found.append(
-            f"{name} is {value!r} in {rows:,} rows, and else never below 0: does that stand for no "
-            f"leader? --no-leader {quote(f'{name}=={value!r}')} leaves such rows out"
+            f"{name} is {value!r} in {rows:,} rows, and else never below 0: is that a missing "
+            f"value (no leader)? --no-leader {quote(f'{name}=={value!r}')} leaves such rows out"
         )
     if noted.unplaced:
-        why = "lie in rows without a leader, belong to no episode, and were not counted"
+        why = "lie in rows that --no-leader leaves out, belong to no episode, and were not counted"
         found.append(f"{noted.unplaced:,} failures {why}")
     return found
 
@@ -262,15 +257,25 @@ def guard_of_log(
     return Guard.of(reviser, interval=dt, machine=machine.copy())
 
 
-def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) -> None:
-    """Let a guard decide on each row, and learn from it; ``show`` is told how many were."""
-    taken = 0
+def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) -> float:
+    """The share in which a guard refuses, of the later half of a log; ``show`` is told of rows."""
+    taken, refused, reviser = 0, bytearray(), guard.reviser
+    assert isinstance(reviser, ActionReviser)
     for episode in episodes_of(chunks):
         seen, times = episode.observations, episode.times - episode.times[0]
         for row, proposal, at in zip(seen[:-1], episode.actions, times, strict=False):
             guard.decide(row, proposal, at)
+            refused.append(reviser.refuses)
         guard.end(episode.failures is not None and len(episode.failures) > 0, seen[-1])
         show(taken := taken + len(times))
+    return float(np.mean(np.array(refused[len(refused) // 2 :])))
+
+
+def refusing(share: float) -> str:
+    """What is said of a guard that refuses in such a share of the time; of few nothing."""
+    why = "what moves the system is not observed (a valve, a set point, a load: name it in "
+    why += "--observe), a column is in another unit, or no action in the range averts the failure"
+    return f"refuses {share:.0%} of the time: perhaps {why}" if share > 0.5 else ""
 
 
 def _ahead(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
@@ -283,14 +288,13 @@ def _ahead(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
             yield chunk
 
 
-def _pass_over(coming: Iterator[Chunk], read: Progress, checkpoint: Checkpoint | None) -> None:
+def _pass_over(coming: Iterator[Chunk], read: Progress) -> None:
     """Leave out the chunks that were learnt before."""
     rows = sum(len(next(coming).times) for _ in range(read.chunks))
     if rows != read.rows:
-        where = checkpoint.path if checkpoint is not None else "it"
         raise ValueError(
-            f"{where} has learnt {read.rows:,} rows, where there are {rows:,} now; the files were "
-            "changed: delete it to begin anew"
+            f"the checkpoint has learnt {read.rows:,} rows, where there are {rows:,} now; the "
+            "files were changed: delete it to begin anew"
         )
 
 

@@ -89,8 +89,7 @@ Step = Annotated[float | None, option("From a row to the next [s], without a clo
 Failed = Annotated[
     str | None,
     option(
-        "What failed: a column of truth values, or a comparison such as 'gap<=0', in units of the "
-        "SI, after --unit. "
+        "What failed: a column of truth values, or a comparison, in SI units, such as 'gap<=0'. "
         "The row with which it becomes true ends the episode in failure.",
         "--failed",
     ),

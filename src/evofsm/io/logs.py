@@ -88,12 +88,11 @@ class Noted:
 
     units: dict[str, str] = field(default_factory=dict)  #: of columns, as they were told
     untold: list[str] = field(default_factory=list)  #: columns of which no unit was told
-    leaderless: int = 0  #: rows without a leader, left out
+    leaderless: int = 0  #: rows without a leader, or in which a number is missing, left out
     after_failure: int = 0  #: rows left out because the failure before them still held
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
     failing: int = 0  #: rows that meet what tells of failures
-    #: From where to where the column goes that is compared for that, in its unit of the SI.
-    compared: tuple[float, float] | None = None
+    compared: tuple[float, float] | None = None  #: range of the column compared for that, in SI
     fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
     longest_step: float = 0.0  #: the usual one, beyond belief [s]
     #: By variable, the number that it is below 0 (0 where there are several), and in how many rows.
@@ -289,7 +288,7 @@ def read_traces(
             yield chunk
         if rows == 0 and noted.leaderless > left_out:
             raise ValueError(
-                f"{path}: no row has a leader; {', '.join(columns.observe.names)} must all be there"
+                f"{path}: no row is left; {', '.join(columns.observe.names)} must all be there"
             )
         if rows == 0:
             raise ValueError(f"{path} has a header but no rows")

@@ -77,7 +77,6 @@ _NOTHING = ("", "na", "n/a", "null", "none")
 # What no text holds.
 _CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
-# Dates and times of day, however they are written; and how they have to be.
 _DATE_LIKE = re.compile(r"\s*\d{1,4}([.:/-])\d\d?\1\d")
 _ISO = "in ISO 8601, such as 2026-03-14T09:26:53.5+01:00"
 
@@ -470,8 +469,7 @@ class ParquetTable(Table):
         for name in wanted.numbers:
             if not self._types[name].is_numeric():
                 raise ValueError(
-                    f"{self.path}: column {name!r} holds {self._types[name]}, not numbers "
-                    f"(a date has to be {_ISO})"
+                    f"{self.path}: column {name!r} holds {self._types[name]}, not numbers"
                 )
         part = self._scan.select(wanted.all)
         # Not collect_batches: it reads ahead of a slow consumer without bound (polars #28569).

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evofsm.cli.learning import refusing
 from evofsm.cli.monitor.decider import HOLE, Answer, Decider
 from evofsm.cli.monitor.messages import End, Row
 from evofsm.cli.show import facts, table
@@ -74,6 +75,8 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
     count, hourly, share = counted(alarms > 0.0)
     told = f"{len(rows):,} in {begins.sum():,.0f} episodes, {lasted.sum() / 3600.0:.3g} h"
     pairs = [("rows", told), ("alarms", f"{count}, or {hourly} an hour, {share} of the time")]
+    if useless := refusing(alarms @ lasted / lasted.sum()):
+        pairs.append(("beware", f"it {useless}"))
     # A moment lasts while an alarm does; the highest risk within it stands for it.
     calm = (alarms == 0.0) & (np.diff(times // _MOMENT, prepend=0.0) != 0.0)
     moments = np.cumsum(~follows | calm | (np.diff(alarms, prepend=0.0) != 0.0))
@@ -87,12 +90,12 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
         pairs.append(("refused", f"{len(refused):,} messages, the first because {refused[0]}"))
     yield facts(title, pairs)
     own = getattr(decider.guard.reviser, "tolerance", None)
-    # Where the risk alone does not decide, only --tolerance tells what another one comes to.
     known = sorted({*(_TOLERANCES if decider.has_margin else ()), *([] if own is None else [own])})
     lines = [(f"{t:g}", *counted(alarms > 0.0 if t == own else risks > t)) for t in known]
     bold = [place for place, tolerance in enumerate(known) if tolerance == own]
     header = ("tolerance", "alarms", "an hour", "of the time")
-    yield table("\nBy tolerance", header, lines, bold=bold)
+    asked = "" if decider.has_margin else " (--tolerance tells of others)"  # not the risk alone
+    yield table(f"\nBy tolerance{asked}", header, lines, bold=bold)
     order = np.lexsort((-risks, moments))
     highest = order[np.unique(moments[order], return_index=True)[1]]
     ranked = np.lexsort((-long[highest], -risks[highest]))[:_WORST]
