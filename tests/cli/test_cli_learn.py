@@ -197,7 +197,7 @@ def test_a_guard_that_refuses_most_of_the_time_is_said_to(evofsm, tmp_path):
     assert re.search(rf"the guard refuses \d\d+% of the time: {re.escape(why)}", told.stderr)
     summed = evofsm("monitor", path, "--guard", guard, *read, "--summary").stdout
     assert why in " ".join(summed.split())
-    assert "(--tolerance tells of others)" in " ".join(summed.split())
+    assert "\nBy tolerance (others: --tolerance)\n" in summed
 
 
 def test_a_guard_that_could_not_be_taught_is_refused_before_the_work(refused, own, tmp_path):

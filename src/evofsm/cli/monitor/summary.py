@@ -94,7 +94,7 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
     lines = [(f"{t:g}", *counted(alarms > 0.0 if t == own else risks > t)) for t in known]
     bold = [place for place, tolerance in enumerate(known) if tolerance == own]
     header = ("tolerance", "alarms", "an hour", "of the time")
-    asked = "" if decider.has_margin else " (--tolerance tells of others)"  # not the risk alone
+    asked = "" if decider.has_margin else " (others: --tolerance)"  # not the risk alone
     yield table(f"\nBy tolerance{asked}", header, lines, bold=bold)
     order = np.lexsort((-risks, moments))
     highest = order[np.unique(moments[order], return_index=True)[1]]
