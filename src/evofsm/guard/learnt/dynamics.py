@@ -17,6 +17,7 @@ from evofsm.guard.learnt.places import ANYWHERE, Place, onset
 from evofsm.guard.learnt.regression import Drift, Recent
 from evofsm.guard.learnt.replay import (
     EARLY,
+    GROWN,
     MOVING,
     ONSET,
     Disturbances,
@@ -70,7 +71,7 @@ _RAYS = 64
 _PATIENCE, _REFUSED, _SOONER, _LESS = 8, 0.75, 4, 0.33
 # So many endings tell where there are any; observations so near the last one [ordinary changes]
 # cannot be told from it.
-_ENDED, _SAME = 3, 0.5
+_ENDED, _SAME = 2, 0.5
 #: Survived observations that are remembered, as many as fill some hundred kilobytes.
 MOST_SURVIVED = 8000
 # Choices that actions are told apart by, each of which has features of its own.
@@ -480,7 +481,7 @@ class Dynamics:
             rows = self._told_apart(ended, went_on)
         rows = rows[regions.inside(rows, ended).sum(1) >= _ENDED]
         failed = self.failures[regions.inside(rows, self.failures).any(0)]
-        self.crashes = self._told_apart(failed, ended)
+        self.crashes = self._told_apart(failed, ended, GROWN)
         unlike = failed[~regions.explained(failed, (), self.crashes, 0.0)]
         self.endings = regions.without_survived(rows, unlike)
 
@@ -490,10 +491,14 @@ class Dynamics:
         ends = regions.explained(self.failures, (), self.endings)
         return np.asarray(ends & regions.explained(self.failures, (), self.crashes, 0.0))
 
-    def _told_apart(self, some: Floats, others: Floats) -> Floats:
-        """Regions (r, 12) of some observations in which no others are; thresholds where they do."""
+    def _told_apart(self, some: Floats, others: Floats, least: float = 0.0) -> Floats:
+        """Regions (r, 12) of some observations in which no others are; thresholds where they do.
+
+        Thresholds first that some are beyond by ``least`` ordinary changes.
+        """
         unit, spread = self._sizes
-        found = explain_failures(some, others.min(0), others.max(0), unit, 0.0 * self.reached)
+        given = some, others.min(0), others.max(0), unit
+        found = explain_failures(*given, 0.0 * self.reached, least)
         sides, rows = regions.explain(found, some, others, unit, spread)
         return np.concatenate([regions.of_thresholds(sides, unit), rows])
 

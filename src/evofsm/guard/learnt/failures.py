@@ -24,14 +24,19 @@ _BEYOND, _BLUR = 1e-12, 5.0
 
 
 def explain_failures(
-    failures: _Floats, lowest: _Floats, highest: _Floats, unit: _Floats, blur: _Floats
+    failures: _Floats,
+    lowest: _Floats,
+    highest: _Floats,
+    unit: _Floats,
+    blur: _Floats,
+    least: float = 0.0,
 ) -> list[tuple[int, float, float]]:
     """Thresholds as (variable, sign, where): a variable beyond its threshold is failure.
 
     Of ``failures`` (k, m), observations in which episodes failed, amid all that was survived from
     ``lowest`` to ``highest`` (m,). ``unit`` (m,) is the ordinary change of each variable. A failure
     within five times ``blur`` (m, 2) of the lowest or the highest may have been beyond it, as noise
-    blurs them; 0 where a variable saturates.
+    blurs them; 0 where a variable saturates. Sides that some are beyond by ``least`` come first.
     """
     m = len(unit)
     if not len(failures) or not np.isfinite(lowest).all():  # or nothing was survived yet
@@ -43,12 +48,13 @@ def explain_failures(
     perhaps = far > -_BLUR * blur.T.ravel()
     left = np.ones(len(failures), bool)
     found: dict[int, float] = {}
-    while (explained := (beyond > _BEYOND) & left[:, None]).any():
-        tied, best = _most_telling(explained, perhaps, beyond)
-        left &= ~explained[:, best]
-        undecided = len(failures) <= _FIRST and len(tied) == 2
-        for k in tied if undecided else [best]:
-            found[k] = float(ends[k])
+    for clear in (least, _BEYOND):
+        while (explained := (beyond > max(clear, _BEYOND)) & left[:, None]).any():
+            tied, best = _most_telling(explained, perhaps, beyond)
+            left &= ~(beyond[:, best] > _BEYOND)
+            undecided = len(failures) <= _FIRST and len(tied) == 2
+            for k in tied if undecided else [best]:
+                found[k] = float(ends[k])
     while (explained := perhaps & left[:, None]).any():
         _, best = _most_telling(explained, perhaps, beyond)
         left &= ~explained[:, best]

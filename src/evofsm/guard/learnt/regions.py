@@ -72,7 +72,8 @@ def without_survived(regions: Floats, survived: Floats) -> Floats:
 def halfway(regions: Floats, failures: Floats) -> Floats:
     """Regions half as far from the innermost of the failures in each as they reached beyond."""
     new, form = regions.copy(), forms(regions, failures)[0]
-    new[:, 6] -= 0.5 * np.where(form > 0.0, form, np.inf).min(1, initial=2.0 * GROWN)
+    within = np.where(form > 0.0, form, np.inf).min(1, initial=np.inf)
+    new[:, 6] -= 0.5 * np.where(np.isfinite(within), within, 2.0 * GROWN)
     return new
 
 
