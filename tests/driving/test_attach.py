@@ -214,6 +214,21 @@ def test_who_skips_steps_is_told_that_nobody_looked(road):
     assert max(abs(one.deed) for one in told) < 9.1
 
 
+def test_who_sets_the_speed_of_a_guarded_car_is_told_that_it_is_not_guarded(road):
+    sumo = road(*NO_GAP)
+    guards = attach(sumo, ["ego"])
+
+    def script():
+        for _ in range(200):
+            sumo.vehicle.setSpeedMode("ego", 0)
+            sumo.vehicle.setSpeed("ego", 20.0)
+            drive(sumo, 0.1)
+
+    with pytest.warns(RuntimeWarning, match="car ego drove faster than its guard had set"):
+        script()
+    assert guards.guarding.overruled > 5
+
+
 # -- Watching --------------------------------------------------------------------------------------
 
 

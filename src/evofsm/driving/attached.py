@@ -43,6 +43,12 @@ _SKIPPED = (
     "SUMO went on by several steps at once (simulationStep with a time, or loadState), in which no "
     "guard looked or acted and no collision was counted; cars begin anew. Go on step by step"
 )
+_OVERRULED = (
+    "car {} drove faster than its guard had set, in {} steps by now: does something else set its "
+    "speed (setSpeed, slowDown)? Then what the guard decides comes to nothing"
+)
+# So much faster than was set [m/s], in so many steps.
+_FASTER, _OFTEN = 0.05, 5
 _NUMBERS = itertools.count()
 _ATTACHED: weakref.WeakSet[Attachment] = weakref.WeakSet()
 # Two that touched within this time before still do [s].
@@ -230,6 +236,7 @@ class Guarding:
         self.decisions = 0
         #: Steps in which a car drove slower than its driver wanted; in shadow, would have.
         self.revised = 0
+        self.overruled = 0  #: steps in which a car drove faster than its guard had set
 
     def begin_anew(self) -> None:
         """Another simulation, or another moment of it, begins."""
@@ -330,6 +337,11 @@ class Guarding:
     def _look_back(self, one: _Car, speed: float) -> None:
         """What the driver wanted, now that it shows; in shadow it is what is judged."""
         wanted = speed
+        if one.mode is not None and speed > one.limit + _FASTER:
+            self.overruled += 1
+            if self.overruled == _OFTEN:
+                said = _OVERRULED.format(one.id, _OFTEN)
+                warnings.warn(said, RuntimeWarning, stacklevel=4)
         # Slower than the limit is what SUMO itself wanted, such as to stop at a red light.
         if one.mode is not None and speed >= one.limit - _SAME:
             wanted = max(one.wish, speed)
