@@ -113,7 +113,7 @@ def draw(guards: dict[int, Guard], tried: dict[int, Trial]) -> Figure:
     looks: dict[str, dict[str, Any]] = {
         "a controller alone": {"color": ink, "linestyle": (0, (3, 1.5)), "linewidth": 1.0},
         "the same, guarded": {"color": blue, "linewidth": 1.5},
-        "the disc, of which nobody told": {"color": ink, "linestyle": ":"},
+        "the disc, which was not given": {"color": ink, "linestyle": ":"},
     }
     figure = Figure(figsize=(7.2, 3.3), layout="constrained")
     panels = figure.subplots(1, len(guards), sharex=True, sharey=True)
