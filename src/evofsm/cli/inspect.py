@@ -269,7 +269,7 @@ def explain(
     """
     if (observation is None) == (state is None):
         raise ValueError("name one situation, by --observation or by --state")
-    model, *_ = load_model(file)
+    model, _, guard = load_model(file)
     done = None if action is None else _index("--action", action, model.n_actions)
     if observation is not None:
         found = [model.explain(action=done, observation=_values(observation))]
@@ -282,8 +282,9 @@ def explain(
         return
     if not model.failures_told:
         print(textwrap.fill(_UNTOLD, 80))
+    here = guard.told_here(_values(observation)) if guard and observation is not None else ""
     for each in found:
-        say(textwrap.fill(each.text, 80, subsequent_indent="   "))
+        say(textwrap.fill(f"{each.text} {here}", 80, subsequent_indent="   "))
 
 
 def _index(option: str, number: object, count: int) -> int:

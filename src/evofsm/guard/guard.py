@@ -608,15 +608,15 @@ class Guard:
         else:
             nearest = self._frozen.nearest(self._monitor.held)
             text = explain(self._frozen, situation.belief, action, self._labels, nearest).text
-        if told := self._told_here(situation.observation):
+        if told := self.told_here(situation.observation):
             text = f"{text} {told}"
         return revision._replace(explanation=text)
 
-    def _told_here(self, z: NDArray[np.float64]) -> str:
-        """What the judge knows of dead ends near an observation, and in which state they are."""
+    def told_here(self, z: ArrayLike) -> str:
+        """What the judge knows of failures and dead ends near an observation (m,), in words."""
         if self._observing is None or self.machine is None:
             return ""
-        told, centre = self._observing.told_here(z)
+        told, centre = self._observing.told_here(np.asarray(z, np.float64))
         if centre is None:
             return told
         state = (self._frozen or self.machine.model()).nearest(centre).state

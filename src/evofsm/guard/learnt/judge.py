@@ -256,10 +256,9 @@ class LearntRisk(ActionJudge):
     @property
     def told_by_experience(self) -> str:
         """What was learnt so far, in words."""
-        dynamics, names = self.dynamics, self.labels.names
+        dynamics, called = self.dynamics, self._called
         if not dynamics.n_variables:
             return self._no_threshold
-        called = names or [f"variable {j + 1}" for j in range(dynamics.n_variables)]
         fails = [(called[j], sign < 0.0, at) for j, sign, at in dynamics.thresholds]
         latest = {one.variable: one.since + 1 for one in dynamics.drifts}
         drifts = [(called[j], since) for j, since in latest.items()]
@@ -288,16 +287,28 @@ class LearntRisk(ActionJudge):
     def told_here(self, observation: Floats) -> tuple[str, Floats | None]:
         """What was learnt of an observation, in words, and the centre of the dead end it is near.
 
-        Empty, and None, where it is in and near none.
+        Empty, and None, where it is in and near none, nor near a region of failures.
         """
-        if math.isnan(observation.dot(observation)) or not self.dynamics.n_variables:
+        dynamics = self.dynamics
+        if math.isnan(observation.dot(observation)) or not dynamics.n_variables:
             return "", None
-        far, ends = distances_to(self.dynamics.model, observation), self.dynamics.dead_ends
+        told, there = "", regions.distances(dynamics.regions, observation[None])[:, 0]
+        if there.min(initial=np.inf) <= _LARGEST:
+            k = int(there.argmin())
+            count = int(regions.inside(dynamics.regions[[k]], dynamics.failures).sum())
+            told = words.is_near_failure(self._called, dynamics.regions[k], count, float(there[k]))
+        far, ends = distances_to(dynamics.model, observation), dynamics.dead_ends
         if far.min(initial=np.inf) > _LARGEST:
-            return "", None
+            return told, None
         k = int(far.argmin())
-        told = words.is_near(int(ends.numbers[k]), int(ends.counts[k]), float(far[k]))
-        return told, ends.centres[k]
+        near = words.is_near(int(ends.numbers[k]), int(ends.counts[k]), float(far[k]))
+        return f"{told} {near}".lstrip(), ends.centres[k]
+
+    @property
+    def _called(self) -> Sequence[str]:
+        """Names of variables, as people read them."""
+        every = range(self.dynamics.n_variables)
+        return self.labels.names or [f"variable {j + 1}" for j in every]
 
     @property
     def _no_threshold(self) -> str:

@@ -103,6 +103,14 @@ def is_near(dead_end: int, count: int, distance: float) -> str:
     return f"This is {where} dead end {dead_end}, from where {failed([count])}."
 
 
+def is_near_failure(
+    names: Sequence[str], row: Sequence[float], failures: int, distance: float
+) -> str:
+    """What is said of a situation in or near a region of failures, as `is_near` of dead ends."""
+    where = "" if distance < 0.0 else f"{changes(distance)} from "
+    return f"This is {where}where it fails: {region(names, row, failures)}."
+
+
 def dead_ends(counts: Sequence[int]) -> str:
     """How many there are, those first from where most failed; empty without any."""
     if not counts:
