@@ -101,7 +101,7 @@ def test_a_disc_is_learnt_said_and_no_threshold(taught):
     survived = np.concatenate([dynamics.survived, dynamics.brinks])
     assert (distances(dynamics.regions, survived) > 0.0).all()
     assert "ellipse of variable 1 and variable 2 around (" in taught.judge.told_by_experience
-    assert taught.told_here([0.0, 0.0, 0.0, 0.0]).startswith("This is where it fails: inside an ell")
+    assert taught.told_here([0.0, 0.0, 0.0, 0.0]).startswith("This is where it fails: inside")
     assert "ordinary changes from where it fails" in taught.told_here([-0.9, 0.0, 0.0, 0.0])
     assert taught.told_here([-2.0, 1.5, 0.0, 0.0]) == ""
     again = Guard.load(BytesIO(saved(taught)))
