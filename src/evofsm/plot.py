@@ -194,8 +194,7 @@ def experience(
     if not isinstance(judge, LearntRisk) or not judge.dynamics.n_variables:
         raise ValueError("the judge of this guard has not learnt where it fails")
     known, m, ends = judge.dynamics, judge.dynamics.n_variables, judge.dynamics.dead_ends
-    tell = [*known.regions[:, :2].ravel().astype(int), *(j for j, _, _ in known.thresholds)]
-    pair = list(variables or dict.fromkeys([*tell, *range(max(m, 2))]))[:2]
+    pair = list(variables or dict.fromkeys([*known.telling, *range(max(m, 2))]))[:2]
     _refuse_other(pair, m)
     ax, called, red = _given_or_new(ax), judge.labels.variable, COLORS["dead end"]
     dots: Look = {"linestyle": "none", "marker": ".", "markersize": 1.5, "color": ink(0.4)}
@@ -235,7 +234,7 @@ def experience(
         "dead end" + ", all else as in its centre" * (m > 2): {"marker": "$1$", "color": red},
         "state": {"marker": "o", "fillstyle": "none", "color": ink()},
     }
-    if elsewhere := sorted({*tell} - {*pair}):
+    if elsewhere := sorted({*known.telling} - {*pair}):
         looks[f"not in view: fails by {', '.join(map(called, elsewhere))}"] = {"marker": ""}
     look = {"linestyle": "none"}
     _explain(ax, [Line2D([], [], label=name, **{**look, **one}) for name, one in looks.items()])

@@ -253,9 +253,8 @@ def _no_better(known: Harm) -> str:
 
 
 def _plane(learnt: Dynamics) -> tuple[int, int]:
-    """Variables of the first region, then of thresholds, then those that tell failures most."""
-    named = [*learnt.regions[:, :2].astype(int).ravel().tolist()]
-    named += [j for j, _, _ in learnt.thresholds]
+    """Variables by which it fails, then those that differ most where it failed."""
+    named = learnt.telling
     if len(learnt.failures) and len(learnt.survived):
         apart = np.abs(learnt.failures.mean(0) - learnt.survived.mean(0))
         named += np.argsort(-apart / (learnt.survived.std(0) + 1e-9), kind="stable").tolist()

@@ -450,8 +450,9 @@ class Dynamics:
         count = len(self.regions)
         if len(self.ended) >= _ENDED and not waits:
             self._find_endings()
+        crashes = self._crashed
         if self.failed is None:
-            sums, failures = self.sums, self.failures[~self._crashed]
+            sums, failures = self.sums, self.failures[~crashes]
             blur = np.where(self.reached < _REACHED, sums.scale[:, None], 0.0)
             unit = np.maximum(sums.unit, 1e-300)
             found = explain_failures(failures, self.lowest, self.highest, unit, blur)
@@ -462,7 +463,7 @@ class Dynamics:
                 if count:
                     self.thresholds = stay = [one for one in found if one[:2] in before]
                 known = waits or regions.explained(failures, stay, self.regions).all()
-                if failed or not known or (crashed != self._crashed).any():
+                if failed or not known or (crashed != crashes).any():
                     given = failures, survived, *self._sizes
                     self.thresholds, self.regions = regions.explain(found, *given)
         elif not waits:
@@ -524,6 +525,12 @@ class Dynamics:
         if self.held >= patience:
             self.held = -1
             self.rebuild()
+
+    @property
+    def telling(self) -> list[int]:
+        """The variables by which it fails, those of regions first."""
+        of_regions = self.regions[:, :2].astype(int).ravel().tolist()
+        return list(dict.fromkeys([*of_regions, *(j for j, _, _ in self.thresholds)]))
 
     @property
     def fails(self) -> bool:

@@ -48,8 +48,8 @@ def explain_failures(
     perhaps = far > -_BLUR * blur.T.ravel()
     left = np.ones(len(failures), bool)
     found: dict[int, float] = {}
-    for clear in (least, _BEYOND):
-        while (explained := (beyond > max(clear, _BEYOND)) & left[:, None]).any():
+    for clear in (max(least, _BEYOND), _BEYOND):
+        while (explained := (beyond > clear) & left[:, None]).any():
             tied, best = _most_telling(explained, perhaps, beyond)
             left &= ~(beyond[:, best] > _BEYOND)
             undecided = len(failures) <= _FIRST and len(tied) == 2

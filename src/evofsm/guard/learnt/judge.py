@@ -307,8 +307,7 @@ class LearntRisk(ActionJudge):
     @property
     def _called(self) -> Sequence[str]:
         """Names of variables, as people read them."""
-        every = range(self.dynamics.n_variables)
-        return self.labels.names or [f"variable {j + 1}" for j in every]
+        return self.labels.names or [f"variable {j + 1}" for j in range(self.dynamics.n_variables)]
 
     @property
     def _no_threshold(self) -> str:
