@@ -3,9 +3,12 @@
 import json
 import math
 import socket
+import socketserver
+import threading
 import time
 from contextlib import contextmanager, suppress
 from http.client import HTTPConnection
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import pytest
@@ -51,11 +54,12 @@ def get(page, path, host=None, **headers):
         connection.close()
 
 
-def looking_on(page, *, origin=None, token=None, sock=None):
+def looking_on(page, *, origin=None, token=None, sock=None, host=None, port=None):
+    own = f"127.0.0.1:{page.port}"
     return connect(
-        f"ws://127.0.0.1:{page.port}/{token or page.token}/socket",
-        origin=origin or f"http://127.0.0.1:{page.port}",
-        sock=sock,
+        f"ws://{host or own}/{token or page.token}/socket",
+        origin=origin or f"http://{own}",
+        sock=sock or socket.create_connection(("127.0.0.1", port or page.port)),
         proxy=None,
         open_timeout=60,
     )
@@ -98,10 +102,56 @@ def test_files_beside_the_page_are_not_served(page):
         assert get(page, f"/{page.token}/{name}")[0] in (403, 404)
 
 
-@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:1", "localhost.evil:80"])
+FOREIGN = ("evil.example:9000", "localhost.evil:80", "127.0.0.1.evil", "a@localhost", "[::2]:80")
+
+
+@pytest.mark.parametrize("host", FOREIGN)
 def test_other_names_are_refused(page, host):
     """As when a page elsewhere lets its name point to this computer (DNS rebinding)."""
-    assert get(page, f"/{page.token}/", host=host)[0] == 403
+    status, _, said = get(page, f"/{page.token}/", host=host)
+    assert status == 403
+    assert b"ssh -L 9000:127.0.0.1:%d" % page.port in said
+
+
+@contextmanager
+def tunnel(port):
+    """Another port of this computer that leads there, as one of ssh, an editor or a container."""
+
+    def pump(here, there):
+        with suppress(OSError):
+            while data := here.recv(4096):
+                there.sendall(data)
+        with suppress(OSError):
+            there.shutdown(socket.SHUT_WR)
+
+    class Both(socketserver.BaseRequestHandler):
+        def handle(self):
+            with socket.create_connection(("127.0.0.1", port)) as there:
+                back = threading.Thread(target=pump, args=(there, self.request))
+                back.start()
+                pump(self.request, there)
+                back.join()
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Both) as server:
+        threading.Thread(target=server.serve_forever).start()
+        yield server.server_address[1]
+        server.shutdown()
+
+
+@pytest.mark.parametrize("name", ["localhost", "127.0.0.1", "[::1]"])
+@pytest.mark.parametrize("rewrites", [False, True])
+def test_own_names_are_let_in_at_any_port(page, name, rewrites):
+    with tunnel(page.port) as port:
+        there = f"{name}:{port}"
+        host = f"127.0.0.1:{page.port}" if rewrites else there  # which some tunnels put there
+        status, headers, _ = get(SimpleNamespace(port=port), f"/{page.token}/page.js", host)
+        assert status == 200
+        assert "connect-src 'self'" in headers["Content-Security-Policy"]
+        with looking_on(page, origin=f"http://{there}", host=host, port=port) as client:
+            assert told(client, "start")["case"] == 0
+        for origin in FOREIGN:
+            with pytest.raises(InvalidStatus):
+                looking_on(page, origin=f"http://{origin}", host=host, port=port)
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1"])

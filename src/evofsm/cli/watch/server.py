@@ -2,14 +2,16 @@
 
 Whoever may see and steer a run must know the token in the address. Names other than this
 computer's own are refused (a page elsewhere could have its name point here), and so are pages of
-other origins. Nobody who looks on can hold the run up: nobody is waited for, and whoever reads too
-slowly is cut off, comes again, and is shown all of it at once.
+other origins; its own may come with any port, as through a tunnel or from a container. Nobody who
+looks on can hold the run up: nobody is waited for, and whoever reads too slowly is cut off, comes
+again, and is shown all of it at once.
 """
 
 from __future__ import annotations
 
 import hmac
 import logging
+import re
 import secrets
 from collections import deque
 from http import HTTPStatus
@@ -30,8 +32,15 @@ with needs("websockets", "watch", "the live page"):
     from websockets.http11 import Request, Response
 
 _HOST = "127.0.0.1"
+# Names that no page elsewhere can have, and pages from there.
+_OWN = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
+_OWN_PAGE = re.compile(f"http://{_OWN.pattern}")
+_FOREIGN = (
+    "This page answers to the names of its own computer only. From another one, forward a port to "
+    "it, ssh -L 9000:127.0.0.1:{} NAME, and open the same address with localhost:9000."
+)
 # A run keeps so many frames.
-_MOST_FRAMES, _MOST_CLIENTS = 20_000, 200
+_MOST_FRAMES = 20_000
 # Who leaves more unread is cut off, all of a run is less; a command is short [bytes].
 _MOST_UNREAD, _LONGEST_COMMAND = 1 << 26, 512
 _WELCOME = {
@@ -42,7 +51,7 @@ _WELCOME = {
     ),
 }
 # Close codes (RFC 6455).
-_NOT_TEXT, _NOT_UNDERSTOOD, _TOO_MANY = 1003, 1008, 1013
+_NOT_TEXT, _NOT_UNDERSTOOD = 1003, 1008
 
 _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # junk on the socket is nobody's traceback
@@ -142,28 +151,24 @@ class LivePage:
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The files of the page; None lets a socket be opened."""
         token, _, name = request.path.removeprefix("/").partition("/")
-        if request.headers.get_all("Host") not in [[host] for host in self._hosts()]:
-            return _refusal(HTTPStatus.FORBIDDEN, "This page answers under its own address only.")
+        hosts, origins = (request.headers.get_all(each) for each in ("Host", "Origin"))
+        if len(hosts) != 1 or not _OWN.fullmatch(hosts[0]):
+            return _refusal(HTTPStatus.FORBIDDEN, _FOREIGN.format(self.port))
         if not hmac.compare_digest(token.encode(), self.token.encode()):
             return _refusal(HTTPStatus.FORBIDDEN, "The address lacks its token, or has another.")
-        origins = request.headers.get_all("Origin")
         if name == "socket":
-            if origins not in [[f"http://{host}"] for host in self._hosts()]:
+            # Not compared with the host, which a tunnel may have put there.
+            if len(origins) != 1 or not _OWN_PAGE.fullmatch(origins[0]):
                 return _refusal(HTTPStatus.FORBIDDEN, "Only the page itself may open the socket.")
             return None
         name = name or "page.html"
         if name not in self._files:
             return _refusal(HTTPStatus.NOT_FOUND, "There is no such file.")
-        sources = " ".join(f"ws://{host}" for host in self._hosts())
-        return _response(HTTPStatus.OK, self._files[name], _WELCOME[name], sources)
-
-    def _hosts(self) -> list[str]:
-        return [f"{name}:{self.port}" for name in (_HOST, "localhost")]
+        # No policy knows addresses in brackets; 'self' does.
+        sockets = "" if hosts[0].startswith("[") else f"ws://{hosts[0]}"
+        return _response(HTTPStatus.OK, self._files[name], _WELCOME[name], sockets)
 
     async def _attend(self, connection: ServerConnection) -> None:
-        if len(self._clients) >= _MOST_CLIENTS:
-            await connection.close(_TOO_MANY, "too many look on already")
-            return
         parts = ",".join([*self._latest.values(), *self._frames])  # the start first
         broadcast([connection], f'{{"kind":"whole","parts":[{parts}]}}')
         self._clients.add(connection)
