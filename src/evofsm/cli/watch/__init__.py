@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import webbrowser
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
     from evofsm.cli.watch.player import Watched
     from evofsm.cli.watch.session import Session
 
+# How a file begins, soon, that holds a guard, a machine or a judge.
+_LEARNT = b'{"__metadata__"'
 # Of a simulation of somebody else's that are watched [s], and positions of cars in them.
 _SECONDS, _ENOUGH = 600.0, 100_000
 
@@ -136,15 +139,31 @@ async def _serve(watched: Watched, port: int, *, live: bool, browse: bool) -> No
 
 
 def _is_log(what: str) -> bool:
-    """Whether it is a log that others wrote."""
+    """Whether it is a log that others wrote; what is nothing that can be watched is refused."""
     from evofsm.driving import FAMILIES
     from evofsm.io.tables import file_kind
 
     place = Path(what)
-    if what in FAMILIES or place.suffix == ".py":
+    if what.partition("+")[0] in FAMILIES or re.search(r"-v\d+$", what):
         return False
-    if not (place.is_file() or (place / "metadata.yaml").is_file()):
+    if not place.exists():
+        if place.suffix or len(place.parts) > 1:
+            raise FileNotFoundError(2, "no such file or directory", what)
+        raise ValueError(
+            f"{what} is neither a file nor one of the families {', '.join(FAMILIES)}; an "
+            "environment of Gymnasium is named with its version: CartPole-v1"
+        )
+    if place.suffix == ".py":
         return False
+    if place.is_dir():
+        if not (place / "metadata.yaml").is_file():
+            raise ValueError(f"{what} is a folder, but no bag of ROS 2; name a file in it")
+        return True
+    with place.open("rb") as file:
+        if _LEARNT in file.read(32):
+            raise ValueError(
+                f"{what} holds what was learnt, which nobody drives: evofsm inspect prints it"
+            )
     # What is damaged is no kind of MCAP: whoever reads runs says so.
     return place.suffix != ".mcap" or file_kind(what) in ("mcap", "bag")
 

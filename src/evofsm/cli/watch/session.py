@@ -321,7 +321,9 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
         with _of_file(what):
             found = runpy.run_path(what)
             if "environment" not in found:
-                return None
+                if "family" in found:
+                    return None
+                raise ValueError("it defines neither environment() nor a Family called family")
             own = {name: found[name] for name in _PARTS if name in found}
             return Simulated(Path(what).stem, found["environment"](), **own, **settings)
     if not re.search(r"-v\d+$", what):
