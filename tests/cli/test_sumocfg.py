@@ -10,6 +10,7 @@ pytest.importorskip("libsumo")
 from evofsm.cli.sumocfg import trace_configuration
 from evofsm.cli.watch import _is_log
 from evofsm.cli.watch.recorded import Recording, record_log
+from evofsm.cli.watch.words import tell
 
 CARS = """<routes>
     <vType id="calm" sigma="0" speedFactor="0.4" speedDev="0"/>
@@ -67,13 +68,26 @@ def test_a_configuration_that_sumo_refuses_is_one_line(refused, configuration):
     assert "no such file" in refused("drive", configuration.parent / "none.sumocfg")
 
 
-def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tmp_path):
+@pytest.mark.parametrize("afterwards", ["teleport", "warn"])
+def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tmp_path, afterwards):
+    configuration.write_text(CONFIGURATION.replace('"warn"', f'"{afterwards}"'))
     log, run = tmp_path / "my.xml", tmp_path / "run.mcap"
-    assert trace_configuration(configuration, log, 30.0, 10**6) == 30.0
-    assert trace_configuration(configuration, log, 30.0, 40) < 30.0
-    names, _ = record_log(str(log), run)
-    recorded = Recording(run, names)
-    assert recorded.start.cases[0].startswith("ego behind lead (")
-    frames = [recorded.step() for _ in range(20)]
-    assert frames[-1].time > frames[0].time
+    assert trace_configuration(configuration, log, 30.0, 10**6)[:2] == (30.0, True)
+    assert trace_configuration(configuration, log, 30.0, 40)[0] < 30.0
+    *whole, collisions = trace_configuration(configuration, log, 600.0, 10**6)
+    assert whole == [80.0, False]
+    stretches, _ = record_log(str(log), run, collisions=collisions)
+    recorded = Recording(run, stretches)
+    assert recorded.start.cases[0] == "ego behind lead, from 0.0 s (collision)"
+    frames = [recorded.step()]
+    while not frames[-1].over:
+        frames.append(recorded.step())
+    met = collisions["ego behind lead"][0]  # whom SUMO takes away is not seen then
+    assert frames[-1].time == pytest.approx(met - 0.1 * (afterwards == "teleport"), abs=0.01)
+    told = tell(frames[-1], recorded.start)
+    assert told.headline == "Collision (by SUMO)"
+    closing = frames[-1].cars.v_follower - 8.0
+    assert f"{closing:.1f}\xa0m/s faster than the leader, 0." in told.outcome
+    assert "only watched, in shadow mode" in told.done
+    assert "The reviser" not in told.done
     assert _is_log(str(configuration))

@@ -2,22 +2,25 @@
 
 import asyncio
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from evofsm.cli.driving import Setup, make_guard
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.recorded import Recording, record_log
 from evofsm.cli.watch.session import (
     OnRoads,
     Session,
+    _names_of,
     learn_first,
     read_simulated,
     watched_guard,
 )
 from evofsm.cli.watch.shown import Chronicle, Judged, known_of
-from evofsm.cli.watch.words import tell
+from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.fsm.observations import ObservationEncoder
@@ -85,19 +88,19 @@ def test_danger_is_over_two_seconds_after_the_last_wish_that_was_not_tolerable()
     risks = {0.0: 0.5, 1.0: 0.01, 1.9: 0.01, 2.0: 0.01, 3.0: 0.03, 4.0: math.nan}
     told = []
     for time, risk in risks.items():
-        frame = calm._replace(time=time, proposed_risk=Judged(risk), revised=True)
+        frame = calm._replace(time=time, proposed_risk=Judged(risk), revised=True, advises=True)
         told.append(chronicle.tell(frame))
     assert [story.in_danger for story in told] == [True, True, True, False, True, True]
     assert (told[-1].first, told[-1].danger.began.time, told[-1].danger.last) == (0.0, 3.0, 3.0)
-    assert (told[-1].revised, told[-1].danger.revised) == (6, 2)
+    assert (told[-1].revised, told[-1].danger.revised, told[-1].danger.wishes) == (6, 1, 1)
 
 
 def test_states_grow_from_empty_and_keep_their_numbers():
     session = opened(guard=watched_guard(PAPER))
     assert session.graph().states == ()
-    created = [frame for frame in drive(session) if frame.event == "created"]
+    drive(session)
     graph = session.graph()
-    assert len(created) >= len(graph.states) - 1 > 3
+    assert len(graph.states) > 4
     assert [state.state for state in graph.states] == list(range(len(graph.states)))
     origins = {origin for origin, _, _ in graph.transitions}
     assert all(origin != target for origin, target, _ in graph.transitions)
@@ -106,7 +109,8 @@ def test_states_grow_from_empty_and_keep_their_numbers():
 
 def test_any_environment_is_watched_by_a_guard_that_is_given_nothing_but_which_episodes_failed():
     system = read_simulated("CartPole-v1")
-    learn_first(system.guard, system, 12)
+    learn_first(system.guard, system, 24)
+    assert 12 < system.guard.n_episodes <= 24
     with Session(system, system.guard, on=False) as session:
         *_, alone = drive(session)
         assert alone.failed
@@ -115,14 +119,41 @@ def test_any_environment_is_watched_by_a_guard_that_is_given_nothing_but_which_e
         session.restart()
         *frames, last = drive(session)
         known, start = session.known(), session.start
-    assert last.time > alone.time
+    assert last.time > 10.0 * alone.time  # what is seen first is what it has learnt to do
     assert any(frame.revised for frame in frames)
     assert {frame.executed for frame in frames} == {(0.0,), (1.0,)}
     assert max(frame.proposed_risk.risk for frame in frames) > 0.5
-    assert (start.names[2], start.discrete, start.high) == ("variable 3", True, (1.0,))
+    assert (start.names[2], start.discrete, start.high) == ("pole angle [rad]", True, (1.0,))
+    assert "pole angular velocity" in last.here
     assert known.plane[0] in {variable for variable, _, _ in known.thresholds}
-    assert len(known.failed) == 13 + last.failed
     assert "The controller alone would have failed at" in tell(last, start).alone
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_the_first_failure_of_a_kind_is_called_so_and_no_other_one(on):
+    system, said = read_simulated("CartPole-v1"), []
+    with Session(system, system.guard, on=on) as session:
+        for case in (0, 0, 2):  # the pole falls to the left, again, and to the right
+            session.restart(case)
+            last = drive(session)[-1]
+            if last.failed:
+                before, told = set(said), tell(last, session.start)
+                first = told.headline == "Failure, the first of its kind"
+                sides = {(k, sign) for k, sign, _ in session.known().thresholds}
+                assert first == bool(sides - before)
+                assert first == ("A guard cannot prevent the first failure" in told.done)
+                said += sides
+    assert len(set(said)) >= 2 - on
+
+
+def test_variables_of_known_environments_have_names():
+    told = "CartPole-v1 4 MountainCar-v0 2 Pendulum-v1 3 Acrobot-v1 6 LunarLander-v3 8"
+    words = f"{told} BipedalWalker-v3 24 Other-v0 4 CartPole-v1 5".split()
+    for name, size in zip(words[::2], map(int, words[1::2]), strict=True):
+        env = SimpleNamespace(spec=SimpleNamespace(id=name))
+        env.observation_space = SimpleNamespace(shape=(size,))
+        is_known = (name, size) not in (("Other-v0", 4), ("CartPole-v1", 5))  # that is wrapped
+        assert len({*_names_of(env)}) == size * is_known
 
 
 def test_a_guard_that_is_no_better_than_the_controller_alone_says_so():
@@ -158,27 +189,17 @@ def test_a_file_holds_an_environment_of_ones_own(tmp_path):
 # -- A recording ----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def recorded(tmp_path):
-    """A log of two episodes, revised and not, and its drives."""
+def test_a_recording_shows_what_was_decided(tmp_path):
     machine, risk = learners_of(learnt())
-    drives = [
-        drive
-        for mode in (Mode.ACT, Mode.SHADOW)
-        for drive in teach(
-            guard_for_family(PAPER, mode=mode, machine=machine, judge=risk), [PAPER.draw(0, 0)]
-        )
-    ]
+    drives = []
+    for mode in (Mode.ACT, Mode.SHADOW):
+        guard = guard_for_family(PAPER, mode=mode, machine=machine, judge=risk)
+        drives += teach(guard, [PAPER.draw(0, 0)])
     path = tmp_path / "run.mcap"
     with recording(path, {"family": "paper"}) as log:
-        for drive in drives:
-            log.add(drive)
+        for drive_ in drives:
+            log.add(drive_)
         log.attach(machine.model())
-    return path, drives
-
-
-def test_a_recording_shows_what_was_decided(recorded):
-    path, drives = recorded
     shown = Recording(path)
     for case, drive_ in enumerate(drives):
         shown.restart(case)
@@ -197,6 +218,79 @@ def test_a_recording_shows_what_was_decided(recorded):
         shown.restart(2)
 
 
+# What a run was: how far which reviser went, why nothing was done, and whether wishes were judged.
+MODES = [
+    ("act", "least-risk", "", True),
+    ("shadow", "least-risk", "only watched, in shadow mode", True),
+    ("advise", "least-risk", "only advised", True),
+    ("off", "least-risk", "was off", False),
+    ("act", "none", "was off", False),
+    ("act", "rss", "", False),
+    ("act", "passing", "might have done harm, so what was proposed passed", True),
+    ("live", "on", "", True),
+    ("live", "passing", "may do harm, so what is proposed passes", True),
+    ("live", "off", "the reviser is off", True),
+]
+
+
+def was_so(tmp_path, mode, reviser):
+    """Frames of such a run, its start, and how often the proposal was not executed."""
+    passes = reviser == "passing"
+    if mode == "live":
+        guard = learnt()
+    else:
+        setup = Setup(PAPER, "least-risk" if passes else reviser, mode=Mode(mode))
+        guard = make_guard(setup)
+    teach(guard, [PAPER.draw(0, 1)])
+    if passes:  # as one of which is known that it fails sooner than the controller alone
+        guard._why_passing = lambda: "shadow"
+    if mode == "live":
+        with opened(guard=guard, on=reviser != "off") as session:
+            frames = drive(session)
+            return frames, session.start, sum(f.executed != f.proposed for f in frames)
+    (driven,) = teach(guard, [PAPER.draw(0, 0)])
+    with recording(tmp_path / "run.mcap", setup.settings) as log:
+        log.add(driven)
+    shown = Recording(tmp_path / "run.mcap")
+    return drive(shown), shown.start, int((driven.executed != driven.proposed).sum())
+
+
+@pytest.mark.parametrize(("mode", "reviser", "idle", "is_judged"), MODES)
+def test_every_sentence_says_what_was_so(tmp_path, mode, reviser, idle, is_judged):
+    frames, start, changed = was_so(tmp_path, mode, reviser)
+    told = [tell(frame, start) for frame in frames]
+    told = [one._replace(outcome=one.outcome.replace("\xa0", " ")) for one in told]
+    assert bool(changed) == (not idle)
+    # What the reviser did, or would have done.
+    done = " ".join(one.done for one in told)
+    assert ("The reviser stepped in" in done) == (not idle and is_judged)
+    assert ("The reviser changed" in done) == (not idle and not is_judged)
+    assert ("would have changed" in done) == (bool(idle) and is_judged)
+    assert ("Nothing had to be done" in done) == is_judged
+    assert all(idle in one.done for one in told if "would have" in one.done)
+    if not idle:
+        assert f"changed {changed} " in told[-1].done
+    # What was judged.
+    assert {one.status for one in told[:-1]} <= (
+        {"safe", "danger", "averted", "dead end"} if is_judged else {"unjudged"}
+    )
+    assert ("averted" in {one.status for one in told}) == (not idle and is_judged)
+    assert all(("Nothing was judged, for " in one.why) == (not is_judged) for one in told)
+    # What came of it: truly, and never slower than the leader.
+    last = frames[-1]
+    hit, closing = last.cars.gap <= 0.0, last.cars.v_follower - last.cars.v_leader
+    assert told[-1].headline == ("Collision" if hit else "No collision")
+    assert (f"Collision at {last.time:.1f}" in told[-1].outcome) == hit
+    assert (f"{closing:.1f} m/s faster than the leader" in told[-1].outcome) == hit
+    assert "−" not in told[-1].outcome
+    # What is said before it begins.
+    intro, learning = introduce(start).values()
+    assert intro.startswith("This was recorded.") == ("Recorded" in learning) == (mode != "live")
+    assert ("replaced actions" in intro) == (mode == "act" and reviser != "none")
+    assert ("was off" in intro) == (idle == "was off")
+    assert ("did not act" in intro) == (mode in ("shadow", "advise"))
+
+
 # -- A log of others ------------------------------------------------------------------------------
 
 
@@ -213,8 +307,8 @@ def objects(path, rows=80):
 
 def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
     out = tmp_path / "run.mcap"
-    names, more = record_log(objects(tmp_path / "objects.csv"), out)
-    assert (names, more) == (["ego behind other"], False)
+    found = record_log(objects(tmp_path / "objects.csv"), out)
+    assert found == ([("ego behind other, from 0.0 s", "Collision")], False)
     columns = read_run(out).episodes[0].columns
     assert (columns["executed"] == columns["proposed"]).all()
     assert columns["gap"][0] == pytest.approx(36.0)
@@ -222,38 +316,52 @@ def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
     assert columns["advised"][60] < -2.0
     assert columns["risk_proposed"][60] > columns["risk_proposed"][0]
     shown = Recording(out)
-    assert shown.start.about == "recorded in objects.csv"
     assert not shown.revising
-    first, *_, last = drive(shown)
+    first, *_, last = frames = drive(shown)
+    assert not any(frame.revised for frame in frames)
     assert first.cars.v_follower == pytest.approx(20.0)
     found = last.cars.a_follower, last.cars.a_leader, last.cars.x_follower
     assert found == pytest.approx((0.0, -5.0, 158.0))
 
 
-def test_episodes_of_a_log_are_sorted_by_what_came_of_them_and_begin_where_it_is_worth_a_look(
+def test_episodes_of_a_log_end_with_a_contact_are_sorted_and_begin_where_it_is_worth_a_look(
     tmp_path,
 ):
     lines = ["pair,time,gap,v_follower,v_leader,a_follower"]
     for pair, (far, closing) in enumerate([(90, 0), (20, 1), (4, 0)]):
         for k in range(300):
-            gap = far - max(0, k - 200) * 0.3 * closing
-            if gap < -0.3:
-                break
-            lines.append(f"{pair},{k / 10:.1f},{gap:.2f},20,{20 - 3 * closing},0")
+            # Contact after 26.7 s; the impact slows the follower, and the leader drives off.
+            gap, crashed = far - max(0, k - 200) * 0.3 * closing, False
+            if gap <= 0.0:
+                gap, crashed = (-0.1, True) if k < 275 else (k - 275.0, False)
+            slow = crashed and gap < 0.0
+            lines.append(f"{pair},{k / 10:.1f},{gap:.2f},{12 if slow else 20},{20 - 3 * closing},0")
     (tmp_path / "log.csv").write_text("\n".join([*lines, ""]))
-    names, _ = record_log(str(tmp_path / "log.csv"), tmp_path / "run.mcap")
-    shown = Recording(tmp_path / "run.mcap", names)
-    worst, second, third = shown.start.cases
+    stretches, _ = record_log(str(tmp_path / "log.csv"), tmp_path / "run.mcap")
+    shown = Recording(tmp_path / "run.mcap", stretches)
+    worst, second, *rest = shown.start.cases
     assert worst == "episode 2 (collision)"
-    assert second.startswith("episode 3 (risk ")
-    assert third == "episode 1 (risk 0.0%)"
+    assert second.startswith("episode 2 (risk ")  # after they came apart
+    assert [name.partition(" (")[0] for name in rest] == ["episode 3", "episode 1"]
     frames = drive(shown)
     assert frames[-1].failed
     assert shown.start.begins == pytest.approx(frames[-1].time - 10.0)
     told = tell(frames[-1], shown.start)
-    assert "it only watched, in shadow mode" in told.done
-    assert "off" not in told.done
-    assert shown.choose(2).case == 1  # the third of the log
+    assert "Collision at 26.7\xa0s, 3.0\xa0m/s faster than the leader." in told.outcome
+    assert "only watched, in shadow mode" in told.done
+    assert shown.choose(3).case == 2  # the fourth that was written
+
+
+def test_a_failure_that_a_log_tells_of_is_no_collision_but_a_failure(tmp_path):
+    rows = [f"{k / 10:.1f},{30 - k},20,10,0.1,{int(k == 25)}" for k in range(26)]
+    (tmp_path / "log.csv").write_text("\n".join(["time,gap,v,lead,a,failed", *rows, ""]))
+    columns = LogColumns(ObservationEncoder("gap", "v", "lead"), "a", failed="failed")
+    stretches, _ = record_log(str(tmp_path / "log.csv"), tmp_path / "run.mcap", columns)
+    shown = Recording(tmp_path / "run.mcap", stretches)
+    assert shown.start.cases == ("episode 1 (failure)",)
+    told = tell(drive(shown)[-1], shown.start)
+    assert told.headline == "Failure (by the log)"
+    assert "at 2.5\xa0s, 10.0\xa0m/s faster than the leader, 5.0\xa0m behind it." in told.outcome
 
 
 def test_a_log_is_watched_by_its_own_columns_and_units(tmp_path, capsys):
@@ -345,7 +453,7 @@ def told_over(episodes, *, on=True):
 def test_before_the_first_failure_nothing_is_called_safe():
     for frame, told in told_over(0)[:-1]:
         assert math.isnan(frame.proposed_risk.risk)
-        assert (told.status, told.headline) == ("unjudged", "Nothing is judged yet")
+        assert (told.status, told.headline) == ("unjudged", "Nothing is judged")
         assert told.why == "Nothing was judged, for no failure was known yet."
         assert frame.reason == "nothing was learnt yet"
 
@@ -360,7 +468,7 @@ def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
     assert {"dead end", "failure"} <= {told.status for _, told in frames}
     for frame, told in frames:  # what it changes where it sees no danger, it changes for the margin
         story = frame.story
-        assert ("by a margin" in told.done) == (story.danger is None and story.revised > 0)
+        assert ("by a margin" in told.done) == (story.danger is None and story.advised > 0)
 
 
 def test_the_same_rows_get_the_same_risks_as_from_the_monitor(tmp_path):

@@ -71,19 +71,26 @@ def drive_configuration(
     }
 
 
-def trace_configuration(file: Path, out: Path, seconds: float, enough: int) -> float:
+def trace_configuration(
+    file: Path, out: Path, seconds: float, enough: int
+) -> tuple[float, bool, dict[str, list[float]]]:
     """Run a configuration as it is, and write where its cars were as an FCD file.
 
-    So many seconds at most, and no more once so many positions were written; returns how long [s].
+    So many seconds at most, and no more once so many positions were written. Returns how long [s],
+    whether it would have gone on, and when there were collisions [s], by who was behind whom.
     """
+    met: dict[str, list[float]] = {}
     with _running(file, "--fcd-output", str(out)) as (sumo, steps):
-        begun, written = float(sumo.simulation.getTime()), 0
-        now = begun
+        begun, written, is_cut = float(sumo.simulation.getTime()), 0, False
+        now, dt = begun, float(sumo.simulation.getDeltaT())
         for now in steps:
+            for each in sumo.simulation.getCollisions():
+                # A step is written with the time at which it began.
+                met.setdefault(f"{each.collider} behind {each.victim}", []).append(now - dt)
             written += sumo.vehicle.getIDCount()
-            if now >= begun + seconds or written >= enough:
+            if is_cut := now >= begun + seconds or written >= enough:
                 break
-        return now - begun
+        return now - begun, is_cut, met
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import webbrowser
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.options import (
     BRAKES,
@@ -25,14 +25,12 @@ from evofsm.cli.options import (
     Observed,
     Seed,
     Step,
-    Switches,
     TimeColumn,
     Tolerance,
     TopicsFile,
     Units,
     World,
     argument,
-    family_of,
     option,
     reading_of,
     require,
@@ -42,7 +40,7 @@ from evofsm.cli.show import progress, say, warn
 
 if TYPE_CHECKING:
     from evofsm.cli.options import Reading
-    from evofsm.cli.watch.player import Watched
+    from evofsm.cli.watch.recorded import Recording
     from evofsm.cli.watch.session import Session
 
 # How a file begins, soon, that holds a guard, a machine or a judge.
@@ -73,9 +71,8 @@ def watch(
     world: InWorld = "kinematic",
     judge: ByJudge = "kinematic",
     tolerance: Tolerance = TOLERANCE,
-    switches: Switches = "",
     seed: Seed = 0,
-    learn_first: Annotated[int, option("Episodes to learn from before.", min=0)] = 60,
+    learn_first: Annotated[int, option("Episodes to learn from before, at most.", min=0)] = 60,
     brakes: Brakes = BRAKES,
     observe: Observed = "gap,v_follower,v_leader",
     action: ActionColumn = "a_follower",
@@ -110,27 +107,28 @@ def watch(
     if not is_log and any((episode, dt, failed, unit, topics, no_leader, vehicle_length)):
         raise ValueError(f"options of columns are for a log, and {what} is none")
     is_recorded = is_log or what.endswith(".mcap")
-    opened: AbstractContextManager[Watched]
+    opened: AbstractContextManager[Session | Recording]
     if is_recorded:
         require(scipy="study", mcap="mcap")
         asked = observe, action, time, episode, dt, failed, unit, topics, no_leader, vehicle_length
         reading = reading_of(*asked) if is_log else None
         opened = _recorded(what, case, judge, tolerance, brakes, reading)
     else:
-        opened = _driven(what, case or 1, world, judge, tolerance, switches, seed, learn_first)
+        opened = _driven(what, case or 1, world, judge, tolerance, seed, learn_first)
     with suppress(KeyboardInterrupt), opened as watched:
-        asyncio.run(_serve(watched, port, live=not is_recorded, browse=not no_browser))
+        asyncio.run(_serve(watched, port, browse=not no_browser))
     say("\nThe page is closed.")
 
 
-async def _serve(watched: Watched, port: int, *, live: bool, browse: bool) -> None:
+async def _serve(watched: Session | Recording, port: int, *, browse: bool) -> None:
     """Play to whoever opens the page."""
     from evofsm.cli.watch.player import Player
     from evofsm.cli.watch.server import LivePage
 
-    async with LivePage(port, live=live) as page:
+    async with LivePage(port) as page:
         page.player = Player(watched, page, awaits=True)
-        say("Watch it here (Ctrl-C ends it); whoever has this address may steer the run:")
+        may = "steer the run" if watched.start.mode == "live" else "look on"
+        say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
         print(f"  {page.address}", flush=True)
         if browse:
             webbrowser.open(page.address)
@@ -175,7 +173,7 @@ def _recorded(
     tolerance: float,
     brakes: float,
     reading: Reading | None,
-) -> AbstractContextManager[Watched]:
+) -> AbstractContextManager[Session | Recording]:
     """A run that was recorded, or a log with what a guard would have said; read beforehand."""
     from tempfile import TemporaryDirectory
 
@@ -187,16 +185,18 @@ def _recorded(
     else:
         with TemporaryDirectory() as folder, progress("Reading", MOST_ROWS) as move:
             run, log = Path(folder) / "run.mcap", what
+            settings: dict[str, Any] = {"judge": judge, "brakes": brakes, "tolerance": tolerance}
             if log.endswith(".sumocfg"):
                 log = str(Path(folder) / Path(what).name)
-                written = trace_configuration(Path(what), Path(log), _SECONDS, _ENOUGH)
-                warn(f"watched are the first {written:,.0f} s of the simulation")
-            names, more = record_log(
-                log, run, *reading, judge=judge, brakes=brakes, tolerance=tolerance, show=move
-            )
+                written, is_cut, settings["collisions"] = trace_configuration(
+                    Path(what), Path(log), _SECONDS, _ENOUGH
+                )
+                if is_cut:
+                    warn(f"watched are the first {written:,.0f} s of the simulation")
+            stretches, more = record_log(log, run, *reading, **settings, show=move)
             if more:
                 warn(f"watched are the first {MOST_ROWS:,} rows; there are more")
-            recording = Recording(run, names)
+            recording = Recording(run, stretches)
     if case is not None:
         recording.choose(case - 1)
     return nullcontext(recording)
@@ -209,7 +209,6 @@ def _driven(
     world: World,
     judge: Judge,
     tolerance: float,
-    switches: str,
     seed: int,
     episodes: int,
 ) -> Iterator[Session]:
@@ -227,9 +226,10 @@ def _driven(
         simulated = read_simulated(what, seed=seed, tolerance=tolerance)
         if simulated is None:
             require_world(world)
+            from evofsm.driving import load_family
             from evofsm.driving.sumo import open_world
 
-            family = family_of(what, switches)
+            family = load_family(what)
             system: System = OnRoads(family, stack.enter_context(open_world(world)), seed)
             guard = watched_guard(family, judge=judge, tolerance=tolerance)
         else:

@@ -7,9 +7,13 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from evofsm.cli.watch.shown import Frame, Graph, Known, Start
+from evofsm.cli.watch.shown import Frame
+
+if TYPE_CHECKING:
+    from evofsm.cli.watch.recorded import Recording
+    from evofsm.cli.watch.session import Session
 
 #: Speeds that can be chosen, as multiples of real time.
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
@@ -20,25 +24,6 @@ _GRAPH_EVERY = 8
 _FOLLOWED = 12.5
 # Who is late by more does not hurry to make up for it [s].
 _LATE = 0.1
-
-
-class Watched(Protocol):
-    """Anything that can be watched: a session, or a run that was recorded."""
-
-    start: Start  #: what is known as the run begins
-    revising: bool  #: whether the reviser may act
-
-    def restart(self, case: int | None = None) -> object:
-        """Begin anew, or another case."""
-
-    def step(self) -> Frame:
-        """The next frame."""
-
-    def graph(self) -> Graph:
-        """The states at the latest frame."""
-
-    def known(self) -> Known:
-        """What is known of failure."""
 
 
 class Clock(NamedTuple):
@@ -60,7 +45,7 @@ class Player:
 
     def __init__(
         self,
-        watched: Watched,
+        watched: Session | Recording,
         audience: Callable[[str, Any], object],
         *,
         paused: bool = False,
@@ -74,7 +59,7 @@ class Player:
         self._paused, self._speed, self._over = paused, speed, False
         self._steps = False  # once, although it is paused
         self._due = 0.0  # when the next frame is [s]
-        self._since = 0  # frames since the latest graph
+        self._since = self._states = 0  # frames since the latest graph, and its states
         self._order: Callable[[], object] | None = None  # of what may take time, the latest
         self._news = asyncio.Event()
 
@@ -153,15 +138,20 @@ class Player:
         self._over, self._due = False, time.monotonic()
         self._audience("start", self._watched.start)
         self._audience("clock", self._clock())
-        self._audience("graph", self._watched.graph())
+        self._draw()
         self._audience("known", self._watched.known())
+
+    def _draw(self) -> None:
+        graph = self._watched.graph()
+        self._audience("graph", graph)
+        self._since, self._states = 0, len(graph.states)
 
     def _show(self, frame: Frame) -> None:
         self._audience("frame", frame)
         self._since += 1
-        if frame.event == "created" or frame.over or self._since >= _GRAPH_EVERY:
-            self._audience("graph", self._watched.graph())
-            self._since = 0
+        is_new = frame.state is not None and frame.state >= self._states
+        if is_new or frame.over or self._since >= _GRAPH_EVERY:
+            self._draw()
         if frame.over:
             self._over = True
             self._audience("known", self._watched.known())

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from evofsm.cli.learning import warnings_of
 from evofsm.cli.options import BRAKES
 from evofsm.cli.show import warn
 from evofsm.cli.watch.shown import (
+    OF_CARS,
     Cars,
     Chronicle,
     Frame,
@@ -24,7 +26,6 @@ from evofsm.cli.watch.shown import (
     Start,
     graph_of,
     most_believed,
-    numbers,
 )
 from evofsm.driving import guard_for_cars
 from evofsm.driving.assumed import HIGHEST, Given, assumptions, guard_of_monitor
@@ -34,7 +35,7 @@ from evofsm.driving.trials import shadow_drive
 from evofsm.fsm.naming import Labels
 from evofsm.guard import TOLERANCE, Guard, Mode
 from evofsm.io.foxglove import recording
-from evofsm.io.logs import Chunk, LogColumns, Noted, episodes_of, read_traces
+from evofsm.io.logs import LONGEST_STEP, Chunk, LogColumns, Noted, episodes_of, read_traces
 from evofsm.io.rosbag import Topics
 from evofsm.io.runs import RecordedEpisode, Run, read_run
 from evofsm.io.vehicles import VehicleLengths
@@ -43,6 +44,14 @@ from evofsm.io.vehicles import VehicleLengths
 MOST_ROWS = 20_000
 
 _LABELS = Labels(names=VARIABLES, units=UNITS)
+# Why a reviser did not act, by its mode.
+_IDLE = {
+    "off": "the reviser was off",
+    "shadow": "the reviser only watched, in shadow mode",
+    "advise": "the reviser only advised",
+}
+_ACTIONS = ("proposed", "executed", "advised")
+_PASSED = "the guard might have done harm, so what was proposed passed"
 # So many of a log's episodes can be chosen among.
 _MOST_EPISODES = 500
 _NONE = -1
@@ -52,6 +61,8 @@ _SAME = 0.05
 _BEFORE = 10.0
 # Whoever wants to see something needs as many.
 _FEWEST_ROWS = 10
+# Times that differ by less are one [s].
+_TICK = 5e-4
 
 
 class Recording:
@@ -61,27 +72,32 @@ class Recording:
     which states are dead ends; those in which a collision ended are marked instead.
     """
 
-    def __init__(self, path: str | PathLike[str], names: Sequence[str] = ()) -> None:
+    def __init__(
+        self, path: str | PathLike[str], stretches: Sequence[tuple[str, str]] = ()
+    ) -> None:
         self._run: Run = read_run(path)
         self._name = self._run.about.get("source", Path(path).name)
         self._episodes = [one for one in self._run.episodes if len(one.columns["time"])]
         if not self._episodes:
             raise ValueError(f"{path} holds no episode with a decision")
+        self._fails = ["Collision" * one.collided for one in self._episodes]
         self._names = [f"episode {k + 1}" for k in range(len(self._episodes))]
         self._order = list(range(len(self._episodes)))
-        self._jumps = bool(names)
-        if names:
+        self._jumps = bool(stretches)
+        if stretches:
+            self._fails = [fails for _, fails in stretches]
             risks = [
                 float(np.nanmax([0.0, *one.columns["risk_proposed"]])) for one in self._episodes
             ]
-            rank = [(-one.collided, -risk) for one, risk in zip(self._episodes, risks, strict=True)]
-            self._order.sort(key=rank.__getitem__)
+            self._order.sort(key=lambda k: (not self._fails[k], -risks[k]))
             self._names = [
-                f"{name} ({'collision' if one.collided else f'risk {risk:.1%}'})"
-                for one, risk, name in zip(self._episodes, risks, names, strict=True)
+                f"{name} ({fails.partition(' ')[0].lower() or f'risk {risk:.1%}'})"
+                for (name, fails), risk in zip(stretches, risks, strict=True)
             ]
-        self._tolerance = float(self._run.about.get("tolerance", TOLERANCE))
-        self.revising = self._run.about.get("mode", "act") == "act"
+        self._reviser = self._run.about.get("reviser", "least-risk")
+        mode = self._run.about.get("mode", "act")
+        self._mode = "off" if self._reviser == "none" else mode
+        self.revising = self._mode == "act"
         self.start = self.restart(0)
 
     def restart(self, case: int | None = None) -> Start:
@@ -89,11 +105,18 @@ class Recording:
         case = self.start.case if case is None else case
         if not 0 <= case < len(self._episodes):
             raise ValueError(f"episode is {case + 1}; there are 1 to {len(self._episodes)}")
-        self._episode = self._episodes[self._order[case]]
-        self._frames = list(_frames(self._episode, revising=self.revising))
-        self._number = 0
-        self._chronicle = Chronicle(self._tolerance)
+        number = self._order[case]
+        self._episode, self._fail, self._number = self._episodes[number], self._fails[number], 0
         self.start = self._begun(case)
+        # Where it acts, what is executed is what it advises; else a proposal that can be executed.
+        columns = self._episode.columns
+        passed = (np.abs(columns["advised"] - columns["executed"]) > _SAME).any()
+        idle = _IDLE.get(self._mode, _PASSED if passed else "")
+        chronicle, frames = Chronicle(self.start.tolerance), list(_moved(self._episode, idle))
+        for number, frame in enumerate(frames):
+            frame = self._decided(frame, number) if number + 1 < len(frames) else self._end(frame)
+            frames[number] = frame._replace(story=chronicle.tell(frame))
+        self._frames = frames
         return self.start
 
     def choose(self, number: int) -> Start:
@@ -102,17 +125,8 @@ class Recording:
 
     def step(self) -> Frame:
         """The next frame."""
-        number, decisions = self._number, len(self._episode.columns["time"])
-        frame = self._frames[number]
-        if number < decisions:
-            frame = frame._replace(**_decided(self._episode.columns, number))
-        else:
-            collided, rear_ended = self._episode.collided, self._episode.rear_ended
-            assert frame.cars is not None
-            cars = frame.cars._replace(rear_ended=rear_ended)
-            frame = frame._replace(over=True, failed=collided, cars=cars)
         self._number += 1
-        return frame._replace(story=self._chronicle.tell(frame))
+        return self._frames[self._number - 1]
 
     def graph(self) -> Graph:
         """The states as they were after the last episode."""
@@ -128,54 +142,64 @@ class Recording:
     def _begun(self, case: int) -> Start:
         about, columns = self._run.about, self._episode.columns
         times = np.append(columns["time"], self._episode.end_time)
-        commands = np.concatenate([columns["proposed"], columns["executed"], [0.0]])
+        commands = np.concatenate([[0.0], *(columns[name] for name in _ACTIONS)])
+        unjudged = "no failure was known yet"
+        if self._reviser not in ("least-risk", "none"):
+            unjudged = f"{self._reviser} knows no risk"
         return Start(
             system=about.get("family", self._name),
-            about=f"recorded in {self._name}",
+            about="each row was judged afterwards." if self._jumps else f"from {self._name}.",
             cases=tuple(self._names[k] for k in self._order[:_MOST_EPISODES]),
             case=case,
-            tolerance=self._tolerance,
+            tolerance=float(about.get("tolerance", TOLERANCE)),
             interval=float(np.median(np.diff(times))),
-            names=tuple(_LABELS.variable(k) for k in range(len(VARIABLES))),
+            names=OF_CARS,
             low=(float(np.nanmin(commands)),),
             high=(float(np.nanmax(commands)),),
             learnt=0,
             judge=about.get("judge", "kinematic"),
-            shadow=not self.revising,
+            mode=self._mode,
+            unjudged="the reviser was off" if self._mode == "off" else unjudged,
+            fails=self._fail,
             begins=self._worst() - _BEFORE if self._jumps else 0.0,
         )
 
     def _worst(self) -> float:
         """When it collided, or was in most danger [s]."""
         risks = self._episode.columns["risk_proposed"]
-        if self._episode.collided or np.isnan(risks).all():
+        if self._fail or np.isnan(risks).all():
             return self._episode.end_time
         return float(self._episode.columns["time"][np.nanargmax(risks)])
 
+    def _decided(self, frame: Frame, number: int) -> Frame:
+        """What was recognised, judged and decided."""
+        row = {name: values[number] for name, values in self._episode.columns.items()}
+        executed = Judged(*map(float, (row["risk_executed"], row["risk_low"], row["risk_high"])))
+        risk = float(row["risk_proposed"])
+        proposed, executes, advised = (float(row[name]) for name in _ACTIONS)
+        revised = not frame.idle and abs(executes - proposed) > _SAME
+        return frame._replace(
+            proposed=(proposed,),
+            executed=(proposed if frame.idle else executes,),
+            advised=(advised,),
+            revised=revised,
+            advises=revised or abs(advised - executes) > _SAME,
+            reason=str(row["reason"]),
+            explanation=str(row["explanation"]),
+            belief=most_believed(row["belief"]),
+            state=None if row["state"] == _NONE else int(row["state"]),
+            # The log has the interval of what was executed only.
+            proposed_risk=executed if risk == executed.risk else Judged(risk),
+            executed_risk=executed,
+        )
 
-def _decided(columns: Any, number: int) -> dict[str, Any]:
-    """What was recognised, judged and decided, by the names of a frame."""
-    state, before = (int(columns["state"][k]) for k in (number, max(0, number - 1)))
-    executed = Judged(
-        *(float(columns[name][number]) for name in ("risk_executed", "risk_low", "risk_high"))
-    )
-    proposed = float(columns["risk_proposed"][number])
-    # The log has the interval of what was executed only.
-    is_kept = proposed == executed.risk
-    actions = {name: numbers(columns[name][number]) for name in ("proposed", "executed", "advised")}
-    return {
-        **actions,
-        "revised": abs(actions["executed"][0] - actions["proposed"][0]) > _SAME,
-        **{name: str(columns[name][number]) for name in ("reason", "explanation")},
-        "belief": most_believed(columns["belief"][number]),
-        "state": None if state == _NONE else state,
-        "event": "moved" if state != before else "",
-        "proposed_risk": executed if is_kept else Judged(proposed),
-        "executed_risk": executed,
-    }
+    def _end(self, frame: Frame) -> Frame:
+        assert frame.cars is not None
+        cars = frame.cars._replace(rear_ended=self._episode.rear_ended)
+        return frame._replace(over=True, failed=bool(self._fail), cars=cars)
 
 
-def _frames(episode: RecordedEpisode, *, revising: bool) -> Iterator[Frame]:
+def _moved(episode: RecordedEpisode, idle: str) -> Iterator[Frame]:
     """Where the cars are at each decision and at the end, and how they got there."""
     columns = episode.columns
     time = np.append(columns["time"], episode.end_time)
@@ -192,7 +216,7 @@ def _frames(episode: RecordedEpisode, *, revising: bool) -> Iterator[Frame]:
             time=float(time[number]),
             observation=(gap, speed, leader_speed),
             here=_LABELS.place(observed[number]),
-            revising=revising,
+            idle=idle,
             cars=Cars(
                 gap=gap,
                 v_follower=speed,
@@ -229,12 +253,16 @@ def record_log(
     judge: str = "kinematic",
     brakes: float = BRAKES,
     tolerance: float = TOLERANCE,
+    collisions: Mapping[str, Sequence[float]] = MappingProxyType({}),
     show: Callable[[int], object] = lambda rows: None,
-) -> tuple[list[str], bool]:
+) -> tuple[list[tuple[str, str]], bool]:
     """Write the episodes of a log of cars as a run, decided on by a guard that learns on the way.
 
-    Returns what they are called, and whether rows after the first `MOST_ROWS` were left out;
-    ``show`` is told how many were decided on.
+    An episode is over with a contact; where the cars come apart again, another one begins. So it is
+    with ``collisions`` that a simulation counted [s], by the name of who follows whom.
+
+    Returns what they are called, with how each failed, and whether rows after the first `MOST_ROWS`
+    were left out; ``show`` is told how many were decided on.
     """
     names = VARIABLES if columns is None else columns.observe.names
     if len(names) != len(VARIABLES):
@@ -244,28 +272,24 @@ def record_log(
         )
     noted = Noted()
     reading = read_traces([path], columns, lengths, noted=noted, topics=topics)
-    taken, more, called = 0, False, list[str]()
+    taken, more, written = 0, False, list[tuple[str, str]]()
     about: dict[str, Any] = {"source": Path(path).name, "mode": "shadow", "judge": judge}
     guard = None
     with recording(out, about | {"controller": "as recorded", "tolerance": tolerance}) as log:
-        for episode in episodes_of(_first(reading, MOST_ROWS + 1)):
-            more = taken + len(episode.times) > MOST_ROWS
-            episode = episode.rows(0, MOST_ROWS - taken)
-            taken += len(episode.times)
+        for number, whole in enumerate(episodes_of(_first(reading, MOST_ROWS + 1)), 1):
+            more = taken + len(whole.times) > MOST_ROWS
+            whole = whole.rows(0, MOST_ROWS - taken)
+            taken += len(whole.times)
             show(taken)
-            if len(episode.times) >= _FEWEST_ROWS:
+            name = "".join(whole.names) or f"episode {number}"
+            for episode, fails in _stretches(whole, collisions.get(name, ())):
                 if guard is None:
                     guard = _guard(judge, episode.dt, brakes, tolerance)
-                called += episode.names or [f"episode {len(called) + 1}"]
-                log.add(
-                    shadow_drive(
-                        guard,
-                        episode.times - episode.times[0],
-                        episode.observations,
-                        episode.actions,
-                        failed=episode.failures is not None and len(episode.failures) > 0,
-                    )
-                )
+                began = float(episode.times[0])
+                called = f"{name}, from {began:.1f} s" if whole.names else name
+                written.append((called, fails))
+                times, did = episode.times - began, episode.actions
+                log.add(shadow_drive(guard, times, episode.observations, did, failed=bool(fails)))
         if guard is None:
             raise ValueError(f"{path}: nobody follows anybody for {_FEWEST_ROWS} rows")
         if guard.machine is not None:
@@ -274,7 +298,27 @@ def record_log(
         warn(f"warning: {warning}")
     if judge == "kinematic":
         warn(assumptions(brakes, tolerance))
-    return called, more
+    return written, more
+
+
+def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Chunk, str]]:
+    """Those of an episode that are long enough, and how each failed."""
+    counted = np.zeros(len(episode.times), np.bool_)
+    for time in collisions:  # who collides may be taken off the road before it is written down
+        row = int(np.searchsorted(episode.times, time + _TICK)) - 1
+        counted[row] |= row >= 0 and time - episode.times[row] < LONGEST_STEP * episode.dt
+    touching = counted | (episode.observations[:, 0] <= 0.0)
+    begins = np.flatnonzero(~touching & np.append(True, touching[:-1]))
+    for first in begins.tolist():
+        ends = np.flatnonzero(touching[first:])
+        last = first + int(ends[0]) if len(ends) else len(touching) - 1
+        if last + 1 - first < _FEWEST_ROWS:
+            continue
+        told = episode.failures is not None and last in episode.failures
+        fails = "Failure (by the log)" if told else ""
+        if touching[last]:
+            fails = "Collision (by SUMO)" if episode.observations[last, 0] > 0.0 else "Collision"
+        yield episode.rows(first, last + 1), fails
 
 
 def _guard(judge: str, interval: float, brakes: float, tolerance: float) -> Guard:

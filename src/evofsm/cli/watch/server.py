@@ -21,8 +21,8 @@ from typing import Any, Self
 import msgspec
 
 from evofsm.cli.watch.player import SPEEDS, Player
-from evofsm.cli.watch.shown import Frame, Start
-from evofsm.cli.watch.words import tell
+from evofsm.cli.watch.shown import LIVE, Frame, Start
+from evofsm.cli.watch.words import introduce, tell
 from evofsm.extras import needs
 
 with needs("websockets", "watch", "the live page"):
@@ -57,7 +57,7 @@ _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # junk on the socket is nobody's traceback
 
 
-def message(kind: str, what: Any, start: Start | None = None, *, live: bool = True) -> str:
+def message(kind: str, what: Any, start: Start | None = None) -> str:
     """What a `Player` tells, as a page reads it: JSON, null for what is no finite number.
 
     >>> message("failed", "no road")
@@ -65,7 +65,7 @@ def message(kind: str, what: Any, start: Start | None = None, *, live: bool = Tr
     """
     told: dict[str, Any] = what._asdict() if hasattr(what, "_asdict") else {"text": what}
     if isinstance(what, Start):
-        told |= {"live": live, "speeds": SPEEDS}
+        told |= {"live": what.mode == LIVE, "speeds": SPEEDS, **introduce(what)}
     elif isinstance(what, Frame):
         assert start is not None
         story, danger = what.story, what.story.danger
@@ -91,14 +91,13 @@ def _rounded(value: Any) -> Any:
 class LivePage:
     """Serves a run to browsers on this computer, in ``async with``; the audience of a `Player`.
 
-    ``port`` may be 0, for any that is free; ``live`` says whether the run can be acted on.
+    ``port`` may be 0, for any that is free.
     """
 
-    def __init__(self, port: int = 0, *, live: bool = True) -> None:
+    def __init__(self, port: int = 0) -> None:
         self.token = secrets.token_urlsafe(24)
         self.player: Player | None = None  #: does what pages ask for
         self.port = port  #: where it listens
-        self._live = live
         self._latest: dict[str, str] = {}  # messages of the present run, for who comes later
         self._frames: deque[str] = deque(maxlen=_MOST_FRAMES)
         self._clients: set[ServerConnection] = set()
@@ -138,7 +137,7 @@ class LivePage:
             self._start = what
             self._frames.clear()
             self._latest.clear()
-        text = message(kind, what, self._start, live=self._live)
+        text = message(kind, what, self._start)
         if kind == "frame":
             self._frames.append(text)
         else:
@@ -202,7 +201,7 @@ class LivePage:
                 self.player.step()
             case ("speed", float(speed)) if speed in SPEEDS:
                 self.player.speed(speed)
-            case ("revise", bool(on)) if self._live:
+            case ("revise", bool(on)) if self._start.mode == LIVE:
                 self.player.revise(on)
             case ("restart", None):
                 self.player.restart()

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from evofsm.cli.watch.shown import (
     CALM,
+    OF_CARS,
     Cars,
     Chronicle,
     Frame,
@@ -26,6 +27,7 @@ from evofsm.cli.watch.shown import (
     Judged,
     Known,
     Start,
+    first_of_its_kind,
     graph_of,
     known_of,
     most_believed,
@@ -72,6 +74,8 @@ _STANDING = 3.0
 _STEPS_PER_SECOND, _CALM = 10.0, 8
 # A change of an action by less is none [half ranges].
 _SAME = 0.02
+# So many episodes in a row without a failure tell that a guard has learnt.
+_LASTED = 10
 # An environment that does not end by itself is left after so many decisions, where nobody looks on.
 _MOST_DECISIONS = 2000
 # Seeds of episodes that are learnt from are so far from those that are watched.
@@ -83,6 +87,21 @@ _LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
 _PARTS = ("controller", "failed", "variables")
 # Of more variables only those of the plane are named.
 _FEW = 4
+# What Gymnasium's documentation calls the variables of its environments, with units.
+_LEG = "hip {0} angle [rad], hip {0} speed, knee {0} angle [rad], knee {0} speed, foot {0} contact"
+_LANDER = "x, y, speed x, speed y, angle [rad], angular velocity, left contact, right contact"
+_NAMES = {
+    "CartPole": "cart position [m], cart velocity [m/s], pole angle [rad], "
+    "pole angular velocity [rad/s]",
+    **dict.fromkeys(("MountainCar", "MountainCarContinuous"), "position [m], velocity"),
+    "Pendulum": "cosine of the angle, sine of the angle, angular velocity [rad/s]",
+    "Acrobot": "cosine of angle 1, sine of angle 1, cosine of angle 2, sine of angle 2, "
+    "angular velocity 1 [rad/s], angular velocity 2 [rad/s]",
+    **dict.fromkeys(("LunarLander", "LunarLanderContinuous"), _LANDER),
+    "BipedalWalker": "hull angle [rad], hull angular velocity, speed x, speed y, "
+    + ", ".join([_LEG.format(1), _LEG.format(2), *(f"lidar {k}" for k in range(1, 11))]),
+}
+_NAMES["BipedalWalkerHardcore"] = _NAMES["BipedalWalker"]
 
 
 def watched_guard(family: Family, **settings: Any) -> Guard:
@@ -98,13 +117,20 @@ def learn_first(
 ) -> None:
     """Drive a system for a while, in draws that are not watched, to learn.
 
-    An environment's controller drives alone then: it fails more often, which is what is learnt.
+    An environment's controller drives alone in the first half: it fails more often, which is what
+    is learnt. In the second half the guard acts, and comes to kinds of failure that are farther
+    off; that is over once it prevented all of some in a row.
     """
-    if isinstance(system, Simulated):
-        guard.reviser.mode = Mode.SHADOW  # type: ignore[attr-defined]
+    lasted = 0
     for index in range(episodes):
+        acts = 2 * index >= episodes
+        if isinstance(system, Simulated):
+            guard.reviser.mode = Mode.ACT if acts else Mode.SHADOW  # type: ignore[attr-defined]
         system.teach(guard, index)
         show(index + 1)
+        lasted = lasted + 1 if acts and isinstance(system, Simulated) and not system.failed else 0
+        if lasted == _LASTED:
+            break
 
 
 # -- Cars -----------------------------------------------------------------------------------------
@@ -129,10 +155,10 @@ class OnRoads:
         self.close()
         draw = self.family.draw(self.seed, case)
         self._controller = draw.controller
+        alone = drive(unrevised_guard(self.family), draw, self.world)
+        self.alone = float(alone.time[-1]) if alone.collided else math.inf
         self._road = self._closing.enter_context(self.world.open(draw.scenario))
         self._steps = draw.scenario.steps(self.interval)
-        alone = drive(unrevised_guard(self.family), draw)
-        self.alone = float(alone.time[-1]) if alone.collided else math.inf
         self._row, self._position, self._stood = 0, 0.0, 0.0
         self._held = np.full(3, np.nan)
         self._look()
@@ -213,7 +239,9 @@ class Simulated:
         fails = "what its file says" if failed else "an episode that is terminated"
         self.about = f"{acts} drives it; failure is {fails}."
         ends = _ends(name, env.action_space)
-        judge = LearntRisk(self.interval, **ends, names=variables, seed=seed)
+        named = [each.partition(" [") for each in variables or _names_of(env)]
+        names, units = [one[0] for one in named], [one[2].rstrip("]") for one in named]
+        judge = LearntRisk(self.interval, **ends, names=names, units=units, seed=seed)
         made = Guard(**ends, interval=self.interval, judge=judge, tolerance=tolerance)
         spaces = env.observation_space, env.action_space
         self._terms = gym.Terms(made, *spaces, None, failed, 0.0)
@@ -225,8 +253,8 @@ class Simulated:
             belief_tolerance=BELIEF_TOLERANCE,
         )
         self.guard = Guard.of(made.reviser, interval=self.interval, machine=machine)
-        names = variables or [f"variable {k + 1}" for k in range(seen.shape[1])]
-        self.labels = Labels(names=tuple(names), dt=self.interval)
+        names = names or [f"variable {k + 1}" for k in range(seen.shape[1])]
+        self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.interval)
 
     def _reset(self, env: Any, index: int) -> None:
         seed = (1000 * self.seed + index) % 2**31
@@ -290,6 +318,12 @@ class Simulated:
     def close(self) -> None:
         """Leave it."""
         self._env.close()
+
+
+def _names_of(env: Any) -> list[str]:
+    """Of an environment's variables, with their units, where it is one that is known."""
+    known = _NAMES.get(env.spec.id.partition("-v")[0], "").split(", ") if env.spec else []
+    return known if (len(known),) == env.observation_space.shape else []
 
 
 def _ends(name: str, space: Any) -> dict[str, Any]:
@@ -375,6 +409,14 @@ class Session:
     def revising(self, on: bool) -> None:
         self._reviser.mode = Mode.ACT if on else Mode.SHADOW  # type: ignore[attr-defined]
 
+    def _idle(self) -> str:
+        """Why the reviser does not act; empty where it does."""
+        if not self.revising:
+            return "the reviser is off"
+        passing: str = self._reviser.passing  # type: ignore[attr-defined]
+        harm = "may do harm" if passing == "shadow" else passing
+        return passing and f"the guard {harm}, so what is proposed passes"
+
     def restart(self, case: int | None = None) -> Start:
         """Begin a run anew, or another one; one that is under way is broken off."""
         case, system = self.case if case is None else case, self.system
@@ -386,7 +428,6 @@ class Session:
         calm = min(CALM, _CALM * system.interval)
         self._chronicle = Chronicle(self._tolerance, system.alone, calm)
         self._number = 0
-        self._state: int | None = None
         self.start = self._begun()
         return self.start
 
@@ -400,7 +441,7 @@ class Session:
             time=self.system.time,
             observation=tuple(seen.tolist()),
             here=self._place(seen),
-            revising=self.revising,
+            idle=self._idle(),
             cars=cars,
         )
         frame = self._end(frame) if self.system.over else self._decide(frame)
@@ -426,14 +467,14 @@ class Session:
         labels = self.system.labels
         if len(center) > _FEW:
             two = list(self.known().plane)
-            labels = Labels(names=tuple(labels.names[k] for k in two), dt=labels.dt)
-            center = center[two]
+            names, units = (tuple(each[k] for k in two if each) for each in labels[1:3])
+            labels, center = Labels(names=names, units=units, dt=labels.dt), center[two]
         return labels.place(center)
 
     def _begun(self) -> Start:
         system, actions = self.system, self._guard.actions
         low, high = limits(actions)
-        count = len(system.observation)
+        count, is_cars = len(system.observation), isinstance(system, OnRoads)
         return Start(
             system=system.name,
             about=system.about,
@@ -441,27 +482,24 @@ class Session:
             case=self.case,
             tolerance=self._tolerance,
             interval=system.interval,
-            names=tuple(system.labels.variable(k) for k in range(count)),
+            names=OF_CARS if is_cars else tuple(map(system.labels.variable, range(count))),
             low=numbers(low),
             high=numbers(high),
             discrete=isinstance(actions, Choices),
-            cars=isinstance(system, OnRoads),
+            cars=is_cars,
             learnt=self._guard.n_episodes,
             judge=name_judge(self.judge),
+            unjudged="no failure was known yet",
         )
 
     def _decide(self, frame: Frame) -> Frame:
-        guard, known = self._guard, self.machine.n_states
+        guard = self._guard
         revision = guard.decide(self.system.observation, self.system.propose(), frame.time)
         situation, judged = guard.situation, self._judged
         self.system.advance(revision)
-        created = self.machine.n_states > known
-        moved = self._state is not None and situation.state != self._state
-        self._state = situation.state
         return frame._replace(
             belief=most_believed(situation.belief),
             state=situation.state,
-            event="created" if created else "moved" if moved else "",
             proposed_risk=_judged(judged, 0),
             executed_risk=_judged(judged, 1),
             least_risk=float(judged.risk[2]),
@@ -469,6 +507,7 @@ class Session:
             executed=numbers(revision.executed),
             advised=numbers(revision.advised),
             revised=change(guard.actions, self._wanted, revision.executed) > _SAME,
+            advises=change(guard.actions, self._wanted, revision.advised) > _SAME,
             reason=revision.reason,
             explanation=revision.explanation,
             **self._needed(judged),
@@ -494,9 +533,12 @@ class Session:
         return {"needed": judge.margin, "why": why}
 
     def _end(self, frame: Frame) -> Frame:
-        system = self.system
+        system, before = self.system, self.known()
         self._guard.end(system.failed, system.observation, terminated=system.terminated)
-        return frame._replace(over=True, failed=system.failed)
+        novel = ""
+        if system.failed:
+            novel = first_of_its_kind(frame.observation, before, self.known())
+        return frame._replace(over=True, failed=system.failed, novel=novel)
 
 
 def _ignore(*told: Any, **named: Any) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from evofsm.fsm.model import FSMModel
 from evofsm.guard import LearningJudge, LearntRisk
 from evofsm.guard.harm import Harm
 from evofsm.guard.learnt.dynamics import Dynamics
+from evofsm.guard.learnt.regions import SIZE, inside
 from evofsm.guard.learnt.words import harm
 
 # The classic measures that are shown beside, with their thresholds.
@@ -29,6 +30,10 @@ _MOST_WAYS, _LEAST_SHARE = 3, 0.02
 # Observations of what was survived that are shown; of fewer failures nothing is said.
 _MOST_SURVIVED, _FEW = 500, 4
 
+#: A run that is driven now (`Start.mode`).
+LIVE = "live"
+#: What is observed of cars.
+OF_CARS = ("gap [m]", "follower's speed [m/s]", "leader's speed [m/s]")
 #: Danger is over once wishes were tolerable for so long [s].
 CALM = 2.0
 # A dead end: the best that can be done would as likely as not be too late.
@@ -41,10 +46,12 @@ class Danger(NamedTuple):
     """A stretch of time in which the controller's wishes were not tolerable."""
 
     began: Frame
-    last: float  #: time of the latest decision that was not tolerable [s]
-    stepped_in: Frame | None = None  #: in which the reviser first changed something
-    revised: int = 0  #: decisions that the reviser changed
-    decisions: int = 0
+    last: float  #: time of the latest wish that was not tolerable [s]
+    wishes: int = 0  #: that were not tolerable
+    revised: int = 0  #: of them, those that the reviser changed
+    advised: int = 0  #: of them, those that it changed, or would have
+    stepped_in: Frame | None = None  #: in which it first changed one
+    called: Frame | None = None  #: in which it first did, or would have
     hardest: float = math.inf  #: lowest acceleration of a car that was put through [m/s²]
     dead_end: float = math.nan  #: since when nothing would have been enough [s]
 
@@ -60,7 +67,9 @@ class Story(NamedTuple):
     time_headway: float = math.nan  #: the same of time headway [s]
     leader_brakes: float = math.nan  #: when the leader first braked hard [s]
     leader_decel: float = 0.0  #: how hard it has braked since, at most [m/s²]
+    closing: float = math.nan  #: how fast the gap closes; after a contact, as it did then [m/s]
     revised: int = 0  #: decisions that the reviser changed, in danger or not
+    advised: int = 0  #: decisions that it changed, or would have
     alone: float = math.nan  #: when the controller alone fails [s]; infinite if it does not
     failure: float = math.nan  #: [s]
 
@@ -90,12 +99,14 @@ class Start(NamedTuple):
     high: tuple[float, ...]
     learnt: int  #: episodes learnt from before
     judge: str  #: by what it was told, a name of `evofsm.driving.cars.TOLD`
+    mode: str = LIVE  #: or how far the reviser went as it was recorded, a name of `Mode`
+    unjudged: str = ""  #: why nothing is judged, where nothing is
+    fails: str = ""  #: who says that it failed, where a record does
     discrete: bool = False  #: whether an action is an index
     cars: bool = True  #: whether they are cars
     car_length: float = 5.0  #: as it is drawn; worlds need none [m]
     ttc_threshold: float = _TTC.threshold  #: time to collision below which it warns [s]
     headway_threshold: float = _HEADWAY.threshold  #: the same of time headway [s]
-    shadow: bool = False  #: recorded by a guard that changed nothing
     begins: float = 0.0  #: what was before is shown at once [s]
 
 
@@ -125,13 +136,12 @@ class Frame(NamedTuple):
     time: float  #: [s]
     observation: tuple[float, ...]
     here: str  #: the same in words
-    revising: bool  #: whether the reviser may act
+    idle: str = ""  #: why the reviser does not act; empty where it does
     cars: Cars | None = None  #: where they are, if it is cars
     story: Story = Story()  #: what has happened so far
     #: the most probable states, and how probable they are
     belief: tuple[tuple[int, float], ...] = ()
     state: int | None = None  #: the most probable one
-    event: str = ""  #: ``created``, ``moved``, or nothing
     proposed_risk: Judged = Judged()  #: of what the controller wants
     executed_risk: Judged = Judged()  #: of what is executed
     #: of full braking at once, or of the best that a learnt judge knows: high in a dead end
@@ -144,9 +154,11 @@ class Frame(NamedTuple):
     executed: tuple[float, ...] = ()
     advised: tuple[float, ...] = ()  #: what the reviser would execute, on or off
     revised: bool = False  #: whether the reviser changed what was proposed
+    advises: bool = False  #: or would have
     reason: str = ""  #: the reviser's
     explanation: str = ""  #: what the machine has seen of such situations
     failed: bool = False  #: whether the run ended here in failure
+    novel: str = ""  #: what was learnt, if no failure of this kind was known before
     over: bool = False  #: whether it ended here
 
 
@@ -241,6 +253,21 @@ def known_of(judge: LearningJudge) -> Known:
     )
 
 
+def first_of_its_kind(seen: Sequence[float], before: Known, after: Known) -> str:
+    """What was learnt of a failure there, if nothing told of such failures before; else nothing."""
+    now, known = _kinds(after, seen), _kinds(before)
+    return "" if not now or now & known or _kinds(before, seen) else after.told.partition(";")[0]
+
+
+def _kinds(known: Known, seen: Sequence[float] | None = None) -> set[tuple[float, float]]:
+    """Sides of variables, and pairs of them, that tell of failures; or of one that was seen."""
+    sides, pairs = known.thresholds, np.array(known.regions, np.float64).reshape(-1, SIZE)
+    if seen is not None:
+        sides = [(j, sign, at) for j, sign, at in sides if sign * (seen[j] - at) >= 0.0]
+        pairs = pairs[inside(pairs, np.array([seen]))[:, 0]]
+    return {(j, sign) for j, sign, _ in sides} | {(i, j) for i, j in pairs[:, :2].tolist()}
+
+
 def _no_better(known: Harm) -> str:
     """Where guarded episodes fail as often as those of the controller alone, and as soon."""
     each = [[one.steps for one in some if one.failed] for some in (known.guarded, known.alone)]
@@ -282,6 +309,7 @@ class Chronicle:
         self.story = story = story._replace(
             judged=story.judged or not math.isnan(frame.proposed_risk.risk),
             revised=story.revised + frame.revised,
+            advised=story.advised + frame.advises,
             failure=frame.time if frame.failed else math.nan,
         )
         if not frame.over:
@@ -311,26 +339,31 @@ def _on_the_road(story: Story, frame: Frame, cars: Cars) -> Story:
         return frame.time if math.isnan(at) and holds else at
 
     warns = cars.time_to_collision < _TTC.threshold
+    # A record may hold the speeds after the impact.
+    closing = cars.v_follower - cars.v_leader
     return story._replace(
         time_to_collision=first(story.time_to_collision, moves and warns),
         time_headway=first(story.time_headway, moves and cars.time_headway < near),
+        closing=closing if closing > 0.0 or not frame.failed else story.closing,
         leader_brakes=first(story.leader_brakes, brakes),
         leader_decel=max(story.leader_decel, -cars.a_leader if brakes else 0.0),
     )
 
 
 def _went_on(danger: Danger, frame: Frame, is_tolerable: bool) -> Danger:
-    if frame.revised:
-        danger = danger._replace(
-            stepped_in=danger.stepped_in or frame,
-            revised=danger.revised + 1,
-            hardest=min(danger.hardest, frame.executed[0]),
-        )
     dead_end = math.nan  # where it is over, or not known
     if frame.least_risk > _DEAD_END:
         dead_end = frame.time if math.isnan(danger.dead_end) else danger.dead_end
+    danger = danger._replace(dead_end=dead_end)
+    if is_tolerable:
+        return danger
+    if frame.revised:
+        hardest = min(danger.hardest, frame.executed[0])
+        danger = danger._replace(stepped_in=danger.stepped_in or frame, hardest=hardest)
     return danger._replace(
-        last=danger.last if is_tolerable else frame.time,
-        decisions=danger.decisions + 1,
-        dead_end=dead_end,
+        last=frame.time,
+        wishes=danger.wishes + 1,
+        revised=danger.revised + frame.revised,
+        advised=danger.advised + frame.advises,
+        called=danger.called or (frame if frame.advises else None),
     )

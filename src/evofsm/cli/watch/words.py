@@ -7,18 +7,27 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from evofsm.cli.watch.shown import Cars, Danger, Frame, Start, Story
-from evofsm.fsm.validation import action_name
+from evofsm.cli.watch.shown import LIVE, Cars, Danger, Frame, Start, Story
+from evofsm.fsm.validation import action_name, counted
 from evofsm.guard.actions import action_text
 
 # Changes of speed that are smaller are "at the same speed" [m/s], and softer accelerations none.
 _EQUAL, _HARDLY = 0.5, 0.3
+# What the reviser does in a run, or did in one that was recorded, by its mode.
+_REVISER = "This was recorded. The reviser, a safety filter,"
+_INTRODUCED = {
+    LIVE: "The reviser, a safety filter that learns on the way, replaces actions that it finds too "
+    "risky; switched off, it only watches.",
+    "act": f"{_REVISER} replaced actions that it found too risky.",
+    "off": f"{_REVISER} was off.",
+    "shadow": f"{_REVISER} did not act; it says which actions it would have replaced.",
+}
 # Components of an action that are told.
 _COMPONENTS = 3
 # A number and its unit stay on one line.
 _UNIT = re.compile(r"(?<=\d) (?=(?:s|m|m/s|m/s²)\b)")
 _HEADLINES = {
-    "unjudged": "Nothing is judged yet",
+    "unjudged": "Nothing is judged",
     "safe": "Safe",
     "danger": "Danger",
     "averted": "Danger, held off",
@@ -26,9 +35,9 @@ _HEADLINES = {
     "failure": "Failure",
     "ended": "No failure",
 }
-# Where there are cars, by whether the judge was told how leaders brake.
-_OF_CARS = {"failure": "Collision", "ended": "No collision"}
+# Where the judge was told how leaders brake.
 _OF_LEADERS = {"dead end": "Dead end, if the leader brakes hard now"}
+_FIRST = "A guard cannot prevent the first failure of a kind; this one is learnt now"
 
 
 class Told(NamedTuple):
@@ -43,43 +52,58 @@ class Told(NamedTuple):
     alone: str  #: what the controller would have come to by itself
 
 
+def introduce(start: Start) -> dict[str, str]:
+    """What is said of a run before it begins: what the reviser does in it, and what was learnt."""
+    before = f"Learnt from {start.learnt} episodes before" if start.learnt else "Began from empty"
+    learning = f"{before}, and goes on learning."
+    if start.mode != LIVE:
+        learning = "Recorded: the states as they were at its end."
+    return {"intro": _INTRODUCED.get(start.mode, _INTRODUCED["shadow"]), "learning": learning}
+
+
 def tell(frame: Frame, start: Start) -> Told:
     """What has happened up to a frame."""
     story, danger = frame.story, frame.story.danger
     knows_leaders = start.judge != "learnt"
-    status = _status(frame, start.tolerance, is_judged=story.judged or knows_leaders)
-    headlines = (
-        _HEADLINES | (_OF_CARS if frame.cars else {}) | (_OF_LEADERS if knows_leaders else {})
-    )
+    status = _status(frame, start.tolerance)
+    headlines = _HEADLINES | (_OF_LEADERS if knows_leaders else {})
+    if frame.cars:
+        headlines |= {"failure": start.fails or "Collision", "ended": "No collision"}
+    headline = headlines[status]
     if danger is None:
-        when = "No danger so far."
-        why, done = _no_danger(frame, knows_leaders), _quiet(story, knows_leaders)
+        when = "No danger was seen." if frame.over else "No danger so far."
+        why, done = _no_danger(frame, start), _quiet(frame, start)
     else:
-        when = _when(story, danger, knows_leaders)
-        why, done = _why(danger.began, start), _done(danger, frame, start)
-    if frame.failed and frame.revising and story.alone > frame.time:
+        when, why = _when(story, danger, knows_leaders), _why(danger.began, start)
+        done = _done(danger, frame, start)
+    if frame.over and danger and story.revised:
+        done += f" In all it changed {story.revised} of {counted(frame.number, 'decision')}."
+    if frame.failed and story.revised and story.alone > frame.time:
         done += " The controller alone would have lasted longer."
-    told = status, headlines[status], when, why, done, _outcome(frame), _alone(frame)
+    if frame.novel:
+        headline += ", the first of its kind"
+        done += f" {_FIRST}: {frame.novel}."
+    told = status, headline, when, why, done, _outcome(frame, start), _alone(frame)
     return Told(*(_UNIT.sub("\u00a0", text) for text in told))
 
 
-def _status(frame: Frame, tolerance: float, *, is_judged: bool) -> str:
+def _status(frame: Frame, tolerance: float) -> str:
     story = frame.story
     if frame.failed or (frame.cars and frame.cars.rear_ended):
         return "failure"
     if frame.over:
         return "ended"
     if not story.in_danger or story.danger is None:
-        return "safe" if is_judged else "unjudged"
+        return "safe" if story.judged else "unjudged"
     if not math.isnan(story.danger.dead_end):
         return "dead end"
-    return "averted" if frame.revising and frame.executed_risk.risk <= tolerance else "danger"
+    return "averted" if not frame.idle and frame.executed_risk.risk <= tolerance else "danger"
 
 
-def _no_danger(frame: Frame, knows_leaders: bool) -> str:
-    if not (knows_leaders or frame.story.judged):
-        return "Nothing was judged, for no failure was known yet."
-    if math.isnan(frame.needed) or not knows_leaders:  # which recordings do not hold
+def _no_danger(frame: Frame, start: Start) -> str:
+    if not frame.story.judged:
+        return f"Nothing was judged, for {start.unjudged}."
+    if math.isnan(frame.needed) or start.judge == "learnt":  # which recordings do not hold
         return "Nothing that was proposed was judged to be too risky."
     return (
         f"If the leader braked as hard as must be expected (up to {frame.needed:.1f} m/s²), "
@@ -87,21 +111,30 @@ def _no_danger(frame: Frame, knows_leaders: bool) -> str:
     )
 
 
-def _quiet(story: Story, knows_leaders: bool) -> str:
+def _quiet(frame: Frame, start: Start) -> str:
     """What was done where the judge saw no danger; classic measures may have."""
-    if story.revised == 0:
-        had = "Nothing had to be done" if story.judged or knows_leaders else "Nothing"
+    story = frame.story
+    if not story.advised:
+        had = "Nothing had to be done" if story.judged else "Nothing was done"
         return f"{had}: all that was proposed was carried out."
-    changed = f"The reviser changed {story.revised} decision{'s' * (story.revised != 1)}"
-    if not knows_leaders:
-        return f"{changed}, to survive all that it remembers by a margin."
-    return f"{changed}, though latent risk saw no danger."
+    why = ", though the risk was tolerable"
+    if not story.judged:
+        why = ", by a measure that knows no risk"
+    elif start.judge == "learnt":
+        why = ", to survive all that it remembers by a margin"
+    if story.revised:
+        return f"The reviser changed {counted(story.revised, 'decision')}{why}."
+    would = counted(story.advised, "decision")
+    return f"Nothing: {frame.idle}. It would have changed {would}{why}."
 
 
 def _when(story: Story, danger: Danger, knows_leaders: bool) -> str:
-    text = f"Danger began at {_seconds(danger.began.time)}"
+    began, last = _seconds(danger.began.time), _seconds(danger.last)
+    text = f"Danger began at {began}"
+    if story.first < danger.began.time:
+        text += f" (for the first time at {_seconds(story.first)})"
     if not story.in_danger:
-        return f"{text}; it was over at {_seconds(danger.last)}."
+        return f"{text}; it was over {'at once' if began == last else f'at {last}'}."
     if math.isnan(danger.dead_end):
         return f"{text}."
     what = "nothing that it knows to do would most likely have been enough"
@@ -116,15 +149,12 @@ def _why(began: Frame, start: Start) -> str:
     if cars is None:
         wanted = f"At {began.here}, the controller wanted {_action(began.proposed, start)}"
     else:
-        gap, speed, leader_speed = began.observation
-        closing = speed - leader_speed
+        closing = cars.v_follower - cars.v_leader
         pace = f"{abs(closing):.1f} m/s {'faster' if closing > 0.0 else 'slower'} than it"
         if abs(closing) <= _EQUAL:
             pace = "as fast as it"
-        wish = _wish(began.proposed[0])
-        wanted = (
-            f"{gap:.1f} m behind the leader at {speed:.0f} m/s, {pace}, the driver wanted to {wish}"
-        )
+        at = f"{cars.gap:.1f} m behind the leader at {cars.v_follower:.0f} m/s, {pace}"
+        wanted = f"{at}, the driver wanted {_wish(began.proposed[0])}"
     if began.why:
         return f"{wanted}: a risk of {risk.risk:.0%}. After that {began.why}."
     if cars is None or math.isnan(risk.critical):  # which recordings do not hold
@@ -137,40 +167,45 @@ def _why(began: Frame, start: Start) -> str:
 
 
 def _done(danger: Danger, frame: Frame, start: Start) -> str:
-    first, share = danger.stepped_in, f"{danger.revised} of {danger.decisions} decisions in danger"
-    if first is None:
-        if frame.revising:
-            return "The reviser has changed nothing yet."
-        began = danger.began
-        instead = _instead(began.advised, began.proposed, start)
-        why = "it only watched, in shadow mode" if start.shadow else "the reviser is off"
-        return f"Nothing: {why}. It would have begun at once, {instead}."
-    if not frame.revising:
-        return f"The reviser changed {share}, but now it is off."
-    hardest = ""
-    if frame.cars and danger.hardest < -_HARDLY:
-        hardest = f"; at its hardest it braked by {-danger.hardest:.1f} m/s²"
+    first, called = danger.stepped_in, danger.called
+    n = danger.wishes
+    risky = f"of {n} wishes that were too risky" if n > 1 else "wish that was too risky"
+    if first is not None:
+        hardest = ""
+        if frame.cars and danger.hardest < -_HARDLY:
+            hardest = f"; at its hardest it braked by {-danger.hardest:.1f} m/s²"
+        now = f". Now {frame.idle}" if frame.idle else ""
+        return (
+            f"The reviser stepped in at {_seconds(first.time)}, at first "
+            f"{_instead(first.executed, first.proposed, start)}. "
+            f"It changed {danger.revised} {risky}{hardest}{now}."
+        )
+    if called is None:
+        idle = f"{frame.idle}, and it" if frame.idle else "the reviser"
+        return f"Nothing: {idle} knew nothing better."
     return (
-        f"The reviser stepped in at {_seconds(first.time)}, at first "
-        f"{_instead(first.executed, first.proposed, start)}. It changed {share}{hardest}."
+        f"Nothing: {frame.idle}. From {_seconds(called.time)} on it would have changed "
+        f"{danger.advised} {risky}, at first {_instead(called.advised, called.proposed, start)}."
     )
 
 
-def _wish(
-    acceleration: float, faster: str = "accelerate by", slower: str = "brake by", kept: str = "keep"
-) -> str:
-    if acceleration > _HARDLY:
-        return f"{faster} {acceleration:.1f} m/s²"
-    if acceleration < -_HARDLY:
-        return f"{slower} {-acceleration:.1f} m/s²"
-    return f"{kept} about its speed ({acceleration:+.1f} m/s²)"
+def _wish(acceleration: float) -> str:
+    if math.isnan(acceleration):
+        return "what is not known"
+    if abs(acceleration) <= _HARDLY:
+        return f"to keep about its speed ({_signed(acceleration)})"
+    return f"to {'accelerate' if acceleration > 0.0 else 'brake'} by {abs(acceleration):.1f} m/s²"
+
+
+def _signed(acceleration: float) -> str:
+    return f"{acceleration:+.1f} m/s²".replace("-", "−")
 
 
 def _instead(better: Sequence[float], wished: Sequence[float], start: Start) -> str:
     if not start.cars:
         return f"{_action(better, start)} instead of {_action(wished, start)}"
-    wishing = _wish(wished[0], "accelerating by", "braking by only", "keeping")
-    return f"to {_wish(better[0])} instead of {wishing}"
+    instead = "what is not known" if math.isnan(wished[0]) else _signed(wished[0])
+    return f"{_wish(better[0])} instead of {instead}"
 
 
 def _action(action: Sequence[float], start: Start) -> str:
@@ -182,25 +217,26 @@ def _action(action: Sequence[float], start: Start) -> str:
     return text if len(action) <= _COMPONENTS else f"{text[:-1]}, ...)"
 
 
-def _outcome(frame: Frame) -> str:
+def _outcome(frame: Frame, start: Start) -> str:
     when, cars = _seconds(frame.time), frame.cars
     if cars is not None:
-        return _on_the_road(frame, cars)
+        return _on_the_road(frame, cars, start)
     if frame.over:
         return f"Failed at {when}." if frame.failed else f"It ended at {when} without failure."
     return ""
 
 
-def _on_the_road(frame: Frame, cars: Cars) -> str:
-    story, parts = frame.story, []
+def _on_the_road(frame: Frame, cars: Cars, start: Start) -> str:
+    story, parts, when = frame.story, [], _seconds(frame.time)
     if not math.isnan(story.leader_brakes):
-        when = _seconds(story.leader_brakes)
-        parts.append(f"The leader braked from {when} on, by up to {story.leader_decel:.1f} m/s².")
+        since = _seconds(story.leader_brakes)
+        parts.append(f"The leader braked from {since} on, by up to {story.leader_decel:.1f} m/s².")
     if frame.failed:
-        impact = cars.v_follower - cars.v_leader
-        parts.append(f"Collision at {_seconds(frame.time)}, {impact:.1f} m/s too fast.")
+        pace = f", {story.closing:.1f} m/s faster than the leader" if story.closing > 0.0 else ""
+        where = f", {cars.gap:.1f} m behind it" if cars.gap > 0.0 else ""
+        parts.append(f"{start.fails or 'Collision'} at {when}{pace}{where}.")
     elif cars.rear_ended:
-        parts.append(f"The car behind ran into the follower at {_seconds(frame.time)}.")
+        parts.append(f"The car behind ran into the follower at {when}.")
     elif frame.over and cars.v_follower == 0.0:
         parts.append(f"No collision: stopped {cars.gap:.1f} m behind the leader.")
     elif frame.over:

@@ -4,7 +4,7 @@ import { readColours, seconds } from "./paint.js";
 import { drawPlots, placeOf, span, timeAt } from "./plots.js";
 import { drawRoad } from "./road.js";
 import { Run } from "./run.js";
-import { drawBelief, drawPlane, placeHere } from "./plane.js";
+import { drawBelief, drawPlane, marksDeadEnds, placeHere } from "./plane.js";
 
 const at = (id) => document.getElementById(id);
 const run = new Run();
@@ -46,6 +46,8 @@ const send = (what, value) => {
 // -- What is shown as words and controls ------------------------------------------------------------
 
 function showStart(start) {
+  document.title = `${start.system}: evofsm`;
+  at("intro").textContent = start.intro;
   at("about").textContent = `Here ${start.cases[start.case] ?? "a run"} of “${start.system}”: ${start.about}`;
   at("of-cases").textContent = start.live ? "Case" : "Episode";
   at("case").replaceChildren(...start.cases.map((name, k) => new Option(name, k, false, k === start.case)));
@@ -53,6 +55,7 @@ function showStart(start) {
   for (const id of ["across", "up"]) at(id).replaceChildren(...start.names.map((name, k) => new Option(name, k)));
   for (const element of document.querySelectorAll("[data-live]")) element.hidden = !start.live;
   for (const element of document.querySelectorAll("[data-judge]")) element.hidden = element.dataset.judge !== start.judge;
+  for (const element of document.querySelectorAll("[data-ends]")) element.hidden = element.dataset.ends !== String(marksDeadEnds(start));
   for (const element of document.querySelectorAll("[data-cars]")) element.hidden = !start.cars;
   document.body.classList.toggle("cars", start.cars);
   at("experience").textContent = "";
@@ -71,14 +74,13 @@ function showKnown(known) {
 
 /** How much it knew, and what the plane shows. */
 function learnt(start, known) {
-  const before = start.learnt ? `Learnt from ${start.learnt} episodes before, and goes on.` : "Began from empty, and goes on learning.";
   const signs = ["+ now, blue: its way", "○ state"];
   if (known.survived.length) signs.push("· survived");
   if (known.failed.length) signs.push("✕ failed");
   if (known.regions.length + known.thresholds.length) signs.push("shaded: expected to fail");
   if (known.dead_ends.length) signs.push("dashed: dead end");
-  signs.push(start.live && start.judge !== "learnt" ? "⬢ dead end" : "⬢ state in which it failed");
-  return `${start.live ? before : "Recorded: the states as they were at its end."} ${signs.join(", ")}.`;
+  signs.push(marksDeadEnds(start) ? "⬢ dead end" : "⬢ state in which it failed");
+  return `${start.learning} ${signs.join(", ")}.`;
 }
 
 function showControls() {
@@ -92,7 +94,7 @@ function showControls() {
 
 function showMode() {
   at("live").hidden = run.isLive;
-  const recorded = !run.start || run.start.live ? "live" : run.start.shadow ? "shadow" : "recorded";
+  const recorded = run.start.mode === "act" ? "recorded" : run.start.mode;
   const mode = !run.isLive ? "past" : run.clock.over ? "ended" : run.clock.paused ? "paused" : recorded;
   if (socket.readyState === WebSocket.OPEN) at("mode").textContent = mode;
   at("time").textContent = seconds(run.shown);
@@ -112,7 +114,7 @@ function showStory() {
   for (const part of ["when", "why", "done", "outcome", "alone"]) write(part, frame.told[part]);
   const decision = run.decision;
   write("decision", `${decision.here}; ${decision.reason}`);
-  write("experience", decision.explanation || "nothing yet");
+  write("experience", decision.explanation);
 }
 
 /** Only what is new, so that screen readers say only that. */
@@ -197,7 +199,8 @@ function setTheme(isDark) {
   changed = true;
 }
 dark.addEventListener("change", () => setTheme(dark.matches));
-new ResizeObserver(() => { changed = true; }).observe(document.body);
+const resized = new ResizeObserver(() => { changed = true; });
+for (const canvas of document.querySelectorAll("canvas")) resized.observe(canvas);
 
 // -- Every frame of the screen ----------------------------------------------------------------------
 

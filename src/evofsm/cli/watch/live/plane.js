@@ -8,11 +8,14 @@ const APART = [20, 16]; // of two numbers, or of what a circle would cover of on
 const EDGE = { left: 44, right: 14, top: 18, bottom: 34 };
 const CELL = 4; // of the grid on which regions are drawn [px]
 
+/** Whether states are marked that are dead ends; else those in which it failed. */
+export const marksDeadEnds = (start) => start.live && start.judge !== "learnt";
+
 export function drawBelief(list, run) {
   const decision = run.decision, graph = run.graph;
   if (!decision || !graph) return;
   const likely = decision.belief.slice(0, MOST_BARS);
-  const marked = run.start.live && run.start.judge !== "learnt" ? "dead end" : "it failed here";
+  const marked = marksDeadEnds(run.start) ? "dead end" : "it failed here";
   while (list.children.length < MOST_BARS) list.append(bar());
   [...list.children].forEach((item, k) => {
     const [state, share] = likely[k] ?? [null, 0];

@@ -9,17 +9,18 @@ const LEAST_HEIGHT = 104; // of a panel [px]
 
 /** What is drawn in each panel; `value` answers a frame's value, null where there is none. */
 function panels(run) {
-  const { start } = run, cars = start.cars;
+  const { start } = run, cars = start.cars, acts = start.live || start.mode === "act";
   const percent = (value) => `${Math.round(100 * value)} %`;
   const { follower, leader, danger, third, soft } = colour;
   const wish = (value) => ({ label: cars ? "driver's wish" : "proposed", ink: danger, width: 2.5, dash: [], value });
   const executed = (value) => ({ label: "executed", ink: follower, width: 2, dash: [5, 3], value });
+  const advised = (k) => (acts ? executed((f) => f.executed[k]) : { ...executed((f) => f.advised[k]), label: "advised" });
   const changed = (k) => ({ ...wish((f) => (f.revised ? f.proposed[k] : null)), label: "proposed, where changed", dots: true });
   const byLeaders = start.judge !== "learnt", fails = cars ? "collision" : "failure";
   const risk = {
     title: "Risk", about: `${byLeaders ? "of collision if the leader brakes now" : `that ${fails} can't be avoided any more`}; ${percent(start.tolerance)} is accepted`,
     low: 0, high: 1, ticks: [0, 0.5, 1], show: percent,
-    lines: [wish((f) => f.proposed_risk.risk), executed((f) => f.executed_risk.risk)],
+    lines: [wish((f) => f.proposed_risk.risk), ...(acts ? [executed((f) => f.executed_risk.risk)] : [])],
     bands: [{ ink: colour.band, ends: ({ proposed_risk: { low, high } }) => (high === null || high - low > MOST_BAND ? null : [low, high]) }],
     limits: [{ at: start.tolerance, ink: soft }],
   };
@@ -49,7 +50,7 @@ function panels(run) {
     return {
       title: cars ? "Acceleration" : several > 1 ? `Action ${k + 1} of ${several}` : "Action", about: cars ? "m/s²" : "",
       low: low - pad, high: high + pad, ticks, show: start.discrete ? (value) => `a(${value + 1})` : shown,
-      lines: cars ? [wish((f) => f.proposed[k]), executed((f) => f.executed[k])] : [{ ...executed((f) => f.executed[k]), width: 1.4, dash: [] }, changed(k)],
+      lines: cars ? [wish((f) => f.proposed[k]), advised(k)] : [{ ...executed((f) => f.executed[k]), width: 1.4, dash: [] }, changed(k)],
       steps: !cars,
       bands: [], limits: low < 0 && high > 0 ? [{ at: 0, ink: soft }] : [],
     };
@@ -98,7 +99,11 @@ export function drawPlots(canvas, run) {
     drawFrame(pen, panel, box, y, width);
     for (const band of panel.bands) drawBand(pen, visible, band, x, y);
     for (const one of panel.lines) drawLine(pen, visible, one, x, y, panel.steps);
+    if (!visible.some((frame) => panel.lines.some((one) => (one.value(frame) ?? null) !== null))) {
+      text(pen, "nothing is judged", (LEFT + width) / 2, (box.top + box.bottom) / 2, { align: "center", ink: colour.soft });
+    }
   });
+  canvas.setAttribute("aria-label", `${all.map((panel) => panel.title).join(", ")} over time`);
   drawTimes(pen, x, most, bottom);
   drawMarks(pen, marks, x, top, bottom);
   // Words come last, on ground of their own, so that no mark strikes them through.
@@ -111,12 +116,12 @@ export function drawPlots(canvas, run) {
 function marksOf(frame) {
   const story = frame.story;
   return [
-    { at: story.first, label: "▲ danger began", ink: colour.danger },
+    { at: story.first, label: "▲ first danger", ink: colour.danger },
     { at: story.time_headway, label: "time headway warns", ink: colour.third },
     { at: story.dead_end, label: "⬢ dead end", ink: colour.danger },
     { at: story.leader_brakes, label: "leader brakes", ink: colour.ink },
     { at: story.time_to_collision, label: "time to collision warns", ink: colour.leader },
-    { at: story.failure, label: frame.cars ? "✕ collision" : "✕ failure", ink: colour.danger },
+    { at: story.failure, label: `✕ ${frame.told.headline.match(/\w+/)[0].toLowerCase()}`, ink: colour.danger },
   ].filter((mark) => mark.at !== null).map((mark) => ({ ...mark, label: `${mark.label} ${seconds(mark.at)}` }));
 }
 
@@ -127,8 +132,8 @@ function place(pen, marks, x, width) {
   for (const mark of marks) {
     const wide = pen.measureText(mark.label).width + 12;
     mark.wide = wide;
-    mark.right = x(mark.at) + wide > width;
-    const [from, to] = mark.right ? [x(mark.at) - wide, x(mark.at)] : [x(mark.at), x(mark.at) + wide];
+    const from = Math.max(0, Math.min(x(mark.at), width - wide)), to = from + wide;
+    mark.from = from;
     mark.row = rows.findIndex((taken) => taken.every(([a, b]) => to < a || from > b));
     if (mark.row < 0) mark.row = rows.push([]) - 1;
     rows[mark.row].push([from, to]);
@@ -143,11 +148,8 @@ function drawMarks(pen, marks, x, top, bottom) {
   }
   for (const mark of marks) {
     pen.fillStyle = colour.panel;
-    const wide = mark.wide - 7;
-    pen.fillRect(x(mark.at) + (mark.right ? -wide - 2 : 2), y(mark) - 7, wide, 14);
-    text(pen, mark.label, x(mark.at) + (mark.right ? -4 : 4), y(mark), {
-      size: 11, bold: true, ink: mark.ink, align: mark.right ? "right" : "left",
-    });
+    pen.fillRect(mark.from + 2, y(mark) - 7, mark.wide - 7, 14);
+    text(pen, mark.label, mark.from + 4, y(mark), { size: 11, bold: true, ink: mark.ink });
   }
 }
 

@@ -50,7 +50,7 @@ export function drawRoad(canvas, run) {
     size, bold: true, align: "right", ink: colour.leader,
   });
   const frame = run.frame;
-  if (frame.failed) drawCollision(pen, front, middle, carHeight);
+  if (frame.failed && frame.told.headline.startsWith("Collision")) drawCollision(pen, front, middle, carHeight);
   if (frame.cars.rear_ended) drawCollision(pen, front - length * scale, middle, carHeight);
   canvas.setAttribute("aria-label", `${left}. ${right}. Gap ${Math.max(0, motion.gap).toFixed(1)} metres.`);
 }
