@@ -1,8 +1,10 @@
+import faulthandler
 import hashlib
 import io
 import json
 import re
 import shutil
+from contextlib import contextmanager
 from html import unescape
 from html.parser import HTMLParser
 
@@ -46,6 +48,21 @@ def sumo_road():
         )
 
     return write
+
+
+@pytest.fixture(scope="session")
+def ends_in_time():
+    """Ends the process where something takes a minute: nothing interrupts compiled loops."""
+
+    @contextmanager
+    def within():
+        faulthandler.dump_traceback_later(60.0, exit=True)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+
+    return within
 
 
 @pytest.fixture(scope="session")

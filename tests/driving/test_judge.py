@@ -113,6 +113,14 @@ def test_some_are_never_hit_and_some_for_sure(asked, hardest):
     assert critical(*asked) == hardest
 
 
+@given(asked=st.tuples(*[st.floats(-1e100, 1e100)] * 4), decel=st.floats(5e-324, 1e100))
+@example(asked=(1e30, 1e18, 0.0, 0.0), decel=4.0)
+@example(asked=(1e100, 1e100, 1e-300, 1.0), decel=5e-324)
+def test_a_rehearsal_of_any_numbers_ends(asked, decel, ends_in_time):
+    with ends_in_time():
+        assert 0.0 <= critical(*asked, decel=decel) <= HARDEST
+
+
 @given(GAPS, SPEEDS, ACTIONS, st.floats(-0.3, -1e-9))
 def test_a_sensor_that_shows_a_standing_car_as_rolling_back_changes_nothing(
     gap, speed, action, rolling

@@ -116,39 +116,28 @@ static double drive_on(double *speed, double acceleration) {
   return reached >= 0.0 ? 0.5 * (was + reached) * EVOFSM_INTERVAL : -0.5 * was * was / acceleration;
 }
 
-/* Whether no collision comes of an acceleration and full braking after it. At most STEPS steps: a
-   car of 150 m/s stands by then. Of what is faster nothing is believed. */
+/* Whether no collision comes of an acceleration and full braking after it. */
 static int survives(const double here[3], double acceleration, double before, double leader_decel) {
   const double caution = -DECEL;
   double gap = here[0] - CLEARANCE, speed = greater(here[1], 0.0), leader = greater(here[2], 0.0);
   double asked = greater(acceleration, caution), last = greater(before, caution);
+  double left, closing;
   int t;
   if (speed <= 0.0 && greater(asked, last) <= 0.0) {
     return here[0] > 0.0;
   }
-  for (t = 0; t < STEPS && gap > 0.0; t++) {
-    const double realised = LAG * last + (1.0 - LAG) * asked;
-    double driven, driven_by_leader;
-    if (speed <= 0.0 && realised <= 0.0 && asked == caution) {
-      return 1;
-    }
-    driven = drive_on(&speed, realised);
-    driven_by_leader = drive_on(&leader, -leader_decel);
-    gap += driven_by_leader - driven;
-    if (asked == caution && last == caution) { /* both brake until they stand */
-      if (leader_decel > DECEL) {
-        const double rest = 0.5 * leader * leader / leader_decel;
-        const double left = gap + rest - 0.5 * speed * speed / DECEL;
-        return lesser(gap, left) > 0.0;
-      }
-      if (speed <= leader) {
-        return gap > 0.0;
-      }
-    }
+  for (t = 0; t < 2 && gap > 0.0 && !(asked == caution && last == caution); t++) {
+    const double driven = drive_on(&speed, LAG * last + (1.0 - LAG) * asked);
+    gap += drive_on(&leader, -leader_decel) - driven;
     last = asked;
     asked = caution;
   }
-  return 0;
+  if (leader_decel >= DECEL || speed * leader_decel > leader * DECEL) {
+    left = 0.5 * leader * leader / leader_decel - 0.5 * speed * speed / DECEL;
+    return gap + lesser(left, 0.0) > 0.0;
+  }
+  closing = greater(speed - leader, 0.0);
+  return gap - 0.5 * closing * closing / (DECEL - leader_decel) > 0.0;
 }
 
 /* The hardest braking of the leader that is survived [m/s²]. */

@@ -23,7 +23,7 @@ from evofsm import store
 from evofsm.driving import perception, rehearsal
 from evofsm.driving.brakes import OwnBrakes, hardest_seen
 from evofsm.driving.leaders import BrakeWatch, LeaderBrakes, Manoeuvres
-from evofsm.driving.naming import LABELS
+from evofsm.driving.naming import LABELS, RANGES
 from evofsm.driving.perception import Perception, is_whole
 from evofsm.driving.rehearsal import HARDEST, Body, Three, critical_decelerations
 from evofsm.driving.revisers import GENTLE_BRAKE
@@ -54,8 +54,6 @@ if TYPE_CHECKING:
 _STANDS = 0.1
 # Where a situation is not sure, it may be worse by so many standard deviations.
 _CAUTION = 2.5
-# In C rehearsals are bounded, and long enough for such a speed [m/s].
-_FASTEST = 150.0
 
 
 # -- What a file may hold -------------------------------------------------------------------------
@@ -129,7 +127,7 @@ class LatentRisk:
     (array([1., 1.]), 0.0)
     """
 
-    labels = LABELS
+    labels, ranges = LABELS, RANGES
     fallback = GENTLE_BRAKE
 
     def __init__(
@@ -280,16 +278,13 @@ class LatentRisk:
         higher the risk. Where nothing was seen before either, every risk is 1.
         """
         here = self._cautious(situation.observation)
-        actions = _series("accelerations", accelerations)
+        actions = _finite("accelerations", accelerations)
         table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
         if not is_whole(here):  # where one is cannot be told: nothing can be survived for sure
-            sure = np.ones(len(_finite("accelerations", actions)))
+            sure = np.ones(len(actions))
             return Judgement(sure, 0.0 * sure, sure, 0.0 * sure, evidence, situation.seen)
         judged = np.empty((4, len(actions)))
-        if not _judge(
-            here, actions, self._commands[1], *self.body, self.dt, table, evidence, judged
-        ):
-            refuse_unusable("accelerations", actions)
+        _judge(here, actions, self._commands[1], self.body, self.dt, table, evidence, judged)
         risk, low, high, critical = judged
         return Judgement(risk, low, high, critical, evidence, situation.seen)
 
@@ -381,12 +376,9 @@ class LatentRisk:
         from evofsm.guard.export import Part
 
         lowest, highest = nearest_bounds(reviser.actions)
-        decel, quickest = self.brakes.decel, max(float(highest[0]), 0.0)
-        fastest = _FASTEST + 2.0 * quickest * self.dt
         constants = {
-            **{"DECEL": decel, "LAG": self.brakes.lag, "LIKELY": self.brakes._likely},
+            **{"DECEL": self.brakes.decel, "LAG": self.brakes.lag, "LIKELY": self.brakes._likely},
             **{"KNOWN": self.brakes.known, "LOWEST": self.lowest, "CLEARANCE": self.margin},
-            "STEPS": math.ceil(fastest / (decel * self.dt)) + 4,
             **{"HARDEST": HARDEST, "HALVINGS": rehearsal._HALVINGS, "STANDS": _STANDS},
             **{"LEADER": perception._LEADER, "UNEVEN": perception._UNEVEN, "CAUTION": _CAUTION},
             "DOUBT": perception._OWN if self.brakes.known else perception._OWN_UNKNOWN,
@@ -397,8 +389,7 @@ class LatentRisk:
         }
         about = (
             f"{self.told_by_experience}\na decision: at most {len(lowest)} options times "
-            f"{rehearsal._HALVINGS + 2} rehearsals of {constants['STEPS']} steps, enough for "
-            f"{_FASTEST:g} m/s; what would take more is taken for a collision\n"
+            f"{rehearsal._HALVINGS + 2} rehearsals of 2 steps\n"
         )
         return Part(Path(__file__).with_suffix(".c"), 3, {"OPTIONS": len(lowest)}, constants, about)
 
@@ -505,15 +496,12 @@ def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
 def _one_finite(name: str, value: float) -> float:
     if type(value) is float and abs(value) <= LARGEST_OBSERVATION:  # false of NaN
         return value
-    given = _series(name, [value])
-    refuse_unusable(name, given)
-    return float(given[0])
+    return float(_finite(name, [value])[0])
 
 
 def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
     array = _series(name, values)
-    if not np.isfinite(array).all():
-        refuse_unusable(name, array)
+    refuse_unusable(name, array)
     return array
 
 
@@ -535,24 +523,17 @@ def _judge(
     observation: Three,
     accelerations: NDArray[np.float64],
     before: float,
-    decel: float,
-    lag: float,
-    margin: float,
+    body: Body,
     dt: float,
     table: NDArray[np.float64],
     evidence: float,
     judged: NDArray[np.float64],
-) -> bool:
-    """Write risk, its interval and the critical deceleration; False if an action is no number."""
-    for acceleration in accelerations:
-        if not np.isfinite(acceleration):
-            return False
-    body = Body(decel, lag, margin)
+) -> None:
+    """Write risk, its interval and the critical deceleration."""
     critical_decelerations(observation, accelerations, before, body, dt, judged[3])
     for k in range(len(accelerations)):
         judged[0, k] = _interpolated(judged[3, k], table)
         judged[1, k], judged[2, k] = wilson_bounds(judged[0, k], evidence + 1.0)
-    return True
 
 
 @inner_kernel

@@ -16,11 +16,14 @@ from evofsm.guard.record import RECORD, Column
 
 #: What is observed of car following, and its units.
 VARIABLES, UNITS = ("gap", "v_follower", "v_leader"), ("m", "m/s", "m/s")
+#: What a speed of a car [m/s] can be, and what these three.
+SPEEDS = -150.0, 150.0
+RANGES = (-1e3, 1e6), SPEEDS, SPEEDS
 
 # Up to these a gap [m] and a speed [m/s] are called so.
 Bands = Sequence[tuple[float, str]]
-_GAPS = ((2.0, "nearly touching"), (15.0, "close"), (40.0, "at a distance"), (math.inf, "far"))
-_SPEEDS = ((0.5, "standing"), (8.0, "slow"), (20.0, "at medium speed"), (math.inf, "fast"))
+_NEAR = ((2.0, "nearly touching"), (15.0, "close"), (40.0, "at a distance"), (math.inf, "far"))
+_FAST = ((0.5, "standing"), (8.0, "slow"), (20.0, "at medium speed"), (math.inf, "fast"))
 # Speeds that differ by less are called equal [m/s].
 _EQUAL = 0.5
 
@@ -38,7 +41,7 @@ def name_state(center: ArrayLike, decimals: int = 0) -> str:
     change = f"{'closing' if closing > 0.0 else 'opening'} at {abs(closing):.{decimals}f} m/s"
     if abs(closing) < _EQUAL and decimals == 0:
         change = "at equal speeds"
-    places = _placed(gap, _GAPS, decimals, "m"), _placed(speed, _SPEEDS, decimals, "m/s")
+    places = _placed(gap, _NEAR, decimals, "m"), _placed(speed, _FAST, decimals, "m/s")
     return ", ".join([*places, change])
 
 

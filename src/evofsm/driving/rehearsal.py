@@ -81,22 +81,20 @@ def survives(
     last = max(before, caution)
     if speed <= 0.0 and max(asked, last) <= 0.0:
         return bool(observation[0] > 0.0)  # who stands, and stays, may be closer than the margin
-    while gap > 0.0:
-        realised = body.lag * last + (1.0 - body.lag) * asked
-        if speed <= 0.0 and realised <= 0.0 and asked == caution:
-            return True
-        distance, speed = _drive_on(speed, realised, dt)
+    for _ in range(2):  # until full braking rules alone
+        if gap <= 0.0 or (asked == caution and last == caution):
+            break
+        distance, speed = _drive_on(speed, body.lag * last + (1.0 - body.lag) * asked, dt)
         leader_distance, leader_speed = _drive_on(leader_speed, -leader_decel, dt)
         gap += leader_distance - distance
-        if asked == caution and last == caution:  # both brake until they stand
-            if leader_decel > body.decel:  # then the gap is smallest at the end, if it shrinks
-                leader_distance = 0.5 * leader_speed * leader_speed / leader_decel
-                left = gap + leader_distance - 0.5 * speed * speed / body.decel
-                return bool(min(gap, left) > 0.0)
-            if speed <= leader_speed:  # a faster leader who brakes less is never met
-                return bool(gap > 0.0)
         last, asked = asked, caution
-    return False
+    # Both brake until they stand: the gap is smallest at the end, if it shrinks until then, ...
+    if leader_decel >= body.decel or speed * leader_decel > leader_speed * body.decel:
+        leader_distance = 0.5 * leader_speed * leader_speed / leader_decel
+        left = leader_distance - 0.5 * speed * speed / body.decel
+        return bool(gap + min(left, 0.0) > 0.0)
+    closing = max(speed - leader_speed, 0.0)  # ... or where they are as fast as each other
+    return bool(gap - 0.5 * closing * closing / (body.decel - leader_decel) > 0.0)
 
 
 @kernel
