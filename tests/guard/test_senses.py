@@ -1,10 +1,14 @@
 """Observations that are late, come twice, after a gap in time, or with a sensor missing."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from evofsm.driving import Object, Scene, guard_for_cars, guard_for_traffic
 from evofsm.driving.drivers import IDM
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.measures import TimeToCollision
@@ -18,6 +22,7 @@ from evofsm.fsm.rules import Novelty
 from evofsm.guard.api import Intake, Proposal
 from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser
+from evofsm.guard.scene import SceneRisk
 
 NAN = math.nan
 ACTIONS = IntervalActions(low=-4.0, high=2.5, width=0.5, outside="clip")
@@ -134,6 +139,48 @@ def test_it_drives_on_when_sensors_fail_now_and_then(learn, policy):
     before = watch.machine.endings.sum()
     watch.end(failed=True, observation=[NAN, 10.0, 0.0])  # unseen
     assert watch.machine.endings.sum() == before + learn
+
+
+LARGE = (5e-324, 1e-300, 1e-160, 150.0, 1e3, 1e6, 1e15, 1e18, 1e29, 1e30)
+ODD = st.sampled_from([*LARGE, *np.negative(LARGE), -0.0]) | st.floats(-200.0, 200.0) | st.floats()
+
+
+@cache
+def odd(kind):
+    """A guard that knows of failures, and what it might observe."""
+    if kind == "cars":
+        return guard_for_cars(-4.0, 2.5), [30.0, 20.0, 18.0]
+    if kind == "traffic":
+        seen = Scene(Object("", 0.0, 0.0, 20.0), [Object("", 30.0, 0.5, 10.0)]).rows(1)
+        return guard_for_traffic(-9.0, 2.6, 4.5, 0.1), seen.tolist()
+    judge, m = (SceneRisk(1.0, 3, columns=4), 12) if kind == "scene" else (None, 2)
+    actions = {"low": 0.0, "high": 2.0} if judge is None else {"n_actions": 3}
+    taught, random = Guard(**actions, interval=1.0, judge=judge), np.random.default_rng(0)
+    for _ in range(5):
+        for step in np.linspace(0.0, 1.0, 30):
+            taught.decide(random.normal(step, 0.1, m), 0)
+        taught.end(failed=True, observation=np.ones(m))
+    return taught, [1.0] * m
+
+
+@pytest.mark.parametrize("kind", ["cars", "traffic", "learnt", "scene"])
+@settings(max_examples=50)
+@given(data=st.data())
+def test_whatever_is_seen_is_decided_in_time_or_refused_by_name(kind, data, ends_in_time):
+    taught, usual = odd(kind)
+    changed = st.dictionaries(st.integers(0, len(usual) - 1), ODD, max_size=4)
+    rows = data.draw(st.lists(st.tuples(changed, st.none() | st.integers(0, 2)), max_size=5))
+    twin = taught.copy()
+    with ends_in_time():
+        for row, proposal in rows:
+            seen = [row.get(k, value) for k, value in enumerate(usual)]
+            try:
+                executed, said = twin.decide(seen, proposal).executed, "must lie between"
+            except ValueError as error:
+                executed, said = twin.decide(usual, proposal).executed, str(error)
+            assert "must lie between" in said
+            assert twin.actions.low <= executed <= twin.actions.high
+        twin.end(failed=True)
 
 
 def test_rejecting_is_an_error_that_names_the_variables():

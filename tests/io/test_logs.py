@@ -458,6 +458,16 @@ def test_where_fields_end_at_a_semicolon_numbers_may_have_a_decimal_comma(tmp_pa
     assert "line 6, column 'gap': '1.000,5' is no number" in refusal(bad)
 
 
+@pytest.mark.parametrize(
+    ("row", "nobody"),
+    [("p,0.3,1e30,10,11,0,0", "gap>1e6"), ("p,0.3,9,10,-151,0,0", "v_leader<-150")],
+)
+def test_what_no_car_can_do_is_refused_unless_it_stands_for_nobody(tmp_path, row, nobody):
+    path = write(tmp_path / "a.csv", [*short([9, 8, 7]), row], SHORT)
+    assert re.search("line 5, column .* cannot be right .* in SI it lies", refusal(path))
+    assert together(path, no_leader=nobody)[0] == [9, 8, 7]
+
+
 # -- Dates and units -------------------------------------------------------------------------------
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.driving.judge import LatentRisk
+from evofsm.driving.naming import SPEEDS
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.validation import real_array
@@ -29,6 +30,8 @@ _Floats = NDArray[np.float64]
 
 #: What a row of a scene holds; the first is 1 where the row is in use.
 COLUMNS = ("present", "x", "y", "vx", "vy", "length", "width")
+#: Nothing on a road is farther away, or larger [m].
+PLACES, SIZES = (-1e9, 1e9), (0.0, 1e3)
 
 # Who will be in one's path within this time at the present lateral speed cuts in, or crosses [s].
 _AHEAD = 2.0
@@ -194,6 +197,7 @@ class TrafficRisk(ActionJudge):
     """
 
     fallback = Fallback(0.0, "keeping the speed")
+    ranges = (0.0, 1.0), PLACES, PLACES, SPEEDS, SPEEDS, SIZES, SIZES
 
     def __init__(self, ahead: LatentRisk, low: float, high: float) -> None:
         if not -math.inf < low < 0.0 < high < math.inf:

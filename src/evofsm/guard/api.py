@@ -137,7 +137,9 @@ class Trial(NamedTuple):
 class ActionJudge(Protocol):
     """Anything that can be asked how dangerous an action is, whatever system it knows.
 
-    Actions come as a (k,) array, of `BoxActions` as a (k, d) one.
+    Actions come as a (k,) array, of `BoxActions` as a (k, d) one. One that knows what the variables
+    of an observation can be may say so as ``ranges``, (least, most) of each, of more in turn: a
+    guard refuses all else.
     """
 
     #: What it calls the variables of an observation.

@@ -10,6 +10,7 @@ import copy
 import math
 import warnings
 from collections.abc import Callable, Mapping
+from functools import cache
 from io import BytesIO
 from typing import Any, Protocol, Self
 
@@ -23,7 +24,7 @@ from evofsm.fsm.machine import EvolvingFSM, alone, share
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
-from evofsm.fsm.validation import positive, real_array, refuse_unusable
+from evofsm.fsm.validation import positive, real_array
 from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
 from evofsm.guard.api import (
     BELIEF_TOLERANCE,
@@ -450,7 +451,8 @@ class Guard:
         Raises
         ------
         TypeError, ValueError
-            If observation or proposal are not real numbers, or an entry is infinite or too large.
+            If observation or proposal are not real numbers, or an entry is infinite, larger than
+            1e30, or beyond the judge's ``ranges``.
         """
         with self._lock:
             wanted = proposal.action if isinstance(proposal, Proposal) else proposal
@@ -499,21 +501,28 @@ class Guard:
     def _checked(self, observation: ArrayLike) -> NDArray[np.float64]:
         """An observation that judge and machine can take in; NaN stays."""
         z = real_array("observation", observation, 1)
-        if not np.abs(z).max(initial=0.0) <= _LARGEST:  # or something was not observed
-            seen = np.where(np.isnan(z), 0.0, z)
-            refuse_unusable("observation", seen)
-            if (largest := np.abs(seen).max()) > _LARGEST:
-                raise ValueError(
-                    f"observation holds {largest:g}; a guard takes numbers of at most {_LARGEST:g}"
-                )
         known = len(self.variables) or (0 if self.machine is None else self.machine.n_variables)
         if known and len(z) != known:
             named = f" ({', '.join(self.variables)})" if self.variables else ""
             raise ValueError(f"observation has {len(z)} variables; it must have {known}{named}")
+        if told := self.beyond(z):
+            raise ValueError(" ".join(told))
         if (judge := self._observing) and len(z) != judge.dynamics.n_variables:
             learnt = judge.dynamics
             refuse_too_many(len(z), learnt.size, box=not learnt.choices)
         return z
+
+    def beyond(self, z: NDArray[np.float64]) -> tuple[str, str] | None:
+        """The first variable of an observation (m,) that cannot be so, and why; NaN can."""
+        least, most = ends_of(getattr(self.reviser, "risk", self.judge), len(z))
+        if not (wrong := (z < least) | (z > most)).any():
+            return None
+        k = int(wrong.argmax())
+        name = self.variables[k] if self.variables else f"observation[{k}]"
+        return name, (
+            f"is {z[k]:g}; it must lie between {least[k]:g} and {most[k]:g} (in another unit, or "
+            "does it stand for what was not seen? That is NaN, in JSON null)"
+        )
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:
         """Where it is; machine and judge learn the transition to it."""
@@ -817,6 +826,16 @@ class Guard:
                 missing=Missing(kept["missing"]),
                 **{name: kept[name] for name in _PLAIN},
             )
+
+
+def ends_of(judge: ActionJudge | None, m: int) -> NDArray[np.float64]:
+    """(2, m) ndarray: least and most that each of m variables can be."""
+    return _resized(getattr(judge, "ranges", ((-_LARGEST, _LARGEST),)), m)
+
+
+@cache
+def _resized(ranges: tuple[tuple[float, float], ...], m: int) -> NDArray[np.float64]:
+    return np.resize(ranges, (m, 2)).T
 
 
 def _actions(low: ArrayLike | None, high: ArrayLike | None, n_actions: int | None) -> ActionSet:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving.naming import VARIABLES
+from evofsm.driving.naming import RANGES, VARIABLES
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import vehicles
 from evofsm.io.tables import (
@@ -45,6 +45,7 @@ _SAME_STEP = 0.05
 _FASTEST, _LONGEST_USUAL = 60.0, 5.0
 _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
 _MICROSECOND = 1e-6
+_NO_CAR = "{!r} cannot be right (another unit? --unit; a stand-in for nobody? --no-leader); in SI "
 
 _SIGNS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt}
 _SIGNS |= {"==": operator.eq, "!=": operator.ne}
@@ -532,6 +533,10 @@ class _Reader:
                 # Where the table knows its episodes, the action may be derived, and NaN.
                 for name in (*self._observed, *([columns.action] if piece.starts is None else [])):
                     piece.refuse_unusable(name, kept)
+            cars = VARIABLES if self._observed == [*VARIABLES] else ()
+            for name, ends in zip(cars, RANGES, strict=False):
+                why = f"{_NO_CAR}it lies between {ends[0]:g} and {ends[1]:g}"
+                piece.refuse_unusable(name, kept, ends, why)
             episodes = (
                 np.searchsorted(piece.starts or (), np.flatnonzero(starts & kept), "right") - 1
             )

@@ -241,11 +241,18 @@ class Piece:
         place, text = self.find(row, name)
         raise ValueError(f"{place}, column {name!r}: {why.format(text[:40]) or explained(text)}")
 
-    def refuse_unusable(self, name: str, where: NDArray[np.bool_] | bool = True) -> None:
-        """Raise where a number cannot be learnt; NaN is none."""
-        unusable = ~(np.abs(self.numbers[name]) <= LARGEST_OBSERVATION) & where
+    def refuse_unusable(
+        self,
+        name: str,
+        where: NDArray[np.bool_] | bool = True,
+        ends: tuple[float, float] = (-LARGEST_OBSERVATION, LARGEST_OBSERVATION),
+        why: str = "",
+    ) -> None:
+        """Raise where a number cannot be learnt, or lies outside of these ends; NaN is none."""
+        numbers = self.numbers[name]
+        unusable = ~((numbers >= ends[0]) & (numbers <= ends[1])) & where
         if unusable.any():
-            self.refuse(int(np.argmax(unusable)), name)
+            self.refuse(int(np.argmax(unusable)), name, why)
 
 
 class Wanted(NamedTuple):

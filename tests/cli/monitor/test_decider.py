@@ -81,6 +81,26 @@ def test_speeds_that_must_be_of_another_unit_are_noted_once():
     assert notes == ["v_follower is above 60 m/s: is that km/h?", None, None]
 
 
+@pytest.mark.parametrize(
+    ("row", "about", "why"),
+    [
+        ({"gap": 1e30, "v_follower": 1e18}, "gap", "is 1e+30; it must lie between -1000 and 1e+06"),
+        ({"v_leader": -151.0}, "v_leader", "is -151; it must lie between -150 and 150 (in another"),
+        ({"v_follower": 180.0, "end": True}, "v_follower", "is 180"),
+    ],
+)
+def test_a_row_that_no_car_can_drive_is_refused_by_name_and_changes_nothing(row, about, why):
+    decider, plain = Decider(made()), Decider(made())
+    first, second = rows(2)
+    base = {name: first[name] for name in ("gap", "v_follower", "v_leader")}
+    whole = base if "end" in row else first
+    assert decider.answer(line(first)) == plain.answer(line(first))
+    refused = decider.answer(line(whole | row))
+    assert (refused["kind"], refused["about"]) == ("error", about)
+    assert why in refused["error"]
+    assert decider.answer(line(second)) == plain.answer(line(second))
+
+
 def test_an_episode_ends_where_it_is_told_to_and_learns_of_it():
     guard = made(learn=True)
     decider = Decider(guard)

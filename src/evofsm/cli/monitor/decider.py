@@ -77,6 +77,9 @@ class Decider:
         """
         try:
             told = self.form.read(line)
+            beyond = self.guard.beyond(np.array(told.observation or (), np.float64))
+            if beyond is not None:
+                raise MessageError(*beyond, told.time)
             self._next = self._sent_before(told)
             if self._next is not None:
                 return self._recent[self._next][1]

@@ -16,7 +16,8 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from evofsm.driving import Object, Scene, TrafficRisk
-from evofsm.driving.naming import VARIABLES
+from evofsm.driving.naming import SPEEDS, VARIABLES
+from evofsm.driving.traffic import PLACES, SIZES
 from evofsm.fsm.naming import visible
 from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
 from evofsm.store import LARGEST_OBSERVATION
@@ -33,6 +34,9 @@ _SHOWN = 40
 _WIDTH = 1.8
 
 _Number = Annotated[float, Meta(ge=-LARGEST_OBSERVATION, le=LARGEST_OBSERVATION)]
+_Place = Annotated[float, Meta(ge=PLACES[0], le=PLACES[1])]
+_Speed = Annotated[float, Meta(ge=SPEEDS[0], le=SPEEDS[1])]
+_Size = Annotated[float, Meta(ge=SIZES[0], le=SIZES[1])]
 _Seen = _Number | None
 _Name = Annotated[str, Meta(max_length=_SHOWN)] | Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 
@@ -71,15 +75,15 @@ Message = Row | End
 class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     """Ego or an object of a scene, as it is sent."""
 
-    vx: _Number
-    length: _Number
+    vx: _Speed
+    length: _Size
     id: _Name | UnsetType = UNSET
-    s: _Number | UnsetType = UNSET
-    x: _Number | UnsetType = UNSET
-    y: _Number | UnsetType = UNSET
+    s: _Place | UnsetType = UNSET
+    x: _Place | UnsetType = UNSET
+    y: _Place | UnsetType = UNSET
     lane: _Number | _Name | UnsetType = UNSET
-    vy: _Number = 0.0
-    width: _Number = _WIDTH
+    vy: _Speed = 0.0
+    width: _Size = _WIDTH
 
 
 class Form:
