@@ -4,6 +4,7 @@ import io
 import json
 import math
 import os
+import signal
 import socket
 import sys
 import threading
@@ -94,6 +95,15 @@ def test_a_line_without_an_end_takes_no_more_memory_than_the_longest():
     Server(Decider(guard_of_monitor(0.1, 6.0))).converse(lambda _: next(pieces, b""), id)
     assert tracemalloc.get_traced_memory()[1] < 20 * LONGEST
     tracemalloc.stop()
+
+
+def test_it_ends_after_the_message_under_way_however_many_came_at_once(monkeypatch):
+    server = Server(Decider(guard_of_monitor(0.1, 6.0)))
+    monkeypatch.setattr(server.decider, "answer", lambda line: time.sleep(0.02) or {})
+    threading.Timer(0.3, os.kill, [os.getpid(), signal.SIGINT]).start()
+    begun = time.monotonic()
+    server.run(Stream(Pieces(b"x\n" * 5000), io.BytesIO()))
+    assert time.monotonic() - begun < PATIENCE
 
 
 def test_a_heartbeat_where_nothing_comes():

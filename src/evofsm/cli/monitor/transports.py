@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -43,13 +44,14 @@ class Server:
         self.heartbeat = heartbeat  #: where so long nothing came, it says that it is there [s]
         self._heard = self._said = time.monotonic()
         self._turn = threading.Lock()
-        self._over = threading.Event()
+        self._over, self._ends = threading.Event(), False
         self._failure: Exception | None = None
 
     def answer(self, lines: Iterable[bytes]) -> bytes:
         """What is answered to lines, each with an end."""
         with self._turn:
-            answers = b"".join([_line(self.decider.answer(line)) for line in lines])
+            going_on = takewhile(lambda _: not self._ends, lines)
+            answers = b"".join([_line(self.decider.answer(line)) for line in going_on])
             self._heard = self._said = time.monotonic()
         return answers
 
@@ -83,6 +85,7 @@ class Server:
                     if self._patience() == 0.0:
                         transport.send(self._beat())
         finally:
+            self._ends = True  # after the message under way
             self._turn.acquire()  # for good: nothing is decided any more
             transport.close()
         if self._failure is not None:
