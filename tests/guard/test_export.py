@@ -6,6 +6,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import c99
@@ -56,6 +57,65 @@ def test_a_guard_in_c_decides_as_in_python(wall, tmp_path):
     assert found.changed > 100
     assert found.refused > 5
     assert "-0.0," not in (tmp_path / "evofsm.c").read_text()  # no risk prints as -0
+
+
+INEXACT = [
+    *("-Ofast", "-ffast-math", "-O2 -ffinite-math-only", "-funsafe-math-optimizations"),
+    *("-fassociative-math -fno-signed-zeros -fno-trapping-math", "-freciprocal-math"),
+    *("-fno-signed-zeros", "-fsingle-precision-constant", "-D_M_FP_FAST", "-D__FP_FAST"),
+    "-U__DBL_MANT_DIG__ -D__DBL_MANT_DIG__=24",  # a double as short as a float
+    "-U__FLT_EVAL_METHOD__ -D__FLT_EVAL_METHOD__=2",  # computed as a long double
+]
+# As of compilers that do not say how they compute.
+UNTOLD = "FAST_MATH", "FINITE_MATH_ONLY", "ASSOCIATIVE_MATH", "RECIPROCAL_MATH", "NO_SIGNED_ZEROS"
+
+
+@pytest.mark.parametrize("flags", INEXACT)
+def test_what_would_compute_otherwise_does_not_compile(wall, flags, tmp_path):
+    write_c99(wall.guard, tmp_path)
+    command = ["cc", "-std=c99", "-w", *flags.split(), "-c", "evofsm.c"]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert built.returncode != 0
+    assert "evofsm needs" in built.stderr.replace("_", " ")
+
+
+@pytest.mark.parametrize("flags", [flags for flags in INEXACT[:6] if flags != "-Ofast"])
+def test_where_no_macro_tells_of_that_it_decides_nothing(wall, flags, tmp_path):
+    untold = [f"-U__{name}__" for name in UNTOLD]
+    program = c99.build(wall.guard, tmp_path, "-O2", *flags.split(), *untold, "-w")
+    told = subprocess.run([program], input=bytes(8 * 5 * 3), capture_output=True, check=True)
+    assert np.frombuffer(told.stdout).reshape(3, -1)[:, 0].tolist() == [3.0] * 3
+
+
+@pytest.mark.parametrize(
+    "prefix",
+    [
+        *("", "2nd", "_guard", "a-b", "a b", "a__b", "a_", "käfig", "wall\n", "size_t", "../wall"),
+        *("int", "class", "constexpr", "restrict", "and", "std", "linux", "Math", "errno", "NAN"),
+    ],
+)
+def test_a_prefix_that_is_no_name_is_refused(wall, prefix, tmp_path):
+    with pytest.raises(ValueError, match="begins no name in C"):
+        write_c99(wall.guard, tmp_path / "out", prefix)
+    assert not (tmp_path / "out").exists()
+
+
+EVIL = "*/ #error \x1b[2J", "?" + "?/\n*/", "/*\\", "\u202e\u2066\u200f\ufffe\ud800", "a<&\"'\t"
+
+
+@pytest.mark.parametrize("names", [EVIL[:2], EVIL[2:4], EVIL[3:], ("x", "x"), ("\x1b", "\\u001b")])
+def test_no_name_gets_out_of_its_place(wall, names, tmp_path):
+    guard, fmpy = wall.guard.copy(), pytest.importorskip("fmpy")
+    guard.judge.labels = guard.judge.labels._replace(names=names, units=names)
+    write_c99(guard, tmp_path)
+    subprocess.run(["cc", *c99.FLAGS, "-c", "evofsm.c"], cwd=tmp_path, check=True)
+    header = (tmp_path / "evofsm.h").read_text()
+    assert all(sign.isprintable() or sign == "\n" for sign in header)
+    write_fmu(guard, tmp_path / "unit.fmu")
+    told = fmpy.read_model_description(tmp_path / "unit.fmu")
+    variables = [one.name for one in told.modelVariables]
+    assert len({*variables}) == 7
+    assert all(map(str.isprintable, variables))
 
 
 class Own(LatentRisk):
@@ -202,17 +262,17 @@ def test_an_fmu_drives_as_python_does(name, episodes, tmp_path):
 
 
 @pytest.mark.slow
-def test_two_guards_are_linked_into_one_program(wall, tmp_path):
-    write_c99(wall.guard, tmp_path, "wall")
+@pytest.mark.parametrize("name", ["wall", "exit", "main", "ACC", "my_evofsm_2", "EVOFSM", "K"])
+def test_two_guards_are_linked_into_one_program_whatever_is_called_so_in_c(wall, name, tmp_path):
+    write_c99(wall.guard, tmp_path, name)
     write_c99(c99.learnt("cars", episodes=0).guard, tmp_path, "cars")
     (tmp_path / "main.cpp").write_text(
-        '#include <cmath>\n#include <cstdio>\n#include "wall.hpp"\n#include "cars.hpp"\n'
-        'int main() { std::printf("%d %d\\n", wall::Guard().decide({NAN, 0.0}, {1.0})->reason,'
+        f'#include <cmath>\n#include <cstdio>\n#include <cstdlib>\n#include "{name}.hpp"\n'
+        '#include "cars.hpp"\nint main() { std::printf("%d %d\\n", '
+        f"{name}::Guard().decide({{NAN, 0.0}}, {{1.0}})->reason,"
         " cars::Guard().decide({9.0, 30.0, 1.0}, {1.0})->reason - CARS_TRIED); }"
     )
-    assert run_cpp(tmp_path, "main.cpp", "wall", "cars") == ["4 0"]
-    with pytest.raises(ValueError, match="'2nd' begins no name in C"):
-        write_c99(wall.guard, tmp_path, "2nd")
+    assert run_cpp(tmp_path, "main.cpp", name, "cars") == ["4 0"]
 
 
 @pytest.mark.slow

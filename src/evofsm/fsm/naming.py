@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from functools import cache
@@ -14,14 +15,18 @@ from numpy.typing import ArrayLike
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.validation import action_name, counted
 
-# What a terminal obeys, or cannot print: control characters but for tab and newline, ends of lines
-# and directions of Unicode, halves of characters.
-_UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+# All but what surely is plain.
+_ODD = re.compile(r"[^\n\t -~]")
 
 
 def visible(text: str) -> str:
-    """A text in which no character tells a terminal what to do: as JSON writes those."""
-    return _UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    """A text in which nothing tells a terminal what to do, or cannot be seen: as JSON writes it."""
+    return _ODD.sub(lambda one: one[0] if one[0].isprintable() else json.dumps(one[0])[1:-1], text)
+
+
+def in_a_line(text: str) -> str:
+    """The same of a name: without tabs and newlines."""
+    return visible(text).replace("\n", r"\n").replace("\t", r"\t")
 
 
 class Words(NamedTuple):

@@ -26,7 +26,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from evofsm import __version__, store
-from evofsm.fsm.naming import visible
+from evofsm.fsm.naming import in_a_line, visible
 from evofsm.fsm.rules import weights_of
 from evofsm.guard import guard as looping
 from evofsm.guard import reviser as revising
@@ -47,6 +47,23 @@ _LIBRARIES = {"darwin": "dylib", "win32": "dll"}
 _FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-fvisibility=hidden", "-shared")
 
 
+# What no prefix may be, in small letters: words of C and C++, headers that its file would hide, and
+# what these define.
+_TAKEN = """
+alignas alignof and and_eq asm auto bitand bitor bool break case catch char class compl concept
+const const_cast consteval constexpr constinit continue co_await co_return co_yield decltype default
+delete do double dynamic_cast else enum explicit export extern false float for friend goto if inline
+int long mutable namespace new noexcept not not_eq nullptr operator or or_eq private protected
+public register reinterpret_cast requires restrict return short signed sizeof static static_assert
+static_cast struct switch template this thread_local throw true try typedef typeid typename typeof
+typeof_unqual union unsigned using virtual void volatile while xor xor_eq assert complex ctype errno
+fenv inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic stdbit stdbool
+stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wctype
+alloca endian features malloc memory pthread sched strings unistd eof file i386 infinity lconv linux
+nan null posix std stderr stdin stdout timespec tm unix
+"""
+
+
 class Part(NamedTuple):
     """A judge in C."""
 
@@ -64,14 +81,18 @@ def write_c99(guard: Guard, folder: Path, prefix: str = "evofsm") -> None:
     two. A ValueError if its reviser or judge is of someone's own class, it judges nothing (mode
     off), nothing was learnt yet by which it could decide, or it steps back or may do harm.
     """
-    if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", prefix):
-        raise ValueError(f"the prefix {prefix!r} begins no name in C: take letters, digits and _")
+    is_name = re.fullmatch("[A-Za-z](_?[A-Za-z0-9])*(?<!_t)", prefix)
+    if not is_name or prefix.lower() in _TAKEN.split():
+        raise ValueError(
+            f"the prefix {prefix!r} begins no name in C and C++, or is one of theirs: take "
+            "letters, digits and single _, such as my_guard"
+        )
     texts = _texts(guard)
     folder.mkdir(parents=True, exist_ok=True)
     for ending in ("h", "hpp", "c"):
-        text = re.sub(r"evofsm(?! \d)", prefix, texts[f"evofsm.{ending}"])
+        text = texts[f"evofsm.{ending}"].replace("EVOFSM", prefix.upper())
         with store.replacing(folder / f"{prefix}.{ending}") as place:
-            place.write(text.replace("EVOFSM", prefix.upper()).encode())
+            place.write(re.sub(r"evofsm(?! \d)", prefix, text).encode())
 
 
 def write_fmu(guard: Guard, file: Path) -> None:
@@ -111,6 +132,9 @@ def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
             "only a guard with an ActionReviser whose mode is not off is exported, not one of "
             f"{type(reviser).__name__}{' in mode off' * hasattr(reviser, 'mode')}"
         )
+    labels = reviser.risk.labels
+    names, units = _told(labels.names), _told(labels.units)
+    reviser.risk.labels = labels._replace(names=names, units=units)
     frozen.begin()
     if reviser.passing:
         raise ValueError(
@@ -127,13 +151,13 @@ def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
     sizes, constants = _common(frozen, reviser, part.variables)
     sizes |= part.sizes
     sizes["STACK"] = _STACK + 64 * sizes.get("NUMBERS", 0) + 32 * sizes.get("LANES", 0)
-    m, a, names = sizes["VARIABLES"], sizes["ACTIONS"], reviser.risk.labels.names
+    m, a = sizes["VARIABLES"], sizes["ACTIONS"]
     seen = ", ".join(names) or "variables in their order"
-    told = f"{frozen}\nan observation: {seen}\n{part.about}"
+    told = visible(f"{frozen}\nan observation: {seen}\n{part.about}").replace("\n", "\n   ")
     learnt = _written({**constants, **part.constants})
     texts = {
         "TOOL": f"evofsm {__version__}",
-        "ABOUT": told.replace("*/", "* /").replace("\n", "\n   "),
+        "ABOUT": re.sub("(?<=[*/?])(?=[*/?])", " ", told),  # neither a comment nor a trigraph
         "SIZES": _written({f"EVOFSM_{name}": value for name, value in sizes.items()}),
         "STATE": judge["state"],
         "CONSTANTS": learnt,
@@ -148,6 +172,14 @@ def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
     return {of: pattern.sub(lambda found: texts[found[1]], text) for of, text in common.items()}
 
 
+def _told(names: Sequence[str]) -> tuple[str, ...]:
+    """Names in a line each; counted where two would be the same."""
+    lines = tuple(map(in_a_line, names))
+    if len(set(lines)) == len(lines):
+        return lines
+    return tuple(f"{k}: {line}" for k, line in enumerate(lines, start=1))
+
+
 def _variables(names: Sequence[object], a: int, *, whole: bool) -> str:
     """Variables of an FMU for its description, in the order of ``fmi2.c``."""
     m, seen = len(names), [f"observation[{name}]" for name in names]
@@ -158,7 +190,7 @@ def _variables(names: Sequence[object], a: int, *, whole: bool) -> str:
     how = ['"input"'] * (m + a) + ['"output" initial="exact"'] * (a + 3)
     every = zip([*seen, *acts, "risk", "reason", "revised"], kinds, how, strict=True)
     return "".join(
-        f'    <ScalarVariable name={quoteattr(visible(name))} valueReference="{k}" '
+        f'    <ScalarVariable name={quoteattr(name)} valueReference="{k}" '
         f'causality={causality} variability="discrete"><{kind} start="0"/></ScalarVariable>\n'
         for k, (name, kind, causality) in enumerate(every)
     )
@@ -174,6 +206,7 @@ def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any
     """Sizes and constants of the loop: states, input, actions."""
     actions, model = guard.actions, guard._frozen
     low, high = (np.atleast_1d(end) for end in limits(actions))
+    seen_from, seen_to = looping.ends_of(reviser.risk, m)
     sizes = {
         "VARIABLES": m,
         "ACTIONS": len(low),
@@ -187,8 +220,7 @@ def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any
         "LONGEST_GAP": looping._GAP * guard.interval,
         "TOLERANCE": reviser.tolerance,
         **{name: getattr(revising, f"_{name}") for name in ("NEW", "RELEASE", "TRIAL")},
-        "action_low": low,
-        "action_high": high,
+        **{"action_low": low, "action_high": high, "seen_from": seen_from, "seen_to": seen_to},
         "fallback": np.atleast_1d(put_into(actions, reviser.fallback.action)),
     }
     if model is not None and model.n_states:

@@ -16,8 +16,9 @@ extern "C" {
 /* What evofsm_decide returns. But for EVOFSM_OK nothing has changed, and nothing was written. */
 enum {
   EVOFSM_OK = 0,
-  EVOFSM_UNUSABLE = 1, /* an entry of the observation is infinite, or beyond 1e30 */
-  EVOFSM_MISSING = 2   /* one is NaN, and the guard rejects that */
+  EVOFSM_UNUSABLE = 1, /* an entry of the observation is infinite, or cannot be so */
+  EVOFSM_MISSING = 2,  /* one is NaN, and the guard rejects that */
+  EVOFSM_MISCOMPILED = 3 /* it does not compute as IEEE 754 says, so that nothing is decided */
 };
 
 /* Why something is executed. */
@@ -95,7 +96,8 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
 
 #include "evofsm.h"
 
-namespace evofsm {
+// No namespace, which could not be called as a function of the C library is.
+struct evofsm {
 
 using Observation = std::array<double, EVOFSM_VARIABLES>;  // NaN where not seen
 using Action = std::array<double, EVOFSM_ACTIONS>;
@@ -128,14 +130,31 @@ class Guard {
   evofsm_state state_;
 };
 
-}  // namespace evofsm
+};
 
 #endif
 /* ==== evofsm.c ==== */
 #include "evofsm.h"
 
+#include <float.h>
 #include <math.h>
 #include <stddef.h>
+
+/* NaN is "not seen" and "nothing proposed", and decisions are the same to the bit. */
+#if defined __FAST_MATH__ || __FINITE_MATH_ONLY__ || defined __ASSOCIATIVE_MATH__ || \
+    defined __RECIPROCAL_MATH__ || defined __NO_SIGNED_ZEROS__ || defined _M_FP_FAST || \
+    defined __FP_FAST
+#error "evofsm needs NaN and exact arithmetic: compile this file without -Ofast, -ffast-math, \
+-ffinite-math-only, -funsafe-math-optimizations or /fp:fast"
+#endif
+#if FLT_RADIX != 2 || DBL_MANT_DIG != 53 || DBL_MAX_EXP != 1024
+#error "evofsm needs a double of 64 bits (IEEE 754): compile without what shortens it"
+#endif
+#if FLT_EVAL_METHOD != 0 && FLT_EVAL_METHOD != 1
+#error "evofsm needs a double that is computed as such: on x86 compile with -msse2 -mfpmath=sse"
+#endif
+/* Fails where constants are single, as by -fsingle-precision-constant. */
+typedef char evofsm_needs_constants_that_are_double[sizeof 1.0 == 8 && sizeof(double) == 8 ? 1 : -1];
 
 UNIT_CONSTANTS
 /* As Python has them: of equals, and beside NaN, the first. */
@@ -234,6 +253,14 @@ static int make_usable(evofsm_state *s, const double proposal[EVOFSM_ACTIONS]) {
 
 /* -- The loop: Guard.decide -------------------------------------------------------------------- */
 
+/* Whether it is computed as written: not each compiler tells where it is not. */
+static int is_exact(void) {
+  static const volatile double given[] = {1.0, 1e-18, 49.0, 98.0, 147.0, NAN};
+  const double one = given[0], small = given[1], by = given[2], none = given[5];
+  const double parts = given[2] / by + given[3] / by + given[4] / by;
+  return (one + small) - one == 0.0 && parts == 6.0 && isnan(none) && !(none <= one);
+}
+
 static void begin(evofsm_state *s) {
   int j;
   for (j = 0; j < EVOFSM_VARIABLES; j++) {
@@ -256,8 +283,11 @@ int evofsm_decide(evofsm_state *state, const double observation[EVOFSM_VARIABLES
 int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIABLES],
                      const double proposal[EVOFSM_ACTIONS], double time, evofsm_decision *out) {
   int i, intake;
+  if (!is_exact()) {
+    return EVOFSM_MISCOMPILED;
+  }
   for (i = 0; i < EVOFSM_VARIABLES; i++) {
-    if (!isnan(observation[i]) && !(fabs(observation[i]) <= 1e30)) {
+    if (observation[i] < seen_from[i] || observation[i] > seen_to[i]) {
       return EVOFSM_UNUSABLE;
     }
   }
@@ -367,23 +397,17 @@ static fmi2Status fail(const unit *of, const char *message) {
   return fmi2Error;
 }
 
-static fmi2Status lacks(int count, ...) {
-  (void)count;
-  return fmi2Error;
-}
-
-static fmi2Status fine(int count, ...) {
-  (void)count;
-  return fmi2OK;
-}
+/* What is of no account, and what a unit without it answers. */
+#define NOTHING(Name, ...) \
+  EXPORT fmi2Status fmi2##Name(__VA_ARGS__) { return fmi2OK; }
+#define LACKS(Name, ...) \
+  EXPORT fmi2Status fmi2##Name(__VA_ARGS__) { return fmi2Error; }
 
 EXPORT const char *fmi2GetTypesPlatform(void) { return "default"; }
 
 EXPORT const char *fmi2GetVersion(void) { return "2.0"; }
 
-EXPORT fmi2Status fmi2SetDebugLogging(void *c, int on, size_t count, const char *const names[]) {
-  return fine(4, c, on, count, names); /* errors alone are told, and always */
-}
+NOTHING(SetDebugLogging, void *c, int on, size_t count, const char *const names[])
 
 EXPORT fmi2Status fmi2Reset(void *c) {
   unit *of = c;
@@ -396,7 +420,6 @@ EXPORT fmi2Status fmi2Reset(void *c) {
 EXPORT void *fmi2Instantiate(const char *name, int kind, const char *guid, const char *resources,
                              const fmi2CallbackFunctions *callbacks, int visible, int logging) {
   unit *of = calloc(1, sizeof *of);
-  fine(3, resources, visible, logging);
   if (of == NULL) {
     return NULL;
   }
@@ -413,25 +436,22 @@ EXPORT void *fmi2Instantiate(const char *name, int kind, const char *guid, const
 
 EXPORT void fmi2FreeInstance(void *c) { free(c); }
 
-EXPORT fmi2Status fmi2SetupExperiment(void *c, int bounded, double tolerance, double start,
-                                      int ends, double stop) {
-  return fine(6, c, bounded, tolerance, start, ends, stop);
-}
-
-EXPORT fmi2Status fmi2EnterInitializationMode(void *c) { return fine(1, c); }
-
-EXPORT fmi2Status fmi2ExitInitializationMode(void *c) { return fine(1, c); }
-
-EXPORT fmi2Status fmi2Terminate(void *c) { return fine(1, c); }
+NOTHING(SetupExperiment, void *c, int bounded, double tolerance, double start, int ends, double stop)
+NOTHING(EnterInitializationMode, void *c)
+NOTHING(ExitInitializationMode, void *c)
+NOTHING(Terminate, void *c)
 
 /* Decide on the inputs as they stand. Steps are as long as the guard's interval, or a whole part of
    it: then it decides at the first of them. */
 EXPORT fmi2Status fmi2DoStep(void *c, double time, double step, int no_return) {
   unit *of = c;
   const double *proposal = of->values + PROPOSAL, steps = floor(EVOFSM_INTERVAL / step + 0.5);
+  static const char *const why[] = {
+      "", "an observation is infinite, or cannot be so; NaN says not seen",
+      "an observation is NaN, which this guard rejects",
+      "this unit was compiled to compute otherwise than IEEE 754 says"};
   evofsm_decision decision;
   int i, rc;
-  fine(2, time, no_return);
   if (!(steps >= 1.0) || !(fabs(steps * step / EVOFSM_INTERVAL - 1.0) <= 1e-6)) {
     return fail(of, "a step has to be as long as stepSize in modelDescription.xml, or a whole part");
   }
@@ -441,8 +461,7 @@ EXPORT fmi2Status fmi2DoStep(void *c, double time, double step, int no_return) {
   }
   rc = evofsm_decide(&of->state, of->values, proposal, &decision);
   if (rc != EVOFSM_OK) {
-    return fail(of, rc == EVOFSM_MISSING ? "an observation is NaN, which this guard rejects"
-                                         : "an observation is infinite; NaN says not seen");
+    return fail(of, why[rc]);
   }
   of->wait = steps - 1.0;
   of->values[RISK] = decision.risk_executed;
@@ -483,54 +502,24 @@ GET(Boolean, int)
 SET(Real, double)
 SET(Integer, int)
 
-/* -- What does not apply -------------------------------------------------------------------------- */
-
-#define REFUSE(Name, type)                                                                \
-  EXPORT fmi2Status fmi2##Name(void *c, const unsigned at[], size_t count, type values) { \
-    return lacks(4, c, at, count, values);                                                \
-  }
-REFUSE(SetBoolean, const int *)
-REFUSE(SetString, const char *const *)
-REFUSE(GetString, const char **)
-#define OF_STATE(Name, type) \
-  EXPORT fmi2Status fmi2##Name(void *c, type state) { return lacks(2, c, state); }
-OF_STATE(GetFMUstate, void **)
-OF_STATE(SetFMUstate, void *)
-OF_STATE(FreeFMUstate, void **)
-#define STATUS(Name, type) \
-  EXPORT fmi2Status fmi2Get##Name(void *c, int kind, type *value) { return lacks(3, c, kind, value); }
-STATUS(Status, fmi2Status)
-STATUS(RealStatus, double)
-STATUS(IntegerStatus, int)
-STATUS(BooleanStatus, int)
-STATUS(StringStatus, const char *)
-
-EXPORT fmi2Status fmi2SerializedFMUstateSize(void *c, void *state, size_t *size) {
-  return lacks(3, c, state, size);
-}
-
-EXPORT fmi2Status fmi2SerializeFMUstate(void *c, void *state, char bytes[], size_t size) {
-  return lacks(4, c, state, bytes, size);
-}
-
-EXPORT fmi2Status fmi2DeSerializeFMUstate(void *c, const char bytes[], size_t size, void **state) {
-  return lacks(4, c, bytes, size, state);
-}
-
-EXPORT fmi2Status fmi2GetDirectionalDerivative(void *c, const unsigned of[], size_t count,
-                                               const unsigned by[], size_t others,
-                                               const double along[], double found[]) {
-  return lacks(7, c, of, count, by, others, along, found);
-}
-
-EXPORT fmi2Status fmi2SetRealInputDerivatives(void *c, const unsigned at[], size_t count,
-                                              const int order[], const double values[]) {
-  return lacks(5, c, at, count, order, values);
-}
-
-EXPORT fmi2Status fmi2GetRealOutputDerivatives(void *c, const unsigned at[], size_t count,
-                                               const int order[], double values[]) {
-  return lacks(5, c, at, count, order, values);
-}
-
-EXPORT fmi2Status fmi2CancelStep(void *c) { return lacks(1, c); }
+LACKS(SetBoolean, void *c, const unsigned at[], size_t count, const int values[])
+LACKS(SetString, void *c, const unsigned at[], size_t count, const char *const values[])
+LACKS(GetString, void *c, const unsigned at[], size_t count, const char *values[])
+LACKS(GetFMUstate, void *c, void **state)
+LACKS(SetFMUstate, void *c, void *state)
+LACKS(FreeFMUstate, void *c, void **state)
+LACKS(SerializedFMUstateSize, void *c, void *state, size_t *size)
+LACKS(SerializeFMUstate, void *c, void *state, char bytes[], size_t size)
+LACKS(DeSerializeFMUstate, void *c, const char bytes[], size_t size, void **state)
+LACKS(GetDirectionalDerivative, void *c, const unsigned of[], size_t count, const unsigned by[],
+      size_t others, const double along[], double found[])
+LACKS(SetRealInputDerivatives, void *c, const unsigned at[], size_t count, const int order[],
+      const double values[])
+LACKS(GetRealOutputDerivatives, void *c, const unsigned at[], size_t count, const int order[],
+      double values[])
+LACKS(CancelStep, void *c)
+LACKS(GetStatus, void *c, int kind, fmi2Status *value)
+LACKS(GetRealStatus, void *c, int kind, double *value)
+LACKS(GetIntegerStatus, void *c, int kind, int *value)
+LACKS(GetBooleanStatus, void *c, int kind, int *value)
+LACKS(GetStringStatus, void *c, int kind, const char **value)

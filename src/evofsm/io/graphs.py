@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterator
 import numpy as np
 
 from evofsm.fsm.model import FSMModel
+from evofsm.fsm.naming import in_a_line
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.
 _DOT_MARK = ',\n      shape=hexagon, style=filled, fillcolor="#D55E00", fontcolor=white, penwidth=2'
@@ -110,18 +111,13 @@ def _where(model: FSMModel, state: int) -> list[str]:
     nothing = ("",) * model.n_variables
     variables = zip(model.names or nothing, model.units or nothing, strict=True)
     return [
-        " ".join(part for part in (_shown(name), f"{value:.4g}", _shown(unit)) if part)
+        " ".join(part for part in (in_a_line(name), f"{value:.4g}", in_a_line(unit)) if part)
         for (name, unit), value in zip(variables, model.centers[state], strict=True)
     ]
 
 
 def _counted(number: float, what: str) -> str:
     return f"{number:,.0f} {what}{'' if round(number) == 1 else 's'}"
-
-
-def _shown(text: str) -> str:
-    """In one line, without control characters."""
-    return "".join(sign for sign in " ".join(text.split()) if sign.isprintable())
 
 
 # -- PRISM ----------------------------------------------------------------------------------------
