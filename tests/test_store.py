@@ -1,8 +1,11 @@
+import errno
 import io
 import json
 import os
+import shutil
 import signal
 import stat
+import tempfile
 import threading
 import time
 import tracemalloc
@@ -338,6 +341,44 @@ def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):
         assert link.is_symlink()
         assert store.read_header(target).kind == "draws"
     assert sorted(tmp_path.rglob("*")) == sorted([link, target, target.parent])
+
+
+@pytest.mark.parametrize("may_write_the_folder", [True, False])
+@pytest.mark.parametrize("before", [b"", b"x" * 100_000])
+def test_what_no_file_can_take_the_place_of_is_written_over(
+    tmp_path, monkeypatch, caplog, before, may_write_the_folder
+):
+    """As one file that is bound into a container, where renaming onto it fails."""
+    path, elsewhere = tmp_path / "data" / "file", tmp_path / "elsewhere"
+    path.parent.mkdir()
+    elsewhere.mkdir()
+    path.write_bytes(before)
+    monkeypatch.setattr(tempfile, "tempdir", str(elsewhere))
+
+    def busy(*_):
+        raise OSError(errno.EBUSY if may_write_the_folder else errno.EXDEV, "busy")
+
+    monkeypatch.setattr(os, "replace", busy)
+    monkeypatch.setattr(os, "access", lambda *_: may_write_the_folder)
+    with pytest.raises(OSError, match="busy"):
+        write(path.with_name("new"))
+    write(path)
+    assert store.read(path, DRAWS)[0] == SETTINGS
+    assert "bind its folder instead" in caplog.text
+    whole = path.read_bytes()
+
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(0, 0, -len(whole)))
+    with pytest.raises(OSError, match="No space left"):
+        write(path)
+    assert path.read_bytes() == whole
+    assert sorted(tmp_path.rglob("*")) == sorted([path, path.parent, elsewhere])
+    monkeypatch.undo()
+    monkeypatch.setattr(os, "replace", busy)
+    monkeypatch.setattr(shutil, "copyfileobj", busy)
+    with pytest.raises(OSError, match="busy") as raised:
+        write(path)
+    (note,) = raised.value.__notes__
+    assert store.read(note.rpartition(" ")[2], DRAWS)[0] == SETTINGS  # nothing is lost
 
 
 def test_what_is_no_file_is_left_alone(tmp_path):

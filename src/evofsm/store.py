@@ -13,24 +13,30 @@ anew, and kernels take sizes and indices on trust.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import logging
 import math
 import os
 import re
 import secrets
+import shutil
 import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any, BinaryIO, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm import __version__
+
+_log = logging.getLogger(__name__)
 
 #: A file by its name, or one that is open.
 Place: TypeAlias = str | os.PathLike[str] | BinaryIO
@@ -52,6 +58,8 @@ _TYPES = {"BOOL": np.bool_, "U8": np.uint8, "I64": np.int64, "F64": np.float64}
 _NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
 # Nobody writes a file any more that did not change for so long [s].
 _OLD = 600.0
+# Why no file can take the place of another one.
+_IRREPLACEABLE = (errno.EBUSY, errno.EXDEV, errno.EACCES, errno.EPERM, errno.EROFS)
 # Of an error that quotes a damaged file, so many letters are told.
 _MOST_SAID = 300
 # What reading a damaged file may run into (RuntimeError: JSON that is nested too deep).
@@ -222,11 +230,16 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     The last one to end stays. A link is followed, and the mode of a file that was there is kept.
     Where it cannot be written, an OSError names the file, and what was there is as it was.
+
+    No file can take the place of one that is mounted on its own, or whose folder may not be
+    written: what is whole is then written over it, and a warning says so.
     """
     temporary = None
     try:
         target, mode = _place_of(path)
-        temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.part")
+        beside = mode is None or os.access(target.parent, os.W_OK)
+        folder = target.parent if beside else Path(gettempdir())
+        temporary = folder / f".{target.name}.{secrets.token_hex(8)}.part"
         opener = partial(os.open, mode=0o666 if mode is None else 0o600)
         with open(temporary, "x+b", opener=opener) as file:
             yield file
@@ -236,21 +249,50 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
                 os.chmod(temporary, mode)
             if os.name == "nt":  # where an open file cannot be renamed
                 file.close()
-            os.replace(temporary, target)
+            try:
+                os.replace(temporary, target)
+            except OSError as error:
+                if mode is None or error.errno not in _IRREPLACEABLE:
+                    raise
+                _write_over(target, file)
+                temporary.unlink()
+                _log.warning(
+                    "%s was written over, as no file can take its place (is it bound into a "
+                    "container on its own?): a kill in that moment leaves it damaged; bind its "
+                    "folder instead",
+                    os.fspath(path),
+                )
     except BaseException as error:
         if isinstance(error, OSError) and error.errno is not None:
             error.filename, error.filename2 = os.fspath(path), None
-        if temporary is not None:
+        if temporary is not None and not hasattr(error, "__notes__"):
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
         raise
     # Not all systems can flush a folder; the file is whole, if not under its name, without it.
     with suppress(OSError):
-        folder = os.open(target.parent, os.O_RDONLY)
+        opened = os.open(target.parent, os.O_RDONLY)
         try:
-            os.fsync(folder)
+            os.fsync(opened)
         finally:
-            os.close(folder)
+            os.close(opened)
+
+
+def _write_over(target: Path, whole: BinaryIO) -> None:
+    """Write a whole file over another one, for which there is room."""
+    whole.seek(0)
+    with open(target, "r+b") as file:
+        free = shutil.disk_usage(target).free + os.fstat(file.fileno()).st_size
+        if free < os.fstat(whole.fileno()).st_size:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        try:
+            shutil.copyfileobj(whole, file)
+            file.truncate()
+            file.flush()
+            os.fsync(file.fileno())
+        except BaseException as error:
+            error.add_note(f"it is damaged, and what was to be written is whole in {whole.name}")
+            raise
 
 
 def _place_of(path: str | os.PathLike[str]) -> tuple[Path, int | None]:

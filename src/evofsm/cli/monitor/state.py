@@ -56,7 +56,6 @@ class State:
                     "back, or delete the journal to begin anew"
                 )
             return fresh()
-        store.sweep(self.path)
         self._provenance = dict(store.read_header(self.path).provenance)
         saved = self._provenance.pop(_PROVENANCE, None)
         if saved is None:
@@ -81,6 +80,7 @@ class State:
 
     def begin(self, decider: Decider) -> int:
         """Go on where it was; returns the number of messages that were taken in again."""
+        store.sweep(self.path)  # of what may be whole where that was not
         decider.keep = lambda told: self._keep(told, decider)
         if self._memory is not None:
             decider.remember(self._memory)
