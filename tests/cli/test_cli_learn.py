@@ -177,6 +177,28 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
     assert "3 episodes ended in one" in text
 
 
+@pytest.mark.parametrize("names", [("gap", "v_follower", "v_leader"), ("d", "own", "lead")])
+def test_columns_that_are_named_in_another_order_are_what_they_are_called(evofsm, tmp_path, names):
+    path, guard, fields = (
+        tmp_path / "log.csv",
+        tmp_path / "car.evofsm",
+        ("time", *names, "a", "hit"),
+    )
+    rows = [f"{k / 10:.1f},{30 - 0.4 * k:.2f},20,16,0.0,{int(k > 75)}" for k in range(80)]
+    path.write_text("\n".join([",".join(fields), *rows, ""]))
+    asked = "--action", "a", "--failed", "hit", "--observe"
+    judge = "--judge", "kinematic" if names[0] == "gap" else "learnt"
+    told = ",".join(names[::-1] if names[0] == "gap" else names)
+    saved = evofsm("learn", path, *asked, told, "--guard", guard, *judge)
+    assert f"takes rows of time [s], {names[0]}" in saved.stdout
+    usual, turned = (
+        evofsm("monitor", path, "--guard", guard, "--summary", *asked, ",".join(order)).stdout
+        for order in (names, names[::-1])
+    )
+    assert "The worst moments" in usual
+    assert turned == usual
+
+
 def test_a_guard_that_refuses_most_of_the_time_is_said_to(evofsm, tmp_path):
     """A tank whose inlet, which nobody sees, opens and closes as it likes."""
     path, guard, chance = tmp_path / "tank.csv", tmp_path / "tank.evofsm", random.Random(3)
@@ -225,10 +247,11 @@ def test_a_bad_row_late_in_the_file_leaves_the_model_of_before(evofsm, refused, 
     before = path.read_bytes()
     bad = tmp_path / "bad.csv"
     bad.write_text(log.read_text() + "r,v9,0,0.0,nan,1,1,1\n")
-    assert "bad.csv, line 702, column 'gap'" in refused("learn", log, bad, "--out", path)
+    strict = "--skip-bad", 0
+    assert "bad.csv, line 702, column 'gap'" in refused("learn", log, bad, "--out", path, *strict)
     assert path.read_bytes() == before
     new = tmp_path / "new.evofsm"
-    refused("learn", bad, "--out", new)
+    refused("learn", bad, "--out", new, *strict)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.csv", "log.csv", "model.evofsm"]
 
 
@@ -321,7 +344,7 @@ def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, refused, tmp_
     rows = [f"p,{100 * k},{'' if k == 9 else 20},54,54,0.1" for k in range(30)]
     header = "pair,time,gap,v_follower,v_leader,a_follower"
     path.write_text("\n".join([header, *rows, ""]))
-    assert "no leader? --no-leader end" in refused("learn", path)
+    assert "no leader? --no-leader end" in refused("learn", path, "--skip-bad", 0)
     told = evofsm(
         *("learn", path, "--no-leader", "end", "--unit", "v=km/h", "--unit", "time=ms"),
         *("--out", tmp_path / "model"),

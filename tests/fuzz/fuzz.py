@@ -60,11 +60,16 @@ def seeds(name):
     return [path.read_bytes() for path in sorted((CORPUS / name).iterdir())]
 
 
-def osi_messages(k, **leader):
+def osi_messages(k, *, logical=False, **leader):
     """Ground truth, and the same in a sensor view, of one car behind another one."""
     import betterosi as osi
 
     def moving(name, x, vx, length=4.0, kind="VEHICLE", lane=7, yaw=0.0):
+        lanes = osi.Identifier(value=lane)
+        where = {"assigned_lane_id": [lanes] * bool(lane)}
+        if logical:
+            there = osi.LogicalLaneAssignment(assigned_lane_id=lanes, s_position=x)
+            where = {"logical_lane_assignment": [there]}
         return osi.MovingObject(
             id=osi.Identifier(value=name),
             base=osi.BaseMoving(
@@ -74,9 +79,7 @@ def osi_messages(k, **leader):
                 velocity=osi.Vector3d(x=vx, y=0.0, z=0.0),
             ),
             type=osi.MovingObject.Type[kind],
-            moving_object_classification=osi.MovingObject.MovingObjectClassification(
-                assigned_lane_id=[osi.Identifier(value=lane)] * bool(lane)
-            ),
+            moving_object_classification=osi.MovingObject.MovingObjectClassification(**where),
         )
 
     truth = osi.GroundTruth(

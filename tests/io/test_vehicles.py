@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evofsm.cli.learning import warnings_of
 from evofsm.cli.options import lengths_given
 from evofsm.fsm.observations import ObservationEncoder
 from evofsm.io import vehicles
-from evofsm.io.logs import LogColumns, episodes_of, read_traces
+from evofsm.io.logs import LogColumns, Noted, episodes_of, read_traces
 
 polars = pytest.importorskip("polars")
 
@@ -34,8 +35,9 @@ def episodes(path, lengths=None, **columns):
 
 
 def refusal(path, **columns):
+    """What is said where no bad row is left out."""
     with pytest.raises(ValueError, match=re.escape(str(path))) as caught:
-        list(read_traces([str(path)], LogColumns(**columns)))
+        list(read_traces([str(path)], LogColumns(skip_bad=0, **columns)))
     return str(caught.value)
 
 
@@ -96,7 +98,7 @@ def test_lengths_are_those_of_the_leader_s_type(tmp_path):
     assert episodes(path, lengths_given(["4", "truck=12"]))[0][0][0, 0] == 18.0
     assert episodes(path, lengths_given(["4"]))[0][0][0, 0] == 26.0
     assert str(lengths_given(["4", "truck=12"])) == "truck 12 m, others 4 m"
-    with pytest.raises(ValueError, match=r"has the type 'lorry' .* the types are truck"):
+    with pytest.raises(ValueError, match=r"has the type 'lorry' .* the types are car, truck"):
         episodes(path, lengths_given(["lorry=12"]))
     for text in ("truck=", "-1", "nan"):
         with pytest.raises(ValueError, match="--vehicle-length is"):
@@ -150,13 +152,15 @@ def test_persons_and_vehicles_off_the_road_are_passed_over(tmp_path):
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        (' lane="e_0"', "", "line 3: there is no 'lane'; SUMO writes it unless --fcd-output"),
+        (' lane="e_0"', "", "or --fcd-output.attributes without lane?"),
         (' id="b"', "", "line 4: there is no 'id'"),
         ('pos="20.0"', 'pos="nan"', "line 4, pos: nan cannot be learnt"),
         ('time="0.0"', 'time="00:00:01"', "--human-readable-time"),
         ('time="0.1"', 'time="0.0"', "line 6: time goes from 0 to 0"),
         ("fcd-export>", "tripinfos>", "begins with <tripinfos>"),
         ("</fcd-export>", "", "XML is cut off or damaged"),
+        ("</timestep>", "</time>", "XML is cut off or damaged"),
+        ('id="b"', 'id="a"', "line 4: 'a' is there twice"),
         ("vehicle", "person", "no vehicle on a lane"),
         ('"e_0" pos="20', '"e_1" pos="20', "no vehicle ever follows another"),
     ],
@@ -165,6 +169,111 @@ def test_what_is_wrong_in_xml_is_named(tmp_path, before, after, message):
     text = xml({0.0: PAIR, 0.1: PAIR})
     assert before in text
     assert message in refusal(write(tmp_path / "a.xml", text.replace(before, after)))
+
+
+def bad_and_left_out(path, said, **columns):
+    """What is read without a bad moment, which is refused where none may be left out."""
+    noted = Noted()
+    assert said in refusal(path, **columns)
+    chunks = list(read_traces([str(path)], LogColumns(**columns), noted=noted))
+    assert said in " ".join(warnings_of(noted))
+    return [one.times.round(3).tolist() for one in episodes_of(chunks)]
+
+
+def test_a_bad_moment_is_left_out_with_all_that_is_there_then(tmp_path):
+    """Without one of its vehicles, others would be taken for pairs."""
+    road = {k / 10: [("a", "e", 90, 1), ("b", "e", 50 + k, 1), ("c", "e", 10, 1)] for k in range(6)}
+    text, path = xml(road), tmp_path / "a.xml"
+    path.write_text(text[: text.rindex("<vehicle")])
+    assert bad_and_left_out(path, "cut off") == [[0.0, 0.1, 0.2, 0.3, 0.4]] * 2
+    path.write_text(text.replace('pos="53"', 'pos="x"'))
+    apart = [[0.0, 0.1, 0.2], [0.4, 0.5]]
+    assert sorted(bad_and_left_out(path, "pos: 'x' is no number")) == sorted(apart * 2)
+    seen = [(t, *car) for t, cars in road.items() for car in cars]
+    rows = [f"{t},{name},{v},{at},{lane}" for t, name, lane, at, v in seen]
+    table = tmp_path / "a.csv"
+    for bad in ("0.3,b,1", "0.3,b,1,x,e"):
+        table.write_text("\n".join([FCD, *rows[:10], bad, *rows[11:], ""]))
+        assert sorted(bad_and_left_out(table, "line 12")) == sorted(apart * 2)
+    table.write_text("\n".join([FCD, *rows[:9], "x,a,1,90,e", *rows[10:], ""]))  # of 0.2 or 0.3 s
+    assert sorted(bad_and_left_out(table, "line 11")) == [[0.0, 0.1]] * 2 + [[0.4, 0.5]] * 2
+    table.write_text("\n".join([FCD, *rows[:-1], "0.5,c"]))
+    assert bad_and_left_out(table, "line 19") == [[0.0, 0.1, 0.2, 0.3, 0.4]] * 2
+    table.write_text("\n".join([FCD, *rows[:4], *rows[3:], ""]))
+    whole = [k / 10 for k in range(6)]
+    assert bad_and_left_out(table, "line 6: 'a' is there twice") == [whole] * 2
+
+
+ACROSS = {"a": (62, 1.2), "b": (60, -1.2), "c": (50, 1.1), "d": (49, -1.3), "truck": (30, 0)}
+ACROSS |= {"e": (10, 1.2)}  # along and across one lane: two files of bikes, and a truck
+BEHIND = {"c behind a", "d behind b", "truck behind d", "e behind truck"}
+
+
+def along_a_road(turned, along, across):
+    c, s = math.cos(turned), math.sin(turned)
+    return along * c - across * s, along * s + across * c
+
+
+@pytest.mark.parametrize("told", [("posLat",), ("x", "y", "angle")])
+@pytest.mark.parametrize("ending", ["xml", "csv"])
+def test_who_is_beside_is_nobody_s_leader_in_fcd(tmp_path, told, ending):
+    rows = []
+    for time in (0.0, 0.1):
+        for name, (along, across) in ACROSS.items():
+            x, y = along_a_road(math.radians(60.0), along, across)
+            places = {"posLat": across, "x": x, "y": y, "angle": 30.0}
+            kind = {"type": "truck" if name == "truck" else "bike"}
+            seen = {"id": name, "lane": "e", "pos": along, "speed": 5.0, **kind}
+            rows.append((time, seen | {place: places[place] for place in told}))
+    if ending == "csv":
+        text = [",".join(["timestep_time", *(f"vehicle_{name}" for name in rows[0][1])])]
+        text += [",".join(map(str, [time, *seen.values()])) for time, seen in rows]
+    else:
+        tags = [" ".join(f'{name}="{value}"' for name, value in seen.items()) for _, seen in rows]
+        steps = [f"<vehicle {tag}/>" for tag in tags]
+        text = ["<fcd-export>", '<timestep time="0">', *steps[:6], "</timestep>"]
+        text += ['<timestep time="0.1">', *steps[6:], "</timestep>", "</fcd-export>"]
+    path, noted = write(tmp_path / f"a.{ending}", "\n".join(text)), Noted()
+    lengths = lengths_given(["bike=1.6x0.65", "truck=12x2.5"])
+    (chunk,) = read_traces([path], LogColumns(), lengths, noted=noted)
+    assert set(chunk.names) == BEHIND
+    assert warnings_of(noted) == []
+    (chunk,) = read_traces([path], LogColumns(), lengths_given(["12x2.5"]), noted=noted)
+    assert "is it narrower than 2.5 m? --vehicle-length bike=12x0.8" in " ".join(warnings_of(noted))
+
+
+@pytest.mark.parametrize("turned", [0.7, -2.0])
+def test_who_is_beside_is_nobody_s_leader_among_objects(tmp_path, turned):
+    rows = [
+        (name, time, *along_a_road(turned, along, across), *along_a_road(turned, 5.0, 0.0), *kind)
+        for time in (0.0, 0.1)
+        for name, (along, across) in ACROSS.items()
+        for kind in [(12, 1, 2.5) if name == "truck" else (1.6, 1, 0.65)]
+    ]
+    (chunk,) = read_traces([objects(tmp_path / "a.csv", rows, OBJECTS + ",width")])
+    assert set(chunk.names) == BEHIND
+    rows = [row[:-1] for row in rows if row[0] in "abcd"]  # of no width, as wide as a car
+    (chunk,) = read_traces([objects(tmp_path / "b.csv", rows)])
+    assert set(chunk.names) == {"c behind a", "d behind b"}
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "timestep_time;vehicle_{};person_id;person_pos;person_speed;person_lane",
+        "timestep_time;timestep_vehicle_{};timestep_person_id;a;b;c",
+        "time;{};a;b;c;d",
+        "timestep_time;person_{};a;b;c;d",
+    ],
+)
+def test_columns_of_fcd_may_be_called_as_sumo_likes(tmp_path, header):
+    first, rest = header.split("{}")
+    names = ";".join(first.split(";")[-1] + name for name in ("id", "lane", "pos", "speed"))
+    rows = [f"{t};{name};e;{at};5;;;;" for t in (0, 1) for name, at in (("a", 50), ("b", 20))]
+    rows.insert(2, "0;;;;;walker;3;1;")
+    text = "\n".join([f"{first.split(';')[0]};{names}{rest}", *rows, ""])
+    ((observations, _, _),) = episodes(write(tmp_path / "a.csv", text))
+    assert observations.tolist() == [[25.0, 5.0, 5.0]] * 2
 
 
 FCD = "timestep_time,vehicle_id,vehicle_speed,vehicle_pos,vehicle_lane"
@@ -359,6 +468,58 @@ def test_mcap_is_read_by_its_schema_and_named_where_it_holds_something_else(tmp_
             assert "its schemas are Log, SensorData" in refusal(path)
         else:
             assert_pair(path)
+
+
+def test_logical_lanes_are_lanes_where_there_are_no_others(tmp_path, osi):
+    (tmp_path / "trace.osi").write_bytes(next(osi.osi_traces(logical=True)))
+    assert_pair(tmp_path / "trace.osi")
+
+
+LEFT_OPEN = {
+    "without an index": {"index_types": 0, "use_statistics": False, "use_summary_offsets": False},
+    "a lean summary": {"repeat_schemas": False, "repeat_channels": False},
+    "without chunks": {"use_chunking": False},
+}
+
+
+@pytest.mark.parametrize("how", LEFT_OPEN.values(), ids=LEFT_OPEN.keys())
+def test_what_mcap_leaves_open_may_be_left_out_or_there(tmp_path, osi, how):
+    writing, path = pytest.importorskip("mcap.writer"), tmp_path / "trace.mcap"
+    if "index_types" in how:
+        how = how | {"index_types": writing.IndexType.NONE}
+    with path.open("wb") as file:
+        writer = writing.Writer(file, enable_data_crcs=False, **how)
+        writer.start(profile="", library="another")
+        schema = writer.register_schema("osi3.GroundTruth", "protobuf", b"")
+        channel = writer.register_channel("truth", "protobuf", schema)
+        writer.add_attachment(0, 0, "picture", "image/png", b"\xff" * 99)
+        writer.add_metadata("drive", {"driver": "none"})
+        for k in range(5):
+            writer.add_message(channel, k, osi.osi_messages(k)[0], k)
+        writer.finish()
+    assert_pair(path)
+    whole = path.read_bytes()
+    unknown = b"\x99" + (3).to_bytes(8, "little") + b"own"
+    path.write_bytes(whole[:8] + unknown + whole[8:])
+    if "index_types" in how:  # no place is told that would have moved
+        assert_pair(path)
+    for end in (len(whole) - 8, len(whole) - 60):
+        path.write_bytes(whole[:end])
+        assert_pair(path)
+        assert "it ends within a record" in refusal(path)
+
+
+def test_of_a_trace_that_ends_early_the_beginning_is_read(tmp_path, osi):
+    truth, path, noted = next(osi.osi_traces()), tmp_path / "trace.osi", Noted()
+    path.write_bytes(truth[:-3])
+    (chunk,) = read_traces([str(path)], noted=noted)
+    assert len(chunk.times) == 4
+    assert "ends within message 5" in " ".join(warnings_of(noted))
+    size = int.from_bytes(truth[:4], "little") + 4
+    path.write_bytes(truth[:size] + b"\2\0\0\0\x0b\0" + truth[size:])
+    (chunk,) = read_traces([str(path)], noted=noted)
+    assert len(chunk.times) == 5
+    assert "message 2 is not ground truth" in " ".join(warnings_of(noted))
 
 
 def test_osi_that_cannot_be_right_is_refused_in_words(tmp_path, osi):

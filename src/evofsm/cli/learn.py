@@ -13,16 +13,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 from evofsm.cli.inspect import model_document, tables_of
 from evofsm.cli.options import (
     BRAKES,
+    SKIPPED,
     TOLERANCE,
     ActionColumn,
     Brakes,
     EpisodeColumns,
     Failed,
+    Hold,
     Json,
     Judge,
     Lengths,
     NoLeader,
     Observed,
+    SkipBad,
     Step,
     TimeColumn,
     Tolerance,
@@ -74,6 +77,8 @@ def learn(
     unit: Units = None,
     topics: TopicsFile = None,
     no_leader: NoLeader = None,
+    hold: Hold = None,
+    skip_bad: SkipBad = SKIPPED,
     vehicle_length: Lengths = None,
     rule: Annotated[
         str,
@@ -157,7 +162,8 @@ def learn(
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
     actions = _actions(action_range)
     columns, lengths, known_topics = reading_of(
-        observe, action, time, episode, dt, failed, unit, topics, no_leader, vehicle_length
+        *(observe, action, time, episode, dt, failed, unit, topics, no_leader),
+        *(hold, skip_bad, vehicle_length),
     )
     encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
@@ -167,7 +173,7 @@ def learn(
     keeper = None
     if checkpoint is not None:
         _check_apart(checkpoint, [out, guard], files)
-        names = ("action", "time", "failed", "dt", "no_leader")
+        names = ("action", "time", "failed", "dt", "no_leader", "hold", "skip_bad")
         settings = {name: getattr(columns, name) for name in names}
         settings |= {"observe": observe, "episode": columns.episode, "units": unit or []}
         settings |= {f"bytes of {file['name']}": file["bytes"] for file in known}
@@ -282,12 +288,13 @@ def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]
     from evofsm.driving import SAFETY_RULE
     from evofsm.driving.naming import VARIABLES
     from evofsm.fsm.validation import positive
+    from evofsm.io.tables import quoted_name
 
     given = {}
     for text in scale or ():
         column, _, number = text.rpartition("=")
         try:
-            given[column] = positive("it", float(number))
+            given["".join(quoted_name(column))] = positive("it", float(number))
         except ValueError:
             what = "write COLUMN=NUMBER, such as gap=4"
             raise ValueError(f"--scale is {text!r}; {what}") from None
@@ -339,7 +346,7 @@ def _check_out(out: Path | None, option: str = "--out") -> None:
         return
     if not out.parent.is_dir():
         raise FileNotFoundError(f"{option} {out}: there is no folder {out.parent}")
-    if not os.access(out.parent, os.W_OK):
+    if not (os.access(out.parent, os.W_OK) or os.access(out, os.W_OK)):
         raise PermissionError(f"{option} {out}: the folder {out.parent} may not be written")
     if out.is_dir():
         raise IsADirectoryError(f"{option} {out} is a folder; name a file in it")
@@ -476,7 +483,9 @@ def _read_otherwise(
         left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
         yield "failures", text + (left_out if noted.after_failure else "")
     if noted.leaderless:
-        why = "a number is missing" + f", or {columns.no_leader}" * (columns.no_leader != "end")
+        why = "a number is missing" + f", or {columns.no_leader}" * (
+            columns.no_leader not in (None, "end")
+        )
         yield "left out", f"{noted.leaderless:,} rows: {why}; there an episode ends"
     told = {name: unit for name, unit in noted.units.items() if UNITS.get(unit, 1.0) != 1.0}
     if told:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from evofsm import store
 from evofsm.driving.assumed import guard_of_monitor
+from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM
@@ -52,6 +53,14 @@ _CALLED = re.compile(_WORD + "((?i:km[/_ ]?p?h|kph|mph|knots|feet|ft|cm|mm|km))[
 _TIME_CALLED = re.compile(_WORD + "((?i:ms|us|ns))(?:ec)?[^A-Za-z]*$")
 # Units of time that logs are in, of which that counts by which a row comes every 0.1 s or so.
 _SHORTER = ("ms", "us", "ns")
+# So near must a unit come to what two columns differ by, to be named.
+_FITS = 0.02
+# What is said of what was left out, where it is no row.
+_LEFT_OUT = {
+    "comment": "comments between rows were passed over",
+    "action": "rows have no action, and what leads on from them was not learnt",
+    "cut": "file ends early, and what is whole was read",
+}
 # Numbers that stand for nobody in many recordings.
 _NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
 
@@ -113,7 +122,6 @@ class Checkpoint:
         if not self.path.exists():
             self.save(machine, Progress(), first=True)
             return machine, Progress()
-        store.sweep(self.path)
         kept = store.read_header(self.path).provenance.get("learning")
         if kept is None:
             raise ValueError(f"{self.path} is no checkpoint; name another file")
@@ -122,7 +130,9 @@ class Checkpoint:
                 f"{self.path} is the checkpoint of other work: {found}; run it with those, name "
                 "another file, or delete this one to begin anew"
             )
-        return EvolvingFSM.load(self.path), msgspec.convert(kept["read"], Progress)
+        loaded = EvolvingFSM.load(self.path)
+        store.sweep(self.path)  # what may be whole where that is not
+        return loaded, msgspec.convert(kept["read"], Progress)
 
     def offer(self, machine: EvolvingFSM, read: Progress) -> None:
         """Save, if that was not done for a while."""
@@ -222,7 +232,7 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         found.append(
             f"{noted.failed_at_once:,} of {noted.failed:,} failed episodes fail with their first "
             f"row, and {name} is {value:g} there each time: does that stand for a missing "
-            f"value (no leader)? --no-leader '{name}=={value:g}' leaves such rows out"
+            f"value (no leader)? --no-leader {quote(f'{name}=={value:g}')} leaves such rows out"
         )
     if alone := [(name, *one) for name, one in noted.below.items() if one[0] and one[1] > 2]:
         name, value, rows = min(alone, key=lambda one: one[1] not in _NOBODY)
@@ -230,10 +240,34 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
             f"{name} is {value!r} in {rows:,} rows, and else never below 0: is that a missing "
             f"value (no leader)? --no-leader {quote(f'{name}=={value!r}')} leaves such rows out"
         )
+    found += _contradictions(noted, columns)
     if noted.unplaced:
-        why = "lie in rows that --no-leader leaves out, belong to no episode, and were not counted"
+        why = "lie in rows that are left out, belong to no episode, and were not counted"
         found.append(f"{noted.unplaced:,} failures {why}")
-    return found
+    for kind, (count, first) in noted.skipped.items():
+        what = _LEFT_OUT.get(kind, "bad rows were left out (--skip-bad)")
+        found.append(f"{count:,} {what}, the first: {first}")
+    return [*found, *noted.told]
+
+
+def _contradictions(noted: Noted, columns: LogColumns) -> Iterator[str]:
+    """Where two columns say different things of one, with the unit or the sign that mends it."""
+    speeds = list(VARIABLES[1:])
+    of_units = {  # of which columns, and whether their unit makes the rate larger
+        "gap": {"m/s": (speeds, 1), "m": (["gap"], -1)},
+        "action": {"m/s²": ([columns.action], 1), "m/s": (speeds, -1)},
+    }
+    for what, rate in noted.rates.items():
+        is_gap = what == "gap"
+        mend = "is one of them in another unit, or mixed up with another one?"
+        if abs(rate + 1.0) < _FITS:
+            mend = "are the speeds mixed up?" if is_gap else "is a brake above 0 there?"
+        for unit, (names, power) in ((u, of_units[what].get(SI[u], ([], 1))) for u in SI):
+            if UNITS[unit] != 1.0 and names and abs(rate * UNITS[unit] ** -power - 1.0) < _FITS:
+                options = (f"--unit {quote(f'{name}={unit}')}" for name in names)
+                mend = f"{' '.join(options)} converts from {unit}"
+        shown, said = ("gap", " and ".join(speeds)) if is_gap else ("v_follower", columns.action)
+        yield f"{shown} changes {rate:.3g} times as fast as {said} say in the first rows: {mend}"
 
 
 # -- A guard --------------------------------------------------------------------------------------

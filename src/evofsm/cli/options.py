@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from collections.abc import Iterable
 from importlib.util import find_spec
@@ -69,7 +70,12 @@ Switches = Annotated[str, option("noise, delay, actuator, jerk, third_car; with 
 
 # What the columns of a log mean; `reading_of` takes them.
 Observed = Annotated[
-    str, option("Columns to observe. A discrete one has its values: light=red/green.", "--observe")
+    str,
+    option(
+        "Columns to observe. A discrete one has its values: light=red/green. A name with a comma "
+        "stands in double quotes.",
+        "--observe",
+    ),
 ]
 ActionColumn = Annotated[
     str, option("Column of the action taken from a row to the next.", "--action")
@@ -115,10 +121,28 @@ NoLeader = Annotated[
         "--no-leader",
     ),
 ]
+Hold = Annotated[
+    float | None,
+    option(
+        "Signals of several clocks in one table: an empty field has the latest value, not older "
+        "than this [s]; rows are those with an action. [default: 0.5 where no row is whole]",
+        "--hold",
+        min=0.0,
+    ),
+]
+SkipBad = Annotated[
+    int,
+    option(
+        "Bad rows of a file that are left out, and said; more are refused.", "--skip-bad", min=0
+    ),
+]
+#: As `evofsm.io.logs.SKIPPED`, without what that loads.
+SKIPPED = 10
 Lengths = Annotated[
     list[str] | None,
     option(
-        "FCD: of vehicles [m], or of a type: truck=12. May be repeated. [default: 5.0]",
+        "FCD: of vehicles [m], or of a type; where they drive side by side also their width: "
+        "truck=12, bike=1.6x0.65. May be repeated. [default: 5x1.8]",
         "--vehicle-length",
     ),
 ]
@@ -161,8 +185,20 @@ def imported(name: str) -> Any:
 
 
 def split_names(text: str) -> list[str]:
-    """Names that were given with commas between them."""
-    return [name.strip() for name in text.split(",") if name.strip()]
+    """Names that were given with commas between them; one with a comma stands in double quotes.
+
+    >>> split_names('gap, "v, in m/s"')
+    ['gap', 'v, in m/s']
+    """
+    return ["".join(one) for one in _named(text)]
+
+
+def _named(text: str) -> list[tuple[str, str]]:
+    """What stands between commas: a name in quotes, if there is one, and the rest."""
+    from evofsm.io.tables import quoted_name
+
+    found = re.findall(r'(?:"(?:[^"]|"")*"(?=\s*(?:[,=]|$))|[^,])+', text)
+    return [quoted_name(one.strip()) for one in found if one.strip()]
 
 
 def family_of(name: str, switches: str) -> Family:
@@ -182,30 +218,42 @@ def reading_of(
     unit: list[str] | None,
     topics: Path | None,
     no_leader: str | None,
+    hold: float | None,
+    skip_bad: int,
     vehicle_length: list[str] | None,
 ) -> Reading:
     """How a log is read, from the options of those names."""
+    from evofsm.driving.naming import VARIABLES
     from evofsm.fsm.observations import Category, ObservationEncoder
     from evofsm.fsm.validation import positive
     from evofsm.io import LogColumns, Topics
+    from evofsm.io.tables import quoted_name
 
-    def variable(text: str) -> str | Category:
-        name, discrete, values = text.partition("=")
-        return Category(name, values.split("/")) if discrete else name
+    if hold is not None and dt is not None:
+        raise ValueError("--hold goes by a clock, and --dt stands in for one; give one of them")
+
+    def variable(quoted: str, rest: str) -> str | Category:
+        name, discrete, values = rest.partition("=")
+        return Category(quoted or name, values.split("/")) if discrete else quoted or name
 
     try:
-        encoder = ObservationEncoder(*map(variable, split_names(observe)))
+        variables = [variable(*one) for one in _named(observe)]
+        if sorted(split_names(observe)) == sorted(VARIABLES):  # in whatever order they are named
+            variables = [*VARIABLES]
+        encoder = ObservationEncoder(*variables)
     except ValueError as error:
         raise ValueError(f"--observe {observe}: {error}") from None
     columns = LogColumns(
         observe=encoder,
-        action=action,
-        time=time,
+        action="".join(quoted_name(action)),
+        time="".join(quoted_name(time)),
         episode=None if episode is None else split_names(episode),
         dt=None if dt is None else positive("--dt", dt),
         failed=failed,
         units=units_given(unit or ()),
         no_leader=no_leader,
+        hold=hold,
+        skip_bad=skip_bad,
     )
     lengths = lengths_given(vehicle_length or ())
     return columns, lengths, None if topics is None else Topics.load(topics)
@@ -213,11 +261,11 @@ def reading_of(
 
 def units_given(texts: Iterable[str]) -> dict[str, str]:
     """Units by the column, or the beginning of columns, from what --unit was given."""
-    from evofsm.io.tables import UNITS
+    from evofsm.io.tables import UNITS, quoted_name
 
     found: dict[str, str] = {}
     for text in texts:
-        name, _, unit = (part.strip() for part in text.rpartition("="))
+        name, _, unit = ("".join(quoted_name(part.strip())) for part in text.rpartition("="))
         if not (name and unit in UNITS):
             raise ValueError(f"--unit is {text!r}; write NAME=UNIT with one of {', '.join(UNITS)}")
         if name in found:
@@ -227,22 +275,24 @@ def units_given(texts: Iterable[str]) -> dict[str, str]:
 
 
 def lengths_given(texts: Iterable[str]) -> VehicleLengths:
-    """Lengths of vehicles from texts such as ``5.0`` and ``truck=12``."""
+    """Lengths of vehicles, and widths, from texts such as ``5.0``, ``truck=12`` and ``5x1.8``."""
     from evofsm.fsm.validation import positive
     from evofsm.io import VehicleLengths
 
     lengths = VehicleLengths()
     for text in texts:
-        kind, _, number = text.rpartition("=")
+        kind, _, size = text.rpartition("=")
         try:
-            length = positive("length", float(number))
+            length, *width = (positive("it", float(number)) for number in size.split("x", 1))
         except ValueError:
             raise ValueError(
                 f"--vehicle-length is {text!r}; write a positive length such as 5.0, or "
-                "truck=12 for one type"
+                "truck=12 for one type, or 5.0x1.8 with a width"
             ) from None
         if kind:
             lengths.by_type[kind] = length
         else:
             lengths.default = length
+        if width:
+            lengths.widths[kind] = width[0]
     return lengths

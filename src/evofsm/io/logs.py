@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
+from operator import attrgetter
+from shlex import quote
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -23,9 +26,13 @@ from evofsm.io.tables import (
     OnRead,
     ParquetTable,
     Piece,
+    Skips,
     Table,
     Wanted,
     file_kind,
+    is_date,
+    is_number,
+    quoted_name,
     silent,
 )
 from evofsm.io.vehicles import ACTION, PairTable, VehicleLengths
@@ -39,14 +46,30 @@ USUAL_EPISODE = ("run", "pair", "segment", "episode")
 LONGEST_STEP = 1.5
 # Rows of a file whose steps tell the usual one.
 _FIRST_ROWS = 8192
+#: Bad rows of a file that are left out where nobody said how many.
+SKIPPED = 10
+# Signals are joined where so many values of each and no whole row are among the first ones.
+_FEWEST = 5
+#: So old may a value be that is held, as `Topics` has it [s].
+OLDEST = 0.5
 # Share by which the usual steps of two files may differ.
 _SAME_STEP = 0.05
 # Speeds [m/s] and usual steps [s] beyond these are most likely in another unit.
 _FASTEST, _LONGEST_USUAL = 60.0, 5.0
+# Two witnesses of one thing are compared in more rows than so, and where they go up and down
+# together as far as that (a correlation).
+_COMPARED, _ALIKE = 50, 0.9
 _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
 _MICROSECOND = 1e-6
 _NO_CAR = "{!r} cannot be right (another unit? --unit; a stand-in for nobody? --no-leader); in SI "
 
+# What may be done about a number that is missing.
+_HELD = "signals of several clocks in one table? --hold 0.5 holds the latest values)"
+_NO_ACTION = f" (a missing or failed measurement, or {_HELD}"
+_NO_LEADER = (
+    " (a missing or failed measurement, or no leader? --no-leader end leaves such rows out; or "
+    + _HELD
+)
 _SIGNS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt}
 _SIGNS |= {"==": operator.eq, "!=": operator.ne}
 _TRUTHS = {"true": 1, "yes": 1, "1": 1, "1.0": 1, "false": 0, "no": 0, "0": 0, "0.0": 0}
@@ -89,6 +112,11 @@ class Noted:
 
     units: dict[str, str] = field(default_factory=dict)  #: of columns, as they were told
     untold: list[str] = field(default_factory=list)  #: columns of which no unit was told
+    #: What was left out because it cannot be right, by its kind: how many, and the first.
+    skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
+    told: list[str] = field(default_factory=list)  #: what else is to be said, as sentences
+    #: How many times a rate is what another column says, where they differ: of gap, and action.
+    rates: dict[str, float] = field(default_factory=dict)
     leaderless: int = 0  #: rows without a leader, or in which a number is missing, left out
     after_failure: int = 0  #: rows left out because the failure before them still held
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
@@ -103,8 +131,10 @@ class Noted:
     #: What a variable was whenever an episode failed at once, if always the same.
     at_once: dict[str, float] = field(default_factory=dict)
 
-    def see(self, chunk: Chunk, names: Sequence[str]) -> None:
-        """Look for speeds and steps that are beyond belief."""
+    def see(self, chunk: Chunk, names: Sequence[str], *, first: bool = False) -> None:
+        """Look for what is beyond belief; in the first rows also for what contradicts itself."""
+        if first and set(VARIABLES) <= set(names):
+            self._compare_rates(chunk, *(names.index(name) for name in VARIABLES))
         for name, values in zip(names, chunk.observations.T, strict=True):
             if _SPEED.match(name) and (fastest := float(np.abs(values).max())) > _FASTEST:
                 self.fastest[name] = max(fastest, self.fastest.get(name, 0.0))
@@ -119,6 +149,26 @@ class Noted:
                 here = dict(zip(names, chunk.observations[row].tolist(), strict=True))
                 same = self.at_once.items() & here.items() if self.failed_at_once else here
                 self.at_once, self.failed_at_once = dict(same), self.failed_at_once + 1
+
+    def _compare_rates(self, chunk: Chunk, gap: int, follower: int, leader: int) -> None:
+        """The gap changes as speeds differ, and the own speed as the action says."""
+        within = np.diff(chunk.times) > 0.0
+        within[chunk.starts[1:] - 1] = False
+        steps = np.diff(chunk.times)[within]
+        seen, changed = chunk.observations, np.diff(chunk.observations, axis=0)[within]
+        closing = seen[:, leader] - seen[:, follower]
+        told = {
+            "gap": (changed[:, gap] / steps, 0.5 * (closing[1:] + closing[:-1])[within]),
+            "action": (changed[:, follower] / steps, chunk.actions[:-1][within]),
+        }
+        for what, (shown, said) in told.items():
+            known = np.isfinite(said)
+            x, y = said[known], shown[known]
+            if len(x) > _COMPARED and x.std() > 0.0 < y.std():
+                alike = float(np.corrcoef(x, y)[0, 1])
+                rate = alike * float(y.std() / x.std())
+                if abs(alike) > _ALIKE and not 0.8 < rate < 1.25:
+                    self.rates[what] = rate
 
 
 # -- What columns mean ----------------------------------------------------------------------------
@@ -150,10 +200,11 @@ class Condition(NamedTuple):
 
     @classmethod
     def parse(cls, text: str, option: str = "--failed") -> Condition:
-        """From ``collided`` or ``gap<=0``."""
-        column, sign, number, *_ = *re.split("([<>]=?|[=!]=)", text, maxsplit=1), "", "0"
+        """From ``collided`` or ``gap<=0``; a name with a sign in it stands in double quotes."""
+        name, rest = quoted_name(text)
+        column, sign, number, *_ = *re.split("([<>]=?|[=!]=)", rest, maxsplit=1), "", "0"
         try:
-            condition = cls(column.strip(), sign, float(number))
+            condition = cls(name + column.strip(), sign, float(number))
         except ValueError:
             condition = cls("", "", np.nan)
         if not (condition.column and np.isfinite(condition.number)):
@@ -171,13 +222,13 @@ class Condition(NamedTuple):
         texts = piece.texts[self.column].str.strip_chars().str.to_lowercase()
         values = texts.replace_strict(_TRUTHS, default=-1).to_numpy()
         if (values < 0).any():
-            piece.refuse(
-                int(np.argmin(values)),
+            piece.leave_out(
                 self.column,
+                values < 0,
                 "{!r} is no truth value; here a column of 0 and 1, true and false or yes and no is "
                 f"needed, or a comparison such as '{self.column}>0'",
             )
-        return values.astype(np.bool_)
+        return np.asarray(values > 0)
 
 
 @dataclass(frozen=True)
@@ -205,8 +256,13 @@ class LogColumns:
         Units by the column, or the beginning of columns, that are not those of the SI: ``"km/h"``.
     no_leader : str, optional
         ``"end"``: a row in which an observed number is missing (an empty field, NaN, infinity) ends
-        the episode, and is left out; else it is refused. A condition, as ``failed`` takes one,
+        the episode, and is left out; else it is a bad row. A condition, as ``failed`` takes one,
         such as ``"precedingId==0"``: so does a row in which it holds, whatever stands there.
+    hold : float, optional
+        Signals of several clocks in one table: a field without a value has the latest one, if it is
+        not older than this [s]; rows are those with an action. Where no row has all values, 0.5 s.
+    skip_bad : int
+        So many bad rows of a file are left out, and counted; with more it is refused.
     """
 
     observe: ObservationEncoder = field(default_factory=lambda: ObservationEncoder(*VARIABLES))
@@ -217,6 +273,8 @@ class LogColumns:
     failed: str | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     no_leader: str | None = None
+    hold: float | None = None
+    skip_bad: int = SKIPPED
 
 
 # -- Reading --------------------------------------------------------------------------------------
@@ -280,20 +338,27 @@ def read_traces(
     clock = _Clock(columns.dt)
     for path in paths:
         clock.open(path)
-        rows, left_out = 0, noted.leaderless
-        table = _open(path, columns, lengths, on_read, topics)
+        rows, left_out, skips = 0, noted.leaderless, Skips(columns.skip_bad, noted.skipped)
+        table = _open(path, columns, lengths, on_read, topics, skips, noted.told)
         these = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
         for chunk in _Reader(table, these, clock, noted).chunks():
             rows += len(chunk.times)
-            noted.see(chunk, columns.observe.names)
+            noted.see(chunk, columns.observe.names, first=rows == len(chunk.times))
             yield chunk
         if rows == 0 and noted.leaderless > left_out:
             raise ValueError(
                 f"{path}: no row is left; {', '.join(columns.observe.names)} must all be there"
             )
         if rows == 0:
-            raise ValueError(f"{path} has a header but no rows")
+            skips.refuse_nothing(f"{path} has a header but no rows")
     lengths.refuse_unknown()
+    for kind, times in lengths.overlaps.most_common(1):
+        length, width = lengths.size_of(kind)
+        noted.told.append(
+            f"{times:,} times a vehicle overlaps another one that is not in line with it (type "
+            f"{kind!r}): is it narrower than {width:g} m? --vehicle-length "
+            f"{quote(f'{kind}={length:g}x0.8')} says its length and width"
+        )
 
 
 def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
@@ -377,7 +442,13 @@ def _joined(parts: Sequence[Chunk]) -> Chunk:
 
 
 def _open(
-    path: str, columns: LogColumns, lengths: VehicleLengths, on_read: OnRead, topics: Topics | None
+    path: str,
+    columns: LogColumns,
+    lengths: VehicleLengths,
+    on_read: OnRead,
+    topics: Topics | None,
+    skips: Skips,
+    told: list[str],
 ) -> Table:
     """The rows of a file, whatever it holds."""
     kind = file_kind(path)
@@ -389,26 +460,36 @@ def _open(
             )
         from evofsm.io.rosbag import BagTable
 
-        return BagTable(path, topics, on_read)
+        return BagTable(path, topics, on_read, skips, told)
     if kind == "run":
         raise ValueError(
             f"{path} is a run that evofsm drove and learnt from: evofsm watch replays it, and "
             "evofsm inspect prints its model"
         )
+    moments = None
     if kind in ("osi", "mcap"):
         read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap
-        return PairTable(path, vehicles.pairs_of_scenes(path, read(path, on_read)))
-    if kind == "xml":
-        rows = vehicles.fcd_of_xml(path, on_read)
-        return PairTable(path, vehicles.pairs_of_fcd(path, rows, lengths))
-    table: Table = CsvTable(path, on_read) if kind == "csv" else ParquetTable(path, on_read)
+        moments = vehicles.pairs_of_scenes(path, read(path, on_read, skips), skips)
+    elif kind == "xml":
+        steps = vehicles.fcd_of_xml(path, on_read, skips)
+        moments = vehicles.pairs_of_fcd(path, steps, lengths, skips)
+    if moments is not None:
+        return PairTable(path, moments, skips)
+    asked = {*columns.observe.names, columns.action, columns.time}
+    names = asked.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
+    table: Table = (
+        CsvTable(path, on_read, names, skips)
+        if kind == "csv"
+        else ParquetTable(path, on_read, skips)
+    )
     there = set(table.columns)
-    if vehicles.FCD_TIME in there:
-        rows = vehicles.fcd_of_table(table)
-        return PairTable(path, vehicles.pairs_of_fcd(path, rows, lengths))
-    if set(vehicles.OBJECT_COLUMNS) <= there and not set(columns.observe.names) <= there:
+    if set(columns.observe.names) <= there:
+        return table
+    if (fcd := vehicles.fcd_of_table(table)) is not None:
+        return PairTable(path, vehicles.pairs_of_fcd(path, fcd, lengths, skips), skips)
+    if set(vehicles.OBJECT_COLUMNS) <= there:
         scenes = vehicles.scenes_of_table(table)
-        return PairTable(path, vehicles.pairs_of_scenes(path, scenes))
+        return PairTable(path, vehicles.pairs_of_scenes(path, scenes, skips), skips)
     return table
 
 
@@ -417,6 +498,7 @@ def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
     asked = [f"--observe {name}" for name in columns.observe.names if name not in VARIABLES]
     asked += [f"--action {columns.action}"] if columns.action != ACTION else []
     given = {"--episode": columns.episode, "--dt": columns.dt, "--unit": columns.units or None}
+    given |= {"--hold": columns.hold}
     asked += [option for option, value in given.items() if value is not None]
     if columns.no_leader not in (None, "end"):  # who has none is no pair
         asked += [f"--no-leader {columns.no_leader}"]
@@ -450,24 +532,41 @@ class _Clock:
 
     def holes(
         self, times: NDArray[np.float64], starts: NDArray[np.bool_], piece: Piece
-    ) -> NDArray[np.bool_]:
-        """Mark rows that come too late, or too soon, to follow the row before in its episode."""
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Mark rows after a hole in time within an episode, and those that bring nothing later."""
+        late = np.zeros(piece.rows, np.bool_)
         steps = np.diff(times, prepend=self._last)
         steps[starts] = np.nan
-        self._last = times[-1]
         if (steps <= 0.0).any():
-            row = int(np.argmax(steps <= 0.0))
-            raise ValueError(
-                f"{piece.at(row)}: time goes from {times[row] - steps[row]:g} to {times[row]:g} "
-                "within an episode; it must run forward (rows not sorted by time, or several "
-                "episodes mixed? --episode names the columns that tell them apart)"
-            )
+            late = self._late(times, starts, piece)
+            on = np.flatnonzero(~late)
+            steps[late], steps[on] = np.nan, np.diff(times[on], prepend=self._last)
+            steps[starts] = np.nan
+            times = np.append(self._last, times[on])
+        self._last = times[-1]
         first = steps[:_FIRST_ROWS]
         if np.isnan(self._usual) and not np.isnan(first).all():
-            exact = -math.log10(np.spacing(abs(times[-1])))  # digits that such times can have
+            exact = -math.log10(np.spacing(np.nanmax(abs(times))))  # digits that times can have
             self._settle(round(float(np.nanmedian(first)), min(9, int(exact))))
         unusual = (steps > LONGEST_STEP * self._usual) | (steps < self._usual / LONGEST_STEP)
-        return np.asarray(unusual)
+        return np.asarray(unusual), late
+
+    def _late(
+        self, times: NDArray[np.float64], starts: NDArray[np.bool_], piece: Piece
+    ) -> NDArray[np.bool_]:
+        late, latest = np.zeros(piece.rows, np.bool_), self._last
+        for row, (time, begins) in enumerate(zip(times.tolist(), starts.tolist(), strict=True)):
+            late[row] = not begins and time <= latest
+            if late[row]:
+                piece.skips.leave_out(
+                    "time",
+                    f"{piece.at(row)}: time goes from {latest:g} to {time:g} within an episode; it "
+                    "must run forward (a row twice, rows not sorted by time, a clock of too few "
+                    "digits, or several episodes mixed? --episode names the columns that tell them "
+                    "apart, and --dt stands in for a clock)",
+                )
+            latest = latest if late[row] else time
+        return late
 
     def _settle(self, usual: float) -> None:
         if usual <= 0.0:
@@ -500,51 +599,50 @@ class _Reader:
             self._nobody = Condition.parse(columns.no_leader, "--no-leader")
         self._before = 0  # rows
         self._first_date = np.nan
+        # How long values are held, 0 for not at all; and those held, with their times.
+        self._hold = columns.hold
+        self._held_numbers: dict[str, tuple[float, float]] = {}
+        self._held_texts: dict[str, str] = {}
         # Episodes that there were, and the latest one.
         self._known: set[tuple[str, ...]] = set()
         self._latest: tuple[str, ...] | None = None
         # Whether the condition held in the row before, and whether that ended its episode.
         self._held = self._ended = False
+        self._unknown: Callable[[], str] | None = None  # says where that row has no action
 
     def chunks(self) -> Iterator[Chunk]:
         """The rows that are learnt, piece by piece."""
-        columns, clock = self._columns, self._clock
+        action, clock = self._columns.action, self._clock
         wanted, factors = self._wanted()
-        nobody = () if self._nobody is None else (self._nobody.column,)
-        may_lack = (*self._observed, columns.action, *nobody)
-        only_compared = [name for name in wanted.gaps if name not in may_lack]
-        for piece in self._table.pieces(wanted):
+        for piece in filter(attrgetter("rows"), self._table.pieces(wanted)):
             for name, factor in factors.items():
                 piece.numbers[name] = piece.numbers[name] * factor
-            starts = self._starts(piece)
-            anew, holes = starts.copy(), np.zeros(piece.rows, np.bool_)
+            if clock.ticks and wanted.date is None:
+                piece.leave_out_unusable(self._columns.time)
             times = self._times(piece, wanted.date)
+            if clock.ticks and (filled := self._fill(piece, times)) is not None:
+                piece, times = piece.take(filled), times[filled]
+            if not piece.rows:
+                continue
+            starts = self._starts(piece)
+            anew, late, holes = starts.copy(), *np.zeros((2, piece.rows), np.bool_)
+            starts[[row for row in piece.anew if row < piece.rows]] = True
             if clock.ticks:
-                holes = clock.holes(times, starts, piece)
+                holes, late = clock.holes(times, starts, piece)
             starts |= holes
             self._before += piece.rows
-            kept, fails = self._sift(piece, anew, starts)
+            observations = np.column_stack([_encoded(piece, v) for v in self._variables])
+            kept, fails = self._sift(piece, anew, starts, late)
             if not kept.any():
                 continue
-            for name in only_compared:
-                if (lacks := kept & np.isnan(piece.numbers[name])).any():
-                    piece.refuse(int(np.argmax(lacks)), name)
-            if columns.no_leader:
-                # Where the table knows its episodes, the action may be derived, and NaN.
-                for name in (*self._observed, *([columns.action] if piece.starts is None else [])):
-                    piece.refuse_unusable(name, kept)
-            cars = VARIABLES if self._observed == [*VARIABLES] else ()
-            for name, ends in zip(cars, RANGES, strict=False):
-                why = f"{_NO_CAR}it lies between {ends[0]:g} and {ends[1]:g}"
-                piece.refuse_unusable(name, kept, ends, why)
             episodes = (
                 np.searchsorted(piece.starts or (), np.flatnonzero(starts & kept), "right") - 1
             )
             rows = slice(None) if kept.all() else kept  # a slice copies nothing
             yield Chunk(
                 source=self._table.path,
-                observations=np.column_stack([_encoded(piece, v) for v in self._variables])[rows],
-                actions=piece.numbers[columns.action][rows],
+                observations=observations[rows],
+                actions=piece.numbers[action][rows],
                 times=times[rows],
                 starts=np.flatnonzero(starts[rows]),
                 dt=clock.dt,
@@ -552,6 +650,39 @@ class _Reader:
                 failures=None if self._failed is None else np.flatnonzero(fails[rows]),
                 names=[piece.names[k] for k in episodes] if piece.names else (),
             )
+
+    def _fill(self, piece: Piece, times: NDArray[np.float64]) -> NDArray[np.int64] | None:
+        """Fill in the latest values of each signal, and say which rows count: those with an action.
+
+        Nothing where the table has one clock: some row of the first ones has all that is wanted.
+        """
+        there = {name: np.isfinite(values) for name, values in piece.numbers.items()}
+        if self._hold is None:
+            is_whole = np.logical_and.reduce(list(there.values())).any()
+            is_joined = not is_whole and all(each.sum() > _FEWEST for each in there.values())
+            self._hold = OLDEST if is_joined else 0.0
+            if self._hold:
+                self._noted.told.append(
+                    f"{piece.at(0)}: no row has all values, as where signals of several clocks are "
+                    f"joined: rows are those with {self._columns.action}, other values the latest, "
+                    f"none older than {OLDEST:g} s (--hold)"
+                )
+        if not self._hold:
+            return None
+        rows = np.arange(piece.rows + 1)
+        for name in set(piece.numbers) - {self._columns.time}:
+            value, since = self._held_numbers.get(name, (np.nan, -np.inf))
+            values, when = np.append(value, piece.numbers[name]), np.append(since, times)
+            latest = np.maximum.accumulate(np.where(np.append(True, there[name]), rows, 0))
+            self._held_numbers[name] = float(values[latest[-1]]), float(when[latest[-1]])
+            age = np.abs(times - when[latest[1:]])  # below 0 where another episode begins
+            too_old = age > self._hold * (1.0 + 1e-9)
+            piece.numbers[name] = np.where(too_old, np.nan, values[latest[1:]])
+        for name, texts in piece.texts.items():
+            filled = texts.replace("", None).forward_fill()
+            piece.texts[name] = filled.fill_null(self._held_texts.get(name, ""))
+            self._held_texts[name] = piece.texts[name][-1]
+        return np.flatnonzero(there[self._columns.action])
 
     def _wanted(self) -> tuple[Wanted, dict[str, float]]:
         """What is read, and what turns columns into units of the SI, for those that need it."""
@@ -579,7 +710,7 @@ class _Reader:
                     f"{table.path} has no column {name!r}; it has {shown}{more} ({option} names "
                     f"the right one{stands_in})"
                 )
-        date = columns.time if clock and table.holds_dates(columns.time) else None
+        date = columns.time if clock and is_date(table.first(columns.time)) else None
         numbers = [*learnt, *compared, *(clock if date is None else [])]
         try:
             given = {name: unit for name in numbers if (unit := table.units.get(name))}
@@ -594,21 +725,35 @@ class _Reader:
             raise ValueError(f"{table.path}: {error}") from None
         self._noted.units |= given
         self._noted.untold += [name for name in numbers if name not in given]
-        gaps = [name for name in compared if name not in learnt]
-        gaps += learnt if columns.no_leader else []
-        wanted = Wanted(numbers, [*self._episode, *categories, *told], gaps, date)
+        if not clock and is_number(table.first(columns.time)):
+            numbers.append(columns.time)  # to be compared with --dt
+        wanted = Wanted(numbers, [*self._episode, *categories, *told], date)
         return wanted, {name: UNITS[unit] for name, unit in given.items() if unit in UNITS}
 
     def _times(self, piece: Piece, date: str | None) -> NDArray[np.float64]:
         if not self._clock.ticks:
+            if self._before == 0:
+                self._compare_dt(piece)
             rows = np.arange(self._before, self._before + piece.rows)
             return rows * np.float64(self._clock.dt)
-        times = piece.numbers[self._columns.time]
+        times = np.where(piece.bad, np.nan, piece.numbers[self._columns.time])
         if date is None:
             return times
         if np.isnan(self._first_date):
-            self._first_date = times[0]
+            self._first_date = times[np.argmin(np.isnan(times))]
         return (times - self._first_date) * _MICROSECOND
+
+    def _compare_dt(self, piece: Piece) -> None:
+        """Say where a clock that is not read says something else than --dt."""
+        time, dt = self._columns.time, self._clock.dt
+        steps = np.diff(piece.numbers.get(time, np.zeros(0)))
+        step = float(np.median(steps)) if len(steps) else np.nan
+        units = (1.0, 1e-3, 1e-6, 1e-9)
+        if step > 0.0 and not any(abs(step * unit / dt - 1.0) < _SAME_STEP for unit in units):
+            self._noted.told.append(
+                f"{self._table.path}: --dt says {dt:g} s from a row to the next, and column "
+                f"{time!r} goes on by {step:g}: without --dt that column is the clock"
+            )
 
     def _starts(self, piece: Piece) -> NDArray[np.bool_]:
         """The rows that begin another episode.
@@ -638,26 +783,48 @@ class _Reader:
         return starts
 
     def _sift(
-        self, piece: Piece, anew: NDArray[np.bool_], starts: NDArray[np.bool_]
+        self,
+        piece: Piece,
+        anew: NDArray[np.bool_],
+        starts: NDArray[np.bool_],
+        late: NDArray[np.bool_],
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which rows are kept, and which of them fail; marks ``starts`` after those that end one.
 
         An episode begins ``anew`` where the log says so, and at ``starts``. A condition that still
         holds is no second failure, and a hole in time does not make it one.
         """
-        lacking, fails = np.zeros((2, piece.rows), np.bool_)
-        for name in self._observed if self._columns.no_leader else ():
+        action, compared = self._columns.action, self._failed
+        lacking = np.zeros(piece.rows, np.bool_)
+        for name in self._observed if self._columns.no_leader or self._hold else ():
             lacking |= ~np.isfinite(piece.numbers[name])
         nobody = False if self._nobody is None else self._nobody.holds(piece)
         lacking |= nobody
-        kept = ~lacking
-        if self._failed is not None:
-            holds = self._failed.holds(piece) & ~np.asarray(nobody)
+        cars = VARIABLES if self._observed == [*VARIABLES] else ()
+        for name in self._observed:
+            piece.leave_out_unusable(name, ~lacking, _NO_LEADER)
+        for name, ends in zip(cars, RANGES, strict=False):
+            why = f"{_NO_CAR}it lies between {ends[0]:g} and {ends[1]:g}"
+            piece.leave_out_unusable(name, ~lacking, "", ends, why)
+        unknown = np.isnan(piece.numbers[action])
+        piece.leave_out_unusable(action, ~lacking & ~unknown)
+        if not self._table.derives:
+            self._count_unknown(piece, unknown & ~lacking, starts)
+        if compared is not None and compared.sign and compared.column not in self._observed:
+            piece.leave_out(compared.column, np.isnan(piece.numbers[compared.column]) & ~lacking)
+        fails = np.zeros(piece.rows, np.bool_)
+        holds = None if compared is None else compared.holds(piece) & ~np.asarray(nobody)
+        kept = ~(lacking | piece.bad | late)
+        if compared is not None and holds is not None:
+            for row in np.flatnonzero(late)[::-1]:  # whose time the row before has
+                holds[max(row - 1, 0)] |= holds[row]
+            for row in np.flatnonzero(late):
+                holds[row] = holds[row - 1] if row else self._held
             self._noted.failing += int(holds.sum())
-            if self._failed.sign:
-                values = piece.numbers[self._failed.column]
-                seen = [*values[np.isfinite(values)].tolist(), *(self._noted.compared or ())]
-                self._noted.compared = (min(seen), max(seen)) if seen else None
+            if compared.sign:
+                values = piece.numbers[compared.column]
+                seen = np.append(values[np.isfinite(values)], self._noted.compared or ())
+                self._noted.compared = (float(seen.min()), float(seen.max())) if len(seen) else None
             before = np.concatenate([[self._held], holds[:-1]]) & ~anew
             self._held = bool(holds[-1])
             fails, still = holds & ~before, holds & before
@@ -666,10 +833,21 @@ class _Reader:
             fails &= kept
             kept &= ~still
         self._noted.leaderless += int(lacking.sum())
-        ends = fails | ~kept
+        ends = fails | ~(kept | late)
         starts |= np.concatenate([[self._ended], ends[:-1]])
         self._ended = bool(ends[-1])
         return kept, fails
+
+    def _count_unknown(
+        self, piece: Piece, unknown: NDArray[np.bool_], starts: NDArray[np.bool_]
+    ) -> None:
+        """Count rows without an action, but the last ones of episodes, which need none."""
+        if self._unknown is not None and not starts[0]:
+            piece.skips.leave_out("action", self._unknown)
+        told = partial(piece.told, name=self._columns.action, hint=_NO_ACTION)
+        for row in np.flatnonzero(unknown[:-1] & ~starts[1:]).tolist():
+            piece.skips.leave_out("action", partial(told, row))
+        self._unknown = partial(told, piece.rows - 1) if unknown[-1] else None
 
 
 def _encoded(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
@@ -682,5 +860,5 @@ def _encoded(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
     found = piece.texts[variable.name].replace_strict(places, default=-1).to_numpy()
     if (found < 0).any():
         why = "{!r} is none of the values that --observe names: " + ", ".join(variable.values)
-        piece.refuse(int(np.argmin(found)), variable.name, why)
+        piece.leave_out(variable.name, found < 0, why)
     return np.asarray(codes[found], np.float64)

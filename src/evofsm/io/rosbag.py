@@ -13,7 +13,8 @@ import re
 import sqlite3
 import tomllib
 from array import array
-from collections.abc import Collection, Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from itertools import chain
 from os import PathLike
@@ -25,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.io.tables import UNITS, OnRead, Piece, RefusedError, Table, Wanted, readable
+from evofsm.io.runs import messages
+from evofsm.io.tables import UNITS, OnRead, Piece, RefusedError, Skips, Table, Wanted, readable
 from evofsm.io.vehicles import ACTION
 
 with needs("msgspec", "ros", "a bag of ROS 2"):
@@ -35,7 +37,16 @@ with needs("msgspec", "ros", "a bag of ROS 2"):
 _NANOSECONDS = 1_000_000_000
 _MCAP = b"\x89MCAP0\r\n"
 _ZSTD = b"\x28\xb5\x2f\xfd"  # how what is compressed begins; no message in CDR does
-_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+\])*)")
+_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[[^\]]+\])*)(?:\.(?=.)|$)")
+# What the elements of an array are called by, where they have such a field.
+_CALLED = ("name", "child_frame_id", "key")
+_MOST_BYTES = 1 << 30  # of a chunk, unpacked
+# Spans of two clocks differ where they do by such a share, and by such a time [s].
+_SHARE, _SPAN = 0.05, 0.5
+
+
+# When there were messages with a field [ns], in order, and what stood there.
+_Values = tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
 class Field(NamedTuple):
@@ -43,39 +54,63 @@ class Field(NamedTuple):
 
     text: str
     topic: str
-    steps: tuple[str | int, ...]  #: names of fields, and places in arrays, from 0
+    #: Names of fields, and in brackets places in arrays, from 0, or names of what is in them.
+    steps: tuple[str | tuple[int | str], ...]
 
     @classmethod
     def parse(cls, text: str) -> Self:
         """A topic, and behind its first dot the way to the number: ``/scan.ranges[3]``."""
         topic, _, way = text.partition(".")
-        found = [_STEP.fullmatch(name) for name in way.split(".")]
-        steps: list[str | int] = []
-        for step in found:
-            if not (step and topic):
-                raise ValueError(
-                    f"{text!r} is no field; write /topic.field, /topic.field.field or "
-                    "/topic.field[0].field"
-                )
-            steps += [step[1], *map(int, re.findall(r"\d+", step[2]))]
+        steps: list[str | tuple[int | str]] = []
+        while step := _STEP.match(way):
+            places = re.findall(r"\[([^\]]+)\]", step[2])
+            steps += [step[1], *((int(one) if one.isdecimal() else one,) for one in places)]
+            way = way[step.end() :]
+        if way or not (steps and topic):
+            raise ValueError(
+                f"{text!r} is no field; write /topic.field, /topic.field.field, "
+                "/topic.field[0].field or, of what has a name in the message, /topic.field[name]"
+            )
         return cls(text, topic, tuple(steps))
 
-    def read(self, message: Any) -> float:
-        """The number in a message; NaN behind the end of an array."""
-        value = message
+    def read(self, message: Any, called: dict[int, str], count: int = 1) -> float | None:
+        """The number in a message; NaN behind the end of an array, None where no name is its own.
+
+        What stands in a place the first time is known by its name from then on, if it has one.
+        """
+        owner, value = None, message
         try:
-            for step in self.steps:
-                if isinstance(step, int):
-                    if step >= len(value):
-                        return math.nan
-                    value = value[step]
-                else:
-                    value = getattr(value, step)
+            for number, step in enumerate(self.steps):
+                if isinstance(step, str):
+                    owner, value = value, getattr(value, step)
+                    continue
+                place, names = step[0], _names_in(owner, value)
+                if isinstance(place, int) and number not in called and place < len(names):
+                    called[number] = names[place]
+                if isinstance(name := called.get(number, place), str):
+                    if name not in names:
+                        return None
+                    place = names.index(name)
+                if int(place) >= len(value):
+                    return math.nan
+                owner, value = None, value[place]
             return float(value)
         except (AttributeError, TypeError, ValueError) as error:
             raise RefusedError(
-                f"{self.text} is no number in messages of {self.topic!r}: {error}"
+                f"{self.text} is no number in message {count} of {self.topic!r}: {error}"
             ) from None
+
+
+def _names_in(owner: Any, array: Any) -> list[str]:
+    """What the elements of an array are called, in it or in an array beside it; or nothing."""
+    for beside in vars(owner).values() if owner is not None else ():
+        is_names = isinstance(beside, list) and bool(beside) and isinstance(beside[0], str)
+        if is_names and len(beside) == len(array):
+            return list(beside)
+    for field in _CALLED:
+        if len(array) and hasattr(array[0], field):
+            return [str(getattr(one, field)) for one in array]
+    return []
 
 
 class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -168,12 +203,13 @@ class BagTable(Table):
     next row.
     """
 
-    def __init__(self, path: str, topics: Topics, on_read: OnRead) -> None:
-        self.path = path
-        self._topics = topics
-        self._on_read = on_read
-        self._derives = "v_follower" in topics.variables and ACTION not in topics.variables
-        self.columns = ["time", *topics.variables, *([ACTION] if self._derives else [])]
+    def __init__(
+        self, path: str, topics: Topics, on_read: OnRead, skips: Skips, told: list[str]
+    ) -> None:
+        self.path, self.skips = path, skips
+        self._topics, self._on_read, self._told = topics, on_read, told
+        self.derives = "v_follower" in topics.variables and ACTION not in topics.variables
+        self.columns = ["time", *topics.variables, *([ACTION] if self.derives else [])]
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """All columns, whichever are wanted, as one piece."""
@@ -189,19 +225,13 @@ class BagTable(Table):
                 f"{self.path}: at no time are all variables known, none older than "
                 f"{self._topics.oldest:g} s (oldest in the file of --topics)"
             )
-        piece = Piece.of_numbers(self.path, 0, numbers, [0], ())
-        for name in wanted.numbers:
-            if name in self._topics.variables and name not in wanted.gaps:
-                piece.refuse_unusable(name)
-        yield piece
+        yield Piece.of_numbers(self.path, 0, numbers, [0], (), self.skips)
 
-    def _held(
-        self, messages: Mapping[str, tuple[NDArray[np.int64], Mapping[str, NDArray[np.float64]]]]
-    ) -> dict[str, NDArray[np.float64]]:
+    def _held(self, found: Mapping[str, _Values]) -> dict[str, NDArray[np.float64]]:
         """Of each tick in which all are known, the latest values before it."""
         topics = self._topics
         interval, oldest = (round(x * _NANOSECONDS) for x in (topics.interval, topics.oldest))
-        stamps = np.sort(np.concatenate([of_topic for of_topic, _ in messages.values()]))
+        stamps = np.sort(np.concatenate([stamps for stamps, _ in found.values()]))
         # Ticks while anything was heard of lately: clocks may jump by years.
         ends = np.append(np.flatnonzero(np.diff(stamps) > oldest + interval), len(stamps) - 1)
         begins = np.append(0, ends[:-1] + 1)
@@ -214,64 +244,97 @@ class BagTable(Table):
         at = stamps[0] + interval * ticks[ticks * interval <= stamps[-1] - stamps[0]]
         values: dict[str, NDArray[np.float64]] = {}
         known = np.ones(len(at), np.bool_)
-        for of_topic, fields in messages.values():
-            latest = np.searchsorted(of_topic, at, side="right") - 1
-            known &= (latest >= 0) & (at - of_topic[latest] <= oldest)
-            values |= {field: of_field[latest] for field, of_field in fields.items()}
-        numbers = {"time": (at - stamps[0])[known] / _NANOSECONDS}
+        for field, (of_field, numbers) in found.items():
+            latest = np.searchsorted(of_field, at, side="right") - 1
+            known &= (latest >= 0) & (at - of_field[latest] <= oldest)
+            values[field] = numbers[latest]
+        rows = {"time": (at - stamps[0])[known] / _NANOSECONDS}
         for name, one in topics.variables.items():
             value = values[one.field] - (values[one.minus] if one.minus else 0.0)
             factor = 1.0 if one.unit is None else UNITS[one.unit]
-            numbers[name] = (factor * value + one.offset)[known]
-        if self._derives:
-            action = np.diff(numbers["v_follower"], append=np.nan) / topics.interval
+            rows[name] = (factor * value + one.offset)[known]
+        if self.derives:
+            action = np.diff(rows["v_follower"], append=np.nan) / topics.interval
             follows = np.diff(at[known], append=0) == interval
-            numbers[ACTION] = np.where(follows, action, np.nan)
-        return numbers
+            rows[ACTION] = np.where(follows, action, np.nan)
+        return rows
 
-    def _messages(self) -> dict[str, tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]]:
-        """Of each topic that is wanted, when its messages were, and what stands in their fields."""
+    def _messages(self) -> dict[str, _Values]:
+        """Of each field, when there were messages with it, and what stood there."""
         with needs("rosbags", "ros", f"{self.path}: a bag of ROS 2"):
             import zstandard  # of rosbags
             from rosbags.typesys.store import Typestore
-        texts = {text for one in self._topics.variables.values() for text in one.fields}
-        fields = [Field.parse(text) for text in texts]
-        of_topic = {one.topic: [f for f in fields if f.topic == one.topic] for one in fields}
-        stamps = {topic: array("q") for topic in of_topic}
-        values = {text: array("d") for text in texts}
+        fields = [
+            Field.parse(text)
+            for text in {text for one in self._topics.variables.values() for text in one.fields}
+        ]
+        topics = {one.topic for one in fields}
+        values = {one.text: (array("q"), array("d"), dict[int, str]()) for one in fields}
         stores: dict[_Type, Typestore] = {}
-        there: set[str] = set()
+        spans: dict[str, list[int]] = {}  # as recorded from and to, and by headers [ns]
+        there, counts = set[str](), Counter[str]()
         for topic, kind, stamp, data in chain.from_iterable(
-            (_of_mcap if is_mcap else _of_sqlite)(file, set(of_topic), there)
+            (self._of_mcap if is_mcap else _of_sqlite)(file, topics, there)
             for file, is_mcap in _files(Path(self.path))
         ):
             self._on_read(len(data))
+            counts[topic] += 1
             if data.startswith(_ZSTD):  # as only the folder's metadata.yaml would say
                 data = zstandard.decompress(data)
             if kind not in stores:
                 stores[kind] = kind.store(topic)
             message = stores[kind].deserialize_cdr(data, kind.name)
-            if self._topics.stamp == "header":
-                if not hasattr(message, "header"):
-                    raise RefusedError(
-                        f"messages of {topic!r} ({kind.name}) have no header; write "
-                        'stamp = "received"'
-                    )
-                at = message.header.stamp
-                stamp = at.sec * _NANOSECONDS + at.nanosec
-            stamps[topic].append(stamp)
-            for field in of_topic[topic]:
-                values[field.text].append(field.read(message))
-        if lacking := sorted(set(of_topic) - there):
+            if hasattr(message, "header"):
+                at = message.header.stamp.sec * _NANOSECONDS + message.header.stamp.nanosec
+                first, last, begin, end = spans.get(topic, (stamp, stamp, at, at))
+                spans[topic] = [min(first, stamp), max(last, stamp), min(begin, at), max(end, at)]
+                stamp = at if self._topics.stamp == "header" else stamp
+            elif self._topics.stamp == "header":
+                raise RefusedError(
+                    f'messages of {topic!r} ({kind.name}) have no header; write stamp = "received"'
+                )
+            for field in fields:
+                if field.topic == topic:
+                    stamps, numbers, called = values[field.text]
+                    number = field.read(message, called, counts[topic])
+                    if number is not None:
+                        stamps.append(stamp)
+                        numbers.append(number)
+        if lacking := sorted(topics - there):
             raise RefusedError(f"it has no topic {lacking[0]!r}; it has {', '.join(sorted(there))}")
-        found = {}
-        for topic, of_one in stamps.items():
-            if not len(of_one):
-                raise RefusedError(f"its topic {topic!r} has no messages")
-            order = np.argsort(np.array(of_one), kind="stable")
-            of_fields = {one.text: np.array(values[one.text])[order] for one in of_topic[topic]}
-            found[topic] = np.array(of_one)[order], of_fields
+        if self._topics.stamp == "received":
+            self._compare(spans)
+        found: dict[str, _Values] = {}
+        for text, (stamps, numbers, _) in values.items():
+            if not len(stamps):
+                topic = text.partition(".")[0]
+                lacks = f"messages with {text}" if counts[topic] else "messages"
+                raise RefusedError(f"its topic {topic!r} has no {lacks}")
+            order = np.argsort(np.array(stamps), kind="stable")
+            found[text] = np.array(stamps)[order], np.array(numbers)[order]
         return found
+
+    def _compare(self, spans: Mapping[str, Sequence[int]]) -> None:
+        """Say where messages are recorded at another rate than the one of their headers."""
+        for topic, (first, last, begin, end) in spans.items():
+            recorded, own = (last - first) / _NANOSECONDS, (end - begin) / _NANOSECONDS
+            if own and abs(own - recorded) > max(_SPAN, _SHARE * recorded):
+                self._told.append(
+                    f"{self.path}: messages of {topic} span {own:.3g} s by their headers, and "
+                    f"{recorded:.3g} s as recorded, by which times are (played, or simulated, at "
+                    'another speed?): stamp = "header" in the file of --topics goes by the headers'
+                )
+                return
+
+    def _of_mcap(self, file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
+        for schema, channel, message in messages(file, _MOST_BYTES, self.skips):
+            there.add(channel.topic)
+            if channel.topic in wanted:
+                told = ("", "", b"")
+                if schema is not None:
+                    told = schema.name, schema.encoding, schema.data
+                kind = _Type(told[0], channel.message_encoding, told[1], told[2].decode())
+                yield channel.topic, kind, message.log_time, message.data
 
 
 # -- Files of a bag -------------------------------------------------------------------------------
@@ -326,20 +389,6 @@ def _files(path: Path) -> Iterator[tuple[Path, bool]]:
                 file = unpacked
             with file.open("rb") as opened:
                 yield file, opened.read(len(_MCAP)) == _MCAP
-
-
-def _of_mcap(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
-    with needs("mcap", "ros", f"{file}: a bag of ROS 2"):
-        from mcap.reader import make_reader
-    with file.open("rb") as opened:
-        reader = make_reader(opened)
-        if (summary := reader.get_summary()) is not None:
-            there |= {channel.topic for channel in summary.channels.values()}
-        for schema, channel, message in reader.iter_messages(wanted, log_time_order=False):
-            there.add(channel.topic)
-            told = ("", "", b"") if schema is None else (schema.name, schema.encoding, schema.data)
-            kind = _Type(told[0], channel.message_encoding, told[1], told[2].decode())
-            yield channel.topic, kind, message.log_time, message.data
 
 
 def _of_sqlite(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:

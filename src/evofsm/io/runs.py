@@ -12,6 +12,7 @@ import io
 import json
 import math
 import os
+import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,10 +25,10 @@ from evofsm.driving.naming import DECISION_COLUMNS, VARIABLES
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel
 from evofsm.guard.record import RECORD, Column
-from evofsm.io.tables import readable
+from evofsm.io.tables import RefusedError, Skips, readable
 
 if TYPE_CHECKING:
-    from mcap.records import Chunk, McapRecord
+    from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 
 #: The profile by which our files are known, and the record that says what was driven.
 PROFILE = "evofsm"
@@ -165,20 +166,52 @@ def read_run(path: str | os.PathLike[str]) -> Run:
         return _run_of(_unpacked(path, _LARGEST_CHUNK))
 
 
-def records(path: str | os.PathLike[str], largest: int) -> Iterator[McapRecord]:
-    """All records of any MCAP file, in their order; none of its chunks is larger than so [byte]."""
+def messages(
+    path: str | os.PathLike[str], largest: int, skips: Skips
+) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """All messages of any MCAP file, in their order, with the schemas and channels before them.
+
+    None of its chunks is larger than so [byte]; where it ends early, so do they.
+    """
+    with needs("mcap", "mcap", f"{os.fspath(path)}: MCAP"):
+        from mcap.records import Channel, Message, Schema
+    schemas, channels = dict[int, Schema](), dict[int, Channel]()
     with readable(path, "MCAP (damaged, cut off, or still being written?)"):
-        yield from _unpacked(path, largest)
+        for record in _unpacked(path, largest, skips):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                if (channel := channels.get(record.channel_id)) is None:
+                    raise RefusedError(
+                        f"a message is of channel {record.channel_id}; there is none"
+                    )
+                yield schemas.get(channel.schema_id), channel, record
 
 
-def _unpacked(path: str | os.PathLike[str], largest: int) -> Iterator[McapRecord]:
+def _unpacked(
+    path: str | os.PathLike[str], largest: int, skips: Skips | None = None
+) -> Iterator[McapRecord]:
     with needs("mcap", "mcap", "reading MCAP"):
+        from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
         from mcap.records import Chunk
         from mcap.stream_reader import StreamReader, breakup_chunk
     with open(path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
         reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
-        for record in reader.records:
+        records = reader.records
+        while True:
+            try:
+                record = next(records, None)
+            except (EndOfFile, RecordLengthLimitExceeded, struct.error) as error:
+                if skips is None:
+                    raise
+                why = f"it ends within a record, or is damaged there {error}".strip()
+                skips.leave_out("cut", f"{os.fspath(path)}, byte {file.tell():,}: {why}")
+                return
+            if record is None:
+                return
             if not isinstance(record, Chunk):
                 yield record
                 continue

@@ -10,7 +10,7 @@ import re
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn, Self
 
@@ -50,10 +50,13 @@ _FOREIGN = {
     b"#ROSBAG ": "is a bag of ROS 1; convert it: rosbags-convert --src FILE --dst FOLDER",
     b"LOGG": "is a CAN log of Vector (BLF); decode it to CSV: python-can, cantools",
     b"MDF ": "is a measurement in ASAM MDF (MF4); write it as Parquet or CSV: asammdf",
-    b"ARROW1": "is an Arrow (Feather) file; write it as Parquet: pyarrow, polars or pandas",
-    b"\xff\xfe": "is text in UTF-16; write it in UTF-8: iconv -f UTF-16 -t UTF-8 FILE",
-    b"\xfe\xff": "is text in UTF-16; write it in UTF-8: iconv -f UTF-16 -t UTF-8 FILE",
-    b"\x93NUMPY": "is an array of NumPy; write it as CSV with names of columns: numpy.savetxt",
+    b"ARROW1": "is an Arrow (Feather) file; write it as Parquet: "
+    "polars.read_ipc('FILE').write_parquet('drive.parquet')",
+    b"\xff\xfe": "is text in UTF-16; write it in UTF-8: iconv -f UTF-16 -t UTF-8 FILE > drive.csv",
+    b"\xfe\xff": "is text in UTF-16; write it in UTF-8: iconv -f UTF-16 -t UTF-8 FILE > drive.csv",
+    b"\x93NUMPY": "is an array of NumPy; write it as CSV with the names of its columns: "
+    "numpy.savetxt('drive.csv', numpy.load('FILE'), delimiter=',', header='time,gap,...')",
+    b"{": "is JSON; write its rows as CSV: polars.read_ndjson('FILE').write_csv('drive.csv')",
 }
 # Where an MCAP file has its profile: behind the mark, an opcode and two lengths.
 _PROFILE = len(_MCAP) + 1 + 8 + 4
@@ -72,6 +75,8 @@ UNITS = {unit: factor for group in _GROUPS.values() for unit, factor in group.it
 SI = {unit: base for base, group in _GROUPS.items() for unit in group}
 _SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": "m/s", "sec": "s"}
 _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
+# Names of columns are looked for in so many lines; what stands before the last line of a comment.
+_MOST_ABOVE, _COMMENT = 100, re.compile(r"\s*(#|%|//)+\s*")
 # What stands in a field where there is no number.
 _NOTHING = ("", "na", "n/a", "null", "none")
 # What no text holds.
@@ -91,6 +96,16 @@ def unit_of(text: str) -> str:
     return next(
         (one for one in (text, text.lower()) if one in UNITS), _SPELT.get(text.lower(), text)
     )
+
+
+def quoted_name(text: str) -> tuple[str, str]:
+    """The name in double quotes that a text begins with, as CSV writes one, and the rest.
+
+    >>> quoted_name('"gap, in m"<=0'), quoted_name("gap<=0")
+    (('gap, in m', '<=0'), ('', 'gap<=0'))
+    """
+    found = re.match(r'\s*"((?:[^"]|"")+)"\s*', text)
+    return (found[1].replace('""', '"'), text[found.end() :]) if found else ("", text)
 
 
 def silent(count: int) -> None:
@@ -113,7 +128,7 @@ def file_kind(path: str) -> Kind:
     if not beginning:
         raise ValueError(f"{path} is empty")
     if foreign := next((says for mark, says in _FOREIGN.items() if beginning.startswith(mark)), ""):
-        raise ValueError(f"{path} {foreign}")
+        raise ValueError(f"{path} {foreign.replace('FILE', path)}")
     if beginning.startswith(_MCAP):
         profile = beginning[_PROFILE:]
         kinds: dict[bytes, Kind] = {b"ros2": "bag", b"evofsm": "run"}
@@ -122,17 +137,49 @@ def file_kind(path: str) -> Kind:
     return next((kind for mark, kind in marks.items() if beginning.startswith(mark)), "csv")
 
 
-class Source:
-    """A file that is read once, unpacked if it is gzipped."""
+class Skips:
+    """Rows of a file that cannot be right: so many are left out, and counted; more are refused."""
 
-    def __init__(self, path: str, on_read: OnRead = silent) -> None:
+    def __init__(self, most: int = 0, kinds: dict[str, tuple[int, str]] | None = None) -> None:
+        self._left = self._most = most
+        self._kinds = {} if kinds is None else kinds  # of all files: how many, and the first
+        self._first: dict[str, str] = {}  # of this file
+
+    def leave_out(self, kind: str, why: str | Callable[[], str], rows: int = 1) -> None:
+        """Leave a row out, or raise where that is one too many; ``why`` begins with its place."""
+        if kind not in self._first:
+            self._first[kind] = why if isinstance(why, str) else why()
+        self._left -= rows
+        if self._left < 0:
+            more = f"--skip-bad {self._most} leaves out so many bad rows, and there are more"
+            raise ValueError(f"{self._first[kind]}; {more}")
+        count, first = self._kinds.get(kind, (0, self._first[kind]))
+        self._kinds[kind] = count + 1, first
+
+    @contextmanager
+    def leaving_out(self, kind: str) -> Iterator[None]:
+        """Leave out what a ValueError is about, which names the place."""
+        try:
+            yield
+        except ValueError as error:
+            self.leave_out(kind, str(error))
+
+    def refuse_nothing(self, otherwise: str) -> NoReturn:
+        """Raise where no row is left, for what was left out first."""
+        raise ValueError(next(iter(self._first.values()), otherwise))
+
+
+class Source:
+    """A file that is read once, unpacked if it is gzipped; it may end early if ``skips`` allow."""
+
+    def __init__(self, path: str, on_read: OnRead = silent, skips: Skips | None = None) -> None:
         if os.path.isdir(path):
             raise IsADirectoryError(f"{path} is a folder; name the files in it")
         if os.path.exists(path) and not os.path.isfile(path):
             raise ValueError(f"{path} is a pipe or a device; write it to a file first")
         self.path = path
         self.lines = 0  # read so far of one that is gzipped
-        self._on_read = on_read
+        self._on_read, self._skips, self._ended = on_read, skips, False
         self._raw = io.BufferedReader(io.FileIO(path))
         self._packed = self._raw.peek(2).startswith(_GZIP)
         self._file = gzip.GzipFile(fileobj=self._raw) if self._packed else self._raw
@@ -173,14 +220,20 @@ class Source:
         return bytes(block)
 
     def _take(self, most: int, to_line_end: bool = False) -> bytes:
+        if self._ended:
+            return b""
         before = self._raw.tell()
         try:
             data: bytes = self._file.readline(most) if to_line_end else self._file.read1(most)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            raise ValueError(
+            told = (
                 f"{self.path}, after line {self.lines}: the gzip data ends early or is damaged "
                 f"(was a copy or a download interrupted, or is it still being written?): {error}"
-            ) from error
+            )
+            if self._skips is None or not isinstance(error, EOFError):
+                raise ValueError(told) from error
+            self._skips.leave_out("cut", told)
+            self._ended, data = True, b""
         if self._packed:
             self.lines += data.count(b"\n")
         self._on_read(self._raw.tell() - before)
@@ -202,27 +255,42 @@ def readable(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
         raise ValueError(f"{os.fspath(path)}: {error}") from None
     except Exception as error:
         why = str(error)[:300] or type(error).__name__
+        if why.startswith(os.fspath(path)):
+            raise
         raise ValueError(f"{os.fspath(path)} cannot be read as {kind}: {why}") from error
 
 
 # -- Pieces of tables -----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass
 class Piece:
     """Some consecutive rows of a table: T values for each column that was asked for."""
 
     rows: int
     numbers: Numbers  #: NaN where one is missing
     find: Find
+    skips: Skips
     texts: dict[str, polars.Series] = field(default_factory=dict)
     #: Rows that begin an episode, of a table that knows; None where columns tell episodes apart.
     starts: Sequence[int] | None = None
     names: Sequence[str] = ()  #: of these episodes, of a table that knows
+    #: Rows before which something was left out; behind the last one too.
+    anew: Sequence[int] = ()
+    bad: NDArray[np.bool_] = field(init=False)  #: (T,) rows to leave out
+
+    def __post_init__(self) -> None:
+        self.bad = np.zeros(self.rows, np.bool_)
 
     @classmethod
     def of_numbers(
-        cls, path: str, before: int, numbers: Numbers, starts: Sequence[int], names: Sequence[str]
+        cls,
+        path: str,
+        before: int,
+        numbers: Numbers,
+        starts: Sequence[int],
+        names: Sequence[str],
+        skips: Skips,
     ) -> Self:
         """Rows of numbers alone, after so many others."""
 
@@ -230,29 +298,50 @@ class Piece:
             text = "" if name is None else str(numbers[name][row])
             return f"{path}, row {before + row + 1}", text
 
-        return cls(len(next(iter(numbers.values()))), numbers, find, starts=starts, names=names)
+        rows = len(next(iter(numbers.values())))
+        return cls(rows, numbers, find, skips, starts=starts, names=names)
 
     def at(self, row: int) -> str:
         """Where a row stands, for a message."""
         return self.find(row, None)[0]
 
-    def refuse(self, row: int, name: str, why: str = "") -> NoReturn:
-        """Raise for what stands in a row and column."""
+    def told(self, row: int, name: str, why: str = "", hint: str = "") -> str:
+        """Where a row stands, and what is wrong with what it has in a column."""
         place, text = self.find(row, name)
-        raise ValueError(f"{place}, column {name!r}: {why.format(text[:40]) or explained(text)}")
+        return f"{place}, column {name!r}: {why.format(text[:40]) or explained(text, hint)}"
 
-    def refuse_unusable(
+    def leave_out(self, name: str, where: NDArray[np.bool_], why: str = "", hint: str = "") -> None:
+        """Leave out rows for what stands in a column."""
+        for row in np.flatnonzero(where & ~self.bad).tolist():
+            self.skips.leave_out("field", partial(self.told, row, name, why, hint))
+            self.bad[row] = True
+
+    def leave_out_unusable(
         self,
         name: str,
         where: NDArray[np.bool_] | bool = True,
+        hint: str = "",
         ends: tuple[float, float] = (-LARGEST_OBSERVATION, LARGEST_OBSERVATION),
         why: str = "",
     ) -> None:
-        """Raise where a number cannot be learnt, or lies outside of these ends; NaN is none."""
+        """Leave out rows in which a number is missing, or lies outside of these ends."""
         numbers = self.numbers[name]
         unusable = ~((numbers >= ends[0]) & (numbers <= ends[1])) & where
         if unusable.any():
-            self.refuse(int(np.argmax(unusable)), name, why)
+            self.leave_out(name, unusable, why, hint)
+
+    def take(self, rows: NDArray[np.int64]) -> Piece:
+        """Some of its rows."""
+        taken = replace(
+            self,
+            rows=len(rows),
+            numbers={name: values[rows] for name, values in self.numbers.items()},
+            texts={name: texts.gather(rows) for name, texts in self.texts.items()},
+            find=lambda row, name: self.find(int(rows[row]), name),
+            anew=np.searchsorted(rows, self.anew).tolist(),
+        )
+        taken.bad[:] = self.bad[rows]
+        return taken
 
 
 class Wanted(NamedTuple):
@@ -260,7 +349,6 @@ class Wanted(NamedTuple):
 
     numbers: Sequence[str]
     texts: Sequence[str] = ()
-    gaps: Collection[str] = ()  #: numbers that may be missing or infinite; others are refused then
     date: str | None = None  #: comes as a number, of microseconds
 
     @property
@@ -269,22 +357,22 @@ class Wanted(NamedTuple):
         dates = [self.date] if self.date else []
         return list(dict.fromkeys([*self.numbers, *self.texts, *dates]))
 
-    def piece(self, found: Mapping[str, polars.Series], find: Find) -> Piece:
+    def piece(
+        self, found: Mapping[str, polars.Series], find: Find, skips: Skips, anew: Sequence[int] = ()
+    ) -> Piece:
         """The columns of some rows as what is wanted of them; numbers may be given as texts."""
         import polars
 
-        piece = Piece(len(found[self.all[0]]), {}, find)
+        piece = Piece(len(found[self.all[0]]), {}, find, skips, anew=anew)
         for name in dict.fromkeys(self.numbers):
             values = found[name]
             if values.dtype == polars.String:
                 fields = values.str.strip_chars()
                 values = fields.cast(polars.Float64, strict=False)
-                wrong = values.is_null() & ~fields.str.to_lowercase().is_in(_NOTHING)
+                wrong = values.is_null() & ~fields.fill_null("").str.to_lowercase().is_in(_NOTHING)
                 if wrong.any():
-                    piece.refuse(int(wrong.arg_max() or 0), name)
+                    piece.leave_out(name, wrong.to_numpy())
             piece.numbers[name] = values.cast(polars.Float64).to_numpy()
-            if name not in self.gaps:
-                piece.refuse_unusable(name)
         for name in self.texts:
             texts = found[name].cast(polars.String)
             piece.texts[name] = texts.fill_null("") if texts.null_count() else texts
@@ -298,139 +386,231 @@ class Table:
 
     path: str
     columns: Sequence[str]
+    skips: Skips
     #: As a row below the names says; empty of a column of which it does not.
     units: Mapping[str, str] = {}
+    #: Whether an action is what the rows say of the next one, and unknown where none follows.
+    derives = False
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """Read columns, in the order of rows."""
         raise NotImplementedError
 
-    def holds_dates(self, name: str) -> bool:
-        """Whether a column holds times of ISO 8601 in place of numbers, as its first row says."""
-        return False
+    def first(self, name: str) -> str:
+        """What stands first in a column; nothing of a table of numbers alone."""
+        return ""
+
+
+class _Odd(NamedTuple):
+    """What Python's own reader makes of some lines."""
+
+    columns: Sequence[str]  #: of the next lines
+    lines: list[int]  #: of the rows
+    rows: list[list[str]]  #: what is wanted of them
+    anew: list[int]  #: rows before which something was left out, or the columns are named again
+    left_out: list[tuple[int, str]]  #: lines that are no rows, and why; of a comment nothing
 
 
 class CsvTable(Table):
     """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
 
-    Where they end at a semicolon, a number may have a decimal comma.
+    Without any of these they end at a space. At a semicolon, a number may have a decimal comma. The
+    header is the line that has most of the names that are looked for; what stands above is passed
+    over, and one further down, as in files that were appended to another, names the columns anew.
     polars reads blocks of plain lines; Python's own reader, which is slower, blocks with anything
     odd, such as a line break within quotes, and what a message is to name.
     """
 
-    def __init__(self, path: str, on_read: OnRead = silent) -> None:
+    def __init__(
+        self,
+        path: str,
+        on_read: OnRead = silent,
+        names: Collection[str] = (),
+        skips: Skips | None = None,
+    ) -> None:
         with needs("polars", "tables", f"{path}: a table"):
             import polars  # noqa: F401 (said here, before the work begins)
-        self.path = path
+        self.path, self.skips = path, skips or Skips()
         self._on_read = on_read
         # A field may be long that nobody asks for; lines are bounded.
         csv.field_size_limit(max(csv.field_size_limit(), _CSV_BYTES + 2 * _LONGEST_LINE))
-        with Source(path) as source:
-            lines = self._text(source.rows(), 0).removeprefix("\ufeff").split("\n", 4)[:4]
-        self._above = 1 + lines[0].startswith("sep=")  # lines before the first row
-        text, *first = (line.rstrip("\r") for line in lines[self._above - 1 :] or [""])
-        self._separator = max(",;\t", key=text.count)
-        self.columns = [name.strip() for name in self._split(text, 1)]
+        with Source(path, skips=Skips(1)) as source:  # said where the rows are read
+            text = self._text(source.rows(), 0).removeprefix("\ufeff")
+        lines = [line.rstrip("\r") for line in text.split("\n", _MOST_ABOVE)[:_MOST_ABOVE]]
+        at = self._header(lines, set(names))
+        self._above = at + 1  # lines before the first row
+        header, first = _COMMENT.sub("", lines[at], count=1), lines[at + 1 : at + 4]
+        self._separator = _separator(header)
+        self.columns = _fields(header, self._separator)
         # With nothing in it that has a meaning; polars is not to be left alone with others.
         quoted = f'"[^"{self._separator}\\r\\n]*"(?=[{self._separator}\\r\\n])'
         self._quoted = re.compile(quoted.encode())
-        rows = [self._split(row, 2) for row in first]
+        rows = [_fields(row, self._separator) for row in first]
         told = [unit_of(text) for text in rows[0]] if rows else []
-        if any(one in UNITS for one in told) and not any(map(_is_number, told)):
+        if any(one in UNITS for one in told) and not any(map(is_number, told)):
             self.units = dict(zip(self.columns, told, strict=False))
             self._above, rows = self._above + 1, rows[1:]
         self._first_row = rows[0] if rows else []
-        if all(_is_number(name) for name in self.columns):
+        if all(is_number(name) for name in self.columns):
             raise ValueError(
-                f"{path}, line 1: {text.strip()[:200]!r} is no header; the first line must name "
-                "the columns"
+                f"{path}, line {at + 1}: {header.strip()[:200]!r} is no header; a line above the "
+                "rows must name the columns"
             )
 
-    def _split(self, line: str, number: int) -> list[str]:
-        try:  # the first row may go on in the next line
-            return next(csv.reader([line], delimiter=self._separator, strict=number == 1), [])
-        except csv.Error as error:
-            raise self._no_csv(number, error) from error
+    def _header(self, lines: Sequence[str], names: set[str]) -> int:
+        """Which line names the columns: the one with most names, or the last before the rows."""
+        best, most = 0, 0
+        for at, line in enumerate(lines):
+            text = _COMMENT.sub("", line, count=1)
+            if (there := len(names.intersection(_fields(text, _separator(text))))) > most:
+                best, most = at, there
+        if most:
+            return best
+        rows = [at for at, one in enumerate(lines) if one.strip() and not _COMMENT.match(one)]
+        first = next((at for at in rows if not lines[at].startswith("sep=")), 0)
+        separator = _separator(lines[first])
+        above, row = (_fields(lines[at], separator) for at in (max(first - 1, 0), first))
+        return first - 1 if first and is_number(row[0]) and len(above) == len(row) else first
 
-    def _no_csv(self, line: int, error: csv.Error) -> ValueError:
-        return ValueError(f"{self.path}, line {line}: {error} (an unclosed quote?)")
-
-    def holds_dates(self, name: str) -> bool:
-        """Whether the first row has a time of ISO 8601 there; what else it has is not judged."""
-        first = dict(zip(self.columns, self._first_row, strict=False))
-        return _DATE.match(first.get(name, "")) is not None
+    def first(self, name: str) -> str:
+        """What the first row has in a column."""
+        return dict(zip(self.columns, self._first_row, strict=False)).get(name, "")
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """Read columns, in the order of rows."""
         import polars
 
         if twice := [name for name in wanted.all if self.columns.count(name) > 1]:
-            raise ValueError(f"{self.path}, line 1: two columns are called {twice[0]!r}")
-        places = {name: self.columns.index(name) for name in wanted.all}
-        with Source(self.path, self._on_read) as source:
-            reached = 0
+            raise ValueError(
+                f"{self.path}, line {self._above}: two columns are called {twice[0]!r}"
+            )
+        columns, reached, behind = self.columns, 0, False
+        with Source(self.path, self._on_read, self.skips) as source:
             while block := source.rows():
                 if not block.isascii():
                     block = self._text(block, reached).encode()
                 while reached < self._above:
                     block, reached = block.partition(b"\n")[2], reached + 1
-                found = self._plain(block, places, wanted.numbers)
-                is_plain = found is not None
+                here, lines = (
+                    partial(self._odd, block, reached, columns, wanted),
+                    block.count(b"\n"),
+                )
+                if lines == len(block):
+                    reached += lines
+                    continue
+                found = self._plain(block, columns, wanted)
+                anew = [0] if behind else []
                 if found is None:
-                    rows = self._odd(block, reached)[1]
-                    fields = {name: [row[k] for row in rows] for name, k in places.items()}
-                    found = polars.DataFrame(fields, dict.fromkeys(places, polars.String)).to_dict()
-                    for name in wanted.numbers if self._separator == ";" else ():
-                        found[name] = found[name].str.replace(",", ".", literal=True)
-                if n_rows := len(found[wanted.all[0]]):
-                    yield wanted.piece(found, partial(self._find, block, reached))
-                reached += n_rows if is_plain else block.count(b"\n")
+                    odd = here()
+                    columns, anew = odd.columns, anew + odd.anew
+                    for line, why in odd.left_out:
+                        place = f"{self.path}, line {line}: {why or 'a comment'}"
+                        self.skips.leave_out("row" if why else "comment", place, bool(why))
+                    fields = zip(*odd.rows, strict=True) if odd.rows else [()] * len(wanted.all)
+                    found = {
+                        name: polars.Series(name, each, polars.String)
+                        for name, each in zip(wanted.all, fields, strict=True)
+                    }
+                if self._separator == ";":
+                    for name in wanted.numbers:
+                        if found[name].dtype == polars.String:
+                            found[name] = found[name].str.replace(",", ".", literal=True)
+                n_rows = len(found[wanted.all[0]])
+                behind = n_rows in anew
+                if n_rows or anew:
+                    yield wanted.piece(found, partial(self._find, here, wanted), self.skips, anew)
+                reached += lines
 
     def _plain(
-        self, block: bytes, places: Mapping[str, int], numbers: Sequence[str]
+        self, block: bytes, columns: Sequence[str], wanted: Wanted
     ) -> dict[str, polars.Series] | None:
-        """The columns, numbers as such; None where anything is odd."""
+        """The columns, numbers as such where all are; None where anything is odd."""
         import polars
 
         if b'"' in block and 2 * len(self._quoted.findall(block)) != block.count(b'"'):
             return None
+        places = {name: columns.index(name) for name in wanted.all}
+        separators = block.count(self._separator.encode())
         # As polars calls columns, for there may be two of one name.
-        kinds: dict[str, Any] = {f"column_{k + 1}": polars.String for k in range(len(self.columns))}
-        kinds |= {f"column_{places[name] + 1}": polars.Float64 for name in numbers}
-        wanted = [f"column_{place + 1}" for place in places.values()]
+        kinds: dict[str, Any] = {f"column_{k + 1}": polars.String for k in range(len(columns))}
+        numbers = {f"column_{places[name] + 1}": polars.Float64 for name in wanted.numbers}
         dialect: Any = {"separator": self._separator, "decimal_comma": self._separator == ";"}
-        try:
-            frame = polars.read_csv(block, columns=wanted, schema=kinds, **dialect, **_PLAIN)
-        except (polars.exceptions.PolarsError, polars.exceptions.PanicException):
-            return None
+        for schema in (kinds | numbers, kinds):
+            try:
+                frame = polars.read_csv(
+                    block,
+                    columns=[f"column_{place + 1}" for place in places.values()],
+                    schema=schema,
+                    **dialect,
+                    **_PLAIN,
+                )
+            except (polars.exceptions.PolarsError, polars.exceptions.PanicException):
+                return None
+            if separators != len(frame) * (len(columns) - 1):
+                return None
+            if not any(frame[name].null_count() for name in numbers):
+                break
         found = {name: frame[f"column_{place + 1}"] for name, place in places.items()}
-        is_whole = block.count(self._separator.encode()) == len(frame) * (len(self.columns) - 1)
-        lacks = any(found[name].null_count() for name in numbers)
-        return found if is_whole and not lacks else None
+        names_anew = (
+            found[name].str.strip_chars().is_in(wanted.all).any()
+            for name in wanted.numbers
+            if found[name].dtype == polars.String
+        )
+        return None if any(names_anew) else found
 
-    def _odd(self, block: bytes, reached: int) -> tuple[list[int], list[list[str]]]:
-        """The lines of rows, and their fields."""
+    def _odd(self, block: bytes, reached: int, columns: Sequence[str], wanted: Wanted) -> _Odd:
+        """The rows of some lines; those of another length are none."""
         text = io.StringIO(block.decode(), newline="")
-        rows = csv.reader(text, delimiter=self._separator, strict=True)
-        lines, found = list[int](), list[list[str]]()
-        try:
-            for fields in filter(None, rows):
-                lines.append(reached + rows.line_num)
-                found.append(fields)
-                if len(fields) != len(self.columns):
-                    raise ValueError(
-                        f"{self.path}, line {lines[-1]}: {len(fields)} fields, but the header "
-                        f"names {len(self.columns)} (was the file cut off, is a quote not closed, "
-                        f"or does a field hold {self._separator!r}?)"
-                    )
-        except csv.Error as error:
-            raise self._no_csv(reached + rows.line_num, error) from error
-        return lines, found
+        reader = csv.reader(text, delimiter=self._separator, strict=True)
+        lines, rows, anew = list[int](), list[list[str]](), list[int]()
+        left_out = list[tuple[int, str]]()
+        places = [columns.index(name) for name in wanted.all]
+        may_name = any(name.encode() in block for name in wanted.all)
+        begun = 0
+        while True:
+            try:
+                for fields in filter(None, reader):
+                    line = reached + reader.line_num
+                    if may_name and self._named_anew(fields, wanted, line):
+                        columns = _names(fields)
+                        places = [columns.index(name) for name in wanted.all]
+                        anew.append(len(lines))
+                    elif len(fields) == len(columns):
+                        lines.append(line)
+                        rows.append([fields[place] for place in places])
+                    elif _COMMENT.match(fields[0]):
+                        left_out.append((line, ""))
+                    else:
+                        anew.append(len(lines))
+                        why = f"{len(fields)} fields, but the header names {len(columns)}"
+                        mark = f"does a field hold {self._separator!r}?"
+                        left_out.append((line, f"{why} (cut off, a quote not closed, or {mark})"))
+                    begun = reader.line_num
+                return _Odd(columns, lines, rows, anew, left_out)
+            except csv.Error as error:
+                line, why = reached + reader.line_num, f"{error} (an unclosed quote?)"
+                if reader.line_num > begun + 1:
+                    raise ValueError(f"{self.path}, line {line}: {why}") from error
+                anew.append(len(lines))
+                left_out.append((line, why))
+                begun = reader.line_num
 
-    def _find(self, block: bytes, reached: int, row: int, name: str | None) -> tuple[str, str]:
-        lines, rows = self._odd(block, reached)
-        text = "" if name is None else rows[row][self.columns.index(name)]
-        return f"{self.path}, line {lines[row]}", text
+    def _named_anew(self, fields: Sequence[str], wanted: Wanted, line: int) -> bool:
+        """Whether a row is no row but names the columns once more."""
+        lacking = set(wanted.all).difference(_names(fields))
+        if lacking and len(wanted.all) - len(lacking) > 1:
+            raise ValueError(
+                f"{self.path}, line {line}: it names the columns anew, without {min(lacking)!r} "
+                "(two logs in one file? learn them apart)"
+            )
+        return not lacking
+
+    def _find(
+        self, here: Callable[[], _Odd], wanted: Wanted, row: int, name: str | None
+    ) -> tuple[str, str]:
+        odd = here()
+        text = "" if name is None else odd.rows[row][wanted.all.index(name)]
+        return f"{self.path}, line {odd.lines[row]}", text
 
     def _text(self, block: bytes, reached: int) -> str:
         """Lines in UTF-8 or, where they are none, in the encoding of Western Europe."""
@@ -449,10 +629,10 @@ class CsvTable(Table):
 class ParquetTable(Table):
     """A Parquet file; read with polars because pyarrow cannot be imported beside libsumo."""
 
-    def __init__(self, path: str, on_read: OnRead = silent) -> None:
+    def __init__(self, path: str, on_read: OnRead = silent, skips: Skips | None = None) -> None:
         with needs("polars", "tables", f"{path}: Parquet"):
             import polars
-        self.path = path
+        self.path, self.skips = path, skips or Skips()
         self._on_read = on_read
         # polars takes other paths for addresses on the network, or of somebody's home.
         self._scan = polars.scan_parquet(os.path.abspath(path), glob=False)
@@ -461,15 +641,13 @@ class ParquetTable(Table):
             self._rows = int(self._scan.select(polars.len()).collect().item())
         self.columns = list(self._types)
 
-    def holds_dates(self, name: str) -> bool:
-        """Whether its type says so, or the first of its texts."""
-        import polars
-
-        if self._types[name] == polars.String and self._rows:
-            with self._readable():
-                first = self._scan.select(name).head(1).collect().item()
-            return _DATE.match(str(first or "")) is not None
-        return isinstance(self._types[name], polars.Datetime)
+    def first(self, name: str) -> str:
+        """The first of its values."""
+        if name not in self.columns:
+            return ""
+        with self._readable():
+            found = self._scan.select(name).drop_nulls().head(1).collect()
+        return str(found.item()) if len(found) else ""
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """Read columns, in the order of rows."""
@@ -484,7 +662,7 @@ class ParquetTable(Table):
             with self._readable():
                 frame = part.slice(first, _PARQUET_ROWS).collect()
             found = {name: frame[name] for name in wanted.all}
-            yield wanted.piece(found, partial(self._find, frame, first))
+            yield wanted.piece(found, partial(self._find, frame, first), self.skips)
             self._on_read(os.path.getsize(self.path) * len(frame) // self._rows)
 
     def _find(
@@ -509,26 +687,40 @@ class ParquetTable(Table):
 # -- Fields ---------------------------------------------------------------------------------------
 
 
-def explained(text: str) -> str:
+def _separator(line: str) -> str:
+    return max(",;\t", key=line.count) if re.search("[,;\t]", line) else " "
+
+
+def _fields(line: str, separator: str) -> list[str]:
+    """The fields of a line as names; where its quotes are odd, as they stand."""
+    return _names(next(csv.reader([line.replace("\r", " ")], delimiter=separator), []))
+
+
+def _names(fields: Sequence[str]) -> list[str]:
+    first = [_COMMENT.sub("", one, count=1) for one in fields[:1]]
+    return [name.strip() for name in (*first, *fields[1:])]
+
+
+def explained(text: str, hint: str = "") -> str:
     """Why a text is not the number it should be, or one that cannot be learnt."""
     if not text.strip():
-        return (
-            "the field is empty (a missing measurement, or no leader? --no-leader end leaves such "
-            "rows out; an episode's last action may be any number)"
-        )
-    if _is_number(text):
-        return (
-            f"{text[:40]} cannot be learnt (a missing or failed measurement? leave the row out: a "
-            "hole in time begins a new episode)"
-        )
-    if _is_number(text.replace(",", ".")):
+        return f"the field is empty{hint or ' (a missing measurement?)'}"
+    if is_number(text):
+        return f"{text[:40]} cannot be learnt{hint or ' (a missing or failed measurement?)'}"
+    if is_number(text.replace(",", ".")):
         return f"{text[:40]!r} is no number (a decimal comma? write 1.5)"
     if _DATE_LIKE.match(text):
         return f"{text[:40]!r} is no number (a date? it has to be {_ISO})"
     return f"{text[:40]!r} is no number (a text, a date, or a unit behind the number?)"
 
 
-def _is_number(text: str) -> bool:
+def is_date(text: str) -> bool:
+    """Whether it is, or is meant to be, a time of ISO 8601."""
+    return _DATE.match(text) is not None
+
+
+def is_number(text: str) -> bool:
+    """Whether it is one for all that read tables."""
     try:
         float(text.replace("_", "x"))  # which Python reads, and nobody else
     except ValueError:
@@ -545,8 +737,8 @@ def _microseconds(piece: Piece, name: str, dates: polars.Series) -> NDArray[np.f
         texts = dates.str.strip_chars().str.replace(",", ".", literal=True)
         try:
             dates = texts.str.to_datetime(strict=False)
-        except polars.exceptions.ComputeError:
-            piece.refuse(0, name, why)
+        except polars.exceptions.ComputeError:  # it knows no form from the first one
+            dates = polars.Series(name, [None] * len(texts), polars.Datetime("us"))
     if dates.null_count():
-        piece.refuse(int(dates.is_null().arg_max() or 0), name, why)
+        piece.leave_out(name, dates.is_null().to_numpy(), why)
     return dates.dt.epoch("us").cast(polars.Float64).to_numpy()

@@ -6,15 +6,15 @@ the two stay a pair from one time to the next; a leader beyond the end of the la
 
 from __future__ import annotations
 
+import cmath
 import math
 import struct
 from array import array
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain, groupby, pairwise
-from operator import itemgetter
+from itertools import chain
 from typing import Any, NamedTuple, NoReturn
 from xml.parsers import expat
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving.naming import VARIABLES
 from evofsm.extras import needs
-from evofsm.io.tables import OnRead, Piece, Source, Table, Wanted, explained
+from evofsm.io.tables import OnRead, Piece, Skips, Source, Table, Wanted, explained
 from evofsm.store import LARGEST_OBSERVATION
 
 #: The action of a pair of vehicles: what the follower did until the next time.
@@ -63,9 +63,10 @@ class PairTable(Table):
     """The pairs of a file, as a table with a row for each pair and time; episodes end to end."""
 
     columns = COLUMNS
+    derives = True
 
-    def __init__(self, path: str, moments: Iterable[Moment]) -> None:
-        self.path = path
+    def __init__(self, path: str, moments: Iterable[Moment], skips: Skips) -> None:
+        self.path, self.skips = path, skips
         self._moments = moments
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
@@ -78,10 +79,13 @@ class PairTable(Table):
                 starts.append(starts[-1] + len(rows))
             if waiting and (rows is None or starts[-1] >= _ROWS_AT_ONCE):
                 numbers = dict(zip(COLUMNS, np.concatenate(waiting).T, strict=True))
-                yield Piece.of_numbers(self.path, before, numbers, starts[:-1], names)
+                known = starts[:-1], names
+                yield Piece.of_numbers(self.path, before, numbers, *known, self.skips)
                 before, starts, waiting, names = before + starts[-1], [0], [], []
         if before == 0:
-            raise ValueError(f"{self.path}: no vehicle ever follows another one on the same lane")
+            self.skips.refuse_nothing(
+                f"{self.path}: no vehicle ever follows another one on the same lane"
+            )
 
     def _episodes(self) -> Iterator[tuple[tuple[str, str, str], NDArray[np.float64] | None]]:
         """Rows of a pair for as long as it stays one, or until too many wait."""
@@ -89,10 +93,12 @@ class PairTable(Table):
         waiting, before = 0, -math.inf
         for moment in self._moments:
             if not moment.time > before:
-                raise ValueError(
+                self.skips.leave_out(
+                    "time",
                     f"{moment.place()}: time goes from {before:g} to {moment.time:g}; it must run "
-                    "forward (rows not sorted by time, or two recordings in one file?)"
+                    "forward (rows not sorted by time, or two recordings in one file?)",
                 )
+                continue
             before = moment.time
             present: dict[tuple[str, str, str], array[float]] = {}
             for pair in moment.pairs:
@@ -121,17 +127,23 @@ def _with_actions(rows: array[float]) -> NDArray[np.float64]:
 
 # -- FCD ------------------------------------------------------------------------------------------
 
-#: The column by which an FCD table is known.
-FCD_TIME = "timestep_time"
+#: Columns of FCD tables, whose names begin by what SUMO was told to (--output.column-header).
+FCD_COLUMNS = ("timestep_time", "time", "id", "lane", "pos", "speed", "vehicle_id", "vehicle_lane")
 
 _BYTES_AT_ONCE = 1 << 16
 # SUMO writes neither longer tags or comments [byte] nor more tags within tags.
 _LONGEST_TAG, _DEEPEST = 1_000_000, 16
+# A vehicle as wide as SUMO's passenger car [m], where nobody said; who is less aside is in line;
+# and who is that near may be beside by its place in the plane.
+_WIDTH, _IN_LINE, _NEAR = 1.8, 0.4, 20.0
+# What the parser says where a file ends early.
+_CUT = {expat.errors.XML_ERROR_NO_ELEMENTS, expat.errors.XML_ERROR_UNCLOSED_TOKEN}
+_CUT |= {expat.errors.XML_ERROR_PARTIAL_CHAR}
 
 
 @dataclass
 class VehicleLengths:
-    """Lengths assumed for vehicles in SUMO's FCD, which holds none, by their type.
+    """Lengths assumed for vehicles in SUMO's FCD, which holds none, by their type; and widths.
 
     Parameters
     ----------
@@ -139,24 +151,29 @@ class VehicleLengths:
         Length of a type not named [m]; 5 m is SUMO's passenger car.
     by_type : dict
         Lengths of single types [m].
+    widths : dict
+        Widths of single types [m]; of others, under an empty name, 1.8 m as SUMO's passenger car.
     """
 
     default: float = 5.0
     by_type: dict[str, float] = field(default_factory=dict)
+    widths: dict[str, float] = field(default_factory=lambda: {"": _WIDTH})
     seen: set[str] = field(default_factory=set, init=False)  #: types met so far
+    #: Times that one of a type was not beside, but not in line either, where it overlaps.
+    overlaps: Counter[str] = field(default_factory=Counter, init=False)
 
-    def of(self, kind: str) -> float:
-        """Length of a vehicle of the given type [m]."""
+    def size_of(self, kind: str) -> tuple[float, float]:
+        """Length and width of a vehicle of the given type [m]."""
         kind = kind.partition("@")[0]  # a vehicle changed on its own has the type `car@id`
         self.seen.add(kind)
-        return self.by_type.get(kind, self.default)
+        return self.by_type.get(kind, self.default), self.widths.get(kind, self.widths[""])
 
     def refuse_unknown(self) -> None:
-        """Raise if a length was given for a type that no leader had: most likely a slip."""
+        """Raise if a length was given for a type that no vehicle had: most likely a slip."""
         for kind in self.by_type:
             if kind not in self.seen:
                 raise ValueError(
-                    f"no leading vehicle has the type {kind!r} of --vehicle-length; the types "
+                    f"no vehicle has the type {kind!r} of --vehicle-length; the types "
                     f"are {', '.join(sorted(self.seen)) or 'not in the file'}"
                 )
 
@@ -165,77 +182,123 @@ class VehicleLengths:
         return ", ".join([*named, f"{'others ' if named else ''}{self.default:g} m"])
 
 
-# Texts of a vehicle, or without a lane of a time at which there may be none: where it stands, time
-# [s] and number of the timestep, id, lane, position of the front bumper along it [m], speed [m/s],
-# type.
-_FcdRow = tuple[Place, tuple[float, int], str | None, str, str | None, str | None, str]
+class _Car(NamedTuple):
+    lane: str
+    along: float  #: of the front bumper, along the lane [m]
+    name: str
+    speed: float  #: [m/s]
+    kind: str
+    length: float  #: [m]
+    width: float  #: [m]
+    #: Where it is across its lane [m], in the plane [m], and where it points; NaN if not told.
+    lateral: float
+    place: complex
+    heading: complex
 
 
-def pairs_of_fcd(path: str, rows: Iterable[_FcdRow], lengths: VehicleLengths) -> Iterator[Moment]:
+# Time [s], where it stands, and all that is there then: where, and what stands there by its name.
+_Timestep = tuple[float, Place, list[tuple[Place, Mapping[str, str]]]]
+
+
+def pairs_of_fcd(
+    path: str, steps: Iterable[_Timestep], lengths: VehicleLengths, skips: Skips
+) -> Iterator[Moment]:
     """At each time, the vehicles of which one follows the other."""
     has_vehicles = False
-    for (time, _), of_time in groupby(rows, key=itemgetter(1)):
-        vehicles, places = list[tuple[str, float, str, str, float]](), list[Place]()
-        for place, _, name, lane, position, speed, kind in of_time:
-            places = places or [place]
-            if not lane:  # persons, empty timesteps and vehicles off the road have none
-                continue
-            if name is None:
-                _refuse_lack(place(), "id")
-            along, v = _number(place, "pos", position), _number(place, "speed", speed)
-            vehicles.append((lane, along, name, kind, v))
-        has_vehicles = has_vehicles or bool(vehicles)
-        pairs = [
-            Following((a[0], a[2], b[2]), b[1] - lengths.of(b[3]) - a[1], a[4], b[4])
-            for a, b in pairwise(sorted(vehicles))
-            if a[0] == b[0]
-        ]
-        yield Moment(time, places[0], pairs)
+    for time, place, seen in steps:
+        cars = dict[str, _Car]()
+        with skips.leaving_out("timestep"):  # without one of them, others would be taken for pairs
+            for where, told in seen:
+                if told.get("lane"):  # persons, and vehicles off the road, have none
+                    car = _car(where, told, lengths)
+                    if car.name in cars:
+                        skips.leave_out("twice", f"{where()}: {car.name[:40]!r} is there twice")
+                    cars.setdefault(car.name, car)
+            has_vehicles = has_vehicles or bool(cars)
+            yield Moment(time, place, list(_queues(sorted(cars.values()), lengths)))
     if not has_vehicles:
-        raise ValueError(
-            f"{path} holds no vehicle on a lane (an empty simulation, or persons only?)"
+        skips.refuse_nothing(
+            f"{path} holds no vehicle on a lane (an empty simulation, persons only, or "
+            "--fcd-output.attributes without lane?)"
         )
 
 
-def fcd_of_xml(path: str, on_read: OnRead) -> Iterator[_FcdRow]:
+def _car(place: Place, told: Mapping[str, str], lengths: VehicleLengths) -> _Car:
+    along, speed = (_number(place, name, told.get(name)) for name in ("pos", "speed"))
+    x, y, angle, lateral = (
+        _number(place, name, told[name]) if told.get(name) else math.nan
+        for name in ("x", "y", "angle", "posLat")
+    )
+    if "id" not in told:
+        _refuse_lack(place(), "id")
+    kind, heading = told.get("type", ""), cmath.rect(1.0, math.radians(90.0 - angle))
+    seen = told["lane"], along, told["id"], speed, kind, *lengths.size_of(kind)
+    return _Car(*seen, lateral, complex(x, y), heading)
+
+
+def _queues(cars: Sequence[_Car], lengths: VehicleLengths) -> Iterator[Following]:
+    """Each vehicle and the next one ahead on its lane that is not beside its way."""
+    for place, one in enumerate(cars):
+        for other in cars[place + 1 :]:
+            if other.lane != one.lane:
+                break
+            aside = abs(other.lateral - one.lateral)
+            if aside != aside and other.along - one.along < _NEAR:
+                aside = float(_across(other.place - one.place, one.heading + other.heading))
+            if not aside >= 0.5 * (one.width + other.width):
+                gap = other.along - other.length - one.along
+                if gap <= 0.0 and aside > _IN_LINE:
+                    lengths.overlaps[other.kind] += 1
+                yield Following((one.lane, one.name, other.name), gap, one.speed, other.speed)
+                break
+
+
+def _across(apart: Any, headings: Any) -> Any:
+    """How far two are apart across the way, in the complex plane.
+
+    On a bend a chord has the mean of the headings at its ends, of which this is given the sum.
+    """
+    return abs((apart * headings.conjugate()).imag) / (abs(headings) + 1e-9)
+
+
+def fcd_of_xml(path: str, on_read: OnRead, skips: Skips) -> Iterator[_Timestep]:
     """Read FCD in XML, with a parser that keeps nothing and knows its line."""
-    reader = _FcdReader(path)
-    with Source(path, on_read) as source:
+    reader = _FcdReader(path, skips)
+    with Source(path, on_read, skips) as source:
         while data := source.read(_BYTES_AT_ONCE):
             yield from reader.feed(data)
         yield from reader.feed(b"", last=True)
 
 
 class _FcdReader:
-    def __init__(self, path: str) -> None:
-        self._path = path
+    def __init__(self, path: str, skips: Skips) -> None:
+        self._path, self._skips = path, skips
         # Told the encoding, it asks no codec for the one that a file names: SUMO writes UTF-8.
         parser = self._parser = expat.ParserCreate("utf-8")
         self._fed = self._depth = 0
-        self._lanes_seen, self._without = False, ""  # and where a vehicle had none
-        self._time = (math.nan, 0)
-        self._rows: list[_FcdRow] = []
+        self._step: _Timestep = math.nan, str, []
+        self._steps: list[_Timestep] = []  # which are whole
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
         # Entities could grow without end, or be read from elsewhere.
         parser.StartDoctypeDeclHandler = self._refuse_doctype
 
-    def feed(self, data: bytes, last: bool = False) -> list[_FcdRow]:
-        """Parse more of the file; returns the rows that began in it."""
+    def feed(self, data: bytes, last: bool = False) -> list[_Timestep]:
+        """Parse more of the file; returns the timesteps that ended in it."""
         try:
             self._parser.Parse(data, last)
         except expat.ExpatError as error:
-            raise ValueError(
-                f"{self._path}, line {error.lineno}: this XML is cut off or damaged: "
-                f"{expat.ErrorString(error.code)} (was SUMO or a copy interrupted?)"
-            ) from error
+            why = expat.ErrorString(error.code)
+            told = f"{self._path}, line {error.lineno}: this XML is cut off or damaged: {why}"
+            told += " (was SUMO or a copy interrupted?)"
+            if not (last and self._fed and why in _CUT):
+                raise ValueError(told) from error
+            self._skips.leave_out("cut", told)
         self._fed += len(data)
         if self._fed - self._parser.CurrentByteIndex > _LONGEST_TAG:
             self._refuse(f"a tag or comment of more than {_LONGEST_TAG:,} bytes begins here")
-        if last and self._without and not self._lanes_seen:
-            _refuse_lack(self._without, "lane")
-        rows, self._rows = self._rows, []
-        return rows
+        steps, self._steps = self._steps, []
+        return steps
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self._depth += 1
@@ -250,19 +313,14 @@ class _FcdReader:
             return
         place = partial("{}, line {}".format, self._path, self._parser.CurrentLineNumber)
         if name == "timestep":
-            self._time = _number(place, "time", attributes.get("time")), self._time[1] + 1
-            self._rows.append((place, self._time, None, "", None, None, ""))
+            self._step = (_number(place, "time", attributes.get("time")), place, [])
             return
-        lane = attributes.get("lane")
-        if lane is None and not self._without:
-            self._without = place()
-        self._lanes_seen = self._lanes_seen or bool(lane)
-        who, along, speed = (attributes.get(name) for name in ("id", "pos", "speed"))
-        kind = attributes.get("type", "")
-        self._rows.append((place, self._time, who, lane or "", along, speed, kind))
+        self._step[2].append((place, attributes))
 
     def _end(self, name: str) -> None:
         self._depth -= 1
+        if name == "timestep":
+            self._steps.append(self._step)
 
     def _refuse_doctype(self, name: str, *_: object) -> None:
         self._refuse(f"there is a <!DOCTYPE {name[:40]}>, and entities are not read")
@@ -274,30 +332,59 @@ class _FcdReader:
         )
 
 
-def fcd_of_table(table: Table) -> Iterator[_FcdRow]:
-    """Read FCD in CSV or Parquet: a row per vehicle, consecutive rows of a time together."""
-    if list(table.columns) == [FCD_TIME]:  # all that SUMO writes of an empty road
-        return
-    # SUMO names the columns after what it writes first, be it a person.
-    prefix = "person" if "person_id" in table.columns else "vehicle"
-    names = [f"{prefix}_{name}" for name in ("id", "lane", "pos", "speed")]
-    for name in names:
-        if name not in table.columns:
+def fcd_of_table(table: Table) -> Iterator[_Timestep] | None:
+    """Read FCD in CSV or Parquet: a row per vehicle, consecutive rows of a time together.
+
+    Nothing where a table is none. SUMO names columns after what it writes first, be it a person;
+    with --output.column-header full by all tags around it, with plain by none; its xml2csv names
+    vehicles and persons apart.
+    """
+    columns = table.columns
+    if list(columns) == ["timestep_time"]:  # all that SUMO writes of an empty road
+        return iter(())
+    whose = [name[:-2] for name in columns if name == "id" or name.endswith("_id")]
+    whose.sort(key=lambda one: (f"{one}lane" not in columns, "vehicle" not in one))
+    prefix = whose[0] if whose else "vehicle_"
+    needed = [f"{prefix}{name}" for name in ("id", "lane", "pos", "speed")]
+    time = "timestep_time" if prefix or "timestep_time" in columns else "time"
+    if time not in columns or not (prefix or set(needed) <= set(columns)):
+        return None
+    for name in needed:
+        if name not in columns:
             _refuse_lack(table.path, name)
-    kinds = [name for name in [f"{prefix}_type"] if name in table.columns]
-    for place, time, name, lane, along, speed, *kind in _rows(
-        table, Wanted([FCD_TIME], [*names, *kinds])
-    ):
-        yield place, (time, 0), name, lane, along, speed, kind[0] if kind else ""
+    others = [f"{prefix}{name}" for name in ("type", "posLat", "x", "y", "angle")]
+    names = [*needed, *(name for name in others if name in columns)]
+    plain = [name.removeprefix(prefix) for name in names]
+    return (
+        (at, rows[0][0], [(place, dict(zip(plain, row, strict=True))) for place, *row in rows])
+        for at, rows in _by_time(table, Wanted([time], names))
+    )
 
 
-def _rows(table: Table, wanted: Wanted) -> Iterator[tuple[Any, ...]]:
-    """Place, numbers and texts of each row."""
+def _by_time(table: Table, wanted: Wanted) -> Iterator[tuple[float, list[tuple[Any, ...]]]]:
+    """Place, numbers behind the time, and texts of all rows of a time.
+
+    Where a row is left out, so are those of its time: others would be taken for pairs.
+    """
+    now, rows, is_whole = math.nan, list[tuple[Any, ...]](), True
     for piece in table.pieces(wanted):
+        piece.leave_out_unusable(wanted.numbers[0])
         columns = [piece.numbers[name].tolist() for name in wanted.numbers]
         columns += [piece.texts[name].to_list() for name in wanted.texts]
-        for row, values in enumerate(zip(*columns, strict=True)):
-            yield partial(piece.at, row), *values
+        bad = set(np.flatnonzero(piece.bad).tolist())
+        lost = {row for row in bad if math.isnan(columns[0][row])}  # of this time or of that
+        broken = {*piece.anew, *lost, *(row + 1 for row in lost)}
+        for row, (time, *values) in enumerate(zip(*columns, strict=True)):
+            is_whole = is_whole and row not in broken
+            if time != now:
+                if rows and is_whole:
+                    yield now, rows
+                now, rows, is_whole = time, [], row not in broken
+            is_whole = is_whole and row not in bad
+            rows.append((partial(piece.at, row), *values))
+        is_whole = is_whole and piece.rows not in broken
+    if rows and is_whole:
+        yield now, rows
 
 
 def _number(place: Place, name: str, text: str | None) -> float:
@@ -326,7 +413,6 @@ def _refuse_lack(place: str, name: str) -> NoReturn:
 #: The columns that a table of objects has, and by which it is known. ``x`` and ``y`` are of the
 #: middle of the box; units are those of the SI.
 OBJECT_COLUMNS = ("id", "t", "x", "y", "vx", "vy", "length", "lane")
-_HEADING = "heading"
 # Whoever is slower [m/s] points where it pointed before.
 _STANDING = 0.1
 
@@ -343,7 +429,8 @@ class Object(NamedTuple):
     length: float  #: [m]
     #: Where it points, from the x axis [rad]; where it is NaN, it points where it moves or, where
     #: it stands, where it moved last.
-    heading: float
+    heading: float = math.nan
+    width: float = math.nan  #: [m], where it is known
 
 
 class Scene(NamedTuple):
@@ -356,26 +443,28 @@ class Scene(NamedTuple):
 
 def scenes_of_table(table: Table) -> Iterator[Scene]:
     """Read a table of objects, whose rows of one time stand together."""
-    headings = [_HEADING] if _HEADING in table.columns else []
+    others = [name for name in ("heading", "width") if name in table.columns]
     numbers = ["x", "y", "vx", "vy", "length"]
-    wanted = Wanted(["t", *numbers, *headings], ["id", "lane"], [*numbers, *headings])
-    for time, of_time in groupby(_rows(table, wanted), key=itemgetter(1)):
-        objects, places = list[Object](), list[Place]()
-        for place, _, x, y, vx, vy, length, *heading, name, lane in of_time:
-            places = places or [place]
-            if not lane:  # whoever follows nobody may lack anything
-                continue
-            for column, value in zip(numbers, (x, y, vx, vy, length), strict=True):
-                if not abs(value) <= LARGEST_OBSERVATION:
-                    raise ValueError(f"{place()}, column {column!r}: {explained(f'{value:g}')}")
-            if not length > 0.0:
-                raise ValueError(f"{place()}: the length is {length:g}; it must be positive")
-            objects.append(Object(name, lane, x, y, vx, vy, length, *(heading or [math.nan])))
-        yield Scene(time, places[0], objects)
+    for time, rows in _by_time(table, Wanted(["t", *numbers, *others], ["id", "lane"])):
+        with table.skips.leaving_out("scene"):
+            objects = []
+            for place, *values, name, lane in rows:
+                if not lane:  # whoever follows nobody may lack anything
+                    continue
+                given = dict(zip([*numbers, *others], values, strict=True))
+                for column in numbers:
+                    if not abs(given[column]) <= LARGEST_OBSERVATION:
+                        said = explained(f"{given[column]:g}")
+                        raise ValueError(f"{place()}, column {column!r}: {said}")
+                if not given["length"] > 0.0:
+                    length = f"{given['length']:g}"
+                    raise ValueError(f"{place()}: the length is {length}; it must be positive")
+                objects.append(Object(name, lane, **given))
+            yield Scene(time, rows[0][0], objects)
 
 
-def pairs_of_scenes(path: str, scenes: Iterable[Scene]) -> Iterator[Moment]:
-    """At each time, each vehicle and the nearest one ahead of it on its lane.
+def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterator[Moment]:
+    """At each time, each vehicle and the nearest one ahead of it on its lane, or nearly beside it.
 
     The gap is the distance between the middles, in a straight line, less half of both lengths:
     where a lane bends, it is a little too small.
@@ -387,17 +476,19 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene]) -> Iterator[Moment]:
         names = set[str]()
         for one in scene.objects:
             if one.id in names:
-                raise ValueError(
+                skips.leave_out(
+                    "twice",
                     f"{scene.place()}: {one.id[:40]!r} is there twice at {scene.time:g} s (several "
-                    "recordings in one file?)"
+                    "recordings in one file?)",
                 )
+                continue
             names.add(one.id)
             lanes[one.lane].append(_pointing(one, pointed))
         has_lanes = has_lanes or bool(lanes)
         pairs = [pair for lane in lanes.values() for pair in _following(scene, lane)]
         yield Moment(scene.time, scene.place, pairs)
     if not has_lanes:
-        raise ValueError(
+        skips.refuse_nothing(
             f"{path}: no object is on a lane, and who follows whom is told by lanes (recorded "
             "without a map? assign the lanes first)"
         )
@@ -426,7 +517,13 @@ def _following(scene: Scene, lane: Sequence[Object]) -> Iterator[Following]:
     x, y, headings = np.array([(one.x, one.y, one.heading) for one in lane]).T
     dx, dy = x[None, :] - x[:, None], y[None, :] - y[:, None]
     along = dx * np.cos(headings)[:, None] + dy * np.sin(headings)[:, None]
-    apart = np.where(along > 0.0, np.hypot(dx, dy), np.inf)  # of those that are ahead
+    widths = np.array([one.width for one in lane])
+    widths[~(widths > 0.0)] = _WIDTH
+    others = np.where(np.isnan(headings), headings[:, None], headings)
+    mean = np.exp(1j * headings[:, None]) + np.exp(1j * others)
+    beside = _across(dx + 1j * dy, mean) >= 0.5 * (widths[:, None] + widths)
+    ahead = (along > 0.0) & ~(beside & (along < _NEAR))
+    apart = np.where(ahead, np.hypot(dx, dy), np.inf)
     for follower, nearest, distance in zip(lane, apart.argmin(1), apart.min(1), strict=True):
         leader = lane[int(nearest)]
         if np.isfinite(distance):
@@ -444,10 +541,10 @@ _MOST_BYTES = 1 << 28  # of a message; one of a sensor with images has a few mil
 _LENGTH = struct.Struct("<I")
 
 
-def scenes_of_osi(path: str, on_read: OnRead) -> Iterator[Scene]:
+def scenes_of_osi(path: str, on_read: OnRead, skips: Skips) -> Iterator[Scene]:
     """Read ground truth, or that within sensor views, from a ``.osi`` file, scene by scene."""
     osi = _osi(path)
-    with Source(path, on_read) as source:
+    with Source(path, on_read, skips) as source:
         is_view, number = False, 0
         while head := source.read(_LENGTH.size):
             number += 1
@@ -459,43 +556,36 @@ def scenes_of_osi(path: str, on_read: OnRead) -> Iterator[Scene]:
                 )
             data = source.read(size)
             if len(head) < _LENGTH.size or len(data) < size:
-                raise ValueError(
-                    f"{path} ends within message {number} (was a copy or a simulation interrupted?)"
-                )
+                why = "(was a copy or a simulation interrupted?)"
+                skips.leave_out("cut", f"{path} ends within message {number} {why}")
+                return
             if number == 1:
                 is_view = _is_view(osi, data)
-            yield _scene(osi, f"{path}, message {number}", data, is_view)
+            with skips.leaving_out("message"):
+                yield _scene(osi, f"{path}, message {number}", data, is_view)
 
 
-def scenes_of_mcap(path: str, on_read: OnRead) -> Iterator[Scene]:
+def scenes_of_mcap(path: str, on_read: OnRead, skips: Skips) -> Iterator[Scene]:
     """Read OSI in MCAP: the first channel of ground truth or of sensor views."""
-    with needs("mcap", "mcap", f"{path}: MCAP"):
-        from mcap.records import Channel, Message, Schema
+    from evofsm.io.runs import messages
 
-        from evofsm.io.runs import records
     osi = _osi(path)
-    kinds, channels = dict[int, str](), dict[int, str]()
-    chosen, number = None, 0
-    for record in records(path, _MOST_BYTES):
-        if isinstance(record, Schema):
-            kinds[record.id] = record.name.rpartition(".")[2]
-        elif isinstance(record, Channel):
-            channels[record.id] = kinds.get(record.schema_id, "")
-        elif isinstance(record, Message):
-            kind = channels.get(record.channel_id, "")
-            if chosen is None and kind in ("GroundTruth", "SensorView"):
-                chosen = record.channel_id
-            if record.channel_id == chosen:
-                number += 1
-                on_read(len(record.data))
-                place = f"{path}, message {number}"
-                yield _scene(osi, place, record.data, kind == "SensorView")
+    chosen, number, kinds = None, 0, set[str]()
+    for schema, channel, message in messages(path, _MOST_BYTES, skips):
+        kind = "" if schema is None else schema.name.rpartition(".")[2]
+        kinds.add(kind)
+        if chosen is None and kind in ("GroundTruth", "SensorView"):
+            chosen = channel.id
+        if channel.id == chosen:
+            number += 1
+            on_read(len(message.data))
+            with skips.leaving_out("message"):
+                yield _scene(osi, f"{path}, message {number}", message.data, kind == "SensorView")
     if chosen is None:
-        names = ", ".join(sorted(set(kinds.values()))) or "none"
-        raise ValueError(
+        names = ", ".join(sorted(kinds - {""})) or "none"
+        skips.refuse_nothing(
             f"{path}: no channel of it holds GroundTruth or SensorView of OSI; its schemas are "
-            f"{names} (if they are of ROS 2: the header names no profile, as after merging; "
-            "ros2 bag convert writes it anew)"
+            f"{names} (of a bag of ROS 2 --topics says what they mean, whatever its header says)"
         )
 
 
@@ -538,7 +628,9 @@ def _lane(moving: Any) -> str:
     """Where it is; empty where that is not known: it follows nobody, and nobody follows it."""
     classified = moving.moving_object_classification
     lanes = (classified and classified.assigned_lane_id) or moving.assigned_lane_id
-    return str(lanes[0].value) if lanes else ""
+    if lanes or not (classified and classified.logical_lane_assignment):
+        return str(lanes[0].value) if lanes else ""
+    return f"logical {classified.logical_lane_assignment[0].assigned_lane_id.value}"
 
 
 def _object(place: str, moving: Any, lane: str) -> Object:
@@ -554,4 +646,5 @@ def _object(place: str, moving: Any, lane: str) -> Object:
             f"({vx:g}, {vy:g}) m/s; it needs a length, and numbers"
         )
     heading = base.orientation.yaw if base.orientation else math.nan
-    return Object(name, lane, x, y, vx, vy, length, heading)
+    width = base.dimension.width or math.nan
+    return Object(name, lane, x, y, vx, vy, length, heading, width)

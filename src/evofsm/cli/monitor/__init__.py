@@ -13,12 +13,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import (
     BRAKES,
+    SKIPPED,
     TOLERANCE,
     ActionColumn,
     Failed,
+    Hold,
     Lengths,
     ModeName,
     NoLeader,
+    SkipBad,
     Step,
     TimeColumn,
     TopicsFile,
@@ -27,6 +30,7 @@ from evofsm.cli.options import (
     option,
     reading_of,
     require,
+    split_names,
 )
 from evofsm.cli.show import show, warn
 
@@ -104,6 +108,8 @@ def monitor(
     unit: Units = None,
     topics: TopicsFile = None,
     no_leader: NoLeader = None,
+    hold: Hold = None,
+    skip_bad: SkipBad = SKIPPED,
     vehicle_length: Lengths = None,
 ) -> int | None:
     """Decide alongside a stack of your own: rows in, decisions out, a JSON line each.
@@ -155,9 +161,12 @@ def monitor(
 
             used = fresh() if guard else None
             if is_log:
-                names = observe or ",".join(used.variables if used else VARIABLES)
-                asked = names, action, time, episode, dt, failed, unit, topics, no_leader
-                chunks, interval = _episodes(file, reading_of(*asked, vehicle_length))
+                own = used.variables if used else VARIABLES
+                if observe is None or set(split_names(observe)) == set(own):  # in its own order
+                    observe = ",".join(f'"{name}"' for name in own)
+                asked = observe, action, time, episode, dt, failed, unit, topics, no_leader
+                reading = reading_of(*asked, hold, skip_bad, vehicle_length)
+                chunks, interval = _episodes(file, reading)
             used = used or fresh()
             _prepare(used, mode, tolerance, None, stack, learn=learn)
             warn(_of_saved(guard, used) if guard else assumptions(reckoned, tolerated))

@@ -12,18 +12,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.options import (
     BRAKES,
+    SKIPPED,
     TOLERANCE,
     ActionColumn,
     Brakes,
     ByJudge,
     EpisodeColumns,
     Failed,
+    Hold,
     InWorld,
     Judge,
     Lengths,
     NoLeader,
     Observed,
     Seed,
+    SkipBad,
     Step,
     TimeColumn,
     Tolerance,
@@ -83,6 +86,8 @@ def watch(
     unit: Units = None,
     topics: TopicsFile = None,
     no_leader: NoLeader = None,
+    hold: Hold = None,
+    skip_bad: SkipBad = SKIPPED,
     vehicle_length: Lengths = None,
     port: Annotated[int, option("Of the page; 0 for any that is free.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
@@ -110,8 +115,8 @@ def watch(
     opened: AbstractContextManager[Session | Recording]
     if is_recorded:
         require(scipy="study", mcap="mcap")
-        asked = observe, action, time, episode, dt, failed, unit, topics, no_leader, vehicle_length
-        reading = reading_of(*asked) if is_log else None
+        asked = observe, action, time, episode, dt, failed, unit, topics, no_leader, hold, skip_bad
+        reading = reading_of(*asked, vehicle_length) if is_log else None
         opened = _recorded(what, case, judge, tolerance, brakes, reading)
     else:
         opened = _driven(what, case or 1, world, judge, tolerance, seed, learn_first)
