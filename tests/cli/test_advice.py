@@ -1,0 +1,234 @@
+"""Every hint in a message about a log works when it is followed: message, what it advises, read."""
+
+import json
+import math
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+polars = pytest.importorskip("polars")
+pytest.importorskip("typer")
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def table(names="time,gap,v_follower,v_leader,a_follower", rows=60, **columns):
+    """Text of a CSV: of each column a function of the row, or what it usually has."""
+    usual = {
+        "time": lambda k: f"{k / 10:.1f}",
+        "t": lambda k: f"{k / 10:.1f}",
+        "gap": lambda k: f"{20 + math.sin(k / 9):.3f}",
+        "v_follower": lambda k: f"{15 + math.sin(k / 7):.3f}",
+        "v_leader": lambda k: f"{15 + math.cos(k / 7):.3f}",
+        "a_follower": lambda k: f"{math.cos(k / 7) / 0.7:.2f}",
+        "u": lambda k: k % 3,
+    }
+    of_each = [{**usual, **columns}.get(name, lambda k: k % 7) for name in names.split(",")]
+    return "\n".join([names, *(",".join(str(of(k)) for of in of_each) for k in range(rows)), ""])
+
+
+def beside(*across):
+    """FCD of two bikes and a car."""
+    seen = zip("abc", (50, 49, 20), across, ("bike", "bike", "car"), strict=True)
+    cars = [
+        f'<vehicle id="{name}" lane="e" pos="{pos}" speed="9" posLat="{lat}" type="{kind}"/>'
+        for name, pos, lat, kind in seen
+    ]
+    steps = (f'<timestep time="{k}">{"".join(cars)}</timestep>' for k in range(5))
+    return f"<fcd-export>{''.join(steps)}</fcd-export>"
+
+
+CARS = "time,gap,v_follower,v_leader,a_follower"
+LEVEL = "--observe level --action u"
+OWN = "--observe d,v,w --action u --guard car.evofsm"
+LAPS = {"time": lambda k: k % 30 / 10, "id": lambda k: k // 30}
+#: A log, how it is read, and where in what is said then stands what is to be added; and its value.
+OPTIONS = {
+    "no leader": (table(gap=lambda k: 9 if k < 20 else ""), "", r"\? (--no-leader end) leaves", ""),
+    "less often": (table(gap=lambda k: "" if k % 4 else k), "", r"\? (--hold 0.5) holds", ""),
+    "0 is nobody": (
+        table("id," + CARS, **LAPS, gap=lambda k: k // 30 and 9 + k),
+        "--episode id --failed 'gap<=0'",
+        *(r"\? (--no-leader gap==0) leaves", ""),
+    ),
+    "-1 is nobody": (
+        *(table(gap=lambda k: -1 if k % 20 < 4 else 9 + k), ""),
+        *(r"\? (--no-leader gap==-1.0) leaves", ""),
+    ),
+    "km/h": (table(v_leader=lambda k: 70 + k / 9), "", r"\? (--unit v_leader=km/h) converts", ""),
+    "ms": (table(time=lambda k: 100 * k), "", r"\? (--unit time=ms) converts", ""),
+    "called km/h": (
+        *(table("time,ego_kmh,u"), "--observe ego_kmh --action u"),
+        *(r"of the SI: (--unit ego_kmh=km/h) converts", ""),
+    ),
+    "called km/h, and right": (
+        *(table("time,ego_kmh,u"), "--observe ego_kmh --action u"),
+        *(r"\((--unit ego_kmh=m/s): it is right", ""),
+    ),
+    "no scale": (
+        *(table("time,level,u"), LEVEL + " --rule novelty", r": (--scale level=2) \(", ""),
+    ),
+    "no failures": (table("time,d,v,w,u"), OWN, r"cars in pairs (--judge kinematic) needs", ""),
+    "no failures of a judge": (
+        *(table(gap=lambda k: 30 - k), "--guard car.evofsm --judge learnt"),
+        *(r"(--failed 'gap<=0') says it", ""),
+    ),
+    "a blur": (
+        *(table("time,level,u", 400), LEVEL + " --spread 99"),
+        *(r"Try (--rule novelty --scale level=\S+), or a smaller (?=--spread)", "--spread 1"),
+    ),
+    "beside": (beside(0.6, -0.6, 0), "", r"\? (--vehicle-length bike=5x0.8) says its length", ""),
+    "a coarse clock": (table(time=lambda k: k // 20), "", r"and (--dt) stands in", "0.05"),
+    "several episodes": (table("id," + CARS, **LAPS), "", r"\? (--episode) names", "id"),
+    "another clock": (table(CARS.replace("time", "t")), "", r"\((--time) names the right", "t"),
+    "no clock": (table(CARS[5:]), "", r"and (--dt) stands in for a clock", "0.1"),
+    "another action": (table("time,gap,v_follower,v_leader,u"), "", r"\((--action) names", "u"),
+    "others": (table("time,level,a_follower"), "", r"\((--observe) names", "level"),
+    "bad rows": (table() + "1,2\n" * 12, "", r"; (--skip-bad) 10 leaves out", "12"),
+}
+
+
+def said(result):
+    return " ".join((result.stderr + result.stdout).split())
+
+
+@pytest.mark.parametrize(("log", "how", "where", "value"), OPTIONS.values(), ids=OPTIONS.keys())
+def test_an_option_that_is_advised_mends_it(evofsm, log, how, where, value):
+    Path("drive.log").write_text(log)
+    asked = ["learn", "drive.log", *shlex.split(how)]
+    told = re.search(where, said(evofsm(*asked)))
+    added = shlex.split(f"{told[1]} {value}")
+    asked = asked[:-2] if "--spread" in added else asked
+    mended = evofsm(*asked, *added)
+    assert mended.exit_code == 0, mended.stderr
+    assert re.search(where, said(mended)) is None
+
+
+def test_an_option_that_is_too_much_is_left_out(evofsm):
+    Path("drive.csv").write_text(table())
+    told = said(evofsm("learn", "drive.csv", "--dt", 1))
+    assert "0.1: without --dt that column is the clock" in told
+    assert evofsm("learn", "drive.csv").stderr == ""
+    Path("fcd.xml").write_text(beside(0, 0, 0))
+    asked = "learn", "fcd.xml", "--failed", "crash"
+    found = re.search(r"--failed crash \(but with '(\S+)'\)", said(evofsm(*asked, "--dt", 1)))
+    assert evofsm(*asked[:-1], found[1]).exit_code == 0
+    found = re.search(r"the types are (\w+)", said(evofsm(*asked[:2], "--vehicle-length", "bik=2")))
+    assert evofsm(*asked[:2], "--vehicle-length", f"{found[1]}=2").exit_code == 0
+
+
+def test_rows_are_sorted_and_logs_learnt_apart_as_it_is_advised(evofsm):
+    rows = [(k // 2 / 10, k % 2, 0.5) for k in range(80)]
+    frame = polars.DataFrame(rows, ["time", "car", "u"], orient="row")
+    frame.write_csv("drive.csv")
+    asked = "--observe", "car", "--action", "u", "--episode", "car"
+    told = said(evofsm("learn", "drive.csv", *asked))
+    found = re.search(r"; sort the file by (\w+) and then by (\w+)", told)
+    frame.sort(found.groups()).write_csv("drive.csv")
+    assert evofsm("learn", "drive.csv", *asked).exit_code == 0
+    frame.with_columns(time=polars.col("time") * 3).sort("car", "time").write_csv("slow.csv")
+    assert "or learn them apart" in said(evofsm("learn", "drive.csv", "slow.csv", *asked))
+    assert evofsm("learn", "slow.csv", *asked).exit_code == 0
+
+
+# -- Files of other kinds -------------------------------------------------------------------------
+
+
+def shell(command):
+    """What a reader does in a terminal, where the Python in a message runs as it stands."""
+    names = "header='time,gap,v_follower,v_leader,a_follower'"
+    if command.startswith(("numpy.", "polars.")):
+        code = command.replace("header='time,gap,...'", names)
+        command = shlex.join([sys.executable, "-c", f"import numpy, polars; {code}"])
+    if shutil.which(command.split()[0], path=PATH) is None:
+        pytest.skip(f"{command.split()[0]} is not installed")
+    subprocess.run(command, shell=True, check=True, env=os.environ | {"PATH": PATH})
+
+
+PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+
+
+def packed(tool, ending):
+    def make(text):
+        Path("drive.csv").write_text(text)
+        if shutil.which(tool.split()[0]) is None:
+            pytest.skip(f"{tool} is not installed")
+        subprocess.run([*tool.split(), "drive.csv"], check=True)
+        Path("drive.csv").unlink(missing_ok=True)
+        return f"drive.csv.{ending}"
+
+    return make
+
+
+def as_array(text):
+    np.save("drive.npy", np.loadtxt(text.splitlines(), delimiter=",", skiprows=1))
+    return "drive.npy"
+
+
+def as_arrow(text):
+    polars.read_csv(text.encode()).write_ipc("drive.arrow")
+    return "drive.arrow"
+
+
+def as_json(text):
+    Path("rows.jsonl").write_text(polars.read_csv(text.encode()).write_ndjson())
+    return "rows.jsonl"
+
+
+def as_utf_16(text):
+    Path("own.csv").write_text(text, encoding="utf-16")
+    return "own.csv"
+
+
+@pytest.mark.parametrize(
+    ("make", "read"),
+    [
+        (packed("xz", "xz"), "drive.csv"),
+        (packed("xz --format=lzma", "lzma"), "drive.csv"),
+        (packed("bzip2", "bz2"), "drive.csv"),
+        (packed("zstd --rm -q", "zst"), "drive.csv"),
+        (as_array, "drive.csv"),
+        (as_arrow, "drive.parquet"),
+        (as_json, "drive.csv"),
+        (as_utf_16, "drive.csv"),
+    ],
+)
+def test_a_command_that_is_advised_makes_a_file_that_is_read(evofsm, make, read):
+    text = table()
+    told = evofsm("learn", make(text)).stderr
+    shell(told.strip().rpartition(": ")[2])
+    assert json.loads(evofsm("learn", read, "--json").stdout)["rows"] == 60
+
+
+def test_a_bag_of_ros_1_is_converted_and_its_topics_are_told_as_it_is_advised(evofsm):
+    pytest.importorskip("rosbags")
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, kind = get_typestore(Stores.ROS1_NOETIC), "std_msgs/msg/Float64"
+    with Writer("drive.bag") as bag:
+        topic = bag.add_connection("/v", kind, typestore=store)
+        for k in range(50):
+            message = store.serialize_ros1(store.types[kind](k / 10), kind)
+            bag.write(topic, 100_000_000 * k, message)
+    shell(evofsm("learn", "drive.bag").stderr.strip().rpartition(": ")[2].replace("FOLDER", "bag"))
+    assert "--topics names a file" in evofsm("learn", "bag").stderr
+    variables = (f'{name} = "/v.data"' for name in ("gap", "v_follower", "v_leader"))
+    topics = "\n".join(['stamp = "header"', "[variables]", *variables])
+    Path("topics.toml").write_text(topics)
+    asked = "learn", "bag", "--topics", "topics.toml"
+    advice = re.search('write (stamp = "received")', evofsm(*asked).stderr)[1]
+    Path("topics.toml").write_text(topics.replace('stamp = "header"', advice))
+    assert evofsm(*asked).exit_code == 0
+    advice = re.search("write --failed '(\\S+)'", evofsm(*asked, "--failed", "gap").stderr)[1]
+    assert "1 episode ended with gap>0" in said(evofsm(*asked, "--failed", advice))
