@@ -803,9 +803,9 @@ class _Reader:
         cars = VARIABLES if self._observed == [*VARIABLES] else ()
         for name in self._observed:
             piece.leave_out_unusable(name, ~lacking, _NO_LEADER)
-        for name, ends in zip(cars, RANGES, strict=False):
-            why = f"{_NO_CAR}it lies between {ends[0]:g} and {ends[1]:g}"
-            piece.leave_out_unusable(name, ~lacking, "", ends, why)
+        for name, span in zip(cars, RANGES, strict=False):
+            why = f"{_NO_CAR}it lies between {span[0]:g} and {span[1]:g}"
+            piece.leave_out_unusable(name, ~lacking, "", span, why)
         unknown = np.isnan(piece.numbers[action])
         piece.leave_out_unusable(action, ~lacking & ~unknown)
         if not self._table.derives:
