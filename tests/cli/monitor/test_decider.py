@@ -5,7 +5,7 @@ import pytest
 from evofsm.cli.monitor.decider import Decider
 from evofsm.driving import AlwaysBrake, guard_for_cars
 from evofsm.driving.assumed import guard_of_monitor, guard_of_traffic
-from evofsm.guard import AuditLog, Guard, Mode
+from evofsm.guard import AuditLog, Guard, Mode, audit
 from monitor_rows import closing_in as rows
 from monitor_rows import line
 
@@ -262,8 +262,8 @@ def test_where_the_audit_log_cannot_be_written_the_decisions_go_on(tmp_path, mon
         for message in [line(row), b'{"end": true}'][: 2 if k % 10 == 9 else 1]:
             assert decider.answer(message) == plain.answer(message)
     assert guard.audit is None
-    with pytest.raises(OSError, match="the audit log ends with record"):
-        log.close()
+    log.close()
+    assert audit(log.path).is_good  # as far as it goes
 
 
 def test_a_judge_that_searches_alarms_where_it_refuses_whatever_the_risk():

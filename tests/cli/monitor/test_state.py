@@ -1,7 +1,11 @@
+from contextlib import suppress
+
+import msgspec
 import pytest
 
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.state import State
+from evofsm.cli.monitor.transports import Server
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.guard import Guard, Mode
 from evofsm.store import read_header
@@ -155,6 +159,30 @@ def test_rows_in_flight_across_an_end_are_decided_once_though_it_is_killed(tmp_p
         for message in messages[lost + 9 : 690]:
             decider.answer(message)
     state.close()
+
+
+def test_rows_that_a_sender_does_not_wait_with_are_decided_once_though_it_is_killed(tmp_path):
+    rows = [line(row) for row in traffic(620)]
+    plain, answers = Decider(made()), []
+    expected = [msgspec.json.decode(msgspec.json.encode(plain.answer(row))) for row in rows]
+    for count in (400, 619, 999):  # with so many it is killed, before the last is answered
+        decider, state = opened(tmp_path / "state.evofsm")
+        keep, pieces = decider.keep, iter([b"".join(row + b"\n" for row in rows[len(answers) :])])
+
+        def kept(told, keep=keep, decider=decider, count=count):
+            keep(told)
+            if decider.n == count:
+                raise SystemExit
+
+        decider.keep = kept
+        with suppress(SystemExit):
+            Server(decider).converse(
+                lambda _, pieces=pieces: next(pieces, b""),
+                lambda data: answers.extend(map(msgspec.json.decode, data.splitlines())),
+            )
+        abandoned(state)
+    assert answers == expected
+    assert decider.n == 620
 
 
 def test_a_refused_end_stops_no_restart(tmp_path):

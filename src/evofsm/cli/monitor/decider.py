@@ -10,7 +10,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -34,6 +34,7 @@ HOLE, _OFTEN = 1.5, 0.5
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
 
 Answer = dict[str, Any]
+_T = TypeVar("_T")
 
 
 class Decider:
@@ -85,6 +86,8 @@ class Decider:
                 return self._recent[self._next][1]
             if isinstance(told, Row) and isinstance(self.latest, Row):
                 _refuse_stale(told, self.latest)
+            if isinstance(told, Row) and not told.time < told.time + self.guard.interval:
+                raise MessageError("time", "is too large to tell rows apart", told.time)
         except MessageError as refused:
             return self.error(refused.about, str(refused), refused.time)
         try:
@@ -152,10 +155,7 @@ class Decider:
 
     def end(self, failed: bool = False, observation: Any = None) -> None:
         """End the episode under way."""
-        try:
-            self.guard.end(failed, observation)
-        except OSError as error:  # only the audit log writes
-            self._lose_audit(error)
+        self._without_lost_audit(lambda: self.guard.end(failed, observation))
         self.rows, self._said_often, self._said_fast = 0, False, False
 
     def _end_unasked(self) -> None:
@@ -176,7 +176,6 @@ class Decider:
             said |= dict.fromkeys(_RISKS) | {"reason": "nothing is ahead in the lane"}
             said |= {"alarm": False, "mode": self.mode.value}
             return self._of("decision", time=row.time, ahead=None, **said, **note)
-        self.rows += 1
         try:
             revision = self._revision(row)
         except Exception as error:  # whatever a judge of somebody's own raises
@@ -184,6 +183,7 @@ class Decider:
                 _log.exception("the guard failed at %s s", row.time)
             self._has_failed = True
             return self.error("guard", f"failed: {type(error).__name__}: {error}", row.time)
+        self.rows += 1
         low, high = revision.interval
         known = {**revision._asdict(), "risk_low": low, "risk_high": high}
         said = {name: plain(known[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
@@ -231,18 +231,18 @@ class Decider:
         if isinstance(self.guard.actions, BoxActions) and proposal is not None:
             proposal = np.array(proposal)
         seen: Any = _numbers(row.observation)
+        return self._without_lost_audit(lambda: self.guard.decide(seen, proposal, row.time))
+
+    def _without_lost_audit(self, call: Callable[[], _T]) -> _T:
+        """Somebody has to go on; the log says itself with which record it ends."""
         try:
-            return self.guard.decide(seen, proposal, row.time)
+            return call()
         except OSError as error:
             if self.guard.audit is None:
                 raise
-            self._lose_audit(error)
-            return self.guard.decide(seen, proposal, row.time)
-
-    def _lose_audit(self, error: OSError) -> None:
-        """Somebody has to go on; the log says itself with which record it ends."""
-        _log.error("without an audit log from here on: %s", error)
-        self.guard.audit = None
+            _log.error("without an audit log from here on: %s", error)
+            self.guard.audit = None
+            return call()
 
     def _is_alarm(self, revision: Revision) -> bool:
         """Whether the proposal is too risky, or, where that alone does not decide, is not kept."""

@@ -56,13 +56,18 @@ class Server:
         return answers
 
     def converse(self, read: Callable[[int], bytes], write: Callable[[bytes], object]) -> None:
-        """Answer the lines of a stream to its end; one that is too long is cut off, and refused."""
+        """Answer the lines of a stream to its end; one that is too long is cut off, and refused.
+
+        Each is answered before the next is decided on: of those that were and nobody heard of, as
+        it is killed, there are never more than are known again when they are sent again.
+        """
         begun, data = b"", b"\n"
         while data:
             data = read(_CHUNK)
             *whole, begun = (begun + (data or b"\n" * bool(begun))).split(b"\n")
             begun = begun[: LONGEST + 1]  # however long it gets
-            write(self.answer(line.removesuffix(b"\r") for line in whole))
+            for line in whole:
+                write(self.answer([line.removesuffix(b"\r")]))
 
     def answer_packet(self, data: bytes) -> bytes:
         """What is answered to some lines that came at once."""
