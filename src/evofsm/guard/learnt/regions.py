@@ -154,7 +154,7 @@ def _learnt(
     asked = _asked(failures, survived, spread)
     found: list[Floats] = []
     groups, whole = [np.arange(len(failures))], True
-    while groups and len(found) < _MOST:
+    while groups and len(asked) and len(found) < _MOST:  # or nothing ever moved
         if len(found) + len(groups) >= fewer:  # each takes a region at least
             whole = False
             break
@@ -214,7 +214,8 @@ def _asked(failures: Floats, survived: Floats, spread: Floats) -> Ints:
         tells = 0.5 * (ratio - 1.0 - np.log(ratio))
         moving = np.sort(moving[np.argsort(-tells, kind="stable")[:_SCREENED]])
     alone = [(j, j, 0) for j in moving]
-    return np.array(alone + [(i, j, kind) for i, j in combinations(moving, 2) for kind in (1, 2)])
+    both = [(i, j, kind) for i, j in combinations(moving, 2) for kind in (1, 2)]
+    return np.array(alone + both, np.int64).reshape(-1, 3)
 
 
 def _split(x: Floats) -> Flags:
