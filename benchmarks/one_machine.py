@@ -136,8 +136,8 @@ def threads(times: int, _folder: Path, random: np.random.Generator) -> Counter[s
 class Interrupter:
     """Raises KeyboardInterrupt at one line of the package, the ``line``-th that is come to."""
 
-    def __init__(self, line: int) -> None:
-        self.left = line
+    def __init__(self, line: int, error: type[BaseException] = KeyboardInterrupt) -> None:
+        self.left, self._error = line, error
         self._entered: set[tuple[FrameType, int]] = set()
 
     def __enter__(self) -> Interrupter:
@@ -156,7 +156,7 @@ class Interrupter:
         if event == "line" and not self._leaves_with(frame):
             self.left -= 1
             if self.left == 0:
-                raise KeyboardInterrupt
+                raise self._error
         return self._line
 
     def _leaves_with(self, frame: FrameType) -> bool:

@@ -22,7 +22,7 @@ import tracemalloc
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from typing import Any
 
 import numpy as np
 
+import one_guard
 import one_machine
 from evofsm import store
 from evofsm.cli import driving as driving_module
@@ -37,6 +38,7 @@ from evofsm.cli.driving import GUARD, Results, Setup, drive_in_turn, make_guard
 from evofsm.cli.learning import Checkpoint, learn_traces
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.state import State
+from evofsm.cli.monitor.transports import Server, Stream
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.families import load_family
 from evofsm.driving.judge import LatentRisk
@@ -270,8 +272,8 @@ class _Child:
     """Another process, which works until it is killed."""
 
     def __init__(self, work: Callable[[], None]) -> None:
-        self._number = os.fork()
-        if self._number == 0:
+        self.number = os.fork()
+        if self.number == 0:
             try:
                 work()
             finally:
@@ -279,12 +281,14 @@ class _Child:
 
     def has_crashed(self) -> bool:
         """Whether it ended before it was killed."""
-        os.kill(self._number, signal.SIGKILL)
-        return os.WIFEXITED(os.waitpid(self._number, 0)[1])
+        os.kill(self.number, signal.SIGKILL)
+        return os.WIFEXITED(os.waitpid(self.number, 0)[1])
 
 
 # -- Monitors -------------------------------------------------------------------------------------
 
+# So many rows come at once.
+_ROWS = 620
 # What no guard of two variables takes at its end.
 _REFUSED_ENDS = ("[3.4e38, 0]", "[1e100, 1]", "[1, 2, 3]", "[null]")
 
@@ -327,6 +331,65 @@ def _monitor(path: Path, write: int, rows: int) -> None:
             return
         os.write(write, f"{decider.n}\n".encode())
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def pipeline(times: int, folder: Path, random: np.random.Generator) -> Counter[str]:
+    """Kill monitors beside a sender that waits for no answer; each row is learnt once."""
+    found: Counter[str] = Counter()
+    warm()
+    rows = [
+        json.dumps({"time": 0.1 * k, "observation": [k % 7, k % 5], "proposal": k % 2}).encode()
+        for k in range(_ROWS)
+    ]
+    with tempfile.TemporaryDirectory(dir=folder) as name:
+        plain = _learner(whole := State(Path(name) / "whole", {}))
+        for row in rows:
+            plain.answer(row)
+        while found["kills"] < times:
+            path, heard = Path(name) / f"state{found['kills']}", 0
+            while heard < _ROWS:
+                (rest, send), (hear, answers) = os.pipe(), os.pipe()
+                child = _Child(partial(_serve, path, rest, answers, (send, hear)))
+                os.close(rest)
+                os.close(answers)
+                sending = threading.Thread(target=_send, args=(send, rows[heard:]))
+                sending.start()
+                with open(hear, "rb") as told:
+                    for _ in range(int(random.integers(3)) * (_ROWS - heard) // 2):
+                        heard += told.readline().endswith(b"\n")
+                    time.sleep(random.uniform(0.0, 0.5))
+                    os.kill(child.number, signal.SIGKILL)
+                    heard += sum(line.endswith(b"\n") for line in told)
+                os.waitpid(child.number, 0)
+                sending.join()
+                found["kills"] += 1
+            again = _learner(state := State(path, {}))
+            found["results"] += 1
+            found["results that differ"] += _saved(again.guard) != _saved(plain.guard)
+            found["lost observations"] += abs(again.n - _ROWS)
+            state.close()
+        whole.close()
+    return found
+
+
+def _learner(state: State) -> Decider:
+    decider = Decider(state.guard(lambda: Guard(n_actions=2, interval=0.1)), episode=200)
+    state.begin(decider)
+    return decider
+
+
+def _serve(path: Path, rest: int, answers: int, others: Sequence[int]) -> None:
+    for one in others:
+        os.close(one)
+    logging.disable()
+    with open(rest, "rb", buffering=0) as source, open(answers, "wb", buffering=0) as sink:
+        Server(_learner(State(path, {}))).converse(source.read, Stream(source, sink).send)
+        signal.pause()  # it is killed
+
+
+def _send(send: int, rows: Sequence[bytes]) -> None:
+    with suppress(BrokenPipeError), open(send, "wb", buffering=0) as pipe:
+        pipe.write(b"".join(row + b"\n" for row in rows))
 
 
 def rival(times: int, folder: Path, random: np.random.Generator) -> Counter[str]:
@@ -670,6 +733,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ("two threads on one file", partial(share, False, loads)),
             ("two processes on one file", partial(share, True, loads)),
             ("monitors that refuse ends", partial(restart, starts)),
+            ("a sender that waits not", partial(pipeline, starts // 2)),
             ("two monitors on one state", partial(rival, rivals)),
             ("damaged files", partial(damage, files)),
             ("many variables", partial(dimensions, 60)),
@@ -678,6 +742,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "interrupted at a line",
                 partial(one_machine.interrupts, every=97 if asked.short else 1),
             ),
+            (
+                "guards broken off",
+                partial(one_guard.interrupts, every=997 if asked.short else 5),
+            ),
+            ("forks amid a call", partial(one_guard.forked, starts // 2)),
         ):
             began = time.perf_counter()
             found = run(folder, random)

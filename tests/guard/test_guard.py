@@ -2,8 +2,10 @@
 
 import io
 import math
+import os
 import sys
 import threading
+from collections import Counter
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,13 +13,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import one_guard
 from evofsm import EvolvingFSM, Guard, Labels, store
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.judge import LatentRisk
 from evofsm.guard.actions import BoxActions, Choices, put_into, same_action
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Search
 from evofsm.guard.guard import KIND
+from evofsm.guard.learnt.dynamics import Dynamics
 from evofsm.guard.learnt.judge import LearntRisk
+from evofsm.guard.loop import run_episode
 from evofsm.guard.reviser import Mode
 from evofsm.guard.scene import SceneRisk
 
@@ -260,7 +265,7 @@ def test_a_failure_is_told_or_found_by_the_function():
     for last, end, failures in (
         (0.1, {"observation": [0.9, 0.0]}, 1),
         (0.1, {}, 1),
-        (0.1, {"failed": True}, 2),
+        (0.1, {"failed": np.bool_(True)}, 2),
         (0.9, {}, 3),  # the last observation decided on was one
     ):
         guard.decide([last, 0.0], 0.0)
@@ -480,32 +485,160 @@ def test_what_makes_no_guard_is_refused(settings, message):
 
 
 @pytest.mark.parametrize(
-    ("observation", "proposal"),
+    ("call", "name", "value"),
     [
-        ([0.1], 0.0),
-        ([0.1, 0.0, 0.0], 0.0),
-        ([[0.1, 0.0]], 0.0),
-        ([0.1, math.inf], 0.0),
-        ([0.1, 1e200], 0.0),
-        (["a", "b"], 0.0),
-        (None, 0.0),
-        ([0.1, 0.0], "much"),
-        ([0.1, 0.0], Proposal("much")),
+        *(("decide", "observation", z) for z in ([0.1], [0.1, 0.0, 0.0], [[0.1, 0.0]], None)),
+        *(("decide", "observation", z) for z in ([0.1, math.inf], [0.1, 1e200], ["a", "b"])),
+        *(("decide", "proposal", p) for p in ("much", Proposal("much"))),
+        *(("decide", "time", t) for t in (math.inf, -math.inf, math.nan, 1e300, "1.0", [0.2])),
+        ("end", "observation", [0.0]),
+        *(("end", "failed", v) for v in (np.array([True]), [True], 1, 0.0, None, "no")),
+        *(("end", "terminated", v) for v in (np.array([True]), 1)),
     ],
 )
-def test_what_is_refused_leaves_it_as_it_was(make, observation, proposal, snapshot):
+def test_what_is_refused_leaves_it_as_it_was(make, call, name, value, snapshot):
     guard, twin = make(), make()
     for one in (guard, twin):
         balance(one, pushes(make, 10))
         one.decide([0.1, 0.0], SMALL[make])
+    usual = {"observation": [0.2, 0.1]} | ({"proposal": SMALL[make]} if call == "decide" else {})
     with pytest.raises((TypeError, ValueError)):
-        guard.decide(observation, proposal)
-    with pytest.raises((TypeError, ValueError)):
-        guard.end(observation=[0.0])
-    said = [repr(one.decide([0.2, 0.1], SMALL[make])) for one in (guard, twin)]
+        getattr(guard, call)(**usual | {name: value})
+    said = [repr(getattr(one, call)(**usual)) for one in (guard, twin)]
     assert said[0] == said[1]
     assert snapshot(guard.machine) == snapshot(twin.machine)
-    assert guard.judge.gust == twin.judge.gust
+    assert (guard.judge.gust, guard.n_episodes) == (twin.judge.gust, twin.n_episodes)
+
+
+def test_where_nothing_moves_before_it_fails_it_learns_all_the_same():
+    for rows, last in ((40, 0.0), (40, 1.0), (3, 0.0), (1, 0.0)):
+        guard = Guard(low=-1.0, high=1.0, interval=DT)
+        for _ in range(4):
+            for _ in range(rows):
+                guard.decide([1.0, 2.0], 0.1)
+            guard.end(True, [1.0, 2.0 + last])
+        assert guard.n_failed == guard.judge.n_failed == 4
+
+
+# -- What is broken off -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", one_guard.MAKES)
+@pytest.mark.parametrize("error", [one_guard.BrokenError, KeyboardInterrupt])
+def test_wherever_a_call_is_broken_off_nothing_is_done_and_it_works_again(kind, error):
+    """At lines of all of the package, in each of its calls; ``make torture`` tries every line."""
+    found = Counter(one_guard.harms(kind, 257, error))
+    assert found.pop("") > 20
+    assert not found
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        *("judge.judge", "judge.why", "judge.learn", "judge.start_episode", "judge.end"),
+        *("machine.observe", "machine.act", "machine.start_episode", "machine.fail"),
+        *("reviser.revise", "reviser.start_episode"),
+        *("audit.begin", "audit.seen", "audit.decided", "audit.ended"),
+    ],
+)
+def test_what_raises_in_a_part_of_it_is_done_again_by_the_same_call(broken, snapshot):
+    part, name = broken.split(".")
+    nothing = dict.fromkeys(("begin", "seen", "decided", "ended"), lambda *_, **__: None)
+    guard, twin = (continuous(audit=SimpleNamespace(**nothing)) for _ in range(2))
+    for one in (guard, twin):
+        balance(one, pushes(continuous, 10), gusts=[0.1])
+    calls = [
+        *(lambda one, k=k: one.decide([0.2, 0.1 * k], 2.0, DT * k) for k in range(3)),
+        lambda one: one.decide([0.3, 0.3], 2.0, 2.0),  # after a gap
+        lambda one: one.end(True),
+        lambda one: one.decide([0.1, 0.3], 2.0),
+    ]
+    times = 0
+
+    def fails(*_, **__):
+        raise RuntimeError("a bug of somebody's own")
+
+    for call in calls:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(getattr(guard, part), name, fails)
+            before = snapshot(guard.machine), guard.judge.gust, guard.n_episodes
+            try:
+                came = call(guard)
+            except RuntimeError:
+                times += 1
+                assert (snapshot(guard.machine), guard.judge.gust, guard.n_episodes) == before
+                patch.undo()
+                came = call(guard)
+        assert repr(came) == repr(call(twin))
+        assert snapshot(guard.machine) == snapshot(twin.machine)
+        assert (guard.judge.gust, guard.n_episodes) == (twin.judge.gust, twin.n_episodes)
+    assert times
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing can fork here")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_child_forked_amid_an_end_in_another_thread_has_the_guard_of_before(monkeypatch):
+    guard, twin = one_guard.learnt(), one_guard.learnt()
+    amid, over, settle = threading.Event(), threading.Event(), Dynamics.settle
+
+    def waits(dynamics, **how):
+        settle(dynamics, **how)
+        if threading.current_thread() is thread:
+            amid.set()
+            over.wait()
+
+    monkeypatch.setattr(Dynamics, "settle", waits)
+    thread = threading.Thread(target=guard.end, args=(True, [1.2, 0.1]))
+    thread.start()
+    amid.wait()
+    if (child := os.fork()) == 0:
+        code = 1
+        try:
+            before = one_guard.held(guard) == one_guard.held(twin)
+            guard.end(True, [1.2, 0.1])
+            twin.end(True, [1.2, 0.1])
+            code = int(not before or one_guard.gone_on(guard) != one_guard.gone_on(twin))
+        finally:
+            os._exit(code)
+    over.set()
+    thread.join()
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+# -- Who feeds it -------------------------------------------------------------------------------
+
+
+class Falling:
+    """An environment that falls sooner or later."""
+
+    def reset(self, *, seed=None, options=None):
+        self.k = 0
+        return [0.1, 0.0], {}
+
+    def step(self, action):
+        self.k += 1
+        return [0.1 + 0.1 * self.k, 0.1], 0.0, self.k > 7, False, {}
+
+
+def test_two_that_feed_one_guard_by_turns_are_told_and_one_after_the_other_may():
+    guard = continuous()
+    one, other = (run_episode(Falling(), guard, lambda _: 0.0) for _ in range(2))
+    next(one)
+    next(other)
+    before = guard.situation
+    with pytest.raises(RuntimeError, match=r"RevisedVectorActions.*guard of its own"):
+        next(one)
+    assert guard.situation is before
+    assert len(list(other)) == 7
+    assert (guard.n_episodes, guard.n_failed) == (1, 1)
+    first = guard.begin()
+    second = guard.begin()
+    guard.end(True, episode=first)  # which was broken off
+    guard.freeze()
+    guard.decide([0.1, 0.0], 0.0, episode=second)  # it goes on under its number
+    guard.learn = True
+    guard.end(True, episode=second)
+    assert (second - first, guard.n_episodes) == (1, 2)
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ from evofsm.fsm.kernels import compiled, inner_kernel
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import wilson_bounds
+from evofsm.fsm.sharing import Retraced, Rollback, step
 from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import Action, nearest_bounds
@@ -96,7 +97,7 @@ def _refuse_other_brakes(dt: float, arrays: Mapping[str, NDArray[Any]]) -> None:
     short.refuse_others("doubts_shortfalls", arrays["doubts_shortfalls"])
 
 
-class LatentRisk:
+class LatentRisk(Retraced):
     """Learns online what an action leads to if the leader brakes and one is cautious from then on.
 
     Parameters
@@ -197,9 +198,14 @@ class LatentRisk:
         """
         seen = _three_finite(observation, whole=False)
         command = _one_finite("acceleration", acceleration)
-        if not is_whole(seen):
-            self.follow(observation, acceleration)
-            return
+        if is_whole(seen):
+            self._learn(seen, command, watched)
+        else:
+            self._keep_up(seen, command)
+
+    @step
+    def _learn(self, seen: Three, command: float, watched: bool) -> None:
+        """Learn from what was seen whole."""
         estimate = self.perception.see(seen, self._expected, sure=self.brakes.known)
         self.manoeuvres.remember(self._follow(seen, command))
         self.brakes.see(seen[1], command, estimate.mean[1], watched=watched)
@@ -221,7 +227,11 @@ class LatentRisk:
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
         """Keep up with what happens, as `learn`, without learning from it."""
         command = _one_finite("acceleration", acceleration)
-        seen = _three_finite(observation, whole=False)
+        self._keep_up(_three_finite(observation, whole=False), command)
+
+    @step
+    def _keep_up(self, seen: Three, command: float) -> None:
+        """Keep up with what was seen."""
         self._watched = False
         self.perception.see(seen, self._expected, sure=self.brakes.known, learn=False)
         if is_whole(seen):
@@ -231,6 +241,7 @@ class LatentRisk:
             self.brakes.clear()
             self._commands = (self._commands[1], command)
 
+    @step
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
         ended, shown = self._watch.end(), self._own_watch.end()
@@ -242,6 +253,20 @@ class LatentRisk:
         self.brakes.clear()
         self.perception.clear()
         self._commands = (0.0, 0.0)
+
+    def savepoint(self) -> Rollback:
+        """What takes back all that it learns from now on, of leaders, whom others share, too."""
+        take_back, leaders = super().savepoint(), self.manoeuvres
+        known = leaders.gentle, leaders.decels, leaders.table
+
+        def rollback() -> None:
+            take_back()
+            leaders.gentle, leaders.decels, leaders.table = known
+
+        return rollback
+
+    def _become(self, again: Self) -> None:
+        vars(self).update({**vars(again), "manoeuvres": self.manoeuvres})
 
     def end(self, observation: ArrayLike | None, *, failed: bool) -> None:
         """What comes is not a consequence of what was; how it ended teaches nothing."""

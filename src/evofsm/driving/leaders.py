@@ -101,7 +101,7 @@ class Manoeuvres:
         hard = [decel for decel in seen if decel >= self.hard]
         self.gentle += len(seen) - len(hard)
         if hard:
-            self.decels.extend(hard)
+            self.decels = deque([*self.decels, *hard], self.decels.maxlen)
             self._tabulate()
 
     def begin_with(self, leaders: LeaderBrakes) -> None:

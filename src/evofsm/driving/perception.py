@@ -53,6 +53,8 @@ class Estimate(NamedTuple):
 
     def deviation(self, weights: Three) -> float:
         """Standard deviation of a weighed sum of the three."""
+        if self.covariance is _EXACT:
+            return 0.0
         variance = 0.0
         for one, row in zip(weights, self.covariance, strict=True):
             for other, each in zip(weights, row, strict=True):

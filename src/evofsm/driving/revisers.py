@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from evofsm.driving import measures
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import positive
 from evofsm.guard import Fallback, Proposal, Revision, RiskMeasure, Situation, make_usable
 from evofsm.guard.parts import part_class, part_name
@@ -48,6 +50,10 @@ class EnvelopeReviser:
     def start_episode(self) -> None:
         """What was seen before belongs to another episode."""
         self._seen: list[NDArray[np.float64]] = []
+
+    def savepoint(self) -> Rollback:
+        """What takes back all that is seen from now on."""
+        return partial(setattr, self, "_seen", self._seen)
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """Full braking where the measure is above 0, else the proposal."""

@@ -12,12 +12,8 @@ vehicle control system via online recognition of latent risks", arXiv:1908.10823
 from __future__ import annotations
 
 import copy
-import os
-from collections.abc import Callable, Mapping, Sequence
-from functools import wraps
-from threading import RLock
-from typing import Any, Self, SupportsIndex, TypeVar, cast
-from weakref import WeakSet
+from collections.abc import Mapping, Sequence
+from typing import Any, Self, SupportsIndex, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,12 +40,11 @@ from evofsm.fsm.model import FSMModel, Policy, believed, check_forecast
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import StateRule
+from evofsm.fsm.sharing import Retraced, alone, share, step
 from evofsm.fsm.step import EVENTS, PREDICTED, Event, Step, Trace, blank_trace
 from evofsm.fsm.transitions import room_for
 from evofsm.fsm.validation import Floats, positive, whole
 from evofsm.store import LARGEST_OBSERVATION, Place
-
-Method = TypeVar("Method", bound=Callable[..., Any])
 
 # What a machine does not have to be given, with what holds if it is not.
 _LIMITS = {"max_states": None, "failure_horizon": None}
@@ -60,28 +55,9 @@ _ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers", 
 _FLOAT64 = np.dtype(np.float64)
 # Compiled code of a step, with and without a limit to the states.
 _LIMITED, _UNLIMITED = Entry(stepping.learn_rows), Entry(stepping.learn_rows)
-# All that threads share, for a process that is forked.
-_SHARED: WeakSet[Any] = WeakSet()
 
 
-def share(one: Any) -> Any:
-    """A lock of an object, so that threads may share it: its ``_lock``."""
-    _SHARED.add(one)
-    return RLock()
-
-
-def alone(method: Method) -> Method:
-    """A method of what is shared, during which no other thread changes it."""
-
-    @wraps(method)
-    def locked(self: Any, *args: Any, **kwargs: Any) -> Any:
-        with self._lock:
-            return method(self, *args, **kwargs)
-
-    return cast(Method, locked)
-
-
-class EvolvingFSM:
+class EvolvingFSM(Retraced):
     """A finite state machine that grows its states and transitions from what it observes.
 
     It has the arrays of a snapshot, `FSMModel`, under their names, as `visits`.
@@ -207,9 +183,10 @@ class EvolvingFSM:
             given = valid.real_array("observation", z, ndim=1)
             if (absent := np.isnan(given)).any():
                 return self._observe_partly(given, absent, missing, failed)
-        return self._step(z, NO_ACTION, failed)
+        return self._step(self._checked(z), NO_ACTION, failed)
 
     @alone
+    @step
     def act(self, i: SupportsIndex) -> None:
         """Say which action (from 0) was commanded after the latest observation.
 
@@ -231,7 +208,7 @@ class EvolvingFSM:
         z, i
             As `observe` and `act` take them.
         """
-        return self._step(z, valid.check_action(i, self.n_actions), None)
+        return self._step(self._checked(z), valid.check_action(i, self.n_actions), None)
 
     @alone
     def learn_many(
@@ -274,6 +251,7 @@ class EvolvingFSM:
             self._fit(observations.shape[1])
         trace, row = blank_trace(rows), 0
         beliefs = np.zeros((rows if belief else 0, self._capacity))
+        self._known = None
         while row < rows:
             given = self._learnt, self._settings, self._limit, observations, actions, starts
             told, scratch = failures is not None, np.empty((3, self._capacity))
@@ -284,11 +262,13 @@ class EvolvingFSM:
         return trace._replace(belief=beliefs[:, : self.n_states]) if belief else trace
 
     @alone
+    @step
     def start_episode(self) -> None:
         """Begin a new episode: no transition is learnt from the last observation to the next."""
         self._learnt.now[["action", "chained"]] = NO_ACTION, 0
 
     @alone
+    @step
     def fail(self) -> None:
         """End the episode in failure, to which the action after the latest observation led."""
         if not self._learnt.now["chained"][0]:
@@ -297,6 +277,7 @@ class EvolvingFSM:
         stepping.fail(self._learnt, self._settings)
 
     @alone
+    @step
     def onset(self) -> None:
         """Count that something unexpected began in the state before the latest observation's.
 
@@ -305,6 +286,8 @@ class EvolvingFSM:
         if (before := self._learnt.now["before"][0]) >= 0:
             self._learnt.sums[arrays.ONSETS, before] += 1.0
 
+    @alone
+    @step
     def tell_of_failures(self) -> None:
         """Say that failures are told: an episode that ends without one is known to have had none.
 
@@ -494,6 +477,12 @@ class EvolvingFSM:
         now = self._learnt.now[0]
         return int(now["state"]) if now["chained"] else None
 
+    savepoint = alone(Retraced.savepoint)
+
+    @alone
+    def _become(self, again: Self) -> None:
+        self._learnt, self._settings = again._learnt, again._settings
+
     # -- Files and copies -------------------------------------------------------------------------
 
     def copy(self) -> Self:
@@ -561,7 +550,8 @@ class EvolvingFSM:
 
     def _share(self) -> None:
         """Be ready for threads. They wait for whoever steps, grows, or takes a copy."""
-        self._lock = share(self)
+        share(self)
+        self._known = None
         self._limit = self.max_states
         # Room for a single row.
         flags = np.zeros((2, 1), np.bool_)
@@ -571,9 +561,12 @@ class EvolvingFSM:
     def _capacity(self) -> int:
         return len(self._learnt.belief)
 
-    def _step(self, z: ArrayLike, action: int, failed: bool | None) -> Step:
+    @step
+    def _step(self, z: Floats, action: int, failed: bool | None) -> Step:
         """Observe, then act: a single row."""
-        row = self._checked(z)[None]
+        if z.shape != self._learnt.variables.shape:
+            self._fit(len(z))
+        row = z[None]
         actions, starts, failures, trace, none = self._one
         actions[0], failures[0] = action, bool(failed)
         scratch = np.empty((3, len(self._learnt.belief)))
@@ -588,6 +581,7 @@ class EvolvingFSM:
         belief = self._learnt.belief[:n].copy()
         return Step(trace.state.item(), belief, event, predicted, surprise)
 
+    @step
     def _observe_partly(
         self, z: Floats, absent: NDArray[np.bool_], missing: Missing, failed: bool | None
     ) -> Step:
@@ -634,7 +628,6 @@ class EvolvingFSM:
         if self.n_states:
             self._refuse_other_length(len(vector))
         valid.refuse_unusable("observation", vector)
-        self._fit(len(vector))
         return vector
 
     def _refuse_other_length(self, m: int) -> None:
@@ -670,16 +663,6 @@ class EvolvingFSM:
 def opened(machine: EvolvingFSM) -> tuple[Learnt, Settings]:
     """What a machine has learnt and was given, itself."""
     return machine._learnt, machine._settings
-
-
-def _unlock_all() -> None:
-    """In a process just forked: it lacks the threads that held locks and would release them."""
-    for one in _SHARED:
-        one._lock = RLock()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_unlock_all)
 
 
 def _below_1(name: str, value: float) -> float:

@@ -113,6 +113,8 @@ def real_rows(name: str, values: ArrayLike) -> Floats:
 
 def _array(name: str, values: Any) -> NDArray[Any]:
     """An array, NaN where a mask hides a number, which NumPy would take as it is."""
+    if type(values) is np.ndarray:
+        return values
     try:
         if isinstance(values, list | tuple) and any(map(np.ma.is_masked, values)):
             values = np.ma.array(values)

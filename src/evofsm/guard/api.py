@@ -196,7 +196,9 @@ class LearningJudge(ActionJudge, Protocol):
     """A judge that learns from what happens, and can be kept in a file.
 
     One that also learns from being asked, or tries actions, may have an attribute ``learning``: the
-    guard sets it to whether anything may be learnt.
+    guard sets it to whether anything may be learnt. A method that raises should leave it as it was;
+    what others did in the same call a guard takes back where it has a method ``savepoint`` (see
+    `Guard`).
     """
 
     dt: float  #: time between decisions [s]

@@ -15,6 +15,8 @@ import logging
 import math
 import os
 import platform
+import stat
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -29,6 +31,7 @@ from numpy.typing import NDArray
 
 import evofsm
 from evofsm import store
+from evofsm.fsm.sharing import Rollback
 from evofsm.guard.actions import written
 from evofsm.guard.api import Proposal, Revision, Situation
 from evofsm.guard.guard import Guard
@@ -42,7 +45,7 @@ _log = logging.getLogger(__name__)
 LOG_VERSION = 1
 # Most probable states of a belief that are written; decisions that are held back at most, which a
 # kill loses; and bytes of a line, which holds a machine at most.
-_STATES, _MOST_QUIET, _LONGEST = 3, 240, 1 << 29
+_STATES, _MOST_QUIET, _LONGEST = 3, 240, 1 << 26
 _SEAL, _END = b',"hash":"', b'"}\n'
 # How a log begins: so a half-written one is told from other people's files.
 _ABOUT = "evofsm audit log"
@@ -181,7 +184,7 @@ class Chain:
     def records(self) -> Iterator[Record]:
         """The records, after which `finding` is known; a ValueError if there is none."""
         known = self._kept in (None, NOTHING)
-        reading = lines(self.path)
+        reading = lines(self.path, _LONGEST)
         for line in reading:
             if not line.endswith(b"\n"):
                 self.half_written = len(line)
@@ -217,13 +220,18 @@ class Chain:
         return Finding(at, f"record {at} was altered: {why}")
 
 
-def lines(path: Path) -> Iterator[bytes]:
-    """The lines of a log, the last perhaps without an end; of one that grows, those now there."""
+def lines(path: Path, longest: int) -> Iterator[bytes]:
+    """The lines of a file, the last perhaps without an end; of one that grows, those now there.
+
+    None may be longer [byte], as in a file of another kind: it would take all memory.
+    """
     with open(path, "rb") as file:
-        left = os.fstat(file.fileno()).st_size
-        while line := file.readline(min(_LONGEST, left)):
-            if len(line) == _LONGEST:
-                raise ValueError(f"{path} has a line of more than {_LONGEST >> 20} MiB")
+        status = os.fstat(file.fileno())
+        left = status.st_size if stat.S_ISREG(status.st_mode) else sys.maxsize
+        while line := file.readline(min(longest + 1, left)):
+            if len(line) > longest:
+                what = f"{path} has a line of more than {longest >> 20} MiB"
+                raise ValueError(f"{what}: is it another kind of file?")
             left -= len(line)
             yield line
 
@@ -245,7 +253,7 @@ class AuditLog:
     """Logs what a guard decides, so that nobody can change it unnoticed: ``Guard(..., audit=log)``.
 
     Where the disk fails while driving, the log is broken off there, which is logged, and raised as
-    the episode ends.
+    the episode ends, or the next one begins. Without the log, or with another, the same call works.
 
     Parameters
     ----------
@@ -267,7 +275,7 @@ class AuditLog:
     Notes
     -----
     Between the episodes of a log anything may teach machine or judge, during one nothing else may.
-    An interrupt (Ctrl-C) while something is written breaks the episode off in the log. Where a
+    What a guard takes back, as after an interrupt (Ctrl-C), is taken back here, too. Where a
     process forks, the log stays with the parent.
 
     Examples
@@ -298,7 +306,6 @@ class AuditLog:
         self._settings: dict[str, Any] = {}
         self._before: list[list[Any]] = []
         self._seen: list[Any] = []  # what a proposal is waited for
-        self._busy = False  # longer than a call lasts: an interrupt has left a hole in the episode
         try:
             store.only_writer(self._file, path, "name another file")
             self._find_end()
@@ -317,8 +324,6 @@ class AuditLog:
             return
         try:
             if os.getpid() == self._owner:  # what is held back is the parent's to write
-                if self._busy:
-                    self._recover()
                 self._flush()
                 self._force()
                 store.let_others_write(self._file)
@@ -337,15 +342,6 @@ class AuditLog:
     def begin(self, guard: Guard) -> None:
         """An episode begins."""
         self._raise()
-        if self._busy:
-            self._recover()
-            _log.error(
-                "the audit log %s was interrupted at record %s: the rest of that episode is not "
-                "in it",
-                self.path,
-                self.head.number,
-            )
-        self._busy = True
         self._flush()  # of an episode that was broken off
         self._seen = []
         who = (guard.reviser, guard.machine, guard.judge, guard.failed)
@@ -355,25 +351,19 @@ class AuditLog:
         self._settings = settings_now(guard)
         self._write("begin", settings=self._settings)
         self._force()
-        self._busy = False
         self._raise()
 
     def seen(self, observation: NDArray[np.float64], time: float) -> None:
         """An observation came in, at ``time`` [s]."""
         if self._guard is None:
             raise ValueError("the log was given to a guard within an episode; give it before one")
-        if self._busy:
-            return
-        self._busy = True
         self._keep_seen()
         self._seen = [float(time), observation.tolist()]
-        self._busy = False
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
         """A decision was made. When this returns it is written down, if it said something."""
-        if self._busy or self._guard is None:
+        if self._guard is None:
             return
-        self._busy = True
         now = settings_now(self._guard)
         if now != self._settings:
             self._flush()
@@ -388,13 +378,11 @@ class AuditLog:
             self._before.append([time, observation, written(proposal.action)])
             if len(self._before) >= _MOST_QUIET:
                 self._flush()
-        self._busy = False
 
     def ended(self, observation: Any, *, failed: bool, terminated: bool) -> None:
         """The episode ended; an OSError if something could not be written since it began."""
-        if self._busy or self._guard is None:
+        if self._guard is None:
             return
-        self._busy = True
         self._keep_seen()
         self._learnt = sums_of(self._guard)
         last = None if observation is None else observation.tolist()
@@ -402,19 +390,21 @@ class AuditLog:
         how = {"failed": bool(failed), "terminated": terminated}
         self._write("end", before=before, learnt=self._learnt, observation=last, **how)
         self._force()
-        self._guard, self._busy = None, False
+        self._guard = None
         self._raise()
 
-    # -- Writing ----------------------------------------------------------------------------------
+    def savepoint(self) -> Rollback:
+        """What takes back all that is logged from now on, in the file, too."""
+        kept = {**self.__dict__, "_before": [*self._before]}
 
-    def _recover(self) -> None:
-        """After an interrupt the file alone knows what was written."""
-        self._who = ()
-        try:
-            self._refuse_child()
-            self._find_end()
-        except OSError as error:
-            self._fail(error)
+        def rollback() -> None:
+            self.__dict__.update(kept)
+            with suppress(OSError):  # else before more is written
+                self._cut()
+
+        return rollback
+
+    # -- Writing ----------------------------------------------------------------------------------
 
     def _refuse_child(self) -> None:
         if os.getpid() != self._owner:
@@ -442,6 +432,12 @@ class AuditLog:
         self.cut_off = chain.half_written
         self._head, self._size = chain.head, chain.size
 
+    def _cut(self) -> None:
+        """Cut off what was taken back, or is half of a record."""
+        mine = os.getpid() == self._owner and not self._file.closed
+        if mine and os.fstat(self._file.fileno()).st_size > self._size:
+            self._file.truncate(self._size)
+
     def _keep_seen(self) -> None:
         """Nothing was proposed to what came in last."""
         if self._seen:
@@ -463,15 +459,13 @@ class AuditLog:
         line, head = seal({"kind": kind, "clock": clock, **content}, self._head)
         try:
             self._refuse_child()
-            try:
-                data = line
-                while data:  # a disk that gets full takes a part of it first
-                    data = data[self._file.write(data) :]
-            except OSError:
-                with suppress(OSError):
-                    self._file.truncate(self._size)
-                raise
+            self._cut()  # what could not be cut off then
+            data = line
+            while data:  # a disk that gets full takes a part of it first
+                data = data[self._file.write(data) :]
         except OSError as error:
+            with suppress(OSError):
+                self._cut()
             self._fail(error)
             return
         self._head, self._size = head, self._size + len(line)
@@ -492,7 +486,8 @@ class AuditLog:
         if self._failure is not None:
             raise OSError(
                 self._failure.errno,
-                f"{self._failure.strerror}; the audit log ends with record {self.head.number}",
+                f"{self._failure.strerror}; the audit log ends with record {self.head.number}: go "
+                "on with another one, or with none (guard.audit = None)",
                 str(self.path),
             ) from self._failure
 
@@ -516,6 +511,8 @@ def _start(guard: Guard) -> dict[str, Any]:
     file = BytesIO()
     if known := can_be_made_again(guard):
         guard.save(file)
+        if not (known := file.tell() < _LONGEST // 2):
+            _log.warning("the guard is too large for an audit log: it will not be replayed")
     return {
         "about": _ABOUT,
         "guard": base64.b64encode(file.getvalue()).decode() if known else None,

@@ -12,18 +12,21 @@ import warnings
 from collections.abc import Callable, Mapping
 from functools import cache
 from io import BytesIO
-from typing import Any, Protocol, Self
+from operator import attrgetter
+from typing import Any, NamedTuple, Protocol, Self, SupportsFloat
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
 from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.arrays import VISITS
 from evofsm.fsm.explanation import explain
-from evofsm.fsm.machine import EvolvingFSM, alone, share
+from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
+from evofsm.fsm.sharing import Rollback, alone, share, transaction
 from evofsm.fsm.validation import positive, real_array
 from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
 from evofsm.guard.api import (
@@ -58,23 +61,22 @@ _LACKING = {Missing.PARTIAL: Intake.PARTIAL, Missing.HOLD: Intake.HELD}
 _LARGEST = 1e30
 
 
-class InputMonitor:
+class InputMonitor(NamedTuple):
     """Tells what is wrong with observations: late, twice, after a gap in time, or incomplete.
 
     They are due every ``interval`` [s].
     """
 
-    def __init__(self, missing: Missing, interval: float) -> None:
-        self.missing = missing
-        self.interval = interval
-        #: The latest value of each variable; NaN of one that was never seen.
-        self.held: NDArray[np.float64] = np.empty(0)
-        self._time = math.nan
+    missing: Missing
+    interval: float
+    #: The latest value of each variable; NaN of one that was never seen.
+    held: NDArray[np.float64] = np.empty(0)
+    time: float = math.nan  #: of the latest observation [s]
 
-    def take(self, observation: NDArray[np.float64], time: float) -> Intake:
-        """What is wrong with an observation at ``time`` [s]; one out of order is not taken in."""
-        if time <= self._time:
-            return Intake.REPEATED if time == self._time else Intake.LATE
+    def take(self, observation: NDArray[np.float64], time: float) -> tuple[Intake, InputMonitor]:
+        """What is wrong with an observation at ``time`` [s], and itself, unless it was too late."""
+        if time <= self.time:
+            return Intake.REPEATED if time == self.time else Intake.LATE, self
         found, held = Intake.WHOLE, observation
         if math.isnan(observation.dot(observation)):  # the quickest way to ask for NaN
             absent = np.isnan(observation)
@@ -84,10 +86,9 @@ class InputMonitor:
             if len(self.held) == len(observation):  # what was seen of them before is still held
                 held = np.where(absent, self.held, observation)
             found = _LACKING[self.missing]
-        if time - self._time > _GAP * self.interval:
+        if time - self.time > _GAP * self.interval:
             found |= Intake.GAP
-        self.held, self._time = held.copy(), time
-        return found
+        return found, InputMonitor(self.missing, self.interval, held.copy(), time)
 
 
 class DecisionLogger(Protocol):
@@ -108,6 +109,12 @@ class DecisionLogger(Protocol):
 
 # Settings that stand in a file as they are.
 _PLAIN = ("explaining", "interval", "learn", "n_episodes", "n_failed", "shadow")
+# What of a guard changes in an episode.
+_CHANGING = (
+    *("_monitor", "_latest", "_under_way", "_passing", "_decisions", "_acted", "_watched", "_kept"),
+    *("_begun", "_learn", "_frozen", "n_episodes", "n_failed"),
+)
+_CHANGES = attrgetter(*_CHANGING)
 # What a judge has that learns.
 _LEARNS = ("dt", "learn", "watch", "follow", "start_episode", "end", "sums", "save", "load")
 # The files of the machine and of the judge, as bytes.
@@ -185,8 +192,10 @@ class Guard:
     one stream of observations. A file is saved between two calls. What an attribute returns, as
     `machine` or `judge`, has to be left alone meanwhile.
 
-    An input that is refused leaves the guard as it was. Where the judge itself raises, the
-    observation was taken in; asking again with the same time decides on it.
+    Each call is done as a whole: where it raises (an input is refused, a judge or the audit log
+    fails, Ctrl-C), guard, machine, judge and audit log are as before, and it may be made again. A
+    judge, reviser or logger of your own takes part if it has a method ``savepoint``, which returns
+    a function that takes back what was done since; else what raises in it should change nothing.
 
     Examples
     --------
@@ -301,7 +310,7 @@ class Guard:
                 f"failed is {failed!r}; it must be a function of an observation, such as "
                 "failed=lambda z: z[0] <= 0"
             )
-        self._lock = share(self)
+        share(self)
         self.actions = reviser.actions
         self.interval = positive("interval", interval)
         asked = reviser.risk if isinstance(reviser, ActionReviser) else judge
@@ -353,7 +362,8 @@ class Guard:
         self._frozen: FSMModel | None = None
         self._monitor = InputMonitor(missing, interval)
         self._latest: Situation | None = None
-        self._under_way, self._passing = False, ""
+        self._under_way, self._passing, self._learn = False, "", True
+        self._begun = self._decisions = self._acted = self._watched = self._kept = 0
         #: Whether episodes may be driven in shadow, or it may step back, where it may do harm.
         self.shadow = bool(shadow)
         self.learn = learn
@@ -366,7 +376,7 @@ class Guard:
         return self._learn
 
     @learn.setter
-    @alone
+    @transaction
     def learn(self, learn: bool) -> None:
         self._learn = learn
         if self.judge is not None and hasattr(self.judge, "learning"):
@@ -376,6 +386,7 @@ class Guard:
             self.machine.start_episode()
         self._frozen = None if learn or self.machine is None else self.machine.model()
 
+    @transaction
     def freeze(self) -> None:
         """Learn nothing from now on: what is decided depends on the present episode alone.
 
@@ -383,11 +394,9 @@ class Guard:
         is broken off: nothing more is learnt from it. Where it steps back, or guarded episodes seem
         to fail sooner than those of the controller alone, proposals pass, of which it warns.
         """
-        with self._lock:
-            self.learn = False
-            why = self._why_passing()
-        if why:
-            warnings.warn(f"this guard {why}: frozen so, proposals pass", stacklevel=2)
+        self.learn = False
+        if why := self._why_passing():
+            warnings.warn(f"this guard {why}: frozen so, proposals pass", stacklevel=3)
 
     def _why_passing(self) -> str:
         """Why proposals pass in the episode to come; empty where they need not."""
@@ -402,12 +411,33 @@ class Guard:
             raise RuntimeError("no observation was given yet in this episode")
         return self._latest
 
-    @alone
-    def begin(self, twin: Self | None = None) -> None:
+    def _savepoint(self) -> Rollback:
+        """What takes back all that is done from now on."""
+        kept = _CHANGES(self)
+        parts: Any = self.machine, self.judge, self.reviser, self.audit
+        rollbacks = [one.savepoint() for one in parts if hasattr(one, "savepoint")]
+
+        def rollback() -> None:
+            for name, value in zip(_CHANGING, kept, strict=True):
+                setattr(self, name, value)
+            for take_back in rollbacks:
+                take_back()
+
+        return rollback
+
+    @transaction
+    def begin(self, twin: Self | None = None) -> int:
         """Begin an episode; one that is under way is broken off, and nothing follows from it.
 
-        Where it is only taken in (`take_in`), ``twin`` is the guard that decided it already.
+        Returns its number, from 1, by which `decide` and `end` know whose episode they are asked
+        of. Where it is only taken in (`take_in`), ``twin`` is the guard that decided it already.
         """
+        self._begun += 1
+        self._begin(twin)
+        return self._begun
+
+    def _begin(self, twin: Self | None = None) -> None:
+        """Begin the episode of that number."""
         self._monitor = InputMonitor(self.missing, self.interval)
         self._latest = None
         self._decisions = self._acted = self._watched = self._kept = 0
@@ -423,11 +453,14 @@ class Guard:
             self.audit.begin(self)
         self._under_way = True
 
+    @transaction
     def decide(
         self,
         observation: ArrayLike,
         proposal: Proposal | ArrayLike | None,
         time: float | None = None,
+        *,
+        episode: int | None = None,
     ) -> Revision:
         """What to execute instead of a proposal; the proposal itself where that will do.
 
@@ -440,7 +473,10 @@ class Guard:
             of actions is a box.
         time : float, optional
             Of the observation, in this episode [s]; without it decisions are counted, one every
-            `interval`.
+            `interval`. What is not later than the one before tells nothing new.
+        episode : int, optional
+            Its number, which `begin` returned: so several that feed one guard cannot mix their
+            episodes up.
 
         Returns
         -------
@@ -451,15 +487,22 @@ class Guard:
         Raises
         ------
         TypeError, ValueError
-            If observation or proposal are not real numbers, or an entry is infinite, larger than
-            1e30, or beyond the judge's ``ranges``.
+            If observation, proposal or time are not real numbers, or an entry is infinite, larger
+            than 1e30, or beyond the judge's ``ranges``.
+        RuntimeError
+            If another episode was begun since the one of that number.
         """
-        with self._lock:
-            wanted = proposal.action if isinstance(proposal, Proposal) else proposal
-            wanted = no_action(self.actions) if wanted is None else self._proposed(wanted)
-            if time is None:
-                time = self._decisions * self.interval if self._under_way else 0.0
-            return self.revise(self.recognise(observation, time), Proposal(wanted))
+        if episode not in (None, self._begun):
+            raise RuntimeError(
+                f"episode {episode} was broken off as another began with the same guard (several "
+                "environments with one guard?); run them all under RevisedVectorActions or "
+                "RevisedAgents, or give each a guard of its own, such as guard.copy(); then reset"
+            )
+        wanted = proposal.action if isinstance(proposal, Proposal) else proposal
+        wanted = no_action(self.actions) if wanted is None else self._proposed(wanted)
+        if time is None:
+            time = self._decisions * self.interval if self._under_way else 0.0
+        return self.revise(self.recognise(observation, time), Proposal(wanted))
 
     def _proposed(self, action: ArrayLike) -> Action:
         """An action of the right type, whatever its values."""
@@ -467,6 +510,7 @@ class Guard:
             return self.actions.checked("proposal", action)
         return float(action)  # type: ignore[arg-type]
 
+    @transaction
     def recognise(self, observation: ArrayLike, time: float) -> Situation:
         """The first half of `decide`: where the system is; machine and judge learn from it.
 
@@ -478,25 +522,35 @@ class Guard:
         observation, time
             As in `decide`.
         """
-        with self._lock:
-            z = self._checked(observation)
-            if not self._under_way:
-                self.begin()
-            intake = self._monitor.take(z, time)
-            if intake and intake & STALE and self._latest is not None:
-                situation = self._latest._replace(intake=intake)
-            else:
-                # What comes after a gap does not follow from what was before. The machine begins
-                # first, as a judge learns from what it made of it.
-                if intake and intake & Intake.GAP:
-                    if self.machine is not None and self._learn:
-                        self.machine.start_episode()
-                    if self.judge is not None:
-                        self.judge.start_episode(learn=self._learn)
-                situation = self._latest = self._recognised(z, time, intake)
-            if self.audit is not None:
-                self.audit.seen(z, time)
-            return situation
+        z, time = self._checked(observation), self._seconds(time)
+        if not self._under_way:
+            self._begin()
+        intake, self._monitor = self._monitor.take(z, time)
+        if intake and intake & STALE and self._latest is not None:
+            situation = self._latest._replace(intake=intake)
+        else:
+            # What comes after a gap does not follow from what was before. The machine begins
+            # first, as a judge learns from what it made of it.
+            if intake and intake & Intake.GAP:
+                if self.machine is not None and self._learn:
+                    self.machine.start_episode()
+                if self.judge is not None:
+                    self.judge.start_episode(learn=self._learn)
+            situation = self._latest = self._recognised(z, time, intake)
+        if self.audit is not None:
+            self.audit.seen(z, time)
+        return situation
+
+    def _seconds(self, time: float) -> float:
+        """A time after which another is later by an interval."""
+        is_number = type(time) is float or isinstance(time, SupportsFloat)  # asked quickly first
+        seconds = float(time) if is_number else math.nan
+        if not seconds < seconds + self.interval:  # nor is it of NaN, or infinite
+            raise ValueError(
+                f"time is {time!r}; it must be a number of seconds, finite and small enough to "
+                f"tell {self.interval:g} s apart: count from the start of the episode"
+            )
+        return seconds
 
     def _checked(self, observation: ArrayLike) -> NDArray[np.float64]:
         """An observation that judge and machine can take in; NaN stays."""
@@ -545,9 +599,11 @@ class Guard:
             if began and machine is not None:
                 machine.onset()
         if machine is not None and state is not None:
-            seen = float((known or machine).visits[state]) * self.interval
+            visits = opened(machine)[0].sums[VISITS] if known is None else known.visits
+            seen = float(visits[state]) * self.interval
         return Situation(z, belief, state, surprise, time, intake, seen)
 
+    @transaction
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """The second half of `decide`: what to execute; machine and judge learn from it.
 
@@ -556,19 +612,18 @@ class Guard:
         situation, proposal
             What `recognise` returned, and what the controller wants.
         """
-        with self._lock:
-            revision = self.reviser.revise(situation, proposal)
-            if self.explaining or self.audit is not None:
-                revision = self._explained(situation, revision)
-            if self.audit is not None:
-                self.audit.decided(situation, proposal, revision)
-            self._take_in(situation, revision.executed)
-            if isinstance(self.actions, Choices):
-                executed, advised = int(revision.executed), int(revision.advised)
-                revision = revision._replace(executed=executed, advised=advised)
-            return revision
+        revision = self.reviser.revise(situation, proposal)
+        if self.explaining or self.audit is not None:
+            revision = self._explained(situation, revision)
+        if self.audit is not None:
+            self.audit.decided(situation, proposal, revision)
+        self._take_in(situation, revision.executed)
+        if isinstance(self.actions, Choices):
+            executed, advised = int(revision.executed), int(revision.advised)
+            revision = revision._replace(executed=executed, advised=advised)
+        return revision
 
-    @alone
+    @transaction
     def take_in(self, situation: Situation, proposal: Proposal, executed: Action) -> None:
         """Instead of `revise`, where it was decided elsewhere: learn from what was executed.
 
@@ -588,7 +643,7 @@ class Guard:
     def _take_in(self, situation: Situation, executed: Action) -> None:
         """Machine and judge learn what was executed."""
         self._decisions += 1
-        if self.machine is not None and self._learn and self.machine.state is not None:
+        if self.machine is not None and self._learn and situation.state is not None:
             self.machine.act(self.actions.encode(executed))
         if self._observing is not None and self._learn:
             self._observing.act(executed)
@@ -631,13 +686,14 @@ class Guard:
         state = (self._frozen or self.machine.model()).nearest(centre).state
         return f"{told} Its centre is in #{state + 1}."
 
-    @alone
+    @transaction
     def end(
         self,
         failed: bool = False,
         observation: ArrayLike | None = None,
         *,
         terminated: bool = False,
+        episode: int | None = None,
     ) -> None:
         """End the episode, and learn from how it ended.
 
@@ -651,14 +707,26 @@ class Guard:
         terminated : bool
             Whether it ended by itself, as where a goal is reached, and was not cut off: a learnt
             judge learns where, and looks no further. As in Gymnasium; what failed has failed.
+        episode : int, optional
+            As in `decide`; of one that was broken off nothing is left to end.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If ``failed`` or ``terminated`` is neither True nor False, or as in `decide`.
+        OSError
+            If the audit log cannot be written. Give the guard another, or none, and end it then.
         """
+        if episode not in (None, self._begun):
+            return
+        failed, terminated = _truth("failed", failed), _truth("terminated", terminated)
         z = None if observation is None else self._checked(observation)
         if not self._under_way:
-            self.begin()
+            self._begin()
         last = self._latest.observation if z is None and self._latest is not None else z
         if self.failed is not None and last is not None:
             failed = failed or bool(self.failed(last))
-        terminated = bool(terminated) and not failed
+        terminated = terminated and not failed
         machine = self.machine if self._learn else None
         if machine is not None:
             has_gaps = z is not None and math.isnan(z.dot(z))
@@ -686,7 +754,7 @@ class Guard:
                 driven, how = (self._acted, self._watched, self._kept), {"tests": self.shadow}
                 judge.harm = judge.harm.after(driven, failed=failed, ended=terminated, **how)
             self.n_episodes += 1
-            self.n_failed += bool(failed)
+            self.n_failed += failed
         if self.audit is not None:
             self.audit.ended(z, failed=failed, terminated=terminated)
 
@@ -718,11 +786,11 @@ class Guard:
     # What another process gets has a lock of its own.
     @alone
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_lock"}
+        return {name: vars(self)[name] for name in vars(self) if name not in ("_lock", "_call")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._lock = share(self)
+        share(self)
 
     # -- Keeping it -----------------------------------------------------------------------------
 
@@ -836,6 +904,13 @@ def ends_of(judge: ActionJudge | None, m: int) -> NDArray[np.float64]:
 @cache
 def _resized(ranges: tuple[tuple[float, float], ...], m: int) -> NDArray[np.float64]:
     return np.resize(ranges, (m, 2)).T
+
+
+def _truth(name: str, value: Any) -> bool:
+    """True or False, NumPy's as well."""
+    if np.ndim(value) or np.asarray(value).dtype != np.bool_:
+        raise TypeError(f"{name} is {value!r}; it must be True or False, of one environment")
+    return bool(value)
 
 
 def _actions(low: ArrayLike | None, high: ArrayLike | None, n_actions: int | None) -> ActionSet:

@@ -87,19 +87,20 @@ def run_episode(
     """
     propose = getattr(controller, "propose", None) or (lambda seen, time: controller(seen))  # type: ignore[operator]
     observation, info = environment.reset(seed=seed, options=options)
-    guard.begin()
+    episode = guard.begin()
     held, count, over, failed = _whole(observation, None), 0, False, False
     while not over:
         time = info.get("time", count * guard.interval)
         proposal = _asked(propose, held, time)
         begin = perf_counter()
-        revision = guard.decide(np.ravel(observation), proposal, time)
+        revision = guard.decide(np.ravel(observation), proposal, time, episode=episode)
         seconds, situation = perf_counter() - begin, guard.situation
         observation, reward, terminated, truncated, info = environment.step(revision.executed)
         held, count = _whole(observation, held), count + 1
         over, failed = bool(terminated or truncated), bool(info.get("failed", terminated))
         if over:
-            guard.end(failed, np.ravel(observation), terminated=bool(terminated))
+            last, how = np.ravel(observation), bool(terminated)
+            guard.end(failed, last, terminated=how, episode=episode)
         realised = float(info.get("realised", math.nan))
         yield Decision(situation, revision, realised, float(reward), failed, seconds)
 

@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import Enum
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import probability
 from evofsm.guard.actions import (
     Action,
@@ -159,6 +161,11 @@ class ActionReviser:
         """Nothing is under way yet."""
         self._revising = False
         self._trial = 0
+
+    def savepoint(self) -> Rollback:
+        """What takes back all that is decided from now on."""
+        now = {"_revising": self._revising, "_trial": self._trial, "passing": self.passing}
+        return partial(vars(self).update, now)
 
     @property
     def fallback(self) -> Fallback:

@@ -27,6 +27,7 @@ from evofsm import store
 from evofsm.fsm.kernels import compiled
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import wilson_bounds
+from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import positive, whole
 from evofsm.guard.actions import Action
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
@@ -274,6 +275,16 @@ class SceneRisk(ActionJudge):
             if np.isfinite(last.own).all():
                 self._seen.append(last)
         self._remember(failed=failed)
+
+    def savepoint(self) -> Rollback:
+        """What takes back all that it learns from now on."""
+        seen, actions, learnt = [*self._seen], [*self._actions], {**vars(self.memory)}
+
+        def rollback() -> None:
+            self._seen, self._actions = [*seen], [*actions]
+            vars(self.memory).update(learnt)
+
+        return rollback
 
     def _remember(self, *, failed: bool) -> None:
         """Add what was seen to the memory, if it was more than a moment."""

@@ -4,7 +4,6 @@ import copy
 import math
 import pickle
 import re
-from contextlib import suppress
 from dataclasses import replace
 from io import BytesIO
 
@@ -330,35 +329,6 @@ def test_a_question_changes_nothing_of_what_is_learnt(point, content):
         point.play(asked, episode, seen=ask)
         point.play(unasked, episode)
     assert content(asked) == content(unasked)
-
-
-@pytest.mark.parametrize("name", ["_begins", "_learn", "_study", "disturbances", "keep"])
-def test_what_an_interrupt_breaks_off_is_not_learnt_at_all(points, content, monkeypatch, name):
-    """Of an observation, or of how an episode ended; then it goes on as if nothing had happened."""
-    guard, other = points["box"].taught(9), points["box"].taught(9)
-    judges = guard.judge, other.judge
-    draw = np.random.default_rng(1)
-    rows = np.cumsum(0.02 * draw.normal(size=(40, 2)), axis=0)
-
-    def interrupt(*given, **told):
-        raise KeyboardInterrupt
-
-    def broken_off(act, *given, **told):
-        with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
-            patch.setattr(Dynamics, name, interrupt)
-            act(*given, **told)
-            return  # it is not asked for here
-        act(*given, **told)
-
-    for z in rows:
-        broken_off(judges[0].observe, z)
-        judges[1].observe(z)
-        for judge in judges:
-            judge.act(0.1)
-            judge.learn(z, 0.1, np.ones(1))
-    broken_off(judges[0].end, rows[-1], failed=False)
-    judges[1].end(rows[-1], failed=False)
-    assert content(judges[0]) == content(judges[1])
 
 
 def test_after_a_change_the_margin_begins_anew(point, monkeypatch):

@@ -261,7 +261,7 @@ class Dynamics:
         """What was done after the latest observation, encoded; a second one replaces the first."""
         last = self.n_under_way - 1
         if self.has_acted:
-            self.used = self.used - self._ends(self._u[last])
+            self.used, self._u = self.used - self._ends(self._u[last]), self._u.copy()
         self.used = self.used + self._ends(action)
         self._u[last], self.has_acted = action, True
 

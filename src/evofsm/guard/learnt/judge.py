@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import wraps
-from typing import Any, ParamSpec, Self, TypeVar
+from functools import partial
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm import store
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import poisson_bounds
+from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import action_name, positive
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import OUTCOMES, SETTINGS, Harm
@@ -30,9 +31,6 @@ from evofsm.guard.learnt.library import Backups, Parts, Violations
 from evofsm.guard.learnt.replay import CUT_SHORT, KEPT, Disturbances, Floats, Ints, pairs, search
 from evofsm.guard.learnt.words import Remembered
 from evofsm.store import COUNT, FROM_1, SHARE, SIZE, Kind, Numbers, Place
-
-_P = ParamSpec("_P")
-_T = TypeVar("_T")
 
 #: Parts that can be left out, to see what each is worth.
 JUDGE_PARTS: tuple[str, ...] = ("margin", "backups", "dead-ends", *DYNAMICS_PARTS)
@@ -64,27 +62,6 @@ _MOST_STEPS = 10_000
 _ENOUGH = 3
 # What comes instead of the next part of a study that has none.
 _OVER = object()
-
-
-def _atomic(learn: Callable[_P, _T]) -> Callable[_P, _T]:
-    """All of it is learnt, or nothing: after an error or an interrupt the judge is as it was."""
-
-    @wraps(learn)
-    def wrapped(*given: _P.args, **named: _P.kwargs) -> _T:
-        judge: Any = given[0]
-        dynamics = judge.dynamics
-        own = {**judge.__dict__, "_notes": list(judge._notes)}  # notes and sums change in place
-        moves = dict(dynamics.__dict__)
-        sums = [array.copy() for array in (dynamics.sums if dynamics.n_variables else ())]
-        try:
-            return learn(*given, **named)
-        except BaseException:
-            judge.__dict__, dynamics.__dict__ = own, moves
-            for array, before in zip(moves["sums"] if sums else (), sums, strict=True):
-                array[:] = before
-            raise
-
-    return wrapped
 
 
 class LearntRisk(ActionJudge):
@@ -148,6 +125,7 @@ class LearntRisk(ActionJudge):
     # Of the present episode.
     _at: Floats | None  # the situation in which one was last, by all that was seen
     _action: Floats  # what was done there
+    _sought: tuple[Any, ...]  # an observation that was asked of, from where, and what it came to
     _certified: bool  # whether at the decision before some backup survived all
     _was_certified: bool  # and at any before
     _holds: bool  # and at this one
@@ -216,7 +194,9 @@ class LearntRisk(ActionJudge):
         self.situations = np.empty((0, 0))
         self.backups: Backups | None = None
         self.disturbances: Disturbances | None = None
-        self._rest: Iterator[None] | None = None  # of the study of an episode that goes on
+        # Of the study of an episode that goes on the rest; what it began with, and calls since.
+        self._rest: Iterator[None] | None = None
+        self._since: tuple[Rollback, list[Callable[[], Any]]] | None = None
         self._forget()
 
     @property
@@ -332,7 +312,9 @@ class LearntRisk(ActionJudge):
 
         ``revising`` changes nothing: a band in which a proposal is refused longer gained nothing.
         """
+        self._note(self.search, situation, wanted, tolerance=tolerance, revising=revising)
         dynamics, here, one = self.dynamics, self._here(situation.observation), np.array([wanted])
+        self._sought = situation.observation, self._at, here
         disturbances, backups = self.disturbances, self.backups
         if disturbances is None or backups is None:
             return Search(one, _unjudged(1), 0, words.NOTHING_LEARNT)
@@ -500,12 +482,37 @@ class LearntRisk(ActionJudge):
 
     # -- Learning -------------------------------------------------------------------------------
 
-    @_atomic
+    def _note(self, method: Callable[..., Any], *given: Any, **named: Any) -> None:
+        """Note a call, to make it again where a study is taken back that goes on in it."""
+        if self._since is not None:
+            self._since[1].append(partial(method, *given, **named))
+
+    def savepoint(self) -> Rollback:
+        """What takes back all that it learns from now on."""
+        dynamics = self.dynamics
+        own, moves, noted = {**self.__dict__}, {**dynamics.__dict__}, len(self._notes)
+        sums = [array.copy() for array in (dynamics.sums if dynamics.n_variables else ())]
+        since, count = self._since, len(self._since[1]) if self._since else 0
+
+        def rollback() -> None:
+            self.__dict__, dynamics.__dict__ = {**own}, {**moves}
+            del self._notes[noted:]
+            for array, before in zip(moves["sums"] if sums else (), sums, strict=True):
+                array[:] = before
+            if since is not None:  # a study cannot go back: from its beginning once more
+                since[0]()
+                self._go_on(anew=True)
+                for call in since[1][:count]:
+                    call()
+
+        return rollback
+
     def observe(self, observation: Floats) -> bool:
         """Learn the transition to an observation; whether something unexpected began with it.
 
         One of which something was not seen ends what can be learnt from.
         """
+        self._note(self.observe, observation)
         dynamics = self.dynamics
         if dynamics.n_variables not in (0, len(observation)):
             raise ValueError(
@@ -520,11 +527,13 @@ class LearntRisk(ActionJudge):
 
     def act(self, action: Any) -> None:
         """Take in what was executed after the latest observation; another one replaces it."""
+        self._note(self.act, action)
         if self.dynamics.n_under_way:
             self.dynamics.act(self.dynamics.encode(action))
 
     def learn(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
         """Take in what was executed, and whether the certificate of before still held."""
+        self._note(self.learn, observation, action, belief)
         if "margin" not in self.without and self.backups is not None:
             violated = self._certified and not self._holds
             self.n_violated += violated
@@ -537,21 +546,25 @@ class LearntRisk(ActionJudge):
 
     def watch(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
         """Take in what someone else does: then nothing was certified."""
+        self._note(self.watch, observation, action, belief)
         self._certified = False
         self._take_in(observation, action)
 
     def _take_in(self, observation: ArrayLike, action: Any) -> None:
-        self.follow(observation, action)
+        self._keep_up(observation, action)
         self._notes.append((self._refused, self._dead_end, self._certified))
-        if self.dynamics.n_episodes != self.n_studied:  # it goes on, but was long enough to study
-            self._rest = self._study()
-        if self._rest is not None:
-            self._go_on()
-        del self._notes[: max(0, len(self._notes) - self.dynamics.n_under_way)]
+        # An episode that goes on may be long enough to study.
+        self._go_on(anew=self.dynamics.n_episodes != self.n_studied)
 
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
-        here = self._here(np.array(observation, np.float64))
+        self._note(self.follow, observation, action)
+        self._keep_up(observation, action)
+
+    def _keep_up(self, observation: ArrayLike, action: Any) -> None:
+        z, (seen, at, here) = np.asarray(observation, np.float64), self._sought
+        if z is not seen or at is not self._at:
+            here = self._here(z)
         if here is not None:
             self._at, self._action = here, self.dynamics.encode(action)
 
@@ -564,7 +577,6 @@ class LearntRisk(ActionJudge):
             self.dynamics.forget_episode()
             self._forget()
 
-    @_atomic
     def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
         """Learn from an episode; its last observation was taken in (`observe`)."""
         self.n_failed += int(failed)
@@ -577,26 +589,33 @@ class LearntRisk(ActionJudge):
         self._forget()
 
     def _forget(self) -> None:
-        self._at, self._action = None, np.zeros(0)
+        self._at, self._action, self._sought = None, np.zeros(0), (None, None, None)
         self._certified = self._was_certified = self._holds = self._violated = False
         self._refused = self._dead_end = False
         self._notes = []
         self._unsurvived, self._fails_after, self._asked = 0, 0.0, _ASKED
         self._ranks = np.zeros(0, int) if self.backups is None else self.backups.ranks
 
-    @_atomic
-    def _go_on(self) -> None:
-        """The next part of a study, of which no decision waits for more."""
+    def _go_on(self, *, anew: bool) -> None:
+        """The next part of a study, or the first of another: no decision waits for more."""
+        if anew:
+            self._rest = self._since = None
+            self._since = self.savepoint(), []
+            self._rest = self._study()
         if self._rest is not None and next(self._rest, _OVER) is _OVER:
-            self._rest = None
+            self._rest = self._since = None
+        if (over := len(self._notes) - self.dynamics.n_under_way) > 0:
+            self._notes = self._notes[over:]
 
     def _finish(self) -> None:
         """The rest of a study: its episode is over."""
-        while self._rest is not None:
-            self._go_on()
+        for _ in self._rest or ():
+            pass
+        self._rest = self._since = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_rest": None}  # a copy, as a file, has what was learnt so far
+        # A copy, as a file, has what was learnt so far.
+        return {**self.__dict__, "_rest": None, "_since": None}
 
     def _study(self) -> Iterator[None]:
         """Learn from the latest episode: what to remember, and what to do about it."""

@@ -1,0 +1,128 @@
+"""What threads share: a lock each, and calls that are done as a whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from copy import deepcopy
+from functools import wraps
+from threading import RLock, get_ident
+from typing import Any, TypeAlias, TypeVar, cast
+from weakref import WeakSet
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+#: Takes back what was done since it was made; twice is as good as once.
+Rollback: TypeAlias = Callable[[], None]
+
+# So many steps are gone through again at most.
+_STEPS = 512
+# All that threads share, for a process that is forked.
+_SHARED: WeakSet[Any] = WeakSet()
+
+
+def share(one: Any) -> None:
+    """Give an object a lock, so that threads may share it: its ``_lock``."""
+    one._lock = RLock()
+    one._call = None  # of a transaction under way the thread, and what takes it back
+    _SHARED.add(one)
+
+
+def alone(method: Method) -> Method:
+    """A method of what is shared, during which no other thread changes it."""
+
+    @wraps(method)
+    def locked(self: Any, *args: Any, **kwargs: Any) -> Any:
+        with self._lock:
+            return method(self, *args, **kwargs)
+
+    return cast(Method, locked)
+
+
+def transaction(method: Method) -> Method:
+    """A method that is `alone`, and done as a whole: where it raises, all is as before.
+
+    Its object's ``_savepoint`` returns what takes back whatever is done from then on.
+    """
+
+    @wraps(method)
+    def done(self: Any, *args: Any, **kwargs: Any) -> Any:
+        if self._lock._is_owned():  # within another call, with which it is taken back
+            return method(self, *args, **kwargs)
+        with self._lock:
+            return attempted(self, *args, **kwargs)
+
+    def attempted(self: Any, *args: Any, **kwargs: Any) -> Any:
+        if self._call is not None:  # an interrupt broke off the taking back, too
+            self._call[1]()
+        rollback: Rollback = self._savepoint()
+        try:
+            self._call = get_ident(), rollback
+            result = method(self, *args, **kwargs)
+            self._call = None
+            return result
+        except BaseException:
+            rollback()
+            self._call = None
+            raise
+
+    return cast(Method, done)
+
+
+class Retraced:
+    """What is taken back by going through its latest steps again: that costs nothing before.
+
+    What changes it is under `step`; ``_become`` makes it what a copy is.
+    """
+
+    _known: tuple[Any, list[tuple[Any, Any, Any]]] | None = None  # a copy, and the steps since
+    _become: Callable[[Any], None]
+
+    def savepoint(self) -> Rollback:
+        """What takes back all that it learns from now on."""
+        if self._known is None:
+            self._known = deepcopy(self), []
+        (before, steps), count = self._known, len(self._known[1])
+
+        def rollback() -> None:
+            again = deepcopy(before)
+            for method, args, named in steps[:count]:
+                method(again, *args, **named)
+            self._become(again)
+            self._known = None
+
+        return rollback
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_known": None}
+
+
+def step(method: Method) -> Method:
+    """A method that changes what is `Retraced`, by arguments that nobody changes later."""
+
+    @wraps(method)
+    def noted(self: Any, *args: Any, **named: Any) -> Any:
+        known, self._known = self._known, None  # of a step that is broken off nothing is known
+        result = method(self, *args, **named)
+        if known is not None and len(known[1]) < _STEPS:
+            known[1].append((method, args, named))
+            self._known = known
+        return result
+
+    return cast(Method, noted)
+
+
+def _begin_alone() -> None:
+    """In a process just forked: it lacks the threads that held locks and would go on.
+
+    What they were amid is taken back.
+    """
+    for one in (every := list(_SHARED)):
+        one._lock = RLock()
+    for one in every:
+        if one._call is not None and one._call[0] != get_ident():
+            one._call[1]()
+            one._call = None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_alone)
