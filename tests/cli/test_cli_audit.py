@@ -1,4 +1,6 @@
 import json
+import re
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -24,6 +26,25 @@ def log(tmp_path):
             guard.revise(guard.recognise(seen, 0.25 * step), Proposal(1.0))
         guard.end(failed=False, observation=np.array([13.0, 10.0, 11.0]))
     return written.path, str(written.head)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("audit", "huge"), ("monitor", "huge", "--summary"), ("monitor", "--state", "huge.evofsm")],
+)
+def test_a_file_of_one_line_is_refused_by_name_and_not_held_in_memory(
+    evofsm, tmp_path, monkeypatch, words
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ("huge", "huge.evofsm.journal"):
+        with open(tmp_path / name, "wb") as file:
+            file.truncate(1 << 32)  # without holding that on the disk either
+    tracemalloc.start()
+    result = evofsm(*words)
+    assert tracemalloc.get_traced_memory()[1] < 1 << 28
+    tracemalloc.stop()
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert re.search(r"huge\S* has a line of more than \d+ MiB: is it another", result.stderr)
 
 
 def test_a_log_that_is_whole(evofsm, log):

@@ -25,6 +25,7 @@ from threading import Thread
 from typing import Any, NamedTuple
 
 from evofsm import store
+from evofsm.cli.journal import Journal
 from evofsm.driving import (
     EnvelopeReviser,
     Episode,
@@ -42,7 +43,6 @@ from evofsm.driving.trials import Row, Trial
 from evofsm.driving.world import World
 from evofsm.extras import needs
 from evofsm.guard import TOLERANCE, DecisionLogger, Guard, Mode, Reviser
-from evofsm.guard.journal import Journal
 
 _log = logging.getLogger(__name__)
 

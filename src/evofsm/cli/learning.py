@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm import store
+from evofsm.cli.journal import differences
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
@@ -31,7 +32,6 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.step import Trace
 from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
-from evofsm.guard.journal import differences
 from evofsm.io import Chunk, episodes_of
 from evofsm.io.logs import Condition, LogColumns, Noted
 from evofsm.io.tables import SI, TIMES, UNITS

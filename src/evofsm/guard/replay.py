@@ -230,7 +230,7 @@ class _Player:
         if content["guard"] is None:
             self.not_replayed.append(
                 f"{content['reviser']} is no reviser that is known here, or asks a judge that is "
-                "not, or that was not told what happened"
+                "not, or that was not told what happened, or the guard was too large"
             )
         elif told and self._failed is None:
             self.not_replayed.append(_NO_FUNCTION)

@@ -174,7 +174,7 @@ def monitor(
             if is_log:
                 answers = decided_on_log(decider, chunks)
             else:
-                answers = decided_on_lines(decider, stack.enter_context(file.open("rb")))
+                answers = decided_on_lines(decider, file)
             show(*summary_of(decider, answers, str(file)))
             return None
         saved = None

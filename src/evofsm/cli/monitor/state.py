@@ -16,10 +16,10 @@ from typing import Any
 import msgspec
 
 from evofsm import store
+from evofsm.cli.journal import Journal, differences
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.messages import Message
 from evofsm.guard import Guard
-from evofsm.guard.journal import Journal, differences
 
 _log = logging.getLogger(__name__)
 

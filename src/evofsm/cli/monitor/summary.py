@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,12 +13,15 @@ from evofsm.cli.learning import refusing
 from evofsm.cli.monitor.decider import HOLE, Answer, Decider
 from evofsm.cli.monitor.messages import End, Row
 from evofsm.cli.show import facts, table
+from evofsm.guard.audit_log import lines
 from evofsm.io.logs import Chunk
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rich.console import RenderableType
 
+# A line of more bytes is of another kind of file; one that is longer than a message is refused.
+_LONGEST = 1 << 20
 # Beside the guard's own.
 _TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 # So many moments and variables are shown; without an alarm a moment lasts so long [s].
@@ -40,9 +44,9 @@ def decided_on_log(decider: Decider, episodes: Iterable[Chunk]) -> Answers:
         yield decider.act(End(failed, last)), None
 
 
-def decided_on_lines(decider: Decider, lines: Iterable[bytes]) -> Answers:
+def decided_on_lines(decider: Decider, file: Path) -> Answers:
     """The answers to messages; of those that are refused, the error."""
-    for line in lines:
+    for line in lines(file, _LONGEST):
         answer = decider.answer(line.rstrip(b"\r\n"))
         yield answer, decider.latest if isinstance(decider.latest, Row) else None
 

@@ -24,8 +24,11 @@ from zlib import crc32
 import msgspec
 
 from evofsm import store
+from evofsm.guard.audit_log import lines
 
 _SEAL = b',"crc":"'
+# A record has at most so many bytes.
+_LONGEST = 1 << 20
 # So many settings that differ are named in an error.
 _NAMED = 4
 
@@ -98,8 +101,7 @@ class Journal:
     def _read(self) -> int:
         """Read what is there, and say up to where it is good; without a record, nothing is."""
         good, damaged, begun_with = 0, 0, self.settings
-        self._file.seek(0)
-        for number, line in enumerate(self._file.read().splitlines(keepends=True), 1):
+        for number, line in enumerate(lines(self.path, _LONGEST), 1):
             record = _record(line)
             if record is None:
                 if number == 1 and not _line({"settings": self.settings}).startswith(line):
