@@ -96,6 +96,12 @@ def test_who_is_warm_compiles_no_more():
     assert finished.stdout == ""
 
 
+def test_without_a_compiler_all_runs_in_python():
+    """As projects set it for their tests, to debug or to measure coverage."""
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    subprocess.run([sys.executable, "-W", "error", "-c", WARMED], env=environment, check=True)
+
+
 @pytest.mark.slow
 def test_a_machine_without_a_limit_compiles_nothing_that_merges_states():
     """What is rare stays out of the kernel of every step: it takes as long to compile as a step."""

@@ -7,7 +7,7 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-from river import checks, datasets, stream
+from river import checks, datasets, evaluate, metrics, stream
 from river.checks import common
 
 from evofsm.fsm.machine import EvolvingFSM
@@ -95,6 +95,17 @@ def test_features_that_are_named_wait_for_a_whole_observation_and_others_are_lef
     assert clusterer.predict_proba_one({"gap": 2.0}) == {}
     clusterer.learn_one({"noise": 1.0, "gap": 2.0, "speed": 3.0})
     assert clusterer.machine.centers.tolist() == [[3.0, 2.0]]
+
+
+def test_rivers_metrics_of_clusterers_score_it():
+    clusterer = RiverClusterer(rule=Novelty(1.5))
+    rows = [(x, None) for x in as_features(walk())]
+    score = evaluate.progressive_val_score(rows, clusterer, metrics.Silhouette())
+    assert 0.0 < score.get() < 1.0
+    assert [
+        list(one.values()) for one in clusterer.centers.values()
+    ] == clusterer.machine.centers.tolist()
+    assert RiverClusterer().centers == {}
 
 
 @pytest.mark.parametrize(

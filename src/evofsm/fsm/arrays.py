@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.kernels import lanes
+from evofsm.fsm.kernels import lanes, records
 from evofsm.fsm.validation import Floats, refuse_more_failures, refuse_unless_distribution
 from evofsm.store import (
     COUNT,
@@ -105,10 +105,10 @@ class Settings(NamedTuple):
 def blank(m: int, q: int, capacity: int, places: int) -> Learnt:
     """What a machine has learnt that has seen nothing, with room for so much."""
     learnt = Learnt(
-        np.zeros(1, NOW),
-        np.zeros(capacity, STATE),
-        np.zeros(m, VARIABLE),
-        np.zeros(q, ACTION),
+        records(1, NOW),
+        records(capacity, STATE),
+        records(m, VARIABLE),
+        records(q, ACTION),
         np.zeros((len(SUMS), capacity)),
         np.zeros(capacity),
         np.zeros(capacity),
@@ -120,7 +120,7 @@ def blank(m: int, q: int, capacity: int, places: int) -> Learnt:
         np.zeros((places, capacity)),
         np.zeros((places, capacity)),
         np.zeros((places, capacity)),
-        np.zeros((places, capacity), TRY),
+        records((places, capacity), TRY),
     )
     learnt.now["action"] = NO_ACTION
     learnt.now["before"] = -1

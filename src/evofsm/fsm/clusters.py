@@ -122,7 +122,7 @@ def potential_of(now: Any, variables: Records, weights: Floats, z: Floats) -> fl
     """Density at ``z`` of the observations so far, in its mean and variance form."""
     squared_distance = 0.0
     for j in range(len(z)):
-        offset = (z[j] - variables[j].first - variables[j].mean) * weights[j]
+        offset = (z[j] - variables[j].first - variables[j]["mean"]) * weights[j]
         squared_distance += offset * offset
     return float(1.0 / (1.0 + squared_distance + now.scatter / now.n_observations))
 
@@ -154,9 +154,9 @@ def _absorb(now: Any, variables: Records, weights: Floats, z: Floats) -> None:
         variable = variables[j]
         variable.latest = z[j]
         offset = z[j] - variable.first
-        before = offset - variable.mean
-        mean = variable.mean + before * share
-        variable.mean = mean
+        before = offset - variable["mean"]
+        mean = variable["mean"] + before * share
+        variable["mean"] = mean
         added += (before * weights[j]) * ((offset - mean) * weights[j])
     now.n_observations += 1
     now.scatter += added

@@ -27,11 +27,15 @@ Function = TypeVar("Function", bound=Callable[..., object])
 # Kernels own no memory, so there are no references to count. A product and a sum may be one
 # instruction, but sums are in the order as written: a batch and single steps agree bit for bit.
 _OPTIONS = {"fastmath": {"contract"}, "_nrt": False}
+#: False with ``NUMBA_DISABLE_JIT=1``: kernels then run in Python, some thousand times slower.
+COMPILES = not numba.config.DISABLE_JIT
 _njit: Any = partial(numba.njit, error_model="numpy", no_cfunc_wrapper=True)
 
 
 def compiled(function: Function, **options: Any) -> Function:
     """Compile with Numba on the first call, and keep the code on disk where there is a place."""
+    if not COMPILES:
+        return cast(Function, np.errstate(all="ignore")(function))
     try:
         return cast(Function, _njit(cache=True, **options)(function))
     except RuntimeError:  # neither the package nor the user's cache folder may be written
@@ -58,6 +62,11 @@ def rare_kernel(function: Function) -> Function:
     return _inside(function)
 
 
+def uncompiled(kernel: Function) -> Function:
+    """The function of a kernel, where to compile it would take longer than it does."""
+    return cast(Function, getattr(kernel, "py_func", kernel))
+
+
 def _inside(function: Function, **options: Any) -> Function:
     return cast(Function, _njit(no_cpython_wrapper=True, **_OPTIONS, **options)(function))
 
@@ -68,11 +77,17 @@ class Entry:
     def __init__(self, kernel: Any) -> None:
         self._kernel = kernel
         #: The kernel; once it is compiled, that is no call of Python.
-        self.call: Callable[..., Any] = self._first
+        self.call: Callable[..., Any] = self._first if COMPILES else kernel
 
     def _first(self, *given: Any) -> Any:
         self.call = self._kernel.compile(tuple(map(numba.typeof, given)))
         return self.call(*given)
+
+
+def records(shape: Any, kind: np.dtype[Any]) -> NDArray[Any]:
+    """Records of zeros, with attributes as in kernels where those are functions of Python."""
+    zeros = np.zeros(shape, kind)
+    return zeros if COMPILES else zeros.view(np.recarray)
 
 
 #: Numbers in a cache line.

@@ -35,7 +35,7 @@ from evofsm.fsm.arrays import (
 from evofsm.fsm.clusters import PAPER, width_of
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.explanation import Explanation, Nearest, explain
-from evofsm.fsm.kernels import LINE, Entry
+from evofsm.fsm.kernels import LINE, Entry, uncompiled
 from evofsm.fsm.model import FSMModel, Policy, believed, check_forecast
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
@@ -458,8 +458,7 @@ class EvolvingFSM(Retraced):
         """Width of recognition, a squared distance; 0 before the first observation."""
         now = self._learnt.now[0]
         seen = now["n_observations"]
-        width = cast(Any, width_of).py_func
-        return float(width(self._settings, now["scatter"] / seen)) if seen else 0.0
+        return float(uncompiled(width_of)(self._settings, now["scatter"] / seen)) if seen else 0.0
 
     @property
     @alone

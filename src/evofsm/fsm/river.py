@@ -77,6 +77,12 @@ class RiverClusterer(base.Clusterer):
             self.machine.observe(z, missing=Missing.PARTIAL)
             self.machine.act(_ACTION)
 
+    @property
+    def centers(self) -> dict[int, dict[Hashable, float]]:
+        """The centre of each state by feature, as River's metrics of clusterers ask for them."""
+        rows = self.machine.centers.tolist() if self.machine.n_states else ()
+        return {k: dict(zip(self._observed, row, strict=True)) for k, row in enumerate(rows)}
+
     def predict_one(self, x: Mapping[Hashable, Any]) -> int:
         """Index of the most probable state; 0 before anything was learnt."""
         belief = self._recognise(x)

@@ -8,7 +8,7 @@ episode may end, is no state of the machine: it is counted.
 from __future__ import annotations
 
 from enum import IntFlag
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 from evofsm.fsm.arrays import ENDINGS, EPISODES, FAILED_SOON, NO_ACTION, VISITS, Learnt, Settings
 from evofsm.fsm.clusters import CREATED, MERGED, MOVED, UNCHANGED, determine, recognise, width_of
 from evofsm.fsm.divergence import jensen_shannon_kernel
-from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced_kernel
+from evofsm.fsm.kernels import (
+    inner_kernel,
+    kernel,
+    lanes,
+    rare_kernel,
+    spliced_kernel,
+    uncompiled,
+)
 from evofsm.fsm.transitions import expand, forecast_and_identify, merge_closest, place_of, room_for
 from evofsm.fsm.validation import Floats
 
@@ -133,7 +140,7 @@ def fail(learnt: Learnt, settings: Settings) -> None:
 def believe(learnt: Learnt, belief: Floats) -> None:
     """Go on in the episode with a belief over all states, from which nothing else is learnt."""
     now: Any = learnt.now.view(np.recarray)[0]
-    cast(Any, _tick).py_func(now)
+    uncompiled(_tick)(now)
     learnt.belief[: len(belief)] = belief
     now.state, now.action, now.chained = belief.argmax(), NO_ACTION, 1
 

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from evofsm.fsm.kernels import announce_compiling
+from evofsm.fsm.kernels import COMPILES, announce_compiling
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
 from evofsm.guard.api import TOLERANCE, Situation
@@ -30,6 +30,8 @@ def warm() -> None:
 @cache
 def warm_machine(*, limited: bool) -> None:
     """Compile what machines need, with a limit to the number of states or without."""
+    if not COMPILES:
+        return
     announce_compiling()
     machine = EvolvingFSM(1, max_states=1 if limited else None)
     machine.learn_many([[0.0, 0.0], [9.0, 0.0]], [0, 0])
@@ -39,6 +41,8 @@ def warm_machine(*, limited: bool) -> None:
 @cache
 def warm_judge() -> None:
     """Compile what learnt judges need."""
+    if not COMPILES:
+        return
     announce_compiling()
     judge, random = LearntRisk(1.0, -1.0, 1.0), np.random.default_rng(0)
     for _ in range(3):
