@@ -1,8 +1,11 @@
 """Any environment of Gymnasium or PettingZoo runs under a guard, alone or many at once."""
 
 import importlib
+import itertools
 import math
+import os
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -10,20 +13,23 @@ import pytest
 
 gymnasium = pytest.importorskip("gymnasium")
 
+from gymnasium import wrappers  # noqa: E402
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete  # noqa: E402
 from gymnasium.utils.env_checker import check_env  # noqa: E402
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper  # noqa: E402
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper  # noqa: E402
 
 from evofsm.driving import CarFollowing, guard_for_cars  # noqa: E402
-from evofsm.fsm import Labels  # noqa: E402
+from evofsm.fsm import Labels, Missing  # noqa: E402
 from evofsm.guard import (  # noqa: E402
     ActionJudge,
+    AuditLog,
     Fallback,
     Guard,
     Judgement,
     RevisedActions,
     RevisedVectorActions,
     Search,
+    run_episode,
 )
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -184,9 +190,14 @@ def test_a_proposal_that_is_kept_is_passed_on_untouched():
 
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space:UserWarning")
 @pytest.mark.filterwarnings("ignore:.*different from the unwrapped version:UserWarning")
-def test_gymnasium_finds_nothing_to_complain_of():
+@pytest.mark.filterwarnings("ignore:.*value is -?infinity:UserWarning")
+@pytest.mark.parametrize("own", [True, False])
+def test_gymnasium_finds_nothing_to_complain_of(own):
     env = of_cars(CarFollowing())
     env.guard.freeze()
+    if not own:  # one that it can make again, under a guard that has judged nothing yet
+        env = gymnasium.make("CartPole-v1", disable_env_checker=True)
+        env = RevisedActions(env, Guard(n_actions=2, interval=0.02))
     check_env(env, skip_render_check=True)
 
 
@@ -227,6 +238,30 @@ def test_what_is_executed_stays_in_the_environments_space():
     info = env.step(np.float32(1.0))[-1]
     assert info["reviser/executed_action"] in env.action_space
     assert info["reviser/executed_action"] == -2.0
+
+
+@pytest.mark.parametrize("missing", Missing)
+def test_what_was_not_observed_is_the_guards_to_deal_with(missing):
+    script = Script(FAR, [np.nan, 20.0, 10.0], FAR, NEAR)
+    env = RevisedActions(script, guard_for(ONE, missing=missing))
+    env.reset()
+    env.step(np.array([0.0]))
+    if missing is Missing.REJECT:
+        with pytest.raises(ValueError, match=r"variables \[0\] of the observation"):
+            env.step(np.array([0.0]))
+        return
+    infos = [env.step(np.array([0.0]))[-1] for _ in range(2)]
+    assert [bool(np.isnan(row[0][0])) for row in env.guard.judge.episodes[0][0]] == [0, 1, 0]
+    assert not any(isinstance(it, float) and np.isnan(it) for info in infos for it in info.values())
+
+
+def test_a_sensor_that_is_silent_is_named():
+    env = RevisedActions(Script(*[[90.0, np.nan, 10.0]] * 150), guard_for(ONE))
+    env.reset()
+    with pytest.warns(
+        UserWarning, match=r"none of 100 observations .* was variable 2 in 100. .*sensor"
+    ):
+        drive(env, lambda seen, info: np.array([0.0]))
 
 
 @pytest.mark.parametrize("seen", [[1.0, 2.0], [np.inf, 2.0, 3.0]])
@@ -384,6 +419,274 @@ def test_more_values_than_a_guard_can_take_are_refused_at_once():
     with pytest.raises(ValueError, match=r"each of 500 values .* at most 64"):
         RevisedActions(script, guard_for(ONE))
     RevisedActions(script, guard_for(ONE), lambda place: divmod(place, 20))
+
+
+# -- Whoever wraps, resets, takes turns or forbids ----------------------------------------------
+
+
+def cart(*wraps, steps=None):
+    env = gymnasium.make("CartPole-v1", max_episode_steps=steps)
+    for wrap in wraps:
+        env = wrap(env)
+    return env
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "told"),
+    [
+        ("NormalizeObservation", (), "statistics that change, so that no threshold stays"),
+        ("NormalizeReward", (), "rescales the reward, which failed looks at"),
+        ("StickyAction", (0.2,), "executes other actions than the guard"),
+        ("DelayObservation", (2,), "shows the guard where the system was"),
+        ("RepeatAction", (2,), ""),
+        ("TimeAwareObservation", (), ""),
+        ("FrameStackObservation", (2,), ""),
+        ("RecordEpisodeStatistics", (), ""),
+    ],
+)
+@pytest.mark.parametrize("many", [False, True])
+def test_a_wrapper_under_which_nothing_can_be_learnt_is_named(name, given, told, many):
+    def below():
+        return wrappers.TimeLimit(getattr(wrappers, name)(cart(), *given), 9)
+
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        guard, how = guard_for(Discrete(2)), {"failed": lambda step: step.reward < 0.0}
+        if many:
+            RevisedVectorActions(SyncVectorEnv([below] * 2), guard, **how)
+        else:
+            RevisedActions(below(), guard, **how)
+    said = "".join(str(one.message) for one in heard)
+    assert said.startswith(f"{name} below the guard") and told in said if told else said == ""
+    getattr(wrappers, name)(RevisedActions(cart(), guard, **how), *given)  # as it was advised
+
+
+def test_statistics_that_change_no_more_are_as_good_as_none():
+    frozen = wrappers.NormalizeObservation(cart())
+    frozen.update_running_mean = False
+    RevisedActions(frozen, guard_for(Discrete(2)))
+    RevisedActions(cart(wrappers.NormalizeReward), guard_for(Discrete(2)))  # nobody looks at it
+
+
+@pytest.mark.parametrize("high", [2.5, 3.0])
+def test_a_guard_may_not_act_beyond_what_a_wrapper_clips_to(high):
+    guard = Guard(low=-2.5, high=high, interval=0.1, judge=Spy())
+    clipped = wrappers.ClipAction(Script(FAR))
+    for wrap in (RevisedActions, lambda *given: RevisedVectorActions(*given)):
+        env = clipped if wrap is RevisedActions else SyncVectorEnv([lambda: clipped])
+        with pytest.raises(ValueError, match="beyond") if high > 2.5 else nullcontext():
+            wrap(env, guard)
+
+
+class Again(gymnasium.Wrapper):
+    """Begins the next episode by itself, in the step after one ends, or with a name in that."""
+
+    name = over = None
+
+    def step(self, action):
+        if self.over and not self.name:
+            self.over = False
+            return self.env.reset()[0], 0.0, False, False, {}
+        seen, reward, terminated, truncated, info = self.env.step(action)
+        self.over = terminated or truncated
+        if self.over and self.name:
+            info, seen = {self.name: seen, "final_info": info}, self.env.reset()[0]
+        return seen, reward, terminated, truncated, info
+
+
+NAMES = ("final_obs", "final_observation", "terminal_observation")
+
+
+@pytest.mark.parametrize(
+    ("wrap", "name"), [(wrappers.Autoreset, None), *((Again, name) for name in (None, *NAMES))]
+)
+def test_episodes_that_an_environment_begins_by_itself_are_learnt(monkeypatch, wrap, name):
+    monkeypatch.setattr(Again, "name", name)
+    monkeypatch.setattr(Recorder, "ended", [])
+    env = wrappers.TimeLimit(wrap(Recorder(cart(steps=20))), 999)
+    env = RevisedActions(env, guard_for(Discrete(2)))
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        for _ in range(90):
+            env.step(env.action_space.sample())
+    assert len(Recorder.ended) > 3
+    assert env.guard.judge.episodes == Recorder.ended
+    assert ["reset()" in str(one.message) for one in heard] == [True] * (wrap is Again and not name)
+
+
+@pytest.mark.parametrize("way", ["call reset", "observe returned None", "many: observe returned"])
+def test_who_is_attached_and_never_decides_says_so(way):
+    class Over(Script):
+        def step(self, action):
+            return FAR, 0.0, "reset" in way, False, {}
+
+    given = guard_for(ONE), None if "reset" in way else lambda seen: None
+    if way.startswith("many"):
+        env = RevisedVectorActions(SyncVectorEnv([lambda: Over(FAR)] * 2), *given)
+    else:
+        env = RevisedActions(Over(FAR), *given)
+    env.reset()
+
+    def silent():
+        for _ in range(220):
+            env.step(env.action_space.sample())
+
+    why = way.removeprefix("many: ")
+    with pytest.warns(UserWarning, match=f"nothing was decided in 200 steps on end: .*{why}"):
+        silent()
+
+
+def test_environments_that_take_turns_may_share_a_guard(monkeypatch):
+    monkeypatch.setattr(Recorder, "ended", [])
+    guard = guard_for(Discrete(2))
+    envs = [RevisedActions(Recorder(cart(steps=15)), guard) for _ in range(3)]
+
+    def step(env):
+        *_, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            env.reset()
+
+    for k, env in enumerate(envs):
+        env.reset(seed=k)
+        env.action_space.seed(k)
+    for _ in range(60):
+        for env in envs:
+            step(env)
+    assert guard.judge.episodes == Recorder.ended
+    assert len(Recorder.ended) > 9
+
+
+def test_of_an_episode_amid_which_another_environment_begins_the_rest_is_learnt():
+    guard = guard_for(ONE)
+    one, other = (RevisedActions(Script(*[FAR] * 8, end), guard) for end in (NEAR, HIT))
+    one.reset()
+    for _ in range(3):
+        one.step(np.array([0.0]))
+    drive(other, lambda seen, info: np.array([1.0]))
+    for _ in range(5):
+        one.step(np.array([0.0]))
+    told = [(len(rows), rows[0][1], last) for rows, last, _ in guard.judge.episodes]
+    assert told == [(8, (1.0,), tuple(HIT)), (5, (0.0,), tuple(NEAR))]
+
+
+def test_what_is_learnt_in_another_process_does_not_come_back():
+    guard, here = guard_for(Discrete(2)), os.getpid()
+    why = r"made in another process.*SyncVectorEnv"
+
+    def make():
+        with nullcontext() if os.getpid() == here else pytest.warns(UserWarning, match=why):
+            return RevisedActions(cart(), guard)
+
+    AsyncVectorEnv([make]).close()
+
+
+def test_a_log_that_follows_one_episode_refuses_a_second_environment(tmp_path):
+    with AuditLog(tmp_path / "log") as log:
+        guard = Guard(n_actions=2, interval=0.1, audit=log)
+        one, other = RevisedActions(cart(), guard), RevisedActions(cart(), guard)
+        for env in (one, other):
+            env.reset(seed=0)
+        one.step(0)
+        with pytest.raises(ValueError, match=r"one episode at a time.*reset that"):
+            other.step(0)
+        one.reset()  # as it was advised
+        other.step(0)
+
+
+class Barred(gymnasium.Env):
+    """Bars one action, each time another, and says so in one of three ways."""
+
+    action_space = Discrete(3)
+
+    def __init__(self, how="info"):
+        self.how, self.executed = how, []
+        self.observation_space = Box(-1.0, 9.0, (1,))
+        if how == "observation":
+            masks = Box(0, 1, (3,), np.int8)
+            self.observation_space = Dict(observation=self.observation_space, action_mask=masks)
+        if how == "method":
+            self.action_masks = lambda: self.mask
+
+    @property
+    def mask(self):
+        return np.roll([1, 1, 0], self.k).astype(np.int8)
+
+    def told(self):
+        seen, mask = np.array([self.k], np.float32), self.mask
+        if self.how == "observation":
+            seen = {"observation": seen, "action_mask": mask}
+        return seen, {"action_mask": mask} if self.how == "info" else {}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.k = 0
+        return self.told()
+
+    def step(self, action):
+        assert self.mask[action]
+        self.executed.append(int(action))
+        self.k += 1
+        seen, info = self.told()
+        return seen, 0.0, self.k == 4, False, info
+
+
+class Searching(Spy):
+    def search(self, situation, wanted, *, tolerance, revising, mask=(1, 1, 1)):
+        options = np.append(wanted, np.flatnonzero(mask))
+        judged = self.judge(situation, options)
+        return Search(options, judged, int(judged.risk.argmin()), "searched")
+
+
+@pytest.mark.parametrize("judge", [Spy, Searching])
+@pytest.mark.parametrize(
+    ("host", "how"),
+    [
+        *itertools.product(("one", "many"), ("info", "observation", "method")),
+        *(("loop", how) for how in ("info", "method")),
+    ],
+)
+def test_only_what_the_environment_allows_is_executed(host, how, judge):
+    inner, guard = Barred(how), guard_for(Discrete(3), judge(lambda action: action == 1))
+    if host == "one":
+        drive(RevisedActions(wrappers.TimeLimit(inner, 9), guard), lambda seen, info: 1)
+    elif host == "many":
+        drive_all(RevisedVectorActions(SyncVectorEnv([lambda: inner]), guard), 4, wish=1)
+    else:
+        list(run_episode(inner, guard, lambda seen: 1))
+    assert inner.executed == [0, 2, 0, 0]  # it wants the first; of 0 and 2 one is allowed
+
+
+class Brake(gymnasium.Env):
+    """Drives towards a wall at 1; its brake, the last action, is barred where it is slow."""
+
+    observation_space, action_space = Box(-9.0, 9.0, (2,)), Discrete(3)
+
+    def seen(self):
+        return np.float32(self.at), {"action_mask": np.array([1, 1, self.at[1] > 0.03], np.int8)}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at = np.zeros(2)
+        return self.seen()
+
+    def step(self, action):
+        pushed = 0.95 * self.at[1] + (0.02, 0.0, -0.03)[action] + self.np_random.normal(0.0, 0.001)
+        self.at = self.at[0] + pushed, pushed
+        seen, info = self.seen()
+        return seen, 0.0, self.at[0] >= 1.0, False, info
+
+
+def test_a_guard_counts_on_nothing_that_is_barred():
+    env = RevisedActions(wrappers.TimeLimit(Brake(), 60), Guard(n_actions=3, interval=0.1))
+    env.action_space.seed(0)
+    ends = [
+        drive(env, lambda seen, info: env.action_space.sample(info["action_mask"]), seed=k)[-1][2]
+        for k in range(14)
+    ]
+    assert sum(ends[:4]) >= 1
+    assert sum(ends[4:]) <= 1
 
 
 # -- Many at once ------------------------------------------------------------------------------
@@ -735,6 +1038,79 @@ def test_what_an_agent_meets_after_a_step_without_an_action_is_no_consequence(cr
         (5, True),
         (3, True),
     ]
+
+
+@pytest.mark.parametrize("name", [None, "final_obs"])
+def test_agents_whose_environment_begins_again_by_itself_are_learnt(crowd, name):
+    from evofsm.guard import RevisedAgents
+
+    class Once(crowd):
+        def step(self, actions):
+            if not self.agents:
+                return self.reset()[0], *[
+                    dict.fromkeys(self.scripts, x) for x in (0.0, False, False, {})
+                ]
+            seen, *said, infos = super().step(actions)
+            if not self.agents and name:
+                infos = {one: info | {name: seen[one]} for one, info in infos.items()}
+                seen = self.reset()[0]
+            return seen, *said, infos
+
+    guard = guard_for(ONE)
+    env = RevisedAgents(Once(4, 4), guard)
+    env.reset()
+    for _ in range(12):
+        env.step({agent: np.array([0.0]) for agent in ("a0", "a1")})
+    ends = [(len(rows), last, failed) for rows, last, failed in guard.judge.episodes]
+    assert ends == [(3, tuple(NEAR), True)] * (8 if name else 6)
+
+
+def test_of_a_masked_agent_only_what_is_allowed_is_executed(crowd):
+    from evofsm.guard import RevisedAgents
+
+    class Masked(crowd):
+        def __init__(self):
+            self.scripts, self.possible_agents = {"a": Barred("observation")}, ["a"]
+
+        def observation_space(self, agent):
+            return self.scripts[agent].observation_space
+
+        def action_space(self, agent):
+            return Discrete(3)
+
+        def reset(self, seed=None, options=None):
+            self.agents = ["a"]
+            return tuple({"a": it} for it in self.scripts["a"].reset())
+
+        def step(self, actions):
+            return tuple({"a": it} for it in self.scripts["a"].step(actions["a"]))
+
+    env = RevisedAgents(Masked(), guard_for(Discrete(3), Spy(lambda action: action == 1)))
+    env.reset()
+    for _ in range(4):
+        env.step({"a": 1})
+    assert env.env.scripts["a"].executed == [0, 2, 0, 0]
+
+
+def test_agents_that_take_turns_are_told_of_the_parallel_interface(crowd):
+    from pettingzoo.utils import aec_to_parallel, parallel_to_aec
+
+    from evofsm.guard import RevisedAgents
+
+    crowd.metadata = {"name": "crowd", "is_parallelizable": True}
+    turns = parallel_to_aec(crowd(4))
+    for wrong in (
+        lambda: RevisedAgents(turns, guard_for(ONE)),
+        lambda: RevisedActions(turns, guard_for(ONE)),
+    ):
+        with pytest.raises(TypeError, match=r"PettingZoo, as parallel_env\(\).*aec_to_parallel"):
+            wrong()
+    guard = guard_for(ONE)  # as it was advised, and around again
+    turns = parallel_to_aec(RevisedAgents(aec_to_parallel(turns), guard))
+    turns.reset()
+    for _ in turns.agent_iter(9):
+        turns.step(None if turns.last()[2] else np.array([0.0]))
+    assert [len(rows) for rows, *_ in guard.judge.episodes] == [3]
 
 
 def test_pettingzoo_finds_nothing_to_complain_of(crowd):

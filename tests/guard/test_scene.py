@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evofsm import store
-from evofsm.guard import Guard, Mode, SceneRisk
+from evofsm.guard import Guard, Mode, Proposal, SceneRisk
 from evofsm.guard.actions import same_action
 from evofsm.guard.scene import _KIND, Contact, Foreseen, Memory
 
@@ -113,6 +113,25 @@ def test_what_is_harmless_is_kept_and_what_is_changed_is_changed_for_a_reason(ta
         assert one.risk_executed <= one.risk_proposed
         if not is_kept:
             assert "an object is met within 5 s" in one.reason
+
+
+def test_only_what_a_mask_allows_is_executed(taught):
+    changed, decide, masks = 0, taught.decide, ~np.eye(3, dtype=bool)
+
+    def each(row, wanted):
+        nonlocal changed
+        first = decide(row, wanted, 0.0)
+        for mask in masks[np.arange(3) != wanted]:  # asked again at the same time
+            said = decide(row, Proposal(wanted, mask), 0.0)
+            assert mask[said.executed]
+            changed += said.executed not in (wanted, first.executed)
+        taught.begin()
+        return first
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(taught, "decide", each)
+        Rain().play(taught, 700)
+    assert changed
 
 
 def test_what_oneself_never_did_at_first_is_learnt_too():

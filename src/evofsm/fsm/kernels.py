@@ -28,14 +28,14 @@ Function = TypeVar("Function", bound=Callable[..., object])
 # instruction, but sums are in the order as written: a batch and single steps agree bit for bit.
 _OPTIONS = {"fastmath": {"contract"}, "_nrt": False}
 #: False with ``NUMBA_DISABLE_JIT=1``: kernels then run in Python, some thousand times slower.
-COMPILES = not numba.config.DISABLE_JIT
+COMPILES = not cast(Any, numba.config).DISABLE_JIT
 _njit: Any = partial(numba.njit, error_model="numpy", no_cfunc_wrapper=True)
 
 
 def compiled(function: Function, **options: Any) -> Function:
     """Compile with Numba on the first call, and keep the code on disk where there is a place."""
     if not COMPILES:
-        return cast(Function, np.errstate(all="ignore")(function))
+        return np.errstate(all="ignore")(function)
     try:
         return cast(Function, _njit(cache=True, **options)(function))
     except RuntimeError:  # neither the package nor the user's cache folder may be written

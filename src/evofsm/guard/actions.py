@@ -26,6 +26,8 @@ _LEVELS = 17
 
 #: One action: a float, or a (d,) array where the set is a `BoxActions`.
 Action: TypeAlias = Any
+#: Which actions of `Choices` are allowed.
+Mask: TypeAlias = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -217,6 +219,19 @@ def is_usable(actions: ActionSet, action: Action) -> bool:
     if isinstance(actions, BoxActions):
         return np.shape(action) == actions.half.shape and bool(np.isfinite(action).all())
     return math.isfinite(action) and not (isinstance(actions, Choices) and action not in actions)
+
+
+def checked_mask(actions: ActionSet, mask: ArrayLike | None) -> Mask | None:
+    """Which of a few actions are allowed; None where all are, or none, which tells nothing."""
+    if mask is None:
+        return None
+    allowed = np.asarray(mask).astype(np.bool_)
+    if not isinstance(actions, Choices) or allowed.shape != (actions.n_actions,):
+        raise ValueError(
+            f"the mask of allowed actions has shape {allowed.shape}, but the guard has {actions}; "
+            "it must have an entry for each of Choices"
+        )
+    return allowed if 0 < allowed.sum() < len(allowed) else None
 
 
 def limits(actions: ActionSet) -> tuple[Action, Action]:

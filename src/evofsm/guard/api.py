@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:  # whoever asks for a number here waits for no compiler
     from evofsm.fsm.naming import Labels
-    from evofsm.guard.actions import Action, ActionSet
+    from evofsm.guard.actions import Action, ActionSet, Mask
     from evofsm.store import Place
 
 #: The highest risk, a probability of failure, that a reviser lets pass.
@@ -27,11 +27,13 @@ class Proposal(NamedTuple):
     Examples
     --------
     >>> Proposal(1.2)
-    Proposal(action=1.2)
+    Proposal(action=1.2, mask=None)
     """
 
     #: of a car the acceleration [m/s²]; of `Choices` an index, of `BoxActions` a (d,) array
     action: Action
+    #: (n,) which actions of `Choices` are allowed now, whatever is executed; None for all
+    mask: Mask | None = None
 
 
 class Intake(IntFlag):
@@ -187,7 +189,8 @@ class SearchingJudge(ActionJudge, Protocol):
     ) -> Search:
         """The action closest to ``wanted``, one of the set, that is within the tolerance.
 
-        ``revising`` says that the proposal before, in this episode, was not kept.
+        ``revising`` says that the proposal before, in this episode, was not kept. One of `Choices`
+        takes ``mask`` too, which is given where not all of them are allowed; ``wanted`` is.
         """
 
 

@@ -3,7 +3,8 @@
 docs/audit.md says what is in a record, a JSON object on a line of its own. ``hash``, its last, is
 the SHA-256 of the line up to the comma before it, and ``previous`` that of the record before (zeros
 for the first): a hash chain as in Haber and Stornetta (J. Cryptology 3, 1991). A row of ``before``
-is ``[time, observation]``, with the proposal after that if there was one.
+is ``[time, observation]``, with the proposal after that if there was one, and with its mask if it
+had one.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ _TOLD = tuple(name for name in RECORD if name not in ("time", "n_states", "risk_
 FIELDS: Mapping[str, set[str]] = {
     "start": {"about", "cut_off", "guard", "made_by", "reviser", "told_failures", "version"},
     "begin": {"settings"},
-    "decision": {"before", "belief", "interval", "observation", "time", *_TOLD},
+    "decision": {"before", "belief", "interval", "mask", "observation", "time", *_TOLD},
     "quiet": {"before"},
     "settings": {"settings"},
     "end": {"before", "failed", "learnt", "observation", "terminated"},
@@ -375,7 +376,8 @@ class AuditLog:
             before = self._take_before()
             self._write("decision", before=before, time=time, observation=observation, **decision)
         else:
-            self._before.append([time, observation, written(proposal.action)])
+            masked = [] if proposal.mask is None else [proposal.mask.tolist()]
+            self._before.append([time, observation, written(proposal.action), *masked])
             if len(self._before) >= _MOST_QUIET:
                 self._flush()
 
@@ -558,6 +560,7 @@ def decision_of(situation: Situation, proposal: Proposal, revision: Revision) ->
         **{name: _plain(RECORD[name].kind, RECORD[name].read(decided)) for name in _TOLD},
         "belief": [[state, float(situation.belief[state])] for state in likely],
         "interval": [float(bound) for bound in revision.interval],
+        "mask": None if proposal.mask is None else proposal.mask.tolist(),
     }
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 import warnings
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -28,7 +29,15 @@ from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.sharing import Rollback, alone, share, transaction
 from evofsm.fsm.validation import positive, real_array
-from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
+from evofsm.guard.actions import (
+    Action,
+    ActionSet,
+    BoxActions,
+    Choices,
+    checked_mask,
+    fixed,
+    no_action,
+)
 from evofsm.guard.api import (
     BELIEF_TOLERANCE,
     INCOMPLETE,
@@ -54,6 +63,8 @@ from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
 _INTERVALS = 17
 # States of the machine that is made where none is given.
 _MOST_STATES = 200
+# So many observations on end that lack something are told of.
+_MANY = 100
 # Longer than so many intervals is a gap in time.
 _GAP = 1.5
 _LACKING = {Missing.PARTIAL: Intake.PARTIAL, Missing.HOLD: Intake.HELD}
@@ -311,6 +322,7 @@ class Guard:
                 "failed=lambda z: z[0] <= 0"
             )
         share(self)
+        self.process = os.getpid()  #: in which it was made; a copy elsewhere learns for itself
         self.actions = reviser.actions
         self.interval = positive("interval", interval)
         asked = reviser.risk if isinstance(reviser, ActionReviser) else judge
@@ -364,6 +376,7 @@ class Guard:
         self._latest: Situation | None = None
         self._under_way, self._passing, self._learn = False, "", True
         self._begun = self._decisions = self._acted = self._watched = self._kept = 0
+        self._lacking: NDArray[Any] | None = None  # since an observation was whole
         #: Whether episodes may be driven in shadow, or it may step back, where it may do harm.
         self.shadow = bool(shadow)
         self.learn = learn
@@ -470,7 +483,7 @@ class Guard:
             NaN where a variable was not observed.
         proposal : float, (d,) array_like, Proposal or None
             What the controller wants; None, or NaN, where it has nothing. A vector where the set
-            of actions is a box.
+            of actions is a box. ``Proposal(action, mask=...)`` also says which are allowed now.
         time : float, optional
             Of the observation, in this episode [s]; without it decisions are counted, one every
             `interval`. What is not later than the one before tells nothing new.
@@ -498,11 +511,12 @@ class Guard:
                 "environments with one guard?); run them all under RevisedVectorActions or "
                 "RevisedAgents, or give each a guard of its own, such as guard.copy(); then reset"
             )
-        wanted = proposal.action if isinstance(proposal, Proposal) else proposal
+        wanted, mask = proposal if isinstance(proposal, Proposal) else (proposal, None)
         wanted = no_action(self.actions) if wanted is None else self._proposed(wanted)
+        mask = checked_mask(self.actions, mask)
         if time is None:
             time = self._decisions * self.interval if self._under_way else 0.0
-        return self.revise(self.recognise(observation, time), Proposal(wanted))
+        return self.revise(self.recognise(observation, time), Proposal(wanted, mask))
 
     def _proposed(self, action: ArrayLike) -> Action:
         """An action of the right type, whatever its values."""
@@ -564,6 +578,7 @@ class Guard:
         if (judge := self._observing) and len(z) != judge.dynamics.n_variables:
             learnt = judge.dynamics
             refuse_too_many(len(z), learnt.size, box=not learnt.choices)
+        self._count_missing(z)
         return z
 
     def beyond(self, z: NDArray[np.float64]) -> tuple[str, str] | None:
@@ -577,6 +592,22 @@ class Guard:
             f"is {z[k]:g}; it must lie between {least[k]:g} and {most[k]:g} (in another unit, or "
             "does it stand for what was not seen? That is NaN, in JSON null)"
         )
+
+    def _count_missing(self, z: NDArray[np.float64]) -> None:
+        """Warn where no observation is whole for long: nothing is learnt from such."""
+        if not math.isnan(z.dot(z)):
+            self._lacking = None
+            return
+        before = 0 if self._lacking is None else self._lacking
+        self._lacking = np.append(1, np.isnan(z)) + before  # the first is how many in all
+        if self._lacking[0] == _MANY:
+            gone = enumerate(self._lacking[1:].tolist())
+            told = ", ".join(f"{self._labels.variable(k)} in {count}" for k, count in gone if count)
+            warnings.warn(
+                f"none of {_MANY} observations on end was whole, and nothing is learnt from such: "
+                f"missing (NaN) was {told}. Leave it out of what is observed, or see to the sensor",
+                stacklevel=4,
+            )
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:
         """Where it is; machine and judge learn the transition to it."""

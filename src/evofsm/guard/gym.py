@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+import os
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, SupportsFloat
+from weakref import WeakKeyDictionary, WeakSet
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,18 +20,22 @@ from evofsm.guard.actions import (
     ActionSet,
     BoxActions,
     Choices,
+    Mask,
     change,
+    checked_mask,
     is_usable,
     put_into,
     same_action,
 )
 from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.guard import Guard
+from evofsm.guard.loop import action_masks
 from evofsm.guard.reviser import make_usable, unjudged_revision
 
 with needs("gymnasium", "gym", "a wrapper for Gymnasium"):
     import gymnasium
-    from gymnasium.spaces import Box, Discrete, Space
+    from gymnasium.spaces import Box, Dict, Discrete, Space
+    from gymnasium.utils import RecordConstructorArgs
     from gymnasium.vector import VectorEnv, VectorWrapper
     from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
@@ -37,6 +44,17 @@ Observe = Callable[[Any], ArrayLike | None]
 _Convert = Callable[[Any], Any]
 # Each value of ``Discrete`` is a variable of its own; more of them would take too long.
 _MOST_VALUES = 64
+# Not in ``info`` where nothing was judged: NaN there is unlike itself.
+_RISKS = "reviser/risk", "reviser/risk_proposed"
+# So many steps on end without a decision are told of.
+_SILENT = 200
+# Where ``info`` holds the last observation of an episode, as the one returned is of the next.
+_LAST = ("final_obs", "final_observation", "terminal_observation")
+_BY_ITSELF = (
+    "step() went on after an episode ended, without reset(): it is taken that the environment "
+    "begins the next one in that step, on which nothing is decided. If it had begun it in the step "
+    "before, info['final_obs'] of that has to hold the last observation of the episode"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,25 +71,30 @@ class StepResult:
 Failed = Callable[[StepResult], bool]
 
 
-class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
+class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Executes a guard's revision of each action, and forwards all else as it is.
 
     The guard learns while the environment runs. ``info`` holds ``reviser/proposed_action`` and
     ``reviser/executed_action``, as the environment takes them, ``reviser/reason``,
-    ``reviser/risk``, the probability of failure under the executed action,
-    ``reviser/risk_proposed``, that under the proposed one (NaN where nothing was judged), and
-    ``reviser/penalty``, the size of the change.
+    ``reviser/penalty``, the size of the change, and, where it was judged, ``reviser/risk``, the
+    probability of failure under the executed action, and ``reviser/risk_proposed``, that under the
+    proposed one.
 
     Parameters
     ----------
     env : gymnasium.Env
-        One step of it is one decision, ``guard.interval`` long [s].
+        One step of it is one decision, ``guard.interval`` long [s]. It may begin episodes by
+        itself, as under ``Autoreset``. A warning names wrappers under which nothing can be learnt.
     guard : Guard
-        What is executed always lies in its set of actions.
+        What is executed always lies in its set of actions, and is allowed where the environment
+        has an action mask: in ``info["action_mask"]``, in an observation that is a dictionary, or
+        by a method ``action_masks``. Environments that take turns may share it; it then learns as
+        `RevisedVectorActions` does.
     observe : callable, optional
         From an observation of ``env`` to the guard's; to None where there is nothing to judge,
-        such as no car ahead: then nothing is revised or learnt. Without it a box is flattened, and
-        each value of ``Discrete`` is a variable that is 1 or 0.
+        such as no car ahead: then nothing is revised or learnt. NaN is what was not observed, and
+        the guard's ``missing`` says what comes of it. Without it a box is flattened, and each value
+        of ``Discrete`` is a variable that is 1 or 0.
     failed : callable, optional
         From a step to whether it ended in failure: of ``step.observation``, ``step.reward``,
         ``step.terminated``, ``step.truncated`` and ``step.info``. Without it the guard's own
@@ -86,7 +109,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     Raises
     ------
     TypeError
-        If ``observe`` or ``failed`` is no function.
+        If ``env`` is none of Gymnasium, or ``observe`` or ``failed`` no function.
     ValueError
         If actions of ``env`` are not the guard's or do not reach as far, its observations are
         neither a box nor ``Discrete`` of at most 64 values and ``observe`` is missing, or the
@@ -121,11 +144,15 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         *,
         penalty: float = 0.0,
     ) -> None:
-        super().__init__(env)
+        refuse_unless(isinstance(env, gymnasium.Env), env)
+        given = {"guard": guard, "observe": observe, "failed": failed, "penalty": penalty}
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **given)  # for `spec`
+        gymnasium.Wrapper.__init__(self, env)
         self.guard, self.failed = guard, failed
-        spaces = env.observation_space, env.action_space
-        terms = Terms(guard, *spaces, observe, failed, penalty)
-        self._lane = Lane(terms, shared=False)
+        terms = Terms(guard, *_spaces(env), observe, failed, penalty)
+        self._lane = Lane(terms, shared=False, env=env)
+        self._resets_itself = any(type(one).__name__ == "Autoreset" for one in _layers(env))
+        warn_of(env, guard, failed)
 
     @property
     def revision(self) -> Revision | None:
@@ -138,15 +165,18 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Begin an episode; one that is under way ends without failure."""
         self._lane.end(failed=False)
         observation, info = self.env.reset(seed=seed, options=options)
-        self._lane.begin(observation)
+        self._lane.begin(observation, info)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Execute the guard's revision of ``action``."""
-        decided = self._lane.decide(action)
+        was_open, decided = self._lane.is_open, self._lane.decide(action)
         observation, reward, terminated, truncated, info = self.env.step(decided.executed)
         ends = bool(terminated), bool(truncated)
         self._lane.follow(StepResult(observation, reward, *ends, info))
+        if self._lane.is_open and not was_open and not self._resets_itself:
+            self._resets_itself = True
+            warnings.warn(_BY_ITSELF, stacklevel=2)
         return observation, decided.paid(reward), terminated, truncated, {**info, **decided.info}
 
 
@@ -205,13 +235,15 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         *,
         penalty: float = 0.0,
     ) -> None:
+        refuse_unless(isinstance(env, VectorEnv), env)
         super().__init__(env)
         self.guard = guard
-        spaces = env.single_observation_space, env.single_action_space
-        terms = Terms(guard, *spaces, observe, failed, penalty)
+        terms = Terms(guard, *_spaces(env), observe, failed, penalty)
         mode = env.metadata.get("autoreset_mode")  # which not everybody names
-        self._mode = getattr(mode, "value", mode)
-        self._lanes = [Lane(terms, shared=True) for _ in range(self.num_envs)]
+        self._same_step = getattr(mode, "value", mode) == "SameStep"
+        each = getattr(env.unwrapped, "envs", [None] * self.num_envs)
+        self._lanes = [Lane(terms, shared=True, env=one) for one in each]
+        warn_of(env, guard, failed)
 
     @property
     def revisions(self) -> list[Revision | None]:
@@ -225,10 +257,10 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         mask = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
         observations, infos = self.env.reset(seed=seed, options=options)
         each = iterate(self.env.observation_space, observations)
-        for lane, observation, begins in zip(self._lanes, each, mask, strict=True):
-            if begins:
+        for k, (lane, observation) in enumerate(zip(self._lanes, each, strict=True)):
+            if mask[k]:
                 lane.end(failed=False)
-                lane.begin(observation)
+                lane.begin(observation, _of_one(infos, k, self.num_envs))
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -244,6 +276,8 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         if any(one.cost for one in decided):
             each = (-1,) + (1,) * (np.ndim(rewards) - 1)
             rewards = rewards - np.reshape([one.cost for one in decided], each)
+        for name in _RISKS:
+            infos |= {name: np.zeros(self.num_envs), f"_{name}": np.zeros(self.num_envs, bool)}
         for k, (one, was_open) in enumerate(zip(decided, were_open, strict=True)):
             infos = self._add_info(infos, one.info, k)
             if not was_open:
@@ -256,21 +290,9 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     ) -> None:
         """Tell each environment's lane what followed."""
         each = iterate(self.env.observation_space, observations)
-        mode = self._mode or ("SameStep" if "final_obs" in infos else "NextStep")
         for k, (lane, observation) in enumerate(zip(self._lanes, each, strict=True)):
-            ends = bool(terminated[k]), bool(truncated[k])
-            if not lane.is_open:
-                if mode == "NextStep" and not any(ends):  # this step was the reset
-                    lane.begin(observation)
-                continue
-            info, last = _of_one(infos, k, self.num_envs), observation
-            resets = any(ends) and mode == "SameStep"
-            if resets:
-                last = info.pop("final_obs", None)
-                info = info.pop("final_info", info)
-            lane.follow(StepResult(last, rewards[k], *ends, info))
-            if resets:
-                lane.begin(observation)
+            ends, info = (bool(terminated[k]), bool(truncated[k])), _of_one(infos, k, self.num_envs)
+            lane.follow(StepResult(observation, rewards[k], *ends, info), resets=self._same_step)
 
 
 def _of_one(infos: Mapping[str, Any], k: int, count: int) -> dict[str, Any]:
@@ -307,62 +329,104 @@ class Decided(NamedTuple):
 class Lane:
     """The episodes of one environment, or of one agent, under a guard or a twin of a shared one."""
 
-    def __init__(self, terms: Terms, *, shared: bool) -> None:
+    def __init__(self, terms: Terms, *, shared: bool, env: Any = None) -> None:
         if shared and terms.guard.audit is not None:
             raise ValueError("an audit log follows one episode at a time; give a guard without one")
         self.terms = terms
         self.revision: Revision | None = None  #: the latest decision
         self.is_open = False  #: whether the environment is within an episode
-        self._shared = shared
+        self._shared, self._allowed = shared, action_masks(env)
         self._guard: Guard | None = None  # that decides, within an episode of the guard
         self._seen: _Seen = None
+        self._mask: Mask | None = None
         self._past: list[tuple[NDArray[np.float64], Proposal, Action]] = []
 
-    def begin(self, observation: Any) -> None:
+    def begin(self, observation: Any, info: Mapping[str, Any]) -> None:
         """An episode of the environment begins."""
-        self.is_open, self._seen = True, self.terms.look(observation)
+        _LANES.setdefault(self.terms.guard, WeakSet()).add(self)
+        self.is_open = True
+        self._look(observation, info)
+
+    def _look(self, observation: Any, info: Mapping[str, Any]) -> None:
+        self._seen = self.terms.look(observation)
+        if isinstance(self.terms.guard.actions, Choices):
+            self._mask = checked_mask(self.terms.guard.actions, self._allowed(observation, info))
 
     def decide(self, action: Any) -> Decided:
         """What to execute; the action itself where there is nothing to judge, or to decide."""
-        terms, proposal = self.terms, Proposal(self.terms.to_guard(action))
+        terms, proposal = self.terms, Proposal(self.terms.to_guard(action), self._mask)
         if not self.is_open:
+            terms.say_if_silent("no episode was under way: call reset()")
             unjudged = terms.decided(action, terms.unjudged(proposal))
             return unjudged._replace(executed=action, cost=0.0)
         if self._seen is None:
+            terms.say_if_silent("observe returned None: there was nothing to judge", ever=False)
             self.revision = terms.unjudged(proposal)
             return terms.decided(action, self.revision)
+        terms.say_if_silent()
         if self._guard is None:
-            self._guard = terms.guard.copy() if self._shared else terms.guard
-            self._guard.begin()
+            self._guard = self._begun()
         self.revision = self._guard.decide(self._seen, proposal)
-        if self._shared:
+        if self._guard is not terms.guard:
             self._past.append((self._seen, proposal, self.revision.executed))
         return terms.decided(action, self.revision)
 
-    def follow(self, step: StepResult) -> None:
-        """What followed in the environment."""
+    def _begun(self) -> Guard:
+        """Who decides in an episode that begins: the guard, or a twin where others feed it too.
+
+        Whom the guard itself decided for so far goes on with a twin of its own.
+        """
+        guard = self.terms.guard
+        for lane in _LANES.get(guard, ()):
+            if lane is not self and lane.is_open:
+                if guard.audit is not None and lane._guard is guard:
+                    raise ValueError(
+                        "an audit log follows one episode at a time, and that of another "
+                        "environment is under way: reset that, or give this one its own guard"
+                    )
+                lane._guard = None if lane._guard is guard else lane._guard
+                _SHARED.add(guard)
+        shared = guard.audit is None and (self._shared or guard in _SHARED)
+        decider = guard.copy() if shared else guard
+        decider.begin()
+        return decider
+
+    def follow(self, step: StepResult, *, resets: bool = False) -> None:
+        """What followed in the environment; ``resets`` says that what ends begins anew with it."""
+        over, now = step.terminated or step.truncated, step
+        if not self.is_open:
+            if not over:  # it began the next episode by itself
+                self.begin(now.observation, now.info)
+            return
+        last = [step.info[name] for name in _LAST if name in step.info]
+        resets = over and (resets or bool(last))
+        if resets:
+            info = step.info.get("final_info", step.info)
+            step = replace(step, observation=last[0] if last else None, info=info)
         failed = self.terms.failed(step)
-        self._seen = self.terms.look(step.observation)
-        over = step.terminated or step.truncated
+        self._look(step.observation, step.info)
         if failed or over or self._seen is None:
             self.end(failed=failed, terminated=step.terminated)
-        if over:
-            self.is_open = False
+        self.is_open = not over
+        if resets:
+            self.begin(now.observation, now.info)
 
     def end(self, *, failed: bool, terminated: bool = False) -> None:
         """The guard's episode ends, if one is under way."""
-        decider, self._guard = self._guard, None
-        past, self._past = self._past, []
-        guard = self.terms.guard
-        if decider is None or (self._shared and not guard.learn):
-            return
-        if self._shared:
+        decider, guard = self._guard, self.terms.guard
+        if decider is not None and decider is not guard and guard.learn:
             guard.begin(decider)
-            for step, (seen, proposal, executed) in enumerate(past):
+            for step, (seen, proposal, executed) in enumerate(self._past):
                 situation = guard.recognise(seen, step * guard.interval)
                 guard.take_in(situation, proposal, executed)
-        guard.end(failed, self._seen, terminated=terminated)
+        if decider is guard or (decider is not None and guard.learn):
+            guard.end(failed, self._seen, terminated=terminated)
+        self._guard, self._past = None, []
 
+
+# Lanes of a guard that began an episode, and guards that lanes were seen to share.
+_LANES: WeakKeyDictionary[Guard, WeakSet[Lane]] = WeakKeyDictionary()
+_SHARED: WeakSet[Guard] = WeakSet()
 
 _SUCH_AS = {
     "observe": "n observation, such as observe=lambda seen: seen['state']",
@@ -390,8 +454,20 @@ class Terms:
                 raise TypeError(f"{name} is {given!r}; it must be a function of a{_SUCH_AS[name]}")
         self.guard = guard
         self.penalty = penalty
+        self._silent, self._has_decided = 0, False
         self._observe, self._failed = observe or _flat(observations), failed
         self.to_guard, self._to_env = _conversions(actions, guard.actions)
+
+    def say_if_silent(self, why: str = "", *, ever: bool = True) -> None:
+        """Count steps on end without a decision; warn, saying why, where they are many.
+
+        With ``ever`` false only as long as nothing was ever decided.
+        """
+        self._has_decided |= not why
+        told = why and (ever or not self._has_decided)
+        self._silent = self._silent + 1 if told else 0
+        if self._silent == _SILENT:
+            warnings.warn(f"nothing was decided in {_SILENT} steps on end: {why}", stacklevel=4)
 
     def unjudged(self, proposal: Proposal) -> Revision:
         """The proposal, made usable, where there is nothing to judge."""
@@ -409,10 +485,10 @@ class Terms:
             "reviser/proposed_action": deepcopy(action),
             "reviser/executed_action": deepcopy(executed),
             "reviser/penalty": size,
-            "reviser/risk": revision.risk_executed,
-            "reviser/risk_proposed": revision.risk_proposed,
             "reviser/reason": revision.reason,
         }
+        risks = zip(_RISKS, (revision.risk_executed, revision.risk_proposed), strict=True)
+        info |= {name: risk for name, risk in risks if not math.isnan(risk)}
         return Decided(executed, info, self.penalty * size)
 
     def failed(self, step: StepResult) -> bool:
@@ -434,11 +510,11 @@ class Terms:
         if given is None:
             return None
         seen, names = np.array(given, dtype=np.float64), self.guard.variables
-        if seen.ndim != 1 or len(seen) != (len(names) or len(seen)) or not np.isfinite(seen).all():
+        if seen.ndim != 1 or len(seen) != (len(names) or len(seen)) or np.isinf(seen).any():
             what = f"{' and '.join(names)}, {len(names)} finite numbers" if names else "finite"
             raise ValueError(
-                f"observe returned {given}; it must be {what}, or None where there is nothing to "
-                "judge"
+                f"observe returned {given}; it must be {what}, with NaN for what was not observed, "
+                "or None where there is nothing to judge"
             )
         return seen
 
@@ -447,6 +523,9 @@ def _flat(space: Space[Any]) -> Observe:
     """From an observation to a vector."""
     if isinstance(space, Box):
         return lambda observation: np.reshape(observation, -1)
+    if isinstance(space, Dict) and space.keys() == {"observation", "action_mask"}:
+        inner = _flat(space["observation"])
+        return lambda observation: inner(observation["observation"])
     if isinstance(space, Discrete):
         if space.n > _MOST_VALUES:
             raise ValueError(
@@ -494,3 +573,68 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
         return np.asarray(np.clip(again, space.low, space.high))
 
     return to_guard, to_env
+
+
+# -- Environments and wrappers that do not fit --------------------------------------------------
+
+
+def refuse_unless(fits: bool, env: Any) -> None:
+    """Raise for an environment of another kind than a wrapper takes."""
+    if not fits:
+        raise TypeError(
+            f"this wrapper takes no {type(env).__name__}: RevisedActions takes a gymnasium.Env, "
+            "RevisedVectorActions a gymnasium.vector.VectorEnv, RevisedAgents a ParallelEnv of "
+            "PettingZoo, as parallel_env() makes it, or pettingzoo.utils.aec_to_parallel(env); "
+            "wrap the single environments of a VecEnv of Stable-Baselines3"
+        )
+
+
+def _spaces(env: Any) -> tuple[Space[Any], Space[Any]]:
+    """Of observations and of actions; where a wrapper clips those, what they are clipped to."""
+
+    def of(one: Any, what: str) -> Any:
+        return getattr(one, f"single_{what}", getattr(one, what, None))
+
+    acts = of(env, "action_space")
+    for one in _layers(env):
+        if of(one, "action_space") != acts:
+            break
+        if type(one).__name__ == "ClipAction":
+            acts = of(one.env, "action_space")
+    return of(env, "observation_space"), acts
+
+
+def _layers(env: Any) -> Iterator[Any]:
+    """An environment and those that it wraps, from the outermost; of many the first."""
+    while env is not None:
+        yield env
+        many = getattr(env, "envs", None) if isinstance(env, VectorEnv) else None
+        env = many[0] if many else getattr(env, "env", None)
+
+
+def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
+    """Name what stands below a guard and keeps it from learning, or others from what it learns."""
+    if guard.learn and guard.process != os.getpid():
+        warnings.warn(
+            "the guard was made in another process, and what it learns in this one stays here: run "
+            "the environments in one process (DummyVecEnv, SyncVectorEnv), or save it here",
+            stacklevel=3,
+        )
+    for one in _layers(env):
+        name, own, why = type(one).__name__, getattr(one, "__dict__", ()), ""
+        updates = getattr(one, "update_running_mean", getattr(one, "training", True))
+        uses_reward = "reward" in getattr(getattr(failed, "__code__", None), "co_names", ())
+        if "obs_rms" in own and updates:
+            why = "rescales observations by statistics that change, so that no threshold stays"
+        elif "return_rms" in own and updates and uses_reward:
+            why = "rescales the reward, which failed looks at, by statistics that change"
+        elif name.startswith("Sticky"):
+            why = "executes other actions than the guard decides on"
+        elif name == "DelayObservation" and one.delay > 1:
+            why = "shows the guard where the system was, not where it is"
+        if why:
+            warnings.warn(
+                f"{name} below the guard {why}: it learns badly, or nothing. Wrap the environment "
+                f"in the guard first, and that in {name}",
+                stacklevel=3,
+            )

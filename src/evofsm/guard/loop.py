@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol, SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.guard.actions import Action
+from evofsm.guard.actions import Action, Choices, no_action
 from evofsm.guard.api import Controller, Proposal, Revision, Situation
 from evofsm.guard.guard import Guard
 
@@ -25,8 +25,8 @@ class Environment(Protocol):
     """What an episode happens in: an environment of Gymnasium, or anything with its two methods.
 
     Its ``info`` may hold ``failed``, whether the episode ended in failure (without it one that is
-    terminated has failed), ``time`` [s] since the start (without it decisions are counted), and
-    ``realised``, what the action came to.
+    terminated has failed), ``time`` [s] since the start (without it decisions are counted),
+    ``realised``, what the action came to, and ``action_mask``, which of `Choices` are allowed now.
     """
 
     def reset(
@@ -87,11 +87,13 @@ def run_episode(
     """
     propose = getattr(controller, "propose", None) or (lambda seen, time: controller(seen))  # type: ignore[operator]
     observation, info = environment.reset(seed=seed, options=options)
-    episode = guard.begin()
+    episode, allowed = guard.begin(), action_masks(environment)
     held, count, over, failed = _whole(observation, None), 0, False, False
     while not over:
         time = info.get("time", count * guard.interval)
-        proposal = _asked(propose, held, time)
+        proposal = _asked(propose, held, time) or Proposal(no_action(guard.actions))
+        if isinstance(guard.actions, Choices) and proposal.mask is None:
+            proposal = proposal._replace(mask=allowed(observation, info))
         begin = perf_counter()
         revision = guard.decide(np.ravel(observation), proposal, time, episode=episode)
         seconds, situation = perf_counter() - begin, guard.situation
@@ -103,6 +105,27 @@ def run_episode(
             guard.end(failed, last, terminated=how, episode=episode)
         realised = float(info.get("realised", math.nan))
         yield Decision(situation, revision, realised, float(reward), failed, seconds)
+
+
+def action_masks(environment: Any) -> Callable[[Any, Mapping[str, Any]], Any]:
+    """From an observation and ``info`` to which actions an environment allows now.
+
+    It says so in an observation that is a dictionary or in ``info``, by the name that PettingZoo
+    and Gymnasium use, or by a method, as MaskablePPO of Stable-Baselines3 asks it; else it is None.
+    """
+    find = getattr(environment, "get_wrapper_attr", None)  # of Gymnasium, whatever wraps it
+    try:
+        ask = find("action_masks") if find else environment.action_masks
+    except AttributeError:
+        ask = None
+
+    def now(observation: Any, info: Mapping[str, Any]) -> Any:
+        for told in (observation, info):
+            if isinstance(told, Mapping) and told.get("action_mask") is not None:
+                return told["action_mask"]
+        return ask() if ask else None
+
+    return now
 
 
 def _whole(observation: Any, held: NDArray[np.float64] | None) -> NDArray[np.float64]:

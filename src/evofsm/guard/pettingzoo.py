@@ -9,10 +9,10 @@ from typing import Any
 from evofsm.extras import needs
 from evofsm.guard.api import Revision
 from evofsm.guard.guard import Guard
-from evofsm.guard.gym import Failed, Lane, Observe, StepResult, Terms
+from evofsm.guard.gym import Failed, Lane, Observe, StepResult, Terms, refuse_unless, warn_of
 
 with needs("pettingzoo", "pettingzoo", "a wrapper for PettingZoo"):
-    from pettingzoo import ParallelEnv
+    from pettingzoo import AECEnv, ParallelEnv
     from pettingzoo.utils.wrappers import BaseParallelWrapper
 
 _Each = dict[Any, Any]
@@ -36,7 +36,7 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
 
     Raises
     ------
-    ValueError
+    TypeError, ValueError
         As `RevisedVectorActions`.
 
     Examples
@@ -53,12 +53,14 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
         *,
         penalty: float = 0.0,
     ) -> None:
+        refuse_unless(not isinstance(env, AECEnv), env)
         super().__init__(env)
         self.guard = guard
         self._terms = partial(Terms, guard, observe=observe, failed=failed, penalty=penalty)
         self._lanes: dict[Any, Lane] = {}
         for agent in getattr(env, "possible_agents", ()):  # which an environment need not know
             self._enter(agent)
+        warn_of(env, guard, failed)
 
     @property
     def revisions(self) -> dict[Any, Revision]:
@@ -73,7 +75,7 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
             lane.end(failed=False)
             lane.is_open = False
         observations, infos = self.env.reset(seed=seed, options=options)
-        self._begin(observations)
+        self._begin(observations, infos)
         return observations, infos
 
     def step(self, actions: _Each) -> tuple[_Each, _Each, _Each, _Each, _Each]:
@@ -98,14 +100,15 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
                 rewards[agent] = one.paid(rewards[agent])
             if agent in infos or agent in terminated:
                 infos[agent] = {**infos.get(agent, {}), **one.info}
-        self._begin({one: seen for one, seen in observations.items() if one in self.env.agents})
+        here = {one: seen for one, seen in observations.items() if one in self.env.agents}
+        self._begin(here, infos)
         return observations, rewards, terminated, truncated, infos
 
-    def _begin(self, observations: _Each) -> None:
+    def _begin(self, observations: _Each, infos: _Each) -> None:
         """Begin the episodes of agents that are new."""
         for agent, observation in observations.items():
             if not (lane := self._enter(agent)).is_open:
-                lane.begin(observation)
+                lane.begin(observation, infos.get(agent, {}))
 
     def _enter(self, agent: Any) -> Lane:
         """The lane of an agent, which may be new."""

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.fsm.observations import Missing
-from evofsm.guard.actions import Action
+from evofsm.guard.actions import Action, checked_mask
 from evofsm.guard.api import Proposal
 from evofsm.guard.audit_log import (
     FIELDS,
@@ -263,7 +263,7 @@ class _Player:
         self.decisions += 1
 
     def _decision(self, guard: Guard, content: Mapping[str, Any]) -> None:
-        given = (content[name] for name in ("time", "observation", "proposed"))
+        given = (content[name] for name in ("time", "observation", "proposed", "mask"))
         when, told, speaks = self._again(guard, *given)
         if fields := _differing({name: content[name] for name in told}, told):
             raise _DiffersError(f"{when} comes out otherwise", fields)
@@ -273,10 +273,10 @@ class _Player:
 
     @staticmethod
     def _again(
-        guard: Guard, time: Any, observation: Any, action: Any
+        guard: Guard, time: Any, observation: Any, action: Any, mask: Any = None
     ) -> tuple[str, dict[str, Any], bool]:
         """Which decision it is, what is told of it, and whether it is one to speak of."""
-        proposal = Proposal(_action(action))
+        proposal = Proposal(_action(action), checked_mask(guard.actions, mask))
         situation = guard.recognise(_floats(observation), _number(time))
         revision = guard.revise(situation, proposal)
         told = decision_of(situation, proposal, revision)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from enum import Enum
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from evofsm.guard.actions import (
     ActionSet,
     BoxActions,
     Choices,
+    Mask,
     action_text,
     distances,
     fixed,
@@ -75,7 +76,7 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
     """An action of the set, whatever a controller came up with.
 
     A proposal outside an interval is put at its edge; NaN, infinity or an index of no action
-    becomes the fallback.
+    becomes the fallback, and so does one that is not allowed; or else the first that is.
 
     Examples
     --------
@@ -86,14 +87,17 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
     >>> make_usable(Proposal(float("nan")), actions)
     Usable(action=0.0, remark='no usable proposal (nan): doing nothing')
     """
-    wanted = proposal.action
+    wanted, mask = proposal.action, proposal.mask
     if not isinstance(actions, BoxActions) and actions.low <= wanted <= actions.high:
         is_choice = isinstance(actions, Choices)
-        if not is_choice or wanted == int(wanted):  # the usual case, at once
-            return Usable(float(wanted), "")
-    if not is_usable(actions, wanted):
-        nothing = f"no usable proposal ({action_text(wanted)}): {fallback.doing}"
-        return Usable(put_into(actions, fallback.action), nothing)
+        if not is_choice or (wanted == int(wanted) and (mask is None or mask[int(wanted)])):
+            return Usable(float(wanted), "")  # the usual case, at once
+    if mask is not None or not is_usable(actions, wanted):
+        action, doing = put_into(actions, fallback.action), fallback.doing
+        if mask is not None and not mask[int(action)]:
+            action, doing = float(mask.argmax()), "the first that is allowed"
+        barred = ", not allowed here" if is_usable(actions, wanted) else ""
+        return Usable(action, f"no usable proposal ({action_text(wanted)}{barred}): {doing}")
     action = put_into(actions, wanted)
     if same_action(action, wanted):
         return Usable(action, "")
@@ -190,7 +194,7 @@ class ActionReviser:
             self._trial = 0
         if self.mode is Mode.OFF:
             return unjudged_revision(wanted, proposal, remark or "reviser is off")
-        options, judged, best, reason = self._search(situation, wanted, acts)
+        options, judged, best, reason = self._search(situation, wanted, acts, proposal.mask)
         executed = best if acts else 0
         is_number = options.ndim == 1
         if not acts and best != 0:
@@ -210,16 +214,21 @@ class ActionReviser:
             advised=float(options[best]) if is_number else fixed(options[best]),
         )
 
-    def _search(self, situation: Situation, wanted: Action, acts: bool) -> Search:
+    def _search(
+        self, situation: Situation, wanted: Action, acts: bool, mask: Mask | None
+    ) -> Search:
         """Which option should be executed: the judge's own, or the best of those it is given."""
         if self._searches:
+            how: dict[str, Any] = {} if mask is None else {"mask": mask}
             found: Search = self.risk.search(  # type: ignore[attr-defined]
-                situation, wanted, tolerance=self.tolerance, revising=self._revising
+                situation, wanted, tolerance=self.tolerance, revising=self._revising, **how
             )
             self._revising = found.best != 0
             within = np.minimum(np.maximum(found.options, self._low), self._high)
             return found._replace(options=within)
         options = np.minimum(np.maximum(wanted, self._lowest), self._highest)
+        if mask is not None:
+            options = options[np.append(True, mask)]
         if not acts:
             options = self.risk.effective(situation, options)
         judged = self.risk.judge(situation, options)

@@ -29,7 +29,7 @@ from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import positive, whole
-from evofsm.guard.actions import Action
+from evofsm.guard.actions import Action, Mask
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.store import COUNT, FLAG, FROM_1, MOST_COUNTED, SIZE, Kind, Numbers, Place
 
@@ -171,9 +171,15 @@ class SceneRisk(ActionJudge):
     # -- Deciding -------------------------------------------------------------------------------
 
     def search(
-        self, situation: Situation, wanted: Action, *, tolerance: float, revising: bool
+        self,
+        situation: Situation,
+        wanted: Action,
+        *,
+        tolerance: float,
+        revising: bool,
+        mask: Mask | None = None,
     ) -> Search:
-        """The tolerable action that is closest in effect to ``wanted``.
+        """The tolerable action of those in ``mask`` that is closest in effect to ``wanted``.
 
         Else one of the least risky after which it lasts longest; ``wanted``, if it is among them.
         """
@@ -186,9 +192,10 @@ class SceneRisk(ActionJudge):
             said = f"risk within {_STEPS * self.dt:g} s is within the tolerance"
             return Search(np.array([wanted]), judged, 0, said)
         why, after = self.why(judged), found.after
-        good, what = np.flatnonzero(risks <= tolerance), "the closest in effect that can"
+        can = risks if mask is None else np.where(mask, risks, math.inf)
+        good, what = np.flatnonzero(can <= tolerance), "the closest in effect that can"
         if not len(good):
-            good = np.flatnonzero(risks <= risks.min() + tolerance)
+            good = np.flatnonzero(can <= can.min() + tolerance)
             lasting = found.lasting[good].max(1)
             good = good[lasting >= lasting.max() - tolerance]
             what = "nothing can, the one that lasts longest"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from evofsm.guard import Guard, Mode
 from evofsm.guard.actions import same_action
-from evofsm.guard.api import Situation
+from evofsm.guard.api import Proposal, Situation
 from evofsm.guard.audit_log import AuditLog
 from evofsm.guard.learnt import judge as judging
 from evofsm.guard.learnt import library
@@ -209,6 +209,37 @@ def test_a_log_is_replayed_learning_and_frozen(point, tmp_path, monkeypatch, mos
     assert not found.not_replayed
     assert found.contents.spoke > 20
     assert (b"cut short" in (tmp_path / "log").read_bytes()) == (most < math.inf)
+
+
+def test_only_what_a_mask_allows_is_executed_and_a_log_replays_it(points, tmp_path):
+    random, said, point = np.random.default_rng(0), [], points["choices"]
+    with AuditLog(tmp_path / "log") as log:
+        guard = point.guard(audit=log)
+        decide = guard.decide
+
+        def masked(z, proposal):
+            mask = random.permutation([True, True, guard.n_episodes == 0 or random.random() < 0.5])
+            said.append(decide(z, Proposal(proposal, mask)))
+            assert mask[said[-1].executed]
+            assert ("not allowed here" in said[-1].reason) == (not mask[proposal])
+            return said[-1]
+
+        guard.decide = masked
+        for episode in range(6):
+            point.play(guard, episode)
+    assert sum("no backup" in one.reason for one in said) > 9
+    found = audit(tmp_path / "log", log.head)
+    assert found.is_good, found
+    assert found.replayed == found.contents.decisions == len(said)
+
+
+@pytest.mark.parametrize("mask", [[True, False], [[True] * 3], True])
+def test_a_mask_of_other_actions_is_refused(points, mask):
+    for name in ("choices", "box"):
+        guard = points[name].guard()
+        with pytest.raises(ValueError, match=r"mask of allowed actions .* an entry for each"):
+            guard.decide([0.0, 0.0], Proposal(1, mask))
+        assert guard.machine.n_states == 0
 
 
 def test_a_long_episode_is_studied_in_parts_a_decision(points, content, monkeypatch):

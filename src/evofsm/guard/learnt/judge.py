@@ -22,6 +22,7 @@ from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import action_name, positive
+from evofsm.guard.actions import Mask
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import OUTCOMES, SETTINGS, Harm
 from evofsm.guard.learnt import library, regions, words
@@ -60,6 +61,8 @@ _ALIKE, _TRIES = 0.02, 8
 _MOST_STEPS = 10_000
 # From so many situations on backups evolve, and disturbances are looked for.
 _ENOUGH = 3
+# What a backup says to an action that is not allowed.
+_NEVER = -1e300
 # What comes instead of the next part of a study that has none.
 _OVER = object()
 
@@ -306,10 +309,18 @@ class LearntRisk(ActionJudge):
         return few, max(min(_WORK, _WORK_RATE * self.dt) / each, few * self.horizon)
 
     def search(
-        self, situation: Situation, wanted: Any, *, tolerance: float, revising: bool
+        self,
+        situation: Situation,
+        wanted: Any,
+        *,
+        tolerance: float,
+        revising: bool,
+        mask: Mask | None = None,
     ) -> Search:
         """The closest action to ``wanted`` that passes, or else that of the longest-lasting backup.
 
+        Of `Choices` it is one of ``mask``, and backups do what is in it: more may be allowed later,
+        or less, which nobody knows.
         ``revising`` changes nothing: a band in which a proposal is refused longer gained nothing.
         """
         self._note(self.search, situation, wanted, tolerance=tolerance, revising=revising)
@@ -329,7 +340,11 @@ class LearntRisk(ActionJudge):
         few, most = self.effort
         remembered, ranks = self.remembered, self._ranks[:few]
         allowed = self._allowed(tolerance, remembered)
-        asked = model, here, backups.policies, ranks, disturbances, scale
+        policies = backups.policies
+        if mask is not None:
+            policies = policies.copy()
+            policies[:, ~mask, 0] = _NEVER
+        asked = model, here, policies, ranks, disturbances, scale
         how, action, which, left = search(*asked, proposal, self.margin, allowed, most)
         tried = None
         if which != ranks[0]:  # what passed now is asked first the next time
@@ -341,17 +356,18 @@ class LearntRisk(ActionJudge):
                 how = search(*asked, action, 0.0, allowed, most, lasting=False)[0]
                 self._holds = how < CUT_SHORT
             self._certified &= how != CUT_SHORT  # whether one is violated is not known
-            tried = self._untried(action) if self.learning and left < _ALIKE else None
+            tried = self._untried(action, mask) if self.learning and left < _ALIKE else None
             action = action if tried is None else tried
         self._asked = 1 if most < 2 * few * self.horizon else few
         judged, self._dead_end, fails_after = self._judged(
             situation,
             here,
+            policies,
             np.array((proposal, action) if self._refused else (proposal,)),
             left if passes and not allowed else None,
         )
         self._fails_after = max(self._fails_after, fails_after)
-        backup = self._backup_text(which)
+        backup = self._backup_text(which, policies)
         if not self._refused:
             return Search(one, judged, 0, words.kept(backup, remembered, left, allowed))
         why = words.refused(self._unsurvived, remembered, self.margin, scale, allowed)
@@ -360,7 +376,7 @@ class LearntRisk(ActionJudge):
             if k >= 0:
                 ends = dynamics.dead_ends
                 number, count = int(ends.numbers[k]), int(ends.counts[k])
-                why = words.comes_near(self._backup_text(after), number, count)
+                why = words.comes_near(self._backup_text(after, policies), number, count)
         if passes:
             instead = words.changed(backup, remembered, self.margin, allowed)
         else:
@@ -373,8 +389,9 @@ class LearntRisk(ActionJudge):
         given, here = np.asarray(actions, np.float64), self._here(situation.observation)
         if here is None or self.disturbances is None or not self.dynamics.fails:
             return _unjudged(len(given))
+        assert self.backups is not None
         inner = np.array([self.dynamics.encode(one) for one in given])
-        return self._judged(situation, here, inner)[0]
+        return self._judged(situation, here, self.backups.policies, inner)[0]
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
@@ -382,7 +399,12 @@ class LearntRisk(ActionJudge):
         return words.refused(self._unsurvived, self.remembered, self.margin, scale)
 
     def _judged(
-        self, situation: Situation, here: Floats, actions: Floats, passes: float | None = None
+        self,
+        situation: Situation,
+        here: Floats,
+        policies: Floats,
+        actions: Floats,
+        passes: float | None = None,
     ) -> tuple[Judgement, bool, float]:
         """Of some actions; ``passes`` is what is left after the last, if that is known to pass.
 
@@ -390,7 +412,8 @@ class LearntRisk(ActionJudge):
         latest.
         """
         asked = actions if passes is None else actions[:-1]
-        each = [self._foresee(here, action[None], self._ranks[: self._asked]) for action in asked]
+        best = policies[self._ranks[: self._asked]]
+        each = [self._foresee(here, action[None], best) for action in asked]
         if passes is not None:
             each.append((0.0, passes, 0.0))
         unsurvived, left, after = zip(*each, strict=True)
@@ -403,18 +426,14 @@ class LearntRisk(ActionJudge):
         )
         return judged, math.isinf(unsurvived[-1]), max(after)
 
-    def _foresee(
-        self, here: Floats, plan: Floats | None, ranks: Ints
-    ) -> tuple[float, float, float]:
+    def _foresee(self, here: Floats, plan: Floats, policies: Floats) -> tuple[float, float, float]:
         """What comes of a situation and an action if the best of some backups follows.
 
         How many disturbances are not survived, infinite if it fails without any; the least distance
         to failure under the worst of them; and the steps after which it fails at the latest.
         """
         assert self.disturbances is not None
-        assert self.backups is not None
-        policies, steps = self.backups.policies[ranks], self.disturbances.residuals.shape[0]
-        model = self.dynamics.model
+        model, steps = self.dynamics.model, self.disturbances.residuals.shape[0]
         ends = library.harm(model, here[None], policies, self.disturbances, 1.0, plan, 0.0)[:, 0]
         fails = ends[ends < 0.0]
         unsurvived = math.inf if ends[0] < 0.0 else float(len(fails))
@@ -453,11 +472,12 @@ class LearntRisk(ActionJudge):
         z = self.dynamics.corrected(at, self._action, z)
         return np.concatenate([z, z - at[:m], self._action])
 
-    def _untried(self, best: Floats) -> Floats | None:
+    def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
         assert self.backups is not None
         used, order = self.dynamics.used, self.backups.actions  # of equals the first in that order
         if self.dynamics.choices:
+            order = order if mask is None else order[mask[order]]
             i = int(order[used[order, 1].argmin()])
             if used[i, 1] < _TRIES and used[i, 1] < used[:, 1].max():
                 return np.asarray(np.eye(len(used))[i])
@@ -471,11 +491,11 @@ class LearntRisk(ActionJudge):
             return best
         return None
 
-    def _backup_text(self, backup: int) -> str:
+    def _backup_text(self, backup: int, policies: Floats) -> str:
         assert self.backups is not None
         if backup >= self.backups.n_constant:
             return f"feedback {backup - self.backups.n_constant + 1}"
-        action = self.dynamics.decode(self.backups.policies[backup, :, 0])
+        action = self.dynamics.decode(policies[backup, :, 0])
         if self.dynamics.choices:
             return f"always {action_name(int(action[0]))}"
         return words.constant(action.tolist())
