@@ -37,7 +37,7 @@ class GuardBoard(BaseCallback):
         self.told = []
 
     def _on_step(self):
-        self.told += [[info[key] for key in KEYS] for info in self.locals["infos"]]
+        self.told += [[info.get(key, np.nan) for key in KEYS] for info in self.locals["infos"]]
         return True
 
     def _on_rollout_end(self):

@@ -4,6 +4,7 @@ import importlib
 import itertools
 import math
 import os
+import re
 import warnings
 from contextlib import nullcontext
 from pathlib import Path
@@ -1123,6 +1124,19 @@ def test_pettingzoo_finds_nothing_to_complain_of(crowd):
 
 
 # -- Extras and examples -----------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_stable_baselines3_trains_in_several_environments_under_one_guard(capsys):
+    pytest.importorskip("stable_baselines3")
+    page = (EXAMPLES.parent / "docs" / "how-to" / "train-with-stable-baselines3.md").read_text()
+    code = re.search(r"```python\n(.*?)```", page, re.DOTALL)[1]
+    exec(code, {})
+    failed, episodes = map(
+        int, re.match(r"(\d+) of (\d+) episodes", capsys.readouterr().out).groups()
+    )
+    assert failed < 0.6 * episodes
 
 
 @pytest.mark.slow

@@ -491,8 +491,9 @@ class LearntRisk(ActionJudge):
             return best
         return None
 
-    def _backup_text(self, backup: int, policies: Floats) -> str:
+    def _backup_text(self, backup: int, policies: Floats | None = None) -> str:
         assert self.backups is not None
+        policies = self.backups.policies if policies is None else policies
         if backup >= self.backups.n_constant:
             return f"feedback {backup - self.backups.n_constant + 1}"
         action = self.dynamics.decode(policies[backup, :, 0])
