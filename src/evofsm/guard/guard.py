@@ -598,8 +598,9 @@ class Guard:
         if not math.isnan(z.dot(z)):
             self._lacking = None
             return
-        before = 0 if self._lacking is None else self._lacking
-        self._lacking = np.append(1, np.isnan(z)) + before  # the first is how many in all
+        if self._lacking is None or len(self._lacking) != 1 + len(z):
+            self._lacking = np.zeros(1 + len(z), np.int64)
+        self._lacking = self._lacking + np.append(1, np.isnan(z))  # the first counts them all
         if self._lacking[0] == _MANY:
             gone = enumerate(self._lacking[1:].tolist())
             told = ", ".join(f"{self._labels.variable(k)} in {count}" for k, count in gone if count)
