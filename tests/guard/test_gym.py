@@ -571,6 +571,18 @@ def test_of_an_episode_amid_which_another_environment_begins_the_rest_is_learnt(
     assert told == [(8, (1.0,), tuple(HIT)), (5, (0.0,), tuple(NEAR))]
 
 
+def test_what_a_loop_begins_amid_an_episode_is_not_mixed_with_it():
+    env = RevisedActions(Script(*[FAR] * 5), guard_for(ONE))
+    env.reset()
+    env.step(np.array([0.0]))
+    list(run_episode(Script(FAR, NEAR), env.guard, lambda seen: [1.0]))
+    with pytest.raises(RuntimeError, match="another began with the same guard"):
+        env.step(np.array([0.0]))
+    env.reset()  # as it was advised
+    env.step(np.array([0.0]))
+    assert [len(rows) for rows, *_ in env.guard.judge.episodes] == [1]
+
+
 def test_what_is_learnt_in_another_process_does_not_come_back():
     guard, here = guard_for(Discrete(2)), os.getpid()
     why = r"made in another process.*SyncVectorEnv"

@@ -337,6 +337,7 @@ class Lane:
         self.is_open = False  #: whether the environment is within an episode
         self._shared, self._allowed = shared, action_masks(env)
         self._guard: Guard | None = None  # that decides, within an episode of the guard
+        self._episode = 0  # the number of that
         self._seen: _Seen = None
         self._mask: Mask | None = None
         self._past: list[tuple[NDArray[np.float64], Proposal, Action]] = []
@@ -366,7 +367,7 @@ class Lane:
         terms.say_if_silent()
         if self._guard is None:
             self._guard = self._begun()
-        self.revision = self._guard.decide(self._seen, proposal)
+        self.revision = self._guard.decide(self._seen, proposal, episode=self._episode)
         if self._guard is not terms.guard:
             self._past.append((self._seen, proposal, self.revision.executed))
         return terms.decided(action, self.revision)
@@ -388,7 +389,7 @@ class Lane:
                 _SHARED.add(guard)
         shared = guard.audit is None and (self._shared or guard in _SHARED)
         decider = guard.copy() if shared else guard
-        decider.begin()
+        self._episode = decider.begin()
         return decider
 
     def follow(self, step: StepResult, *, resets: bool = False) -> None:
@@ -415,12 +416,12 @@ class Lane:
         """The guard's episode ends, if one is under way."""
         decider, guard = self._guard, self.terms.guard
         if decider is not None and decider is not guard and guard.learn:
-            guard.begin(decider)
+            self._episode = guard.begin(decider)
             for step, (seen, proposal, executed) in enumerate(self._past):
                 situation = guard.recognise(seen, step * guard.interval)
                 guard.take_in(situation, proposal, executed)
         if decider is guard or (decider is not None and guard.learn):
-            guard.end(failed, self._seen, terminated=terminated)
+            guard.end(failed, self._seen, terminated=terminated, episode=self._episode)
         self._guard, self._past = None, []
 
 
