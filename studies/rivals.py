@@ -43,8 +43,9 @@ class Rival(ABC):
     """A judge that is told what it knows; one that learns has ``end`` and ``freeze`` as well."""
 
     told: str  #: in a few words
-    interval: float = math.nan  #: between decisions, and the latest situation, as guards have
+    interval: float = math.nan  #: between decisions, and what else guards have
     situation: Any = None
+    actions: Any = None
 
     def begin(self) -> None:  # noqa: B027
         """Begin an episode."""

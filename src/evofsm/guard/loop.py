@@ -87,7 +87,9 @@ def run_episode(
     """
     propose = getattr(controller, "propose", None) or (lambda seen, time: controller(seen))  # type: ignore[operator]
     observation, info = environment.reset(seed=seed, options=options)
-    episode, allowed = guard.begin(), action_masks(environment)
+    number, allowed = guard.begin(), action_masks(environment)
+    # Who else has a guard's methods may not count episodes.
+    feeding: Any = {} if number is None else {"episode": number}
     held, count, over, failed = _whole(observation, None), 0, False, False
     while not over:
         time = info.get("time", count * guard.interval)
@@ -95,14 +97,14 @@ def run_episode(
         if isinstance(guard.actions, Choices) and proposal.mask is None:
             proposal = proposal._replace(mask=allowed(observation, info))
         begin = perf_counter()
-        revision = guard.decide(np.ravel(observation), proposal, time, episode=episode)
+        revision = guard.decide(np.ravel(observation), proposal, time, **feeding)
         seconds, situation = perf_counter() - begin, guard.situation
         observation, reward, terminated, truncated, info = environment.step(revision.executed)
         held, count = _whole(observation, held), count + 1
         over, failed = bool(terminated or truncated), bool(info.get("failed", terminated))
         if over:
             last, how = np.ravel(observation), bool(terminated)
-            guard.end(failed, last, terminated=how, episode=episode)
+            guard.end(failed, last, terminated=how, **feeding)
         realised = float(info.get("realised", math.nan))
         yield Decision(situation, revision, realised, float(reward), failed, seconds)
 
