@@ -33,7 +33,7 @@ from evofsm.driving import guard_for_family
 from evofsm.fsm import EvolvingFSM
 from evofsm.guard import Guard, LearntRisk, SceneRisk, run_episode
 from evofsm.paper import Figure, Page, Table
-from studies import lib
+from studies import benchmark, lib
 from studies.lib import ALL, FIRST, Frames, Study, Target, at_least, at_most, frame_of
 from studies.rivals import Counted, Unrevised, rivals_of
 from studies.shapes import PEERS, SHAPES
@@ -231,6 +231,7 @@ def trial(
     late: int = 30,
     rounds: int = 100,
     beside: bool = True,
+    change: str = "",
 ) -> dict[str, Any]:
     """Let a judge learn a system while controlling it, freeze it, and try it on held-out episodes.
 
@@ -254,6 +255,8 @@ def trial(
         Of the bootstrap.
     beside : bool
         Whether the controller alone is run in the same draws, too.
+    change : str
+        One of `studies.benchmark.CHANGES`.
 
     Examples
     --------
@@ -262,6 +265,7 @@ def trial(
     (5, 1.0, 0.0)
     """
     system = make_system(name, controller)
+    system = benchmark.Changed(system, change) if change else system
     made = make_judge(judge, system, lib.names_in(without), seed)
     train = system.train if train is None else train
     learnt = [run(system, made, Start.training(base, seed, k)) for k in range(train)]
@@ -438,11 +442,16 @@ class Judges(Study):
     controllers: Annotated[
         str, Option(help="Controllers with commas; all, or first: the first one of each system.")
     ] = ALL
-    seeds: Annotated[int, Option(min=1, help="Learning seeds.")] = 5
+    seeds: Annotated[
+        int | None, Option(min=1, help="Learning seeds; 5, of the benchmark 1, if not given.")
+    ] = None
     train: Annotated[
         int | None, Option(min=1, help="Training episodes; as many as suit a system if not given.")
     ] = None
     test: Annotated[int, Option(min=1, help="Held-out episodes.")] = 100
+    quick: Annotated[
+        bool, Option("--quick", help="The frozen benchmark, beside what was accepted; one seed.")
+    ] = False
 
     def shortened(self) -> Self:
         """One seed, one controller of each system, no part taken away."""
@@ -461,8 +470,9 @@ class Judges(Study):
         if self.without in (ALL, "none"):
             return tuple(PARTS) if self.without == ALL else ()
         named = tuple(dict.fromkeys(lib.names_in(self.without)))
-        if wrong := [part for part in named if part not in PARTS]:
-            raise ValueError(f"there is no part {wrong[0]!r}; there are {', '.join(PARTS)}")
+        known = [*PARTS, *(benchmark.MECHANISMS if self.quick else ())]
+        if wrong := [part for part in named if part not in known]:
+            raise ValueError(f"there is no part {wrong[0]!r}; there are {', '.join(known)}")
         return named
 
     @property
@@ -473,13 +483,19 @@ class Judges(Study):
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Try all that is named, system by system."""
+        if self.quick:
+            without = () if self.without == ALL else self.parts
+            seeds, base = self.seeds or 1, self.seed or benchmark.DRAWS
+            only = "" if self.systems == ALL else self.systems
+            found = benchmark.run(seeds, base, self.judges, without, workers, only)
+            return {"rows": found}
         tasks: list[partial[dict[str, Any]]] = []
         for name in _present(self._wanted)[0]:
             system = make_system(name)
             for controller in system.chosen(self.controllers):
                 one = partial(trial, name, controller, test=self.test, base=self.seed)
                 tasks.append(partial(one, "unrevised", train=0))
-                for seed in range(self.seeds):
+                for seed in range(self.seeds or 5):
                     learning = partial(one, seed=seed, train=self.train)
                     if isinstance(system, Cars):
                         tasks.append(partial(learning, judge="kinematic"))
@@ -492,6 +508,8 @@ class Judges(Study):
     def page(self, found: Frames) -> Page:
         """What fails, what each part is worth, and where it loses."""
         rows = found["rows"]
+        if self.quick:
+            return benchmark.page(rows, self.facts)
         whole = summary(rows.filter(_WHOLE))
         parts: list[Table | Figure] = [
             Table(

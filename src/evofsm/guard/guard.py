@@ -53,7 +53,7 @@ from evofsm.guard.api import (
     Situation,
 )
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.learnt.replay import refuse_too_many
+from evofsm.guard.learnt.rollout import refuse_too_many
 from evofsm.guard.parts import outline, part_class, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.warming import warm_judge, warm_machine

@@ -1,0 +1,403 @@
+"""Where a system fails, or ends by itself: the fewest forms that hold what failed and nothing else.
+
+A form is a row of a table. It says something of where it is above 0: that it fails there, that an
+episode ends by itself there, or that it fails if it ends (`FAILS`, `ENDS`, `CRASHES`). It is linear
+or quadratic in at most two variables.
+
+*Sides* of the box of what was survived are tried first, and what they leave is told by *bent*
+forms: ridge logistic regressions of what failed against what was survived, made so small that what
+was survived is outside. Failures that no form holds alone are dealt out between two. Of forms that
+hold as many the likeliest is taken, less what its weights cost (Schwarz 1978).
+
+What one episode alone survived takes back no failure: that takes a second witness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, FLAT, GROWN, Flags, Floats, Ints
+
+#: Columns of a form: what it says, variables i and j, from where each is counted, the inverse of
+#: its unit, coefficients of 1, x, y, x x, x y, y y; how many failures it holds.
+SIZE = 14
+SAYS, I, J, AT, TO, ONE, OTHER, C, B, D, P, Q, R, HELD = range(SIZE)
+
+# Bent forms at most; a failure so near one [typical steps] is in it, as it is known no better.
+_MAX_FORMS, BLUR = 8, 0.5
+# A side that explains fewer failures, or a smaller share of them, may be challenged.
+_FEW, _SHARE = 3, 0.25
+# So many failures may leave two sides undecided.
+_FIRST = 2
+# Beyond an end is what is so many typical steps beyond; blurred ends are so wide [scales].
+_BEYOND, _BLURRED = 1e-12, 5.0
+# Survived observations of a fit; steps of Newton, and the ridge for each of them.
+_NEAR, _NEWTON, _RIDGE = 400, 40, 1e-9
+# Fits of what explains failures with more likelihood than this each; how many survived ones that
+# are wrongly inside are added.
+_FITS, _UNLIKELY, _WORST = 3, 2.0, 100
+# Variables of which all pairs are tried; pairs of which two forms are, and rounds of dealing
+# failures out between two.
+_SCREENED, _IN_TWO, _ROUNDS = 6, 3, 3
+# Which of x, y, x x, x y, y y a form of one variable has, a line, and a form of two variables.
+_KINDS = np.array([[1, 0, 1, 0, 0], [1, 1, 0, 0, 0], [1, 1, 1, 1, 1]], np.float64)
+
+
+class Survived(NamedTuple):
+    """What was survived, and how it is counted."""
+
+    rows: Floats  #: (n, m) observations
+    lowest: Floats  #: (2, m) ends of the box of them, and those that two episodes came to
+    highest: Floats  #: (2, m)
+    unit: Floats  #: (m,) what a distance of 1 is for each variable
+    spread: Floats  #: (m,) their standard deviation
+
+
+# -- What forms say -------------------------------------------------------------------------------
+
+
+def forms(table: Floats, z: Floats) -> tuple[Floats, Floats]:
+    """(r, n) the forms of a table (r, SIZE) at observations (n, m), and lengths of gradients."""
+    i, j = table[:, [I, J]].T.astype(int)
+    at, to, one, other, c, b, d, p, q, r = table[:, AT:HELD, None].transpose(1, 0, 2)
+    x, y = (z.T[i] - at) * one, (z.T[j] - to) * other
+    slope = (b + 2.0 * p * x + q * y) ** 2 + (d + 2.0 * r * y + q * x) ** 2
+    return c + x * (b + p * x + q * y) + y * (d + r * y), np.sqrt(slope + FLAT)
+
+
+def distances(table: Floats, z: Floats) -> Floats:
+    """(r, n) how far observations are from forms, to first order; negative inside."""
+    form, slope = forms(table, z)
+    return -form / slope
+
+
+def are_sides(table: Floats) -> Flags:
+    """(r,) which forms are thresholds of one variable."""
+    return np.asarray((table[:, I] == table[:, J]) & (table[:, P] == 0.0))
+
+
+def inside(table: Floats, z: Floats, blur: float = BLUR) -> Flags:
+    """(r, n) which observations (n, m) are in which forms, but for a ``blur`` of bent ones."""
+    return distances(table, z) <= np.where(are_sides(table), 0.0, blur)[:, None]
+
+
+def prepared(table: Floats) -> Floats:
+    """(r, 13) forms as kernels take them: what ends first, and linear ones with a gradient of 1.
+
+    Those of two variables that say it fails are `GROWN` as bent ones are.
+    """
+    rows = table[np.argsort(table[:, SAYS] == CRASHES, kind="stable"), :HELD].copy()
+    flat = (rows[:, P:HELD] == 0.0).all(1)
+    length = np.hypot(rows[:, B], rows[:, D])
+    rows[flat, C : D + 1] /= np.where(length > 0.0, length, 1.0)[flat, None]
+    rows[flat & (rows[:, I] != rows[:, J]) & (rows[:, SAYS] == FAILS), C] += GROWN
+    return rows
+
+
+def without(table: Floats, z: Floats) -> Floats:
+    """Forms so small that none of some observations (n, m) is inside."""
+    new, most = table.copy(), forms(table, z)[0].max(1, initial=0.0)
+    new[:, C] -= np.where(most > 0.0, most + 1e-12 * (np.abs(new[:, C]) + most), 0.0)
+    return new
+
+
+def halfway(table: Floats, failures: Floats) -> Floats:
+    """Forms half as far from the innermost of the failures in each as they reached beyond."""
+    new, form = table.copy(), forms(table, failures)[0]
+    within = np.where(form > 0.0, form, np.inf).min(1, initial=np.inf)
+    new[:, C] -= 0.5 * np.where(np.isfinite(within), within, 2.0 * GROWN)
+    return new
+
+
+# -- Which forms there are ------------------------------------------------------------------------
+
+
+def explain(
+    says: int,
+    failures: Floats,
+    survived: Survived,
+    blur: Floats | None = None,
+    least: float = 0.0,
+    *,
+    bends: bool = True,
+) -> Floats:
+    """Fit the fewest forms that hold what failed, or ended.
+
+    Parameters
+    ----------
+    says : int
+        What they say.
+    failures : (k, m) ndarray
+    survived : Survived
+        What is to be outside.
+    blur : (m, 2) ndarray, optional
+        Scales by which noise blurs the lowest and the highest that was survived.
+    least : float
+        Sides that some failures are beyond by so much come first [typical steps].
+    bends : bool
+        Whether there may be bent forms.
+
+    Returns
+    -------
+    (r, SIZE) ndarray
+        Sides that explain few may go if bent forms explain the same failures; and all of them, if
+        bent forms alone explain all and are fewer.
+    """
+    blur = np.zeros((len(survived.unit), 2)) if blur is None else blur
+    stay = _sides(says, failures, survived, blur, least)
+    by, k = inside(stay, failures), len(failures)
+    if not bends or by.any(0).all() or not len(survived.rows) or not k:
+        return _counted(stay, failures)
+    strong = by.sum(1) >= max(_FEW, _SHARE * k)
+    bent, _ = _bent(says, failures[by[strong].sum(0) == 0], survived)
+    if strong.any():
+        alone, whole = _bent(says, failures, survived, len(bent) + int(strong.sum()))
+        if whole:
+            bent, strong = alone, np.zeros(len(strong), bool)
+    within = inside(bent, failures).any(0)
+    keep = [bool(s or not within[mine].all()) for s, mine in zip(strong, by, strict=True)]
+    return _counted(np.concatenate([stay[keep], bent]), failures)
+
+
+def _counted(table: Floats, failures: Floats) -> Floats:
+    table[:, HELD] = inside(table, failures).sum(1)
+    return table
+
+
+def _sides(
+    says: int, failures: Floats, survived: Survived, blur: Floats, least: float
+) -> Floats:
+    """The fewest ends of the box of what was survived that explain failures.
+
+    Of two that explain the first ones alike both hold until another failure tells them apart. A
+    failure within five scales of a blurred end may have been beyond it: then the side is where the
+    innermost of such failures was seen.
+    """
+    m, unit = len(survived.unit), survived.unit
+    table = np.empty((0, SIZE))
+    if not len(failures) or not np.isfinite(survived.lowest[0]).all():
+        return table
+    ends = np.concatenate([survived.lowest[0], survived.highest[0]])
+    far, again = (
+        np.hstack([low - failures, failures - high])
+        for low, high in zip(survived.lowest, survived.highest, strict=True)
+    )
+    with np.errstate(over="ignore"):  # of a variable that never changed it is far enough
+        beyond = far / np.tile(unit, 2)
+    perhaps = (far > -_BLURRED * blur.T.ravel()) | ((again > 0.0) & np.isfinite(again))
+    left = np.ones(len(failures), bool)
+    found: dict[int, float] = {}
+    for clear in (max(least, _BEYOND), _BEYOND):
+        while (explained := (beyond > clear) & left[:, None]).any():
+            tied, best = _most_telling(explained, perhaps, beyond)
+            left &= ~(beyond[:, best] > _BEYOND)
+            undecided = len(failures) <= _FIRST and len(tied) == 2
+            for k in tied if undecided else [best]:
+                found[k] = float(ends[k])
+    while (explained := perhaps & left[:, None]).any():
+        _, best = _most_telling(explained, perhaps, beyond)
+        left &= ~explained[:, best]
+        among = failures[explained[:, best], best % m]
+        found[best] = float(among.max() if best < m else among.min())  # the innermost
+    rows = [
+        [says, k % m, k % m, at, at, 1 / unit[k % m], 1 / unit[k % m], 0, (1, -1)[k < m], *[0] * 5]
+        for k, at in found.items()
+    ]
+    return np.array(rows, np.float64).reshape(-1, SIZE)
+
+
+def _most_telling(explained: Flags, perhaps: Flags, beyond: Floats) -> tuple[list[int], int]:
+    """Ends that explain most failures, and of them the one that may explain most, and by most."""
+    votes = explained.sum(0)
+    tied = np.flatnonzero(votes == votes.max()).tolist()
+    return tied, max(
+        tied,
+        key=lambda k: (perhaps[:, k].sum(), float(np.median(beyond[explained[:, k], k])), -k),
+    )
+
+
+def _bent(
+    says: int, failures: Floats, survived: Survived, fewer: float = np.inf
+) -> tuple[Floats, bool]:
+    """Bent forms that explain failures, and whether these are ``fewer`` and explain all of them."""
+    asked = _asked(failures, survived)
+    found: list[Floats] = []
+    groups, whole = [np.arange(len(failures))], True
+    while groups and len(asked) and len(found) < _MAX_FORMS:  # or nothing ever moved
+        if len(found) + len(groups) >= fewer:  # each takes a form at least
+            whole = False
+            break
+        groups.sort(key=len, reverse=True)
+        group = groups.pop(0)
+        F = failures[group]
+        rows, within, score = _fitted(F, asked, survived)
+        count = within.sum(1)
+        best = max(range(len(asked)), key=lambda n: (count[n], score[n]))
+        if 2 < len(group) and count[best] < len(group):
+            both, mine = _in_two(F, asked, score, survived)
+            if both > count[best]:
+                groups += [group[mine], group[~mine]]
+                continue
+        if count[best] >= min(max(2, 0.5 * len(group)), len(group)):
+            found.append(rows[best])
+            groups += [group[~within[best]]] if count[best] < len(group) else []
+            continue
+        likeliest = asked[int(score.argmax())][:2]
+        mine = _split(F[:, likeliest] / survived.spread[likeliest])
+        whole &= not mine.all()
+        groups += [] if mine.all() else [group[mine], group[~mine]]
+    table = np.array(found).reshape(-1, SIZE)
+    table[:, SAYS] = says
+    return table, whole and not groups
+
+
+def _in_two(F: Floats, asked: Ints, score: Floats, survived: Survived) -> tuple[int, Flags]:
+    """How many failures two forms of the likeliest pairs of variables explain, and which half."""
+    found = 0, np.ones(len(F), bool)
+    pairs = np.flatnonzero(asked[:, 2] == 2)
+    for n in pairs[np.argsort(-score[pairs], kind="stable")[:_IN_TWO]]:
+        mine = _split(F[:, asked[n, :2]] / survived.spread[asked[n, :2]])
+        for _ in range(_ROUNDS):
+            if mine.all() or not mine.any():
+                break
+            each = [_fitted(F[half], asked[[n]], survived) for half in (mine, ~mine)]
+            far = np.concatenate([distances(rows, F) for rows, _, _ in each])
+            explained = int((far.min(0) <= BLUR).sum())
+            found = (explained, mine) if explained > found[0] else found
+            if (mine == (far[0] <= far[1])).all():
+                break
+            mine = far[0] <= far[1]
+    return found
+
+
+def _asked(failures: Floats, survived: Survived) -> Ints:
+    """(c, 3) variables and kinds of forms that are tried: of many variables those that tell most.
+
+    A variable tells failed observations from survived ones where they have another mean or spread.
+    """
+    spread, moving = survived.spread, np.flatnonzero(survived.spread > 0.0)
+    if len(moving) > _SCREENED:
+        seen = survived.rows[:, moving]
+        square = ((failures[:, moving] - seen.mean(0)) ** 2).mean(0) / spread[moving] ** 2
+        ratio = np.maximum(square, 1e-12) / (seen.var(0) / spread[moving] ** 2 + 1e-12)
+        tells = 0.5 * (ratio - 1.0 - np.log(ratio))
+        moving = np.sort(moving[np.argsort(-tells, kind="stable")[:_SCREENED]])
+    alone = [(j, j, 0) for j in moving]
+    both = [(i, j, kind) for i, j in combinations(moving, 2) for kind in (1, 2)]
+    return np.array(alone + both, np.int64).reshape(-1, 3)
+
+
+def _split(x: Floats) -> Flags:
+    """Rows in two, from the pair that is farthest apart: which are with the first of them."""
+    far = ((x[:, None] - x[None]) ** 2).sum(2)
+    a, b = x[list(np.unravel_index(int(far.argmax()), far.shape))]
+    mine = np.ones(len(x), bool)
+    for _ in range(5):
+        mine = ((x - a) ** 2).sum(1) <= ((x - b) ** 2).sum(1)
+        if mine.all() or not mine.any():
+            return np.ones(len(x), bool)
+        a, b = x[mine].mean(0), x[~mine].mean(0)
+    return mine
+
+
+# -- One bent form --------------------------------------------------------------------------------
+
+
+def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, Floats]:
+    """(c, SIZE) the forms that are asked of failures (k, m); which are inside; and scores."""
+    rows, unit = survived.rows, survived.unit
+    scale, those = survived.spread[asked[:, :2]], F[:, asked[:, :2]].transpose(1, 0, 2)
+    at, k = those.mean(1), len(F)
+    near: dict[tuple[int, int], Ints] = {}
+    for i, j, _ in asked.tolist():
+        if (i, j) not in near:
+            near[i, j] = _near(rows[:, [i, j]], F[:, [i, j]], survived.spread[[i, j]])
+    which = np.array([near[i, j] for i, j, _ in asked.tolist()])
+    table, likelihood = np.zeros((len(asked), SIZE)), np.zeros(len(asked))
+    again = np.arange(len(asked))
+    for _ in range(_FITS):  # with what the fit before has wrongly inside
+        seen = rows[which[..., None], asked[again][:, None, :2]]
+        x = np.concatenate([those[again], seen], 1) - at[again][:, None]
+        u, v = (x / scale[again][:, None]).transpose(2, 0, 1)
+        phi = np.stack([u, v, u * u, u * v, v * v], 2) * _KINDS[asked[again, 2]][:, None]
+        w, likelihood[again] = _logistic(phi, np.append(np.ones(k), np.zeros(which.shape[1])))
+        times = unit[asked[again, :2]] / scale[again]
+        found = np.zeros((len(again), SIZE))
+        found[:, I:AT], found[:, AT:ONE] = asked[again, :2], at[again]
+        found[:, ONE:C] = 1.0 / unit[asked[again, :2]]
+        found[:, C], found[:, B:P] = w[:, 5], w[:, :2] * times
+        found[:, P], found[:, R] = w[:, 2] * times[:, 0] ** 2, w[:, 4] * times[:, 1] ** 2
+        found[:, Q] = w[:, 3] * times[:, 0] * times[:, 1]
+        form = forms(found, rows)[0]
+        most = form.max(1)  # as large as it may be with none of them inside
+        wrong = (most > 0.0) & (likelihood[again] > -_UNLIKELY * k)
+        found[:, C] -= most + 1e-12 * (np.abs(found[:, C]) + np.abs(most))
+        table[again] = found
+        again, form, which = again[wrong], form[wrong], which[wrong]
+        if not len(again) or len(rows) <= _NEAR:
+            break
+        which = np.hstack([which, np.argpartition(-form, _WORST, 1)[:, :_WORST]])
+    within = inside(table, F)
+    within[2 * (within & (distances(table, F) < 0.0)).sum(1) < within.sum(1)] = False
+    score = likelihood - 0.5 * _KINDS[asked[:, 2]].sum(1) * np.log(k + 1.0)
+    return table, within, score
+
+
+def _near(survived: Floats, F: Floats, scale: Floats) -> Ints:
+    """Of what was survived as much nearest to each failure as to others, and as much evenly."""
+    n, half = len(survived), _NEAR // 2
+    if n <= _NEAR:
+        return np.arange(n)
+    each = -(-half // len(F))
+    x, y = ((survived[:, k] - F[:, [k]]) / scale[k] for k in (0, 1))
+    far = x * x + y * y
+    near = np.argpartition(far, each, 1)[:, :each].ravel()[:half]
+    return np.append(near, np.linspace(0, n - 1, _NEAR - half).astype(int))
+
+
+def _logistic(phi: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """(c, p + 1) weights of c ridge logistic regressions, the constant last, and likelihoods.
+
+    Of features ``phi`` (c, n, p), standardised, by Newton's method. The ridge is so small that what
+    can be told apart is, and only keeps weights finite.
+    """
+    (count, n, p), mean, size = phi.shape, phi.mean(1), phi.std(1)
+    size = np.where(size > 0.0, size, 1.0)
+    X = np.concatenate([(phi - mean[:, None]) / size[:, None], np.ones((count, n, 1))], 2)
+    hold = np.full((count, p + 1), _RIDGE * n)
+    hold[:, :p][~(phi != 0.0).any(1)] = 1.0  # features that it has not
+    w, to = np.zeros((count, p + 1)), np.where(y > 0.0, -1.0, 1.0)
+
+    def cost(which: Ints, w: Floats) -> Floats:
+        t = np.einsum("cnp,cp->cn", X[which], w) * to
+        lost = np.maximum(t, 0.0) + np.log1p(np.exp(-np.abs(t)))
+        return np.asarray(lost.sum(1) + 0.5 * (hold[which] * w**2).sum(1))
+
+    going, now = np.arange(count), cost(np.arange(count), w)
+    for _ in range(_NEWTON):
+        A = X[going]
+        q = 0.5 * (1.0 + np.tanh(0.5 * np.einsum("cnp,cp->cn", A, w[going])))
+        down = np.einsum("cnp,cn->cp", A, q - y) + hold[going] * w[going]
+        curved = (A * np.maximum(q * (1.0 - q), 1e-12)[..., None]).transpose(0, 2, 1) @ A
+        curved += hold[going][:, :, None] * np.eye(p + 1)
+        step = np.linalg.solve(curved, down[..., None])[..., 0]
+        rate = np.ones(len(going))
+        for _ in range(10):
+            new = cost(going, w[going] - rate[:, None] * step)
+            worse = new > now[going] - 1e-12
+            if not worse.any():
+                break
+            rate[worse] *= 0.5
+        w[going] -= np.where(worse, 0.0, rate)[:, None] * step
+        was = now[going]
+        now[going] = np.where(worse, was, new)
+        going = going[~worse & (was - new >= 1e-4 * new + 1e-9)]
+        if not len(going):
+            break
+    likelihood = -(now - 0.5 * (hold * w**2).sum(1))
+    found = w[:, :p] / size
+    return np.column_stack([found, w[:, p] - (found * mean).sum(1)]), likelihood

@@ -1,0 +1,133 @@
+"""How a system moves: changes by ridge regression, and what was not expected of them.
+
+With features phi (`features`) and changes dz of all transitions,
+
+    W = (sum phi phi' + R)^-1 sum phi dz',
+
+where R is a weak prior in each feature's own variance. Sums of two models add up. Jumps, and what
+rests at an end of a variable, are no dynamics; outliers weigh less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from evofsm.guard.learnt.rollout import Flags, Floats, Model, crossed, features, lags, pairs
+
+# A change so many times those around it, and the typical one, is a jump; so is a row so far from
+# the median of those around it, which is none.
+JUMP = 8.0
+# Of a variable's spread, what a typical step is at least.
+FLOOR = 1e-3
+# The least variance of a feature, and what all weights are held to 0 by, of its mean square: far
+# more than rounding, so that features that did not vary yet share what they explain alike.
+_LEAST, _ALL_ALIKE = 1e-6, 1e-10
+# From so many features on BLAS would call threads, which wait where other processes are busy.
+_LARGE = 100
+
+
+def typical_step(z: Floats) -> Floats:
+    """(m,) how much variables of an episode change in a step, if nothing is known yet."""
+    size = np.abs(np.diff(z, axis=0))
+    middle = np.nanmedian(size, 0)
+    spread = np.nanmedian(np.abs(z - np.nanmedian(z, 0)), 0)
+    mean = np.nanmean(np.minimum(size, 6.0 * middle), 0)
+    return np.maximum(np.maximum(1.2 * middle, mean), FLOOR * spread) + 1e-300
+
+
+def jumps(change: Floats, unit: Floats) -> Flags:
+    """(T, m) which changes (T, m) are far larger than those around them and the typical ones."""
+    size = np.abs(change)
+    before, after = np.vstack([size[:1], size[:-1]]), np.vstack([size[1:], 0.0 * size[-1:]])
+    return np.asarray(size > JUMP * np.maximum(np.maximum(before, after), unit))
+
+
+def without_glitches(z: Floats, unit: Floats) -> Floats:
+    """Observations (T, m), NaN where a variable jumped there and back within two rows."""
+    n = len(z)
+    if n < 5:
+        return z
+    rows = np.arange(n)[:, None] + np.arange(-2, 3)
+    rows = np.abs(rows)
+    rows = np.where(rows >= n, 2 * (n - 1) - rows, rows)
+    around = np.median(z[rows], axis=1)
+    moved = np.abs(np.diff(around, axis=0, prepend=around[:1]))
+    pace = np.maximum(moved, np.vstack([moved[1:], moved[-1:]]))
+    bad = np.abs(z - around) > JUMP * np.maximum(unit, pace)
+    bad[[0, -1]] = False
+    return np.where(bad.any(1, keepdims=True), np.nan, z)
+
+
+def solve(squares: Floats, products: Floats, noisy: Floats, a: int, shy: float) -> Floats:
+    """(p, m) weights: ridge regression, about 0, in units of each feature's own variance.
+
+    Bends, products and, last of all, latest changes are asked only if they have to be, else the
+    first episodes say that one's own throttle speeds others up. The less of a variable's changes is
+    noise, its share ``noisy`` (m,), the less evidence its weights need.
+    """
+    n, size, m = max(1.0, float(squares[0, 0])), np.diag(squares), len(noisy)
+    variance = np.maximum(size - squares[0] ** 2 / n, _LEAST * size)
+    variance[0] = 0.0
+    times = np.full(len(size), shy)
+    times[: 1 + m] = times[1 + 2 * m : 1 + 2 * m + a] = 1.0
+    late = np.ones(len(size))
+    late[lags(m, a)] = 10.0
+    weights = np.empty_like(products)
+    for j, share in enumerate(noisy):
+        prior = np.where(times > 1.0, 30e-6 + share * 20.0 / n, 1e-6 + share * 0.01 / n)
+        weights[:, [j]] = ridge(squares, products[:, [j]], prior * late * variance)
+    return weights
+
+
+def ridge(squares: Floats, products: Floats, held: Floats) -> Floats:
+    """(p, k) weights that are held to 0 by ``held`` (p,), as by so many squares more."""
+    size = np.diag(squares)
+    scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
+    scaled = scale[:, None] * (squares + np.diag(held)) * scale
+    scaled[np.diag_indices_from(scaled)] += _ALL_ALIKE
+    return np.asarray(scale[:, None] * _solved(scaled, scale[:, None] * products))
+
+
+def _solved(squares: Floats, products: Floats) -> Floats:
+    """Of a positive definite matrix, halved until its parts are too small for threads."""
+    if len(squares) < _LARGE:
+        return np.asarray(np.linalg.solve(squares, products))
+    n, columns = len(squares) // 2, products.reshape(len(products), -1)
+    upper = _solved(squares[:n, :n], np.hstack([squares[:n, n:], columns[:n]]))
+    rest = np.hstack([squares[n:, n:], columns[n:]])
+    rest = rest - np.einsum("ij,jk->ik", squares[n:, :n], upper)
+    left = len(squares) - n
+    below = _solved(rest[:, :left], rest[:, left:])
+    above = upper[:, left:] - np.einsum("ij,jk->ik", upper[:, :left], below)
+    return np.vstack([above, below]).reshape(products.shape)
+
+
+def rows_of(model: Model, z: Floats, u: Floats) -> tuple[Floats, Floats, Flags]:
+    """Features (T, p) and changes (T, m) from the second of T + 2 observations on, and which count.
+
+    A row counts where its observation and those before and after were seen.
+    """
+    seen = np.isfinite(z).all(1)
+    known = seen[:-2] & seen[1:-1] & seen[2:]
+    z = np.where(np.isfinite(z), z, model.origin)
+    phi = features(model, z[1:-1], np.diff(z[:-1], axis=0), u[:-1], u[1:])
+    return phi, np.diff(z[1:], axis=0), known
+
+
+def residuals(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
+    """(T, m) what was not expected from the second of T + 2 observations on, under actions u.
+
+    It is 0 where something was not seen, nothing moved, a variable jumped, or is expected beyond
+    where it saturates and stays there: how far it would have gone is not known.
+    """
+    phi, change, known = rows_of(model, z, u)
+    to, after = z[1:-1] + phi @ model.weights, z[2:]
+    held = ((to < model.lowest) & (after <= model.lowest)) | (
+        (to > model.highest) & (after >= model.highest)
+    )
+    jumped = jumps(np.diff(z, axis=0), unit)[1:].any(1) | jumps(np.diff(z, axis=0), unit)[:-1].any(1)
+    none = ~known | (change == 0.0).all(1) | jumped
+    return np.where(held | none[:, None], 0.0, after - to)

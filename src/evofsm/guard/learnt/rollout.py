@@ -1,0 +1,537 @@
+"""A rollout: what comes of a situation amid a disturbance that was seen before, by the model.
+
+An action is taken, then what a backup (b, K) says, until the horizon or failure. With features phi
+of a situation and an action (`features`), weights W, and residuals r of a disturbance times its
+scale eta,
+
+    z' = z + clip(W'phi + eta r),    u = clip(b + K'(z - mean) / spread).
+
+Its value is the least distance to failure on the way. A situation is a row: an observation, its
+change, and the action before.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.fsm.kernels import Entry, compiled, lanes, spliced_kernel
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+#: Where the effect of an action may bend, in each dimension of a box.
+KNOTS = (-0.5, 0.0, 0.5)
+#: Products of two variables are features where there are at most so many, as of 12 variables; and
+#: so are products of actions with variables.
+MAX_PRODUCTS = 80
+# Variables, and features, of a model at most.
+_MAX_VARIABLES, _MAX_FEATURES = 64, 256
+#: What a form says of where it is above 0: that it fails there, that an episode ends by itself, or
+#: that it fails where it ends.
+FAILS, ENDS, CRASHES = 0, 1, 2
+#: The square of a gradient that is none: a form that does not change is far from 0.
+FLAT = 1e-300
+#: Bent forms of failure reach so much farther than they were learnt, and where it ends by itself
+#: begins so much farther in [typical steps].
+GROWN, SHRUNK = 1.0, 0.5
+# So much of half the range of actions a backup leaves unused for each typical step of margin.
+_RESERVE = 0.01
+# What the distance to failure counts compared with the time survived.
+_DISTANCE, _FAR = 0.05, 0.05
+# Halvings between a proposal and an action that passes.
+_HALVINGS = 4
+# Of two backups that last as long up to so much the first is taken.
+_EQUAL = 1e-9
+
+
+class Model(NamedTuple):
+    """What is expected, as kernels see it: m variables, a numbers of an action, p features."""
+
+    weights: Floats  #: (p, m) change of each variable for each feature
+    origin: Floats  #: (m,) from which variables are counted: the first observation
+    reach: Floats  #: (m,) a latest change beyond this has no sequel
+    lowest: Floats  #: (m,) where variables saturate; infinite where they do not
+    highest: Floats  #: (m,)
+    least: Floats  #: (m,) most negative ordinary change there was
+    most: Floats  #: (m,) most positive one
+    #: (r, 13) forms in one or two variables i and j: what they say, i, j, where each is counted
+    #: from, in how large a unit (its inverse), and coefficients of 1, x, y, x x, x y, y y; those
+    #: without squares with a gradient of 1
+    forms: Floats
+    #: (k, m + 2) dead ends: centre, radius in spreads, and typical steps in a spread
+    dead_ends: Floats
+    mean: Floats  #: (m,) of what backups take for their middle
+    inverse: Floats  #: (m,) and one over their spread
+    choices: int  #: number of actions; 0 where the action is a box
+
+
+class Ends(NamedTuple):
+    """How rollouts ended: for each of S situations those of K disturbances, (S K,) each."""
+
+    #: least distance to failure [typical steps]; of one that failed the steps left, negative, less 1
+    value: Floats
+    #: the share of the horizon that is survived, and a little for the distance to failure: the
+    #: least one and, where all is survived, that at the end as well, as who comes back does better
+    #: than who hovers beside failure
+    worth: Floats
+
+
+# -- What is expected -----------------------------------------------------------------------------
+
+
+def n_features(m: int, a: int, *, box: bool) -> int:
+    """Number of features: 1, z, latest change, action, action before, bends, products."""
+    return 1 + 2 * m + 2 * a + (len(KNOTS) * a if box else 0) + crossed(m, a) * m + len(pairs(m)[0])
+
+
+def refuse_too_many(m: int, a: int, *, box: bool) -> None:
+    """Raise a ValueError for more variables than can be learnt of."""
+    most = min(_MAX_VARIABLES, (_MAX_FEATURES - n_features(0, a, box=box)) // 2)
+    if m > most:
+        raise ValueError(
+            f"observation has {m} variables; with actions of {a} numbers a judge learns of at most "
+            f"{max(most, 0)}: choose those on which failure depends, as with observe= of "
+            "RevisedActions"
+        )
+
+
+def lags(m: int, a: int) -> Ints:
+    """Indices of features that say what was just before: latest changes, and the action before."""
+    return np.append(np.arange(1 + m, 1 + 2 * m), np.arange(1 + 2 * m + a, 1 + 2 * m + 2 * a))
+
+
+@cache
+def pairs(m: int) -> tuple[Ints, Ints]:
+    """Of which variables products are features."""
+    return np.triu_indices(m if m * (m + 1) // 2 <= MAX_PRODUCTS else 0)
+
+
+def crossed(m: int, a: int) -> int:
+    """Of how many numbers of an action products with variables are features."""
+    return a if a * m <= MAX_PRODUCTS else 0
+
+
+def features(model: Model, z: Floats, change: Floats, before: Floats, action: Floats) -> Floats:
+    """(T, p) features of situations and actions: ``[1, z, dz, u, u before, |u - knot|, u z, z z]``.
+
+    ``z`` and ``change`` (T, m), ``before`` and ``action`` (T, a).
+    """
+    off, m = z - model.origin, z.shape[1]
+    lagged = np.where(np.abs(change) <= model.reach, change, 0.0)
+    parts = [np.ones((len(z), 1)), off, lagged, action, before]
+    if not model.choices:
+        parts.append(np.abs(action[:, :, None] - KNOTS).reshape(len(z), -1))
+    acts = action[:, : crossed(m, action.shape[1]), None]
+    parts.append((acts * off[:, None]).reshape(len(z), -1))
+    one, other = pairs(m)
+    return np.concatenate([*parts, off[:, one] * off[:, other]], axis=1)
+
+
+@spliced_kernel
+def _fill_features(
+    model: Model,
+    z: Floats,
+    change: Floats,
+    before: Floats,
+    action: Floats,
+    scale: float,
+    found: Floats,
+) -> None:
+    """`features` of n situations and actions side by side, into ``found`` (p, n)."""
+    (m, n), a = z.shape, len(action)
+    for l in range(n):
+        found[0, l] = 1.0
+    for j in range(m):
+        origin, reach = model.origin[j], scale * model.reach[j]
+        for l in range(n):
+            found[1 + j, l] = z[j, l] - origin
+            found[1 + m + j, l] = change[j, l] if abs(change[j, l]) <= reach else 0.0
+    k = 1 + 2 * m
+    for i in range(a):
+        for l in range(n):
+            found[k + i, l] = action[i, l]
+            found[k + a + i, l] = before[i, l]
+    k += 2 * a
+    if model.choices == 0:
+        for i in range(a):
+            for knot in KNOTS:
+                for l in range(n):
+                    found[k, l] = abs(action[i, l] - knot)
+                k += 1
+    for i in range(a if a * m <= MAX_PRODUCTS else 0):
+        for j in range(m):
+            for l in range(n):
+                found[k, l] = action[i, l] * found[1 + j, l]
+            k += 1
+    for i in range(m if m * (m + 1) // 2 <= MAX_PRODUCTS else 0):
+        for j in range(i, m):
+            for l in range(n):
+                found[k, l] = found[1 + i, l] * found[1 + j, l]
+            k += 1
+
+
+@spliced_kernel
+def _expect(weights: Floats, found: Floats, move: Floats) -> None:
+    """The changes (m, n) that are expected of features (p, n), into ``move``."""
+    (p, n), m = found.shape, len(move)
+    for j in range(m):
+        for l in range(n):
+            move[j, l] = 0.0
+    fours = p - p % 4
+    for k in range(0, fours, 4):  # four at once: the sums are the same, and written less often
+        for j in range(m):
+            u, v, w, x = weights[k, j], weights[k + 1, j], weights[k + 2, j], weights[k + 3, j]
+            for l in range(n):
+                y = move[j, l] + found[k, l] * u + found[k + 1, l] * v
+                move[j, l] = y + found[k + 2, l] * w + found[k + 3, l] * x
+    for k in range(fours, p):
+        for j in range(m):
+            weight = weights[k, j]
+            for l in range(n):
+                move[j, l] += found[k, l] * weight
+
+
+@spliced_kernel
+def _follow(model: Model, policy: Floats, z: Floats, end: float, action: Floats) -> None:
+    """Actions (a, n) of a backup (a, 1 + m): saturated at ``end``, or the largest of few."""
+    (a, n), m, choices = action.shape, policy.shape[1] - 1, model.choices
+    for i in range(a):
+        for l in range(n):
+            action[i, l] = policy[i, 0]
+        for j in range(m):
+            slope, mean, inverse = policy[i, 1 + j], model.mean[j], model.inverse[j]
+            for l in range(n):
+                action[i, l] += slope * (z[j, l] - mean) * inverse
+        if choices == 0:
+            for l in range(n):
+                action[i, l] = min(end, max(-end, action[i, l]))
+    if choices > 0:
+        for l in range(n):
+            best = 0
+            for i in range(1, a):
+                if action[i, l] > action[best, l]:
+                    best = i
+            for i in range(a):
+                action[i, l] = 1.0 if i == best else 0.0
+
+
+@spliced_kernel
+def _from_centre(model: Model, s: int, z: Floats, square: Floats) -> None:
+    """Squared distances of n observations (m, n) from the centre of a dead end, in spreads."""
+    m, n = z.shape
+    for l in range(n):
+        square[l] = 0.0
+    for j in range(m):
+        centre, inverse = model.dead_ends[s, j], model.inverse[j]
+        for l in range(n):
+            x = (z[j, l] - centre) * inverse
+            square[l] += x * x
+
+
+@spliced_kernel
+def _measure(
+    model: Model, z: Floats, aside: Floats, square: Floats, far: Floats, over: Floats
+) -> None:
+    """The distance of each of n observations (m, n) to the nearest failure, into ``far`` (n,).
+
+    And to where it ends by itself, into ``over``: there it also fails if it crashes. Distances to
+    bent forms are of first order; their boundary touches what was survived in one place and lies
+    beyond the truth elsewhere, so they are `GROWN`. Dead ends of (k, n) that are set ``aside`` are
+    infinitely far. ``square`` (n,) is overwritten.
+    """
+    n = len(far)
+    for l in range(n):
+        far[l] = over[l] = np.inf
+    for s in range(len(model.forms)):
+        says, i, j = model.forms[s, 0], int(model.forms[s, 1]), int(model.forms[s, 2])
+        at, to, one, other = model.forms[s, 3:7]
+        c, b, d, p, q, r = model.forms[s, 7:13]
+        if p == 0.0 and q == 0.0 and r == 0.0:
+            for l in range(n):
+                square[l] = -(c + b * (z[i, l] - at) * one + d * (z[j, l] - to) * other)
+        else:
+            grown = GROWN if says == FAILS else 0.0
+            for l in range(n):
+                x, y = (z[i, l] - at) * one, (z[j, l] - to) * other
+                form = c + x * (b + p * x + q * y) + y * (d + r * y)
+                u, v = b + 2.0 * p * x + q * y, d + 2.0 * r * y + q * x
+                square[l] = -form / np.sqrt(u * u + v * v + FLAT) - grown
+        if says == ENDS:
+            for l in range(n):
+                over[l] = square[l] if square[l] < over[l] else over[l]
+        else:
+            if says == CRASHES:
+                for l in range(n):
+                    square[l] = max(over[l] - GROWN, square[l])
+            for l in range(n):
+                far[l] = square[l] if square[l] < far[l] else far[l]
+    for s in range(len(model.dead_ends)):
+        _from_centre(model, s, z, square)
+        radius, worth = model.dead_ends[s, -2], model.dead_ends[s, -1]
+        for l in range(n):
+            left = (np.sqrt(square[l]) - radius) * worth + aside[s, l]
+            far[l] = left if left < far[l] else far[l]
+
+
+# -- A rollout ------------------------------------------------------------------------------------
+
+
+@compiled
+def _rollout(
+    model: Model,
+    situations: Floats,
+    plan: Floats,
+    policy: Floats,
+    residuals: Floats,
+    scale: float,
+    enough: float,
+    allowed: int,
+    ends: Ends,
+) -> tuple[int, float, int]:
+    """`rollout` into ``ends``; how many are not survived, the least distance of others, and steps.
+
+    All end as soon as more than ``allowed`` did, or number 0 did, that is no disturbance at all; if
+    all are allowed, each goes on as far as it can, and dead ends in which it begins do not count:
+    who is there has to leave.
+
+    Rollouts lie side by side, so that loops over them (``l``) are vector instructions. No slice is
+    assigned: that takes a second of compiling each.
+    """
+    m, (a, _), p = len(model.origin), policy.shape, len(model.weights)
+    steps, _, each = residuals.shape
+    count = len(situations) * each
+    n = lanes(count)
+    z, change, move = np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
+    before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
+    which, survived = np.empty(n, np.int64), np.empty(n, np.int64)
+    near, far, square, over = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    aside = np.empty((len(model.dead_ends), n))
+    for l in range(n):
+        start = l // each if l < count else 0
+        for j in range(m):
+            z[j, l], change[j, l] = situations[start, j], situations[start, m + j]
+        for i in range(a):
+            before[i, l] = situations[start, 2 * m + i]
+        near[l], survived[l] = np.inf, steps if l < count else -1
+        which[l] = l % each if l < count else 0
+    for s in range(len(aside)):
+        _from_centre(model, s, z, square)
+        radius = model.dead_ends[s, -2]
+        for l in range(n):
+            within = (square[l] < radius * radius) & (allowed >= count)
+            aside[s, l] = np.inf if within else 0.0
+    lost, ended, end, took = 0, 0, 1.0 - _RESERVE * enough, 0
+    for t in range(steps):
+        took += 1
+        if t < len(plan):
+            for i in range(a):
+                for l in range(n):
+                    action[i, l] = plan[t, i]
+        else:
+            _follow(model, policy, z, end, action)
+        _fill_features(model, z, change, before, action, scale, found)
+        _expect(model.weights, found, move)
+        for j in range(m):
+            low, high = scale * model.least[j], scale * model.most[j]
+            lowest, highest = model.lowest[j], model.highest[j]
+            for l in range(n):
+                y = move[j, l] + scale * residuals[t, j, which[l]]
+                y = min(max(z[j, l] + min(max(y, low), high), lowest), highest)
+                change[j, l] = y - z[j, l]
+                z[j, l] = y
+        for i in range(a):
+            for l in range(n):
+                before[i, l] = action[i, l]
+        _measure(model, z, aside, square, far, over)
+        fails = 0
+        for l in range(n):
+            nearer = far[l] if far[l] < near[l] else near[l]
+            near[l] = nearer if survived[l] == steps else near[l]
+        for l in range(n):
+            fails += 1 if (survived[l] == steps) & (near[l] < enough) else 0
+        if fails > 0:
+            for l in range(count):
+                if survived[l] == steps and near[l] < enough:
+                    survived[l] = t
+                    lost += 1
+                    if allowed < count and which[l] == 0:
+                        lost = count
+            if lost >= count or lost > allowed:
+                break
+        for l in range(count):  # what fails at once has failed
+            if survived[l] == steps and over[l] <= -SHRUNK:
+                survived[l] = steps + 1
+                ended += 1
+        if ended > 0 and lost + ended >= count:
+            break
+    left = np.inf
+    for l in range(count):
+        share, distance = min(survived[l], steps) / steps, near[l]
+        if near[l] >= enough:
+            left = min(left, near[l])
+        ends.value[l] = near[l] if survived[l] >= steps else survived[l] - steps - 1.0
+        if survived[l] == steps:
+            distance = 0.5 * (near[l] + far[l])  # those in the end
+        ends.worth[l] = share + _DISTANCE * min(1.0, max(-1.0, _FAR * distance))
+    return lost, left, took
+
+
+_enter = Entry(_rollout)
+
+
+def rollout(
+    model: Model,
+    situations: Floats,
+    policy: Floats,
+    residuals: Floats,
+    scale: float = 1.0,
+    plan: Floats | None = None,
+) -> Ends:
+    """Roll out each of K disturbances from each of S situations.
+
+    Parameters
+    ----------
+    model : Model
+    situations : (S, 2m + a) ndarray
+    policy : (a, 1 + m) ndarray
+        A backup, which is followed after the plan.
+    residuals : (H, m, K) ndarray
+        Of each disturbance; number 0 is none at all.
+    scale : float
+        How much harder than they were disturbances are taken to be.
+    plan : (T, a) ndarray, optional
+        Actions that are taken first.
+
+    Returns
+    -------
+    Ends
+        A rollout ends where it fails or, survived, where the system ends by itself.
+    """
+    count = len(situations) * residuals.shape[2]
+    ends = Ends(np.empty(count), np.empty(count))
+    plan = np.empty((0, len(policy))) if plan is None else plan
+    _enter.call(model, situations, plan, policy, residuals, scale, 0.0, count, ends)
+    return ends
+
+
+def value_of(
+    model: Model,
+    situations: Floats,
+    policies: Floats,
+    residuals: Floats,
+    scale: float = 1.0,
+    plan: Floats | None = None,
+    enough: float = math.inf,
+) -> Floats:
+    """(S, K) how each disturbance ends from each situation under the best of some backups.
+
+    As `Ends.value` has it; once all are ``enough`` no other backup is asked.
+    """
+    found = np.full(len(situations) * residuals.shape[2], -np.inf)
+    for policy in policies:
+        np.maximum(
+            found, rollout(model, situations, policy, residuals, scale, plan).value, out=found
+        )
+        if found.min() >= enough:
+            break
+    return found.reshape(len(situations), -1)
+
+
+# -- What decides ---------------------------------------------------------------------------------
+
+#: What a search finds: the proposal passes, another action passes, none did in time, or none does.
+KEPT, CHANGED, CUT_SHORT, NOTHING_PASSES = 0, 1, 2, 3
+
+
+def search(
+    model: Model,
+    situation: Floats,
+    policies: Floats,
+    ranks: Ints,
+    residuals: Floats,
+    scale: float,
+    proposal: Floats,
+    margin: float,
+    allowed: int,
+    most: float = math.inf,
+    *,
+    lasting: bool = True,
+) -> tuple[int, Floats, int, float]:
+    """Find the action closest to a proposal after which a backup survives by the margin.
+
+    The proposal itself if one does; else what the first of ``ranks`` does that survives, and from
+    there as near to the proposal as halvings come. All disturbances have to be survived but
+    ``allowed``, and that none begins. Where no action passes it is that of the backup that lasts
+    longest, if that is asked (``lasting``). ``situation`` is (2m + a,), proposal and action are
+    (a,). After ``most`` steps of rollouts it is cut short, with the action of the first of
+    ``ranks``.
+
+    Returns what was found, the action, after which backup it passes, and the least distance to
+    failure that is then left; where nothing passes, how far apart backups are, near 0 if all last
+    as long.
+    """
+    m, a, choices = len(model.origin), len(proposal), model.choices
+    count, plan, here = residuals.shape[2], np.empty((1, a)), situation[None]
+    ends = Ends(np.empty(count), np.empty(count))
+    given, done = (residuals, scale, margin, allowed, ends), 0
+
+    def survives(action: Floats, backup: int) -> tuple[bool, float]:
+        """Whether the backup survives after the action, and by how much."""
+        nonlocal done
+        plan[0] = action
+        lost, left, took = _enter.call(model, here, plan, policies[backup], *given)
+        done += took
+        return lost <= allowed and left >= margin, left
+
+    for q in ranks:
+        if done >= most:
+            break
+        passes, left = survives(proposal, q)
+        if passes:
+            return KEPT, proposal, q, left
+    for q in ranks:
+        own = action_of(model, policies[q], situation[:m])
+        if done >= most:
+            first = action_of(model, policies[ranks[0]], situation[:m])
+            return CUT_SHORT, first, ranks[0], math.inf
+        if (own == proposal).all():
+            continue  # it was refused
+        passes, left = survives(own, q)
+        if not passes:
+            continue
+        action, off, refused, share = own, own - proposal, 0.0, 1.0
+        for _ in range(0 if choices else _HALVINGS):
+            half = 0.5 * (refused + share)
+            closer = proposal + half * off
+            passes, distance = survives(closer, q)
+            if passes:
+                action, share, left = closer, half, distance
+            else:
+                refused = half
+        return CHANGED, action, q, left
+    if not lasting:
+        return NOTHING_PASSES, proposal, ranks[0], math.inf
+    which, longest, shortest = ranks[0], -np.inf, np.inf
+    for q in ranks:
+        lasts = float(rollout(model, here, policies[q], residuals, scale).worth.mean())
+        shortest = min(shortest, lasts)
+        if lasts > longest + _EQUAL:
+            which, longest = q, lasts
+    apart = (longest - shortest) / (abs(longest) + 1e-12)
+    return NOTHING_PASSES, action_of(model, policies[which], situation[:m]), which, apart
+
+
+def action_of(model: Model, policy: Floats, z: Floats) -> Floats:
+    """(a,) what a backup (a, 1 + m) does at an observation."""
+    action, off = policy[:, 0], (z - model.mean).tolist()
+    for slope, distance, inverse in zip(policy.T[1:], off, model.inverse.tolist(), strict=True):
+        action = action + slope * distance * inverse
+    if model.choices:
+        return np.asarray(np.eye(len(action))[action.argmax()])
+    return np.minimum(np.maximum(action, -1.0), 1.0)

@@ -1,0 +1,234 @@
+"""All that a learnt judge knows, as one frozen tuple, and what rollouts take of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from evofsm.guard.learnt import failure, model
+from evofsm.guard.learnt.failure import CRASHES, FAILS, HELD, SAYS, Survived
+from evofsm.guard.learnt.rollout import Floats, Ints, Model, n_features
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Numbers of the learnt judge."""
+
+    n_disturbances: int = 10
+    n_situations: int = 32
+    n_asked: int = 3
+    n_linear: int = 3
+    n_mutants: int = 40
+    n_starts: int = 100
+    max_failures: int = 200
+    max_survived: int = 8000
+    margin: float = 3.0
+    margin_max: float = 8.0
+    margin_fade: float = 0.9
+    margin_step: float = 0.25
+    violation_rate: float = 0.001
+    caution: float = 4.0
+    caution_max: float = 2.0
+    caution_again: float = 0.44
+    horizon: int = 64
+    horizon_min: int = 32
+    horizon_max: int = 144
+    ahead: float = 1.5
+    latest: float = 0.98
+    refuted: float = 0.8
+    tries: int = 8
+    alike: float = 0.02
+    prior: float = 0.02
+    shy: float = 30.0
+    outlier: float = 4.0
+    drift: float = 30.0
+    drift_fade: float = 0.95
+    patience: int = 8
+    refused: float = 0.75
+    sooner: int = 4
+    less: float = 0.33
+    few: int = 6
+    work: float = 7e6
+    work_rate: float = 8.75e8
+
+
+class Episode(NamedTuple):
+    """An episode, or a part of a long one, as it was seen; NaN where something was not."""
+
+    observations: Floats  #: (T + 1, m)
+    actions: Floats  #: (T, a)
+    failed: bool
+    terminated: bool  #: whether it ended by itself, without failing
+    refused: Floats  #: (T,) 1 where a proposal was refused
+    lost: Floats  #: (T,) 1 where nothing helped, even without a disturbance
+    certified: Floats  #: (T,) 1 where some backup survived all
+    fails_after: float  #: steps after which what was refused fails, at the latest
+
+
+class State(NamedTuple):
+    """What was learnt, of m variables and actions of a numbers; p features."""
+
+    choices: int
+    n_episodes: int
+    n_failed: int
+    n_scanned: int  #: episodes since some failure was understood
+    n_seen: int  #: observations
+    n_moves: int  #: changes of which the typical step was learnt
+    # model
+    origin: Floats  #: (m,)
+    squares: Floats  #: (p, p)
+    products: Floats  #: (p, m)
+    unit: Floats  #: (m,) typical step
+    least: Floats  #: (m,) most negative change that was no jump
+    most: Floats
+    scale: Floats  #: (m,) of residuals; 0 as long as it is not known
+    noise: Floats
+    power: Floats
+    recent_squares: Floats
+    recent_products: Floats
+    doubt: Floats  #: (m,)
+    since: Floats  #: (m,)
+    drifts: Floats  #: (d, 3) variable, since, noticed
+    # failure
+    lowest: Floats  #: (2, m) least observations of two episodes
+    highest: Floats  #: (2, m)
+    reached: Floats  #: (m, 2) episodes that came to these ends by moving
+    survived: Floats  #: (n, m)
+    survived_in: Floats  #: (n,) episode
+    brinks: Floats  #: (b, m) last observations before failure
+    failures: Floats  #: (k, m)
+    ended: Floats  #: (e, m)
+    forms: Floats  #: (r, SIZE)
+    held: int  #: episodes in which little passed; below 0 while it is doubted
+    # dead ends
+    centres: Floats  #: (d, m)
+    radii: Floats  #: (d,)
+    counts: Floats  #: (d,)
+    # disturbances
+    windows: Floats  #: (K, L, m + a) observations and actions
+    lengths: Floats  #: (K,)
+    situations: Floats  #: (s, 2m + a)
+    # backups
+    policies: Floats  #: (b, a, 1 + m) in their order
+    linear: Floats  #: (b,) 1 of those that evolve
+    used: Floats  #: (a, 2)
+    margin: float
+    time_to_failure: float
+    believed: float
+    horizon: int
+
+    @classmethod
+    def none(cls, m: int, a: int, choices: int, settings: Settings, horizon: int | None) -> State:
+        """Before anything was learnt."""
+        p, e = n_features(m, a, box=not choices), np.empty
+        return cls(
+            choices=choices,
+            n_episodes=0,
+            n_failed=0,
+            n_scanned=0,
+            n_seen=0,
+            n_moves=0,
+            origin=np.zeros(m),
+            squares=np.zeros((p, p)),
+            products=np.zeros((p, m)),
+            unit=np.zeros(m),
+            least=np.zeros(m),
+            most=np.zeros(m),
+            scale=np.zeros(m),
+            noise=np.zeros(m),
+            power=np.zeros(m),
+            recent_squares=np.zeros((p, p)),
+            recent_products=np.zeros((p, m)),
+            doubt=np.zeros(m),
+            since=np.zeros(m),
+            drifts=e((0, 3)),
+            lowest=np.full((2, m), np.inf),
+            highest=np.full((2, m), -np.inf),
+            reached=np.zeros((m, 2)),
+            survived=e((0, m)),
+            survived_in=e(0),
+            brinks=e((0, m)),
+            failures=e((0, m)),
+            ended=e((0, m)),
+            forms=e((0, failure.SIZE)),
+            held=0,
+            centres=e((0, m)),
+            radii=e(0),
+            counts=e(0),
+            windows=e((0, 0, m + a)),
+            lengths=e(0),
+            situations=e((0, 2 * m + a)),
+            policies=e((0, a, 1 + m)),
+            linear=e(0),
+            used=np.zeros((a, 2)),
+            margin=settings.margin,
+            time_to_failure=settings.horizon / settings.ahead,
+            believed=float(settings.horizon_max),
+            horizon=settings.horizon if horizon is None else horizon,
+        )
+
+
+def sizes(state: State) -> Survived:
+    """What was survived, as forms are fitted to it."""
+    rows = np.concatenate([state.survived, state.brinks])
+    spread = state.survived.std(0) if len(state.survived) else np.zeros(len(state.origin))
+    unit = 1.25 * np.maximum(state.unit, model.FLOOR * spread + 1e-300)
+    return Survived(rows, state.lowest, state.highest, unit, spread)
+
+
+def model_of(state: State, settings: Settings, *, daring: bool = False) -> Model:
+    """What rollouts take of it; ``daring``, what is tried while it learns."""
+    m, a = len(state.origin), state.policies.shape[1]
+    spread = state.survived.std(0) if len(state.survived) else np.zeros(m)
+    inverse = 1.0 / np.where(spread > 0.0, spread, 1.0)
+    lowest = np.where(state.reached[:, 0] >= 2, state.lowest[0], -np.inf)
+    highest = np.where(state.reached[:, 1] >= 2, state.highest[0], np.inf)
+    table = state.forms
+    for row in table[failure.are_sides(table) & (table[:, SAYS] == FAILS)]:
+        (lowest if row[failure.B] < 0.0 else highest)[int(row[1])] = row[failure.B] * np.inf
+    if daring:
+        crash = table[:, SAYS] == CRASHES
+        table = table.copy()
+        table[crash] = failure.halfway(table[crash], state.failures)
+        if state.held < 0:
+            table = table[~weak(table, state.failures, settings.few)]
+    worth = 1.0 / (1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) + 1e-300) if m else 1.0
+    noisy = np.where(state.scale > 0.0, state.noise / np.where(state.power > 0.0, state.power, 1.0), 1.0)
+    weights = model.solve(state.squares, state.products, noisy.clip(1e-3, 1.0), a, settings.shy)
+    return Model(
+        weights=weights if np.isfinite(weights).all() else np.zeros_like(weights),
+        origin=state.origin,
+        reach=1.5 * np.maximum(np.abs(state.least), np.abs(state.most)),
+        lowest=lowest,
+        highest=highest,
+        least=state.least,
+        most=state.most,
+        forms=failure.prepared(table),
+        dead_ends=np.column_stack([state.centres, state.radii, np.full(len(state.radii), worth)]),
+        mean=state.survived.mean(0) if len(state.survived) else state.origin,
+        inverse=inverse,
+        choices=state.choices,
+    )
+
+
+def weak(table: Floats, failures: Floats, few: int) -> np.ndarray:
+    """(r,) which forms hardly any failure tells.
+
+    As long as there is no bent form, of sides those that explain nothing that another does not.
+    """
+    held, sides = failure.inside(table, failures), failure.are_sides(table)
+    fails = table[:, SAYS] == FAILS
+    alone = (held & (held[fails & sides].sum(0) < 2)).any(1) & sides & ~(fails & ~sides).any()
+    return fails & (held.sum(1) < few) & ~alone
+
+
+def residuals_of(state: State, known: Model, steps: int) -> Floats:
+    """(H, m, 1 + K) residuals of disturbances as they are seen now; number 0 is none."""
+    m = len(state.origin)
+    found = np.zeros((steps, m, 1 + len(state.windows)))
+    for k, (window, n) in enumerate(zip(state.windows, state.lengths.astype(int), strict=True), 1):
+        rest = model.residuals(known, window[:n, :m], window[: n - 1, m:], state.unit)[:steps]
+        found[: len(rest), :, k] = rest
+    return found
