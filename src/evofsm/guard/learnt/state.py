@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from evofsm.guard.learnt import failure, model
 from evofsm.guard.learnt.failure import CRASHES, FAILS, HELD, SAYS, Survived
 from evofsm.guard.learnt.rollout import Floats, Ints, Model, n_features
+from evofsm.store import COUNT, FLAG, Numbers
+
+# What files hold of a field: observations, what is not negative, and ends that may be infinite.
+_SEEN, _ABOVE_0 = Numbers(least=-1e30, most=1e30), Numbers(least=0.0)
+_END = Numbers(least=-np.inf, most=np.inf)
 
 
 @dataclass(frozen=True)
@@ -70,54 +75,56 @@ class Episode(NamedTuple):
 class State(NamedTuple):
     """What was learnt, of m variables and actions of a numbers; p features."""
 
-    choices: int
-    n_episodes: int
-    n_failed: int
-    n_scanned: int  #: episodes since some failure was understood
-    n_seen: int  #: observations
-    n_moves: int  #: changes of which the typical step was learnt
+    choices: Annotated[int, COUNT]  #: number of actions; 0 where the action is a box
+    n_episodes: Annotated[int, COUNT]
+    n_failed: Annotated[int, COUNT]
+    n_scanned: Annotated[int, COUNT]  #: episodes since some failure was understood
+    n_seen: Annotated[int, COUNT]  #: observations
+    n_moves: Annotated[int, COUNT]  #: changes of which the typical step was learnt
     # model
-    origin: Floats  #: (m,)
-    squares: Floats  #: (p, p)
-    products: Floats  #: (p, m)
-    unit: Floats  #: (m,) typical step
-    least: Floats  #: (m,) most negative change that was no jump
-    most: Floats
-    scale: Floats  #: (m,) of residuals; 0 as long as it is not known
-    noise: Floats
-    power: Floats
-    recent_squares: Floats
-    recent_products: Floats
-    doubt: Floats  #: (m,)
-    since: Floats  #: (m,)
-    drifts: Floats  #: (d, 3) variable, since, noticed
+    origin: Annotated[Floats, _SEEN.of("m")]
+    squares: Annotated[Floats, Numbers(("p", "p"))]
+    products: Annotated[Floats, Numbers(("p", "m"))]
+    unit: Annotated[Floats, _ABOVE_0.of("m")]  #: typical step
+    least: Annotated[Floats, Numbers(("m",))]  #: most negative change that was no jump
+    most: Annotated[Floats, Numbers(("m",))]  #: most positive one
+    scale: Annotated[Floats, _ABOVE_0.of("m")]  #: of residuals; 0 as long as it is not known
+    noise: Annotated[Floats, _ABOVE_0.of("m")]  #: mean square of residuals
+    power: Annotated[Floats, _ABOVE_0.of("m")]  #: mean square of changes
+    recent_squares: Annotated[Floats, Numbers(("p", "p"))]  #: as ``squares``, of the last episodes
+    recent_products: Annotated[Floats, Numbers(("p", "m"))]
+    doubt: Annotated[Floats, _ABOVE_0.of("m")]  #: whether a variable moves otherwise
+    since: Annotated[Floats, COUNT.of("m")]  #: and since which episode
+    drifts: Annotated[Floats, COUNT.of("drifts", 3)]  #: variable, since, noticed
     # failure
-    lowest: Floats  #: (2, m) least observations of two episodes
-    highest: Floats  #: (2, m)
-    reached: Floats  #: (m, 2) episodes that came to these ends by moving
-    survived: Floats  #: (n, m)
-    survived_in: Floats  #: (n,) episode
-    brinks: Floats  #: (b, m) last observations before failure
-    failures: Floats  #: (k, m)
-    ended: Floats  #: (e, m)
-    forms: Floats  #: (r, SIZE)
-    held: int  #: episodes in which little passed; below 0 while it is doubted
+    lowest: Annotated[Floats, _END.of(2, "m")]  #: least observations of two episodes
+    highest: Annotated[Floats, _END.of(2, "m")]
+    reached: Annotated[Floats, COUNT.of("m", 2)]  #: episodes that came to these ends by moving
+    survived: Annotated[Floats, _SEEN.of("survived", "m")]
+    survived_in: Annotated[Floats, COUNT.of("survived")]  #: episode
+    brinks: Annotated[Floats, _SEEN.of("brinks", "m")]  #: last observations before failure
+    failures: Annotated[Floats, _SEEN.of("failures", "m")]
+    ended: Annotated[Floats, _SEEN.of("ended", "m")]  #: where episodes ended without failing
+    forms: Annotated[Floats, Numbers(("forms", failure.SIZE))]  #: where it fails or ends
+    #: episodes in which little passed; below 0 while it is doubted
+    held: Annotated[int, COUNT._replace(least=-1.0)]
     # dead ends
-    centres: Floats  #: (d, m)
-    radii: Floats  #: (d,)
-    counts: Floats  #: (d,)
+    centres: Annotated[Floats, _SEEN.of("dead_ends", "m")]
+    radii: Annotated[Floats, _ABOVE_0.of("dead_ends")]
+    counts: Annotated[Floats, _ABOVE_0.of("dead_ends")]
     # disturbances
-    windows: Floats  #: (K, L, m + a) observations and actions
-    lengths: Floats  #: (K,)
-    situations: Floats  #: (s, 2m + a)
+    windows: Annotated[Floats, _SEEN.of("windows", "steps", "seen")]  #: observations and actions
+    lengths: Annotated[Floats, COUNT.of("windows")]
+    #: observation, its change, action before
+    situations: Annotated[Floats, _SEEN.of("situations", "situation")]
     # backups
-    policies: Floats  #: (b, a, 1 + m) in their order
-    linear: Floats  #: (b,) 1 of those that evolve
-    used: Floats  #: (a, 2)
-    margin: float
-    time_to_failure: float
-    believed: float
-    horizon: int
+    policies: Annotated[Floats, Numbers(("policies", "a", "policy"))]  #: in their order
+    linear: Annotated[Floats, FLAG.of("policies")]  #: 1 of those that evolve
+    used: Annotated[Floats, COUNT.of("a", 2)]
+    margin: Annotated[float, _ABOVE_0]  #: [typical steps]
+    time_to_failure: Annotated[float, _ABOVE_0]  #: [steps]
+    believed: Annotated[float, _ABOVE_0]  #: [steps]
+    horizon: Annotated[int, COUNT._replace(least=1.0, most=1e4)]  #: [steps]
 
     @classmethod
     def none(cls, m: int, a: int, choices: int, settings: Settings, horizon: int | None) -> State:
