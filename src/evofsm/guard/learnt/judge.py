@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evofsm import store
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import action_name, positive, real_array, refuse_unusable, whole
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
-from evofsm.guard.harm import Harm
-from evofsm.guard.learnt import words
+from evofsm.guard.harm import SETTINGS, Harm
+from evofsm.guard.learnt import files, words
 from evofsm.guard.learnt.learn import disturbance_scale, learn
 from evofsm.guard.learnt.rollout import (
     CUT_SHORT,
@@ -30,6 +32,7 @@ from evofsm.guard.learnt.rollout import (
 )
 from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
 from evofsm.guard.learnt.words import Remembered
+from evofsm.store import Place
 
 JUDGE_PARTS = ("margin", "backups", "dead-ends", "stretches", "regions", "rivals", "products", "lags", "doubt", "jumps", "carried", "places")
 _LONGEST = 1024
@@ -297,6 +300,11 @@ class LearntRisk(ActionJudge):
             disturbance_scale(s, self.settings), s.n_seen * self.dt,
         )
 
+    def remake(self) -> None:
+        """Decide by `state`, between two episodes."""
+        self.parts = self._made()
+        self._forget()
+
     def _forget(self):
         self._at, self._action, self._added = None, np.zeros(0), 0.0
         self._z, self._u, self._notes = [], [], []
@@ -308,17 +316,67 @@ class LearntRisk(ActionJudge):
     def sums(self, n_states):
         return {}
 
-    def save(self, path, provenance=None): ...
+    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
+        numbers, arrays = files.packed(self.state)
+        settings = {
+            **{name: getattr(self, name) for name in ("dt", "seed", "given_horizon", "n_violated")},
+            **{name: getattr(self, name).tolist() for name in ("low", "high")},
+            **{name: list(getattr(self.labels, name)) for name in ("names", "units")},
+            "n_actions": self.choices or None,
+            "without": sorted(self.without),
+            "harm": {name: getattr(self.harm, name) for name in SETTINGS},
+            "settings": asdict(self.settings),
+            "state": numbers,
+        }
+        arrays["harm"] = np.array(self.harm.outcomes, np.float64).reshape(-1, 4)
+        store.write(path, files.KIND, settings, arrays, provenance)
 
     @classmethod
-    def load(cls, path): ...
+    def load(cls, path: Place) -> Self:
+        """Read what was learnt, between two episodes; a ValueError if the file is damaged."""
+        settings, arrays = store.read(path, files.KIND)
+        with store.explained(path):
+            names = ("n_actions", "seed", "without", "names", "units")
+            given = {name: settings[name] for name in names}
+            if given["n_actions"] is None:
+                given |= {"low": settings["low"], "high": settings["high"]}
+            given |= {"horizon": settings["given_horizon"]}
+            judge = cls(settings["dt"], settings=Settings(**settings["settings"]), **given)
+            of = judge.choices, judge.settings
+            judge.state = files.unpacked(settings["state"], arrays, *of)
+            if len(judge.state.used) != judge.size:
+                raise ValueError(f"used is of other actions than those of {judge.size} numbers")
+            judge.harm = Harm.restored(settings["harm"], arrays["harm"])
+            judge.n_violated = settings["n_violated"]
+            judge.remake()
+        return judge
 
     @property
-    def told_by_experience(self):
-        return ""
+    def told_by_experience(self) -> str:
+        """What was learnt so far, in words."""
+        told = words.experience(self.state, self.remembered, self.called, self._nothing)
+        return told + words.harm(self.harm, learning=self.learning)
 
-    def told_here(self, z):
-        return "", None
+    def told_here(self, observation: Floats) -> tuple[str, Floats | None]:
+        """What was learnt of an observation, in words, and the centre of the dead end it is near.
+
+        Empty, and None, where it is in and near none, nor near a form of failures.
+        """
+        if math.isnan(observation.dot(observation)) or self.parts is None:
+            return "", None
+        near = self.settings.margin_max
+        return words.here(self.state, self.parts.model, self.called, observation, near)
+
+    @property
+    def called(self) -> Sequence[str]:
+        """Names of variables, as people read them."""
+        return self.labels.names or [f"variable {j + 1}" for j in range(self.n_variables)]
+
+    @property
+    def _nothing(self) -> str:
+        """Why nothing is refused, as long as nothing is."""
+        return words.no_threshold(self.state.n_failed, is_given=self.failed is not None)
 
 
 def _unjudged(count):

@@ -14,12 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from evofsm.guard.harm import Harm
-from evofsm.guard.learnt import library
-from evofsm.guard.learnt.dead_ends import DeadEnds
-from evofsm.guard.learnt.dynamics import MOST, MOST_SURVIVED, Dynamics
+from evofsm.guard.learnt.backups import evolved
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.learnt.regression import Drift, Recent
-from evofsm.guard.learnt.replay import Floats, Sums, crossed, n_products, pairs
+from evofsm.guard.learnt.learn import chosen, dead_ends, disturbance_scale, explained, worst
+from evofsm.guard.learnt.rollout import Floats, crossed, pairs
+from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
 
 
 def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
@@ -55,94 +54,93 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     if not judges:
         raise ValueError("judges is empty; there must be at least one to merge")
     for one in judges[1:]:
-        if not one.dynamics.choices:
-            judges[0].refuse_unfit(one.dynamics.low, one.dynamics.high)
-    if len({(one.dt, one.dynamics.choices) for one in judges}) > 1:
+        if not one.choices:
+            judges[0].refuse_unfit(one.low, one.high)
+    if len({(one.dt, one.choices) for one in judges}) > 1:
         raise ValueError("judges to merge must be of the same actions and interval")
-    told = [one for one in judges if one.dynamics.n_variables]
-    if len({one.dynamics.n_variables for one in told}) > 1:
+    told = [one for one in judges if one.n_variables]
+    if len({one.n_variables for one in told}) > 1:
         raise ValueError("judges to merge must have observed the same variables")
-    merged = copy.deepcopy(max(told or judges, key=lambda one: one.dynamics.n_episodes))
+    merged = copy.deepcopy(max(told or judges, key=lambda one: one.state.n_episodes))
     merged.start_episode(learn=False)
-    if len(told) < 2:
-        return merged
-    merged.dynamics = _merged([one.dynamics for one in told])
-    merged.n_studied = merged.dynamics.n_episodes
-    for name in ("n_violated", "n_failed", "n_scanned"):
-        setattr(merged, name, sum(getattr(one, name) for one in told))
-    for name in ("margin", "time_to_failure", "horizon"):
-        setattr(merged, name, max(getattr(one, name) for one in told))
-    merged.harm = Harm.merged([one.harm for one in told])
-    if merged.backups is not None:
-        each = library.fewer(library.KEPT, merged.dynamics.n_variables) // len(told)
-        seen = [one.situations[-each:] for one in told if len(one.situations)]
-        merged.situations = np.vstack(seen)
-        policies = merged.backups.policies[merged.backups.ranks[:2]]
-        situations, scale = merged.situations, merged.disturbance_scale
-        chosen = library.choose(merged.dynamics, situations, merged.horizon, policies, scale)
-        merged.disturbances = library.at_once(chosen)
-        random = np.random.default_rng([merged.seed, merged.n_studied])
-        merged.backups = library.at_once(merged.evolved(random))
-    merged.start_episode(learn=False)
+    if len(told) > 1:
+        merged.state = merge([one.state for one in told], merged.settings, merged.seed)
+        merged.n_violated = sum(one.n_violated for one in told)
+        merged.harm = Harm.merged([one.harm for one in told])
+        merged.remake()
     return merged
 
 
-def _merged(parts: Sequence[Dynamics]) -> Dynamics:
-    """What dynamics learnt in all, counted from the origin of the first."""
-    merged = copy.deepcopy(parts[0])
-    merged.forget_episode()
-    m, a, p, each = merged.n_variables, merged.size, len(merged.weights), MOST // len(parts)
+def merge(parts: Sequence[State], settings: Settings, seed: int) -> State:
+    """Merge what was learnt apart of systems of one kind, counted from the origin of the first."""
 
     def of(name: str) -> Floats:
         return np.array([getattr(part, name) for part in parts])
 
-    off = of("origin") - merged.origin
-    sums = Sums(*map(np.array, zip(*(part.sums for part in parts), strict=True)))
-    T = np.array([_moved(d, a, p) for d in off])
-    observed, learnt = sums.counts.T
-    known = learnt * (sums.scale[:, 0] > 0.0)
-    mean = observed @ (off + sums.mean) / observed.sum()
-    early = [rows[: int(n)] for rows, n in zip(sums.early, learnt, strict=True)]
-    merged.sums = sums._replace(
-        counts=sums.counts.sum(0),
-        squares=(T @ sums.squares @ T.transpose(0, 2, 1)).sum(0),
-        products=(T @ sums.products).sum(0),
-        mean=mean,
-        scatter=sums.scatter.sum(0) + observed @ (off + sums.mean - mean) ** 2,
-        early=np.resize(np.concatenate(early), sums.early[0].shape),
-        **{name: getattr(sums, name).min(0) for name in ("least", "low")},
-        **{name: getattr(sums, name).max(0) for name in ("most", "high")},
-        **{name: _average(getattr(sums, name), learnt) for name in ("variance", "unit", "moving")},
-        **{name: _average(getattr(sums, name), known) for name in ("scale", "noise")},
-    )
-    merged.used = of("used").sum(0)
-    merged.missed = _average(of("missed"), learnt)
-    merged.doubt_of_lags = float(_average(of("doubt_of_lags"), learnt))
-    lowest, highest = of("lowest"), of("highest")
-    merged.lowest, merged.highest = lowest.min(0), highest.max(0)
-    there = np.stack([lowest, highest], 2), np.stack([merged.lowest, merged.highest], 1)
-    merged.reached = np.where(np.isclose(*there, 1e-9, 0.0), of("reached"), 0.0).sum(0)
-    merged.n_episodes, merged.sequences, drifts = int(of("n_episodes").sum()), [], []
-    events = []
-    for part in parts:  # the latest episode of each is the latest of all
-        later, newest = merged.n_episodes - part.n_episodes, part.sequences[-merged.remembered :]
-        merged.sequences += [one._replace(episode=one.episode + later) for one in newest]
-        events.append(part.events + later * (np.arange(part.events.shape[1]) == 3 * m + 2 * a))
-        drifts += [Drift(j, since + later, noticed + later) for j, since, noticed in part.drifts]
-    merged.drifts = sorted(drifts)
-    for name in ("failures", "brinks", "ended"):
-        setattr(merged, name, np.concatenate([getattr(part, name)[-each:] for part in parts]))
+    def newest(name: str, most: int) -> Floats:
+        return np.concatenate([getattr(part, name)[-(most // len(parts)) :] for part in parts])
+
+    first, moves, n_episodes = parts[0], of("n_moves"), int(of("n_episodes").sum())
+    (p, m), a, nothing = first.products.shape, len(first.used), np.zeros_like
+    T = np.array([_moved(d, a, p) for d in of("origin") - first.origin])
+    lowest, highest = np.sort(np.vstack(of("lowest")), 0), -np.sort(-np.vstack(of("highest")), 0)
+    ends = np.stack([of("lowest")[:, 0], of("highest")[:, 0]], 2)
+    shared = np.isclose(ends, np.stack([lowest[0], highest[0]], 1), 1e-9, 0.0)
+    later = n_episodes - of("n_episodes")  # the latest episode of each is the latest of all
     survived = np.concatenate([part.survived for part in parts])
-    merged.survived = survived[:: -(-len(survived) // MOST_SURVIVED) or 1]
-    jumps = zip(*(part.jumps for part in parts), strict=True)
-    merged.jumps = [np.concatenate([rows[-each:] for rows in seen]) for seen in jumps]
-    merged.events = np.concatenate(events)
-    merged.recent, merged.latest = Recent.none(p, m, merged.n_episodes), None
-    merged.settle(failed=True)
-    known = merged.model.inverse, merged.sums.unit
-    merged.dead_ends = DeadEnds.merged([part.dead_ends for part in parts], *known)
-    merged.rebuild()
-    return merged
+    survived_in = np.concatenate([part.survived_in + k for part, k in zip(parts, later, strict=True)])
+    every = max(1, -(-len(survived) // settings.max_survived))
+    drifts = [part.drifts + [0, k, k] for part, k in zip(parts, later, strict=True)]
+    merged = max(parts, key=lambda part: part.n_episodes)._replace(
+        **{name: int(of(name).sum()) for name in ("n_failed", "n_scanned", "n_seen", "n_moves")},
+        **{name: float(of(name).max()) for name in ("margin", "time_to_failure", "believed")},
+        **{name: _average(of(name), moves) for name in ("unit", "power")},
+        **{name: _average(of(name), moves * (of("scale")[:, 0] > 0.0)) for name in _OF_RESIDUALS},
+        **{name: newest(name, settings.max_failures) for name in ("failures", "brinks", "ended")},
+        n_episodes=n_episodes,
+        origin=first.origin,
+        squares=(T @ of("squares") @ T.transpose(0, 2, 1)).sum(0),
+        products=(T @ of("products")).sum(0),
+        least=of("least").min(0),
+        most=of("most").max(0),
+        recent_squares=nothing(first.squares),
+        recent_products=nothing(first.products),
+        doubt=nothing(first.doubt),
+        since=np.full(m, float(n_episodes)),
+        drifts=np.concatenate(drifts),
+        lowest=lowest[:2],
+        highest=highest[:2],
+        reached=np.where(shared, of("reached"), 0.0).sum(0),
+        survived=survived[::every],
+        survived_in=survived_in[::every],
+        forms=first.forms[:0],
+        held=0,
+        centres=np.concatenate([part.centres for part in parts]),
+        radii=np.concatenate([part.radii for part in parts]),
+        counts=np.concatenate([part.counts for part in parts]),
+        windows=np.concatenate([part.windows for part in parts]),
+        lengths=np.concatenate([part.lengths for part in parts]),
+        situations=newest("situations", settings.n_situations),
+        used=of("used").sum(0),
+        horizon=int(of("horizon").max()),
+    )
+    merged = explained(merged, failed=True)
+    known = model_of(merged, settings)
+    merged = dead_ends(merged, known, survived[:0], _NOTHING)
+    known, scale = model_of(merged, settings), disturbance_scale(merged, settings)
+    rest, random = residuals_of(merged, known, merged.horizon), np.random.default_rng(seed)
+    harmful = worst(known, merged.situations, merged.policies[:2], rest, scale)
+    keep = chosen(harmful, settings.n_disturbances)
+    merged = merged._replace(windows=merged.windows[keep], lengths=merged.lengths[keep])
+    kept = np.ascontiguousarray(rest[:, :, [0, *(1 + k for k in keep)]])
+    given = known, merged.situations, kept, scale, settings, random
+    policies, linear = evolved(merged.policies, merged.linear, *given)
+    return merged._replace(policies=policies, linear=linear)
+
+
+_OF_RESIDUALS = ("scale", "noise")
+_NONE = np.empty(0)
+_NOTHING = Episode(_NONE, _NONE, False, False, _NONE, _NONE, _NONE, 0.0)
 
 
 def _average(rows: Floats, weights: Floats) -> Floats:
@@ -153,7 +151,7 @@ def _moved(d: Floats, a: int, p: int) -> Floats:
     """(p, p) what features become where variables are larger by ``d`` (m,)."""
     m, T = len(d), np.eye(p)
     T[1 : 1 + m, 0] = d
-    products = T[p - n_products(m, a) :]
+    products = T[p - crossed(m, a) * m - len(pairs(m)[0]) :]
     for k in range(crossed(m, a)):
         products[k * m : (k + 1) * m, 1 + 2 * m + k] = d
     for row, i, j in zip(products[crossed(m, a) * m :], *pairs(m), strict=True):

@@ -164,7 +164,7 @@ class State(NamedTuple):
             centres=e((0, m)),
             radii=e(0),
             counts=e(0),
-            windows=e((0, 0, m + a)),
+            windows=e((0, settings.horizon_max + 2, m + a)),
             lengths=e(0),
             situations=e((0, 2 * m + a)),
             policies=e((0, a, 1 + m)),

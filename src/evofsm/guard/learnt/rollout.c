@@ -1,6 +1,6 @@
-/* The learnt judge: replay.py, and of judge.py what a frozen guard asks of it, in C.
+/* The learnt judge: rollout.py, and of judge.py what a frozen guard asks of it, in C.
 
-   Replays of all disturbances lie side by side: loops over them (l) have EVOFSM_LANES turns. Sums
+   Rollouts of all disturbances lie side by side: loops over them (l) have EVOFSM_LANES turns. Sums
    are in the order of Python, so that a compiler that contracts nothing comes to the same bits. */
 /* ==== state ==== */
   /* Observation, its change, and the action before: of the decision before, and now. */
@@ -8,25 +8,19 @@
   double action[EVOFSM_NUMBERS]; /* what was done there */
   int has_past, is_placed;       /* whether there is such a decision; and whether one is now */
   int ranks[EVOFSM_BACKUPS];     /* backups, those first that passed last */
-  int done;                      /* steps of replays in this search */
-  /* Room of a replay. */
+  int done;                      /* steps of rollouts in this search */
+  int ignores;                   /* whether dead ends do not count */
+  /* Room of a rollout. */
   double z[EVOFSM_VARIABLES][EVOFSM_LANES], change[EVOFSM_VARIABLES][EVOFSM_LANES];
-  double move[EVOFSM_VARIABLES][EVOFSM_LANES], after[EVOFSM_VARIABLES][EVOFSM_LANES];
+  double move[EVOFSM_VARIABLES][EVOFSM_LANES];
   double before[EVOFSM_NUMBERS][EVOFSM_LANES], now[EVOFSM_NUMBERS][EVOFSM_LANES];
   double found[EVOFSM_FEATURES][EVOFSM_LANES];
   double near[EVOFSM_LANES], far[EVOFSM_LANES], value[EVOFSM_LANES], worth[EVOFSM_LANES];
   double over[EVOFSM_LANES], square[EVOFSM_LANES];
   int survived[EVOFSM_LANES];
-#if EVOFSM_PLACED
-  double rest[EVOFSM_VARIABLES][EVOFSM_LANES];
-  int clock[EVOFSM_LANES];
-#endif
 #if EVOFSM_DEAD_ENDS > 0
   double aside[EVOFSM_DEAD_ENDS][EVOFSM_LANES];
-  double away[EVOFSM_DEAD_ENDS]; /* how far each is from here */
-  int is_left_out[EVOFSM_DEAD_ENDS], order[EVOFSM_DEAD_ENDS];
 #endif
-  int playing[EVOFSM_LANES]; /* the step of each disturbance; -1: it waits */
 /* ==== source ==== */
 #define M EVOFSM_VARIABLES
 #define A EVOFSM_NUMBERS
@@ -34,7 +28,7 @@
 #define L EVOFSM_LANES
 #define K DISTURBANCES
 
-/* -- Actions: encode and decode of dynamics.py ------------------------------------------------- */
+/* -- Actions: encode and decode of judge.py ---------------------------------------------------- */
 
 static void encode(const double action[EVOFSM_ACTIONS], double inner[A]) {
   int i;
@@ -62,9 +56,9 @@ static void decode(const double inner[A], double action[EVOFSM_ACTIONS]) {
 #endif
 }
 
-/* -- A replay ----------------------------------------------------------------------------------- */
+/* -- A rollout ---------------------------------------------------------------------------------- */
 
-/* fill_features: those of situations and actions side by side, into s->found. */
+/* _fill_features: those of situations and actions side by side, into s->found. */
 static void fill_features(evofsm_state *s, double harder) {
   static const double knots[3] = {-0.5, 0.0, 0.5};
   int i, j, k, l;
@@ -112,7 +106,7 @@ static void fill_features(evofsm_state *s, double harder) {
   }
 }
 
-/* expect: the changes that are expected of features, into s->move. */
+/* _expect: the changes that are expected of features, into s->move. */
 static void expect(evofsm_state *s) {
   int j, k, l;
   for (j = 0; j < M; j++) {
@@ -130,7 +124,7 @@ static void expect(evofsm_state *s) {
   }
 }
 
-/* _follow_policy: actions of a linear policy, saturated at end, or the largest of few. */
+/* _follow: actions of a backup, saturated at end, or the largest of few. */
 static void follow_policy(evofsm_state *s, const double policy[A][1 + M], double end) {
   int i, j, l;
   for (i = 0; i < A; i++) {
@@ -179,168 +173,68 @@ static void from_centre(evofsm_state *s, int end) {
 }
 #endif
 
-#if REGIONS + ENDINGS > 0
-/* _to_region: distances to a region, into s->square. */
-static void to_region(evofsm_state *s, const double row[12]) {
-  const double *one = s->z[(int)row[0]], *other = s->z[(int)row[1]];
-  const double c = row[6], b = row[7], d = row[8], p = row[9], q = row[10], r = row[11];
-  int l;
-  for (l = 0; l < L; l++) {
-    const double x = (one[l] - row[2]) * row[4], y = (other[l] - row[3]) * row[5];
-    const double form = c + x * (b + p * x + q * y) + y * (d + r * y);
-    const double u = b + 2.0 * p * x + q * y, v = d + 2.0 * r * y + q * x;
-    s->square[l] = -form / sqrt(u * u + v * v + FLAT);
-  }
-}
-#endif
-
-/* _distances: to the nearest failure, into s->far, and to where it ends by itself, into s->over. */
+/* _measure: distances to the nearest failure, into s->far, and to where it ends by itself, into
+   s->over. */
 static void measure(evofsm_state *s) {
   int f, l;
   for (l = 0; l < L; l++) {
     s->far[l] = s->over[l] = INFINITY;
   }
-#if ENDINGS > 0
-  for (f = 0; f < ENDINGS; f++) {
-    to_region(s, endings[f]);
-    for (l = 0; l < L; l++) {
-      s->over[l] = s->square[l] < s->over[l] ? s->square[l] : s->over[l];
-    }
-  }
-#endif
-#if CRASHES > 0
-  for (f = 0; f < CRASHES; f++) {
-    to_region(s, crashes[f]);
-    for (l = 0; l < L; l++) {
-      const double left = greater(s->over[l] - GROWN, s->square[l]);
-      s->far[l] = left < s->far[l] ? left : s->far[l];
-    }
-  }
-#endif
-#if THRESHOLDS > 0
-  for (f = 0; f < THRESHOLDS; f++) {
-    const double sign = thresholds[f][1], threshold = thresholds[f][2], worth = thresholds[f][3];
-    const double *z = s->z[(int)thresholds[f][0]];
-    for (l = 0; l < L; l++) {
-      const double left = sign * (threshold - z[l]) * worth;
-      s->far[l] = left < s->far[l] ? left : s->far[l];
-    }
-  }
-#endif
-#if REGIONS > 0
-  for (f = 0; f < REGIONS; f++) {
-    to_region(s, regions[f]);
-    for (l = 0; l < L; l++) {
-      const double left = s->square[l] - GROWN;
-      s->far[l] = left < s->far[l] ? left : s->far[l];
-    }
-  }
-#endif
-#if EVOFSM_DEAD_ENDS > 0
-  for (f = 0; f < EVOFSM_DEAD_ENDS; f++) {
-    if (!s->is_left_out[f]) {
-      from_centre(s, f);
+#if FORMS > 0
+  for (f = 0; f < FORMS; f++) {
+    const double says = forms[f][0], *z = s->z[(int)forms[f][1]], *other_z = s->z[(int)forms[f][2]];
+    const double at = forms[f][3], to = forms[f][4], one = forms[f][5], other = forms[f][6];
+    const double c = forms[f][7], b = forms[f][8], d = forms[f][9];
+    const double p = forms[f][10], q = forms[f][11], r = forms[f][12];
+    if (p == 0.0 && q == 0.0 && r == 0.0) {
       for (l = 0; l < L; l++) {
-        const double off = sqrt(s->square[l]) - dead_ends[f][M];
-        const double left = off * dead_ends[f][M + 1] + s->aside[f][l];
+        s->square[l] = -(c + b * (z[l] - at) * one + d * (other_z[l] - to) * other);
+      }
+    } else {
+      const double grown = says == FAILS ? GROWN : 0.0;
+      for (l = 0; l < L; l++) {
+        const double x = (z[l] - at) * one, y = (other_z[l] - to) * other;
+        const double form = c + x * (b + p * x + q * y) + y * (d + r * y);
+        const double u = b + 2.0 * p * x + q * y, v = d + 2.0 * r * y + q * x;
+        s->square[l] = -form / sqrt(u * u + v * v + FLAT) - grown;
+      }
+    }
+    for (l = 0; l < L; l++) {
+      if (says == ENDS) {
+        s->over[l] = s->square[l] < s->over[l] ? s->square[l] : s->over[l];
+      } else {
+        const double crash = greater(s->over[l] - GROWN, s->square[l]);
+        const double left = says == CRASHES ? crash : s->square[l];
         s->far[l] = left < s->far[l] ? left : s->far[l];
       }
     }
   }
 #endif
-}
-
-#if EVOFSM_PLACED
-/* _wait: disturbances that begin only somewhere; and what is not expected now, into s->rest. */
-static void wait(evofsm_state *s) {
-  int j, l;
-  for (l = 0; l < K; l++) {
-    if (place[l][0] >= 0.0) {
-      const int i = (int)place[l][0], begins = (int)place[l][3], over = (int)place[l][4];
-      const int there = place[l][1] * (s->z[i][l] + s->move[i][l] - place[l][2]) >= 0.0;
-      int plays;
-      if (s->clock[l] >= over && there) {
-        s->clock[l] = begins;
-      }
-      plays = s->clock[l] < over && (s->clock[l] != begins || there);
-      s->playing[l] = plays ? s->clock[l] : -1;
-      s->clock[l] += plays;
-    }
-  }
-  for (j = 0; j < M; j++) {
+#if EVOFSM_DEAD_ENDS > 0
+  for (f = 0; f < (s->ignores ? 0 : EVOFSM_DEAD_ENDS); f++) {
+    from_centre(s, f);
     for (l = 0; l < L; l++) {
-      s->rest[j][l] = s->playing[l] >= 0 ? residuals[s->playing[l]][j][l] : 0.0;
+      const double off = sqrt(s->square[l]) - dead_ends[f][M];
+      const double left = off * dead_ends[f][M + 1] + s->aside[f][l];
+      s->far[l] = left < s->far[l] ? left : s->far[l];
     }
   }
-}
 #endif
-
-#if JUMPS
-/* Where variables that jump now land, into s->after. */
-static void jump(evofsm_state *s) {
-  int i, j, l;
-  for (l = 0; l < K; l++) {
-    for (j = 0; j < M; j++) {
-      if (jump_at[l][j] >= 0.0 && jump_at[l][j] == (double)s->playing[l]) {
-        double y = jump_to[l][j];
-        for (i = 0; i < M; i++) {
-          const double low = jump_from[l][j][i][0], high = jump_from[l][j][i][1];
-          y += jump_slope[l][j][i] * lesser(greater(s->z[i][l], low), high);
-        }
-        s->after[j][l] = lesser(greater(y, landing[l][j][0]), landing[l][j][1]);
-      }
-    }
-  }
 }
-#endif
 
-/* A step of a replay: what is expected, what disturbs it, and where that leads. */
+/* A step of a rollout: what is expected, what disturbs it, and where that leads. */
 static void step(evofsm_state *s, int t, double harder) {
   int i, j, l;
   fill_features(s, harder);
   expect(s);
-  for (l = 0; l < L; l++) {
-    s->playing[l] = t;
-  }
-#if EVOFSM_PLACED
-  wait(s);
-#endif
   for (j = 0; j < M; j++) {
-    const double low = least[j], high = most[j], small = harder * low, large = harder * high;
-    const double *z = s->z[j];
-    double *move = s->move[j], *after = s->after[j];
-#if EVOFSM_PLACED
-    const double *rest = s->rest[j];
-#else
-    const double *rest = residuals[t][j];
-#endif
-    if (drifted[j] > 0.0) {
-      for (l = 0; l < L; l++) {
-        move[l] = lesser(greater(move[l], low), high);
-      }
-    }
-    if (drifted[j] < 0.0) {
-      for (l = 0; l < L; l++) {
-        const double down = lesser(small, greater(move[l], FARTHER * low));
-        const double up = greater(large, lesser(move[l], FARTHER * high));
-        const double y = move[l] + harder * rest[l];
-        after[l] = z[l] + lesser(greater(y, down), up);
-      }
-    } else {
-      for (l = 0; l < L; l++) {
-        const double y = move[l] + harder * rest[l];
-        after[l] = z[l] + lesser(greater(y, small), large);
-      }
-    }
-  }
-#if JUMPS
-  jump(s);
-#endif
-  for (j = 0; j < M; j++) {
+    const double low = harder * least[j], high = harder * most[j];
     for (l = 0; l < L; l++) {
-      const double y = lesser(greater(s->after[j][l], lowest[j]), highest[j]);
-      s->change[j][l] = y - s->z[j][l];
-      s->z[j][l] = y;
+      const double y = s->move[j][l] + harder * residuals[t][j][l];
+      const double to = s->z[j][l] + lesser(greater(y, low), high);
+      const double after = lesser(greater(to, lowest[j]), highest[j]);
+      s->change[j][l] = after - s->z[j][l];
+      s->z[j][l] = after;
     }
   }
   for (i = 0; i < A; i++) {
@@ -350,10 +244,10 @@ static void step(evofsm_state *s, int t, double harder) {
   }
 }
 
-/* _replay, of one situation: an action first, if there is one, then a policy. Returns how many
+/* _rollout, of one situation: an action first, if there is one, then a backup. Returns how many
    disturbances are not survived; into left the least distance of the others. At most STEPS steps. */
-static int replay(evofsm_state *s, const double *action, const double policy[A][1 + M],
-                  double harder, double enough, int allowed, double *left) {
+static int rollout(evofsm_state *s, const double *action, const double policy[A][1 + M],
+                   double harder, double enough, int allowed, double *left) {
   const double end = 1.0 - RESERVE * enough;
   int i, j, l, t, lost = 0, ended = 0;
   for (l = 0; l < L; l++) {
@@ -366,9 +260,6 @@ static int replay(evofsm_state *s, const double *action, const double policy[A][
     }
     s->near[l] = INFINITY;
     s->survived[l] = l < K ? STEPS : -1;
-#if EVOFSM_PLACED
-    s->clock[l] = 0;
-#endif
   }
 #if EVOFSM_DEAD_ENDS > 0
   for (i = 0; i < EVOFSM_DEAD_ENDS; i++) { /* those in which it begins may not count */
@@ -442,7 +333,7 @@ static int replay(evofsm_state *s, const double *action, const double policy[A][
 
 /* Whether a backup survives after an action, by the margin. */
 static int passes(evofsm_state *s, const double action[A], int backup, double *left) {
-  const int lost = replay(s, action, policies[backup], SCALE, MARGIN, ALLOWED, left);
+  const int lost = rollout(s, action, policies[backup], SCALE, MARGIN, ALLOWED, left);
   return lost <= ALLOWED && *left >= MARGIN;
 }
 
@@ -477,7 +368,7 @@ static int are_same(const double one[A], const double other[A]) {
   return same;
 }
 
-/* Mean of how well a replay ended, summed as NumPy sums up to 128 numbers. */
+/* Mean of how well rollouts ended, summed as NumPy sums up to 128 numbers. */
 static double mean_worth(const evofsm_state *s) {
   double sums[8], total = 0.0;
   int k = 0, l;
@@ -498,7 +389,7 @@ static double mean_worth(const evofsm_state *s) {
   return total / (double)K;
 }
 
-/* From the proposal (inner) to the action: at most 2 ASKED + HALVINGS replays, or 3 ASKED. */
+/* From the proposal (inner) to the action: at most 2 ASKED + HALVINGS rollouts, or 3 ASKED. */
 static int search(evofsm_state *s, const double proposal[A], double action[A], int *backup,
                   double *left) {
   double own[A], closer[A], refused = 0.0, share = 1.0, longest = -INFINITY, distance;
@@ -547,7 +438,7 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
   }
   *backup = s->ranks[0];
   for (r = 0; r < ASKED; r++) {
-    replay(s, NULL, policies[s->ranks[r]], SCALE, 0.0, K, &distance);
+    rollout(s, NULL, policies[s->ranks[r]], SCALE, 0.0, K, &distance);
     distance = mean_worth(s);
     if (distance > longest + EQUAL) {
       *backup = s->ranks[r];
@@ -559,66 +450,30 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
   return EVOFSM_NOTHING_PASSES;
 }
 
-#if EVOFSM_DEAD_ENDS > 0
-/* Whether a backup survives after an action with so many of the nearest dead ends alone. */
-static int passes_amid(evofsm_state *s, const double action[A], int backup, int nearest) {
+/* passes_without: the backup after which a proposal passes if dead ends do not count; -1: none. */
+static int passes_without(evofsm_state *s, const double proposal[A]) {
   double left;
-  int k;
-  for (k = 0; k < EVOFSM_DEAD_ENDS; k++) {
-    s->is_left_out[s->order[k]] = k >= nearest;
+  int r, after = -1;
+  s->ignores = 1;
+  for (r = 0; r < ASKED && after < 0; r++) {
+    after = passes(s, proposal, s->ranks[r], &left) ? s->ranks[r] : -1;
   }
-  return passes(s, action, backup, &left);
+  s->ignores = 0;
+  return after;
 }
-
-/* which_refuses: the dead end for which a proposal does not pass that would else, and after which
-   backup; -1: none. At most ASKED replays, and log2 of the number of dead ends. */
-static void find_dead_end(evofsm_state *s, const double proposal[A], evofsm_decision *out) {
-  int f, j, k, r;
-  for (f = 0; f < EVOFSM_DEAD_ENDS; f++) {
-    double square = 0.0;
-    for (j = 0; j < M; j++) {
-      const double x = (s->here[j] - dead_ends[f][j]) * inverse[j];
-      square += x * x;
-    }
-    s->away[f] = (sqrt(square) - dead_ends[f][M]) * dead_ends[f][M + 1];
-    for (k = f; k > 0 && s->away[s->order[k - 1]] > s->away[f]; k--) {
-      s->order[k] = s->order[k - 1];
-    }
-    s->order[k] = f;
-  }
-  for (r = 0; r < ASKED && out->dead_end < 0; r++) {
-    if (passes_amid(s, proposal, s->ranks[r], 0)) {
-      int low = 0, high = EVOFSM_DEAD_ENDS;
-      while (high - low > 1) {
-        const int between = (low + high) / 2;
-        if (passes_amid(s, proposal, s->ranks[r], between)) {
-          low = between;
-        } else {
-          high = between;
-        }
-      }
-      out->dead_end = s->order[high - 1];
-      out->backup_near = s->ranks[r];
-    }
-  }
-  for (f = 0; f < EVOFSM_DEAD_ENDS; f++) {
-    s->is_left_out[f] = 0;
-  }
-}
-#endif
 
 /* -- The judge: LearntRisk ---------------------------------------------------------------------- */
 
 /* _foresee: disturbances not survived after an action, under the best of some backups; -1: it fails
-   without any. At most JUDGED replays. */
+   without any. At most ASKED rollouts. */
 static int foresee(evofsm_state *s, const double action[A]) {
   double best[L], left;
   int l, r, count = 0, all = 0;
   for (l = 0; l < K; l++) {
     best[l] = -INFINITY;
   }
-  for (r = 0; r < JUDGED && !all; r++) {
-    replay(s, action, policies[s->ranks[r]], 1.0, 0.0, K, &left);
+  for (r = 0; r < ASKED && !all; r++) {
+    rollout(s, action, policies[s->ranks[r]], 1.0, 0.0, K, &left);
     all = 1;
     count = 0;
     for (l = 0; l < K; l++) {
@@ -633,9 +488,6 @@ static int foresee(evofsm_state *s, const double action[A]) {
 /* _here: where one is; what was not seen is taken to have gone on as before. */
 static void situate(evofsm_state *s) {
   int i, j;
-#if NOISY
-  int k;
-#endif
   s->is_placed = 1;
   for (j = 0; j < M; j++) {
     s->is_placed &= s->has_past || !isnan(s->observation[j]);
@@ -651,36 +503,6 @@ static void situate(evofsm_state *s) {
   for (j = 0; j < M; j++) {
     s->here[j] = isnan(s->here[j]) ? s->at[j] + s->at[M + j] : s->here[j];
   }
-#if NOISY
-  for (j = 0; j < M; j++) { /* corrected of regression.py */
-    s->z[j][0] = s->at[j];
-    s->change[j][0] = s->at[M + j];
-  }
-  for (i = 0; i < A; i++) {
-    s->before[i][0] = s->at[2 * M + i];
-    s->now[i][0] = s->action[i];
-  }
-  for (j = 0; j < M; j++) { /* the other lanes are not looked at, but hold numbers */
-    for (i = 1; i < L; i++) {
-      s->z[j][i] = s->z[j][0];
-      s->change[j][i] = s->change[j][0];
-    }
-  }
-  for (k = 0; k < A; k++) {
-    for (i = 1; i < L; i++) {
-      s->before[k][i] = s->before[k][0];
-      s->now[k][i] = s->now[k][0];
-    }
-  }
-  fill_features(s, 1.0);
-  expect(s);
-  for (j = 0; j < M; j++) {
-    const double expected = s->at[j] + s->move[j][0];
-    const double missed = s->here[j] - lesser(greater(expected, lowest[j]), highest[j]);
-    const double gain = fabs(missed) > jump_of[j] ? 1.0 : gains[j];
-    s->here[j] += (gain - 1.0) * missed;
-  }
-#endif
   for (j = 0; j < M; j++) {
     s->here[M + j] = s->here[j] - s->at[j];
   }
@@ -693,11 +515,7 @@ static void forget(evofsm_state *s) {
   for (i = 0; i < EVOFSM_BACKUPS; i++) {
     s->ranks[i] = backup_ranks[i];
   }
-#if EVOFSM_DEAD_ENDS > 0
-  for (i = 0; i < EVOFSM_DEAD_ENDS; i++) {
-    s->is_left_out[i] = 0;
-  }
-#endif
+  s->ignores = 0;
 }
 
 static void start_revising(evofsm_state *s) { (void)s; }
@@ -718,11 +536,9 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   }
   encode(s->proposal, proposal);
   out->reason = search(s, proposal, action, &out->backup, &out->left);
-#if EVOFSM_DEAD_ENDS > 0
-  if (out->reason == EVOFSM_CHANGED || out->reason == EVOFSM_NOTHING_PASSES) {
-    find_dead_end(s, proposal, out);
+  if (EVOFSM_DEAD_ENDS > 0 && out->reason != EVOFSM_KEPT && out->reason != EVOFSM_CUT_SHORT) {
+    out->backup_near = passes_without(s, proposal);
   }
-#endif
   for (r = 0; s->ranks[r] != out->backup; r++) { /* at most EVOFSM_BACKUPS: it is one of them */
   }
   for (; r > 0; r--) { /* what passed now is asked first the next time */
