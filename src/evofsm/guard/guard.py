@@ -343,12 +343,12 @@ class Guard:
                 f"{self.actions.n_actions}"
             )
         if isinstance(asked, LearntRisk):
-            if bool(asked.dynamics.choices) != isinstance(self.actions, Choices):
+            if bool(asked.choices) != isinstance(self.actions, Choices):
                 raise ValueError(
                     "the judge was made for a range of actions, but the guard has n_actions, or "
                     "the other way round"
                 )
-            asked.dynamics.failed = failed
+            asked.failed = failed
             warm_judge()
         if machine is not None:
             warm_machine(limited=machine.max_states is not None)
@@ -575,9 +575,8 @@ class Guard:
             raise ValueError(f"observation has {len(z)} variables; it must have {known}{named}")
         if told := self.beyond(z):
             raise ValueError(" ".join(told))
-        if (judge := self._observing) and len(z) != judge.dynamics.n_variables:
-            learnt = judge.dynamics
-            refuse_too_many(len(z), learnt.size, box=not learnt.choices)
+        if (judge := self._observing) and len(z) != judge.n_variables:
+            refuse_too_many(len(z), judge.size, box=not judge.choices)
         self._count_missing(z)
         return z
 

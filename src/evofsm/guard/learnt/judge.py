@@ -1,4 +1,10 @@
-"""What decides: an action passes if after it some backup survives all that is remembered."""
+"""What decides: an action passes if after it some backup survives all that is remembered.
+
+A predictive safety filter (Wabersich & Zeilinger, "A predictive safety filter for learning-based
+control of constrained nonlinear dynamical systems", Automatica 2021), with model, failure,
+disturbances and backups learnt after each episode (`learn`). Within an episode only its rows, the
+situation and the margin change.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +22,7 @@ from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import action_name, positive, real_array, refuse_unusable, whole
+from evofsm.guard.actions import Mask
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import files, words
@@ -28,14 +35,26 @@ from evofsm.guard.learnt.rollout import (
     Model,
     pairs,
     search,
+    survives,
     value_of,
 )
 from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
 from evofsm.guard.learnt.words import Remembered
 from evofsm.store import Place
 
-JUDGE_PARTS = ("margin", "backups", "dead-ends", "stretches", "regions", "rivals", "products", "lags", "doubt", "jumps", "carried", "places")
+#: Parts that can be left out, to see what each is worth.
+JUDGE_PARTS: tuple[str, ...] = (
+    *("margin", "backups", "dead-ends", "stretches", "regions", "rivals", "products", "lags"),
+    *("jumps",),
+)
+# Rows of an episode that are learnt from before it ends.
 _LONGEST = 1024
+# No horizon that is given has more steps: memory and the time of a decision grow with it.
+_MAX_STEPS = 10_000
+# Actions among which one is chosen, at most.
+_MAX_CHOICES = 1_000
+# What a backup says to an action that is not allowed.
+_NEVER = -1e300
 
 
 class Parts(NamedTuple):
@@ -43,102 +62,244 @@ class Parts(NamedTuple):
 
     model: Model
     daring: Model  #: while it learns
-    residuals: Floats
-    scale: float
-    exposure: float
+    residuals: Floats  #: (H, m, 1 + K) of disturbances; number 0 is none
+    scale: float  #: how much harder than they were disturbances are taken to be
+
+    @classmethod
+    def of(cls, state: State, settings: Settings) -> Parts | None:
+        """Make them; None as long as there are no backups."""
+        if not len(state.policies):
+            return None
+        model = model_of(state, settings)
+        daring = model_of(state, settings, daring=True)
+        rest = residuals_of(state, model, state.horizon)
+        return cls(model, daring, rest, disturbance_scale(state, settings))
 
 
 class LearntRisk(ActionJudge):
-    def __init__(self, dt, low=None, high=None, *, n_actions=None, horizon=None, seed=0, without=(), names=(), units=(), settings=Settings()):
+    """Judges actions by what it has learnt of how the system moves and fails.
+
+    It is told neither what variables mean nor how they move. Before the first failure of an episode
+    there is nothing that it could prevent, and all is kept; in the first episode also where failure
+    was given as a function.
+
+    It learns of at most 64 variables, fewer where actions have more than 25 numbers, and expects
+    products of two up to 12 variables, of actions with variables up to 80 such products.
+
+    Parameters
+    ----------
+    dt : float
+        Time between two decisions [s].
+    low, high : float or (d,) array_like, optional
+        Range of the action, or of each of its components.
+    n_actions : int, optional
+        Number of actions, where an action is an index from 0.
+    horizon : float, optional
+        How far it looks ahead [s]. Without it, half as far again as it takes to fail where failure
+        can no longer be avoided, from 32 to 144 steps.
+    seed : int
+        Of the draws with which backups evolve and situations are chosen.
+    without : sequence of str
+        Parts of `JUDGE_PARTS` that are left out.
+    names, units : sequence of str
+        Of the variables, for what people read; nothing is decided by them.
+    settings : Settings, optional
+        Its numbers.
+
+    Raises
+    ------
+    ValueError
+        If ``dt`` is not positive and finite, ``without`` names no part, or not one of a range and
+        ``n_actions`` is given.
+
+    Notes
+    -----
+    A search is cut short after as many steps of rollouts as take a tenth of the interval, of three
+    at least; its reason says so. They are counted, not timed: it comes out the same again.
+
+    The risk of an action is the probability that within the horizon something begins that no
+    backup survives after it: ``1 - exp(-unsurvived / exposure * horizon)``, from the number of
+    remembered disturbances that are not survived and the time in which they were seen; 1 where not
+    even an undisturbed future is survived. Its 90 % interval is that of a Poisson count (Garwood
+    1936); it ends at 1 where all disturbances that it may remember are unsurvived, as those that it
+    forgot may be, too. It speaks of what was seen: what never began is not in it.
+
+    The margin follows adaptive conformal inference (Gibbs & Candes 2021): each violated certificate
+    (a step ago some backup survived all, now none does even without a margin) adds to it, and it
+    fades else.
+
+    Examples
+    --------
+    >>> from evofsm.guard import Guard
+    >>> guard = Guard(low=-2.0, high=2.0, interval=0.02)
+    >>> guard.judge
+    LearntRisk(dt=0.02, seed=0)
+    """
+
+    # Of the present episode.
+    _at: Floats | None  # the situation in which one was last, by all that was seen
+    _action: Floats  # what was done there
+    _z: list[Floats]  # observations that are to be learnt from
+    _u: list[Floats]  # and actions after them
+    # Of each decision: a proposal was refused, nothing helped even undisturbed, some backup held.
+    _notes: list[tuple[bool, bool, bool]]
+    _used: Floats  # (a, 2) how often numbers of an action were near an end of their range
+    _certified: bool  # whether at the decision before some backup survived all
+    _holds: bool  # and at this one
+    _refused: bool  # whether the latest proposal was
+    _lost: bool  # whether nothing helped, even without any disturbance
+    _fails_after: float  # steps after which what was refused fails, at the latest
+    _unsurvived: int
+    _asked: int  # number of backups under which it is judged
+    _ranks: Ints  # of backups, those first that passed last
+
+    def __init__(
+        self,
+        dt: float,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
+        *,
+        n_actions: int | None = None,
+        horizon: float | None = None,
+        seed: int = 0,
+        without: Sequence[str] = (),
+        names: Sequence[str] = (),
+        units: Sequence[str] = (),
+        settings: Settings | None = None,
+    ) -> None:
         self.dt = positive("dt", dt)
         self.given_horizon = None if horizon is None else positive("horizon", horizon)
         steps = None if horizon is None else max(1, round(horizon / self.dt))
-        self.seed, self.without, self.settings = operator.index(seed), frozenset(without), settings
+        if steps is not None and steps > _MAX_STEPS:
+            raise ValueError(
+                f"horizon is {horizon:g} s, {steps:,} decisions of {dt:g} s; a learnt judge "
+                f"looks at most {_MAX_STEPS:,} ahead (is it in seconds?)"
+            )
+        self.seed = operator.index(seed)
+        if unknown := set(without) - set(JUDGE_PARTS):
+            raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(JUDGE_PARTS)}")
+        self.without = frozenset(without)
+        self.settings = Settings() if settings is None else settings
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.dt)
+        #: Number of actions; 0 where the action is a box.
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
-        none = n_actions is not None
-        self.low = np.zeros(0) if none else np.atleast_1d(np.asarray(low, float))
-        self.high = np.zeros(0) if none else np.atleast_1d(np.asarray(high, float))
+        if self.choices > _MAX_CHOICES:
+            raise ValueError(
+                f"n_actions is {n_actions}; a learnt judge takes at most {_MAX_CHOICES:,} actions"
+            )
+        self.low, self.high = _range(low, high, is_none=n_actions is not None)
         self._middle, self._half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        #: How many numbers an action has.
         self.size = self.choices or len(self.low)
-        self.steps = steps
-        self.state = State.none(0, self.size, self.choices, settings, steps)
+        #: Whether it may try actions to learn what they do.
+        self.learning = True
+        #: From an observation to whether it is a failure, if that was given.
+        self.failed: Callable[[Floats], bool] | None = None
+        self.harm = Harm()  #: how episodes ended, guarded and alone
+        self.n_violated = 0  #: certificates that were violated
+        #: All that it has learnt, and what decides, made of it.
+        self.state = State.none(0, self.size, self.choices, self.settings, steps)
         if "margin" in self.without:
             self.state = self.state._replace(margin=0.0)
-        self.failed = None
-        self.learning = True
-        self.harm = Harm()
-        self.n_violated = 0
-        self.dynamics = self
-        self.parts = None
+        self.parts: Parts | None = None
         self._forget()
 
     @property
-    def n_variables(self):
+    def n_variables(self) -> int:
+        """Number of variables of an observation; 0 before the first."""
         return len(self.state.origin)
 
-    def encode(self, action: Any) -> Floats:
-        if self.choices:
-            chosen = np.zeros(self.choices)
-            chosen[int(action)] = 1.0
-            return chosen
-        return np.asarray((np.asarray(action, np.float64) - self._middle) / self._half)
-
-    def decode(self, inner: Floats) -> Floats:
-        if self.choices:
-            return np.array([float(inner.argmax())])
-        found = self._middle + self._half * inner
-        return np.minimum(np.maximum(found, self.low), self.high)
+    @property
+    def margin(self) -> float:
+        """What has to be left of the distance to failure [typical steps]."""
+        return self.state.margin
 
     @property
-    def fallback(self):
+    def horizon(self) -> int:
+        """Steps that it looks ahead."""
+        return self.state.horizon
+
+    @property
+    def fallback(self) -> Fallback:
+        """What is done without a usable proposal, and then revised like any."""
         if self.choices:
             return Fallback(0.0, "the first action")
         middle = self._middle
         return Fallback(middle if len(middle) > 1 else float(middle[0]), "the middle of the range")
 
-    def refuse_unfit(self, low, high): ...
+    def refuse_unfit(self, low: Any, high: Any) -> None:
+        """Raise for another range of actions than it learns of."""
+        own = (0, self.choices - 1) if self.choices else (self.low, self.high)
+        if not all(map(np.array_equal, map(np.atleast_1d, own), map(np.atleast_1d, (low, high)))):
+            raise ValueError(
+                f"the judge was made for actions from {own[0]} to {own[1]}, not from {low} to "
+                f"{high}: give it low and high, or n_actions, of the guard"
+            )
+
+    def encode(self, action: Any) -> Floats:
+        """(a,) an action as it is learnt of: from -1 to 1, or 1 for the chosen one."""
+        if self.choices:
+            return np.asarray(np.eye(self.choices)[int(action)])
+        return np.atleast_1d((np.asarray(action, np.float64) - self._middle) / self._half)
+
+    def decode(self, inner: Floats) -> Floats:
+        """The action that is so encoded."""
+        if self.choices:
+            return np.array([float(inner.argmax())])
+        return np.minimum(np.maximum(self._middle + self._half * inner, self.low), self.high)
+
+    # -- Deciding -------------------------------------------------------------------------------
 
     @property
-    def remembered(self):
-        return Remembered(len(self.state.windows), float(self.state.n_seen) * self.dt)
-
-    # -- Deciding
-
-    @property
-    def margin(self):
-        return self.state.margin
+    def remembered(self) -> Remembered:
+        """Disturbances that it counts on, and the time in which they were seen."""
+        return Remembered(len(self.state.windows), self.state.n_seen * self.dt)
 
     @property
-    def effort(self):
-        few = self.settings.n_asked if len(pairs(self.n_variables)[0]) else 2
-        count = self.parts.residuals.shape[2]
-        model = self.parts.model
-        each = (model.weights.size + model.dead_ends.size) * count
-        s = self.settings
+    def effort(self) -> tuple[int, float]:
+        """Backups that a search asks, and steps of rollouts after which it is cut short."""
+        s, model = self.settings, self.parts.model
+        few = s.n_asked if len(pairs(self.n_variables)[0]) else 2
+        each = (model.weights.size + model.dead_ends.size) * self.parts.residuals.shape[2]
         return few, max(min(s.work, s.work_rate * self.dt) / each, few * self.state.horizon)
 
-    def search(self, situation, wanted, *, tolerance, revising):
-        here, one = self._here(situation.observation), np.array([wanted])
-        parts = self.parts
+    def search(
+        self,
+        situation: Situation,
+        wanted: Any,
+        *,
+        tolerance: float,
+        revising: bool,
+        mask: Mask | None = None,
+    ) -> Search:
+        """The closest action to ``wanted`` that passes, or else that of the longest-lasting backup.
+
+        Of `Choices` it is one of ``mask``, and backups do what is in it: more may be allowed later,
+        or less, which nobody knows.
+        ``revising`` changes nothing: a band in which a proposal is refused longer gained nothing.
+        """
+        here, one, parts = self._here(situation.observation), np.array([wanted]), self.parts
         if parts is None:
             return Search(one, _unjudged(1), 0, words.NOTHING_LEARNT)
         if here is None:
             return Search(one, _unjudged(1), 0, words.NOTHING_SEEN)
         if not len(self.state.forms):
-            return Search(one, _unjudged(1), 0, words.NO_FAILURE)
+            return Search(one, _unjudged(1), 0, self._no_threshold)
         model = parts.daring if self.learning else parts.model
         if not len(model.forms):
             return Search(one, _unjudged(1), 0, words.DOUBTED)
-        proposal, scale = self.encode(wanted), parts.scale
+        proposal, scale, margin = self.encode(wanted), parts.scale, self.state.margin
         few, most = self.effort
         remembered, ranks = self.remembered, self._ranks[:few]
         allowed = self._allowed(tolerance, remembered)
-        margin = self.state.margin + self._added
-        asked = model, here, self.state.policies, ranks, parts.residuals, scale
+        policies = self.state.policies
+        if mask is not None:
+            policies = policies.copy()
+            policies[:, ~mask, 0] = _NEVER
+        asked = model, here, policies, ranks, parts.residuals, scale
         how, action, which, left = search(*asked, proposal, margin, allowed, most)
         tried = None
-        if which != ranks[0]:
+        if which != ranks[0]:  # what passed now is asked first the next time
             self._ranks = np.append(which, self._ranks[self._ranks != which])
         passes, self._refused, cut = how < CUT_SHORT, how != KEPT, how == CUT_SHORT
         self._holds = passes
@@ -146,32 +307,66 @@ class LearntRisk(ActionJudge):
             if self._certified and not cut:
                 how = search(*asked, action, 0.0, allowed, most, lasting=False)[0]
                 self._holds = how < CUT_SHORT
-            self._certified &= how != CUT_SHORT
-            tried = self._untried(action) if self.learning and left < self.settings.alike else None
+            self._certified &= how != CUT_SHORT  # whether one is violated is not known
+            is_alike = self.learning and left < self.settings.alike
+            tried = self._untried(action, mask) if is_alike else None
             action = action if tried is None else tried
-        judged, self._lost, after = self._judged(
-            situation, here, np.array((proposal, action) if self._refused else (proposal,)),
+        self._asked = 1 if most < 2 * few * self.state.horizon else few
+        judged, self._lost, fails_after = self._judged(
+            situation,
+            here,
+            policies,
+            np.array((proposal, action) if self._refused else (proposal,)),
             left if passes and not allowed else None,
         )
-        self._fails_after = max(self._fails_after, after)
+        self._fails_after = max(self._fails_after, fails_after)
+        backup = self._backup_text(which, policies)
         if not self._refused:
-            return Search(one, judged, 0, words.kept(str(which), remembered, left, allowed))
+            return Search(one, judged, 0, words.kept(backup, remembered, left, allowed))
         why = words.refused(self._unsurvived, remembered, margin, scale, allowed)
+        if not cut and len(model.dead_ends):
+            given = model._replace(dead_ends=model.dead_ends[:0]), here
+            amid = parts.residuals, scale, proposal, margin, allowed
+            for after in ranks:
+                if survives(*given, policies[after], *amid)[0]:
+                    why = words.comes_near(self._backup_text(after, policies))
+                    break
+        if passes:
+            instead = words.changed(backup, remembered, margin, allowed)
+        else:
+            instead = words.TRIED if tried is not None else words.lasting(backup, cut=cut)
         executed = np.reshape(self.decode(action), np.shape(wanted))
-        return Search(np.array((one[0], executed)), judged, 1, why)
+        return Search(np.array((one[0], executed)), judged, 1, f"{why}; {instead}")
 
-    def judge(self, situation, actions):
+    def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
+        """Risk of each action, (k,) or (k, d); NaN as long as nothing can be said."""
         given, here = np.asarray(actions, np.float64), self._here(situation.observation)
         if here is None or self.parts is None or not len(self.state.forms):
             return _unjudged(len(given))
-        return self._judged(situation, here, np.array([self.encode(one) for one in given]))[0]
+        inner = np.array([self.encode(one) for one in given])
+        return self._judged(situation, here, self.state.policies, inner)[0]
 
-    def why(self, judged):
-        return words.refused(self._unsurvived, self.remembered, self.margin, self.parts.scale)
+    def why(self, judged: Judgement) -> str:
+        """Why the first action that was judged is dangerous, in a few words."""
+        scale = 1.0 if self.parts is None else self.parts.scale
+        return words.refused(self._unsurvived, self.remembered, self.margin, scale)
 
-    def _judged(self, situation, here, actions, passes=None):
+    def _judged(
+        self,
+        situation: Situation,
+        here: Floats,
+        policies: Floats,
+        actions: Floats,
+        passes: float | None = None,
+    ) -> tuple[Judgement, bool, float]:
+        """Of some actions; ``passes`` is what is left after the last, if that is known to pass.
+
+        And whether the last is lost for good, and after how many steps any of them fails at the
+        latest.
+        """
         asked = actions if passes is None else actions[:-1]
-        each = [self._foresee(here, action[None], self._ranks[: self.settings.n_asked]) for action in asked]
+        best = policies[self._ranks[: self._asked]]
+        each = [self._foresee(here, action[None], best) for action in asked]
         if passes is not None:
             each.append((0.0, passes, 0.0))
         unsurvived, left, after = zip(*each, strict=True)
@@ -179,33 +374,48 @@ class LearntRisk(ActionJudge):
         remembered = self.remembered
         soon = self._soon(remembered.seconds)
         risk, low, high = np.array([self._risk(one, soon) for one in unsurvived]).T
-        judged = Judgement(risk, low, high, np.array(left), float(remembered.number), situation.seen)
+        number = float(remembered.number)
+        judged = Judgement(risk, low, high, np.array(left), number, situation.seen)
         return judged, math.isinf(unsurvived[-1]), max(after)
 
-    def _foresee(self, here, plan, ranks):
-        policies, steps = self.state.policies[ranks], self.parts.residuals.shape[0]
-        ends = value_of(self.parts.model, here[None], policies, self.parts.residuals, 1.0, plan, 0.0)[0]
+    def _foresee(self, here: Floats, plan: Floats, policies: Floats) -> tuple[float, float, float]:
+        """What comes of a situation and an action if the best of some backups follows.
+
+        How many disturbances are not survived, infinite if it fails without any; the least distance
+        to failure under the worst of them; and the steps after which it fails at the latest.
+        """
+        model, rest = self.parts.model, self.parts.residuals
+        ends = value_of(model, here[None], policies, rest, 1.0, plan, 0.0)[0]
         fails = ends[ends < 0.0]
         unsurvived = math.inf if ends[0] < 0.0 else float(len(fails))
+        steps = len(rest)
         return unsurvived, float(ends.min()), float(fails.max(initial=-1.0 - steps)) + 1.0 + steps
 
-    def _soon(self, exposure):
+    def _soon(self, exposure: float) -> float:
+        """The horizon, as a share of the time in which all that is remembered was seen."""
         return self.state.horizon * self.dt / max(exposure, 1e-300)
 
-    def _risk(self, unsurvived, soon):
+    def _risk(self, unsurvived: float, soon: float) -> tuple[float, float, float]:
+        """Probability, with its 90 % interval, that within the horizon something begins of those.
+
+        Certain where nothing helps by the model, of which nobody knows how good it is. Where all
+        that it may remember are not survived, it is not known how many more were forgotten.
+        """
         if math.isinf(unsurvived):
             return 1.0, 0.0, 1.0
         low, high = poisson_bounds(int(unsurvived))
         high = high if unsurvived < self.settings.n_disturbances else math.inf
         return -math.expm1(-unsurvived * soon), -math.expm1(-low * soon), -math.expm1(-high * soon)
 
-    def _allowed(self, tolerance, remembered):
+    def _allowed(self, tolerance: float, remembered: Remembered) -> int:
+        """How many of the disturbances need not be survived, by share and bound of the risk."""
         soon, most, allowed = self._soon(remembered.seconds), tolerance * remembered.number, 0
         while allowed + 1 <= most and self._risk(allowed + 1, soon)[2] <= tolerance:
             allowed += 1
         return allowed
 
-    def _here(self, z):
+    def _here(self, z: Floats) -> Floats | None:
+        """The situation, if that is seen; what was not is taken to have gone on as before."""
         at, m, has_gaps = self._at, len(z), math.isnan(z.dot(z))
         if at is None:
             return None if has_gaps else np.append(z, np.zeros(m + self.size))
@@ -213,11 +423,14 @@ class LearntRisk(ActionJudge):
             z = np.where(np.isnan(z), at[:m] + at[m : 2 * m], z)
         return np.concatenate([z, z - at[:m], self._action])
 
-    def _untried(self, best):
+    def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
+        """An action whose effect is hardly known, if there is one."""
         used, tries = self.state.used + self._used, self.settings.tries
         if self.choices:
-            i = int(used[:, 1].argmin())
-            return np.eye(len(used))[i] if used[i, 1] < tries and used[i, 1] < used[:, 1].max() else None
+            some = np.arange(self.choices) if mask is None else np.flatnonzero(mask)
+            i = int(some[used[some, 1].argmin()])
+            is_rare = used[i, 1] < tries and used[i, 1] < used[:, 1].max()
+            return np.asarray(np.eye(len(used))[i]) if is_rare else None
         k, end = divmod(int(used.argmin()), 2)
         if used[k, end] < tries and used[k, end] < used[k, 1 - end]:
             best = best.copy()
@@ -225,23 +438,55 @@ class LearntRisk(ActionJudge):
             return best
         return None
 
-    # -- Learning
+    def _backup_text(self, backup: int, policies: Floats) -> str:
+        if self.state.linear[backup]:
+            return f"feedback {int(self.state.linear[: backup + 1].sum())}"
+        action = self.decode(policies[backup, :, 0])
+        if self.choices:
+            return f"always {action_name(int(action[0]))}"
+        return words.constant(action.tolist())
 
-    def observe(self, observation):
+    # -- Learning -------------------------------------------------------------------------------
+
+    def savepoint(self) -> Rollback:
+        """What takes back all that it learns from now on."""
+        own, lengths = {**self.__dict__}, (len(self._z), len(self._u), len(self._notes))
+
+        def rollback() -> None:
+            self.__dict__ = {**own}
+            for rows, length in zip((self._z, self._u, self._notes), lengths, strict=True):
+                del rows[length:]
+
+        return rollback
+
+    def observe(self, observation: Floats) -> bool:
+        """Take in an observation, NaN where something was not seen; whether one is to be counted.
+
+        Raises
+        ------
+        ValueError
+            If it has another number of variables than before.
+        """
+        if (m := len(self._z[0]) if self._z else self.n_variables) not in (0, len(observation)):
+            raise ValueError(
+                f"observation has {len(observation)} variables, but the judge learnt of {m}"
+            )
+        if len(self._z) > len(self._u):  # nothing was executed: it does not follow
+            self._study(failed=False, terminated=False)
         self._z.append(observation.copy())
         return False
 
-    def act(self, action):
-        if self._z:
-            inner = self.encode(action)
-            lowest = -1.0 if self.choices else -0.6
-            if len(self._u) == len(self._z):
-                self._u[-1] = inner
-            else:
-                self._u.append(inner)
-            self._used = self._used + np.array([inner < lowest, inner > 0.6]).T
+    def act(self, action: Any) -> None:
+        """Take in what was executed after the latest observation; another one replaces it."""
+        if not self._z:
+            return
+        inner = self.encode(action)
+        self._u = self._u[: len(self._z) - 1] if len(self._u) == len(self._z) else self._u
+        self._u.append(inner)
+        self._used = self._used + np.array([inner < (-1.0 if self.choices else -0.6), inner > 0.6]).T
 
-    def learn(self, observation, action, belief):
+    def learn(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
+        """Take in what was executed, and whether the certificate of before still held."""
         if "margin" not in self.without and self.parts is not None:
             violated = self._certified and not self._holds
             self.n_violated += violated
@@ -251,70 +496,114 @@ class LearntRisk(ActionJudge):
         self._certified = self._holds
         self._take_in(observation, action)
 
-    def watch(self, observation, action, belief):
+    def watch(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
+        """Take in what someone else does: then nothing was certified."""
         self._certified = False
         self._take_in(observation, action)
 
-    def _take_in(self, observation, action):
+    def _take_in(self, observation: ArrayLike, action: Any) -> None:
         self.follow(observation, action)
         self._notes.append((self._refused, self._lost, self._certified))
         if len(self._z) > _LONGEST:
-            self._study(self._z, self._u[:-1], False, False)
-            k = 3
-            self._z, self._u, self._notes = self._z[-k:], self._u[-k:], self._notes[-k:]
+            z, u = self._z, self._u
+            self._u = u[:-1]
+            self._study(failed=False, terminated=False)
+            self._z, self._u, self._notes = z[-3:], u[-3:], [(False, False, False)] * 3
             self._ranks = np.arange(len(self.state.policies))
 
-    def follow(self, observation, action):
+    def follow(self, observation: ArrayLike, action: Any) -> None:
+        """Keep up with what happens, without learning from it."""
         here = self._here(np.array(observation, np.float64))
         if here is not None:
             self._at, self._action = here, self.encode(action)
 
-    def start_episode(self, *, learn=True):
+    def start_episode(self, *, learn: bool = True) -> None:
+        """What comes is not a consequence of what was; the episode before is learnt from."""
         if learn:
             self.end(None, failed=False)
         else:
             self._forget()
 
-    def end(self, observation, *, failed, terminated=False):
-        if len(self._z) > 1 or (failed and self._z):
-            self._study(self._z, self._u[: len(self._z) - 1], failed, terminated and not failed)
+    def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
+        """Learn from an episode; its last observation was taken in (`observe`)."""
+        self.state = self.state._replace(n_failed=self.state.n_failed + int(failed))
+        self._study(failed=failed, terminated=terminated and not failed)
         self._forget()
 
-    def _study(self, z, u, failed, terminated):
-        notes = np.array(self._notes[: len(u)], float).reshape(-1, 3)
-        notes = np.vstack([notes, np.zeros((len(u) - len(notes), 3))])
-        episode = Episode(np.array(z), np.array(u).reshape(-1, self.size), failed, terminated, *notes.T, self._fails_after)
+    def _study(self, *, failed: bool, terminated: bool) -> None:
+        """Learn from the rows of an episode, and forget them."""
+        z, notes = np.array(self._z), self._notes
+        n = max(0, len(z) - 1)
+        u = np.array(self._u[:n]).reshape(-1, self.size)
+        notes = np.array([*notes[:n], *[(False, False, False)] * (n - len(notes))], np.float64)
+        self._z, self._u, self._notes = [], [], []
+        if not len(z) or not np.isfinite(z).all(1).any() or not (n or failed):
+            return
+        columns = notes.reshape(-1, 3).T
+        episode = Episode(z, u, failed, terminated, *columns, self._fails_after)
         if not self.n_variables:
-            margin = self.state.margin
-            self.state = State.none(len(z[0]), self.size, self.choices, self.settings, self.steps)._replace(margin=margin)
-        self.state = learn(self.state, episode, self.settings, self.seed, self.without, self.given_horizon, self.failed)
-        self.parts = self._made()
-
-    def _made(self):
-        s = self.state
-        if not len(s.policies):
-            return None
-        known = model_of(s, self.settings)
-        return Parts(
-            known, model_of(s, self.settings, daring=True), residuals_of(s, known, s.horizon),
-            disturbance_scale(s, self.settings), s.n_seen * self.dt,
+            now = self.state
+            none = State.none(z.shape[1], self.size, self.choices, self.settings, None)
+            self.state = none._replace(
+                horizon=now.horizon, margin=now.margin, n_failed=now.n_failed
+            )
+        is_given = self.given_horizon is not None
+        self.state = learn(
+            self.state, episode, self.settings, self.seed, self.without, is_given, self.failed
         )
+        self.parts = Parts.of(self.state, self.settings)
 
     def remake(self) -> None:
         """Decide by `state`, between two episodes."""
-        self.parts = self._made()
+        self.parts = Parts.of(self.state, self.settings)
         self._forget()
 
-    def _forget(self):
-        self._at, self._action, self._added = None, np.zeros(0), 0.0
+    def _forget(self) -> None:
+        """Begin an episode."""
+        self._at, self._action = None, np.zeros(0)
         self._z, self._u, self._notes = [], [], []
         self._certified = self._holds = self._refused = self._lost = False
-        self._unsurvived, self._fails_after = 0, 0.0
+        self._unsurvived, self._fails_after, self._asked = 0, 0.0, self.settings.n_asked
         self._used = np.zeros((self.size, 2))
         self._ranks = np.arange(len(self.state.policies))
 
-    def sums(self, n_states):
-        return {}
+    # -- For people, and in a file --------------------------------------------------------------
+
+    @property
+    def _no_threshold(self) -> str:
+        """Why nothing is refused."""
+        return words.no_threshold(self.state.n_failed, is_given=self.failed is not None)
+
+    @property
+    def told_by_experience(self) -> str:
+        """What was learnt so far, in words."""
+        told = words.experience(self.state, self.remembered, self.called, self._no_threshold)
+        return told + words.harm(self.harm, learning=self.learning)
+
+    def told_here(self, observation: Floats) -> tuple[str, Floats | None]:
+        """What was learnt of an observation, in words, and the centre of the dead end it is near.
+
+        Empty, and None, where it is in and near none, nor near a form of failures.
+        """
+        if math.isnan(observation.dot(observation)) or self.parts is None:
+            return "", None
+        near = self.settings.margin_max
+        return words.here(self.state, self.parts.model, self.called, observation, near)
+
+    @property
+    def called(self) -> Sequence[str]:
+        """Names of variables, as people read them."""
+        return self.labels.names or [f"variable {j + 1}" for j in range(self.n_variables)]
+
+    def sums(self, n_states: int) -> dict[str, float]:
+        """A few sums that whatever is learnt changes."""
+        return {
+            "margin": self.margin,
+            "violated": float(self.n_violated),
+            "backups": float(self.state.policies.sum()),
+            "disturbances": float(self.state.windows.sum()),
+            "harm": self.harm.chance + self.harm.kept + self.harm.n_episodes,
+        }
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
@@ -352,33 +641,26 @@ class LearntRisk(ActionJudge):
             judge.remake()
         return judge
 
-    @property
-    def told_by_experience(self) -> str:
-        """What was learnt so far, in words."""
-        told = words.experience(self.state, self.remembered, self.called, self._nothing)
-        return told + words.harm(self.harm, learning=self.learning)
-
-    def told_here(self, observation: Floats) -> tuple[str, Floats | None]:
-        """What was learnt of an observation, in words, and the centre of the dead end it is near.
-
-        Empty, and None, where it is in and near none, nor near a form of failures.
-        """
-        if math.isnan(observation.dot(observation)) or self.parts is None:
-            return "", None
-        near = self.settings.margin_max
-        return words.here(self.state, self.parts.model, self.called, observation, near)
-
-    @property
-    def called(self) -> Sequence[str]:
-        """Names of variables, as people read them."""
-        return self.labels.names or [f"variable {j + 1}" for j in range(self.n_variables)]
-
-    @property
-    def _nothing(self) -> str:
-        """Why nothing is refused, as long as nothing is."""
-        return words.no_threshold(self.state.n_failed, is_given=self.failed is not None)
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
 
 
-def _unjudged(count):
+def _range(
+    low: ArrayLike | None, high: ArrayLike | None, *, is_none: bool
+) -> tuple[Floats, Floats]:
+    """The ends of the range of actions, (d,) each; empty where there is to be none."""
+    if is_none != (low is None) or (low is None) != (high is None):
+        raise ValueError("give either low and high, or n_actions")
+    if low is None or high is None:
+        return np.zeros(0), np.zeros(0)
+    ends = [real_array(name, np.atleast_1d(end), 1) for name, end in (("low", low), ("high", high))]
+    for name, end in zip(("low", "high"), ends, strict=True):
+        refuse_unusable(name, end)
+    if ends[0].shape != ends[1].shape or not (ends[0] < ends[1]).all():
+        raise ValueError(f"low is {low} and high is {high}; low must be below high")
+    return ends[0], ends[1]
+
+
+def _unjudged(count: int) -> Judgement:
     nothing = np.full(count, math.nan)
     return Judgement(nothing, nothing, nothing, nothing, 0.0)

@@ -34,7 +34,7 @@ _AT_ONCE, _BY_FAR = 3, 100.0
 _NEAR, _APART, _WAY, _MAX_ENDS = 0.6, 0.15, 0.9, 40
 
 
-def learn(state: State, episode: Episode, settings: Settings, seed: int, parts=frozenset(), given_horizon=None, asked=None) -> State:
+def learn(state: State, episode: Episode, settings: Settings, seed: int, parts=frozenset(), given_horizon=False, asked=None) -> State:
     """Learn from an episode."""
     random = np.random.default_rng([seed, state.n_episodes])
     if not state.n_seen:
@@ -42,7 +42,7 @@ def learn(state: State, episode: Episode, settings: Settings, seed: int, parts=f
     unit = state.unit if state.n_moves else model.typical_step(episode.observations)
     z = model.without_glitches(episode.observations, unit)
     u, failed = episode.actions, episode.failed
-    state = state._replace(n_seen=state.n_seen + len(z), n_failed=state.n_failed + failed)
+    state = state._replace(n_seen=state.n_seen + len(z))
     safe = z[:-1] if failed else z
     u = u[: len(safe) - 1]
     before = state
@@ -70,7 +70,7 @@ def learn(state: State, episode: Episode, settings: Settings, seed: int, parts=f
     if "stretches" not in parts:
         state = disturbances(state, known, safe, u, settings, random)
     rest = residuals_of(state, known, state.horizon)
-    if understood and given_horizon is None:
+    if understood and not given_horizon:
         state = look_ahead(state, known, rest, episode, settings)
     if understood and len(state.situations) >= 3 and "backups" not in parts:
         some = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:5]).astype(int)

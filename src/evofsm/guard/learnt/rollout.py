@@ -449,6 +449,27 @@ def value_of(
 KEPT, CHANGED, CUT_SHORT, NOTHING_PASSES = 0, 1, 2, 3
 
 
+def survives(
+    model: Model,
+    situation: Floats,
+    policy: Floats,
+    residuals: Floats,
+    scale: float,
+    action: Floats,
+    margin: float,
+    allowed: int,
+) -> tuple[bool, float, int]:
+    """Whether a backup survives after an action by the margin, what is left, and steps of rollouts.
+
+    All disturbances have to be survived but ``allowed``, and that none begins.
+    """
+    count = residuals.shape[2]
+    ends = Ends(np.empty(count), np.empty(count))
+    given = residuals, scale, margin, allowed, ends
+    lost, left, took = _enter.call(model, situation[None], action[None], policy, *given)
+    return lost <= allowed and left >= margin, left, took
+
+
 def search(
     model: Model,
     situation: Floats,
@@ -476,23 +497,20 @@ def search(
     failure that is then left; where nothing passes, how far apart backups are, near 0 if all last
     as long.
     """
-    m, a, choices = len(model.origin), len(proposal), model.choices
-    count, plan, here = residuals.shape[2], np.empty((1, a)), situation[None]
-    ends = Ends(np.empty(count), np.empty(count))
-    given, done = (residuals, scale, margin, allowed, ends), 0
+    m, choices, done = len(model.origin), model.choices, 0
 
-    def survives(action: Floats, backup: int) -> tuple[bool, float]:
+    def after(action: Floats, backup: int) -> tuple[bool, float]:
         """Whether the backup survives after the action, and by how much."""
         nonlocal done
-        plan[0] = action
-        lost, left, took = _enter.call(model, here, plan, policies[backup], *given)
+        amid = residuals, scale, action, margin, allowed
+        passes, left, took = survives(model, situation, policies[backup], *amid)
         done += took
-        return lost <= allowed and left >= margin, left
+        return passes, left
 
     for q in ranks:
         if done >= most:
             break
-        passes, left = survives(proposal, q)
+        passes, left = after(proposal, q)
         if passes:
             return KEPT, proposal, q, left
     for q in ranks:
@@ -502,14 +520,14 @@ def search(
             return CUT_SHORT, first, ranks[0], math.inf
         if (own == proposal).all():
             continue  # it was refused
-        passes, left = survives(own, q)
+        passes, left = after(own, q)
         if not passes:
             continue
         action, off, refused, share = own, own - proposal, 0.0, 1.0
         for _ in range(0 if choices else _HALVINGS):
             half = 0.5 * (refused + share)
             closer = proposal + half * off
-            passes, distance = survives(closer, q)
+            passes, distance = after(closer, q)
             if passes:
                 action, share, left = closer, half, distance
             else:
@@ -519,7 +537,7 @@ def search(
         return NOTHING_PASSES, proposal, ranks[0], math.inf
     which, longest, shortest = ranks[0], -np.inf, np.inf
     for q in ranks:
-        lasts = float(rollout(model, here, policies[q], residuals, scale).worth.mean())
+        lasts = float(rollout(model, situation[None], policies[q], residuals, scale).worth.mean())
         shortest = min(shortest, lasts)
         if lasts > longest + _EQUAL:
             which, longest = q, lasts
