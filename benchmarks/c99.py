@@ -28,6 +28,7 @@ from evofsm.guard import Proposal, make_usable
 from evofsm.guard.actions import BoxActions, Choices, limits, no_action, same_action
 from evofsm.guard.export import write_c99, write_fmu
 from evofsm.guard.learnt import words
+from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS
 from evofsm.guard.reviser import unseen_text
 
 Floats = NDArray[np.float64]
@@ -49,8 +50,7 @@ _FAR = 1e7
 # Numbers of a decision, in the order in which the program below writes them.
 NUMBERS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen", "left")
 CODES = (
-    *("reason", "remark", "intake", "is_new", "state", "backup", "unsurvived"),
-    *("dead_end", "backup_near"),
+    *("reason", "remark", "intake", "is_new", "state", "backup", "unsurvived", "backup_near"),
 )
 _MAIN = """#define _POSIX_C_SOURCE 199309L
 #include "evofsm.h"
@@ -62,7 +62,7 @@ int main(void) {
   double row[ROW];
   evofsm_reset(&state);
   while (fread(row, sizeof row[0], ROW, stdin) == ROW) {
-    double numbers[18 + 2 * EVOFSM_ACTIONS] = {0.0};
+    double numbers[17 + 2 * EVOFSM_ACTIONS] = {0.0};
     evofsm_decision d = {0};
     struct timespec begin, end;
     int i;
@@ -77,10 +77,10 @@ int main(void) {
     numbers[5] = d.risk_high, numbers[6] = d.evidence, numbers[7] = d.seen, numbers[8] = d.left;
     numbers[9] = d.reason, numbers[10] = d.remark, numbers[11] = d.intake, numbers[12] = d.is_new;
     numbers[13] = d.state, numbers[14] = d.backup, numbers[15] = d.unsurvived;
-    numbers[16] = d.dead_end, numbers[17] = d.backup_near;
+    numbers[16] = d.backup_near;
     for (i = 0; i < EVOFSM_ACTIONS; i++) {
-      numbers[18 + i] = d.executed[i];
-      numbers[18 + EVOFSM_ACTIONS + i] = d.advised[i];
+      numbers[17 + i] = d.executed[i];
+      numbers[17 + EVOFSM_ACTIONS + i] = d.advised[i];
     }
     fwrite(numbers, sizeof numbers[0], sizeof numbers / sizeof numbers[0], stdout);
   }
@@ -230,39 +230,20 @@ def learnt(name: str, episodes: int | None = None) -> Learnt:
 
 
 def _add_parts(judge: Any) -> None:
-    """Places, drifts, jumps, regions, dead ends: not each system teaches each of them."""
-    chance = np.random.default_rng(0)
-    model, found = judge.dynamics.model, judge.disturbances
-    m, count = found.residuals.shape[1:]
-    seen = judge.situations[:, :m]
-    place = found.place.copy()
-    for k in range(1, count, 2):
-        j = int(chance.integers(m))
-        place[k] = j, chance.choice([-1.0, 1.0]), np.median(seen[:, j]), k % 4, 6 + k
-    jump_at = found.jump_at.copy()
-    jump_at[2::3, 0] = 5.0
-    slope = chance.normal(size=found.jump_slope.shape)
-    ranges = np.sort(chance.normal(size=found.jump_from.shape), -1)
-    landing = np.stack([np.tile(end, (count, 1)) for end in (seen.min(0), seen.max(0))], -1)
-    judge.disturbances = found._replace(
-        place=place, jump_at=jump_at, jump_slope=slope, jump_from=ranges, landing=landing
-    )
-    drifted = np.where(np.arange(m) == m - 1, 1.0, -1.0)
-    unit, low = judge.dynamics.sums.unit, seen.min(0)
-    region = [0, m - 1, low[0], low[m - 1], 1 / unit[0], 1 / unit[m - 1], 1, 0.1, 0.2, -1, 0.3, -2]
-    ending = [0, 0, seen[:, 0].max(), 0.0, 1 / unit[0], 1.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0]
-    crash = [m - 1, m - 1, *[seen[:, -1].max()] * 2, 1 / unit[-1], 1.0, 0.0, 1.0, 0, 0, 0, 0]
+    """Forms of each kind, and dead ends: not each system teaches each of them."""
+    chance, state = np.random.default_rng(0), judge.state
+    m, unit = judge.n_variables, 1.0 / state.unit
+    seen = state.situations[:, :m]
+    low, high, last = seen.min(0), seen.max(0), m - 1
+    fails = [FAILS, 0, last, low[0], low[last], unit[0], unit[last], 1, 0.1, 0.2, -1, 0.3, -2, 3]
+    ends = [ENDS, 0, 0, high[0], high[0], unit[0], unit[0], 2, 1, 0, 0, 0, 0, 3]
+    crashes = [CRASHES, last, last, high[-1], high[-1], unit[-1], unit[-1], 0, 1, 0, 0, 0, 0, 3]
     centres = seen[chance.integers(len(seen), size=3)]
-    ends = np.column_stack([centres, np.full(3, 0.4), np.full(3, 4.0)])
-    judge.dynamics.model = model._replace(
-        drifted=drifted,
-        regions=np.array([region]),
-        endings=np.array([ending]),
-        crashes=np.array([crash]),
-        dead_ends=ends,
+    judge.state = state._replace(
+        forms=np.vstack([ends, crashes, state.forms, fails]),
+        **{"centres": centres, "radii": np.full(3, 0.4), "counts": np.arange(1.0, 4.0)},
     )
-    counted = {name: np.arange(1.0, 4.0) for name in ("numbers", "counts")}
-    judge.dynamics.dead_ends = judge.dynamics.dead_ends._replace(**counted)
+    judge.remake()
 
 
 SYSTEMS: dict[str, tuple[Any, int]] = {
@@ -388,9 +369,9 @@ def compare(guard: Guard, program: Path, asked: Asked) -> Compared:
         found[:, 0],
         found[:, 1],
         found[:, 2:9],
-        found[:, 9:18].astype(int),
+        found[:, 9:17].astype(int),
     )
-    actions, taken = found[:, 18:], asked.codes[:, 0] == 0.0
+    actions, taken = found[:, 17:], asked.codes[:, 0] == 0.0
     # Squares are so large there that a last bit says which state is nearest.
     far = np.nan_to_num(np.abs(asked.rows), nan=0.0).max(1) > _FAR
     codes[far, 4], numbers[far, 5] = asked.codes[far, 2], asked.numbers[far, 5]
@@ -443,17 +424,15 @@ def _learnt(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str
     judge, kind = reviser.risk, code["reason"]
     if kind == 4:
         return words.NOTHING_SEEN
-    remembered, backup = judge.remembered, judge._backup_text(code["backup"])
+    remembered, backup = judge.remembered, judge.backup_text(code["backup"])
     allowed = judge._allowed(reviser.tolerance, remembered)
     if kind == 0:
         return words.kept(backup, remembered, number["left"], allowed)
     why = words.refused(
-        code["unsurvived"], remembered, judge.margin, judge.disturbance_scale, allowed
+        code["unsurvived"], remembered, judge.margin, judge.parts.scale, allowed
     )
-    if (end := code["dead_end"]) >= 0:
-        ends = judge.dynamics.dead_ends
-        near = judge._backup_text(code["backup_near"])
-        why = words.comes_near(near, int(ends.numbers[end]), int(ends.counts[end]))
+    if code["backup_near"] >= 0:
+        why = words.comes_near(judge.backup_text(code["backup_near"]))
     if kind == 1:
         return f"{why}; {words.changed(backup, remembered, judge.margin, allowed)}"
     return f"{why}; {words.lasting(backup, cut=kind == 2)}"

@@ -2,7 +2,7 @@
 
 An FMU is the same C, compiled where a compiler is, with ``fmi2.c`` around it.
 
-The C stands beside the Python that it mirrors: ``guard.c`` is the loop, ``learnt/replay.c`` and
+The C stands beside the Python that it mirrors: ``guard.c`` is the loop, ``learnt/rollout.c`` and
 ``driving/judge.c`` are judges. What was learnt comes before it, as constants.
 """
 
@@ -32,11 +32,11 @@ from evofsm.guard import guard as looping
 from evofsm.guard import reviser as revising
 from evofsm.guard.actions import Choices, limits, put_into
 from evofsm.guard.guard import Guard
-from evofsm.guard.learnt import replay
+from evofsm.guard.learnt import rollout
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.reviser import ActionReviser, Mode
 
-# Replays of disturbances lie side by side by so many; NumPy sums so many numbers as the C does.
+# Rollouts of disturbances lie side by side by so many; NumPy sums so many numbers as the C does.
 _LANES, _MOST_DISTURBANCES = 4, 128
 # Bytes of the stack, but for what numbers of actions and lanes add; a test holds it to compilers.
 _STACK = 2048
@@ -237,68 +237,57 @@ def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any
 def _learnt(reviser: ActionReviser) -> Part:
     """What a learnt judge decides by."""
     risk: Any = reviser.risk
-    dynamics, disturbances, backups = risk.dynamics, risk.disturbances, risk.backups
-    dynamics.failed = None  # what it said stands in the thresholds
-    if disturbances is None or backups is None or not dynamics.fails:
+    state, parts = risk.state, risk.parts
+    if parts is None or not len(state.forms):
         raise ValueError(f"there is nothing to export yet: {risk.told_by_experience}")
-    model = dynamics.model  # frozen, it doubts nothing
-    (steps, m, count), (p, _), a = disturbances.residuals.shape, model.weights.shape, dynamics.size
+    model, rest = parts.model, parts.residuals  # frozen, it doubts nothing
+    (steps, m, count), (p, _), a = rest.shape, model.weights.shape, risk.size
     if count > _MOST_DISTURBANCES:
         raise ValueError(f"at most {_MOST_DISTURBANCES} disturbances are exported, not {count}")
     lanes = -(-count // _LANES) * _LANES
-    residuals = np.pad(disturbances.residuals, [(0, 0), (0, 0), (0, lanes - count)])
     remembered, soon = risk.remembered, risk._soon(risk.remembered.seconds)
-    (few, most), jumps = risk.effort, bool((disturbances.jump_at >= 0.0).any())
-    names = [f"{q}: {risk._backup_text(q)}" for q in range(len(backups.policies))]
-    placed = bool((disturbances.place[:, 0] >= 0.0).any())
+    few, most = risk.effort
+    names = [f"{q}: {risk.backup_text(q)}" for q in range(len(state.policies))]
+    asked = min(few, len(names))
     constants: dict[str, Any] = {
         "DISTURBANCES": count,
         "STEPS": steps,
-        "CROSSED": replay.crossed(m, a),
-        "PAIRED": m if len(replay.pairs(m)[0]) else 0,
-        "THRESHOLDS": len(model.thresholds),
-        **{name.upper(): len(getattr(model, name)) for name in ("regions", "endings", "crashes")},
-        "JUMPS": jumps,
-        "NOISY": dynamics.is_noisy,
-        "SCALE": risk.disturbance_scale,
+        "CROSSED": rollout.crossed(m, a),
+        "PAIRED": m if len(rollout.pairs(m)[0]) else 0,
+        "FORMS": len(model.forms),
+        "SCALE": parts.scale,
         "MARGIN": risk.margin,
         "ALLOWED": risk._allowed(reviser.tolerance, remembered),
-        "ASKED": min(few, len(names)),
-        "JUDGED": 1 if most < 2 * few * risk.horizon else min(few, len(names)),
+        "ASKED": asked,
+        "JUDGED": 1 if most < 2 * few * risk.horizon else asked,
         "MOST_DONE": math.ceil(most),
         "EVIDENCE": float(remembered.number),
-        **{name.strip("_"): getattr(replay, name) for name in _OF_REPLAYS},
+        **{name.strip("_"): getattr(rollout, name) for name in _OF_ROLLOUTS},
         **{name: getattr(model, name) for name in _OF_MODEL},
-        **{name: getattr(disturbances, name) for name in _OF_JUMPS if jumps},
-        "place": disturbances.place if placed else (),
-        "residuals": residuals,
-        "policies": backups.policies,
-        "backup_ranks": backups.ranks,
+        "residuals": np.pad(rest, [(0, 0), (0, 0), (0, lanes - count)]),
+        "policies": state.policies,
         "risks": [risk._risk(one, soon) for one in (math.inf, *map(float, range(count)))],
-        "middle": dynamics._middle,
-        "half": dynamics._half,
-        "gains": dynamics.gains[: None if dynamics.is_noisy else 0],
-        "jump_of": replay.JUMP * dynamics.sums.unit[: None if dynamics.is_noisy else 0],
+        "middle": risk.middle,
+        "half": risk.half,
     }
-    replays = 2 * constants["ASKED"] + max(few, replay._HALVINGS) + 2 * few
-    replays += (few + len(model.dead_ends).bit_length()) * (len(model.dead_ends) > 0)
+    most_rollouts = 2 * asked + max(few, rollout._HALVINGS) + 2 * few
+    most_rollouts += few * (len(model.dead_ends) > 0)
     about = (
         f"backups: {'; '.join(names)}\n"
-        f"a decision: at most {replays} "
-        f"replays of {steps} steps, each of {p} x {m} products in {lanes} lanes\n"
+        f"a decision: at most {most_rollouts} "
+        f"rollouts of {steps} steps, each of {p} x {m} products in {lanes} lanes\n"
     )
-    sizes = {"NUMBERS": a, "FEATURES": p, "LANES": lanes, "BACKUPS": len(names), "PLACED": placed}
+    sizes = {"NUMBERS": a, "FEATURES": p, "LANES": lanes, "BACKUPS": len(names)}
     sizes["DEAD_ENDS"] = len(model.dead_ends)
-    return Part(Path(replay.__file__).with_suffix(".c"), m, sizes, constants, about)
+    return Part(Path(rollout.__file__).with_suffix(".c"), m, sizes, constants, about)
 
 
-# Constants of replays, and arrays of a model, that C has, too.
-_OF_REPLAYS = ["_FARTHER", "_RESERVE", "_DISTANCE", "_FAR", "_HALVINGS", "_EQUAL", "FLAT", "GROWN"]
-_OF_REPLAYS += ["SHRUNK"]
-_OF_JUMPS = ("jump_at", "jump_to", "jump_slope", "jump_from", "landing")
+# Constants of rollouts, and arrays of a model, that C has, too.
+_OF_ROLLOUTS = ["_RESERVE", "_DISTANCE", "_FAR", "_HALVINGS", "_EQUAL", "FLAT", "GROWN", "SHRUNK"]
+_OF_ROLLOUTS += ["FAILS", "ENDS", "CRASHES"]
 _OF_MODEL = (
-    *("weights", "origin", "reach", "lowest", "highest", "least", "most", "thresholds", "regions"),
-    *("endings", "crashes", "dead_ends", "drifted", "mean", "inverse"),
+    *("weights", "origin", "reach", "lowest", "highest", "least", "most", "forms", "dead_ends"),
+    *("mean", "inverse"),
 )
 
 

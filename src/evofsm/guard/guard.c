@@ -51,14 +51,13 @@ typedef struct {
   double risk_low, risk_high;          /* 90 % interval of risk_executed */
   double evidence;                     /* number of disturbances that this rests on */
   double seen;                         /* time spent in such states [s]; NaN: not known */
-  double left; /* learnt: what is left of the distance to failure, if it passes [ordinary changes];
+  double left; /* learnt: what is left of the distance to failure, if it passes [typical steps];
                   cars: the hardest braking of the leader that the proposal survives [m/s²] */
   int reason, remark, intake, is_new;  /* codes as above; 1: never seen before */
   int state;                           /* from 0; -1: none is known */
   int backup;                          /* learnt: after which it passes, or lasts; -1: none */
   int unsurvived; /* learnt: disturbances not survived after the proposal; -1: not even none */
-  int dead_end, backup_near; /* learnt: the dead end, from 0, to which it would come too near, and
-                                after which backup, where the proposal would else pass; -1: none */
+  int backup_near; /* learnt: after which the proposal would pass but for a dead end; -1: none */
 } evofsm_decision;
 
 /* Of one stream of observations. Whoever calls owns it, and leaves what is in it alone; its size is
@@ -306,7 +305,7 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
   out->state = state->state;
   out->seen = state->seen;
   out->left = NAN;
-  out->backup = out->dead_end = out->backup_near = -1;
+  out->backup = out->backup_near = -1;
   out->unsurvived = 0;
   revise(state, out);
   out->is_new = out->seen < NEW;

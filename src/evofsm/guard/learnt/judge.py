@@ -188,7 +188,7 @@ class LearntRisk(ActionJudge):
                 f"n_actions is {n_actions}; a learnt judge takes at most {_MAX_CHOICES:,} actions"
             )
         self.low, self.high = _range(low, high, is_none=n_actions is not None)
-        self._middle, self._half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         #: How many numbers an action has.
         self.size = self.choices or len(self.low)
         #: Whether it may try actions to learn what they do.
@@ -224,7 +224,7 @@ class LearntRisk(ActionJudge):
         """What is done without a usable proposal, and then revised like any."""
         if self.choices:
             return Fallback(0.0, "the first action")
-        middle = self._middle
+        middle = self.middle
         return Fallback(middle if len(middle) > 1 else float(middle[0]), "the middle of the range")
 
     def refuse_unfit(self, low: Any, high: Any) -> None:
@@ -240,13 +240,13 @@ class LearntRisk(ActionJudge):
         """(a,) an action as it is learnt of: from -1 to 1, or 1 for the chosen one."""
         if self.choices:
             return np.asarray(np.eye(self.choices)[int(action)])
-        return np.atleast_1d((np.asarray(action, np.float64) - self._middle) / self._half)
+        return np.atleast_1d((np.asarray(action, np.float64) - self.middle) / self.half)
 
     def decode(self, inner: Floats) -> Floats:
         """The action that is so encoded."""
         if self.choices:
             return np.array([float(inner.argmax())])
-        return np.minimum(np.maximum(self._middle + self._half * inner, self.low), self.high)
+        return np.minimum(np.maximum(self.middle + self.half * inner, self.low), self.high)
 
     # -- Deciding -------------------------------------------------------------------------------
 
@@ -320,7 +320,7 @@ class LearntRisk(ActionJudge):
             left if passes and not allowed else None,
         )
         self._fails_after = max(self._fails_after, fails_after)
-        backup = self._backup_text(which, policies)
+        backup = self.backup_text(which, policies)
         if not self._refused:
             return Search(one, judged, 0, words.kept(backup, remembered, left, allowed))
         why = words.refused(self._unsurvived, remembered, margin, scale, allowed)
@@ -329,7 +329,7 @@ class LearntRisk(ActionJudge):
             amid = parts.residuals, scale, proposal, margin, allowed
             for after in ranks:
                 if survives(*given, policies[after], *amid)[0]:
-                    why = words.comes_near(self._backup_text(after, policies))
+                    why = words.comes_near(self.backup_text(after, policies))
                     break
         if passes:
             instead = words.changed(backup, remembered, margin, allowed)
@@ -438,7 +438,9 @@ class LearntRisk(ActionJudge):
             return best
         return None
 
-    def _backup_text(self, backup: int, policies: Floats) -> str:
+    def backup_text(self, backup: int, policies: Floats | None = None) -> str:
+        """What a backup does, by its number."""
+        policies = self.state.policies if policies is None else policies
         if self.state.linear[backup]:
             return f"feedback {int(self.state.linear[: backup + 1].sum())}"
         action = self.decode(policies[backup, :, 0])

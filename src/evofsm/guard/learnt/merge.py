@@ -48,7 +48,7 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     ...     guard.end(failed=False)
     >>> judge = merge_judges([guard.judge for guard in guards])
     >>> print(judge.remembered)
-    what 2.4 s brought
+    6 disturbances remembered from 2.4 s
     >>> guard = Guard(n_actions=2, interval=0.1, judge=judge)
     """
     if not judges:

@@ -465,14 +465,14 @@ static int passes_without(evofsm_state *s, const double proposal[A]) {
 /* -- The judge: LearntRisk ---------------------------------------------------------------------- */
 
 /* _foresee: disturbances not survived after an action, under the best of some backups; -1: it fails
-   without any. At most ASKED rollouts. */
+   without any. At most JUDGED rollouts. */
 static int foresee(evofsm_state *s, const double action[A]) {
   double best[L], left;
   int l, r, count = 0, all = 0;
   for (l = 0; l < K; l++) {
     best[l] = -INFINITY;
   }
-  for (r = 0; r < ASKED && !all; r++) {
+  for (r = 0; r < JUDGED && !all; r++) {
     rollout(s, action, policies[s->ranks[r]], 1.0, 0.0, K, &left);
     all = 1;
     count = 0;
@@ -513,7 +513,7 @@ static void forget(evofsm_state *s) {
   s->has_past = 0;
   s->is_placed = 0;
   for (i = 0; i < EVOFSM_BACKUPS; i++) {
-    s->ranks[i] = backup_ranks[i];
+    s->ranks[i] = i;
   }
   s->ignores = 0;
 }

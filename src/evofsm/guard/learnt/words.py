@@ -1,7 +1,7 @@
 """What the learnt judge says of a decision: the one place of its words.
 
 A *disturbance* is what began unexpectedly and is remembered. A *backup* is what would be done from
-the next decision on. Distances to failure are counted in *ordinary changes*: how much the variable
+the next decision on. Distances to failure are counted in *typical steps*: how much the variable
 that fails usually changes from one decision to the next. Disturbances that need not be survived
 are *spared*.
 
@@ -9,21 +9,18 @@ Examples
 --------
 >>> ten = Remembered(10, 305.0)
 >>> kept("always -2.5", ten, 0.4)
-'then always -2.5 survives all 10 disturbances remembered from 305 s, by 0.4 ordinary changes'
+'then always -2.5 survives all 10 disturbances remembered from 305 s, by 0.4 typical steps'
 >>> refused(2, ten, 0.4, 1.0)
 'no backup survives 2 of the 10 disturbances remembered from 305 s'
 >>> refused(-1, ten, 0.4, 1.0)
 'no backup prevents failure, even if nothing disturbs it'
 >>> refused(0, Remembered(1, 12.3), 1.0, 1.3)
-'no backup survives the 1 disturbance remembered from 12 s by the margin of 1 ordinary change, \
+'no backup survives the 1 disturbance remembered from 12 s by the margin of 1 typical step, \
 were they 1.3 times as hard'
->>> comes_near("always -2.5", 2, 3)
-'then always -2.5 would come near dead end 2, from where 3 episodes that had been certified failed'
+>>> comes_near("always -2.5")
+'then always -2.5 would come near a dead end, from where episodes that had been certified failed'
 >>> dead_ends([1, 3])
-'; 2 dead-end states: 3 and 1 episodes that had been certified failed from there'
->>> experience([("gap", True, 0.05)], Remembered(0, 4.25), 3.0, [("speed", 101)])
-'fails where gap is below 0.05; what 4.2 s brought, to be survived by 3 ordinary changes; since \
-episode 101 speed moves otherwise'
+'; 2 dead ends: 3 and 1 episodes that had been certified failed from there'
 """
 
 from __future__ import annotations
@@ -33,7 +30,13 @@ from collections.abc import Sequence
 from statistics import median
 from typing import NamedTuple
 
+import numpy as np
+
 from evofsm.guard.harm import Harm, Outcome
+from evofsm.guard.learnt import failure
+from evofsm.guard.learnt.failure import HELD, I, SAYS
+from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, Floats, Model
+from evofsm.guard.learnt.state import State
 
 #: Said as long as there is nothing to judge by.
 NOTHING_LEARNT = "nothing was learnt yet"
@@ -50,6 +53,8 @@ TRIED = "no action passes; what this one does is hardly known, so it is tried"
 _HARDER = 1.05
 # Of more dead ends, those from where most failed are counted.
 _SHOWN = 3
+# What was seen in a form, by what it says.
+_WHAT = {FAILS: "failure", CRASHES: "failure", ENDS: "ending"}
 
 
 class Remembered(NamedTuple):
@@ -92,23 +97,12 @@ def refused(
     return f"no backup survives {'any of ' if unsurvived > 1 else ''}the {remembered}"
 
 
-def comes_near(backup: str, dead_end: int, count: int) -> str:
-    """Why an action is dangerous that passes but for a dead end, by number and failures."""
-    return f"then {backup} would come near dead end {dead_end}, from where {failed([count])}"
-
-
-def is_near(dead_end: int, count: int, distance: float) -> str:
-    """What is said of a situation in or near a dead end, which is so far [ordinary changes]."""
-    where = "in" if distance < 0.0 else f"{changes(distance)} from"
-    return f"This is {where} dead end {dead_end}, from where {failed([count])}."
-
-
-def is_near_failure(
-    names: Sequence[str], row: Sequence[float], failures: int, distance: float
-) -> str:
-    """What is said of a situation in or near a region of failures, as `is_near` of dead ends."""
-    where = "" if distance < 0.0 else f"{changes(distance)} from "
-    return f"This is {where}where it fails: {region(names, row, failures)}."
+def comes_near(backup: str) -> str:
+    """Why an action is dangerous that passes but for a dead end."""
+    return (
+        f"then {backup} would come near a dead end, from where episodes that had been certified "
+        "failed"
+    )
 
 
 def dead_ends(counts: Sequence[int]) -> str:
@@ -116,7 +110,7 @@ def dead_ends(counts: Sequence[int]) -> str:
     if not counts:
         return ""
     several, most_first = "s" * (len(counts) > 1), sorted(counts, reverse=True)
-    return f"; {len(counts)} dead-end state{several}: {failed(most_first)} from there"
+    return f"; {len(counts)} dead end{several}: {failed(most_first)} from there"
 
 
 def failed(counts: Sequence[int]) -> str:
@@ -152,53 +146,54 @@ def no_threshold(n_failed: int, *, is_given: bool) -> str:
     return f"{seen} seen, but beyond no value that was survived, so nothing is refused"
 
 
-def experience(
-    fails: Sequence[tuple[str, bool, float]],
-    remembered: Remembered,
-    margin: float,
-    drifts: Sequence[tuple[str, int]] = (),
-    worse: int = 0,
-    noisy: Sequence[str] = (),
-    differs: float = 0.0,
-    nothing: str = NO_FAILURE,
-    regions: Sequence[str] = (),
-    begin: Sequence[tuple[str, bool, Sequence[float]]] = (),
-    ends: Sequence[int] = (),
-    over: Sequence[str] = (),
-) -> str:
-    """What was learnt so far: variables that fail, whether below a threshold, and which.
+def experience(state: State, remembered: Remembered, names: Sequence[str], nothing: str) -> str:
+    """What was learnt so far; what is said of failure where that is not known is ``nothing``."""
+    said: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: []}
+    sides = []
+    for row, is_side in zip(state.forms, failure.are_sides(state.forms), strict=True):
+        told = region(names, row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])])
+        if is_side and row[SAYS] == FAILS:
+            sides.append(told.removeprefix("where ").partition(" (")[0])
+        else:
+            said[int(row[SAYS])].append(told)
+    latest = {int(j): int(since) + 1 for j, since, _ in state.drifts}
+    more = "".join(f"; since episode {k} {names[j]} moves otherwise" for j, k in latest.items())
+    if said[ENDS]:
+        more += f"; ends by itself {' or '.join(said[ENDS])}"
+    there = [f"where {' or '.join(sides)}"] if sides else []
+    there += said[FAILS] + [f"if it ends {one}" for one in said[CRASHES]]
+    if not there:
+        return nothing + more
+    them = f"{remembered}, to be survived by {changes(state.margin)}"
+    return f"fails {' or '.join(there)}; {them}{more}{dead_ends(state.counts.astype(int).tolist())}"
 
-    Since which episode, from 1, variables move otherwise and disturbances are worse (0: none are).
-    In which share of the states around a given function says otherwise. Beyond which thresholds
-    alone disturbances begin. From how many episodes each dead end is known. Where it ends.
+
+def here(
+    state: State, model: Model, names: Sequence[str], z: Floats, near: float
+) -> tuple[str, Floats | None]:
+    """What is said of an observation (m,), and the centre of the dead end it is in or near.
+
+    Empty, and None, where failures and dead ends are farther than ``near``.
     """
-    since = "".join(f"; since episode {first} {name} moves otherwise" for name, first in drifts)
-    if worse:
-        since += f"; since episode {worse} disturbances are worse than those of before"
-    if noisy:
-        since += f"; sensors are noisy: {', '.join(noisy)}"
-    if over:
-        since += f"; ends by itself {' or '.join(over)}"
-    if not fails and not regions:
-        return nothing + since
-    if differs:
-        since += (
-            f"; failed= says otherwise in {differs:.1%} of the states around, where this decides"
-        )
-    where = " or ".join(
-        f"{name} is {'below' if low else 'above'} {at:.4g}" for name, low, at in fails
-    )
-    for name, low, ats in begin:
-        side, at = ("below", max(ats)) if low else ("above", min(ats))
-        verb = "was" if len(ats) == 1 else "were"
-        since += f"; {len(ats)} of them {verb} seen to begin only where {name} is {side} {at:.4g}"
-    fails_there = " or ".join([*([f"where {where}"] if where else []), *regions])
-    them = f"{remembered}, to be survived by {changes(margin)}"
-    return f"fails {fails_there}; {them}{since}{dead_ends(ends)}"
+    told, forms = "", state.forms[~failure.are_sides(state.forms) & (state.forms[:, SAYS] == FAILS)]
+    away = failure.distances(forms, z[None])[:, 0]
+    if away.min(initial=math.inf) <= near:
+        row, left = forms[int(away.argmin())], float(away.min())
+        where = "" if left < 0.0 else f"{changes(left)} from "
+        what = region(names, row[I:HELD].tolist(), int(row[HELD]))
+        told = f"This is {where}where it fails: {what}."
+    off = np.sqrt((((state.centres - z) * model.inverse) ** 2).sum(1)) - state.radii
+    off = off * model.dead_ends[:, -1]
+    if off.min(initial=math.inf) > near:
+        return told, None
+    k, left = int(off.argmin()), float(off.min())
+    where = "in" if left < 0.0 else f"{changes(left)} from"
+    from_there = f"This is {where} a dead end, from where {failed([int(state.counts[k])])}."
+    return f"{told} {from_there}".lstrip(), state.centres[k]
 
 
 def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "failure") -> str:
-    """Where a region is (a row as in `regions`), in which so many failures were seen.
+    """Where a form is (columns I to R of its row), in which so many failures were seen.
 
     Examples
     --------
@@ -271,6 +266,6 @@ def constant(values: Sequence[float]) -> str:
 
 
 def changes(size: float) -> str:
-    """A distance to failure, in ordinary changes."""
+    """A distance to failure, in typical steps."""
     shown = f"{size:.2g}" if abs(size) < 100.0 else f"{size:,.0f}"
-    return f"{shown} ordinary change{'s' * (shown != '1')}"
+    return f"{shown} typical step{'s' * (shown != '1')}"
