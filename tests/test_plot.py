@@ -171,16 +171,15 @@ def guard():
 
 
 def test_what_failed_is_tinted_and_what_was_survived_is_not(guard):
-    ax, known = plot.experience(guard, new()), guard.judge.dynamics
+    ax, known = plot.experience(guard, new()), guard.judge.state
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
     survived, failed = (line.get_xydata() for line in ax.lines[:2])
     assert np.array_equal(failed, known.failures[:, :2])
     tinted = ax.collections[0].get_paths()[0]
     assert tinted.contains_points([[0.0, 0.0], [-3.0, 0.0]]).tolist() == [True, False]
     assert not tinted.contains_points(survived).any()
-    for ring, centre in zip(ax.patches, known.dead_ends.centres, strict=True):
+    for ring, centre in zip(ax.patches, known.centres, strict=True):
         assert ring.center == pytest.approx(centre[:2])
-    assert f"{known.dead_ends.numbers[0]:.0f}" in texts(ax)
 
 
 def test_what_other_variables_tell_of_failure_is_said(guard):

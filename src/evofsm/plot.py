@@ -18,7 +18,7 @@ from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel, Policy
 from evofsm.fsm.step import Trace
 from evofsm.guard import Guard, LearntRisk
-from evofsm.guard.learnt.regions import forms
+from evofsm.guard.learnt.failure import FAILS, SAYS, I, J, forms, telling
 
 with needs("matplotlib", "plot", "plotting"):
     import matplotlib
@@ -191,10 +191,12 @@ def experience(
     'variable 2'
     """
     judge = guard.judge
-    if not isinstance(judge, LearntRisk) or not judge.dynamics.n_variables:
+    if not isinstance(judge, LearntRisk) or not judge.n_variables:
         raise ValueError("the judge of this guard has not learnt where it fails")
-    known, m, ends = judge.dynamics, judge.dynamics.n_variables, judge.dynamics.dead_ends
-    pair = list(variables or dict.fromkeys([*known.telling, *range(max(m, 2))]))[:2]
+    known, m = judge.state, judge.n_variables
+    fails = known.forms[known.forms[:, SAYS] == FAILS]
+    told = telling(fails)
+    pair = list(variables or dict.fromkeys([*told, *range(max(m, 2))]))[:2]
     _refuse_other(pair, m)
     ax, called, red = _given_or_new(ax), judge.labels.variable, COLORS["dead end"]
     dots: Look = {"linestyle": "none", "marker": ".", "markersize": 1.5, "color": ink(0.4)}
@@ -202,39 +204,30 @@ def experience(
     survived = np.concatenate([known.survived, known.brinks])
     for seen, look in ((survived, dots), (known.failures, crosses)):
         ax.plot(*seen[:, pair].T, **look)
-    sizes = 2.0 * ends.radii[:, None] / known.model.inverse[pair]
-    for centre, (wide, high) in zip(ends.centres[:, pair], sizes, strict=True):
+    sizes = 2.0 * known.radii[:, None] * known.survived.std(0)[pair]
+    for centre, (wide, high) in zip(known.centres[:, pair], sizes, strict=True):
         ax.add_patch(Ellipse(centre, wide, high, fill=False, edgecolor=red, zorder=3.0))
     ax.autoscale_view()
     limits = ax.axis()
     x, y = np.meshgrid(np.linspace(*limits[:2], _GRID), np.linspace(*limits[2:], _GRID))
     z = np.zeros((x.size, m))
     z[:, pair] = np.column_stack([x.ravel(), y.ravel()])
-    here = np.isin(known.regions[:, :2], pair).all(1)
-    fails = [sign * (z[:, j] - at) for j, sign, at in known.thresholds if j in pair]
-    if fails := [*fails, *forms(known.regions[here], z)[0]]:
-        form = np.max(fails, axis=0).reshape(x.shape)
+    here = fails[np.isin(fails[:, [I, J]], pair).all(1)]
+    if len(here):
+        form = forms(here, z)[0].max(0).reshape(x.shape)
         ax.contourf(x, y, form, [0.0, np.inf], colors=[red], alpha=0.15, zorder=0.5)
         ax.contour(x, y, form, [0.0], colors=[red], linewidths=1.2, zorder=2.0)
     if guard.machine is not None:
         draw_centers(ax, guard.machine.centers[:, pair], (), 10.0)
-    told, spans = list[Point](), np.ptp(np.reshape(limits, (2, 2)), axis=1)
-    for number, (to_right, upward) in zip(ends.numbers, ends.centres[:, pair], strict=True):
-        spot = to_right / spans[0], upward / spans[1]
-        if all(math.dist(spot, other) > 0.06 for other in told):  # else they would overlap
-            look = {"color": red, "fontweight": "bold", "zorder": 6.0}
-            look["path_effects"] = [withStroke(linewidth=2.0, foreground="white")]
-            write(ax, f"{number:.0f}", (to_right, upward), (5.0, 5.0), **look)
-            told.append(spot)
     ax.axis(limits)
     looks: dict[str, Look] = {
         "survived (blank: nothing was seen)": {**dots, "markersize": 5.0},
         "failed": crosses,
         "fails, as learnt": {"marker": "s", "markersize": 8.0, "color": red, "alpha": 0.3},
-        "dead end" + ", all else as in its centre" * (m > 2): {"marker": "$1$", "color": red},
+        "dead end" + ", all else as in its centre" * (m > 2): {"marker": "o", "fillstyle": "none", "color": red},
         "state": {"marker": "o", "fillstyle": "none", "color": ink()},
     }
-    if elsewhere := sorted({*known.telling} - {*pair}):
+    if elsewhere := sorted({*told} - {*pair}):
         looks[f"not in view: fails by {', '.join(map(called, elsewhere))}"] = {"marker": ""}
     look = {"linestyle": "none"}
     _explain(ax, [Line2D([], [], label=name, **{**look, **one}) for name, one in looks.items()])

@@ -125,7 +125,7 @@ def test_any_environment_is_watched_by_a_guard_that_is_given_nothing_but_which_e
     assert max(frame.proposed_risk.risk for frame in frames) > 0.5
     assert (start.names[2], start.discrete, start.high) == ("pole angle [rad]", True, (1.0,))
     assert "pole angular velocity" in last.here
-    assert known.plane[0] in {variable for variable, _, _ in known.thresholds}
+    assert known.plane[0] in {form[1] for form in known.forms}
     assert "The controller alone would have failed at" in tell(last, start).alone
 
 
@@ -139,7 +139,7 @@ def test_the_first_failure_of_a_kind_is_called_so_and_no_other_one(on):
             if last.failed:
                 before, told = set(said), tell(last, session.start)
                 first = told.headline == "Failure, the first of its kind"
-                sides = {(k, sign) for k, sign, _ in session.known().thresholds}
+                sides = {(form[1], form[8] > 0.0) for form in session.known().forms}
                 assert first == bool(sides - before)
                 assert first == ("A guard cannot prevent the first failure" in told.done)
                 said += sides

@@ -144,13 +144,9 @@ def test_decisions_are_the_same_and_sanitizers_silent(name, tmp_path):
     for flags in (("-O2",), c99.SANITIZERS):
         found = agrees(learnt, tmp_path / flags[0], *flags)
         assert found.changed > 20
-    has = {"noisy": ("NOISY", 1), "noisy_cars": ("EXACT", 0), "cut_in": ("JUMPS", 1)}
-    has |= {"disc": ("REGIONS", 1), "disc+parts": ("JUMPS", 1)}
-    macro, is_on = has.get(name, ("ACTS", 1))
-    assert bool(constant(tmp_path / "-O2", macro)) == is_on
     if name == "disc+parts":
         reasons = [reason for reason, _ in c99.ask(learnt, 1500).said]
-        assert sum("near dead end" in reason for reason in reasons) > 10
+        assert sum("near a dead end" in reason for reason in reasons) > 10
 
 
 SETTINGS = {

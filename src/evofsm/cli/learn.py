@@ -394,7 +394,7 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
         return
-    nothing = "" if guard.judge.dynamics.fails else " nothing yet"
+    nothing = "" if len(guard.judge.state.forms) else " nothing yet"
     yield f"It judges{nothing}: {guard.judge.told_by_experience}."
     if beyond:
         yield f"It knows no action beyond --action-range, where {beyond:.1%} of the log's are."

@@ -277,15 +277,10 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
 }
 
 static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
-  int j, k;
   if (s->is_located_now) {
     s->is_located = 1;
-    for (j = 0; j < 3; j++) {
-      s->mean[j] = s->here[j];
-      for (k = 0; k < 3; k++) {
-        s->spread[j][k] = s->around[j][k];
-      }
-    }
+    copy(s->mean, s->here, 3);
+    copy(s->spread[0], s->around[0], 9);
   }
   s->before = s->commanded;
   s->commanded = executed[0];

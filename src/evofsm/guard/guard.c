@@ -160,6 +160,13 @@ UNIT_CONSTANTS
 static double lesser(double one, double other) { return other < one ? other : one; }
 static double greater(double one, double other) { return other > one ? other : one; }
 
+static void copy(double *to, const double *from, int count) {
+  int i;
+  for (i = 0; i < count; i++) {
+    to[i] = from[i];
+  }
+}
+
 UNIT_SOURCE
 /* -- States: recognise of clusters.py --------------------------------------------------------- */
 
@@ -309,10 +316,8 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
   out->unsurvived = 0;
   revise(state, out);
   out->is_new = out->seen < NEW;
-  for (i = 0; i < EVOFSM_ACTIONS; i++) {
-    out->advised[i] = state->best[i];
-    out->executed[i] = ACTS ? state->best[i] : state->proposal[i];
-  }
+  copy(out->advised, state->best, EVOFSM_ACTIONS);
+  copy(out->executed, ACTS ? state->best : state->proposal, EVOFSM_ACTIONS);
   state->decisions += 1.0;
   if ((intake & (EVOFSM_REPEATED | EVOFSM_LATE)) == 0) {
     follow(state, out->executed);

@@ -15,8 +15,8 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.guard import LearningJudge, LearntRisk
 from evofsm.guard.harm import Harm
-from evofsm.guard.learnt.dynamics import Dynamics
-from evofsm.guard.learnt.regions import SIZE, inside
+from evofsm.guard.learnt.failure import FAILS, SAYS, SIZE, B, I, J, are_sides, inside, telling
+from evofsm.guard.learnt.state import State
 from evofsm.guard.learnt.words import harm
 
 # The classic measures that are shown beside, with their thresholds.
@@ -81,7 +81,7 @@ class Judged(NamedTuple):
     low: float = math.nan
     high: float = math.nan
     #: Hardest disturbance that is survived: braking of the leader [m/s²]; of a learnt judge what
-    #: the best backup leaves of the distance to failure [ordinary changes].
+    #: the best backup leaves of the distance to failure [typical steps].
     critical: float = math.nan
 
 
@@ -224,8 +224,7 @@ class Known(NamedTuple):
     plane: tuple[int, int] = (0, 1)  #: the two that matter
     survived: Any = ()  #: (n, m) observations, a few of them
     failed: Any = ()  #: (k, m)
-    thresholds: Any = ()  #: variable, sign, and where it fails
-    regions: Any = ()  #: (r, 12) as in `evofsm.guard.learnt.regions`
+    forms: Any = ()  #: (r, 14) where it fails, as in `evofsm.guard.learnt.failure`
     dead_ends: Any = ()  #: (d, m) centres
     radii: Any = ()  #: (d, m) in each variable
     told: str = ""  #: in words
@@ -234,20 +233,20 @@ class Known(NamedTuple):
 
 def known_of(judge: LearningJudge) -> Known:
     """What a judge knows that learns of failure; nothing of another."""
-    if not isinstance(judge, LearntRisk) or not judge.dynamics.n_variables:
+    if not isinstance(judge, LearntRisk) or not judge.n_variables:
         return Known()
-    learnt = judge.dynamics
-    ends, survived = learnt.dead_ends, learnt.survived
+    learnt, survived = judge.state, judge.state.survived
     said = harm(judge.harm, learning=judge.learning).removeprefix("; ")
     said = said or _no_better(judge.harm)
+    fails = learnt.forms[learnt.forms[:, SAYS] == FAILS]
+    spread = survived.std(0) if len(survived) else np.zeros(judge.n_variables)
     return Known(
-        _plane(learnt),
+        _plane(learnt, fails),
         survived[:: 1 + len(survived) // _MOST_SURVIVED].tolist(),
         learnt.failures.tolist(),
-        learnt.thresholds,
-        learnt.regions.tolist(),
-        ends.centres.tolist(),
-        (ends.radii[:, None] / learnt.model.inverse).tolist(),
+        fails.tolist(),
+        learnt.centres.tolist(),
+        (learnt.radii[:, None] * spread).tolist(),
         judge.told_by_experience,
         said,
     )
@@ -261,11 +260,11 @@ def first_of_its_kind(seen: Sequence[float], before: Known, after: Known) -> str
 
 def _kinds(known: Known, seen: Sequence[float] | None = None) -> set[tuple[float, float]]:
     """Sides of variables, and pairs of them, that tell of failures; or of one that was seen."""
-    sides, pairs = known.thresholds, np.array(known.regions, np.float64).reshape(-1, SIZE)
+    forms = np.array(known.forms, np.float64).reshape(-1, SIZE)
     if seen is not None:
-        sides = [(j, sign, at) for j, sign, at in sides if sign * (seen[j] - at) >= 0.0]
-        pairs = pairs[inside(pairs, np.array([seen]))[:, 0]]
-    return {(j, sign) for j, sign, _ in sides} | {(i, j) for i, j in pairs[:, :2].tolist()}
+        forms = forms[inside(forms, np.array([seen]))[:, 0]]
+    columns = np.where(are_sides(forms)[:, None], forms[:, [I, B]], forms[:, [I, J]])
+    return {(i, j) for i, j in columns.tolist()}
 
 
 def _no_better(known: Harm) -> str:
@@ -279,13 +278,13 @@ def _no_better(known: Harm) -> str:
     return f"no better than the controller alone: {len(guarded)} of {n} guarded episodes failed"
 
 
-def _plane(learnt: Dynamics) -> tuple[int, int]:
+def _plane(learnt: State, fails: Any) -> tuple[int, int]:
     """Variables by which it fails, then those that differ most where it failed."""
-    named = learnt.telling
+    named = telling(fails)
     if len(learnt.failures) and len(learnt.survived):
         apart = np.abs(learnt.failures.mean(0) - learnt.survived.mean(0))
         named += np.argsort(-apart / (learnt.survived.std(0) + 1e-9), kind="stable").tolist()
-    first, second, *_ = [*dict.fromkeys([*named, *range(learnt.n_variables)]), 0]
+    first, second, *_ = [*dict.fromkeys([*named, *range(len(learnt.origin))]), 0]
     return first, second
 
 

@@ -85,6 +85,12 @@ def inside(table: Floats, z: Floats, blur: float = BLUR) -> Flags:
     return distances(table, z) <= np.where(are_sides(table), 0.0, blur)[:, None]
 
 
+def telling(table: Floats) -> list[int]:
+    """Variables of forms, those of bent ones first."""
+    rows = table[np.argsort(are_sides(table), kind="stable")]
+    return list(dict.fromkeys(rows[:, [I, J]].astype(int).ravel().tolist()))
+
+
 def prepared(table: Floats) -> Floats:
     """(r, 13) forms as kernels take them: what ends first, and linear ones with a gradient of 1.
 

@@ -109,16 +109,11 @@ static void fill_features(evofsm_state *s, double harder) {
 /* _expect: the changes that are expected of features, into s->move. */
 static void expect(evofsm_state *s) {
   int j, k, l;
-  for (j = 0; j < M; j++) {
-    for (l = 0; l < L; l++) {
-      s->move[j][l] = 0.0;
-    }
-  }
   for (k = 0; k < P; k++) {
     for (j = 0; j < M; j++) {
       const double weight = weights[k][j];
       for (l = 0; l < L; l++) {
-        s->move[j][l] += s->found[k][l] * weight;
+        s->move[j][l] = (k > 0 ? s->move[j][l] : 0.0) + s->found[k][l] * weight;
       }
     }
   }
@@ -161,13 +156,10 @@ static void follow_policy(evofsm_state *s, const double policy[A][1 + M], double
 /* _from_centre: squared distances from the centre of a dead end, in spreads, into s->square. */
 static void from_centre(evofsm_state *s, int end) {
   int j, l;
-  for (l = 0; l < L; l++) {
-    s->square[l] = 0.0;
-  }
   for (j = 0; j < M; j++) {
     for (l = 0; l < L; l++) {
       const double x = (s->z[j][l] - dead_ends[end][j]) * inverse[j];
-      s->square[l] += x * x;
+      s->square[l] = (j > 0 ? s->square[l] : 0.0) + x * x;
     }
   }
 }
@@ -180,7 +172,6 @@ static void measure(evofsm_state *s) {
   for (l = 0; l < L; l++) {
     s->far[l] = s->over[l] = INFINITY;
   }
-#if FORMS > 0
   for (f = 0; f < FORMS; f++) {
     const double says = forms[f][0], *z = s->z[(int)forms[f][1]], *other_z = s->z[(int)forms[f][2]];
     const double at = forms[f][3], to = forms[f][4], one = forms[f][5], other = forms[f][6];
@@ -209,7 +200,6 @@ static void measure(evofsm_state *s) {
       }
     }
   }
-#endif
 #if EVOFSM_DEAD_ENDS > 0
   for (f = 0; f < (s->ignores ? 0 : EVOFSM_DEAD_ENDS); f++) {
     from_centre(s, f);
@@ -224,7 +214,7 @@ static void measure(evofsm_state *s) {
 
 /* A step of a rollout: what is expected, what disturbs it, and where that leads. */
 static void step(evofsm_state *s, int t, double harder) {
-  int i, j, l;
+  int j, l;
   fill_features(s, harder);
   expect(s);
   for (j = 0; j < M; j++) {
@@ -237,11 +227,7 @@ static void step(evofsm_state *s, int t, double harder) {
       s->z[j][l] = after;
     }
   }
-  for (i = 0; i < A; i++) {
-    for (l = 0; l < L; l++) {
-      s->before[i][l] = s->now[i][l];
-    }
-  }
+  copy(s->before[0], s->now[0], A * L);
 }
 
 /* _rollout, of one situation: an action first, if there is one, then a backup. Returns how many
@@ -337,26 +323,17 @@ static int passes(evofsm_state *s, const double action[A], int backup, double *l
   return lost <= ALLOWED && *left >= MARGIN;
 }
 
-/* _action_of: what a backup does here. */
-static void action_of(const evofsm_state *s, int backup, double action[A]) {
-  int i, j;
-  for (i = 0; i < A; i++) {
-    action[i] = policies[backup][i][0];
-    for (j = 0; j < M; j++) {
-      action[i] += policies[backup][i][1 + j] * (s->here[j] - mean[j]) * inverse[j];
-    }
-    if (EVOFSM_CHOICES == 0) {
-      action[i] = lesser(greater(action[i], -1.0), 1.0);
+/* action_of: what a backup does here. */
+static void action_of(evofsm_state *s, int backup, double action[A]) {
+  int i, j, l;
+  for (j = 0; j < M; j++) {
+    for (l = 0; l < L; l++) {
+      s->z[j][l] = s->here[j];
     }
   }
-  if (EVOFSM_CHOICES > 0) {
-    int best = 0;
-    for (i = 1; i < A; i++) {
-      best = action[i] > action[best] ? i : best;
-    }
-    for (i = 0; i < A; i++) {
-      action[i] = i == best ? 1.0 : 0.0;
-    }
+  follow_policy(s, policies[backup], 1.0);
+  for (i = 0; i < A; i++) {
+    action[i] = s->now[i][0];
   }
 }
 
@@ -395,9 +372,7 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
   double own[A], closer[A], refused = 0.0, share = 1.0, longest = -INFINITY, distance;
   int i, r, step_of;
   s->done = 0;
-  for (i = 0; i < A; i++) {
-    action[i] = proposal[i];
-  }
+  copy(action, proposal, A);
   for (r = 0; r < ASKED && s->done < MOST_DONE; r++) {
     *backup = s->ranks[r];
     if (passes(s, proposal, *backup, left)) {
@@ -416,9 +391,7 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
     if (are_same(own, proposal) || !passes(s, own, *backup, left)) {
       continue;
     }
-    for (i = 0; i < A; i++) {
-      action[i] = own[i];
-    }
+    copy(action, own, A);
     for (step_of = 0; step_of < (EVOFSM_CHOICES > 0 ? 0 : HALVINGS); step_of++) {
       const double part = 0.5 * (refused + share);
       for (i = 0; i < A; i++) {
@@ -427,9 +400,7 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
       if (passes(s, closer, *backup, &distance)) {
         share = part;
         *left = distance;
-        for (i = 0; i < A; i++) {
-          action[i] = closer[i];
-        }
+        copy(action, closer, A);
       } else {
         refused = part;
       }
@@ -490,21 +461,13 @@ static void situate(evofsm_state *s) {
   int i, j;
   s->is_placed = 1;
   for (j = 0; j < M; j++) {
-    s->is_placed &= s->has_past || !isnan(s->observation[j]);
-    s->here[j] = s->observation[j];
-    s->here[M + j] = 0.0;
+    const double z = s->observation[j];
+    s->here[j] = s->has_past && isnan(z) ? s->at[j] + s->at[M + j] : z;
+    s->here[M + j] = s->has_past ? s->here[j] - s->at[j] : 0.0;
+    s->is_placed &= !isnan(s->here[j]);
   }
   for (i = 0; i < A; i++) {
     s->here[2 * M + i] = s->has_past ? s->action[i] : 0.0;
-  }
-  if (!s->has_past) {
-    return;
-  }
-  for (j = 0; j < M; j++) {
-    s->here[j] = isnan(s->here[j]) ? s->at[j] + s->at[M + j] : s->here[j];
-  }
-  for (j = 0; j < M; j++) {
-    s->here[M + j] = s->here[j] - s->at[j];
   }
 }
 
@@ -523,10 +486,8 @@ static void start_revising(evofsm_state *s) { (void)s; }
 /* LearntRisk.search: what to execute of s->proposal, into s->best, and how risky that is. */
 static void revise(evofsm_state *s, evofsm_decision *out) {
   double proposal[A], action[A];
-  int i, r, unsurvived = 0;
-  for (i = 0; i < EVOFSM_ACTIONS; i++) {
-    s->best[i] = s->proposal[i];
-  }
+  int r, unsurvived = 0;
+  copy(s->best, s->proposal, EVOFSM_ACTIONS);
   situate(s);
   if (!s->is_placed) {
     out->reason = EVOFSM_NOTHING_SEEN;
@@ -564,13 +525,9 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
 
 /* LearntRisk.follow: keep up with what is executed. */
 static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
-  int i;
-  if (!s->is_placed) {
-    return;
+  if (s->is_placed) {
+    copy(s->at, s->here, 2 * M + A);
+    encode(executed, s->action);
+    s->has_past = 1;
   }
-  for (i = 0; i < 2 * M + A; i++) {
-    s->at[i] = s->here[i];
-  }
-  encode(executed, s->action);
-  s->has_past = 1;
 }

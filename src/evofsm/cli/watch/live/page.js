@@ -77,7 +77,7 @@ function learnt(start, known) {
   const signs = ["+ now, blue: its way", "○ state"];
   if (known.survived.length) signs.push("· survived");
   if (known.failed.length) signs.push("✕ failed");
-  if (known.regions.length + known.thresholds.length) signs.push("shaded: expected to fail");
+  if (known.forms.length) signs.push("shaded: expected to fail");
   if (known.dead_ends.length) signs.push("dashed: dead end");
   signs.push(marksDeadEnds(start) ? "⬢ dead end" : "⬢ state in which it failed");
   return `${start.learning} ${signs.join(", ")}.`;

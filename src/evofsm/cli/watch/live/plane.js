@@ -6,7 +6,7 @@ import { colour, fresh, hexagon, line, niceStep, shown, text } from "./paint.js"
 const MOST_BARS = 4;
 const APART = [20, 16]; // of two numbers, or of what a circle would cover of one [px]
 const EDGE = { left: 44, right: 14, top: 18, bottom: 34 };
-const CELL = 4; // of the grid on which regions are drawn [px]
+const CELL = 4; // of the grid on which forms are drawn [px]
 
 /** Whether states are marked that are dead ends; else those in which it failed. */
 export const marksDeadEnds = (start) => start.live && start.judge !== "learnt";
@@ -88,8 +88,7 @@ export function drawPlane(canvas, run, [across, up]) {
   pen.rect(box.left, box.top, box.right - box.left, box.bottom - box.top);
   pen.clip();
   const { known } = run;
-  for (const [variable, sign, where] of known.thresholds) drawThreshold(pen, x, y, box, variable, sign, where);
-  for (const region of known.regions) drawRegion(pen, x, y, box, region);
+  for (const form of known.forms) drawForm(pen, x, y, box, form);
   pen.fillStyle = colour.soft;
   pen.globalAlpha = 0.45;
   for (const row of known.survived) pen.fillRect(at(row)[0] - 1, at(row)[1] - 1, 2, 2);
@@ -122,24 +121,8 @@ function drawAxes(pen, x, y, box, width, height) {
   text(pen, y.name, 2, 7, { size: 11, ink: colour.soft });
 }
 
-/** What lies beyond a threshold, if it is of a variable that is shown. */
-function drawThreshold(pen, x, y, box, variable, sign, where) {
-  const ink = { ink: colour.danger, width: 1.6 };
-  pen.fillStyle = colour.wash;
-  if (x.variable === variable) {
-    const edge = x.place(where), end = sign > 0 ? box.right : box.left;
-    pen.fillRect(Math.min(edge, end), box.top, Math.abs(end - edge), box.bottom - box.top);
-    line(pen, edge, box.top, edge, box.bottom, ink);
-  }
-  if (y.variable === variable) {
-    const edge = y.place(where), end = sign > 0 ? box.top : box.bottom;
-    pen.fillRect(box.left, Math.min(edge, end), box.right - box.left, Math.abs(end - edge));
-    line(pen, box.left, edge, box.right, edge, ink);
-  }
-}
-
-/** A region, if it is of no other variables: its inside, and its outline by marching squares. */
-function drawRegion(pen, x, y, box, [i, j, at, to, one, other, c, b, d, p, q, r]) {
+/** Where it fails, if that is of no other variables: its inside, and its outline by marching squares. */
+function drawForm(pen, x, y, box, [, i, j, at, to, one, other, c, b, d, p, q, r]) {
   const shows = (variable) => variable === x.variable || variable === y.variable;
   if (!shows(i) || !shows(j)) return;
   const form = (px, py) => {

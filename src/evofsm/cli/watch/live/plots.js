@@ -27,7 +27,7 @@ function panels(run) {
   const most = byLeaders ? 12 : 10;
   const margin = {
     title: byLeaders ? "Braking of the leader that is survived" : "Margin of the best backup",
-    about: byLeaders ? "m/s²; shaded: what leaders are expected to do" : "ordinary changes; shaded: what has to be left",
+    about: byLeaders ? "m/s²; shaded: what leaders are expected to do" : "typical steps; shaded: what has to be left",
     low: byLeaders ? 0 : -2, high: most, ticks: byLeaders ? [0, 4, 8, 12] : [0, 5, 10], show: (value) => (value === most ? `≥ ${most}` : shown(value)),
     lines: [wish((f) => f.proposed_risk.critical), executed((f) => f.executed_risk.critical)],
     bands: [{ ink: colour.grid, ends: ({ needed, usual }) => (needed === null ? null : [usual ?? 0, needed]) }],
