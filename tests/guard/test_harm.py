@@ -22,7 +22,7 @@ def wrong(monkeypatch):
     instead = [1.0]
 
     def search(judge, situation, wanted, **_):
-        if not judge.n_failed:
+        if not judge.state.n_failed:
             return Search(np.array([wanted]), _unjudged(1), 0, "nothing was learnt yet")
         return Search(np.array([wanted, instead[0]]), _unjudged(2), 1, "it must")
 
