@@ -7,7 +7,8 @@ import pytest
 
 from evofsm import Guard, store
 from evofsm.guard.guard import KIND as GUARD
-from evofsm.guard.learnt.judge import KIND, LearntRisk
+from evofsm.guard.learnt.files import KIND
+from evofsm.guard.learnt.judge import LearntRisk
 
 
 def assert_goes_on_alike(point, guard, exactly, content):
@@ -26,12 +27,6 @@ def assert_goes_on_alike(point, guard, exactly, content):
 )
 def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(point, exactly, content, episodes):
     assert_goes_on_alike(point, point.taught(episodes), exactly, content)
-
-
-def test_with_noisy_sensors_it_goes_on_bit_for_bit_too(noisy, exactly, content):
-    guard = noisy.taught(20)
-    assert guard.judge.dynamics.is_noisy
-    assert_goes_on_alike(noisy, guard, exactly, content)
 
 
 @pytest.fixture
@@ -53,21 +48,20 @@ def with_first(value):
 @pytest.mark.parametrize(
     ("settings", "arrays", "why"),
     [
-        ({}, {"backups_variables": lambda one: one * 0.0}, "variables of the backups"),
-        ({"n_constant": 99}, {}, "not 99 constant ones"),
         ({"without": ["luck"]}, {}, "without names"),
         ({"low": [3.0]}, {}, "below high"),
-        ({"n_actions": 4}, {}, "an action has 4 numbers"),
-        ({}, {"situations": lambda one: one[:, 1:]}, "situations are not of 2 variables"),
-        ({}, {"thresholds": with_first(7.0)}, "thresholds are of variables that there are not"),
-        ({}, {"sequence_rows": lambda one: one[1:]}, "not those that they say"),
-        ({}, {"sequence_rows": lambda one: one[:, 1:]}, "another number of variables"),
-        ({}, {"jumps": lambda one: np.zeros((1, 9))}, "another number of variables"),
-        ({}, {"events": lambda one: one[:, 1:]}, "places are of"),
-        ({}, {"sequences": lambda one: one + np.eye(6)[3] * 9}, "places are of"),
-        ({}, {"regions": lambda one: np.full((1, 12), 9.0)}, "regions are of variables"),
-        ({}, {"crashes": lambda one: np.zeros((1, 12))}, "crashes have units that are not"),
-        ({}, {"dead_ends_survived": lambda one: np.zeros((9999, 2))}, "at most 40 dead ends"),
+        ({"n_actions": 4}, {}, "of actions of 1 numbers, but they have 4"),
+        ({"low": [-1.0, -1.0], "high": [1.0, 1.0]}, {}, "of actions of 1 numbers, but they have 2"),
+        ({}, {"situations": lambda one: one[:, 1:]}, "situations has shape"),
+        ({}, {"windows": lambda one: one[:, :, 1:]}, "windows has shape"),
+        ({}, {"policies": lambda one: one[:, :, 1:]}, "policies has shape"),
+        ({}, {"squares": lambda one: one[1:, 1:], "recent_squares": lambda one: one[1:, 1:],
+              "products": lambda one: one[1:], "recent_products": lambda one: one[1:]}, "squares has"),
+        ({}, {"forms": with_first(7.0)}, "forms are of variables that there are not"),
+        ({}, {"forms": lambda one: one + 2.0 * np.eye(14)[2]}, "forms are of variables"),
+        ({}, {"forms": lambda one: one * (np.arange(14) != 5)}, "units that are not positive"),
+        ({}, {"drifts": lambda one: np.full((1, 3), 9.0)}, "drifts are of variables"),
+        ({}, {"lengths": with_first(999.0)}, "windows have other than 3 to 146 steps"),
     ],
 )
 def test_a_file_that_contradicts_itself_is_refused(judge, settings, arrays, why):
@@ -78,11 +72,16 @@ def test_a_file_that_contradicts_itself_is_refused(judge, settings, arrays, why)
         LearntRisk.load(BytesIO(bad.getvalue()))
 
 
-@pytest.mark.parametrize("name", ["backups_policies", "sums_mean"])
+@pytest.mark.parametrize("name", ["policies", "origin", "unit"])
 def test_numbers_that_nothing_could_have_learnt_are_refused(judge, name):
     settings, arrays = judge
-    with pytest.raises(ValueError, match=name):
-        store.write(BytesIO(), KIND, settings, arrays | {name: arrays[name] * 0.0 + np.inf})
+    for number in (np.inf, -np.inf, np.nan):
+        with pytest.raises(ValueError, match=name):
+            store.write(BytesIO(), KIND, settings, arrays | {name: arrays[name] * 0.0 + number})
+
+
+def within(of, name, value):
+    return lambda told, entries, numbers: told["settings"][of].update({name: value})
 
 
 @pytest.mark.parametrize(
@@ -90,12 +89,14 @@ def test_numbers_that_nothing_could_have_learnt_are_refused(judge, name):
     [
         ({"n_actions": 10**9}, "at most 1,000"),
         ({"given_horizon": 1e9}, "looks at most 10,000 ahead"),
-        ({"horizon": 10**9}, "horizon of 1e[+]09"),
         ({"seed": -1}, "seed of -1"),
         ({"seed": None}, "lacks seed"),
         ({"names": None}, "names is None"),
-        ({"dynamics": []}, r"dynamics is \[\]"),
-        ({"margin": []}, "margin"),
+        ({"state": []}, r"state is \[\]"),
+        (within("state", "horizon", 10**9), "horizon of 1e[+]09"),
+        (within("state", "luck", 1), "luck"),
+        (within("settings", "margin", "3"), "margin is '3'"),
+        (within("settings", "n_mutants", 10**9), "n_mutants of 1e[+]09"),
     ],
 )
 def test_a_forged_file_is_refused_before_it_asks_for_memory(

@@ -20,7 +20,7 @@ _FIELDS = {
 }
 _ARRAYS = {name: numbers for name, (kind, numbers) in _FIELDS.items() if kind == Floats}
 _NUMBERS = {name: numbers for name, (_, numbers) in _FIELDS.items() if name not in _ARRAYS}
-_SETTING = {int: COUNT, float: Numbers(least=SMALLEST)}
+_SETTING = {int: COUNT._replace(most=1e6), float: Numbers(least=SMALLEST)}
 KIND = Kind(
     "learntrisk",
     {"harm": OUTCOMES, **_ARRAYS},
@@ -45,7 +45,11 @@ def packed(state: State) -> tuple[dict[str, Any], dict[str, Floats]]:
 
 
 def unpacked(
-    numbers: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], choices: int, settings: Settings
+    numbers: Mapping[str, Any],
+    arrays: Mapping[str, NDArray[Any]],
+    choices: int,
+    size: int,
+    settings: Settings,
 ) -> State:
     """Make a state of what `packed` gave.
 
@@ -56,8 +60,8 @@ def unpacked(
     """
     state = State(**numbers, **{name: arrays[name] for name in _ARRAYS})
     m, a = len(state.origin), len(state.used)
-    if state.choices != choices:
-        raise ValueError(f"it is of {state.choices} actions, and of {choices}")
+    if (state.choices, a) != (choices, size):
+        raise ValueError(f"it is of actions of {a} numbers, but they have {size}")
     refuse_too_many(m, a, box=not choices)
     for name, array in State.none(m, a, choices, settings, None)._asdict().items():
         shape, rows = np.shape(getattr(state, name)), int(name != "squares")

@@ -639,10 +639,8 @@ class LearntRisk(ActionJudge):
                 given |= {"low": settings["low"], "high": settings["high"]}
             given |= {"horizon": settings["given_horizon"]}
             judge = cls(settings["dt"], settings=Settings(**settings["settings"]), **given)
-            of = judge.choices, judge.settings
+            of = judge.choices, judge.size, judge.settings
             judge.state = files.unpacked(settings["state"], arrays, *of)
-            if len(judge.state.used) != judge.size:
-                raise ValueError(f"used is of other actions than those of {judge.size} numbers")
             judge.harm = Harm.restored(settings["harm"], arrays["harm"])
             judge.n_violated = settings["n_violated"]
             judge.remake()
