@@ -23,7 +23,7 @@ import polars as pl
 from evofsm.driving import Draw, drive, held_out, load_family, teach, training
 from evofsm.paper import Page, Table
 from studies import lib
-from studies.systems import Start, System, Vector, make_system
+from studies.systems import Start, System, Vector
 
 #: What was accepted, and with which draws.
 ACCEPTED = Path(__file__).parents[1] / "docs" / "results" / "benchmark.json"

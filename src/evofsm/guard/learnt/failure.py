@@ -14,13 +14,12 @@ What one episode alone survived takes back no failure: that takes a second witne
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, FLAT, GROWN, Flags, Floats, Ints
+from evofsm.guard.learnt.rollout import CRASHES, FAILS, FLAT, GROWN, Flags, Floats, Ints
 
 #: Columns of a form: what it says, variables i and j, from where each is counted, the inverse of
 #: its unit, coefficients of 1, x, y, x x, x y, y y; how many failures it holds.
@@ -174,9 +173,7 @@ def _counted(table: Floats, failures: Floats) -> Floats:
     return table
 
 
-def _sides(
-    says: int, failures: Floats, survived: Survived, blur: Floats, least: float
-) -> Floats:
+def _sides(says: int, failures: Floats, survived: Survived, blur: Floats, least: float) -> Floats:
     """The fewest ends of the box of what was survived that explain failures.
 
     Of two that explain the first ones alike both hold until another failure tells them apart. A

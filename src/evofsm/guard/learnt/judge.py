@@ -26,7 +26,7 @@ from evofsm.guard.actions import Mask
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import files, words
-from evofsm.guard.learnt.learn import disturbance_scale, learn
+from evofsm.guard.learnt.learn import disturbance_scale, ends_of, learn
 from evofsm.guard.learnt.rollout import (
     CUT_SHORT,
     KEPT,
@@ -485,7 +485,7 @@ class LearntRisk(ActionJudge):
         inner = self.encode(action)
         self._u = self._u[: len(self._z) - 1] if len(self._u) == len(self._z) else self._u
         self._u.append(inner)
-        self._used = self._used + np.array([inner < (-1.0 if self.choices else -0.6), inner > 0.6]).T
+        self._used = self._used + ends_of(inner[None], self.choices)
 
     def learn(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
         """Take in what was executed, and whether the certificate of before still held."""
@@ -549,9 +549,14 @@ class LearntRisk(ActionJudge):
             self.state = none._replace(
                 horizon=now.horizon, margin=now.margin, n_failed=now.n_failed
             )
-        is_given = self.given_horizon is not None
         self.state = learn(
-            self.state, episode, self.settings, self.seed, self.without, is_given, self.failed
+            self.state,
+            episode,
+            self.settings,
+            seed=self.seed,
+            without=self.without,
+            has_horizon=self.given_horizon is not None,
+            failed=self.failed,
         )
         self.parts = Parts.of(self.state, self.settings)
 

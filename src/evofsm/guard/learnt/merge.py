@@ -15,8 +15,9 @@ import numpy as np
 
 from evofsm.guard.harm import Harm
 from evofsm.guard.learnt.backups import evolved
+from evofsm.guard.learnt.danger import dead_ends, explained
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.learnt.learn import chosen, dead_ends, disturbance_scale, explained, worst
+from evofsm.guard.learnt.learn import chosen, disturbance_scale, worst
 from evofsm.guard.learnt.rollout import Floats, crossed, pairs
 from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
 
@@ -88,7 +89,9 @@ def merge(parts: Sequence[State], settings: Settings, seed: int) -> State:
     shared = np.isclose(ends, np.stack([lowest[0], highest[0]], 1), 1e-9, 0.0)
     later = n_episodes - of("n_episodes")  # the latest episode of each is the latest of all
     survived = np.concatenate([part.survived for part in parts])
-    survived_in = np.concatenate([part.survived_in + k for part, k in zip(parts, later, strict=True)])
+    survived_in = np.concatenate(
+        [part.survived_in + k for part, k in zip(parts, later, strict=True)]
+    )
     every = max(1, -(-len(survived) // settings.max_survived))
     drifts = [part.drifts + [0, k, k] for part, k in zip(parts, later, strict=True)]
     merged = max(parts, key=lambda part: part.n_episodes)._replace(

@@ -10,12 +10,9 @@ rests at an end of a variable, are no dynamics; outliers weigh less.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
-
 import numpy as np
 
-from evofsm.guard.learnt.rollout import Flags, Floats, Model, crossed, features, lags, pairs
+from evofsm.guard.learnt.rollout import Flags, Floats, Model, features, lags
 
 # A change so many times those around it, and the typical one, is a jump; so is a row so far from
 # the median of those around it, which is none.
@@ -43,6 +40,12 @@ def jumps(change: Floats, unit: Floats) -> Flags:
     size = np.abs(change)
     before, after = np.vstack([size[:1], size[:-1]]), np.vstack([size[1:], 0.0 * size[-1:]])
     return np.asarray(size > JUMP * np.maximum(np.maximum(before, after), unit))
+
+
+def are_jumps(z: Floats, unit: Floats) -> Flags:
+    """(T,) which transitions, from the second of T + 2 observations on, begin or end in a jump."""
+    jumped = jumps(np.diff(z, axis=0), unit).any(1)
+    return np.asarray(jumped[1:] | jumped[:-1])
 
 
 def without_glitches(z: Floats, unit: Floats) -> Floats:
@@ -128,6 +131,5 @@ def residuals(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
     held = ((to < model.lowest) & (after <= model.lowest)) | (
         (to > model.highest) & (after >= model.highest)
     )
-    jumped = jumps(np.diff(z, axis=0), unit)[1:].any(1) | jumps(np.diff(z, axis=0), unit)[:-1].any(1)
-    none = ~known | (change == 0.0).all(1) | jumped
+    none = ~known | (change == 0.0).all(1) | are_jumps(z, unit)
     return np.where(held | none[:, None], 0.0, after - to)

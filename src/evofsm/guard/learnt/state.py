@@ -8,9 +8,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from evofsm.guard.learnt import failure, model
-from evofsm.guard.learnt.failure import CRASHES, FAILS, HELD, SAYS, Survived
-from evofsm.guard.learnt.rollout import Floats, Ints, Model, n_features
-from evofsm.store import COUNT, FLAG, Numbers
+from evofsm.guard.learnt.failure import CRASHES, FAILS, SAYS, Survived
+from evofsm.guard.learnt.rollout import Floats, Model, n_features
+from evofsm.store import COUNT, FLAG, SHARE, Numbers
 
 # What files hold of a field: observations, what is not negative, and ends that may be infinite.
 _SEEN, _ABOVE_0 = Numbers(least=-1e30, most=1e30), Numbers(least=0.0)
@@ -106,6 +106,7 @@ class State(NamedTuple):
     failures: Annotated[Floats, _SEEN.of("failures", "m")]
     ended: Annotated[Floats, _SEEN.of("ended", "m")]  #: where episodes ended without failing
     forms: Annotated[Floats, Numbers(("forms", failure.SIZE))]  #: where it fails or ends
+    differs: Annotated[float, SHARE]  #: of what was asked, where a given function says otherwise
     #: episodes in which little passed; below 0 while it is doubted
     held: Annotated[int, COUNT._replace(least=-1.0)]
     # dead ends
@@ -160,6 +161,7 @@ class State(NamedTuple):
             failures=e((0, m)),
             ended=e((0, m)),
             forms=e((0, failure.SIZE)),
+            differs=0.0,
             held=0,
             centres=e((0, m)),
             radii=e(0),
@@ -201,8 +203,12 @@ def model_of(state: State, settings: Settings, *, daring: bool = False) -> Model
         table[crash] = failure.halfway(table[crash], state.failures)
         if state.held < 0:
             table = table[~weak(table, state.failures, settings.few)]
-    worth = 1.0 / (1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) + 1e-300) if m else 1.0
-    noisy = np.where(state.scale > 0.0, state.noise / np.where(state.power > 0.0, state.power, 1.0), 1.0)
+    worth = (
+        1.0 / (1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) + 1e-300) if m else 1.0
+    )
+    noisy = np.where(
+        state.scale > 0.0, state.noise / np.where(state.power > 0.0, state.power, 1.0), 1.0
+    )
     weights = model.solve(state.squares, state.products, noisy.clip(1e-3, 1.0), a, settings.shy)
     return Model(
         weights=weights if np.isfinite(weights).all() else np.zeros_like(weights),

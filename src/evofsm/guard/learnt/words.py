@@ -34,7 +34,7 @@ import numpy as np
 
 from evofsm.guard.harm import Harm, Outcome
 from evofsm.guard.learnt import failure
-from evofsm.guard.learnt.failure import HELD, I, SAYS
+from evofsm.guard.learnt.failure import HELD, SAYS, I
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, Floats, Model
 from evofsm.guard.learnt.state import State
 

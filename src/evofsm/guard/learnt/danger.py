@@ -1,0 +1,189 @@
+"""What an episode says of where a system fails, and where it ends: forms, and dead ends.
+
+Forms (`failure`) hold observations in which it failed. A *dead end* is a ball of observations from
+which a certified episode failed: the model was wrong there. It shrinks to what was survived, and
+each further episode that failed near it doubles its radius.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Set
+
+import numpy as np
+
+from evofsm.guard.learnt import failure, model
+from evofsm.guard.learnt.failure import CRASHES, ENDS, FAILS, HELD, SAYS, B, I, Survived
+from evofsm.guard.learnt.rollout import Floats, Model
+from evofsm.guard.learnt.state import Episode, Settings, State, sizes
+
+# Episodes of which the end tells where there are any; observations so near the last one [typical
+# steps] cannot be told from it.
+_ENDED, _SAME = 2, 0.5
+# Dead ends: how near an old one counts once more, how far new ones are apart and their first
+# radius [spreads]; share of the way to what was survived; how many at most, of how many rows.
+_NEAR, _APART, _WAY, _MAX_ENDS, _MAX_ROWS = 0.6, 0.15, 0.9, 40, 4000
+# Where failure is given as a function: directions in which it is looked for, how far [spreads],
+# halvings to its edge, and how far beyond that it is asked once more.
+_RAYS, _HALVINGS, _DEEP = 64, 40, 0.05
+_RADII = tuple(0.1 * 1.3**k for k in range(20))
+
+
+def fails(
+    state: State,
+    z: Floats,
+    episode: Episode,
+    settings: Settings,
+    without: Set[str],
+    given: Callable[[Floats], bool] | None,
+) -> State:
+    """Learn where it fails, and where it ends, of observations ``z`` (T + 1, m) of an episode."""
+    failed = episode.failed and bool(np.isfinite(z[-1]).all())
+    rows = z[:-1] if episode.failed else z
+    rows = rows[np.isfinite(rows).all(1)]
+    most, went_on = settings.max_failures, rows
+    if episode.terminated and len(rows):
+        far = (np.abs(rows - rows[-1]) > _SAME * sizes(state).unit).any(1)
+        went_on = rows[: int(np.flatnonzero(far).max(initial=-1)) + 1]
+        state = state._replace(ended=np.vstack([state.ended, rows[-1]])[-most:])
+    if len(went_on):
+        change = np.diff(went_on, axis=0)
+        between = went_on[:-1] + 0.5 * change
+        new = np.concatenate([went_on, between[~model.jumps(change, state.unit).any(1)]])
+        if given is not None:
+            new = new[[not given(row) for row in new]]
+        survived = np.concatenate([state.survived, new])
+        survived_in = np.append(state.survived_in, np.full(len(new), float(state.n_episodes)))
+        while len(survived) > settings.max_survived:
+            survived, survived_in = survived[::2], survived_in[::2]
+        state = state._replace(survived=survived, survived_in=survived_in)
+    if failed:
+        brinks = np.vstack([state.brinks, rows[-1:]])[-most:]
+        state = state._replace(failures=np.vstack([state.failures, z[-1]])[-most:], brinks=brinks)
+    if given is not None:
+        return _asked(state, given, bends="regions" not in without)
+    return explained(state, failed=failed, bends="regions" not in without)
+
+
+def explained(state: State, *, failed: bool, bends: bool = True) -> State:
+    """Explain all that failed or ended by forms, anew if it ``failed`` now."""
+    known, table = sizes(state), state.forms
+    if len(state.ended) >= _ENDED:
+        table = _endings(state, table, known)
+    ends, crashes = table[table[:, SAYS] == ENDS], table[table[:, SAYS] == CRASHES]
+    is_end = failure.inside(ends, state.failures).any(0)
+    failures = state.failures[~(is_end & failure.inside(crashes, state.failures, 0.0).any(0))]
+    blur = np.where(state.reached < 2, state.scale[:, None], 0.0)
+    known = known._replace(rows=np.concatenate([known.rows, state.ended]))
+    was = table[table[:, SAYS] == FAILS]
+    are_sides = failure.are_sides(was)
+    bent = failure.without(was[~are_sides], known.rows)
+    sides = failure.explain(FAILS, failures, known, blur, bends=False)
+    if len(bent):  # others come with other bent forms
+        kept = set(map(tuple, was[are_sides][:, [I, B]]))
+        sides = sides[[row in kept for row in map(tuple, sides[:, [I, B]])]]
+    rows = np.concatenate([sides, bent])
+    is_told = not len(failures) or failure.inside(rows, failures).any(0).all()
+    if bends and (failed or not is_told):
+        rows = failure.explain(FAILS, failures, known, blur)
+    rows[:, HELD] = failure.inside(rows, failures).sum(1)
+    forms = np.concatenate([ends, crashes, rows])
+    changed = failed or _shape(was) != _shape(rows)  # one of two explanations is refuted
+    return state._replace(forms=forms, held=0 if changed else state.held)
+
+
+def _shape(table: Floats) -> tuple[list[list[float]], int]:
+    """Which sides a table has, and how many rows."""
+    return table[failure.are_sides(table)][:, [I, B]].tolist(), len(table)
+
+
+def _endings(state: State, table: Floats, known: Survived) -> Floats:
+    """Where it ends by itself: nowhere where it went on, nor where it failed like that."""
+    rows, ended = failure.without(table[table[:, SAYS] == ENDS], known.rows), state.ended
+    if len(known.rows) and not failure.inside(rows, ended).any(0).all():
+        rows = failure.explain(ENDS, ended, known)
+    rows = rows[failure.inside(rows, ended).sum(1) >= _ENDED]
+    failed = state.failures[failure.inside(rows, state.failures).any(0)]
+    low, high = (np.array([end] * 2) for end in (ended.min(0), ended.max(0)))
+    those = known._replace(rows=ended, lowest=low, highest=high)
+    crashes = failure.explain(CRASHES, failed, those, least=1.0)
+    rows = failure.without(rows, failed[~failure.inside(crashes, failed, 0.0).any(0)])
+    return np.concatenate([rows, crashes, table[table[:, SAYS] == FAILS]])
+
+
+def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> State:
+    """Explain what a function says around what was survived, unless that is explained.
+
+    Looked for in drawn directions, farther along variables that change slowly.
+    """
+    known, survived, spread = sizes(state), state.survived, sizes(state).spread
+    if not len(survived) or not spread.any():
+        return state
+    pace = np.abs(np.diff(survived, axis=0)).mean(0) / np.where(spread > 0.0, spread, np.inf)
+    drawn = np.random.default_rng(state.n_episodes).normal(size=(_RAYS, len(spread)))
+    towards = np.empty_like(drawn)
+    towards[:, np.argsort(pace, kind="stable")] = drawn
+    towards *= np.where(((survived - survived.mean(0)) ** 3).sum(0) < 0.0, -1.0, 1.0) * spread
+    starts = survived[np.linspace(0, len(survived) - 1, _RAYS).astype(int)]
+    lost, kept = list[Floats](), [*known.rows]
+    for z, off in zip(starts, towards, strict=True):
+        near = 0.0
+        for far in _RADII:
+            if given(z + far * off):
+                for _ in range(_HALVINGS):
+                    half = 0.5 * (near + far)
+                    near, far = (near, half) if given(z + half * off) else (half, far)
+                deep = far + _DEEP
+                lost.append(z + (deep if given(z + deep * off) else far) * off)
+                kept.append(z + near * off)
+                break
+            kept.append(z + far * off)
+            near = far
+    failures, rows = np.array(lost).reshape(-1, len(spread)), np.array(kept)
+
+    def differs(table: Floats) -> float:
+        """The share of observations of which the function says otherwise."""
+        wrong = ~failure.inside(table, failures).any(0), failure.inside(table, rows, 0.0).any(0)
+        return float(np.concatenate(wrong).mean()) if lost else 0.0
+
+    table = state.forms
+    if differs(table) > 0.0:
+        low, high = (np.array([end] * 2) for end in (rows.min(0), rows.max(0)))
+        around = known._replace(rows=rows, lowest=low, highest=high)
+        table = failure.explain(FAILS, failures, around, bends=bends)
+    return state._replace(forms=table, differs=differs(table))
+
+
+# -- Dead ends ------------------------------------------------------------------------------------
+
+
+def dead_ends(state: State, known: Model, z: Floats, episode: Episode) -> State:
+    """Learn balls around what was observed between the last certificate and failure."""
+    inverse, centres, counts = known.inverse, state.centres, state.counts
+    held = np.flatnonzero(episode.certified[: len(z) - 1]) if episode.failed else np.empty(0, int)
+    rows = z[held[-1] + 1 :] if len(held) else z[:0]
+    rows = rows[np.isfinite(rows).all(1)]
+    if len(rows):
+        counts = counts + (_between(rows, centres, inverse) < _NEAR).any(0)
+        n = len(centres)
+        for row in rows:
+            far = _between(row[None], centres, inverse)[0]
+            if far.min(initial=np.inf) >= _APART:
+                count = counts[:n][far[:n] < _NEAR].max(initial=1.0)
+                centres, counts = np.vstack([centres, row]), np.append(counts, count)
+    if not len(centres):
+        return state
+    radii = np.minimum(_NEAR, _APART * 2.0 ** (np.minimum(counts, 9.0) - 1.0))
+    went_on = (
+        state.survived[state.survived_in != state.n_episodes] if episode.failed else state.survived
+    )
+    far = _between(centres, went_on[-_MAX_ROWS:], inverse)
+    radii = np.minimum(radii, _WAY * far.min(1, initial=np.inf))
+    typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2)))
+    left = np.flatnonzero(radii > _SAME * typical)
+    left = np.sort(left[np.argsort(-counts[left], kind="stable")[:_MAX_ENDS]])
+    return state._replace(centres=centres[left], radii=radii[left], counts=counts[left])
+
+
+def _between(some: Floats, others: Floats, inverse: Floats) -> Floats:
+    """(k, n) distances of (k, m) and (n, m), in spreads."""
+    return np.asarray(np.sqrt((((some[:, None] - others) * inverse) ** 2).sum(2)))

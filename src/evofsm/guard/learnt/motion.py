@@ -1,0 +1,169 @@
+"""What an episode says of how a system moves: typical steps, ends of variables, and the model.
+
+Sums of features and changes are added up (`model.solve`). Where a correction by the last episodes
+foresees their changes better than the model for long (a CUSUM of gained log likelihood, Page 1954,
+of a heavy-tailed residual), the system moves otherwise now, and the model is corrected.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evofsm.guard.learnt import model
+from evofsm.guard.learnt.rollout import Flags, Floats, Model, lags
+from evofsm.guard.learnt.state import Settings, State, model_of
+
+# Changes of which the typical step is learnt; a larger one counts as so many times that.
+_STEPS, _LARGE = 5000.0, 6.0
+# Of what was seen, the share that is the same up to rounding.
+_SAME = 1e-9
+# Changes of an episode that tell how large residuals are; how much the latest of them counts.
+_SOME, _LATEST = 5, 0.2
+# Episodes before it may move otherwise, and after it did, in which it is learnt how; transitions
+# that a correction needs, and how it is held to 0.
+_LEARNT, _FEW, _HELD = 20, 15.0, 0.3
+
+
+def steps(state: State, z: Floats) -> State:
+    """Learn typical steps, and ends of what was seen, of observations (T + 1, m)."""
+    change = np.diff(z, axis=0)
+    seen = np.isfinite(change).all(1)
+    if not seen.any():
+        return state
+    unit = state.unit if state.n_moves else model.typical_step(z)
+    size = np.minimum(np.abs(change[seen]), _LARGE * unit)
+    n = min(state.n_moves, _STEPS)
+    ordinary = np.where(model.jumps(change, unit) | ~seen[:, None], 0.0, change)
+    rows = z[np.isfinite(z).all(1)]
+    low, high = rows.min(0), rows.max(0)
+    close = _SAME * (high - low)
+    lowest, new_low = _extremes(state.lowest, low, close)
+    highest, new_high = _extremes(-state.highest, -high, close)
+    moving = np.abs(change) > close  # it arrived there, and did not start there
+    arrived = [
+        ((z[1:] <= lowest[0] + close) & moving).any(0),
+        ((z[1:] >= -highest[0] - close) & moving).any(0),
+    ]
+    reached = np.where(np.array([new_low, new_high]).T, 0.0, state.reached)
+    return state._replace(
+        unit=(n * unit + size.sum(0)) / (n + len(size)),
+        power=(n * state.power + (change[seen] ** 2).sum(0)) / (n + len(size)),
+        n_moves=state.n_moves + len(size),
+        least=np.minimum(state.least, ordinary.min(0)),
+        most=np.maximum(state.most, ordinary.max(0)),
+        lowest=lowest,
+        highest=-highest,
+        reached=reached + np.array(arrived).T,
+    )
+
+
+def _extremes(known: Floats, new: Floats, close: Floats) -> tuple[Floats, Flags]:
+    """(2, m) the least of two episodes, and (m,) whether the first of them is new."""
+    is_new = new < known[0] - close
+    second = np.where(is_new, known[0], np.minimum(known[1], new))
+    return np.array([np.where(is_new, new, known[0]), second]), is_new
+
+
+def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: Settings) -> State:
+    """Learn the model of observations (T + 1, m) and actions (T, a); NaN was not seen.
+
+    Outliers of the model ``known`` weigh less; jumps, and what is held at an end of a variable, are
+    left out.
+    """
+    phi, change, seen = model.rows_of(known, z, u)
+    if not seen.any():
+        return state
+    rest, jumped = model.residuals(known, z, u, state.unit), model.are_jumps(z, state.unit)
+    to, after = z[1:-1] + phi @ known.weights, z[2:]
+    held = ((after <= state.lowest[0]) & (to <= after)) | (
+        (after >= state.highest[0]) & (to >= after)
+    )
+    weight = np.where(jumped | ((after == z[1:-1]) & held).any(1), 0.0, 1.0)
+    is_known = bool(state.scale.any())
+    if is_known:
+        off = np.abs(rest) / np.maximum(state.scale, model.FLOOR * state.unit)
+        weight *= np.minimum(1.0, settings.outlier / np.maximum(off.max(1), 1e-12)) ** 2
+        free = ((after > known.lowest) & (after < known.highest)).all(1)
+        ordinary = ((change >= state.least) & (change <= state.most)).all(1)
+        rows = seen & free & ordinary
+        state = _drifted(state, known, phi[rows], change[rows], np.diff(z, axis=0), settings)
+    phi, change, weight = phi[seen], change[seen], weight[seen]
+    state = state._replace(
+        squares=state.squares + phi.T @ (weight[:, None] * phi),
+        products=state.products + phi.T @ (weight[:, None] * change),
+    )
+    moved = seen[:, None] & (after != z[1:-1])
+    if (here := moved.any(1)).sum() < _SOME:
+        return state
+    rest = np.abs(model.residuals(model_of(state, settings), z, u, state.unit))
+    size = [1.4826 * np.median(r[h]) if h.sum() >= _SOME else 0.0 for r, h in zip(rest.T, moved.T)]
+    share = _LATEST if is_known else 1.0
+    scale = (1.0 - share) * state.scale + share * np.array(size)
+    noise = (1.0 - share) * state.noise + share * (rest[here] ** 2).mean(0)
+    return state._replace(scale=np.maximum(scale, model.FLOOR * state.unit), noise=noise)
+
+
+def _drifted(
+    state: State, known: Model, phi: Floats, change: Floats, moves: Floats, settings: Settings
+) -> State:
+    """Correct the model, where it is otherwise now, by features and changes of an episode.
+
+    ``moves`` (T, m) are all changes of the episode.
+    """
+    n = state.n_episodes
+    size = np.maximum(np.maximum(state.scale, 0.5 * state.unit), 1e-300)
+    missed = change - phi @ known.weights
+    left = missed - phi @ _correction(state, known)
+    gained = np.log1p((missed / size) ** 2) - 2.0 * np.log1p((left / size) ** 2)
+    doubt = np.maximum(state.doubt + gained.sum(0), 0.0) * (n >= _LEARNT)
+    young = n - state.drifts[:, 2] < _LEARNT
+    fades = settings.drift_fade if young.any() or doubt.any() else 0.0
+    state = state._replace(
+        recent_squares=fades * state.recent_squares + phi.T @ phi,
+        recent_products=fades * state.recent_products + phi.T @ change,
+        doubt=doubt,
+        since=np.where(doubt > 0.0, state.since, float(n)),
+    )
+    begun = np.flatnonzero(doubt > settings.drift)
+    moved = np.unique(np.append(begun, state.drifts[young, 0])).astype(int)
+    if not len(moved):
+        return state
+    products, doubt, since = state.products.copy(), doubt.copy(), state.since.copy()
+    least, most = state.least.copy(), state.most.copy()
+    weights = known.weights + _correction(state, known)
+    products[:, moved] = state.squares @ weights[:, moved]
+    moves = np.where(model.jumps(moves, state.unit) | ~np.isfinite(moves), 0.0, moves)
+    least[begun], most[begun] = moves.min(0)[begun], moves.max(0)[begun]
+    drifts = np.vstack([state.drifts, *[[j, since[j], n] for j in begun]])
+    doubt[moved], since[moved] = 0.0, float(n)
+    state = state._replace(
+        drifts=drifts, products=products, doubt=doubt, since=since, least=least, most=most
+    )
+    return _anew(state, settings) if len(begun) else state
+
+
+def _anew(state: State, settings: Settings) -> State:
+    """Trust model and disturbances as little as at first: it may take longer to fail, too."""
+    longer = settings.ahead * max(state.time_to_failure, settings.horizon / settings.ahead)
+    return state._replace(
+        time_to_failure=min(longer, settings.horizon_max / settings.ahead),
+        believed=float(settings.horizon_max),
+        n_scanned=0,
+        margin=max(state.margin, settings.margin),
+    )
+
+
+def _correction(state: State, known: Model) -> Floats:
+    """(p, m) what is to be added to the weights, by ridge regression about 0."""
+    if state.recent_squares[0, 0] < _FEW:
+        return np.zeros_like(known.weights)
+    m, a, n = len(state.origin), len(state.used), max(1.0, float(state.squares[0, 0]))
+    size = np.diag(state.squares) / n
+    variance = np.maximum(size - (state.squares[0] / n) ** 2, 1e-6 * size)
+    variance[0] = 1.0
+    held, late = _HELD * variance, lags(m, a)
+    held[1 + 2 * m + 2 * a :] *= 30.0
+    held[late] = 1e12 * np.maximum(size[late], 1e-12)  # these stay as they are
+    missed = state.recent_products - state.recent_squares @ known.weights
+    found = model.ridge(state.recent_squares, missed, held)
+    return found if np.isfinite(found).all() else np.zeros_like(found)
