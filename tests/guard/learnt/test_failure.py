@@ -179,7 +179,9 @@ def test_thresholds_that_one_failure_tells_are_doubted_where_nearly_all_is_refus
     assert len(guard.judge.parts.model.forms) == 2  # of one failure it may be either
     for _ in range(8):  # nearly all is refused
         assert len(guard.judge.parts.daring.forms) == 2
-        play(0.97, failed=False)
+        for _ in range(60):
+            guard.decide(0.95 + 0.02 * rng.normal(size=2), np.ones(1))
+        guard.end(False)
     assert not len(guard.judge.parts.daring.forms)
     assert len(guard.judge.parts.model.forms) == 2
     assert "so it is doubted" in guard.decide(np.zeros(2), np.ones(1)).reason

@@ -12,8 +12,8 @@ from collections.abc import Callable, Set
 import numpy as np
 
 from evofsm.guard.learnt import failure, model
-from evofsm.guard.learnt.failure import CRASHES, ENDS, FAILS, HELD, SAYS, B, I, Survived
-from evofsm.guard.learnt.rollout import Floats, Model
+from evofsm.guard.learnt.failure import HELD, SAYS, B, I, Survived
+from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, Floats, Model
 from evofsm.guard.learnt.state import Episode, Settings, State, sizes
 
 # Episodes of which the end tells where there are any; observations so near the last one [typical
