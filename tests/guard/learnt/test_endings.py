@@ -9,8 +9,8 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from evofsm import Guard  # noqa: E402
 from evofsm.guard import LearntRisk, RevisedActions, merge_judges  # noqa: E402
-from evofsm.guard.learnt.dynamics import Dynamics  # noqa: E402
-from evofsm.guard.learnt.regions import distances  # noqa: E402
+from evofsm.guard.learnt.failure import SAYS, are_sides, distances  # noqa: E402
+from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS  # noqa: E402
 
 
 class Descent(gymnasium.Env):
@@ -104,28 +104,33 @@ def test_a_file_holds_them_and_a_merged_judge_knows_those_of_both(lander):
     again = LearntRisk.load(BytesIO(file.getvalue()))
     assert again.told_by_experience == lander.judge.told_by_experience
     merged = merge_judges([lander.judge, again])
-    assert len(merged.dynamics.ended) == 2 * len(again.dynamics.ended)
+    assert len(merged.state.ended) == 2 * len(again.state.ended)
     assert "ends by itself" in merged.told_by_experience
 
 
-def walk(dynamics, place, **how):
+def walk(judge, place, **how):
     for part in np.linspace(0.0, 1.0, 1 + round(np.abs(place).max() / 0.1)):
-        dynamics.observe(part * np.array(place))
-        dynamics.act(np.zeros(1))
-    dynamics.end(**{"failed": False} | how)
+        judge.observe(part * np.array(place))
+        judge.act(0.0)
+    judge.end(None, **{"failed": False} | how)
+
+
+def said(judge, what):
+    """Forms that say so."""
+    return judge.state.forms[judge.state.forms[:, SAYS] == what]
 
 
 def test_where_something_went_on_or_failed_there_is_none():
-    dynamics, ends = Dynamics(-1.0, 1.0), np.array([[1.05, -0.4], [1.05, 0.0], [1.05, 0.3]])
+    judge, ends = LearntRisk(0.1, -1.0, 1.0), np.array([[1.05, -0.4], [1.05, 0.0], [1.05, 0.3]])
     for y in np.linspace(-1.0, 1.0, 9):
-        walk(dynamics, [0.9, y])
+        walk(judge, [0.9, y])
     for before, z in enumerate(ends):
-        assert (len(dynamics.endings) == 0) == (before < 2)  # two are needed
-        walk(dynamics, z, terminated=True)
-    assert (distances(dynamics.endings, ends) < 0.0).all()
-    walk(dynamics, [1.05, 0.9], failed=True)  # it fails if it ends so far out
-    crashes = distances(dynamics.crashes, np.array([*ends, [1.05, 0.9]])).min(0) < 0.0
+        assert (len(said(judge, ENDS)) == 0) == (before < 2)  # two are needed
+        walk(judge, z, terminated=True)
+    assert (distances(said(judge, ENDS), ends) < 0.0).all()
+    walk(judge, [1.05, 0.9], failed=True)  # it fails if it ends so far out
+    crashes = distances(said(judge, CRASHES), np.array([*ends, [1.05, 0.9]])).min(0) < 0.0
     assert crashes.tolist() == [False, False, False, True]
-    assert not dynamics.thresholds
-    walk(dynamics, [3.0, 0.0])
-    assert (distances(dynamics.endings, np.array([[1.2, 0.0], [3.0, 0.0]])) > 0.0).all()
+    assert not are_sides(said(judge, FAILS)).any()
+    walk(judge, [3.0, 0.0])
+    assert (distances(said(judge, ENDS), np.array([[1.2, 0.0], [3.0, 0.0]])) > 0.0).all()

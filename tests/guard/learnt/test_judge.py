@@ -151,9 +151,9 @@ def test_what_is_noted_of_a_decision_belongs_to_its_observation(points, monkeypa
     """Although the first observations lack something, and a long episode is learnt in parts."""
     guard, noted, learn = points["box"].taught(4), [], judging.learn
 
-    def listen(state, episode, *others):
+    def listen(state, episode, *others, **named):
         noted.append(episode)
-        return learn(state, episode, *others)
+        return learn(state, episode, *others, **named)
 
     monkeypatch.setattr(judging, "learn", listen)
     course, said = long_episode(guard, steps, lambda t, z: z if t > 3 else [z[0], np.nan])

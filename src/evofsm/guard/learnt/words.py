@@ -164,6 +164,9 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
     there += said[FAILS] + [f"if it ends {one}" for one in said[CRASHES]]
     if not there:
         return nothing + more
+    if state.differs:
+        more += f"; failed= says otherwise in {state.differs:.1%} of the states around, where this "
+        more += "decides"
     them = f"{remembered}, to be survived by {changes(state.margin)}"
     return f"fails {' or '.join(there)}; {them}{more}{dead_ends(state.counts.astype(int).tolist())}"
 

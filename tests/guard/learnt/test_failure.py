@@ -1,0 +1,198 @@
+"""Where a system fails."""
+
+from io import BytesIO
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evofsm import Guard
+from evofsm.guard.learnt.failure import B, C, I, AT, SAYS, Survived, are_sides, distances, explain, inside
+from evofsm.guard.learnt.rollout import FAILS
+
+SHAPES = {
+    "disc": lambda z: np.hypot(z[..., 0], z[..., 2]) < 0.8,
+    "oblique": lambda z: 0.8 * z[..., 1] + 0.6 * z[..., 2] > 1.2,
+    "ring": lambda z: np.hypot(z[..., 0], z[..., 1]) > 1.7,
+    "hyperbola": lambda z: z[..., 0] * z[..., 1] > 0.8,
+    "two discs": lambda z: np.hypot(np.abs(z[..., 1]) - 1.0, z[..., 2]) < 0.4,
+    "corner": lambda z: (z[..., 0] > 0.5) & (z[..., 1] > 0.5),
+}
+UNIT = np.full(3, 0.1)
+
+
+def seen(shape, seed=0):
+    """Failures and what was survived, in three variables."""
+    z = np.random.default_rng(seed).uniform(-2.0, 2.0, (2000, 3))
+    fails = SHAPES[shape](z)
+    return z[fails][:40], z[~fails]
+
+
+def survived_as(rows, unit, spread=None):
+    """What was survived, as it is asked of."""
+    lowest, highest = np.array([rows.min(0)] * 2), np.array([rows.max(0)] * 2)
+    return Survived(rows, lowest, highest, unit, rows.std(0) if spread is None else spread)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_forms_explain_failures_and_nothing_that_was_survived_is_inside(shape):
+    failures, survived = seen(shape)
+    forms = explain(FAILS, failures, survived_as(survived, UNIT))
+    assert len(forms) <= 3
+    assert not are_sides(forms).any()
+    assert inside(forms, failures).any(0).mean() >= 0.95
+    assert (distances(forms, survived) > 0.0).all()
+    elsewhere = np.random.default_rng(1).uniform(-2.0, 2.0, (2000, 3))
+    said = (distances(forms, elsewhere) < 0.0).any(0)
+    assert (said != SHAPES[shape](elsewhere)).mean() < 0.06
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_order_unit_direction_and_origin_of_variables_make_no_difference(shape):
+    failures, survived = seen(shape)
+    order, times, off = [2, 0, 1], np.array([-3.7, 0.25, 100.0]), np.array([5.0, -2.0, 30.0])
+
+    def written(z):
+        return (z * times + off)[:, order]
+
+    found = explain(FAILS, failures, survived_as(survived, UNIT))
+    unit = (np.abs(times) * UNIT)[order]
+    other = explain(FAILS, written(failures), survived_as(written(survived), unit))
+    far, otherwise = distances(found, survived), distances(other, written(survived))
+    assert len(far) == len(otherwise)
+    np.testing.assert_allclose(far.min(0), otherwise.min(0), rtol=1e-4, atol=1e-4)
+
+
+def test_sides_that_explain_few_failures_go_where_a_bent_form_explains_all():
+    failures, survived = seen("oblique")
+    survived = survived[survived[:, 2] < np.sort(failures[:, 2])[-2]]
+    forms = explain(FAILS, failures, survived_as(survived, UNIT))
+    assert len(forms) == 1
+    assert not are_sides(forms).any()
+
+
+EXACT = np.zeros((2, 2))
+AMID = [[-0.1, 13.0], [0.1, 4.0], [0.2, 5.0], [0.3, 6.0]]
+ABOVE_ALONE = np.array([[0.0, 0.2], [0.2, 0.2]])  # who stands, does not fail for it
+
+
+def sides(failures, rows, unit, blur):
+    """Variables, directions and places of sides."""
+    found = explain(FAILS, failures, survived_as(rows, unit), blur, bends=False)
+    assert (found[:, C] == 0.0).all()
+    return {(int(i), sign, at) for i, sign, at in found[:, [I, B, AT]].tolist()}
+
+
+@pytest.mark.parametrize(
+    ("failures", "blur", "ends"),
+    [
+        ([[-1.0, 11.0], [-2.0, 5.0]], EXACT, {(0, -1.0, 0.0)}),  # that explains all of them
+        ([[-1.0, 11.0]], EXACT, {(0, -1.0, 0.0), (1, 1.0, 10.0)}),  # of one it may be either
+        ([[5.0, 5.0]], EXACT, set()),  # amid what was survived
+        ([[0.5, 5.0]], EXACT, set()),
+        ([[0.6, 5.0], [0.2, 4.0]], EXACT + 0.2, {(0, -1.0, 0.6)}),  # the innermost says where
+        ([[9.4, 5.0]], EXACT + 0.2, {(0, 1.0, 9.4)}),
+        ([[9.4, 5.0], [9.8, 4.0]], EXACT + 0.2, {(0, 1.0, 9.4)}),
+        ([[2.0, 5.0]], EXACT + 0.2, set()),  # farther in than any noise
+        ([[0.0, 5.0]], ABOVE_ALONE, set()),  # where a variable saturates nothing is blurred
+        (AMID, EXACT + 0.2, {(0, -1.0, 0.3)}),  # the one that may explain most
+    ],
+)
+def test_failures_are_explained_by_ends_of_what_was_survived(failures, blur, ends):
+    rows = np.array([[0.0, 0.0], [10.0, 10.0]])
+    assert sides(np.array(failures), rows, np.ones(2), blur) == ends
+
+
+@pytest.mark.parametrize("blur", [0.0, 0.1])
+@given(st.integers(0, 2**32))
+def test_sides_are_the_same_however_variables_are_written(blur, seed):
+    draw = np.random.default_rng(seed)
+    safe, lost, unit = draw.normal(size=(6, 3)), draw.normal(size=(4, 3)), draw.uniform(0.1, 1.0, 3)
+    order, times = draw.permutation(3), draw.choice([-2.0, 0.5], 3)  # so that none is rounded
+    written = [(one * times)[..., order] for one in (lost, safe, unit)]
+    written[2] = np.abs(written[2])
+    first, again = (
+        sides(*given, blur * np.tile(given[2][:, None], 2)) for given in ((lost, safe, unit), written)
+    )
+    back = {(i := order[j], sign * np.sign(times[i]), at / times[i]) for j, sign, at in again}
+    assert back == first
+
+
+# -- As guards learn them -----------------------------------------------------------------------
+
+
+def play(guard, episode, wanted=None):
+    """Walk in the plane towards random places, amid a disc; whether it failed."""
+    rng = np.random.default_rng(episode)
+    place, speed, said = rng.uniform([-2.0, -1.5], [-1.4, 1.5]), np.zeros(2), []
+    to = rng.uniform([1.4, -1.5], [2.0, 1.5])
+    for _ in range(60):
+        proposal = np.clip(0.7 * (to - place) - speed + 0.2 * rng.normal(size=2), -1.0, 1.0)
+        said.append(guard.decide([*place, *speed], proposal))
+        speed = speed + 0.1 * said[-1].executed + 0.004 * rng.normal(size=2)
+        place = place + 0.1 * speed
+        if np.hypot(*place) < 0.6:
+            break
+    failed = bool(np.hypot(*place) < 0.6)
+    guard.end(failed, [*place, *speed])
+    return said, failed
+
+
+@pytest.fixture(scope="module")
+def taught():
+    """A guard that learnt where the disc is."""
+    guard = Guard(-np.ones(2), np.ones(2), interval=0.1, horizon=2.0)
+    for episode in range(12):
+        play(guard, episode)
+    return guard
+
+
+def test_a_disc_is_learnt_said_and_no_threshold(taught):
+    state = taught.judge.state
+    assert (state.forms[:, SAYS] == FAILS).any()
+    survived = np.concatenate([state.survived, state.brinks])
+    assert (distances(state.forms, survived) > 0.0).all()
+    assert "ellipse of variable 1 and variable 2 around (" in taught.judge.told_by_experience
+    assert taught.told_here([0.0, 0.0, 0.0, 0.0]).startswith("This is where it fails: inside")
+    assert "typical steps from where it fails" in taught.told_here([-0.9, 0.0, 0.0, 0.0])
+    assert taught.told_here([-2.0, 1.5, 0.0, 0.0]) == ""
+    again = Guard.load(BytesIO(saved(taught)))
+    assert saved(again) == saved(taught)
+    held = [play(again, 100 + episode) for episode in range(5)]
+    assert sum(failed for _, failed in held) <= 1
+
+
+def test_thresholds_that_one_failure_tells_are_doubted_where_nearly_all_is_refused_for_long():
+    guard = Guard(-np.ones(1), np.ones(1), interval=0.1, horizon=2.0)
+    rng = np.random.default_rng(0)
+
+    def play(to, failed):
+        z = np.zeros(2)
+        while z[0] < to:
+            guard.decide(z, np.ones(1))
+            z = z + 0.02 + 0.002 * rng.normal(size=2)
+        guard.end(failed, z)
+
+    for k in range(4):
+        play(1.0 if k == 3 else 0.5, k == 3)
+    assert len(guard.judge.parts.model.forms) == 2  # of one failure it may be either
+    for _ in range(8):  # nearly all is refused
+        assert len(guard.judge.parts.daring.forms) == 2
+        for _ in range(60):
+            guard.decide(0.95 + 0.02 * rng.normal(size=2), np.ones(1))
+        guard.end(False)
+    assert not len(guard.judge.parts.daring.forms)
+    assert len(guard.judge.parts.model.forms) == 2
+    assert "so it is doubted" in guard.decide(np.zeros(2), np.ones(1)).reason
+    guard.freeze()
+    guard.decide(np.zeros(2), np.ones(1))
+    assert "is doubted" not in guard.decide(np.zeros(2), np.ones(1)).reason
+    guard.learn = True
+    play(1.0, failed=True)
+    assert len(guard.judge.parts.daring.forms) >= 1
+
+
+def saved(guard):
+    guard.save(file := BytesIO())
+    return file.getvalue()

@@ -1,0 +1,128 @@
+"""What is learnt of how a system moves, of a car that follows another one."""
+
+import numpy as np
+import pytest
+
+from evofsm.guard import LearntRisk
+from evofsm.guard.learnt.rollout import features
+
+
+def follow(judge, Z, U, *, failed=False):
+    """An episode: T + 1 observations and T actions, of which nobody knows what they mean."""
+    for t, z in enumerate(Z):
+        judge.observe(np.asarray(z, np.float64))
+        if t < len(U):
+            judge.act(U[t])
+    judge.end(None, failed=failed)
+
+
+def drive(draw, steps=120, *, braking=None, start=(40.0, 15.0, 15.0), noise=0.01, weakest=-2.5):
+    """A gap [m] and two speeds [m/s] at 4 Hz; the leader brakes from a step on, and stands at 0."""
+    gap, own, leader = start
+    Z, U = [[gap, own, leader]], []
+    for t in range(steps):
+        a = float(np.clip(draw.normal(0.05 * (leader - own), 0.8), -2.5, 2.5))
+        push = -3.0 if braking is not None and braking <= t < braking + 16 else 0.0
+        own_next = max(0.0, own + 0.25 * max(a, weakest))
+        leader_next = max(0.0, leader + 0.25 * push + noise * draw.normal())
+        gap += 0.25 * (leader - own)
+        own, leader = own_next, leader_next
+        Z.append([gap, own, leader])
+        U.append(a)
+    return np.array(Z), np.array(U)
+
+
+def taught(episodes=4, seed=0):
+    """A judge after some episodes without a failure."""
+    draw, judge = np.random.default_rng(seed), LearntRisk(0.25, -2.5, 2.5)
+    for episode in range(episodes):
+        follow(judge, *drive(draw, braking=60 if episode % 2 else None))
+    return judge
+
+
+def ahead(judge, z, action, steps=4):
+    """(steps, m) what is observed under an action, from rest, if nothing disturbs it."""
+    z, change, model = np.array([z], np.float64), np.zeros((1, len(z))), judge.parts.model
+    u, path = judge.encode(action)[None], []
+    for before in [np.zeros_like(u), *[u] * (steps - 1)]:
+        move = features(model, z, change, before, u) @ model.weights
+        after = np.clip(z + np.clip(move, model.least, model.most), model.lowest, model.highest)
+        z, change = after, after - z
+        path.append(z[0])
+    return np.array(path)
+
+
+def test_it_learns_what_a_car_does_but_nothing_of_the_failing_transition():
+    one, other = taught(8), taught(8)
+    assert ahead(one, [40.0, 15.0, 14.0], 1.0, 1)[0] == pytest.approx([39.75, 15.25, 14.0], abs=0.05)
+    Z, U = drive(np.random.default_rng(5))
+    follow(one, Z, U)
+    crash = Z[-1] + [-60.0, -14.0, 20.0]
+    follow(other, np.vstack([Z, crash]), np.append(U, 0.0), failed=True)
+    for name in ("least", "most", "unit", "lowest", "highest"):
+        before, after = getattr(one.state, name), getattr(other.state, name)
+        np.testing.assert_allclose(after, before, rtol=0.01, err_msg=name)
+    before, after = one.parts.model.weights, other.parts.model.weights
+    np.testing.assert_allclose(after, before, atol=0.02)
+    assert not (other.state.windows[:, :, :3] == crash).all(2).any()
+
+
+def test_a_long_rest_at_an_end_teaches_nothing_of_what_an_action_does():
+    judge = taught()
+    effect = judge.parts.model.weights[[7, 8], 1].copy()  # of this action and the one before
+    U = np.full(120, -2.0)
+    own = np.maximum(0.0, 2.0 + 0.25 * np.cumsum(np.append(0.0, U)))
+    Z = np.column_stack([30.0 - 0.25 * np.append(0.0, np.cumsum(own[:-1])), own, np.zeros(121)])
+    for _ in range(2):
+        follow(judge, Z, U)
+        np.testing.assert_allclose(judge.parts.model.weights[[7, 8], 1], effect, atol=0.02)
+    assert judge.parts.model.lowest[1] == 0.0
+
+
+@pytest.mark.parametrize("back", [1, 120])
+def test_a_jump_changes_model_and_units_by_less_than_1_percent(back):
+    one, other = taught(6), taught(6)
+    Z, U = drive(np.random.default_rng(5))
+    follow(one, Z, U)
+    jumped = Z.copy()
+    jumped[50 : 50 + back, 0] += 130.0
+    follow(other, jumped, U)
+    np.testing.assert_allclose(other.state.unit, one.state.unit, rtol=0.01)
+    np.testing.assert_allclose(other.parts.model.reach, one.parts.model.reach, rtol=0.01)
+    paths = [ahead(each, [40.0, 15.0, 14.0], 1.0) for each in (one, other)]
+    np.testing.assert_allclose(paths[1], paths[0], rtol=0.01, atol=0.01 * one.state.unit.max())
+
+
+def test_a_side_on_which_episodes_fail_is_never_a_saturation():
+    judge, draw = taught(0), np.random.default_rng(3)
+    for k in range(6):
+        Z, U = drive(draw, steps=60)
+        Z[:, 0] = np.maximum(Z[:, 0] - Z[-1, 0], 0.0)  # each ends where the gap is 0
+        follow(judge, np.vstack([Z, Z[-1] - [0.5 + 0.1 * k, 0.0, 0.0]]), [*U, 0.0], failed=True)
+    assert judge.state.reached[0, 0] >= 2
+    assert judge.told_by_experience.startswith("fails where variable 1 is below 0")
+    assert judge.parts.model.lowest[0] == -np.inf
+
+
+def test_a_leader_who_brakes_is_remembered_number_0_is_none_and_nothing_disturbs_who_rests():
+    judge = taught(6)
+    found = judge.parts.residuals
+    assert found.shape == (judge.horizon, 3, 1 + judge.remembered.number)
+    assert not found[:, :, 0].any()
+    assert found[:, 2].min() == pytest.approx(-0.75, abs=0.2)  # 3 m/s² for 0.25 s
+    resting = LearntRisk(0.25, -2.5, 2.5)
+    for _ in range(3):
+        follow(resting, np.tile([300.0, 0.0, 0.0], (60, 1)), np.full(59, -1.0))
+    assert not resting.parts.residuals.any()
+
+
+@pytest.mark.parametrize("weakest", [-1.0, -2.5])
+def test_weaker_brakes_are_noticed_and_what_is_remembered_is_seen_with_them(weakest):
+    draw, judge = np.random.default_rng(3), LearntRisk(0.25, -2.5, 2.5)
+    for episode in range(40):
+        weak = weakest if episode >= 30 else -2.5
+        follow(judge, *drive(draw, braking=60 if episode % 2 else None, weakest=weak))
+    slower = 15.0 - ahead(judge, [40.0, 15.0, 15.0], -2.5)[-1, 1]
+    assert (slower < 1.25) == ("variable 2 moves otherwise" in judge.told_by_experience) == (weakest > -2)
+    assert judge.parts.residuals[:, 2].min() < -0.5  # the leader still brakes
+    assert np.abs(judge.parts.residuals[:, 1]).max() < 0.3  # oneself as expected
