@@ -323,10 +323,10 @@ class LearntRisk(ActionJudge):
             return Search(one, judged, 0, words.kept(backup, remembered, left, allowed))
         why = words.refused(self._unsurvived, remembered, margin, scale, allowed)
         if not cut and len(model.dead_ends):
-            given = model._replace(dead_ends=model.dead_ends[:0]), here
+            free = model._replace(dead_ends=model.dead_ends[:0])
             amid = parts.residuals, scale, proposal, margin, allowed
             for after in ranks:
-                if survives(*given, policies[after], *amid)[0]:
+                if survives(free, here, policies[after], *amid)[0]:
                     why = words.comes_near(self.backup_text(after, policies))
                     break
         if passes:
