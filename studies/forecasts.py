@@ -51,6 +51,9 @@ from evofsm.fsm import (
     jensen_shannon,
 )
 from evofsm.guard import BELIEF_TOLERANCE, LearntRisk
+from evofsm.guard.learnt.failure import AT, B, I, are_sides
+from evofsm.guard.learnt.rollout import rollout
+from evofsm.guard.learnt.state import residuals_of
 from evofsm.io import episodes_of, read_traces
 from evofsm.paper import Page, Table
 from studies import lib
@@ -516,23 +519,21 @@ _FARTHEST = 200
 
 
 class Replays:
-    """Ours: dynamics that the learnt judge has of some episodes of a system."""
+    """Ours: what a learnt judge expects after some episodes of a system."""
 
     def __init__(self, name: str, runs: Sequence[Run]) -> None:
         self.runs = runs
         settings = make_system(name).actions.settings
         judge = LearntRisk(1.0, **settings, horizon=float(max(HORIZONS)))
-        self.dynamics = judge.dynamics
-        begun, seen = 0, 0
         for run in runs:
             for t, z in enumerate(run.observations):
-                last = t == len(run.actions)
-                begun += judge.observe(z) and not (last and run.failed)
-                if not last:
+                judge.observe(z)
+                if t < len(run.actions):
                     judge.act(run.executed[t])
-            seen += len(run.observations)
-            self.dynamics.end(failed=run.failed)
-        self._rate = begun / seen
+            judge.end(None, failed=run.failed)
+        self.state, parts = judge.state, judge.parts
+        assert parts is not None
+        self._model, self._rate = parts.model, judge.remembered.number / self.state.n_seen
         self._replayed: dict[int, Floats] = {}
 
     def __call__(self, some: Cases, steps: int) -> Floats:
@@ -562,14 +563,15 @@ class Replays:
         count = min(_BEHAVIOURS, len(done))
         _, near = tree.query(np.column_stack([some.z / scale, some.action]), count)
         horizon = max(HORIZONS)
-        disturbances = self.dynamics.disturbances(horizon)
-        found = []
+        model, rest = self._model, residuals_of(self.state, self._model, horizon)
+        nothing, found = np.zeros(self.state.policies.shape[1:]), []
         for r, behaviours in enumerate(np.reshape(near, (-1, count))):
             situation = np.concatenate([some.z[r], some.change[r], some.before[r]])
             for begin in behaviours:
                 plan = done[np.minimum(begin + np.arange(horizon), ends[begin] - 1)]
                 plan[0] = some.action[r]
-                found.append(self.dynamics.fails_after(situation, plan, disturbances))
+                value = rollout(model, situation[None], nothing, rest, 1.0, plan).value
+                found.append(np.where(value < 0.0, value + horizon + 2.0, np.inf))
         return np.reshape(found, (len(near), count, -1))
 
 
@@ -632,15 +634,15 @@ class Taylor:
     that ours found in the failures, since no task tells them.
     """
 
-    def __init__(self, sides: Floats, order: int) -> None:
-        self.sides, self.order = sides, order
+    def __init__(self, forms: Floats, order: int) -> None:
+        self.sides, self.order = forms[are_sides(forms)], order
 
     def __call__(self, some: Cases) -> Floats:
         """(n,) score: minus the steps to the first boundary; infinite where none is reached."""
         s = np.arange(1.0, _FARTHEST + 1.0)
         first = np.full(len(some.z), np.inf)
-        for variable, sign, threshold, *_ in self.sides:
-            j = int(variable)
+        for j, sign, threshold in zip(*self.sides[:, [I, B, AT]].T, strict=True):
+            j = int(j)
             path = some.z[:, j, None] + s * some.change[:, j, None]
             if self.order > 1:
                 bend = some.change[:, j] - some.earlier[:, j]
@@ -713,7 +715,7 @@ def foresee(
     for steps in HORIZONS:
         some, on = seen.where(seen.known(steps)), others.known(steps)
         truth, came, known = some.left <= steps, others.left[on] <= steps, asked.known(steps)
-        orders = [Taylor(replays.dynamics.model.thresholds, order) for order in (1, 2)]
+        orders = [Taylor(replays.state.forms, order) for order in (1, 2)]
         areas = [lib.Ranked(one(others)[on], came).areas().auroc for one in orders]
         foreseers: dict[str, Callable[[Cases], Floats]] = {
             REPLAY: partial(replays, steps=steps),

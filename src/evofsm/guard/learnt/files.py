@@ -67,7 +67,7 @@ def unpacked(
         shape, rows = np.shape(getattr(state, name)), int(name != "squares")
         if shape[rows:] != np.shape(array)[rows:]:
             raise ValueError(
-                f"{name} has shape {shape}, which is not of {m} variables and actions of {a} numbers"
+                f"{name} has shape {shape}, not one of {m} variables and actions of {a} numbers"
             )
     forms, steps = state.forms, state.windows.shape[1]
     which = forms[:, [SAYS, I, J]]

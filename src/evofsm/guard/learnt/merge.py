@@ -93,7 +93,7 @@ def merge(parts: Sequence[State], settings: Settings, seed: int) -> State:
         [part.survived_in + k for part, k in zip(parts, later, strict=True)]
     )
     every = max(1, -(-len(survived) // settings.max_survived))
-    drifts = [part.drifts + [0, k, k] for part, k in zip(parts, later, strict=True)]
+    drifts = [part.drifts + np.array([0, k, k]) for part, k in zip(parts, later, strict=True)]
     merged = max(parts, key=lambda part: part.n_episodes)._replace(
         **{name: int(of(name).sum()) for name in ("n_failed", "n_scanned", "n_seen", "n_moves")},
         **{name: float(of(name).max()) for name in ("margin", "time_to_failure", "believed")},
