@@ -11,8 +11,8 @@ import numpy as np
 
 from evofsm.guard.learnt import danger, failure, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups
-from evofsm.guard.learnt.failure import FAILS, SAYS
-from evofsm.guard.learnt.rollout import Floats, Model, value_of
+from evofsm.guard.learnt.failure import SAYS
+from evofsm.guard.learnt.rollout import FAILS, Floats, Model, value_of
 from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
 
 # Actions of an episode that says how a system moves, at least; situations from which on disturbances
