@@ -18,7 +18,8 @@ from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel, Policy
 from evofsm.fsm.step import Trace
 from evofsm.guard import Guard, LearntRisk
-from evofsm.guard.learnt.failure import FAILS, SAYS, I, J, forms, telling
+from evofsm.guard.learnt.failure import SAYS, I, J, forms, telling
+from evofsm.guard.learnt.rollout import FAILS
 
 with needs("matplotlib", "plot", "plotting"):
     import matplotlib

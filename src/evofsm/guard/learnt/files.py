@@ -58,7 +58,8 @@ def unpacked(
     ValueError
         If sizes or indices contradict each other, or the actions: kernels take them on trust.
     """
-    state = State(**numbers, **{name: arrays[name] for name in _ARRAYS})
+    fields: dict[str, Any] = {**numbers, **{name: arrays[name] for name in _ARRAYS}}
+    state = State(**fields)
     m, a = len(state.origin), len(state.used)
     if (state.choices, a) != (choices, size):
         raise ValueError(f"it is of actions of {a} numbers, but they have {size}")

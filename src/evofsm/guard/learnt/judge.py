@@ -325,11 +325,11 @@ class LearntRisk(ActionJudge):
             return Search(one, judged, 0, words.kept(backup, remembered, left, allowed))
         why = words.refused(self._unsurvived, remembered, margin, scale, allowed)
         if not cut and len(model.dead_ends):
-            given = model._replace(dead_ends=model.dead_ends[:0]), here
-            amid = parts.residuals, scale, proposal, margin, allowed
-            for after in ranks:
-                if survives(*given, policies[after], *amid)[0]:
-                    why = words.comes_near(self.backup_text(after, policies))
+            free = model._replace(dead_ends=model.dead_ends[:0])
+            for q in ranks:
+                given = free, here, policies[q], parts.residuals, scale, proposal, margin, allowed
+                if survives(*given)[0]:
+                    why = words.comes_near(self.backup_text(q, policies))
                     break
         if passes:
             instead = words.changed(backup, remembered, margin, allowed)

@@ -96,7 +96,10 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: Setting
     if (here := moved.any(1)).sum() < _SOME:
         return state
     rest = np.abs(model.residuals(model_of(state, settings), z, u, state.unit))
-    size = [1.4826 * np.median(r[h]) if h.sum() >= _SOME else 0.0 for r, h in zip(rest.T, moved.T, strict=True)]
+    size = [
+        1.4826 * np.median(r[h]) if h.sum() >= _SOME else 0.0
+        for r, h in zip(rest.T, moved.T, strict=True)
+    ]
     share = _LATEST if is_known else 1.0
     scale = (1.0 - share) * state.scale + share * np.array(size)
     noise = (1.0 - share) * state.noise + share * (rest[here] ** 2).mean(0)
