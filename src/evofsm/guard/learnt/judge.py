@@ -43,10 +43,7 @@ from evofsm.guard.learnt.words import Remembered
 from evofsm.store import Place
 
 #: Parts that can be left out, to see what each is worth.
-JUDGE_PARTS: tuple[str, ...] = (
-    *("margin", "backups", "dead-ends", "stretches", "regions", "rivals", "products", "lags"),
-    *("jumps",),
-)
+JUDGE_PARTS = ("margin", "backups", "dead-ends", "stretches", "regions", "rivals")
 # Rows of an episode that are learnt from before it ends.
 _LONGEST = 1024
 # No horizon that is given has more steps: memory and the time of a decision grow with it.
@@ -258,6 +255,7 @@ class LearntRisk(ActionJudge):
     @property
     def effort(self) -> tuple[int, float]:
         """Backups that a search asks, and steps of rollouts after which it is cut short."""
+        assert self.parts is not None
         s, model = self.settings, self.parts.model
         few = s.n_asked if len(pairs(self.n_variables)[0]) else 2
         each = (model.weights.size + model.dead_ends.size) * self.parts.residuals.shape[2]
@@ -384,6 +382,7 @@ class LearntRisk(ActionJudge):
         How many disturbances are not survived, infinite if it fails without any; the least distance
         to failure under the worst of them; and the steps after which it fails at the latest.
         """
+        assert self.parts is not None
         model, rest = self.parts.model, self.parts.residuals
         ends = value_of(model, here[None], policies, rest, 1.0, plan, 0.0)[0]
         fails = ends[ends < 0.0]
@@ -452,12 +451,13 @@ class LearntRisk(ActionJudge):
 
     def savepoint(self) -> Rollback:
         """What takes back all that it learns from now on."""
-        own, lengths = {**self.__dict__}, (len(self._z), len(self._u), len(self._notes))
+        own = {**self.__dict__}
+        lengths = {name: len(own[name]) for name in ("_z", "_u", "_notes")}
 
         def rollback() -> None:
             self.__dict__ = {**own}
-            for rows, length in zip((self._z, self._u, self._notes), lengths, strict=True):
-                del rows[length:]
+            for name, length in lengths.items():
+                del self.__dict__[name][length:]
 
         return rollback
 
@@ -534,15 +534,16 @@ class LearntRisk(ActionJudge):
 
     def _study(self, *, failed: bool, terminated: bool) -> None:
         """Learn from the rows of an episode, and forget them."""
-        z, notes = np.array(self._z), self._notes
-        n = max(0, len(z) - 1)
+        z, n = np.array(self._z), max(0, len(self._z) - 1)
         u = np.array(self._u[:n]).reshape(-1, self.size)
-        notes = np.array([*notes[:n], *[(False, False, False)] * (n - len(notes))], np.float64)
+        notes = np.zeros((n, 3))
+        notes[: len(self._notes)] = np.array(self._notes, np.float64).reshape(-1, 3)[:n]
         self._z, self._u, self._notes = [], [], []
         if not len(z) or not np.isfinite(z).all(1).any() or not (n or failed):
             return
-        columns = notes.reshape(-1, 3).T
-        episode = Episode(z, u, failed, terminated, *columns, self._fails_after)
+        refused, lost, certified = notes.T
+        seen = z, u, failed, terminated
+        episode = Episode(*seen, refused, lost, certified, self._fails_after)
         if not self.n_variables:
             now = self.state
             none = State.none(z.shape[1], self.size, self.choices, self.settings, None)

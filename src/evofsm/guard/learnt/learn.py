@@ -12,12 +12,12 @@ import numpy as np
 from evofsm.guard.learnt import danger, failure, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups
 from evofsm.guard.learnt.failure import SAYS
-from evofsm.guard.learnt.rollout import FAILS, Floats, Model, value_of
+from evofsm.guard.learnt.rollout import FAILS, Flags, Floats, Model, value_of
 from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
 
-# Actions of an episode that says how a system moves, at least; situations from which on disturbances
-# are looked for and backups evolve; those that are drawn to look for some; disturbances that mutants
-# are tried on, besides none.
+# Actions of an episode that says how a system moves, at least; situations from which on
+# disturbances are looked for and backups evolve; those that are drawn to look for some;
+# disturbances that mutants are tried on, besides none.
 _SHORTEST, _ENOUGH, _TRIED_IN, _TRIED_ON = 3, 3, 8, 5
 # What is lost in so few steps, whatever one does, is no argument; nor is what is survived by more
 # [typical steps].
@@ -200,7 +200,7 @@ def disturbances(
     longest = settings.horizon_max + 2
     windows, lengths = list(state.windows), state.lengths.tolist()
     for t in starts:
-        seen = np.isfinite(z[t : t + longest]).all(1)
+        seen: Flags = np.asarray(np.isfinite(z[t : t + longest]).all(1))
         n = len(seen) if seen.all() else int(seen.argmin())
         if n > _AT_ONCE + 1:
             row = np.zeros((longest, m + a))
@@ -225,7 +225,7 @@ def disturbances(
 def _sizes(rest: Floats, state: State) -> list[int]:
     """Of residuals (H, m, K) the largest first."""
     size = np.abs(rest / state.unit[:, None]).sum((0, 1))
-    return np.argsort(-size, kind="stable").tolist()
+    return [int(k) for k in np.argsort(-size, kind="stable")]
 
 
 def worst(
@@ -247,7 +247,7 @@ def chosen(ends: Floats, most: int) -> list[int]:
         free = np.delete(keep, ends[:, keep].argmin(1))
         free = free if len(free) else keep
         keep = keep[keep != free[mean[free].argmax()]]
-    return keep.tolist()
+    return [int(k) for k in keep]
 
 
 def look_ahead(

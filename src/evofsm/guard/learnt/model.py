@@ -64,24 +64,38 @@ def without_glitches(z: Floats, unit: Floats) -> Floats:
     return np.where(bad.any(1, keepdims=True), np.nan, z)
 
 
-def solve(squares: Floats, products: Floats, noisy: Floats, a: int, shy: float) -> Floats:
+def solve(
+    squares: Floats, products: Floats, noisy: Floats, a: int, prior: tuple[float, float, float]
+) -> Floats:
     """(p, m) weights: ridge regression, about 0, in units of each feature's own variance.
 
     Bends, products and, last of all, latest changes are asked only if they have to be, else the
-    first episodes say that one's own throttle speeds others up. The less of a variable's changes is
-    noise, its share ``noisy`` (m,), the less evidence its weights need.
+    first episodes say that one's own throttle speeds others up.
+
+    Parameters
+    ----------
+    squares : (p, p) ndarray
+        Sums of products of features.
+    products : (p, m) ndarray
+        And of features with changes.
+    noisy : (m,) ndarray
+        Share of a variable's changes that is noise: the less, the less evidence its weights need.
+    a : int
+        How many numbers an action has.
+    prior : tuple of float
+        `Settings.prior`, ``shy`` and ``lags``.
     """
     n, size, m = max(1.0, float(squares[0, 0])), np.diag(squares), len(noisy)
     variance = np.maximum(size - squares[0] ** 2 / n, _LEAST * size)
     variance[0] = 0.0
-    times = np.full(len(size), shy)
-    times[: 1 + m] = times[1 + 2 * m : 1 + 2 * m + a] = 1.0
-    late = np.ones(len(size))
-    late[lags(m, a)] = 10.0
+    is_plain = np.zeros(len(size), bool)
+    is_plain[: 1 + m] = is_plain[1 + 2 * m : 1 + 2 * m + a] = True
+    times = np.ones(len(size))
+    times[lags(m, a)] = prior[2]
     weights = np.empty_like(products)
     for j, share in enumerate(noisy):
-        prior = np.where(times > 1.0, 30e-6 + share * 20.0 / n, 1e-6 + share * 0.01 / n)
-        weights[:, [j]] = ridge(squares, products[:, [j]], prior * late * variance)
+        held = np.where(is_plain, 1e-6 + share * prior[0] / n, 30e-6 + share * prior[1] / n)
+        weights[:, [j]] = ridge(squares, products[:, [j]], held * times * variance)
     return weights
 
 

@@ -27,7 +27,7 @@ _LEARNT, _FEW, _HELD = 20, 15.0, 0.3
 def steps(state: State, z: Floats) -> State:
     """Learn typical steps, and ends of what was seen, of observations (T + 1, m)."""
     change = np.diff(z, axis=0)
-    seen = np.isfinite(change).all(1)
+    seen: Flags = np.asarray(np.isfinite(change).all(1))
     if not seen.any():
         return state
     unit = state.unit if state.n_moves else model.typical_step(z)

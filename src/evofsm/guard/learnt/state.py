@@ -8,8 +8,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from evofsm.guard.learnt import failure, model
-from evofsm.guard.learnt.failure import CRASHES, FAILS, SAYS, Survived
-from evofsm.guard.learnt.rollout import Floats, Model, n_features
+from evofsm.guard.learnt.failure import SAYS, B, I, Survived
+from evofsm.guard.learnt.rollout import CRASHES, FAILS, Flags, Floats, Model, n_features
 from evofsm.store import COUNT, FLAG, SHARE, Numbers
 
 # What files hold of a field: observations, what is not negative, and ends that may be infinite.
@@ -19,7 +19,66 @@ _END = Numbers(least=-np.inf, most=np.inf)
 
 @dataclass(frozen=True)
 class Settings:
-    """Numbers of the learnt judge."""
+    """Numbers of the learnt judge; `python -m studies judges --quick` says what each is worth.
+
+    Parameters
+    ----------
+    n_disturbances, n_situations : int
+        Disturbances that are remembered, and situations on which these and backups are tried.
+    n_asked : int
+        Backups that are asked in a decision; of more than 12 variables 2.
+    n_linear, n_mutants : int
+        Linear backups, and mutants of them that are tried after an episode.
+    n_starts : int
+        Steps of an episode in which a disturbance may begin, at most.
+    max_failures, max_survived : int
+        Observations in which it failed, and that were survived, of which it is learnt; of the
+        latter every second one is left out where there are more.
+    margin, margin_max : float
+        What has to be left of the distance to failure, at first and at most [typical steps].
+    margin_fade : float
+        The share of the margin that is left an episode later.
+    margin_step, violation_rate : float
+        What a violated certificate adds to the margin, which is also the least one [typical
+        steps], and for which share of decisions (adaptive conformal inference, Gibbs & Candes
+        2021).
+    caution, caution_max, caution_again : float
+        Disturbances are taken to be harder than they were by ``caution`` over the number of
+        episodes; by the others at most, at first and after the system changed: a change half as
+        large again as any there was has no sequel.
+    horizon, horizon_min, horizon_max : int
+        How far it looks ahead: at first, at least and at most [steps].
+    ahead : float
+        It looks so many times as far as it takes to fail.
+    latest, refuted : float
+        Of the time that it takes to fail, what is left an episode later, and after one that went on
+        from where nothing seemed to help.
+    tries, alike : float
+        Where backups are alike up to such a share of the horizon, an action that was used less
+        often is tried.
+    prior, shy, lags : float
+        By how many observations weights are held to 0, those of bends and products, and so many
+        times more those of the latest change and the action before.
+    outlier : float
+        From so many scales on residuals weigh less (Huber 1964).
+    drift, drift_fade : float
+        It moves otherwise from so much gained log likelihood on (Page 1954); of the latest episodes
+        what is left an episode later.
+    patience, refused : float
+        Doubt begins after so many episodes without failure of which more than this share was
+        refused.
+    sooner, less : float
+        The same where a form of two variables is known.
+    few : int
+        In doubt forms are left out that hold fewer failures.
+    work, work_rate : float
+        Products in the rollouts of a decision at most: altogether, and in a second of the interval.
+
+    Notes
+    -----
+    They were chosen on the systems of the studies, with other draws than those that results are
+    given of.
+    """
 
     n_disturbances: int = 10
     n_situations: int = 32
@@ -45,8 +104,9 @@ class Settings:
     refuted: float = 0.8
     tries: int = 8
     alike: float = 0.02
-    prior: float = 0.02
-    shy: float = 30.0
+    prior: float = 0.01
+    shy: float = 20.0
+    lags: float = 10.0
     outlier: float = 4.0
     drift: float = 30.0
     drift_fade: float = 0.95
@@ -182,34 +242,47 @@ class State(NamedTuple):
 def sizes(state: State) -> Survived:
     """What was survived, as forms are fitted to it."""
     rows = np.concatenate([state.survived, state.brinks])
-    spread = state.survived.std(0) if len(state.survived) else np.zeros(len(state.origin))
-    unit = 1.25 * np.maximum(state.unit, model.FLOOR * spread + 1e-300)
-    return Survived(rows, state.lowest, state.highest, unit, spread)
+    unit = 1.25 * np.maximum(state.unit, model.FLOOR * _spread(state) + 1e-300)
+    return Survived(rows, state.lowest, state.highest, unit, _spread(state))
+
+
+def _spread(state: State) -> Floats:
+    """(m,) standard deviation of what was survived."""
+    rows = state.survived
+    return np.asarray(rows.std(0) if len(rows) else np.zeros(len(state.origin)))
 
 
 def model_of(state: State, settings: Settings, *, daring: bool = False) -> Model:
-    """What rollouts take of it; ``daring``, what is tried while it learns."""
-    m, a = len(state.origin), state.policies.shape[1]
-    spread = state.survived.std(0) if len(state.survived) else np.zeros(m)
+    """Make what rollouts take.
+
+    Parameters
+    ----------
+    state : State
+    settings : Settings
+    daring : bool
+        Whether to leave out what is doubted, and to come closer to where it crashes: so it is tried
+        while it learns.
+    """
+    spread, table = _spread(state), state.forms
     inverse = 1.0 / np.where(spread > 0.0, spread, 1.0)
     lowest = np.where(state.reached[:, 0] >= 2, state.lowest[0], -np.inf)
     highest = np.where(state.reached[:, 1] >= 2, state.highest[0], np.inf)
-    table = state.forms
-    for row in table[failure.are_sides(table) & (table[:, SAYS] == FAILS)]:
-        (lowest if row[failure.B] < 0.0 else highest)[int(row[1])] = row[failure.B] * np.inf
+    fails = table[:, SAYS] == FAILS
+    for j, sign in table[failure.are_sides(table) & fails][:, [I, B]].tolist():
+        (lowest if sign < 0.0 else highest)[int(j)] = (
+            sign * np.inf
+        )  # nothing is held where it fails
     if daring:
         crash = table[:, SAYS] == CRASHES
         table = table.copy()
         table[crash] = failure.halfway(table[crash], state.failures)
         if state.held < 0:
             table = table[~weak(table, state.failures, settings.few)]
-    worth = (
-        1.0 / (1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) + 1e-300) if m else 1.0
-    )
-    noisy = np.where(
-        state.scale > 0.0, state.noise / np.where(state.power > 0.0, state.power, 1.0), 1.0
-    )
-    weights = model.solve(state.squares, state.products, noisy.clip(1e-3, 1.0), a, settings.shy)
+    typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) if len(spread) else 1.0
+    share = state.noise / np.where(state.power > 0.0, state.power, 1.0)
+    noisy = np.where(state.scale > 0.0, share.clip(1e-3, 1.0), 1.0)
+    held = settings.prior, settings.shy, settings.lags
+    weights = model.solve(state.squares, state.products, noisy, len(state.used), held)
     return Model(
         weights=weights if np.isfinite(weights).all() else np.zeros_like(weights),
         origin=state.origin,
@@ -219,14 +292,16 @@ def model_of(state: State, settings: Settings, *, daring: bool = False) -> Model
         least=state.least,
         most=state.most,
         forms=failure.prepared(table),
-        dead_ends=np.column_stack([state.centres, state.radii, np.full(len(state.radii), worth)]),
+        dead_ends=np.column_stack(
+            [state.centres, state.radii, np.full(len(state.radii), 1.0 / (typical + 1e-300))]
+        ),
         mean=state.survived.mean(0) if len(state.survived) else state.origin,
         inverse=inverse,
         choices=state.choices,
     )
 
 
-def weak(table: Floats, failures: Floats, few: int) -> np.ndarray:
+def weak(table: Floats, failures: Floats, few: int) -> Flags:
     """(r,) which forms hardly any failure tells.
 
     As long as there is no bent form, of sides those that explain nothing that another does not.
@@ -234,7 +309,7 @@ def weak(table: Floats, failures: Floats, few: int) -> np.ndarray:
     held, sides = failure.inside(table, failures), failure.are_sides(table)
     fails = table[:, SAYS] == FAILS
     alone = (held & (held[fails & sides].sum(0) < 2)).any(1) & sides & ~(fails & ~sides).any()
-    return fails & (held.sum(1) < few) & ~alone
+    return np.asarray(fails & (held.sum(1) < few) & ~alone)
 
 
 def residuals_of(state: State, known: Model, steps: int) -> Floats:
