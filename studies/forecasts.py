@@ -51,9 +51,6 @@ from evofsm.fsm import (
     jensen_shannon,
 )
 from evofsm.guard import BELIEF_TOLERANCE, LearntRisk
-from evofsm.guard.learnt.failure import AT, B, I, are_sides
-from evofsm.guard.learnt.rollout import rollout
-from evofsm.guard.learnt.state import residuals_of
 from evofsm.io import episodes_of, read_traces
 from evofsm.paper import Page, Table
 from studies import lib
@@ -531,9 +528,8 @@ class Replays:
                 if t < len(run.actions):
                     judge.act(run.executed[t])
             judge.end(None, failed=run.failed)
-        self.state, parts = judge.state, judge.parts
-        assert parts is not None
-        self._model, self._rate = parts.model, judge.remembered.number / self.state.n_seen
+        self.judge = judge
+        self._rate = judge.remembered.number / judge.state.n_seen
         self._replayed: dict[int, Floats] = {}
 
     def __call__(self, some: Cases, steps: int) -> Floats:
@@ -563,15 +559,13 @@ class Replays:
         count = min(_BEHAVIOURS, len(done))
         _, near = tree.query(np.column_stack([some.z / scale, some.action]), count)
         horizon = max(HORIZONS)
-        model, rest = self._model, residuals_of(self.state, self._model, horizon)
-        nothing, found = np.zeros(self.state.policies.shape[1:]), []
+        found = []
         for r, behaviours in enumerate(np.reshape(near, (-1, count))):
             situation = np.concatenate([some.z[r], some.change[r], some.before[r]])
             for begin in behaviours:
                 plan = done[np.minimum(begin + np.arange(horizon), ends[begin] - 1)]
                 plan[0] = some.action[r]
-                value = rollout(model, situation[None], nothing, rest, 1.0, plan).value
-                found.append(np.where(value < 0.0, value + horizon + 2.0, np.inf))
+                found.append(self.judge.fails_after(situation, plan))
         return np.reshape(found, (len(near), count, -1))
 
 
@@ -634,15 +628,15 @@ class Taylor:
     that ours found in the failures, since no task tells them.
     """
 
-    def __init__(self, forms: Floats, order: int) -> None:
-        self.sides, self.order = forms[are_sides(forms)], order
+    def __init__(self, sides: Floats, order: int) -> None:
+        self.sides, self.order = sides, order
 
     def __call__(self, some: Cases) -> Floats:
         """(n,) score: minus the steps to the first boundary; infinite where none is reached."""
         s = np.arange(1.0, _FARTHEST + 1.0)
         first = np.full(len(some.z), np.inf)
-        for j, sign, threshold in zip(*self.sides[:, [I, B, AT]].T, strict=True):
-            j = int(j)
+        for variable, sign, threshold in self.sides:
+            j = int(variable)
             path = some.z[:, j, None] + s * some.change[:, j, None]
             if self.order > 1:
                 bend = some.change[:, j] - some.earlier[:, j]
@@ -715,7 +709,7 @@ def foresee(
     for steps in HORIZONS:
         some, on = seen.where(seen.known(steps)), others.known(steps)
         truth, came, known = some.left <= steps, others.left[on] <= steps, asked.known(steps)
-        orders = [Taylor(replays.state.forms, order) for order in (1, 2)]
+        orders = [Taylor(replays.judge.thresholds, order) for order in (1, 2)]
         areas = [lib.Ranked(one(others)[on], came).areas().auroc for one in orders]
         foreseers: dict[str, Callable[[Cases], Floats]] = {
             REPLAY: partial(replays, steps=steps),

@@ -26,14 +26,17 @@ from evofsm.guard.actions import Mask
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import files, words
+from evofsm.guard.learnt.failure import AT, SAYS, B, I, are_sides
 from evofsm.guard.learnt.learn import disturbance_scale, ends_of, learn
 from evofsm.guard.learnt.rollout import (
     CUT_SHORT,
+    FAILS,
     KEPT,
     Floats,
     Ints,
     Model,
     pairs,
+    rollout,
     search,
     survives,
     value_of,
@@ -389,6 +392,24 @@ class LearntRisk(ActionJudge):
         unsurvived = math.inf if ends[0] < 0.0 else float(len(fails))
         steps = len(rest)
         return unsurvived, float(ends.min()), float(fails.max(initial=-1.0 - steps)) + 1.0 + steps
+
+    def fails_after(self, situation: Floats, plan: Floats) -> Floats:
+        """(1 + K,) steps after which a plan (T, a) fails, undisturbed and amid each disturbance.
+
+        Infinite where it does not; ``situation`` is an observation, its change, the action before.
+        """
+        assert self.parts is not None
+        model, still = self.parts.model, np.zeros(self.state.policies.shape[1:])
+        rest = residuals_of(self.state, model, len(plan))
+        value = rollout(model, situation[None], still, rest, 1.0, plan).value
+        return np.where(value < 0.0, value + len(plan) + 2.0, np.inf)
+
+    @property
+    def thresholds(self) -> Floats:
+        """(k, 3) variables, on which side they fail (1 or -1), and beyond what."""
+        forms = self.state.forms
+        sides = forms[are_sides(forms) & (forms[:, SAYS] == FAILS)]
+        return np.asarray(sides[:, [I, B, AT]])
 
     def _soon(self, exposure: float) -> float:
         """The horizon, as a share of the time in which all that is remembered was seen."""
