@@ -635,7 +635,7 @@ class Taylor:
         """(n,) score: minus the steps to the first boundary; infinite where none is reached."""
         s = np.arange(1.0, _FARTHEST + 1.0)
         first = np.full(len(some.z), np.inf)
-        for variable, sign, threshold in self.sides:
+        for variable, sign, threshold, *_ in self.sides:
             j = int(variable)
             path = some.z[:, j, None] + s * some.change[:, j, None]
             if self.order > 1:
