@@ -49,9 +49,7 @@ EXTREME = (-0.0, 5e-324, -1e-300, 1e-160, 1e-10, 150.0, -150.0, -1e3, 1e6, -1e18
 _FAR = 1e7
 # Numbers of a decision, in the order in which the program below writes them.
 NUMBERS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen", "left")
-CODES = (
-    *("reason", "remark", "intake", "is_new", "state", "backup", "unsurvived", "backup_near"),
-)
+CODES = (*("reason", "remark", "intake", "is_new", "state", "backup", "unsurvived", "backup_near"),)
 _MAIN = """#define _POSIX_C_SOURCE 199309L
 #include "evofsm.h"
 #include <stdio.h>
@@ -428,9 +426,7 @@ def _learnt(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str
     allowed = judge._allowed(reviser.tolerance, remembered)
     if kind == 0:
         return words.kept(backup, remembered, number["left"], allowed)
-    why = words.refused(
-        code["unsurvived"], remembered, judge.margin, judge.parts.scale, allowed
-    )
+    why = words.refused(code["unsurvived"], remembered, judge.margin, judge.parts.scale, allowed)
     if code["backup_near"] >= 0:
         why = words.comes_near(judge.backup_text(code["backup_near"]))
     if kind == 1:

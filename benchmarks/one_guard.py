@@ -78,9 +78,9 @@ def push(guard: Guard, seed: int, steps: int = _STEPS, *, ends: bool = True) -> 
     draw = np.random.default_rng(seed)
     z = np.array([draw.uniform(-0.3, 0.3), 0.0])
     for _ in range(steps):
-        wish = int(draw.integers(3)) if guard.judge.dynamics.choices else draw.uniform(-0.2, 1.0)  # type: ignore[union-attr]
+        wish = int(draw.integers(3)) if guard.judge.choices else draw.uniform(-0.2, 1.0)  # type: ignore[union-attr]
         done = guard.decide(z, wish).executed
-        pushed = done - 1.0 if guard.judge.dynamics.choices else done  # type: ignore[union-attr]
+        pushed = done - 1.0 if guard.judge.choices else done  # type: ignore[union-attr]
         z = np.array([z[0] + z[1], 0.9 * z[1] + 0.02 * pushed + 0.004 * draw.normal()])
         if z[0] >= 1.0:
             break
@@ -206,9 +206,9 @@ def forked(times: int, _folder: Path, random: np.random.Generator) -> Counter[st
 
 def _is_usable(guard: Guard) -> bool:
     """Whether it goes on, and what it saves loads."""
-    n, known = guard.n_episodes, guard.judge.n_failed  # type: ignore[union-attr]
+    n, known = guard.n_episodes, guard.judge.state.n_failed  # type: ignore[union-attr]
     guard.end(True, [1.1, 0.1])
     push(guard, 5)
     guard.save(file := io.BytesIO())
     again = Guard.load(io.BytesIO(file.getvalue()))
-    return again.n_episodes == n + 2 and guard.judge.n_failed >= known + 1  # type: ignore[union-attr]
+    return again.n_episodes == n + 2 and guard.judge.state.n_failed >= known + 1  # type: ignore[union-attr]

@@ -516,23 +516,20 @@ _FARTHEST = 200
 
 
 class Replays:
-    """Ours: dynamics that the learnt judge has of some episodes of a system."""
+    """Ours: what a learnt judge expects after some episodes of a system."""
 
     def __init__(self, name: str, runs: Sequence[Run]) -> None:
         self.runs = runs
         settings = make_system(name).actions.settings
         judge = LearntRisk(1.0, **settings, horizon=float(max(HORIZONS)))
-        self.dynamics = judge.dynamics
-        begun, seen = 0, 0
         for run in runs:
             for t, z in enumerate(run.observations):
-                last = t == len(run.actions)
-                begun += judge.observe(z) and not (last and run.failed)
-                if not last:
+                judge.observe(z)
+                if t < len(run.actions):
                     judge.act(run.executed[t])
-            seen += len(run.observations)
-            self.dynamics.end(failed=run.failed)
-        self._rate = begun / seen
+            judge.end(None, failed=run.failed)
+        self.judge = judge
+        self._rate = judge.remembered.number / judge.state.n_seen
         self._replayed: dict[int, Floats] = {}
 
     def __call__(self, some: Cases, steps: int) -> Floats:
@@ -562,14 +559,13 @@ class Replays:
         count = min(_BEHAVIOURS, len(done))
         _, near = tree.query(np.column_stack([some.z / scale, some.action]), count)
         horizon = max(HORIZONS)
-        disturbances = self.dynamics.disturbances(horizon)
         found = []
         for r, behaviours in enumerate(np.reshape(near, (-1, count))):
             situation = np.concatenate([some.z[r], some.change[r], some.before[r]])
             for begin in behaviours:
                 plan = done[np.minimum(begin + np.arange(horizon), ends[begin] - 1)]
                 plan[0] = some.action[r]
-                found.append(self.dynamics.fails_after(situation, plan, disturbances))
+                found.append(self.judge.fails_after(situation, plan))
         return np.reshape(found, (len(near), count, -1))
 
 
@@ -713,7 +709,7 @@ def foresee(
     for steps in HORIZONS:
         some, on = seen.where(seen.known(steps)), others.known(steps)
         truth, came, known = some.left <= steps, others.left[on] <= steps, asked.known(steps)
-        orders = [Taylor(replays.dynamics.model.thresholds, order) for order in (1, 2)]
+        orders = [Taylor(replays.judge.thresholds, order) for order in (1, 2)]
         areas = [lib.Ranked(one(others)[on], came).areas().auroc for one in orders]
         foreseers: dict[str, Callable[[Cases], Floats]] = {
             REPLAY: partial(replays, steps=steps),

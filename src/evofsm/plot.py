@@ -18,7 +18,8 @@ from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel, Policy
 from evofsm.fsm.step import Trace
 from evofsm.guard import Guard, LearntRisk
-from evofsm.guard.learnt.failure import FAILS, SAYS, I, J, forms, telling
+from evofsm.guard.learnt.failure import SAYS, I, J, forms, telling
+from evofsm.guard.learnt.rollout import FAILS
 
 with needs("matplotlib", "plot", "plotting"):
     import matplotlib
@@ -220,12 +221,13 @@ def experience(
     if guard.machine is not None:
         draw_centers(ax, guard.machine.centers[:, pair], (), 10.0)
     ax.axis(limits)
+    ring: Look = {"marker": "o", "fillstyle": "none"}
     looks: dict[str, Look] = {
         "survived (blank: nothing was seen)": {**dots, "markersize": 5.0},
         "failed": crosses,
         "fails, as learnt": {"marker": "s", "markersize": 8.0, "color": red, "alpha": 0.3},
-        "dead end" + ", all else as in its centre" * (m > 2): {"marker": "o", "fillstyle": "none", "color": red},
-        "state": {"marker": "o", "fillstyle": "none", "color": ink()},
+        "dead end" + ", all else as in its centre" * (m > 2): {**ring, "color": red},
+        "state": {**ring, "color": ink()},
     }
     if elsewhere := sorted({*told} - {*pair}):
         looks[f"not in view: fails by {', '.join(map(called, elsewhere))}"] = {"marker": ""}

@@ -4,7 +4,6 @@ import asyncio
 import math
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from evofsm.cli.driving import Setup, make_guard
@@ -26,6 +25,7 @@ from evofsm.driving.assumed import guard_of_monitor
 from evofsm.fsm.observations import ObservationEncoder
 from evofsm.guard import Mode
 from evofsm.guard.harm import Harm, Outcome
+from evofsm.guard.learnt.state import State
 from evofsm.io import LogColumns, read_run, recording
 from monitor_rows import line, traffic
 
@@ -158,7 +158,7 @@ def test_variables_of_known_environments_have_names():
 
 def test_a_guard_that_is_no_better_than_the_controller_alone_says_so():
     judge = read_simulated("CartPole-v1").guard.judge
-    judge.dynamics.observe(np.zeros(4))
+    judge.state = State.none(4, judge.size, judge.choices, judge.settings, None)
     for steps, said in ((30, ""), (10, "no better than the controller alone: 5 of 5 guarded")):
         ends = [(20, False)] * 5 + [(steps, True)] * 5
         outcomes = [Outcome(k + 1, n, True, guarded) for k, (n, guarded) in enumerate(ends)]

@@ -20,7 +20,7 @@ from evofsm.driving.judge import LatentRisk
 from evofsm.guard.actions import BoxActions, Choices, put_into, same_action
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Search
 from evofsm.guard.guard import KIND
-from evofsm.guard.learnt.dynamics import Dynamics
+from evofsm.guard.learnt import judge as judging
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.loop import run_episode
 from evofsm.guard.reviser import Mode
@@ -579,15 +579,16 @@ def test_what_raises_in_a_part_of_it_is_done_again_by_the_same_call(broken, snap
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_child_forked_amid_an_end_in_another_thread_has_the_guard_of_before(monkeypatch):
     guard, twin = one_guard.learnt(), one_guard.learnt()
-    amid, over, settle = threading.Event(), threading.Event(), Dynamics.settle
+    amid, over, learn = threading.Event(), threading.Event(), judging.learn
 
-    def waits(dynamics, **how):
-        settle(dynamics, **how)
+    def waits(*given, **how):
+        state = learn(*given, **how)
         if threading.current_thread() is thread:
             amid.set()
             over.wait()
+        return state
 
-    monkeypatch.setattr(Dynamics, "settle", waits)
+    monkeypatch.setattr(judging, "learn", waits)
     thread = threading.Thread(target=guard.end, args=(True, [1.2, 0.1]))
     thread.start()
     amid.wait()

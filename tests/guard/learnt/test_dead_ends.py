@@ -71,7 +71,7 @@ def test_it_grows_by_repetition_and_what_is_survived_there_takes_it_back(wary):
     assert many.counts.max() > few.counts.max()
     assert many.radii.max() > few.radii.max()
     guard = wary.copy()
-    for episode in range(3):  # someone else goes there slowly, and comes back
+    for _ in range(3):  # someone else goes there slowly, and comes back
         for place in [*np.linspace(0.0, TRAP + 0.2, 20), *np.linspace(TRAP + 0.2, 0.0, 20)]:
             guard.judge.observe(np.array([place, 0.02, ICE]))
             guard.judge.act(0.0)

@@ -8,7 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evofsm import Guard
-from evofsm.guard.learnt.failure import B, C, I, AT, SAYS, Survived, are_sides, distances, explain, inside
+from evofsm.guard.learnt.failure import (
+    AT,
+    SAYS,
+    B,
+    C,
+    I,
+    Survived,
+    are_sides,
+    distances,
+    explain,
+    inside,
+)
 from evofsm.guard.learnt.rollout import FAILS
 
 SHAPES = {
@@ -113,7 +124,8 @@ def test_sides_are_the_same_however_variables_are_written(blur, seed):
     written = [(one * times)[..., order] for one in (lost, safe, unit)]
     written[2] = np.abs(written[2])
     first, again = (
-        sides(*given, blur * np.tile(given[2][:, None], 2)) for given in ((lost, safe, unit), written)
+        sides(*given, blur * np.tile(given[2][:, None], 2))
+        for given in ((lost, safe, unit), written)
     )
     back = {(i := order[j], sign * np.sign(times[i]), at / times[i]) for j, sign, at in again}
     assert back == first

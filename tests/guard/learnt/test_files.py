@@ -55,8 +55,16 @@ def with_first(value):
         ({}, {"situations": lambda one: one[:, 1:]}, "situations has shape"),
         ({}, {"windows": lambda one: one[:, :, 1:]}, "windows has shape"),
         ({}, {"policies": lambda one: one[:, :, 1:]}, "policies has shape"),
-        ({}, {"squares": lambda one: one[1:, 1:], "recent_squares": lambda one: one[1:, 1:],
-              "products": lambda one: one[1:], "recent_products": lambda one: one[1:]}, "squares has"),
+        (
+            {},
+            {
+                "squares": lambda one: one[1:, 1:],
+                "recent_squares": lambda one: one[1:, 1:],
+                "products": lambda one: one[1:],
+                "recent_products": lambda one: one[1:],
+            },
+            "squares has",
+        ),
         ({}, {"forms": with_first(7.0)}, "forms are of variables that there are not"),
         ({}, {"forms": lambda one: one + 2.0 * np.eye(14)[2]}, "forms are of variables"),
         ({}, {"forms": lambda one: one * (np.arange(14) != 5)}, "units that are not positive"),

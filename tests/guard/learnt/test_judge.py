@@ -342,9 +342,7 @@ def test_it_says_which_backup_survives_why_a_proposal_is_refused_and_what_fails(
     assert re.match(r"fails where variable 1 is above [01]\.\d*(;| or )", learnt)
     said, _ = point.play(guard, 9)
     assert len(set(kept(said))) == 2
-    survives = re.compile(
-        r".*then (always .+|feedback \d) survives .+, by [\d.]+ typical steps?"
-    )
+    survives = re.compile(r".*then (always .+|feedback \d) survives .+, by [\d.]+ typical steps?")
     for one, as_proposed in zip(said, kept(said), strict=True):
         assert bool(survives.fullmatch(one.reason)) == as_proposed
         assert ("no backup " in one.reason) == (not as_proposed)

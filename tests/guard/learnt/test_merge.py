@@ -30,7 +30,10 @@ def test_what_two_learnt_apart_is_what_one_would_have_of_both(points, content):
             path.append(z[0, 0])
         paths.append(path)
     np.testing.assert_allclose(paths[0], paths[1], rtol=0.05)
-    assert merged.told_by_experience.partition(";")[0] == whole.judge.told_by_experience.partition(";")[0]
+    assert (
+        merged.told_by_experience.partition(";")[0]
+        == whole.judge.told_by_experience.partition(";")[0]
+    )
 
 
 def test_a_merged_judge_knows_what_both_have_learnt_and_goes_on(points):

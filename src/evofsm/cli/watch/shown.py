@@ -15,7 +15,8 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.guard import LearningJudge, LearntRisk
 from evofsm.guard.harm import Harm
-from evofsm.guard.learnt.failure import FAILS, SAYS, SIZE, B, I, J, are_sides, inside, telling
+from evofsm.guard.learnt.failure import SAYS, SIZE, B, I, J, are_sides, inside, telling
+from evofsm.guard.learnt.rollout import FAILS
 from evofsm.guard.learnt.state import State
 from evofsm.guard.learnt.words import harm
 

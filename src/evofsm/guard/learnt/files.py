@@ -58,7 +58,8 @@ def unpacked(
     ValueError
         If sizes or indices contradict each other, or the actions: kernels take them on trust.
     """
-    state = State(**numbers, **{name: arrays[name] for name in _ARRAYS})
+    fields: dict[str, Any] = {**numbers, **{name: arrays[name] for name in _ARRAYS}}
+    state = State(**fields)
     m, a = len(state.origin), len(state.used)
     if (state.choices, a) != (choices, size):
         raise ValueError(f"it is of actions of {a} numbers, but they have {size}")
@@ -67,7 +68,7 @@ def unpacked(
         shape, rows = np.shape(getattr(state, name)), int(name != "squares")
         if shape[rows:] != np.shape(array)[rows:]:
             raise ValueError(
-                f"{name} has shape {shape}, which is not of {m} variables and actions of {a} numbers"
+                f"{name} has shape {shape}, not one of {m} variables and actions of {a} numbers"
             )
     forms, steps = state.forms, state.windows.shape[1]
     which = forms[:, [SAYS, I, J]]

@@ -26,14 +26,18 @@ from evofsm.guard.actions import Mask
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import files, words
+from evofsm.guard.learnt.backups import canonical
+from evofsm.guard.learnt.failure import AT, SAYS, B, I, are_sides
 from evofsm.guard.learnt.learn import disturbance_scale, ends_of, learn
 from evofsm.guard.learnt.rollout import (
     CUT_SHORT,
+    FAILS,
     KEPT,
     Floats,
     Ints,
     Model,
     pairs,
+    rollout,
     search,
     survives,
     value_of,
@@ -324,10 +328,10 @@ class LearntRisk(ActionJudge):
         why = words.refused(self._unsurvived, remembered, margin, scale, allowed)
         if not cut and len(model.dead_ends):
             free = model._replace(dead_ends=model.dead_ends[:0])
-            amid = parts.residuals, scale, proposal, margin, allowed
-            for after in ranks:
-                if survives(free, here, policies[after], *amid)[0]:
-                    why = words.comes_near(self.backup_text(after, policies))
+            for q in ranks:
+                given = free, here, policies[q], parts.residuals, scale, proposal, margin, allowed
+                if survives(*given)[0]:
+                    why = words.comes_near(self.backup_text(q, policies))
                     break
         if passes:
             instead = words.changed(backup, remembered, margin, allowed)
@@ -390,6 +394,24 @@ class LearntRisk(ActionJudge):
         steps = len(rest)
         return unsurvived, float(ends.min()), float(fails.max(initial=-1.0 - steps)) + 1.0 + steps
 
+    def fails_after(self, situation: Floats, plan: Floats) -> Floats:
+        """(1 + K,) steps after which a plan (T, a) fails, undisturbed and amid each disturbance.
+
+        Infinite where it does not; ``situation`` is an observation, its change, the action before.
+        """
+        assert self.parts is not None
+        model, still = self.parts.model, np.zeros(self.state.policies.shape[1:])
+        rest = residuals_of(self.state, model, len(plan))
+        value = rollout(model, situation[None], still, rest, 1.0, plan).value
+        return np.where(value < 0.0, value + len(plan) + 2.0, np.inf)
+
+    @property
+    def thresholds(self) -> Floats:
+        """(k, 3) variables, on which side they fail (1 or -1), and beyond what."""
+        forms = self.state.forms
+        sides = forms[are_sides(forms) & (forms[:, SAYS] == FAILS)]
+        return np.asarray(sides[:, [I, B, AT]])
+
     def _soon(self, exposure: float) -> float:
         """The horizon, as a share of the time in which all that is remembered was seen."""
         return self.state.horizon * self.dt / max(exposure, 1e-300)
@@ -424,16 +446,18 @@ class LearntRisk(ActionJudge):
 
     def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
-        used, tries = self.state.used + self._used, self.settings.tries
+        used, tries, n = self.state.used + self._used, self.settings.tries, self.size
+        order, turns = canonical(self.state)[2:]  # of equals the first in that order
         if self.choices:
-            some = np.arange(self.choices) if mask is None else np.flatnonzero(mask)
-            i = int(some[used[some, 1].argmin()])
+            order = order if mask is None else order[mask[order]]
+            i = int(order[used[order, 1].argmin()])
             is_rare = used[i, 1] < tries and used[i, 1] < used[:, 1].max()
-            return np.asarray(np.eye(len(used))[i]) if is_rare else None
-        k, end = divmod(int(used.argmin()), 2)
-        if used[k, end] < tries and used[k, end] < used[k, 1 - end]:
-            best = best.copy()
-            best[k] = (-1.0, 1.0)[end]
+            return np.asarray(np.eye(n)[i]) if is_rare else None
+        turned = np.where(turns[:, None] > 0.0, used, used[:, ::-1])[order]
+        k, end = divmod(int(turned.argmin()), 2)
+        if turned[k, end] < tries and turned[k, end] < turned[k, 1 - end]:
+            best, i = best.copy(), order[k]
+            best[i] = (-1.0, 1.0)[end] * turns[i]
             return best
         return None
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from evofsm.guard.harm import Harm
 from evofsm.guard.learnt.backups import evolved
 from evofsm.guard.learnt.danger import dead_ends, explained
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.learnt.learn import chosen, disturbance_scale, worst
+from evofsm.guard.learnt.learn import chosen, disturbance_scale, kept, worst
 from evofsm.guard.learnt.rollout import Floats, crossed, pairs
 from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
 
@@ -78,70 +79,58 @@ def merge(parts: Sequence[State], settings: Settings, seed: int) -> State:
     def of(name: str) -> Floats:
         return np.array([getattr(part, name) for part in parts])
 
-    def newest(name: str, most: int) -> Floats:
+    def rows(name: str, most: int = 0) -> Floats:
         return np.concatenate([getattr(part, name)[-(most // len(parts)) :] for part in parts])
 
-    first, moves, n_episodes = parts[0], of("n_moves"), int(of("n_episodes").sum())
-    (p, m), a, nothing = first.products.shape, len(first.used), np.zeros_like
+    first, latest = parts[0], max(parts, key=lambda part: part.n_episodes)
+    (p, m), a, n_episodes = first.products.shape, len(first.used), int(of("n_episodes").sum())
     T = np.array([_moved(d, a, p) for d in of("origin") - first.origin])
-    lowest, highest = np.sort(np.vstack(of("lowest")), 0), -np.sort(-np.vstack(of("highest")), 0)
+    moves = of("n_moves")
+    lowest, highest = np.sort(rows("lowest"), 0), -np.sort(-rows("highest"), 0)
     ends = np.stack([of("lowest")[:, 0], of("highest")[:, 0]], 2)
     shared = np.isclose(ends, np.stack([lowest[0], highest[0]], 1), 1e-9, 0.0)
-    later = n_episodes - of("n_episodes")  # the latest episode of each is the latest of all
-    survived = np.concatenate([part.survived for part in parts])
-    survived_in = np.concatenate(
-        [part.survived_in + k for part, k in zip(parts, later, strict=True)]
-    )
-    every = max(1, -(-len(survived) // settings.max_survived))
-    drifts = [part.drifts + [0, k, k] for part, k in zip(parts, later, strict=True)]
-    merged = max(parts, key=lambda part: part.n_episodes)._replace(
+    after = n_episodes - of("n_episodes")  # the latest episode of each is the latest of all
+    every = max(1, -(-len(rows("survived")) // settings.max_survived))
+    seen_in = np.concatenate([one.survived_in + k for one, k in zip(parts, after, strict=True)])
+    drifts = [one.drifts + np.array([0, k, k]) for one, k in zip(parts, after, strict=True)]
+    fields: dict[str, Any] = {
         **{name: int(of(name).sum()) for name in ("n_failed", "n_scanned", "n_seen", "n_moves")},
         **{name: float(of(name).max()) for name in ("margin", "time_to_failure", "believed")},
         **{name: _average(of(name), moves) for name in ("unit", "power")},
-        **{name: _average(of(name), moves * (of("scale")[:, 0] > 0.0)) for name in _OF_RESIDUALS},
-        **{name: newest(name, settings.max_failures) for name in ("failures", "brinks", "ended")},
-        n_episodes=n_episodes,
-        origin=first.origin,
-        squares=(T @ of("squares") @ T.transpose(0, 2, 1)).sum(0),
-        products=(T @ of("products")).sum(0),
-        least=of("least").min(0),
-        most=of("most").max(0),
-        recent_squares=nothing(first.squares),
-        recent_products=nothing(first.products),
-        doubt=nothing(first.doubt),
-        since=np.full(m, float(n_episodes)),
-        drifts=np.concatenate(drifts),
-        lowest=lowest[:2],
-        highest=highest[:2],
-        reached=np.where(shared, of("reached"), 0.0).sum(0),
-        survived=survived[::every],
-        survived_in=survived_in[::every],
-        forms=first.forms[:0],
-        held=0,
-        centres=np.concatenate([part.centres for part in parts]),
-        radii=np.concatenate([part.radii for part in parts]),
-        counts=np.concatenate([part.counts for part in parts]),
-        windows=np.concatenate([part.windows for part in parts]),
-        lengths=np.concatenate([part.lengths for part in parts]),
-        situations=newest("situations", settings.n_situations),
-        used=of("used").sum(0),
-        horizon=int(of("horizon").max()),
-    )
+        **{name: _average(of(name), moves * of("scale").any(1)) for name in ("scale", "noise")},
+        **{name: rows(name, settings.max_failures) for name in ("failures", "brinks", "ended")},
+        **{name: rows(name) for name in ("centres", "radii", "counts", "windows", "lengths")},
+        **{name: getattr(latest, name) for name in ("policies", "linear")},
+        "n_episodes": n_episodes,
+        "origin": first.origin,
+        "squares": (T @ of("squares") @ T.transpose(0, 2, 1)).sum(0),
+        "products": (T @ of("products")).sum(0),
+        "least": of("least").min(0),
+        "most": of("most").max(0),
+        "since": np.full(m, float(n_episodes)),
+        "drifts": np.concatenate(drifts),
+        "lowest": lowest[:2],
+        "highest": highest[:2],
+        "reached": np.where(shared, of("reached"), 0.0).sum(0),
+        "seen_in": np.concatenate([one.seen_in + k for one, k in zip(parts, after, strict=True)]),
+        "survived": rows("survived")[::every],
+        "survived_in": seen_in[::every],
+        "situations": rows("situations", settings.n_situations),
+        "used": of("used").sum(0),
+        "horizon": int(of("horizon").max()),
+    }
+    merged = State.none(m, a, first.choices, settings, None)._replace(**fields)
     merged = explained(merged, failed=True)
     known = model_of(merged, settings)
-    merged = dead_ends(merged, known, survived[:0], _NOTHING)
+    merged = dead_ends(merged, known, merged.survived[:0], _NOTHING)
     known, scale = model_of(merged, settings), disturbance_scale(merged, settings)
     rest, random = residuals_of(merged, known, merged.horizon), np.random.default_rng(seed)
     harmful = worst(known, merged.situations, merged.policies[:2], rest, scale)
     keep = chosen(harmful, settings.n_disturbances)
-    merged = merged._replace(windows=merged.windows[keep], lengths=merged.lengths[keep])
-    kept = np.ascontiguousarray(rest[:, :, [0, *(1 + k for k in keep)]])
-    given = known, merged.situations, kept, scale, settings, random
-    policies, linear = evolved(merged.policies, merged.linear, *given)
-    return merged._replace(policies=policies, linear=linear)
+    amid = np.ascontiguousarray(rest[:, :, [0, *(1 + k for k in keep)]])
+    return evolved(kept(merged, keep), known, amid, scale, settings, random)
 
 
-_OF_RESIDUALS = ("scale", "noise")
 _NONE = np.empty(0)
 _NOTHING = Episode(_NONE, _NONE, False, False, _NONE, _NONE, _NONE, 0.0)
 
