@@ -16,7 +16,7 @@ from itertools import product
 
 import numpy as np
 
-from evofsm.guard.learnt.rollout import Floats, Model, rollout
+from evofsm.guard.learnt.rollout import Floats, Ints, Model, rollout
 from evofsm.guard.learnt.state import Settings
 
 # Of mutants the share that are of the best, the share of numbers that differ, by a size of 10 to a
@@ -24,12 +24,19 @@ from evofsm.guard.learnt.state import Settings
 _OF_BEST, _CHANGED, _SIZES = 0.8, 0.6, (-1.5, 0.7)
 # What a backup is worth by itself counts so much, compared with what it adds to the others.
 _BY_ITSELF = 0.01
+# Decimals beyond which numbers are equal; what a choice is preferred by to the next one.
+_ROUNDED, _PREFERRED = 9, 1e-9
 # Boxes of more dimensions have an action along each axis, not one in each corner.
 _MAX_CORNERS = 3
 
 
-def first_backups(m: int, a: int, choices: int, n_linear: int) -> tuple[Floats, Floats]:
-    """(b, a, 1 + m) those that nothing was learnt of yet, and (b,) which evolve."""
+def first_backups(u: Floats, m: int, choices: int, n_linear: int) -> tuple[Floats, Floats]:
+    """(b, a, 1 + m) those that nothing was learnt of yet, and (b,) which evolve.
+
+    By actions (T, a) of the first episode: it makes no difference in which order or direction they
+    come.
+    """
+    a, (order, turns) = u.shape[1], _basis(u, choices)
     if choices:
         ends = np.eye(a)
     else:
@@ -38,8 +45,21 @@ def first_backups(m: int, a: int, choices: int, n_linear: int) -> tuple[Floats, 
             ends = np.array(list(product((-1.0, 1.0), repeat=a)))
         ends = np.vstack([ends, np.zeros(a)])
     policies = np.zeros((len(ends) + n_linear, a, 1 + m))
-    policies[: len(ends), :, 0] = ends
+    policies[: len(ends), order, 0] = ends
+    policies *= turns[:, None]
+    if choices:  # of equals the first in that order, whatever its index
+        policies[:, order, 0] -= _PREFERRED * np.arange(a)
     return policies, np.append(np.zeros(len(ends)), np.ones(n_linear))
+
+
+def _basis(rows: Floats, choices: int = 0) -> tuple[Ints, Floats]:
+    """(k,) an order of columns, and their directions, whatever their own ones are.
+
+    By their mean size, of equals by the first rows in which they differ.
+    """
+    exact = (-rows if choices else np.abs(rows)).round(_ROUNDED)
+    turns = np.ones(rows.shape[1]) if choices else np.where((rows**3).sum(0) < 0.0, -1.0, 1.0)
+    return np.lexsort((*exact[::-1], exact.mean(0).round(_ROUNDED))), turns
 
 
 def evolved(
@@ -61,25 +81,30 @@ def evolved(
         return np.asarray(found.reshape(-1, each).mean(1))
 
     values, those = np.array([worth(policy) for policy in policies]), np.flatnonzero(linear)
-    shape = policies.shape[1:]
+    shape, m = policies.shape[1:], len(model.origin)
+    off = (situations[:, :m] - situations[:, :m].mean(0)) * model.inverse
+    variables, flips = _basis(off)
+    actions, turns = _basis(situations[:, 2 * m :], model.choices)
+    own = np.ix_(np.argsort(actions), np.argsort(np.append(0, 1 + variables)))
+    signs = np.append(1.0, flips) * turns[:, None]
     for _ in range(settings.n_mutants if len(those) else 0):
-        parent = those[values[those].mean(1).argmax()]
+        parent = those[values[those].mean(1).round(_ROUNDED).argmax()]
         if random.random() >= _OF_BEST:
             parent = int(random.integers(len(policies)))
         size = 10.0 ** random.uniform(*_SIZES)
         drawn = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
-        child = policies[parent] + drawn
+        child = policies[parent] + drawn[own] * signs
         reached = worth(child)
         tried = np.repeat(values[None], 1 + len(those), 0)  # as they are, and with the child
         tried[1 + np.arange(len(those)), those] = reached
         together = tried.max(1).mean(1) + _BY_ITSELF * tried.mean(2).sum(1)
-        best = int(together.round(9).argmax())  # of equals the first: nothing changes
+        best = int(together.round(_ROUNDED).argmax())  # of equals the first: nothing changes
         if best:
             policies[those[best - 1]], values[those[best - 1]] = child, reached
     left, most, order = list(range(len(values))), np.full(values.shape[1], -1.0), []
     while left:  # first the one that is worth most, then whichever adds most
         adds = np.maximum(values[left] - most, 0.0).mean(1)
-        adds = (adds + _BY_ITSELF * values[left].mean(1)).round(9)
+        adds = (adds + _BY_ITSELF * values[left].mean(1)).round(_ROUNDED)
         order.append(left.pop(int(adds.argmax())))
         most = np.maximum(most, values[order[-1]])
     return policies[order], linear[order]

@@ -447,11 +447,12 @@ class LearntRisk(ActionJudge):
         """An action whose effect is hardly known, if there is one."""
         used, tries = self.state.used + self._used, self.settings.tries
         if self.choices:
-            some = np.arange(self.choices) if mask is None else np.flatnonzero(mask)
-            i = int(some[used[some, 1].argmin()])
+            order = self.state.policies[self.state.linear == 0.0, :, 0].argmax(1)
+            order = order if mask is None else order[mask[order]]  # of equals whose backup is first
+            i = int(order[used[order, 1].argmin()])
             is_rare = used[i, 1] < tries and used[i, 1] < used[:, 1].max()
             return np.asarray(np.eye(len(used))[i]) if is_rare else None
-        k, end = divmod(int(used.argmin()), 2)
+        k, end = divmod(int((used - 1e-6 * used[:, ::-1]).argmin()), 2)
         if used[k, end] < tries and used[k, end] < used[k, 1 - end]:
             best = best.copy()
             best[k] = (-1.0, 1.0)[end]

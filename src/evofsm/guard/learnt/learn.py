@@ -87,8 +87,8 @@ def learn(
     if not moves:
         return state._replace(n_episodes=state.n_episodes + 1)
     if not len(state.policies):
-        m, a = len(state.origin), len(state.used)
-        policies, linear = first_backups(m, a, state.choices, settings.n_linear)
+        given = u, len(state.origin), state.choices, settings.n_linear
+        policies, linear = first_backups(*given)
         state = state._replace(policies=policies, linear=linear)
     state = noted(state, safe, u, episode, settings, random)
     if "rivals" not in without and failed is None:
