@@ -36,7 +36,7 @@ def first_backups(u: Floats, m: int, choices: int, n_linear: int) -> tuple[Float
     By actions (T, a) of the first episode: it makes no difference in which order or direction they
     come.
     """
-    a, (order, turns) = u.shape[1], _basis(u, choices)
+    a, (order, turns) = u.shape[1], basis(u, choices)
     if choices:
         ends = np.eye(a)
     else:
@@ -52,7 +52,7 @@ def first_backups(u: Floats, m: int, choices: int, n_linear: int) -> tuple[Float
     return policies, np.append(np.zeros(len(ends)), np.ones(n_linear))
 
 
-def _basis(rows: Floats, choices: int = 0) -> tuple[Ints, Floats]:
+def basis(rows: Floats, choices: int = 0) -> tuple[Ints, Floats]:
     """(k,) an order of columns, and their directions, whatever their own ones are.
 
     By their mean size, of equals by the first rows in which they differ.
@@ -82,9 +82,8 @@ def evolved(
 
     values, those = np.array([worth(policy) for policy in policies]), np.flatnonzero(linear)
     shape, m = policies.shape[1:], len(model.origin)
-    off = (situations[:, :m] - situations[:, :m].mean(0)) * model.inverse
-    variables, flips = _basis(off)
-    actions, turns = _basis(situations[:, 2 * m :], model.choices)
+    variables, flips = basis((situations[:, :m] - model.mean) * model.inverse)
+    actions, turns = basis(situations[:, 2 * m :], model.choices)
     own = np.ix_(np.argsort(actions), np.argsort(np.append(0, 1 + variables)))
     signs = np.append(1.0, flips) * turns[:, None]
     for _ in range(settings.n_mutants if len(those) else 0):

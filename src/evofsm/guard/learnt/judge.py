@@ -26,6 +26,7 @@ from evofsm.guard.actions import Mask
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import files, words
+from evofsm.guard.learnt.backups import basis
 from evofsm.guard.learnt.failure import AT, SAYS, B, I, are_sides
 from evofsm.guard.learnt.learn import disturbance_scale, ends_of, learn
 from evofsm.guard.learnt.rollout import (
@@ -452,10 +453,12 @@ class LearntRisk(ActionJudge):
             i = int(order[used[order, 1].argmin()])
             is_rare = used[i, 1] < tries and used[i, 1] < used[:, 1].max()
             return np.asarray(np.eye(len(used))[i]) if is_rare else None
-        k, end = divmod(int((used - 1e-6 * used[:, ::-1]).argmin()), 2)
-        if used[k, end] < tries and used[k, end] < used[k, 1 - end]:
+        order, turns = basis(self.state.situations[:, 2 * self.n_variables :])
+        turned = np.where(turns[:, None] > 0.0, used, used[:, ::-1])[order]
+        k, end = divmod(int(turned.argmin()), 2)
+        if turned[k, end] < tries and turned[k, end] < turned[k, 1 - end]:
             best = best.copy()
-            best[k] = (-1.0, 1.0)[end]
+            best[order[k]] = (-1.0, 1.0)[end] * turns[order[k]]
             return best
         return None
 
