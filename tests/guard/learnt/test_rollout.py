@@ -224,7 +224,7 @@ def test_so_many_disturbances_need_not_be_survived_but_that_none_begins():
 def test_feedback_evolves_where_no_constant_action_survives():
     """Between two walls: each constant one runs into one of them."""
     model = mover(forms=np.vstack([side(0, 1.0, 3.0), side(0, -1.0, -3.0)]))
-    policies, linear = first_backups(1, 1, 0, 3)
+    policies, linear = first_backups(np.ones((1, 1)), 1, 0, 3)
     pushed, random = np.zeros((STEPS, 1, 3)), np.random.default_rng(1)
     pushed[:, 0, 1], pushed[:, 0, 2] = 0.5, -0.5
     situations = np.array([[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])

@@ -115,7 +115,7 @@ def _drifted(
     ``moves`` (T, m) are all changes of the episode.
     """
     n = state.n_episodes
-    size = np.maximum(np.maximum(state.scale, 0.5 * state.unit), 1e-300)
+    size = np.maximum(np.maximum(state.scale, 0.5 * state.unit), 1e-100)
     missed = change - phi @ known.weights
     left = missed - phi @ _correction(state, known)
     gained = np.log1p((missed / size) ** 2) - 2.0 * np.log1p((left / size) ** 2)
