@@ -39,8 +39,9 @@ def steps(state: State, z: Floats) -> State:
     seen: Flags = np.asarray(np.isfinite(change).all(1))
     if not seen.any():
         return state
-    unit = state.unit if state.n_moves else model.typical_step(z)
-    size = np.minimum(np.abs(change[seen]), _LARGE * unit)
+    latest = model.typical_step(z)
+    unit = state.unit if state.n_moves else latest
+    size = np.minimum(np.abs(change[seen]), _LARGE * np.maximum(unit, latest))
     n = min(state.n_moves, _STEPS)
     ordinary = np.where(model.jumps(change, unit) | ~seen[:, None], 0.0, change)
     moving = np.abs(change) > close  # it arrived there, and did not start there
