@@ -20,8 +20,11 @@ from evofsm.guard.learnt.state import Episode, Settings, State, sizes
 # steps] cannot be told from it.
 _ENDED, _SAME = 2, 0.5
 # Dead ends: how near an old one counts once more, how far new ones are apart and their first
-# radius [spreads]; share of the way to what was survived; how many at most, of how many rows.
-_NEAR, _APART, _WAY, _MAX_ENDS, _MAX_ROWS = 0.6, 0.15, 0.9, 40, 4000
+# radius [spreads]; share of the way to what was survived; how many at most.
+_NEAR, _APART, _WAY, _MAX_ENDS = 0.6, 0.15, 0.9, 40
+# Survived rows that are compared, the latest, of which each so many-th; and of an episode that was
+# cut off the last ones, of which it is not known that they were survived.
+_MAX_ROWS, _EACH, _UNPROVEN = 6000, 4, 20
 # Where failure is given as a function: directions in which it is looked for, how far [spreads],
 # halvings to its edge, and how far beyond that it is asked once more.
 _RAYS, _HALVINGS, _DEEP = 64, 40, 0.05
@@ -100,14 +103,18 @@ def _endings(state: State, table: Floats, known: Survived) -> Floats:
     """Where it ends by itself: nowhere where it went on, nor where it failed like that."""
     rows, ended = failure.without(table[table[:, SAYS] == ENDS], known.rows), state.ended
     if len(known.rows) and not failure.inside(rows, ended).any(0).all():
-        rows = failure.explain(ENDS, ended, known)
+        rows = failure.explain(ENDS, ended, _boxed(known, known.rows))
     rows = rows[failure.inside(rows, ended).sum(1) >= _ENDED]
     failed = state.failures[failure.inside(rows, state.failures).any(0)]
-    low, high = (np.array([end] * 2) for end in (ended.min(0), ended.max(0)))
-    those = known._replace(rows=ended, lowest=low, highest=high)
-    crashes = failure.explain(CRASHES, failed, those, least=1.0)
+    crashes = failure.explain(CRASHES, failed, _boxed(known, ended), least=1.0)
     rows = failure.without(rows, failed[~failure.inside(crashes, failed, 0.0).any(0)])
     return np.concatenate([rows, crashes, table[table[:, SAYS] == FAILS]])
+
+
+def _boxed(known: Survived, rows: Floats) -> Survived:
+    """Others (n, m) that forms are to leave outside, in the same units."""
+    low, high = (np.array([end] * 2) for end in (rows.min(0), rows.max(0)))
+    return known._replace(rows=rows, lowest=low, highest=high)
 
 
 def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> State:
@@ -147,9 +154,7 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
 
     table = state.forms
     if differs(table) > 0.0:
-        low, high = (np.array([end] * 2) for end in (rows.min(0), rows.max(0)))
-        around = known._replace(rows=rows, lowest=low, highest=high)
-        table = failure.explain(FAILS, failures, around, bends=bends)
+        table = failure.explain(FAILS, failures, _boxed(known, rows), bends=bends)
     return state._replace(forms=table, differs=differs(table))
 
 
@@ -173,10 +178,11 @@ def dead_ends(state: State, known: Model, z: Floats, episode: Episode) -> State:
     if not len(centres):
         return state
     radii = np.minimum(_NEAR, _APART * 2.0 ** (np.minimum(counts, 9.0) - 1.0))
-    went_on = (
-        state.survived[state.survived_in != state.n_episodes] if episode.failed else state.survived
-    )
-    far = _between(centres, went_on[-_MAX_ROWS:], inverse)
+    went_on = state.survived  # of the latest episode it is not known how it went on
+    if not episode.terminated:
+        latest = int((state.survived_in == state.n_episodes).sum())
+        went_on = went_on[: len(went_on) - (latest if episode.failed else min(latest, _UNPROVEN))]
+    far = _between(centres, went_on[-_MAX_ROWS::_EACH], inverse)
     radii = np.minimum(radii, _WAY * far.min(1, initial=np.inf))
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2)))
     left = np.flatnonzero(radii > _SAME * typical)

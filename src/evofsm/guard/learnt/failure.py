@@ -163,7 +163,7 @@ def explain(
         alone, whole = _bent(says, failures, survived, len(bent) + int(strong.sum()))
         if whole:
             bent, strong = alone, np.zeros(len(strong), bool)
-    within = inside(bent, failures).any(0)
+    within: Flags = np.asarray(inside(bent, failures).any(0))
     keep = [bool(s or not within[mine].all()) for s, mine in zip(strong, by, strict=True)]
     return _counted(np.concatenate([stay[keep], bent]), failures)
 

@@ -87,8 +87,7 @@ def learn(
     if not moves:
         return state._replace(n_episodes=state.n_episodes + 1)
     if not len(state.policies):
-        given = u, len(state.origin), state.choices, settings.n_linear
-        policies, linear = first_backups(*given)
+        policies, linear = first_backups(state, settings.n_linear)
         state = state._replace(policies=policies, linear=linear)
     state = noted(state, safe, u, episode, settings, random)
     if "rivals" not in without and failed is None:
@@ -106,9 +105,8 @@ def learn(
     if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
         some = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
         amid = np.ascontiguousarray(rest[:, :, some])
-        given = known, state.situations, amid, disturbance_scale(state, settings), settings, random
-        policies, linear = evolved(state.policies, state.linear, *given)
-        state = state._replace(policies=policies, linear=linear)
+        scale = disturbance_scale(state, settings)
+        state = evolved(state, known, amid, scale, settings, random)
     return state._replace(n_episodes=state.n_episodes + 1)
 
 
@@ -198,7 +196,7 @@ def disturbances(
     else:
         starts = starts[_sizes(new, state)[:_LARGEST]]
     longest = settings.horizon_max + 2
-    windows, lengths = list(state.windows), state.lengths.tolist()
+    windows, lengths, of = list(state.windows), state.lengths.tolist(), state.seen_in.tolist()
     for t in starts:
         seen: Flags = np.asarray(np.isfinite(z[t : t + longest]).all(1))
         n = len(seen) if seen.all() else int(seen.argmin())
@@ -207,8 +205,11 @@ def disturbances(
             row[:n, :m], row[: n - 1, m:] = z[t : t + n], u[t : t + n - 1]
             windows.append(row)
             lengths.append(float(n))
+            of.append(float(state.n_episodes))
     state = state._replace(
-        windows=np.array(windows).reshape(-1, longest, m + a), lengths=np.array(lengths)
+        windows=np.array(windows).reshape(-1, longest, m + a),
+        lengths=np.array(lengths),
+        seen_in=np.array(of),
     )
     if len(windows) <= settings.n_disturbances:
         return state
@@ -219,7 +220,13 @@ def disturbances(
         keep = chosen(ends, settings.n_disturbances)
     else:
         keep = _sizes(found[:, :, 1:], state)[: settings.n_disturbances]
-    return state._replace(windows=state.windows[keep], lengths=state.lengths[keep])
+    return kept(state, keep)
+
+
+def kept(state: State, keep: list[int]) -> State:
+    """Forget all disturbances but these, by their numbers from 0."""
+    of = {name: getattr(state, name)[keep] for name in ("windows", "lengths", "seen_in")}
+    return state._replace(**of)
 
 
 def _sizes(rest: Floats, state: State) -> list[int]:

@@ -18,7 +18,7 @@ from evofsm.guard.harm import Harm
 from evofsm.guard.learnt.backups import evolved
 from evofsm.guard.learnt.danger import dead_ends, explained
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.learnt.learn import chosen, disturbance_scale, worst
+from evofsm.guard.learnt.learn import chosen, disturbance_scale, kept, worst
 from evofsm.guard.learnt.rollout import Floats, crossed, pairs
 from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
 
@@ -112,6 +112,7 @@ def merge(parts: Sequence[State], settings: Settings, seed: int) -> State:
         "lowest": lowest[:2],
         "highest": highest[:2],
         "reached": np.where(shared, of("reached"), 0.0).sum(0),
+        "seen_in": np.concatenate([one.seen_in + k for one, k in zip(parts, after, strict=True)]),
         "survived": rows("survived")[::every],
         "survived_in": seen_in[::every],
         "situations": rows("situations", settings.n_situations),
@@ -126,11 +127,8 @@ def merge(parts: Sequence[State], settings: Settings, seed: int) -> State:
     rest, random = residuals_of(merged, known, merged.horizon), np.random.default_rng(seed)
     harmful = worst(known, merged.situations, merged.policies[:2], rest, scale)
     keep = chosen(harmful, settings.n_disturbances)
-    merged = merged._replace(windows=merged.windows[keep], lengths=merged.lengths[keep])
-    kept = np.ascontiguousarray(rest[:, :, [0, *(1 + k for k in keep)]])
-    given = known, merged.situations, kept, scale, settings, random
-    policies, linear = evolved(merged.policies, merged.linear, *given)
-    return merged._replace(policies=policies, linear=linear)
+    amid = np.ascontiguousarray(rest[:, :, [0, *(1 + k for k in keep)]])
+    return evolved(kept(merged, keep), known, amid, scale, settings, random)
 
 
 _NONE = np.empty(0)

@@ -44,7 +44,7 @@ def jumps(change: Floats, unit: Floats) -> Flags:
 
 def are_jumps(z: Floats, unit: Floats) -> Flags:
     """(T,) which transitions, from the second of T + 2 observations on, begin or end in a jump."""
-    jumped = jumps(np.diff(z, axis=0), unit).any(1)
+    jumped: Flags = np.asarray(jumps(np.diff(z, axis=0), unit).any(1))
     return np.asarray(jumped[1:] | jumped[:-1])
 
 
@@ -127,7 +127,7 @@ def rows_of(model: Model, z: Floats, u: Floats) -> tuple[Floats, Floats, Flags]:
 
     A row counts where its observation and those before and after were seen.
     """
-    seen = np.isfinite(z).all(1)
+    seen: Flags = np.asarray(np.isfinite(z).all(1))
     known = seen[:-2] & seen[1:-1] & seen[2:]
     z = np.where(np.isfinite(z), z, model.origin)
     phi = features(model, z[1:-1], np.diff(z[:-1], axis=0), u[:-1], u[1:])

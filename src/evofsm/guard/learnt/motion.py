@@ -26,6 +26,15 @@ _LEARNT, _FEW, _HELD = 20, 15.0, 0.3
 
 def steps(state: State, z: Floats) -> State:
     """Learn typical steps, and ends of what was seen, of observations (T + 1, m)."""
+    rows = z[np.isfinite(z).all(1)]
+    if not len(rows):
+        return state
+    low, high = rows.min(0), rows.max(0)
+    close = _SAME * (high - low)
+    lowest, new_low = _extremes(state.lowest, low, close)
+    highest, new_high = _extremes(-state.highest, -high, close)
+    reached = np.where(np.array([new_low, new_high]).T, 0.0, state.reached)
+    state = state._replace(lowest=lowest, highest=-highest, reached=reached)
     change = np.diff(z, axis=0)
     seen: Flags = np.asarray(np.isfinite(change).all(1))
     if not seen.any():
@@ -34,25 +43,17 @@ def steps(state: State, z: Floats) -> State:
     size = np.minimum(np.abs(change[seen]), _LARGE * unit)
     n = min(state.n_moves, _STEPS)
     ordinary = np.where(model.jumps(change, unit) | ~seen[:, None], 0.0, change)
-    rows = z[np.isfinite(z).all(1)]
-    low, high = rows.min(0), rows.max(0)
-    close = _SAME * (high - low)
-    lowest, new_low = _extremes(state.lowest, low, close)
-    highest, new_high = _extremes(-state.highest, -high, close)
     moving = np.abs(change) > close  # it arrived there, and did not start there
     arrived = [
         ((z[1:] <= lowest[0] + close) & moving).any(0),
         ((z[1:] >= -highest[0] - close) & moving).any(0),
     ]
-    reached = np.where(np.array([new_low, new_high]).T, 0.0, state.reached)
     return state._replace(
         unit=(n * unit + size.sum(0)) / (n + len(size)),
         power=(n * state.power + (change[seen] ** 2).sum(0)) / (n + len(size)),
         n_moves=state.n_moves + len(size),
         least=np.minimum(state.least, ordinary.min(0)),
         most=np.maximum(state.most, ordinary.max(0)),
-        lowest=lowest,
-        highest=-highest,
         reached=reached + np.array(arrived).T,
     )
 
@@ -81,7 +82,7 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: Setting
     weight = np.where(jumped | ((after == z[1:-1]) & held).any(1), 0.0, 1.0)
     is_known = bool(state.scale.any())
     if is_known:
-        off = np.abs(rest) / np.maximum(state.scale, model.FLOOR * state.unit)
+        off = np.abs(rest) / np.maximum(state.scale, model.FLOOR * state.unit + 1e-300)
         weight *= np.minimum(1.0, settings.outlier / np.maximum(off.max(1), 1e-12)) ** 2
         free = ((after > known.lowest) & (after < known.highest)).all(1)
         ordinary = ((change >= state.least) & (change <= state.most)).all(1)

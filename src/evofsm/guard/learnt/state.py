@@ -176,6 +176,7 @@ class State(NamedTuple):
     # disturbances
     windows: Annotated[Floats, _SEEN.of("windows", "steps", "seen")]  #: observations and actions
     lengths: Annotated[Floats, COUNT.of("windows")]
+    seen_in: Annotated[Floats, COUNT.of("windows")]  #: episode
     #: observation, its change, action before
     situations: Annotated[Floats, _SEEN.of("situations", "situation")]
     # backups
@@ -228,6 +229,7 @@ class State(NamedTuple):
             counts=e(0),
             windows=e((0, settings.horizon_max + 2, m + a)),
             lengths=e(0),
+            seen_in=e(0),
             situations=e((0, 2 * m + a)),
             policies=e((0, a, 1 + m)),
             linear=e(0),
@@ -313,10 +315,16 @@ def weak(table: Floats, failures: Floats, few: int) -> Flags:
 
 
 def residuals_of(state: State, known: Model, steps: int) -> Floats:
-    """(H, m, 1 + K) residuals of disturbances as they are seen now; number 0 is none."""
+    """(H, m, 1 + K) residuals of disturbances as they are seen now; number 0 is none.
+
+    Of a variable that moves otherwise since, nothing is known: what was not expected of it was
+    seen with the model of then.
+    """
     m = len(state.origin)
     found = np.zeros((steps, m, 1 + len(state.windows)))
-    for k, (window, n) in enumerate(zip(state.windows, state.lengths.astype(int), strict=True), 1):
+    rows = zip(state.windows, state.lengths.astype(int), state.seen_in, strict=True)
+    for k, (window, n, episode) in enumerate(rows, 1):
         rest = model.residuals(known, window[:n, :m], window[: n - 1, m:], state.unit)[:steps]
+        rest[:, state.drifts[state.drifts[:, 1] > episode, 0].astype(int)] = 0.0
         found[: len(rest), :, k] = rest
     return found
