@@ -131,7 +131,7 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
     towards[:, np.argsort(pace, kind="stable")] = drawn
     towards *= np.where(((survived - survived.mean(0)) ** 3).sum(0) < 0.0, -1.0, 1.0) * spread
     starts = survived[np.linspace(0, len(survived) - 1, _RAYS).astype(int)]
-    lost, kept = list[Floats](), [*known.rows]
+    lost, kept = list[Floats](), [*survived]
     for z, off in zip(starts, towards, strict=True):
         near = 0.0
         for far in _RADII:
