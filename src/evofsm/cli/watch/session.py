@@ -287,7 +287,7 @@ class Simulated:
 
     def teach(self, guard: Guard, index: int) -> None:
         """Let a guard learn from an episode that nobody watches, by looking on."""
-        env = self._gym.RevisedActions(self._env, guard, failed=self._failed)
+        env = self._gym.RevisedActions(self._env, guard, failed=self._failed or "terminated")
         self._run(env, _APART + index)
         env.reset()  # which ends what did not end by itself
 
