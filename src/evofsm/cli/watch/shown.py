@@ -14,7 +14,6 @@ from evofsm.driving.measures import TimeHeadway, TimeToCollision
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.guard import LearningJudge, LearntRisk
-from evofsm.guard.harm import Harm
 from evofsm.guard.learnt.dynamics import Dynamics
 from evofsm.guard.learnt.regions import SIZE, inside
 from evofsm.guard.learnt.words import harm
@@ -28,7 +27,7 @@ _MOST_BELIEVED, _LEAST_BELIEF = 12, 0.002
 _MOST_WAYS, _LEAST_SHARE = 3, 0.02
 
 # Observations of what was survived that are shown; of fewer failures nothing is said.
-_MOST_SURVIVED, _FEW = 500, 4
+_MOST_SURVIVED = 500
 
 #: A run that is driven now (`Start.mode`).
 LIVE = "live"
@@ -239,7 +238,6 @@ def known_of(judge: LearningJudge) -> Known:
     learnt = judge.dynamics
     ends, survived = learnt.dead_ends, learnt.survived
     said = harm(judge.harm, learning=judge.learning).removeprefix("; ")
-    said = said or _no_better(judge.harm)
     return Known(
         _plane(learnt),
         survived[:: 1 + len(survived) // _MOST_SURVIVED].tolist(),
@@ -266,17 +264,6 @@ def _kinds(known: Known, seen: Sequence[float] | None = None) -> set[tuple[float
         sides = [(j, sign, at) for j, sign, at in sides if sign * (seen[j] - at) >= 0.0]
         pairs = pairs[inside(pairs, np.array([seen]))[:, 0]]
     return {(j, sign) for j, sign, _ in sides} | {(i, j) for i, j in pairs[:, :2].tolist()}
-
-
-def _no_better(known: Harm) -> str:
-    """Where guarded episodes fail as often as those of the controller alone, and as soon."""
-    each = [[one.steps for one in some if one.failed] for some in (known.guarded, known.alone)]
-    (guarded, alone), n, of = each, len(known.guarded), len(known.alone)
-    if not alone or len(guarded) < _FEW or len(guarded) * of < len(alone) * n:
-        return ""
-    if np.median(guarded) > np.median(alone):
-        return ""
-    return f"no better than the controller alone: {len(guarded)} of {n} guarded episodes failed"
 
 
 def _plane(learnt: Dynamics) -> tuple[int, int]:

@@ -774,7 +774,7 @@ class LearntRisk(ActionJudge):
             "violated": float(self.n_violated),
             "backups": 0.0 if backups is None else float(backups.policies.sum()),
             "disturbances": 0.0 if disturbances is None else float(disturbances.residuals.sum()),
-            "harm": self.harm.chance + self.harm.kept + self.harm.n_episodes,
+            "harm": self.harm.kept + self.harm.n_episodes,
         }
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
@@ -792,7 +792,7 @@ class LearntRisk(ActionJudge):
             "n_constant": 0 if backups is None else backups.n_constant,
         }
         arrays = {"situations": self.situations, **dynamics.arrays()}
-        arrays["harm"] = np.array(self.harm.outcomes, np.float64).reshape(-1, 4)
+        arrays["harm"] = self.harm.rows
         sizes = {"b": 0, "a": dynamics.size, "m": dynamics.n_variables}
         sizes["f"] = 1 + dynamics.n_variables
         for name, shape in _BACKUPS.items():
