@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import lru_cache, partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -163,25 +161,24 @@ def tried(case: Case, seed: int, base: int, judge: str, without: str) -> dict[st
     """The row of a case and a learning seed."""
     from studies.judges import trial
 
-    with mechanisms_gone(lib.names_in(without)) as parts:
-        begun = time.process_time()
-        if case.change == "shifted":
-            found = _shifted(case, seed, base, parts)
-        else:
-            found = trial(
-                case.system,
-                case.controller or None,
-                judge,
-                without=",".join(parts),
-                seed=seed,
-                train=case.train,
-                test=case.test,
-                base=base,
-                beside=False,
-                rounds=2,
-                change=case.change,
-            )
-        took = time.process_time() - begun
+    begun = time.process_time()
+    if case.change == "shifted":
+        found = _shifted(case, seed, base, lib.names_in(without))
+    else:
+        found = trial(
+            case.system,
+            case.controller or None,
+            judge,
+            without=without,
+            seed=seed,
+            train=case.train,
+            test=case.test,
+            base=base,
+            beside=False,
+            rounds=2,
+            change=case.change,
+        )
+    took = time.process_time() - begun
     row = case._asdict() | {"judge": judge, "without": without, "seed": seed}
     return row | {name: found[name] for name in _FOUND} | {"cpu_s": round(took, 1)}
 
@@ -320,58 +317,3 @@ def page(rows: pl.DataFrame, facts: dict[str, str]) -> Page:
         ],
         facts=facts | {"sums": sums},
     )
-
-
-# -- Mechanisms that have no switch ---------------------------------------------------------------
-
-
-def _nothing(*given: Any, **named: Any) -> None: ...
-
-
-def _none_in_parts(*given: Any) -> Iterator[None]:
-    yield from ()
-
-
-def _newest(known: Any, situations: Any, horizon: int, *others: Any) -> Iterator[Any]:
-    """Of disturbances the newest, not the most harmful."""
-    found, n = known.disturbances(horizon), len(known.sequences)
-    keep = np.arange(n)[-known.remembered :]
-    known.keep(keep.tolist(), found)
-    return found.of(np.append(0, 1 + keep))
-    yield
-
-
-#: By name what stands in whose place where it is gone.
-MECHANISMS: Mapping[str, Mapping[str, Any]] = {
-    "observer": {"regression.best_gains": lambda missed: np.ones(len(missed))},
-    "drift": {"regression.DOUBT": np.inf},
-    "violations": {"library._BELIEVED": np.inf},
-    "caution": {"judge._CAUTION": 0.0},
-    "exploration": {"judge._TRIES": 0},
-    "horizon": {"judge.LearntRisk._look_ahead": _nothing},
-    "learn-fully": {"dynamics.Dynamics._learn_fully": _nothing},
-    "saturate": {"dynamics.Dynamics._saturate": _nothing},
-    "ends": {"dynamics._REACHED": 10**9, "dynamics.Dynamics._saturate": _nothing},
-    "scan": {"library.scan": _none_in_parts},
-    "harmful": {"library.choose": _newest},
-    "endings": {"dynamics.Dynamics._find_endings": _nothing},
-    "forgetting": {"dynamics._KEPT": 1.0},
-}
-
-
-@contextmanager
-def mechanisms_gone(names: Sequence[str]) -> Iterator[list[str]]:
-    """Without mechanisms, of which those that have a switch are left to the judge."""
-    gone = []
-    for path, put in (one for name in names for one in MECHANISMS.get(name, {}).items()):
-        module, *owners, attribute = path.split(".")
-        one: Any = import_module(f"evofsm.guard.learnt.{module}")
-        for owner in owners:
-            one = getattr(one, owner)
-        gone.append((one, attribute, getattr(one, attribute)))
-        setattr(one, attribute, put)
-    try:
-        yield [name for name in names if name not in MECHANISMS]
-    finally:
-        for one, attribute, before in gone:
-            setattr(one, attribute, before)

@@ -32,6 +32,8 @@ from evofsm.cli import imported
 from evofsm.driving import guard_for_family
 from evofsm.fsm import EvolvingFSM
 from evofsm.guard import Guard, LearntRisk, SceneRisk, run_episode
+from evofsm.guard.learnt.judge import JUDGE_PARTS
+from evofsm.guard.learnt.state import Settings
 from evofsm.paper import Figure, Page, Table
 from studies import benchmark, lib
 from studies.lib import ALL, FIRST, Frames, Study, Target, at_least, at_most, frame_of
@@ -42,18 +44,34 @@ from studies.systems import SYSTEMS, TASKS, Cars, Start, System, Vector, lacking
 #: Parts of the learnt judge that can be taken away, each with what is left then.
 PARTS: dict[str, str] = {
     "stretches": "no disturbances at all",
-    "lags": "no latest change and previous action",
-    "doubt": "lags are used even where they foresaw failure that never came",
-    "jumps": "jumps are learnt like all else",
-    "products": "no products of variables and actions",
-    "carried": "no residual is carried on where a variable saturates",
     "margin": "no margin",
     "backups": "constant backups alone",
     "states": "one state only: nothing may change",
     "regions": "failure by thresholds of single variables alone",
     "dead-ends": "no dead ends from certificates that were refuted",
-    "places": "a disturbance may begin anywhere",
+    "rivals": "what hardly any failure tells is never doubted",
     "harm": "it is not tested whether the guard does harm",
+    "lags": "no latest change and previous action",
+    "products": "no bends and products of variables and actions",
+    "shy": "bends and products are learnt as soon as all else",
+    "outliers": "outliers weigh as much as all else",
+    "drift": "nothing moves otherwise than it did",
+    "caution": "disturbances are taken to be no harder than they were",
+    "scan": "a disturbance begins with the episode",
+    "horizon": "it looks 64 steps ahead",
+    "exploration": "no action is tried to learn what it does",
+}
+#: What stands in its settings where a part has no other switch.
+_GONE: dict[str, dict[str, Any]] = {
+    "lags": {"lags": 1e12},
+    "products": {"shy": 1e12},
+    "shy": {"shy": Settings().prior},
+    "outliers": {"outlier": math.inf},
+    "drift": {"drift": math.inf},
+    "caution": {"caution": 0.0},
+    "scan": {"n_starts": 1},
+    "horizon": {"horizon_min": 64, "horizon_max": 64},
+    "exploration": {"tries": 0},
 }
 #: Our judges: of variables, and of scenes.
 OURS = ("learnt", "scene")
@@ -148,9 +166,12 @@ def learnt_guard(
 
     Without ``harm`` no episode is driven in shadow.
     """
-    parts = [part for part in without if part not in ("states", "harm")]
-    judge = LearntRisk(interval, **told, horizon=horizon, seed=seed, without=parts)
-    guard = Guard(**told, interval=interval, horizon=horizon, judge=judge, failed=failed, seed=seed)
+    parts = [part for part in without if part in JUDGE_PARTS]
+    gone = [_GONE[part] for part in without if part in _GONE]
+    settings = Settings(**{name: value for one in gone for name, value in one.items()})
+    told |= {"horizon": horizon, "seed": seed}
+    judge = LearntRisk(interval, **told, without=parts, settings=settings)
+    guard = Guard(**told, interval=interval, judge=judge, failed=failed)
     guard.shadow = "harm" not in without
     if "states" in without:
         guard.machine = EvolvingFSM(guard.actions.n_actions, max_states=1)
@@ -470,9 +491,8 @@ class Judges(Study):
         if self.without in (ALL, "none"):
             return tuple(PARTS) if self.without == ALL else ()
         named = tuple(dict.fromkeys(lib.names_in(self.without)))
-        known = [*PARTS, *(benchmark.MECHANISMS if self.quick else ())]
-        if wrong := [part for part in named if part not in known]:
-            raise ValueError(f"there is no part {wrong[0]!r}; there are {', '.join(known)}")
+        if wrong := [part for part in named if part not in PARTS]:
+            raise ValueError(f"there is no part {wrong[0]!r}; there are {', '.join(PARTS)}")
         return named
 
     @property

@@ -21,7 +21,7 @@ from evofsm.guard.learnt.rollout import (
     search,
     value_of,
 )
-from evofsm.guard.learnt.state import Settings, State
+from evofsm.guard.learnt.state import Settings
 
 STEPS, WALL = 20, 100.0
 ACTION = 3  # index of the first one among the features: after 1, the variable, its latest change
@@ -224,17 +224,13 @@ def test_so_many_disturbances_need_not_be_survived_but_that_none_begins():
 def test_feedback_evolves_where_no_constant_action_survives():
     """Between two walls: each constant one runs into one of them."""
     model = mover(forms=np.vstack([side(0, 1.0, 3.0), side(0, -1.0, -3.0)]))
-    state, random = State.none(1, 1, 0, Settings(), None), np.random.default_rng(1)
-    situations = np.array([[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    policies, linear = first_backups(state, 3)
-    survived = random.normal(size=(30, 1))
-    state = state._replace(
-        policies=policies, linear=linear, situations=situations, survived=survived
-    )
-    pushed = np.zeros((STEPS, 1, 3))
+    policies, linear = first_backups(np.ones((1, 1)), 1, 0, 3)
+    pushed, random = np.zeros((STEPS, 1, 3)), np.random.default_rng(1)
     pushed[:, 0, 1], pushed[:, 0, 2] = 0.5, -0.5
+    situations = np.array([[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    given = model, situations, pushed, 1.0, Settings(), random
     for _ in range(10):
-        state = evolved(state, model, pushed, 1.0, Settings(), random)
-    assert state.linear[0]
-    assert state.policies[0, 0, 1] < 0.0  # back to the middle
-    assert (value_of(model, situations, state.policies[:1], pushed) >= 0.0).all()
+        policies, linear = evolved(policies, linear, *given)
+    assert linear[0]
+    assert policies[0, 0, 1] < 0.0  # back to the middle
+    assert (value_of(model, situations, policies[:1], pushed) >= 0.0).all()

@@ -17,84 +17,63 @@ from itertools import product
 import numpy as np
 
 from evofsm.guard.learnt.rollout import Floats, Ints, Model, rollout
-from evofsm.guard.learnt.state import Settings, State
+from evofsm.guard.learnt.state import Settings
 
 # Of mutants the share that are of the best, the share of numbers that differ, by a size of 10 to a
 # power between these.
 _OF_BEST, _CHANGED, _SIZES = 0.8, 0.6, (-1.5, 0.7)
 # What a backup is worth by itself counts so much, compared with what it adds to the others.
 _BY_ITSELF = 0.01
+# Decimals beyond which numbers are equal; what a choice is preferred by to the next one.
+_ROUNDED, _PREFERRED = 9, 1e-9
 # Boxes of more dimensions have an action along each axis, not one in each corner.
 _MAX_CORNERS = 3
-# So much less is a choice preferred than the one before it in order, where both are worth the same.
-_PREFERRED = 1e-9
 
 
-def canonical(state: State) -> tuple[Ints, Floats, Ints, Floats]:
-    """Order and signs of variables (m,), and of the numbers of an action (a,).
+def first_backups(u: Floats, m: int, choices: int, n_linear: int) -> tuple[Floats, Floats]:
+    """(b, a, 1 + m) those that nothing was learnt of yet, and (b,) which evolve.
 
-    Draws and ties follow them: so it makes no difference in which order and direction numbers come.
-    Variables are ordered by their pace, actions by how they were used.
+    By actions (T, a) of the first episode: it makes no difference in which order or direction they
+    come.
     """
-    rows, m, a = state.survived, len(state.origin), len(state.used)
-    spread = rows.std(0)
-    pace = state.unit / np.where(spread > 0.0, spread, 1.0)
-    flips = np.where(((rows - rows.mean(0)) ** 3).sum(0) < 0.0, -1.0, 1.0)
-    mean = state.squares[0, 1 + 2 * m : 1 + 2 * m + a]
-    turns = np.where((mean < 0.0) & (state.choices == 0), -1.0, 1.0)
-    order = np.argsort(-np.abs(mean).round(9), kind="stable")
-    return np.argsort(pace, kind="stable"), flips, order, turns
-
-
-def first_backups(state: State, n_linear: int) -> tuple[Floats, Floats]:
-    """(b, a, 1 + m) those that nothing was learnt of yet, and (b,) which evolve."""
-    _, _, actions, turns = canonical(state)
-    a, m = len(state.used), len(state.origin)
-    if state.choices:
-        corners = np.eye(a)
+    a, (order, turns) = u.shape[1], basis(u, choices)
+    if choices:
+        ends = np.eye(a)
     else:
-        corners = np.vstack([-np.eye(a), np.eye(a)])
+        ends = np.vstack([-np.eye(a), np.eye(a)])
         if a <= _MAX_CORNERS:
-            corners = np.array(list(product((-1.0, 1.0), repeat=a)))
-        corners = np.vstack([corners, np.zeros(a)])
-    policies = np.zeros((len(corners) + n_linear, a, 1 + m))
-    policies[: len(corners), actions, 0] = corners * turns[actions]
-    if state.choices:  # of equals the first in that order, whatever its index
-        policies[:, actions, 0] -= _PREFERRED * np.arange(a)
-    return policies, np.append(np.zeros(len(corners)), np.ones(n_linear))
+            ends = np.array(list(product((-1.0, 1.0), repeat=a)))
+        ends = np.vstack([ends, np.zeros(a)])
+    policies = np.zeros((len(ends) + n_linear, a, 1 + m))
+    policies[: len(ends), order, 0] = ends
+    policies *= turns[:, None]
+    if choices:  # of equals the first in that order, whatever its index
+        policies[:, order, 0] -= _PREFERRED * np.arange(a)
+    return policies, np.append(np.zeros(len(ends)), np.ones(n_linear))
+
+
+def basis(rows: Floats, choices: int = 0) -> tuple[Ints, Floats]:
+    """(k,) an order of columns, and their directions, whatever their own ones are.
+
+    By their mean size, of equals by the first rows in which they differ.
+    """
+    exact = (-rows if choices else np.abs(rows)).round(_ROUNDED)
+    turns = np.ones(rows.shape[1]) if choices else np.where((rows**3).sum(0) < 0.0, -1.0, 1.0)
+    return np.lexsort((*exact[::-1], exact.mean(0).round(_ROUNDED))), turns
 
 
 def evolved(
-    state: State,
+    policies: Floats,
+    linear: Floats,
     model: Model,
+    situations: Floats,
     residuals: Floats,
     scale: float,
     settings: Settings,
     random: np.random.Generator,
-) -> State:
-    """Backups that are worth more, in the order in which they are asked.
-
-    Parameters
-    ----------
-    state : State
-    model : Model
-    residuals : (H, m, K) ndarray
-        Of disturbances, number 0 none, amid which they are tried in all situations.
-    scale : float
-        How much harder than they were these are taken to be.
-    settings : Settings
-    random : Generator
-
-    Returns
-    -------
-    State
-        With those backups.
-    """
-    situations, linear = state.situations, state.linear
-    variables, flips, actions, turns = canonical(state)
-    columns = np.append(0, 1 + variables)
-    signs = turns[actions][:, None] * np.append(1.0, flips[variables])
-    policies, each = state.policies.copy(), residuals.shape[2]
+) -> tuple[Floats, Floats]:
+    """Backups that are worth more, in the order in which they are asked."""
+    policies, each = policies.copy(), residuals.shape[2]
 
     def worth(policy: Floats) -> Floats:
         """(S,) how well it ends in each situation, in the mean of all disturbances."""
@@ -102,26 +81,29 @@ def evolved(
         return np.asarray(found.reshape(-1, each).mean(1))
 
     values, those = np.array([worth(policy) for policy in policies]), np.flatnonzero(linear)
-    shape = policies.shape[1:]
+    shape, m = policies.shape[1:], len(model.origin)
+    variables, flips = basis((situations[:, :m] - model.mean) * model.inverse)
+    actions, turns = basis(situations[:, 2 * m :], model.choices)
+    own = np.ix_(np.argsort(actions), np.argsort(np.append(0, 1 + variables)))
+    signs = np.append(1.0, flips) * turns[:, None]
     for _ in range(settings.n_mutants if len(those) else 0):
-        parent = those[values[those].mean(1).argmax()]
+        parent = those[values[those].mean(1).round(_ROUNDED).argmax()]
         if random.random() >= _OF_BEST:
             parent = int(random.integers(len(policies)))
         size = 10.0 ** random.uniform(*_SIZES)
         drawn = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
-        child = policies[parent].copy()
-        child[actions[:, None], columns] += signs * drawn
+        child = policies[parent] + drawn[own] * signs
         reached = worth(child)
         tried = np.repeat(values[None], 1 + len(those), 0)  # as they are, and with the child
         tried[1 + np.arange(len(those)), those] = reached
         together = tried.max(1).mean(1) + _BY_ITSELF * tried.mean(2).sum(1)
-        best = int(together.round(9).argmax())  # of equals the first: nothing changes
+        best = int(together.round(_ROUNDED).argmax())  # of equals the first: nothing changes
         if best:
             policies[those[best - 1]], values[those[best - 1]] = child, reached
     left, most, order = list(range(len(values))), np.full(values.shape[1], -1.0), []
     while left:  # first the one that is worth most, then whichever adds most
         adds = np.maximum(values[left] - most, 0.0).mean(1)
-        adds = (adds + _BY_ITSELF * values[left].mean(1)).round(9)
+        adds = (adds + _BY_ITSELF * values[left].mean(1)).round(_ROUNDED)
         order.append(left.pop(int(adds.argmax())))
         most = np.maximum(most, values[order[-1]])
-    return state._replace(policies=policies[order], linear=linear[order])
+    return policies[order], linear[order]

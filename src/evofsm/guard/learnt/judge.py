@@ -26,7 +26,7 @@ from evofsm.guard.actions import Mask
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import files, words
-from evofsm.guard.learnt.backups import canonical
+from evofsm.guard.learnt.backups import basis
 from evofsm.guard.learnt.failure import AT, SAYS, B, I, are_sides
 from evofsm.guard.learnt.learn import disturbance_scale, ends_of, learn
 from evofsm.guard.learnt.rollout import (
@@ -446,18 +446,19 @@ class LearntRisk(ActionJudge):
 
     def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
-        used, tries, n = self.state.used + self._used, self.settings.tries, self.size
-        order, turns = canonical(self.state)[2:]  # of equals the first in that order
+        used, tries = self.state.used + self._used, self.settings.tries
         if self.choices:
-            order = order if mask is None else order[mask[order]]
+            order = self.state.policies[self.state.linear == 0.0, :, 0].argmax(1)
+            order = order if mask is None else order[mask[order]]  # of equals whose backup is first
             i = int(order[used[order, 1].argmin()])
             is_rare = used[i, 1] < tries and used[i, 1] < used[:, 1].max()
-            return np.asarray(np.eye(n)[i]) if is_rare else None
+            return np.asarray(np.eye(len(used))[i]) if is_rare else None
+        order, turns = basis(self.state.situations[:, 2 * self.n_variables :])
         turned = np.where(turns[:, None] > 0.0, used, used[:, ::-1])[order]
         k, end = divmod(int(turned.argmin()), 2)
         if turned[k, end] < tries and turned[k, end] < turned[k, 1 - end]:
-            best, i = best.copy(), order[k]
-            best[i] = (-1.0, 1.0)[end] * turns[i]
+            best = best.copy()
+            best[order[k]] = (-1.0, 1.0)[end] * turns[order[k]]
             return best
         return None
 

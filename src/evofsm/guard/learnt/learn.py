@@ -87,7 +87,8 @@ def learn(
     if not moves:
         return state._replace(n_episodes=state.n_episodes + 1)
     if not len(state.policies):
-        policies, linear = first_backups(state, settings.n_linear)
+        m = len(state.origin)
+        policies, linear = first_backups(u, m, state.choices, settings.n_linear)
         state = state._replace(policies=policies, linear=linear)
     state = noted(state, safe, u, episode, settings, random)
     if "rivals" not in without and failed is None:
@@ -105,8 +106,9 @@ def learn(
     if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
         some = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
         amid = np.ascontiguousarray(rest[:, :, some])
-        scale = disturbance_scale(state, settings)
-        state = evolved(state, known, amid, scale, settings, random)
+        given = known, state.situations, amid, disturbance_scale(state, settings), settings, random
+        policies, linear = evolved(state.policies, state.linear, *given)
+        state = state._replace(policies=policies, linear=linear)
     return state._replace(n_episodes=state.n_episodes + 1)
 
 
@@ -231,7 +233,7 @@ def kept(state: State, keep: list[int]) -> State:
 
 def _sizes(rest: Floats, state: State) -> list[int]:
     """Of residuals (H, m, K) the largest first."""
-    size = np.abs(rest / state.unit[:, None]).sum((0, 1))
+    size = np.abs(rest / (state.unit[:, None] + 1e-300)).sum((0, 1))
     return [int(k) for k in np.argsort(-size, kind="stable")]
 
 

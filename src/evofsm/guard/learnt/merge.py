@@ -128,7 +128,9 @@ def merge(parts: Sequence[State], settings: Settings, seed: int) -> State:
     harmful = worst(known, merged.situations, merged.policies[:2], rest, scale)
     keep = chosen(harmful, settings.n_disturbances)
     amid = np.ascontiguousarray(rest[:, :, [0, *(1 + k for k in keep)]])
-    return evolved(kept(merged, keep), known, amid, scale, settings, random)
+    given = known, merged.situations, amid, scale, settings, random
+    policies, linear = evolved(merged.policies, merged.linear, *given)
+    return kept(merged, keep)._replace(policies=policies, linear=linear)
 
 
 _NONE = np.empty(0)

@@ -39,8 +39,9 @@ def steps(state: State, z: Floats) -> State:
     seen: Flags = np.asarray(np.isfinite(change).all(1))
     if not seen.any():
         return state
-    unit = state.unit if state.n_moves else model.typical_step(z)
-    size = np.minimum(np.abs(change[seen]), _LARGE * unit)
+    latest = model.typical_step(z)
+    unit = state.unit if state.n_moves else latest
+    size = np.minimum(np.abs(change[seen]), _LARGE * np.maximum(unit, latest))
     n = min(state.n_moves, _STEPS)
     ordinary = np.where(model.jumps(change, unit) | ~seen[:, None], 0.0, change)
     moving = np.abs(change) > close  # it arrived there, and did not start there
@@ -115,7 +116,7 @@ def _drifted(
     ``moves`` (T, m) are all changes of the episode.
     """
     n = state.n_episodes
-    size = np.maximum(np.maximum(state.scale, 0.5 * state.unit), 1e-300)
+    size = np.maximum(np.maximum(state.scale, 0.5 * state.unit), 1e-100)
     missed = change - phi @ known.weights
     left = missed - phi @ _correction(state, known)
     gained = np.log1p((missed / size) ** 2) - 2.0 * np.log1p((left / size) ** 2)

@@ -74,7 +74,8 @@ class Model(NamedTuple):
 class Ends(NamedTuple):
     """How rollouts ended: for each of S situations those of K disturbances, (S K,) each."""
 
-    #: least distance to failure [typical steps]; of one that failed the steps left, negative, less 1
+    #: least distance to failure [typical steps]; of one that failed the steps left, negative,
+    #: less 1
     value: Floats
     #: the share of the horizon that is survived, and a little for the distance to failure: the
     #: least one and, where all is survived, that at the end as well, as who comes back does better
