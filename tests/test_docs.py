@@ -147,7 +147,12 @@ def test_the_notebook_prints_what_it_shows(capsys):
         if cell["cell_type"] == "code":
             exec("".join(cell["source"]), names)
             shown = [line for one in cell["outputs"] for line in one.get("text", ())]
-            assert capsys.readouterr().out == "".join(shown)
+            printed = capsys.readouterr().out
+            if "rounding" in cell["metadata"].get("tags", ()):  # which of two equals is a machine's
+                assert names["revision"].executed < 0.7
+                assert printed.startswith("proposed 1.0, executed ")
+            else:
+                assert printed == "".join(shown)
 
 
 def test_commands_that_are_not_run_would_be_understood():

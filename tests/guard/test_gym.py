@@ -32,6 +32,7 @@ from evofsm.guard import (  # noqa: E402
     run_episode,
 )
 
+pytestmark = pytest.mark.filterwarnings("ignore:nobody says which episodes failed")
 EXAMPLES = Path(__file__).parents[2] / "examples"
 KEYS = {
     *("reviser/proposed_action", "reviser/executed_action", "reviser/reason"),
@@ -361,6 +362,9 @@ def test_observations_become_a_vector(space, observation, observe, seen):
     [
         ({}, None, True, True),  # nobody says otherwise
         ({}, None, False, False),
+        ({"failed": "terminated"}, None, True, True),
+        ({"failed": "terminated"}, None, False, False),
+        ({"failed": "terminated"}, lambda z: z[0] < 0.0, True, True),
         ({}, lambda z: z[0] < 0.0, True, False),  # the guard knows
         ({"failed": lambda step: False}, None, True, False),
         ({"failed": lambda step: step.info["of"] == "step"}, None, False, True),
@@ -379,6 +383,23 @@ def test_what_is_terminated_has_failed_unless_somebody_says_otherwise(
     env.reset()
     assert [ended[-1] for ended in guard.judge.episodes] == [failed]
     assert guard.machine.endings.sum() == failed
+
+
+def test_who_does_not_say_which_episodes_failed_is_told_both_ways_to():
+    def warned(guard, **settings):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            RevisedActions(Script(FAR), guard, **settings)
+        return [str(one.message) for one in caught]
+
+    (said,) = warned(guard_for(ONE))
+    assert "failed='terminated'" in said
+    assert "failed=lambda step:" in said
+    assert not warned(guard_for(ONE), failed="terminated")
+    assert not warned(guard_for(ONE, failed=lambda z: z[0] < 0.0))
+    frozen = guard_for(ONE)
+    frozen.freeze()
+    assert not warned(frozen)
 
 
 @pytest.mark.parametrize("failed", ["failed", {"failed": True}])

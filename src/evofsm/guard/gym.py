@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, SupportsFloat
+from typing import Any, Literal, NamedTuple, SupportsFloat
 from weakref import WeakKeyDictionary, WeakSet
 
 import numpy as np
@@ -68,7 +68,7 @@ class StepResult:
     info: dict[str, Any]
 
 
-Failed = Callable[[StepResult], bool]
+Failed = Callable[[StepResult], bool] | Literal["terminated"]
 
 
 class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -95,13 +95,14 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         such as no car ahead: then nothing is revised or learnt. NaN is what was not observed, and
         the guard's ``missing`` says what comes of it. Without it a box is flattened, and each value
         of ``Discrete`` is a variable that is 1 or 0.
-    failed : callable, optional
+    failed : callable or "terminated"
         From a step to whether it ended in failure: of ``step.observation``, ``step.reward``,
-        ``step.terminated``, ``step.truncated`` and ``step.info``. Without it the guard's own
-        function says so; where it has none either, **an episode that is terminated has failed**,
-        as in CartPole, and one that is truncated has not. Give it where an environment also
-        terminates on success: ``lambda step: step.terminated and step.reward <= 0`` for FrozenLake,
-        ``step.reward <= -100`` for LunarLander and BipedalWalker, ``lambda step: False`` for never.
+        ``step.terminated``, ``step.truncated`` and ``step.info``. ``"terminated"`` says that every
+        episode that is terminated failed, as in CartPole. Where an environment also terminates on
+        success that is wrong: ``lambda step: step.terminated and step.reward <= 0`` for FrozenLake,
+        ``step.reward <= -100`` for LunarLander and BipedalWalker, ``lambda step: False`` for never,
+        as in MountainCar and Acrobot. Not needed where the guard has a function of its own; where
+        nobody says it, it is ``"terminated"``, with a warning.
     penalty : float
         Subtracted from the reward per unit of ``reviser/penalty``: half ranges of the action, in a
         box the root of the sum of squares over its components; 1 for another index.
@@ -341,11 +342,12 @@ class Lane:
         self._seen: _Seen = None
         self._mask: Mask | None = None
         self._past: list[tuple[NDArray[np.float64], Proposal, Action]] = []
+        self._score = 0.0
 
     def begin(self, observation: Any, info: Mapping[str, Any]) -> None:
         """An episode of the environment begins."""
         _LANES.setdefault(self.terms.guard, WeakSet()).add(self)
-        self.is_open = True
+        self.is_open, self._score = True, 0.0
         self._look(observation, info)
 
     def _look(self, observation: Any, info: Mapping[str, Any]) -> None:
@@ -405,14 +407,16 @@ class Lane:
             info = step.info.get("final_info", step.info)
             step = replace(step, observation=last[0] if last else None, info=info)
         failed = self.terms.failed(step)
+        self._score += np.sum(step.reward)
         self._look(step.observation, step.info)
         if failed or over or self._seen is None:
-            self.end(failed=failed, terminated=step.terminated)
+            score = float(self._score) if over and np.isfinite(self._score) else None
+            self.end(failed=failed, terminated=step.terminated, score=score)
         self.is_open = not over
         if resets:
             self.begin(now.observation, now.info)
 
-    def end(self, *, failed: bool, terminated: bool = False) -> None:
+    def end(self, *, failed: bool, terminated: bool = False, score: float | None = None) -> None:
         """The guard's episode ends, if one is under way."""
         decider, guard = self._guard, self.terms.guard
         if decider is not None and decider is not guard and guard.learn:
@@ -421,7 +425,8 @@ class Lane:
                 situation = guard.recognise(seen, step * guard.interval)
                 guard.take_in(situation, proposal, executed)
         if decider is guard or (decider is not None and guard.learn):
-            guard.end(failed, self._seen, terminated=terminated, episode=self._episode)
+            which = self._episode
+            guard.end(failed, self._seen, terminated=terminated, score=score, episode=which)
         self._guard, self._past = None, []
 
 
@@ -432,7 +437,8 @@ _SHARED: WeakSet[Guard] = WeakSet()
 _SUCH_AS = {
     "observe": "n observation, such as observe=lambda seen: seen['state']",
     "failed": " step: its observation, reward, terminated, truncated and info, such as "
-    "failed=lambda step: step.info['failed'] or failed=lambda step: step.reward <= -100",
+    "failed=lambda step: step.info['failed'] or failed=lambda step: step.reward <= -100, or "
+    "'terminated'",
 }
 
 
@@ -451,7 +457,7 @@ class Terms:
         if not 0.0 <= penalty < math.inf:
             raise ValueError(f"penalty is {penalty}; it must be 0 or above, and finite")
         for name, given in (("observe", observe), ("failed", failed)):
-            if given is not None and not callable(given):
+            if not (given is None or callable(given) or (name, given) == ("failed", "terminated")):
                 raise TypeError(f"{name} is {given!r}; it must be a function of a{_SUCH_AS[name]}")
         self.guard = guard
         self.penalty = penalty
@@ -494,8 +500,8 @@ class Terms:
 
     def failed(self, step: StepResult) -> bool:
         """Whether a step ended in failure, unless the guard finds that itself."""
-        if self._failed is None:
-            return step.terminated and self.guard.failed is None
+        if self._failed is None or isinstance(self._failed, str):
+            return step.terminated and (self._failed is not None or self.guard.failed is None)
         try:
             found = self._failed(step)
         except (AttributeError, KeyError, TypeError) as error:
@@ -619,6 +625,13 @@ def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
         warnings.warn(
             "the guard was made in another process, and what it learns in this one stays here: run "
             "the environments in one process (DummyVecEnv, SyncVectorEnv), or save it here",
+            stacklevel=3,
+        )
+    if failed is None and guard.failed is None and guard.learn:
+        warnings.warn(
+            "nobody says which episodes failed: all that are terminated are taken to have. If so, "
+            "say failed='terminated'; if an episode may also end well, say which failed, such as "
+            "failed=lambda step: step.terminated and step.reward <= 0",
             stacklevel=3,
         )
     for one in _layers(env):

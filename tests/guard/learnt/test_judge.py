@@ -61,9 +61,9 @@ def test_told_what_failure_is_it_keeps_from_the_first_one(point):
     ("failed", "says"),
     [
         (lambda z: z[0] >= 0.4, "fails where variable 1 is above 0.4;"),
-        (lambda z: abs(z[0]) >= 0.4, "below -0.4 or variable 1 is above 0.4;"),
+        (lambda z: abs(z[0]) >= 0.4, "above 0.4 or variable 1 is below -0.4;"),
         (lambda z: z[0] + z[1] >= 0.4, "variable 1 + 0.707 variable 2 is above 0.283"),
-        (lambda z: bool(np.hypot(*(z - [0.8, 0.0])) < 0.4), "beyond a curve of variable 1 and"),
+        (lambda z: bool(np.hypot(*(z - [0.8, 0.0])) < 0.4), "inside an ellipse of variable 1 and"),
         (lambda z: bool((z <= -1e9).all()), "true nowhere around"),
     ],
 )

@@ -228,8 +228,8 @@ def test_feedback_evolves_where_no_constant_action_survives():
     pushed, random = np.zeros((STEPS, 1, 3)), np.random.default_rng(1)
     pushed[:, 0, 1], pushed[:, 0, 2] = 0.5, -0.5
     situations = np.array([[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    given = model, situations, pushed, 1.0, Settings(), random
     for _ in range(10):
-        given = model, situations, pushed, 1.0, Settings(), random
         policies, linear = evolved(policies, linear, *given)
     assert linear[0]
     assert policies[0, 0, 1] < 0.0  # back to the middle
