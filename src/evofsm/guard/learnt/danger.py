@@ -149,7 +149,10 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
 
     def differs(table: Floats) -> float:
         """The share of observations of which the function says otherwise."""
-        wrong = ~failure.inside(table, failures).any(0), failure.inside(table, rows, 0.0).any(0)
+        wrong = (
+            ~failure.inside(table, failures).any(0),
+            (failure.distances(table, rows) < 0.0).any(0),
+        )
         return float(np.concatenate(wrong).mean()) if lost else 0.0
 
     table = state.forms

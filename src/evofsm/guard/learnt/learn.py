@@ -127,7 +127,7 @@ def disturbance_scale(state: State, settings: Settings) -> float:
 def doubted(state: State, episode: Episode, settings: Settings) -> State:
     """Doubt forms that hardly any failure tells, if they refuse nearly all for long."""
     if state.held < 0:
-        return state
+        return state._replace(held=state.held - 1)
     s, table = settings, state.forms
     bent = (~failure.are_sides(table) & (table[:, SAYS] == FAILS)).any()
     most, patience = (s.less, s.sooner) if bent else (s.refused, s.patience)

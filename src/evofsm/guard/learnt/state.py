@@ -69,8 +69,9 @@ class Settings:
         refused.
     sooner, less : float
         The same where a form of two variables is known.
-    few : int
-        In doubt forms are left out that hold fewer failures.
+    few, settled : int
+        In doubt forms are left out that hold fewer failures, once there was none in so many
+        episodes also where nothing is learnt: one wrong label is outlived.
     work, work_rate : float
         Products in the rollouts of a decision at most: altogether, and in a second of the interval.
 
@@ -115,6 +116,7 @@ class Settings:
     sooner: int = 4
     less: float = 0.33
     few: int = 6
+    settled: int = 20
     work: float = 7e6
     work_rate: float = 8.75e8
 
@@ -167,8 +169,8 @@ class State(NamedTuple):
     ended: Annotated[Floats, _SEEN.of("ended", "m")]  #: where episodes ended without failing
     forms: Annotated[Floats, Numbers(("forms", failure.SIZE))]  #: where it fails or ends
     differs: Annotated[float, SHARE]  #: of what was asked, where a given function says otherwise
-    #: episodes in which little passed; below 0 while it is doubted
-    held: Annotated[int, COUNT._replace(least=-1.0)]
+    #: episodes in which little passed; below 0 those of doubt
+    held: Annotated[int, COUNT._replace(least=-COUNT.most)]
     # dead ends
     centres: Annotated[Floats, _SEEN.of("dead_ends", "m")]
     radii: Annotated[Floats, _ABOVE_0.of("dead_ends")]
@@ -278,8 +280,8 @@ def model_of(state: State, settings: Settings, *, daring: bool = False) -> Model
         crash = table[:, SAYS] == CRASHES
         table = table.copy()
         table[crash] = failure.halfway(table[crash], state.failures)
-        if state.held < 0:
-            table = table[~weak(table, state.failures, settings.few)]
+    if state.held < (0 if daring else -settings.settled):
+        table = table[~weak(table, state.failures, settings.few)]
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) if len(spread) else 1.0
     share = state.noise / np.where(state.power > 0.0, state.power, 1.0)
     noisy = np.where(state.scale > 0.0, share.clip(1e-3, 1.0), 1.0)
@@ -304,14 +306,15 @@ def model_of(state: State, settings: Settings, *, daring: bool = False) -> Model
 
 
 def weak(table: Floats, failures: Floats, few: int) -> Flags:
-    """(r,) which forms hardly any failure tells.
+    """(r,) which forms hardly any failure tells, and few beside the form that most tell.
 
     As long as there is no bent form, of sides those that explain nothing that another does not.
     """
     held, sides = failure.inside(table, failures), failure.are_sides(table)
-    fails = table[:, SAYS] == FAILS
+    fails, count = table[:, SAYS] == FAILS, held.sum(1)
+    most = count[fails].max(initial=0)
     alone = (held & (held[fails & sides].sum(0) < 2)).any(1) & sides & ~(fails & ~sides).any()
-    return np.asarray(fails & (held.sum(1) < few) & ~alone)
+    return np.asarray(fails & (count < few) & ((2 * count <= most) | (most <= 2)) & ~alone)
 
 
 def residuals_of(state: State, known: Model, steps: int) -> Floats:
