@@ -12,6 +12,7 @@ import json
 import time
 from collections.abc import Sequence
 from functools import lru_cache, partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,7 +62,8 @@ class Changed(System):
     ) -> tuple[Vector, dict[str, Any]]:
         """Begin the episode; which it is says whether anything is wrong in it."""
         start = (options or {})["start"]
-        self._step, self._held, self._late = 0, None, start.split == "test" or start.episode >= 30
+        self._step, self._late = 0, start.split == "test" or start.episode >= 30
+        self._held: Vector | None = None
         self._wrong = start.split == "train" and start.episode == GLITCHED
         self._seen_by = np.random.default_rng([start.seed, start.episode, 77])
         z, info = self._system.reset(seed=seed, options=options)
@@ -126,7 +128,7 @@ class Changed(System):
 
 # Class attributes, which `__getattr__` is not asked for.
 for _name in ("train", "horizon", "measure", "has_failed", "rivals", "learners"):
-    setattr(Changed, _name, property(lambda self, name=_name: getattr(self._system, name)))
+    setattr(Changed, _name, property(attrgetter(f"_system.{_name}")))
 
 _VALUES = {"huge": 65535.0, "missing": -999.0, "minus": -1.0}
 #: What may be wrong in one episode, and what changes a system for good.
@@ -193,8 +195,13 @@ def _shifted(case: Case, seed: int, base: int, parts: Sequence[str]) -> dict[str
     family = load_family(case.system)
     assert family.shifted is not None
     assert case.train is not None
-    ends = {"low": family.actions.low, "high": family.actions.high}
-    guard = learnt_guard(**ends, interval=family.interval, seed=seed, without=parts)
+    guard = learnt_guard(
+        low=family.actions.low,
+        high=family.actions.high,
+        interval=family.interval,
+        seed=seed,
+        without=parts,
+    )
     drives: list[Draw] = [*training(family, base, seed, case.train)]
     drives += training(family.shifted, base, seed, 10, first=case.train)
     collided = [drive(guard, one).collided for one in drives]

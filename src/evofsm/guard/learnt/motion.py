@@ -124,7 +124,7 @@ def _drifted(
     young = n - state.drifts[:, 2] < _LEARNT
     fades = settings.drift_fade if young.any() or doubt.any() else 0.0
     state = state._replace(
-        recent_squares=fades * state.recent_squares + phi.T @ phi,
+        recent_squares=fades * state.recent_squares + phi.T @ (1.0 * phi),  # no threads for it
         recent_products=fades * state.recent_products + phi.T @ change,
         doubt=doubt,
         since=np.where(doubt > 0.0, state.since, float(n)),
