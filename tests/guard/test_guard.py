@@ -517,7 +517,7 @@ def test_where_nothing_moves_before_it_fails_it_learns_all_the_same():
             for _ in range(rows):
                 guard.decide([1.0, 2.0], 0.1)
             guard.end(True, [1.0, 2.0 + last])
-        assert guard.n_failed == guard.judge.n_failed == 4
+        assert guard.n_failed == guard.judge.state.n_failed == 4
 
 
 # -- What is broken off -------------------------------------------------------------------------

@@ -52,7 +52,7 @@ def test_nothing_is_revised_before_the_first_failure_and_it_says_why(point):
 
 
 def test_told_what_failure_is_it_keeps_from_the_first_one(point):
-    guard = point.guard(failed=lambda z: z[0] >= 1.0)
+    guard = point.guard(failed=lambda z: z[0] >= 1.0, shadow=False)
     assert sum(point.play(guard, k)[1] for k in range(6)) <= 1
     assert not any(point.play(guard, 100 + k)[1] for k in range(5))
 
@@ -103,7 +103,7 @@ def test_features_grow_with_the_number_of_variables_or_it_is_refused(m, a, box):
 @pytest.mark.parametrize("places", [7, 20, 32])
 def test_many_variables_are_learnt_of_in_a_few_episodes_too(points, places, content):
     many = replace(points["box"], places=places)
-    guard = many.taught(4)
+    guard = many.taught(4, shadow=False)
     assert guard.judge.parts is not None
     assert Guard.load(BytesIO(content(guard))).judge.n_variables == 2 * places
     assert not many.play(guard, 99)[1]

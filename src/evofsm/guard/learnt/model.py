@@ -29,9 +29,12 @@ _LARGE = 100
 def typical_step(z: Floats) -> Floats:
     """(m,) how much variables of an episode change in a step, if nothing is known yet."""
     size = np.abs(np.diff(z, axis=0))
-    middle = np.nanmedian(size, 0)
+    size = size[np.isfinite(size).all(1)]
+    if not len(size):
+        return np.full(z.shape[1], 1e-300)
+    middle = np.median(size, 0)
     spread = np.nanmedian(np.abs(z - np.nanmedian(z, 0)), 0)
-    mean = np.nanmean(np.minimum(size, 6.0 * middle), 0)
+    mean = np.mean(np.minimum(size, 6.0 * middle), 0)
     return np.maximum(np.maximum(1.2 * middle, mean), FLOOR * spread) + 1e-300
 
 

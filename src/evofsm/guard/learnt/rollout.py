@@ -58,7 +58,7 @@ class Model(NamedTuple):
     reach: Floats  #: (m,) a latest change beyond this has no sequel
     lowest: Floats  #: (m,) where variables saturate; infinite where they do not
     highest: Floats  #: (m,)
-    least: Floats  #: (m,) most negative ordinary change there was
+    least: Floats  #: (m,) most negative change there was that was no jump
     most: Floats  #: (m,) most positive one
     #: (r, 13) forms in one or two variables i and j: what they say, i, j, where each is counted
     #: from, in how large a unit (its inverse), and coefficients of 1, x, y, x x, x y, y y; those
