@@ -106,6 +106,7 @@ def test_many_variables_are_learnt_of_in_a_few_episodes_too(points, places, cont
     guard = many.taught(4, shadow=False)
     assert guard.judge.parts is not None
     assert Guard.load(BytesIO(content(guard))).judge.n_variables == 2 * places
+    guard.shadow = False
     assert not many.play(guard, 99)[1]
 
 
