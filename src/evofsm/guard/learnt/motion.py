@@ -84,7 +84,7 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: Setting
     is_known = bool(state.scale.any())
     if is_known:
         off = np.abs(rest) / np.maximum(state.scale, model.FLOOR * state.unit + 1e-300)
-        weight *= np.minimum(1.0, settings.outlier / np.maximum(off.max(1), 1e-12)) ** 2
+        weight *= np.minimum(1.0, settings.outlier / np.maximum(off.max(1), 1e-12))
         free = ((after > known.lowest) & (after < known.highest)).all(1)
         ordinary = ((change >= state.least) & (change <= state.most)).all(1)
         rows = seen & free & ordinary
