@@ -383,9 +383,7 @@ class FoxgloveSink:
         """A decision was made."""
         self._channels.decision(Decision(situation, revision))
 
-    def ended(
-        self, observation: Any, *, failed: bool, terminated: bool, score: float | None
-    ) -> None:
+    def ended(self, observation: Any, *, failed: bool, terminated: bool) -> None:
         """The episode ended."""
         if observation is not None:
             self._observation = observation

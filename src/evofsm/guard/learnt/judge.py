@@ -635,7 +635,7 @@ class LearntRisk(ActionJudge):
             "violated": float(self.n_violated),
             "backups": float(self.state.policies.sum()),
             "disturbances": float(self.state.windows.sum()),
-            "harm": self.harm.kept + self.harm.n_episodes,
+            "harm": self.harm.chance + self.harm.kept + self.harm.n_episodes,
         }
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
@@ -651,7 +651,7 @@ class LearntRisk(ActionJudge):
             "settings": asdict(self.settings),
             "state": numbers,
         }
-        arrays["harm"] = self.harm.rows
+        arrays["harm"] = np.array(self.harm.outcomes, np.float64).reshape(-1, 4)
         store.write(path, files.KIND, settings, arrays, provenance)
 
     @classmethod
