@@ -37,7 +37,7 @@ def guard_of_monitor(
 
 def guard_of_traffic(interval: float, brakes: float, tolerance: float = TOLERANCE) -> Guard:
     """The same among any number of objects, who is behind included; it learns nothing."""
-    judge = TrafficRisk(_ahead(interval, brakes), -brakes, HIGHEST)
+    judge = TrafficRisk(_ahead(interval, brakes))
     settings: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW}
     return guard_for_traffic(-brakes, HIGHEST, brakes, interval, judge=judge, **settings)
 

@@ -17,7 +17,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving.rehearsal import HARDEST
+from evofsm.driving.rehearsal import HARDEST, Three
 from evofsm.fsm.validation import positive
 
 # Of a manoeuvre the hardest second counts; it shows in the latest half, and takes at least three
@@ -163,7 +163,7 @@ class BrakeWatch:
         ``noise`` is the standard deviation of that on the difference of two speeds [m/s].
         """
         now = gap, speed, leader_speed
-        if self._recent and self._is_another(now):
+        if self._recent and is_another(self._recent[-1], now, self.dt):
             ended = self.end()
             self.clear()
             self._recent.append(now)
@@ -202,9 +202,14 @@ class BrakeWatch:
         """So many decisions, or more if noise blurs a deceleration over them."""
         return max(span, round(self._noise / (blur * self.dt)))
 
-    def _is_another(self, now: tuple[float, float, float]) -> bool:
-        gap, speed, leader_speed = self._recent[-1]
-        expected = gap + 0.5 * self.dt * (leader_speed + now[2] - speed - now[1])
-        if abs(now[2] - leader_speed) > HARDEST * self.dt + _ANOTHER_SPEED:
-            return True
-        return abs(now[0] - expected) > _ANOTHER_GAP
+
+def is_another(before: Three, now: Three, dt: float) -> bool:
+    """Whether another leader is ahead: its speed or the gap changed by more than driving does.
+
+    Gap [m] and both speeds [m/s], ``dt`` [s] apart.
+    """
+    gap, speed, leader_speed = before
+    expected = gap + 0.5 * dt * (leader_speed + now[2] - speed - now[1])
+    if abs(now[2] - leader_speed) > HARDEST * dt + _ANOTHER_SPEED:
+        return True
+    return abs(now[0] - expected) > _ANOTHER_GAP

@@ -14,9 +14,11 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
 from evofsm.cli.show import plain
+from evofsm.driving.traffic import COLUMNS
 from evofsm.guard import ActionReviser, BoxActions, Guard, Mode, Revision, SearchingJudge, is_spoken
 
 _log = logging.getLogger(__name__)
@@ -31,6 +33,7 @@ _FAST = 60.0
 _LATE = 1.0
 #: A gap in time, and rows that come too often, in intervals.
 HOLE, _OFTEN = 1.5, 0.5
+_VX, _AX = COLUMNS.index("vx"), COLUMNS.index("ax")
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
 
 Answer = dict[str, Any]
@@ -230,7 +233,9 @@ class Decider:
         proposal: Any = row.proposal
         if isinstance(self.guard.actions, BoxActions) and proposal is not None:
             proposal = np.array(proposal)
-        seen: Any = _numbers(row.observation)
+        seen: Any = (
+            _accelerating(row, self.latest) if self.form.scenes else _numbers(row.observation)
+        )
         return self._without_lost_audit(lambda: self.guard.decide(seen, proposal, row.time))
 
     def _without_lost_audit(self, call: Callable[[], _T]) -> _T:
@@ -282,6 +287,20 @@ def _refuse_stale(row: Row, latest: Row) -> None:
     if latest.time - _LATE <= row.time < latest.time:
         what = f"{row.time:g} s comes after {latest.time:g} s: late rows are left out"
         raise MessageError("time", what, row.time)
+
+
+def _accelerating(row: Row, before: Message | None) -> NDArray[np.float64]:
+    """A scene with the accelerations that were not sent: since the scene before, else 0."""
+    rows = np.array(_numbers(row.observation)).reshape(-1, len(COLUMNS))
+    latest, step = {}, math.nan
+    if isinstance(before, Row) and before.time < row.time:
+        step = row.time - before.time
+        seen = np.array(_numbers(before.observation)).reshape(-1, len(COLUMNS))
+        latest = dict(zip(("", *before.objects), seen[:, _VX].tolist(), strict=False))
+    for name, one in zip(("", *row.objects), rows, strict=False):
+        if math.isnan(one[_AX]):
+            one[_AX] = (one[_VX] - latest[name]) / step if name in latest else 0.0
+    return rows.ravel()
 
 
 def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None:
