@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
-from evofsm.driving import perception, rehearsal
+from evofsm.driving import leaders, perception, rehearsal
 from evofsm.driving.brakes import OwnBrakes, hardest_seen
 from evofsm.driving.leaders import BrakeWatch, LeaderBrakes, Manoeuvres, is_another
 from evofsm.driving.naming import LABELS, RANGES
@@ -459,6 +459,9 @@ class LatentRisk(Retraced):
             **{"DECEL": self.brakes.decel, "LAG": self.brakes.lag, "LIKELY": self.brakes._likely},
             **{"KNOWN": self.brakes.known, "LOWEST": self.lowest, "CLEARANCE": self.margin},
             **{"HARDEST": HARDEST, "HALVINGS": rehearsal._HALVINGS, "STANDS": _STANDS},
+            **{"COMFORT": self.comfort, "REGAIN": self.regain, "TOUCHING": rehearsal._TOUCHING},
+            "WORST": self.manoeuvres.exceeded_by(reviser.tolerance),
+            **{"ANOTHER_GAP": leaders._ANOTHER_GAP, "ANOTHER_SPEED": leaders._ANOTHER_SPEED},
             **{"LEADER": perception._LEADER, "UNEVEN": perception._UNEVEN, "CAUTION": _CAUTION},
             "DOUBT": perception._OWN if self.brakes.known else perception._OWN_UNKNOWN,
             **{"ANOTHER": perception._ANOTHER_LEADER, "EXACT": not any(self.perception.noise)},
