@@ -48,7 +48,7 @@ def assumptions(brakes: float, tolerance: float) -> str:
     return (
         f"assumed: the own car brakes with {brakes:g} m/s² (--brakes), {share:.0%} of leaders' "
         f"hard brakes are in full ({_FULL:g} m/s²), the others as in public drives; "
-        f"alarm above a risk of {tolerance:.3g} (--tolerance)"
+        f"a risk of {tolerance:.3g} is accepted (--tolerance)"
     )
 
 

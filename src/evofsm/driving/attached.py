@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving.judge import REGAIN, LatentRisk
+from evofsm.driving.judge import REGAIN, SLIGHT, LatentRisk
 from evofsm.driving.leaders import BrakeWatch, Manoeuvres
 from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 from evofsm.driving.naming import VARIABLES
@@ -71,9 +71,8 @@ _NEAR, _GENTLE = 30.0, 3.0
 _WIDTH = 1.8
 # Nobody is nearer in what is judged [m]. SUMO keeps minGap itself: what is kept beside it [m].
 _NEAREST, _MARGIN = 0.05, 0.1
-# An acceleration that is lower by no more is what the driver wanted [m/s²]; slower than this a car
-# stands [m/s], and a speed that differs by no more is the same [m/s].
-_CHANGED, _STANDS, _SAME = 0.1, 0.1, 1e-6
+# Slower than this a car stands, and a speed that differs by no more is the same [m/s].
+_STANDS, _SAME = 0.1, 1e-6
 # So many cars in so many steps without a decision are no accident.
 _MANY_CARS, _MANY_STEPS = 10, 2000
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
@@ -99,6 +98,7 @@ class _Facts(NamedTuple):
     length: float  #: [m]
     min_gap: float  #: [m]
     decel: float  #: [m/s²]
+    late: bool  #: whether it decides less often than in each step, and goes on in between
 
 
 class Seeing:
@@ -137,7 +137,8 @@ class Seeing:
         body = self._bodies.get(car)
         if body is None:
             vehicle = self._vehicle
-            facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car)
+            late = vehicle.getActionStepLength(car) > self.dt + _TICK
+            facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car), late
             body = self._bodies[car] = _Facts(*facts)
         return body
 
@@ -308,7 +309,7 @@ class Guarding:
     def _look(self, one: _Car, speed: float, time: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
         ahead = self._seeing.ahead(one.id, speed)
-        scene = isinstance(one.guard.reviser.risk, TrafficRisk)  # type: ignore[attr-defined]
+        scene = isinstance(_judge(one.guard), TrafficRisk)
         # Who is behind matters only where one brakes: if acting, because somebody is ahead.
         alone = ahead is None and self._acts
         behind = self._seeing.behind(one.id, speed) if scene and not alone else None
@@ -330,7 +331,7 @@ class Guarding:
         assert one.seen is not None
         one.revision = one.guard.decide(one.seen, proposal)
         self.decisions += 1
-        judge = one.guard.reviser.risk  # type: ignore[attr-defined]
+        judge = _judge(one.guard)
         if isinstance(judge, TrafficRisk) and judge.worst is not None:
             other = one.around[judge.worst.number - 1]
             one.about = ("" if other is None else other.id, judge.worst.role)
@@ -343,14 +344,17 @@ class Guarding:
         if revision is None or revision.executed >= one.high:
             self._hand_back(one)
             return
-        if one.mode is None:
-            one.mode = self._vehicle.getSpeedMode(one.id)
-            self._vehicle.setSpeedMode(one.id, one.mode & ~_OFF | _ON)
         reached = max(0.0, speed + float(revision.executed) * self._seeing.dt)
-        self.limited += 1
         # Nor faster than it would drive on a free road.
         one.limit = min(reached, self._vehicle.getAllowedSpeed(one.id))
         one.wish = self._seeing.wish(one.id, speed, one.around[0])
+        if one.wish <= one.limit and not self._seeing.body(one.id).late:
+            self._hand_back(one)  # it drives as it would by itself, with its imperfections
+            return
+        if one.mode is None:
+            one.mode = self._vehicle.getSpeedMode(one.id)
+            self._vehicle.setSpeedMode(one.id, one.mode & ~_OFF | _ON)
+        self.limited += 1
         self._vehicle.setSpeed(one.id, one.limit)
 
     def _hand_back(self, one: _Car) -> None:
@@ -377,7 +381,7 @@ class Guarding:
         assert revision is not None
         stands = max(one.speed, speed, wanted) < _STANDS
         allowed = deed if self._acts else float(revision.advised)
-        self.revised += not stands and allowed < wish - _CHANGED
+        self.revised += not stands and allowed < wish - SLIGHT
         if self._report is not None:
             self._report(GuardedStep(one.time, one.id, wish, deed, revision, *one.about))
 
@@ -409,11 +413,9 @@ class Guarding:
             return guard_for_traffic(*limits, self.interval, judge=self._judge_for(limits), **how)
         guard = self._template.copy()
         guard.freeze()
-        reviser = guard.reviser
-        assert isinstance(reviser, ActionReviser)
-        reviser.mode = mode
-        latent = _latent(reviser.risk)
-        if isinstance(latent, LatentRisk):
+        if isinstance(guard.reviser, ActionReviser):
+            guard.reviser.mode = mode
+        if isinstance(latent := _of_pair(_judge(guard)), LatentRisk):
             latent.manoeuvres = self.leaders
         return guard
 
@@ -435,25 +437,27 @@ def _held_back(sumo: Any) -> set[str]:
     return {car for one in guarding for car, each in one.cars.items() if each.mode is not None}
 
 
-def _latent(judge: ActionJudge) -> ActionJudge:
+def _judge(guard: Guard) -> ActionJudge | None:
+    """Who judges actions; None where a formula alone decides, as in an `EnvelopeReviser`."""
+    return getattr(guard.reviser, "risk", None)
+
+
+def _of_pair(judge: ActionJudge | None) -> ActionJudge | None:
     """Who judges a pair, in which it is a `LatentRisk` that learns how hard leaders brake."""
     return judge.ahead if isinstance(judge, TrafficRisk) else judge
 
 
 def _leaders_of(guard: Guard | None, leader_decel: float) -> Manoeuvres:
     """What a guard knows of leaders; what is assumed without one."""
-    if guard is None:
-        return Manoeuvres(leader_decel)
-    if not isinstance(guard.reviser, ActionReviser):
-        raise TypeError(f"the guard has a {type(guard.reviser).__name__}; it needs a judge")
-    judge = _latent(guard.reviser.risk)
-    if judge.labels.names != VARIABLES:
+    judge = None if guard is None else _of_pair(_judge(guard))
+    if judge is not None and judge.labels.names != VARIABLES:
         raise ValueError(
             f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must be a "
             f"TrafficRisk, or observe {', '.join(VARIABLES)}"
         )
-    known = judge.manoeuvres if isinstance(judge, LatentRisk) else Manoeuvres(leader_decel)
-    return copy.deepcopy(known)
+    return copy.deepcopy(
+        judge.manoeuvres if isinstance(judge, LatentRisk) else Manoeuvres(leader_decel)
+    )
 
 
 # -- Which cars, and what came of them ------------------------------------------------------------
@@ -756,8 +760,9 @@ def attach(
         ``"all"``, ``"type:NAME"``, a share such as 0.1 or ``"10%"``, or ids; those to come as well.
     guard : Guard, optional
         Each car gets a copy, frozen. It observes scenes (`guard_for_traffic`) or gap and speeds
-        (`guard_for_cars`). Without one, each knows the car's own limits: it counts on SUMO's
-        ``decel`` and brakes up to ``emergencyDecel`` where it has to.
+        (`guard_for_cars`, or `Guard.of` an `EnvelopeReviser`). Without one, each knows the car's
+        own limits: it counts on SUMO's ``decel`` and brakes up to ``emergencyDecel`` where it has
+        to.
     mode : {"act", "shadow", "watch"}
         Whether guards act, only say what they would do, or there are none: then only time to
         collision and needed deceleration are measured.
@@ -781,8 +786,6 @@ def attach(
     ValueError
         If there is no such mode or choice of vehicles, the simulation is mesoscopic, or the guard
         decides at other times than those of steps, or observes something else.
-    TypeError
-        If the guard has no judge.
 
     Notes
     -----

@@ -18,8 +18,18 @@ from numpy.typing import NDArray
 
 from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
 from evofsm.cli.show import plain
-from evofsm.driving.traffic import COLUMNS
-from evofsm.guard import ActionReviser, BoxActions, Guard, Mode, Revision, SearchingJudge, is_spoken
+from evofsm.driving.judge import SLIGHT, LatentRisk
+from evofsm.driving.traffic import COLUMNS, TrafficRisk
+from evofsm.guard import (
+    ActionReviser,
+    BoxActions,
+    Guard,
+    Mode,
+    Proposal,
+    Revision,
+    is_spoken,
+    make_usable,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -61,10 +71,9 @@ class Decider:
         self._next: int | None = None  # of the recent ones, where they are being sent again
         self._said_often = self._said_fast = self._has_failed = False
         reviser = guard.reviser
-        self._units = reviser.risk.labels.units if isinstance(reviser, ActionReviser) else ()
-        self.has_margin = isinstance(reviser, ActionReviser) and not isinstance(
-            reviser.risk, SearchingJudge
-        )
+        judge = reviser.risk if isinstance(reviser, ActionReviser) else None
+        self._units = () if judge is None else judge.labels.units
+        self._drives = isinstance(judge, LatentRisk | TrafficRisk)
 
     @property
     def mode(self) -> Mode:
@@ -250,11 +259,19 @@ class Decider:
             return call()
 
     def _is_alarm(self, revision: Revision) -> bool:
-        """Whether the proposal is too risky, or, where that alone does not decide, is not kept."""
+        """Whether the proposal is not kept, or too risky.
+
+        Cars brake in proportion: an alarm begins where a proposal is not kept, but for a little,
+        and lasts until its risk is tolerable.
+        """
         reviser: Any = self.guard.reviser
-        if self.has_margin:
-            return bool(revision.risk_proposed > reviser.tolerance)
-        return is_spoken(reviser, revision)
+        if not self._drives:
+            return is_spoken(reviser, revision)
+        if self.rows > 1 and self._recent[-1][1].get("alarm"):
+            return reviser.refuses or revision.risk_proposed > reviser.tolerance
+        wanted = make_usable(Proposal(revision.proposed), reviser.actions, reviser.fallback).action
+        change = abs(float(revision.advised) - float(wanted))
+        return bool(reviser.refuses and not 0.0 < change <= SLIGHT)
 
     # -- Its end, and its beginning -------------------------------------------------------------
 
