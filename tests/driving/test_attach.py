@@ -153,6 +153,15 @@ def test_a_guarded_car_does_not_collide(road, options, ballistic):
         assert stands or one.deed <= one.revision.executed + 1e-6
 
 
+def test_where_sumo_says_0_of_whatever_is_nearer_than_min_gap_the_car_stops(road):
+    sumo = road(*NO_GAP)
+    guards = attach(sumo, ["ego"])
+    drive(sumo, 1.0)
+    guards._seeing._vehicle = SimpleNamespace(**vars(sumo.vehicle))
+    guards._seeing._vehicle.getLeader = lambda car, _: ("lead", 0.0)  # as at a junction
+    assert drive(sumo, 8.0, brakes_at=0.0)[-1] < 0.3
+
+
 def test_a_car_is_taken_over_only_where_it_has_to_be_and_handed_back(road):
     sumo = road(*NO_GAP)
     guards = attach(sumo, ["ego"])

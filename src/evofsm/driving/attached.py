@@ -181,7 +181,9 @@ class Seeing:
         euler = self._euler
         late = 0.125 * follower.decel * euler * euler - 0.5 * euler * min(0.0, closing)
         # Who is nearer than SUMO lets anybody be stands in a queue, or beside, where lanes merge.
-        return max(gap + (1.0 - self._factor) * follower.min_gap - late, _NEAREST)
+        # Across a junction SUMO says 0 of all that is nearer than minGap.
+        kept = (1.0 - self._factor) * follower.min_gap if gap else 0.0
+        return max(gap + kept - late, _NEAREST)
 
     def rows(
         self, car: str, speed: float, ahead: Neighbour | None, behind: Neighbour | None

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 
 #: Braking that needs no collision to be foreseen [m/s²], and the time in which a gap that is not
 #: safe is to be safe again [s], as the study ``traffic`` chose them.
-COMFORT, REGAIN = 3.0, 2.0
+COMFORT, REGAIN = 3.0, 1.0
 #: An acceleration that differs by no more is the same to whoever drives [m/s²].
 SLIGHT = 0.1
 # Slower than this a car stands, though a sensor may show that it moves [m/s].

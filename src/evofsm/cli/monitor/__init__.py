@@ -124,7 +124,7 @@ def monitor(
     saved.
 
     With --summary it reads FILE, such lines or a log as evofsm learn reads it (by the options from
-    --observe to --vehicle-length), and prints how often it would have alarmed, and how risky that was.
+    --observe to --vehicle-length), and prints how often it would have alarmed and how risky it was.
     """
     if sum(one is not None for one in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
