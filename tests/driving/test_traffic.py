@@ -126,9 +126,10 @@ def test_a_gap_that_is_not_safe_is_regained_in_proportion():
     assert -3.0 < cut_in[1] < 0.0  # safe again in 2 s
     assert cut_in[2] == pytest.approx(-3.0)  # not so soon: as hard as is comfortable
     assert cut_in[3] < -3.0  # what avoids a collision that is foreseen
-    braking = [Object("ahead", 14.0, 0.0, 15.0, ax=-a) for a in (0.0, 4.0, 9.0)]
-    gentle, comfortable, hardest = (decide(scene(one), 0.0).executed for one in braking)
-    assert gentle > comfortable > hardest == LOW
+    braking = [(14.0, 0.0), (14.0, 4.0), (14.0, 9.0), (4.0, 9.0)]
+    seen = [Object("ahead", gap, 0.0, 15.0, ax=-a) for gap, a in braking]
+    gentle, comfortable, hard, hardest = (decide(scene(one), 0.0).executed for one in seen)
+    assert gentle > comfortable > hard > hardest == LOW  # no harder than avoids it, held on
 
 
 def test_one_brakes_no_harder_than_who_is_behind_survives():

@@ -40,6 +40,8 @@ _TYPE = "type:"
 # Leaders are taken to brake so hard, until enough was seen [m/s²]: SUMO's usual ``decel``. In an
 # emergency they brake harder, and so does whoever follows.
 _LEADER_DECEL = 4.5
+# What is seen is so exact [m/s²].
+_EXACT = 0.05
 # Braking harder than this is hard [m/s²].
 _HARD = 5.0
 # Clocks of SUMO count thousandths; two times that differ by less are one [s].
@@ -71,6 +73,8 @@ _NEAR, _GENTLE = 30.0, 3.0
 _WIDTH = 1.8
 # Nobody is nearer in what is judged [m]. SUMO keeps minGap itself: what is kept beside it [m].
 _NEAREST, _MARGIN = 0.05, 0.1
+# Limits are as coarse as that [m/s²], and so far a driver may want more.
+_COARSE = 0.3
 # Slower than this a car stands, and a speed that differs by no more is the same [m/s].
 _STANDS, _SAME = 0.1, 1e-6
 # So many cars in so many steps without a decision are no accident.
@@ -106,6 +110,7 @@ class Seeing:
 
     def __init__(self, sumo: Any) -> None:
         self._vehicle, self._simulation = sumo.vehicle, sumo.simulation
+        self._kinds = sumo.vehicletype
         self._bodies: dict[str, _Facts] = {}
         self.look_up()
 
@@ -121,12 +126,20 @@ class Seeing:
         self.dt = float(simulation.getDeltaT())
         ballistic = str(simulation.getOption("step-method.ballistic")).lower() in ("true", "1")
         # In SUMO's Euler step a car drives all of it at the speed of its end. Against what is
-        # rehearsed, a slower follower is nearer by half a step's worth of the difference; and
-        # whoever brakes to a standstill within a step gets further by up to an eighth of its
-        # braking over the square of the step. What the Euler step adds to the gap is not counted:
-        # with an actionStepLength in any type SUMO steps ballistically, and no option says so.
+        # rehearsed, a faster follower gets less far by half a step's worth of the difference, and a
+        # slower one further; whoever brakes to a standstill within a step, too, by up to an eighth
+        # of its braking over the square of the step.
         self._euler = 0.0 if ballistic else self.dt
+        self._known: set[str] = set()
         self._bodies.clear()
+
+    def look_at_kinds(self) -> None:
+        """With an actionStepLength in any type SUMO steps ballistically, and no option says so."""
+        if self._euler and self._kinds.getIDCount() != len(self._known):
+            new = set(self._kinds.getIDList()) - self._known
+            self._known |= new
+            if any(self._kinds.getActionStepLength(each) > self.dt + _TICK for each in new):
+                self._euler = 0.0
 
     def forget(self, car: str) -> None:
         """It has left."""
@@ -179,7 +192,7 @@ class Seeing:
 
     def _room(self, gap: float, follower: _Facts, closing: float) -> float:
         euler = self._euler
-        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * min(0.0, closing)
+        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * closing
         # Who is nearer than SUMO lets anybody be stands in a queue, or beside, where lanes merge.
         # Across a junction SUMO says 0 of all that is nearer than minGap.
         kept = (1.0 - self._factor) * follower.min_gap if gap else 0.0
@@ -350,7 +363,8 @@ class Guarding:
         # Nor faster than it would drive on a free road.
         one.limit = min(reached, self._vehicle.getAllowedSpeed(one.id))
         one.wish = self._seeing.wish(one.id, speed, one.around[0])
-        if one.wish <= one.limit and not self._seeing.body(one.id).late:
+        late = self._seeing.body(one.id).late
+        if not late and one.wish <= one.limit + _COARSE * self._seeing.dt:
             self._hand_back(one)  # it drives as it would by itself, with its imperfections
             return
         if one.mode is None:
@@ -457,9 +471,9 @@ def _leaders_of(guard: Guard | None, leader_decel: float) -> Manoeuvres:
             f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must be a "
             f"TrafficRisk, or observe {', '.join(VARIABLES)}"
         )
-    return copy.deepcopy(
-        judge.manoeuvres if isinstance(judge, LatentRisk) else Manoeuvres(leader_decel)
-    )
+    # How hard SUMO's cars brake is exactly known, and has an end.
+    assumed = Manoeuvres(leader_decel, width=_EXACT)
+    return copy.deepcopy(judge.manoeuvres if isinstance(judge, LatentRisk) else assumed)
 
 
 # -- Which cars, and what came of them ------------------------------------------------------------
@@ -655,6 +669,7 @@ class Attachment:
                 warnings.warn(_SKIPPED, RuntimeWarning, stacklevel=2)
             self._begin_anew()
         self._now = now
+        self._seeing.look_at_kinds()
         self._count_cars()
         self._count_collisions(now)
         self.looked += len(self._cars.cars)

@@ -371,13 +371,18 @@ class LatentRisk(Retraced):
         return in_proportion(options, judged.risk, tolerances, self.comfort, *foreseen)
 
     def foreseen(
-        self, observation: Three, braking: float, options: NDArray[np.float64], tolerance: float
+        self,
+        observation: Three,
+        braking: float,
+        options: NDArray[np.float64],
+        tolerance: float,
+        hardest: float = 0.0,
     ) -> NDArray[np.bool_]:
         """(2, k) whether options avoid what is seen, and regain a safe gap, as `foresee` has it."""
         worst = self.manoeuvres.exceeded_by(tolerance)
         found = np.empty((2, len(options)), np.bool_)
         seen = min(braking, worst), options, self._commands[1], self.body
-        foresee(observation, *seen, self.dt, worst, self.regain, found)
+        foresee(observation, *seen, self.dt, worst, self.regain, hardest, found)
         return found
 
     def _leader_braking(self, situation: Situation) -> float:

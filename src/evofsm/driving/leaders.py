@@ -83,11 +83,17 @@ REAL_DRIVES = LeaderBrakes(
 
 
 class Manoeuvres:
-    """The decelerations of the latest ``memory`` manoeuvres, and how likely harder ones are."""
+    """The decelerations of the latest ``memory`` manoeuvres, and how likely harder ones are.
 
-    def __init__(self, assumed: float, hard: float = 2.5, memory: int = 500) -> None:
+    ``width`` is that of the kernel [m/s²]; without it Silverman's.
+    """
+
+    def __init__(
+        self, assumed: float, hard: float = 2.5, memory: int = 500, width: float | None = None
+    ) -> None:
         self.assumed = positive("assumed", assumed)
         self.hard = positive("hard", hard)
+        self.width = width
         self.gentle = 0
         self.decels: deque[float] = deque(maxlen=memory)
         self._tabulate()
@@ -130,7 +136,7 @@ class Manoeuvres:
         if self.decels:
             seen = np.array(self.decels)
             # Silverman's rule; where few were seen their spread says little.
-            width = max(_NARROWEST, 2.34 * seen.std() * len(seen) ** -0.2)
+            width = self.width or max(_NARROWEST, 2.34 * seen.std() * len(seen) ** -0.2)
             offset = np.clip((seen - grid[:, None]) / width, -1.0, 1.0)
             harder += (0.5 + offset * (0.75 - 0.25 * offset * offset)).sum(axis=1)
         harder[grid >= HARDEST] = 0.0

@@ -78,21 +78,24 @@ def foresee(
     dt: float,
     worst: float,
     regain: float,
+    hardest: float,
     found: NDArray[np.bool_],
 ) -> None:
     """Write what comes of accelerations if the leader goes on as it is seen: ``found`` (2, k).
 
     First whether full braking after each, if need be, avoids a collision with a leader that goes on
     ``braking`` so hard [m/s²]: whether the gap stays above the margin, or where it is smaller
-    already, does not shrink to half of it. Then whether each, held for ``regain`` [s], has regained
-    a gap in which full braking survives a leader that brakes by ``worst`` [m/s²].
+    already, does not shrink to half of it. Up to ``hardest`` full braking is as hard as what is
+    asked, if that is harder. Then whether each, held for ``regain`` [s], has regained a gap in
+    which full braking survives a leader that brakes by ``worst`` [m/s²].
     """
     gap, speed, leader_speed = observation[0], max(observation[1], 0.0), max(observation[2], 0.0)
     room = max(gap, _TOUCHING)
     near, kept = (room, speed, leader_speed), min(body.margin, 0.5 * room)
-    careful = Body(body.decel, body.lag, kept)
     leader_distance, reached_by_leader = _drive_on(leader_speed, -braking, regain)
     for k in range(len(accelerations)):
+        full = max(body.decel, min(-accelerations[k], hardest))
+        careful = Body(full, body.lag, kept)
         found[0, k] = survives(near, accelerations[k], before, careful, braking, dt)
         distance, reached = _drive_on(speed, accelerations[k], regain)
         then = (gap + leader_distance - distance, reached, reached_by_leader)

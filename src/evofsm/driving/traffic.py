@@ -249,7 +249,8 @@ class TrafficRisk(ActionJudge):
             if pair.role is Role.BEHIND:
                 survived = min(survived, self._survived(pair))
                 continue
-            two = self.ahead.foreseen(pair[2:5], pair.braking, options, tolerances[-1])
+            seen = pair[2:5], pair.braking, options, tolerances[-1]
+            two = self.ahead.foreseen(*seen, hardest=-float(options.min()))
             avoids, regains = avoids & two[0], regains & two[1]
         avoids &= options <= options[0]
         bearable = options >= -survived

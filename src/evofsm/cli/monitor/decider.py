@@ -268,7 +268,7 @@ class Decider:
         if not self._drives:
             return is_spoken(reviser, revision)
         if self.rows > 1 and self._recent[-1][1].get("alarm"):
-            return reviser.refuses or revision.risk_proposed > reviser.tolerance
+            return bool(reviser.refuses or revision.risk_proposed > reviser.tolerance)
         wanted = make_usable(Proposal(revision.proposed), reviser.actions, reviser.fallback).action
         change = abs(float(revision.advised) - float(wanted))
         return bool(reviser.refuses and not 0.0 < change <= SLIGHT)
