@@ -486,13 +486,7 @@ def choose(vehicles: str | float | Iterable[str], seed: int = 0) -> Callable[[An
     if isinstance(vehicles, str) and vehicles.startswith(_TYPE):
         kind = vehicles.removeprefix(_TYPE)
         # A type of which a script changed anything for one car is called NAME@car.
-        return lambda sumo, car: (
-            kind
-            in (
-                name := sumo.vehicle.getTypeID(car),
-                name.rpartition("@")[0],
-            )
-        )
+        return lambda sumo, car: f"{sumo.vehicle.getTypeID(car)}@".startswith(f"{kind}@")
     if isinstance(vehicles, (str, int, float)):
         text = str(vehicles)
         try:

@@ -8,9 +8,9 @@ leader that still ends well is the critical deceleration, and the latent risk is
 that the leader brakes harder than that. A situation is a dead end where, if the leader braked hard
 now, even braking in full at once would be too late; while it does not, that can still be left.
 
-It is left *in proportion*. Braking up to a comfortable deceleration is refused nothing; harder
-braking answers what is seen, not what could begin: the least braking that avoids the collision that
-is foreseen if the leader goes on as it does, and that regains a safe gap within a stated time.
+It is left *in proportion*. What could begin is answered by a comfortable deceleration at most.
+Harder braking answers what is seen: it is the least that avoids the collision that is foreseen if
+the leader goes on as it does. A gap that is not safe is to be safe again within a stated time.
 """
 
 from __future__ import annotations
