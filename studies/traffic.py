@@ -35,12 +35,12 @@ from evofsm.driving import (
     guard_for_family,
     held_out,
     load_family,
+    measures,
     summarise,
     teach,
     training,
     try_out,
 )
-from evofsm.driving.measures import FIXED_MEASURES
 from evofsm.fsm import IntervalActions
 from evofsm.guard import Guard
 from evofsm.paper import Page, Table
@@ -219,7 +219,7 @@ def _formula(policy: str, interval: float) -> Guard | None:
     if policy in (ALONE, OURS):
         return None
     actions = IntervalActions(_LOW, _HIGH, _WIDTH, outside="clip")
-    reviser = EnvelopeReviser(FIXED_MEASURES[policy], actions, interval)
+    reviser = EnvelopeReviser(measures.FIXED_MEASURES[policy], actions, interval)
     return Guard.of(reviser, interval=interval, learn=False)
 
 
