@@ -18,7 +18,7 @@ import evofsm
 ROOT = Path(__file__).parent.parent
 HEAVY = {
     *("numba", "scipy", "libsumo", "matplotlib", "jinja2", "river", "sklearn", "mcap"),
-    *("polars", "pyarrow", "pandas", "typer", "rich", "gymnasium", "highway_env", "distributed"),
+    *("polars", "pyarrow", "pandas", "typer", "rich", "gymnasium", "highway_env"),
 }
 
 
