@@ -12,28 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 from evofsm.cli.inspect import model_document, tables_of
 from evofsm.cli.options import (
     BRAKES,
-    SKIPPED,
     TOLERANCE,
-    ActionColumn,
     Brakes,
-    EpisodeColumns,
-    Failed,
-    Hold,
     Json,
     Judge,
-    Lengths,
-    NoLeader,
-    Observed,
-    SkipBad,
-    Step,
-    TimeColumn,
+    Reading,
     Tolerance,
-    TopicsFile,
-    Units,
     argument,
     imported,
     option,
-    reading_of,
+    reads_logs,
 )
 from evofsm.cli.show import facts, print_json, progress, say, show, table, warn
 
@@ -56,6 +44,7 @@ _MOST_ACTIONS = 1000
 _UNCERTAIN = 0.45
 
 
+@reads_logs
 def learn(
     files: Annotated[
         list[str],
@@ -64,21 +53,11 @@ def learn(
             "traces of ASAM OSI (.osi, MCAP), bags of ROS 2 (folder, MCAP, db3)."
         ),
     ],
-    observe: Observed = "gap,v_follower,v_leader",
-    action: ActionColumn = "a_follower",
+    reading: Reading,
     action_range: Annotated[
-        str, option("Its intervals, LOW:HIGH:WIDTH; what lies beyond goes into the end ones.")
+        str,
+        option("Intervals of --action, LOW:HIGH:WIDTH; what lies beyond goes into the end ones."),
     ] = "-2.5:2.5:0.3",
-    time: TimeColumn = "time",
-    episode: EpisodeColumns = None,
-    dt: Step = None,
-    failed: Failed = None,
-    unit: Units = None,
-    topics: TopicsFile = None,
-    no_leader: NoLeader = None,
-    hold: Hold = None,
-    skip_bad: SkipBad = SKIPPED,
-    vehicle_length: Lengths = None,
     rule: Annotated[
         str,
         option(
@@ -147,10 +126,7 @@ def learn(
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
     actions = _actions(action_range)
-    columns, lengths, known_topics = reading_of(
-        *(observe, action, time, episode, dt, failed, unit, topics, no_leader),
-        *(hold, skip_bad, vehicle_length),
-    )
+    columns, lengths, topics = reading
     encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
     kind = None if guard is None else _judge_of(judge, columns)
@@ -164,10 +140,10 @@ def learn(
 
     with progress("Learning", sum(file["bytes"] for file in known)) as move:  # type: ignore[misc]
         chunks = read_traces(
-            files, columns, lengths, lambda count: move(advance=count), noted, known_topics
+            files, columns, lengths, lambda count: move(advance=count), noted, topics
         )
         learning = learn_traces(chunks, machine, actions, encoder.names, units_read)
-    provenance = _provenance(learning, known, action, failed, unit)
+    provenance = _provenance(learning, known, columns)
     warnings = warnings_of(noted, columns)
     for warning in warnings:
         warn(f"warning: {warning}")
@@ -180,7 +156,7 @@ def learn(
         reckoned = kind, learning.model.dt, brakes, tolerance
         taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
         with progress("Teaching the guard", learning.read.rows) as move:
-            rows = read_traces(files, columns, lengths, topics=known_topics)
+            rows = read_traces(files, columns, lengths, topics=topics)
             share = teach(taught, rows, lambda count: move(count))
         if refused := refusing(share):
             warn(f"warning: in the later half of the log the guard {refused}")
@@ -189,7 +165,7 @@ def learn(
         told = {"files": files, "saved": out, "guard": guard, **_document(learning, provenance)}
         print_json({**told, "noted": noted, "warnings": warnings})
         return
-    read = [*_read(learning, action), *_read_otherwise(noted, columns, learning)]
+    read = [*_read(learning, columns.action), *_read_otherwise(noted, columns, learning)]
     if lengths.seen:
         read.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
     show(facts("What was read", read), *tables_of(learning.model))
@@ -327,17 +303,16 @@ def _check_out(out: Path | None, option: str = "--out") -> None:
 # -- What came of it ------------------------------------------------------------------------------
 
 
-def _provenance(
-    learning: Learning, files: list[Any], action: str, failed: str | None, unit: list[str] | None
-) -> dict[str, Any]:
+def _provenance(learning: Learning, files: list[Any], columns: LogColumns) -> dict[str, Any]:
     """What the model's file says of where it comes from."""
     read = learning.read
     provenance = {"files": files, "rows": read.rows, "episodes": read.episodes}
-    provenance |= {"transitions": learning.transitions, "action": action}
-    if failed is not None:
-        provenance |= {"failed": failed, "failures": read.failures}
-    if unit:
-        provenance["units converted"] = ", ".join(unit)
+    provenance |= {"transitions": learning.transitions, "action": columns.action}
+    if columns.failed is not None:
+        provenance |= {"failed": columns.failed, "failures": read.failures}
+    if columns.units:
+        units = (f"{name}={unit}" for name, unit in columns.units.items())
+        provenance["units converted"] = ", ".join(units)
     return provenance
 
 
