@@ -174,8 +174,6 @@ class Life(RuleBasedStateMachine):
         copy.learn_many(np.ones((4, M)), [0] * 4)  # what becomes of a copy is its own
         self.machine = self.machine.copy()
 
-    # Of what length an observation is, is only known once there was one.
-
     # -- What holds always ---------------------------------------------------------------------
 
     @invariant()
