@@ -108,25 +108,6 @@ def test_skill_is_what_its_definition_says(trace, monkeypatch, dt, steps):
         assert (skill.persistence, skill.divergence) == pytest.approx(tuple(np.mean(ahead, axis=0)))
 
 
-def test_counts_say_what_was_learnt(trace):
-    Z, actions = trace
-    marked = [one._replace(jumps=1) for one in chunks(Z, actions, size=50)]
-    learnt = learn_traces(
-        marked, machine(), ACTIONS, ["x", "y"], notes=lambda: {"units": ["m", "s"]}
-    )
-    read, model = learnt.read, learnt.model
-    assert (read.rows, read.episodes, read.jumps) == (200, 4, 4)
-    assert read.seconds == pytest.approx(0.1 * (200 - 4))
-    # After rows 36, 149 and 199 no row of the episode follows anyway; after 37 neither.
-    assert learnt.transitions == 200 - 4 - 1 == model.uses.sum()
-    assert read.clipped_below == np.nansum(actions < -1.0) > 0
-    assert read.clipped_above == np.nansum(actions > 1.0) > 0
-    assert model.visits.sum() == 200
-    assert (model.actions, model.names, model.units, model.dt) == (
-        *(ACTIONS, ("x", "y"), ("m", "s"), 0.1),
-    )
-
-
 def test_where_the_action_tells_what_comes_forecasts_beat_persistence():
     # A switch: the action says where to go, so the belief never stays and is always foreseen.
     places = np.random.default_rng(3).integers(0, 2, 4000)

@@ -379,32 +379,6 @@ def test_what_is_not_known_is_verified_and_said_not_to_be_replayed(tmp_path):
     assert [why.split()[0] for why in result.not_replayed] == ["Own", "ActionReviser"]
 
 
-def _is_too_close(z):
-    return bool(z[0] <= 6.0)
-
-
-def test_a_guard_that_was_told_where_it_fails_is_replayed_with_that_function_alone(tmp_path):
-    path = tmp_path / "log"
-    with AuditLog(path) as log:
-        guard = Guard(low=-2.5, high=2.5, interval=0.25, failed=_is_too_close, audit=log)
-        for _ in range(6):
-            gap, speed = 30.0, 10.0
-            while gap > 6.0:
-                speed = max(0.0, speed + 0.25 * guard.decide([gap, speed], 1.0).executed)
-                gap += 0.25 * (8.0 - speed)
-                if speed < 8.0:
-                    break
-            guard.end(observation=[gap, speed])
-    without, with_it = audit(path), audit(path, failed=_is_too_close)
-    assert without.is_good
-    assert without.replayed == 0
-    assert "--failed MODULE:FUNCTION" in without.not_replayed[0]
-    assert with_it.is_good
-    assert with_it.replayed == with_it.contents.decisions > 20
-    assert with_it.not_replayed == ()
-    assert audit(path, failed=lambda z: bool(z[0] <= 20.0)).difference is not None
-
-
 # -- Forging --------------------------------------------------------------------------------------
 
 

@@ -59,21 +59,6 @@ def test_it_goes_on_bit_for_bit_wherever_it_is_killed(tmp_path, learn, mode):
     state.close()
 
 
-def test_a_row_that_was_taken_in_but_not_answered_is_answered_when_it_is_sent_again(tmp_path):
-    rows = [line(row) for row in traffic(30)]
-    plain = Decider(made())
-    expected = [plain.answer(row) for row in rows]
-    decider, state = opened(tmp_path / "state.evofsm")
-    for row in rows[:20]:
-        decider.answer(row)
-    decider.answer(rows[20])  # which nobody heard: it is killed
-    abandoned(state)
-    decider, state = opened(tmp_path / "state.evofsm")
-    assert decider.n == 21
-    assert [decider.answer(row) for row in rows[20:]] == expected[20:]
-    state.close()
-
-
 def test_a_saved_guard_is_gone_on_from_and_keeps_where_it_came_from(tmp_path):
     path = tmp_path / "guard.evofsm"
     made().save(path, {"drive": "Monday"})
