@@ -117,10 +117,6 @@ def test_where_the_action_tells_what_comes_forecasts_beat_persistence():
     )
     assert learnt.model.n_states == 2
     assert learnt.skills[0].skill > 0.9
-    found = passages(learnt.model)
-    assert {(p.origin, p.target) for p in found} == {(0, 1), (1, 0)}
-    happened = sum(places[k] != places[k + 1] for k in range(len(Z) - 1))
-    assert sum(p.times for p in found) == pytest.approx(happened, abs=2)
 
 
 def test_a_transition_goes_from_where_one_was_to_where_one_came():

@@ -584,15 +584,11 @@ def test_where_the_disk_is_full_it_drives_on_and_says_so_at_the_end(tmp_path, ca
     assert audit(path).is_good
 
 
-class CtrlCError(KeyboardInterrupt):
-    """Ctrl-C at a place of one's choice."""
-
-
 @contextmanager
-def interrupt(at, *methods):
+def interrupt(at):
     """Ctrl-C before line ``at`` of those that run in a log's methods, or as one of them returns."""
     written = [value for value in vars(AuditLog).values() if hasattr(value, "__code__")]
-    codes, left = {method.__code__ for method in methods or written}, at
+    codes, left = {method.__code__ for method in written}, at
 
     def trace(frame, event, argument):
         nonlocal left
@@ -601,7 +597,7 @@ def interrupt(at, *methods):
         if event in ("line", "return"):
             left -= 1
             if left == -1:
-                raise CtrlCError
+                raise KeyboardInterrupt
         return trace
 
     before = sys.gettrace()
@@ -628,7 +624,7 @@ def test_what_an_interrupt_breaks_off_is_done_again_and_written_once(tmp_path, m
                         with interrupt(at):
                             call()
                         break
-                    except CtrlCError:
+                    except KeyboardInterrupt:
                         times += 1
                 else:
                     call()

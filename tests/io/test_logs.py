@@ -154,18 +154,6 @@ def test_any_table_is_read_as_python_s_own_reader_reads_it(
     assert [t for piece in pieces for t in piece.texts["a text"]] == [row[1] for row in wanted]
 
 
-def test_a_discrete_column_gets_a_coordinate_for_each_value(tmp_path):
-    path = write(tmp_path / "a.csv", ["0,5,red,1", "1,6,green,1"], "time,gap,light,a")
-    encoder = ObservationEncoder("gap", Category("light", ("red", "green"), distance=2.0))
-    (chunk,) = read(path, observe=encoder, action="a")
-    assert chunk.observations[0] == pytest.approx([5.0, np.sqrt(2.0), 0.0])
-    assert np.array_equal(chunk.observations[1], encoder.encode({"gap": 6.0, "light": "green"}))
-    path = write(tmp_path / "b.csv", ["0,5,red,1", "1,6,amber,1"], "time,gap,light,a")
-    message = refusal(path, observe=encoder, action="a")
-    assert "line 3, column 'light': 'amber' is none of the values" in message
-    assert "red, green" in message
-
-
 def test_every_file_begins_an_episode_and_columns_that_tell_them_apart_may_be_named(tmp_path):
     path = write(tmp_path / "a.csv", [*log(3), *log(3, "other", start=0.3)])
     assert [chunk.starts.tolist() for chunk in read(path, path)] == [[0, 3], [0, 3]]
@@ -242,21 +230,6 @@ def test_a_bad_value_is_named_with_its_line_and_column(tmp_path, value, cause, c
     assert cause in message
 
 
-@pytest.mark.parametrize(
-    ("columns", "missing", "option"),
-    [
-        ({"observe": ObservationEncoder("gap", "speed")}, "speed", "--observe"),
-        ({"action": "accel"}, "accel", "--action"),
-        ({"time": "t"}, "t", "--time"),
-        ({"episode": ["run", "driver"]}, "driver", "--episode"),
-        ({"failed": "hit"}, "hit", "--failed"),
-    ],
-)
-def test_a_missing_column_names_those_there_are_and_the_option(tmp_path, columns, missing, option):
-    message = refusal(write(tmp_path / "a.csv", log(3)), **columns)
-    assert f"no column {missing!r}; it has {HEADER.replace(',', ', ')} ({option}" in message
-
-
 def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, monkeypatch):
     """Each block would be an episode of its own, and no row would look wrong."""
     lines = [row for k in range(8) for pair in ("v1", "v2") for row in log(10, pair, start=k)]
@@ -265,13 +238,6 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, monkeypat
     assert "sort the file by run, pair, segment and then by time" in message
     monkeypatch.setattr(tables, "_CSV_BYTES", 1)
     assert "a.csv, line 22: the episode r, v1, 0" in refusal(write(tmp_path / "a.csv", lines))
-
-
-def test_all_files_have_the_step_of_the_first(tmp_path):
-    slow = write(tmp_path / "slow.csv", log(9, step=1.0))
-    message = refusal(write(tmp_path / "fast.csv", log(9)), slow)
-    assert "slow.csv has a row every 1 s" in message
-    assert "fast.csv has one every 0.1 s" in message
 
 
 @pytest.mark.parametrize(
@@ -582,14 +548,6 @@ def test_signals_of_several_clocks_are_held_at_the_times_of_actions(
     assert [21, 10, 30] not in seen.tolist()  # of 0.17 s before
 
 
-def test_one_signal_that_comes_less_often_is_held_where_it_is_asked_for(tmp_path):
-    lines = [f"p,{k / 10:.1f},{k if k % 5 == 0 else ''},10,11,1,0" for k in range(60)]
-    path = write(tmp_path / "a.csv", lines, SHORT)
-    with pytest.raises(ValueError, match=r"several clocks in one table\? --hold 0.5 holds"):
-        read(path)
-    assert together(path, hold=0.5)[:2] == ([k // 5 * 5 for k in range(60)], [0])
-
-
 # -- Failures, and rows without a leader -----------------------------------------------------------
 
 
@@ -653,10 +611,6 @@ def test_a_number_may_stand_for_no_leader(tmp_path):
     assert found[:2] == ([5, 4, 3, 2], [0, 2])
     assert (noted.leaderless, noted.failed, warnings_of(noted)) == (3, 0, [])
     assert "(--no-leader names the right one" in refusal(path, no_leader="lead==0")
-    noted = Noted()
-    read(path, noted=noted, failed="gap<=0")
-    assert "1 of 2 failed episodes fail with their first row, and gap is 0" in warnings_of(noted)[0]
-    assert "--no-leader gap==0 " in warnings_of(noted)[0]
 
 
 @pytest.mark.parametrize(("nobody", "warns"), [((-1, -1), True), ((-1, -2), False)])
@@ -744,14 +698,9 @@ def test_dates_that_are_none_are_refused(tmp_path, texts, says):
 def test_units_are_converted_before_anything_is_learnt(tmp_path):
     lines = [f"p,{100 * k},{1000 * k},36,72,0,0" for k in range(4)]
     units = units_given(["v=km/h", "v_l=m/s", "time=ms", "gap=cm"])  # the longest name counts
-    path, noted = write(tmp_path / "a.csv", lines, SHORT), Noted()
-    (chunk,) = read(path, units=units)
+    (chunk,) = read(write(tmp_path / "a.csv", lines, SHORT), units=units)
     assert chunk.observations[1] == pytest.approx([10.0, 10.0, 72.0])
     assert chunk.dt == 0.1
-    read(path, noted=noted)
-    speed, step = warnings_of(noted)
-    assert re.search("v_leader reaches 72 m/s.*--unit v_leader=km/h", speed)
-    assert re.search("a row every 100 s.*--unit time=ms", step)
 
 
 @pytest.mark.parametrize("row", ["-,[s],m,km/h,kph,m/s^2,", ",ms,cm,m/s,mps,g,-"])

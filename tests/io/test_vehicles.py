@@ -242,7 +242,7 @@ def test_who_is_beside_is_nobody_s_leader_in_fcd(tmp_path, told, ending):
     assert "is it narrower than 2.5 m? --vehicle-length bike=12x0.8" in " ".join(warnings_of(noted))
 
 
-@pytest.mark.parametrize("turned", [0.7, -2.0])
+@pytest.mark.parametrize("turned", [0.7, math.pi, -2.0])
 def test_who_is_beside_is_nobody_s_leader_among_objects(tmp_path, turned):
     rows = [
         (name, time, *along_a_road(turned, along, across), *along_a_road(turned, 5.0, 0.0), *kind)
@@ -252,6 +252,8 @@ def test_who_is_beside_is_nobody_s_leader_among_objects(tmp_path, turned):
     ]
     (chunk,) = read_traces([objects(tmp_path / "a.csv", rows, OBJECTS + ",width")])
     assert set(chunk.names) == BEHIND
+    first = dict(zip(chunk.names, chunk.observations[chunk.starts].tolist(), strict=True))
+    assert first["c behind a"] == pytest.approx([12.0 - 1.6, 5.0, 5.0], abs=1e-3)
     rows = [row[:-1] for row in rows if row[0] in "abcd"]  # of no width, as wide as a car
     (chunk,) = read_traces([objects(tmp_path / "b.csv", rows)])
     assert set(chunk.names) == {"c behind a", "d behind b"}
@@ -368,17 +370,6 @@ def test_the_leader_is_the_nearest_one_ahead_on_the_same_lane(tmp_path):
     polars.read_csv(path, schema_overrides=numbers).write_parquet(tmp_path / "a.parquet")
     again = sorted(episodes(tmp_path / "a.parquet"), key=lambda one: one[0][0, 1])
     assert again[1][0].tolist() == found[1][0].tolist()
-
-
-@pytest.mark.parametrize("turned", [0.7, math.pi, -2.0])
-def test_any_direction_of_the_road_is_alike(tmp_path, turned):
-    def row(name, t, along, speed):
-        c, s = math.cos(turned), math.sin(turned)
-        return (name, t, along * c, along * s, speed * c, speed * s, 5, 7)
-
-    rows = [r for t in (0.0, 0.1) for r in (row("b", t, 0, 10), row("a", t, 25, 12))]
-    ((observations, _, _),) = episodes(objects(tmp_path / "a.csv", rows))
-    assert observations[0] == pytest.approx([20.0, 10.0, 12.0])
 
 
 def test_who_stands_points_where_it_moved_last_or_where_it_is_said_to(tmp_path):
