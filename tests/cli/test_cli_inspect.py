@@ -46,7 +46,6 @@ def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
     ("arguments", "says"),
     [
         (("--state", 0), "--state is 0; there are 1 to"),
-        (("--state", "close"), "--state is close; there are 1 to"),
         (("--observation", "a,b"), "write numbers"),
         (("--observation", "1,2,3", "--state", 1), "name one situation"),
         (("--state", 1, "--action", 99), "--action is 99; there are 1 to 17"),
