@@ -13,8 +13,6 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-import evofsm
-
 ROOT = Path(__file__).parent.parent
 HEAVY = {
     *("numba", "scipy", "libsumo", "matplotlib", "jinja2", "river", "sklearn", "mcap"),
@@ -58,10 +56,6 @@ def test_importing_the_package_costs_little_more_than_importing_numpy():
             )
             measured.append(float(run(sys.executable, "-c", program)))
     assert min(seconds["evofsm"]) <= 1.5 * min(seconds["numpy"])
-
-
-def test_the_version_is_that_of_the_distribution():
-    assert evofsm.__version__ == distribution("evofsm").version
 
 
 # -- What is told of it ------------------------------------------------------------------------

@@ -440,20 +440,10 @@ def test_a_traffic_light_is_not_taken_for_ground_truth_in_a_view(tmp_path, osi):
 
 
 def test_mcap_is_read_by_its_schema_and_named_where_it_holds_something_else(tmp_path, osi):
-    writing = pytest.importorskip("mcap.writer")
+    pytest.importorskip("mcap")
     path = tmp_path / "trace.mcap"
     for kind, place in (("GroundTruth", 0), ("SensorView", 1), ("SensorData", 0)):
-        with path.open("wb") as file:
-            writer = writing.Writer(file)
-            writer.start(profile="", library="another")
-            schema = writer.register_schema(f"osi3.{kind}", "protobuf", b"")
-            other = writer.register_schema("foxglove.Log", "jsonschema", b"{}")
-            data = writer.register_channel("data", "json", other)
-            channel = writer.register_channel("truth", "protobuf", schema)
-            for k in range(5):
-                writer.add_message(data, k, b"\xff", k)
-                writer.add_message(channel, k, osi.osi_messages(k)[place], k)
-            writer.finish()
+        path.write_bytes(osi.osi_mcap(kind, place))
         if kind == "SensorData":
             assert "its schemas are Log, SensorData" in refusal(path)
         else:
@@ -477,18 +467,8 @@ def test_what_mcap_leaves_open_may_be_left_out_or_there(tmp_path, osi, how):
     writing, path = pytest.importorskip("mcap.writer"), tmp_path / "trace.mcap"
     if "index_types" in how:
         how = how | {"index_types": writing.IndexType.NONE}
-    with path.open("wb") as file:
-        writer = writing.Writer(file, enable_data_crcs=False, **how)
-        writer.start(profile="", library="another")
-        schema = writer.register_schema("osi3.GroundTruth", "protobuf", b"")
-        channel = writer.register_channel("truth", "protobuf", schema)
-        writer.add_attachment(0, 0, "picture", "image/png", b"\xff" * 99)
-        writer.add_metadata("drive", {"driver": "none"})
-        for k in range(5):
-            writer.add_message(channel, k, osi.osi_messages(k)[0], k)
-        writer.finish()
+    path.write_bytes(whole := osi.osi_mcap(enable_data_crcs=False, **how))
     assert_pair(path)
-    whole = path.read_bytes()
     unknown = b"\x99" + (3).to_bytes(8, "little") + b"own"
     path.write_bytes(whole[:8] + unknown + whole[8:])
     if "index_types" in how:  # no place is told that would have moved
