@@ -181,11 +181,6 @@ class Page(HTMLParser):
         body = re.sub(r"</t[hd]>|<small>", " ", body)
         return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", "", body)))
 
-    @property
-    def verdict(self) -> str:
-        """The answer at the top, as markup."""
-        return re.search(r'<div class="verdict.*?</div>', self.html, flags=re.DOTALL)[0]
-
     def is_sound(self) -> None:
         """Fails where it loads anything, a link leads nowhere, or a name is given twice."""
         assert all(address.startswith("data:image/svg+xml;base64,") for address in self.loads)
