@@ -64,6 +64,13 @@ def refusal(*paths, **columns):
     return str(caught.value)
 
 
+@pytest.fixture(params=[1, 1 << 20])
+def pieces(request, monkeypatch):
+    """Files are read row by row, or at once."""
+    monkeypatch.setattr(tables, "_CSV_BYTES", request.param)
+    monkeypatch.setattr(tables, "_PARQUET_ROWS", request.param)
+
+
 # -- What is read ---------------------------------------------------------------------------------
 
 
@@ -334,11 +341,7 @@ BAD_ROWS = {
 
 
 @pytest.mark.parametrize(("bad", "said", "starts"), BAD_ROWS.values(), ids=BAD_ROWS.keys())
-@pytest.mark.parametrize("at_once", [1, 1 << 20])
-def test_bad_rows_are_left_out_and_counted_up_to_a_number(
-    tmp_path, monkeypatch, bad, said, starts, at_once
-):
-    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
+def test_bad_rows_are_left_out_and_counted_up_to_a_number(tmp_path, pieces, bad, said, starts):
     good = list(short([7, 1, 2, 3, 4, 5, 6, 7]))
     after = good[5:] if starts == [0, 4] else good[4:]  # in place of a row, or beside it
     path, noted = write(tmp_path / "a.csv", [*good[:4], *bad, *after], SHORT), Noted()
@@ -381,22 +384,16 @@ def test_a_failure_at_a_time_that_is_there_twice_is_one(tmp_path):
     assert together(path, failed="crash") == ([3, 2, 1], [0], [2])
 
 
-def test_a_missing_action_is_counted_where_another_row_follows(tmp_path):
+def test_a_missing_action_is_counted_where_another_row_follows(tmp_path, pieces):
     lines = [
         f"{p},{k / 10:.1f},{k},10,11,{'' if k in (2, 3) else 1},0" for p in "pq" for k in range(4)
     ]
-    for size in (1, 1 << 20):
-        tables._CSV_BYTES, usual = size, tables._CSV_BYTES
-        try:
-            noted = Noted()
-            chunks = read(write(tmp_path / "a.csv", lines, SHORT), noted=noted)
-        finally:
-            tables._CSV_BYTES = usual
-        actions = np.concatenate([chunk.actions for chunk in chunks])
-        assert np.isnan(actions).tolist() == [False, False, True, True] * 2
-        (warning,) = warnings_of(noted)
-        assert "2 rows have no action" in warning
-        assert "line 4, column 'a_follower'" in warning
+    chunks = read(write(tmp_path / "a.csv", lines, SHORT), noted=(noted := Noted()))
+    actions = np.concatenate([chunk.actions for chunk in chunks])
+    assert np.isnan(actions).tolist() == [False, False, True, True] * 2
+    (warning,) = warnings_of(noted)
+    assert "2 rows have no action" in warning
+    assert "line 4, column 'a_follower'" in warning
 
 
 ABOVE = {
@@ -431,9 +428,7 @@ def test_names_may_stand_below_comments_or_behind_a_mark(tmp_path, above):
     assert f"line {header.count(chr(10)) + 5}, column 'gap'" in refusal(bad)
 
 
-@pytest.mark.parametrize("at_once", [1, 1 << 20])
-def test_what_was_appended_is_read_by_its_own_names(tmp_path, monkeypatch, at_once):
-    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
+def test_what_was_appended_is_read_by_its_own_names(tmp_path, pieces):
     other = "note,v_leader,v_follower,gap,time,a_follower,pair"
     more = [f"x,21,20,{gap},{gap / 10},1,p" for gap in (1, 2, 3)]
     path = write(tmp_path / "a.csv", [*short([7, 8]), SHORT, *short([9]), other, *more], SHORT)
@@ -551,10 +546,7 @@ def test_signals_of_several_clocks_are_held_at_the_times_of_actions(
 
 @pytest.mark.parametrize("condition", [" gap <= 0 ", "gap<1e-9", "crash", "crash==1"])
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
-@pytest.mark.parametrize("at_once", [1, 1 << 16])
-def test_the_first_row_in_which_it_holds_ends_the_episode(
-    tmp_path, monkeypatch, condition, ending, at_once
-):
+def test_the_first_row_in_which_it_holds_ends_the_episode(tmp_path, pieces, condition, ending):
     hole = [f"s,{t},{gap},1,1,0,{hit}" for t, gap, hit in ((0, 1, 0), (0.1, 0, 1), (9, 0, 1))]
     lines = [*short([3, 1, 0, -1, -1, 2, 0]), *short([-1, 4], "q"), "r,0,5,1,1,0,0", *hole]
     path = write(tmp_path / "a.csv", lines, SHORT)
@@ -563,8 +555,6 @@ def test_the_first_row_in_which_it_holds_ends_the_episode(
         frame = polars.read_csv(path).with_columns(polars.col("crash").cast(kind))
         path = str(tmp_path / "a.parquet")
         frame.write_parquet(path)
-    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
-    monkeypatch.setattr(tables, "_PARQUET_ROWS", at_once)
     noted = Noted()
     gaps, starts, failures = together(path, noted=noted, failed=condition)
     assert gaps == [3, 1, 0, 2, 0, -1, 4, 5, 1, 0]
@@ -584,9 +574,7 @@ def test_what_only_tells_of_failures_may_be_infinite_but_must_be_there(tmp_path)
 
 
 @pytest.mark.parametrize("nothing", ["", "nan", "NA", "inf", " "])
-@pytest.mark.parametrize("at_once", [1, 1 << 20])
-def test_rows_without_a_leader_end_an_episode(tmp_path, monkeypatch, nothing, at_once):
-    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
+def test_rows_without_a_leader_end_an_episode(tmp_path, pieces, nothing):
     lines = short([nothing, 1, 2, nothing, nothing, 3], crash=[0] * 6)
     path, noted = write(tmp_path / "a.csv", lines, SHORT), Noted()
     assert together(path, noted=noted, no_leader="end")[:2] == ([1, 2, 3], [0, 2])
