@@ -767,7 +767,6 @@ def test_what_each_meets_is_learnt_whole_and_nothing_across_a_reset(name, steps,
     before = len(ended)
     revised.reset(seed=9)  # those under way end as they are
     assert len(guard.judge.episodes) == before + 3
-    envs.close()
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -786,7 +785,6 @@ def test_infos_are_arrays_with_masks(mode):
         assert infos["reviser/reason"].dtype == object
     assert resets == (2 if mode is NEXT_STEP else 0)
     assert all(revision.executed[0] <= 0.5 for revision in revised.revisions)
-    envs.close()
 
 
 def test_a_step_that_only_resets_is_no_decision_and_costs_nothing():
@@ -802,7 +800,6 @@ def test_a_step_that_only_resets_is_no_decision_and_costs_nothing():
         assert infos["reviser/executed_action"] == pytest.approx(executed)
         assert infos["reviser/penalty"] == pytest.approx((2.0 - executed) / 2.0)
         assert not resets or rewards == [0.0]
-    envs.close()
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -821,7 +818,6 @@ def test_a_failure_is_told_by_the_environments_own_info(mode):
     assert all("_length" not in step.info and step.reward == 1.0 for step in asked)
     last = [tuple(map(float, step.observation)) for step in asked if step.terminated]
     assert last == [seen for _, seen, terminated in ended if terminated]
-    envs.close()
 
 
 class Bare(VectorWrapper):
@@ -865,7 +861,6 @@ def test_what_the_documents_call_optional_may_be_absent(mode, without):
     if mode is SAME_STEP and "final_obs" in without:
         ended = [(rows, None, failed) for rows, _, failed in ended]
     assert guard.judge.episodes == ended
-    envs.close()
 
 
 @pytest.mark.parametrize("width", [1, 2])
@@ -896,7 +891,6 @@ def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
     executed = [revised.step(full)[-1]["reviser/executed_action"].ravel() for _ in range(8)]
     assert (np.array(executed[:4]) == 2.0).all()
     assert (np.array(executed[4:]) <= 0.5).all()
-    envs.close()
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -914,7 +908,6 @@ def test_with_one_environment_it_comes_to_the_same_bit_for_bit(mode, snapshot):
         many_said = [np.asarray(infos[name][0]).tolist() for infos in told]
         assert repr(many_said) == repr([np.asarray(info[name]).tolist() for info in alone]), name
     assert snapshot(many.guard.machine) == snapshot(one.guard.machine)
-    envs.close()
 
 
 def test_a_frozen_guard_learns_from_none_of_them():

@@ -44,16 +44,18 @@ def refusal(path, **columns):
 # -- FCD ------------------------------------------------------------------------------------------
 
 
+FIELDS = ("id", "lane", "pos", "speed", "type")
+
+
 def xml(timesteps):
-    """FCD from ``{time: [(id, lane, pos, speed[, type]), ...]}``; a row each, timestep each."""
+    """FCD from ``{time: [(id, lane, pos, speed[, type]), ...]}``, or dicts; a row each."""
     lines = ["<fcd-export>"]
     for time, present in timesteps.items():
         lines.append(f'<timestep time="{time}">')
-        for name, lane, position, speed, *kind in present:
-            kind = f' type="{kind[0]}"' if kind else ""
-            lines.append(
-                f'<vehicle id="{name}" lane="{lane}" pos="{position}" speed="{speed}"{kind}/>'
-            )
+        for one in present:
+            told = one if isinstance(one, dict) else dict(zip(FIELDS, one, strict=False))
+            seen = " ".join(f'{name}="{value}"' for name, value in told.items())
+            lines.append(f"<vehicle {seen}/>")
         lines.append("</timestep>")
     return "\n".join([*lines, "</fcd-export>", ""])
 
@@ -216,23 +218,19 @@ def along_a_road(turned, along, across):
 @pytest.mark.parametrize("told", [("posLat",), ("x", "y", "angle")])
 @pytest.mark.parametrize("ending", ["xml", "csv"])
 def test_who_is_beside_is_nobody_s_leader_in_fcd(tmp_path, told, ending):
-    rows = []
-    for time in (0.0, 0.1):
-        for name, (along, across) in ACROSS.items():
-            x, y = along_a_road(math.radians(60.0), along, across)
-            places = {"posLat": across, "x": x, "y": y, "angle": 30.0}
-            kind = {"type": "truck" if name == "truck" else "bike"}
-            seen = {"id": name, "lane": "e", "pos": along, "speed": 5.0, **kind}
-            rows.append((time, seen | {place: places[place] for place in told}))
+    seen = []
+    for name, (along, across) in ACROSS.items():
+        x, y = along_a_road(math.radians(60.0), along, across)
+        places = {"posLat": across, "x": x, "y": y, "angle": 30.0}
+        kind = "truck" if name == "truck" else "bike"
+        seen.append(dict(zip(FIELDS, (name, "e", along, 5.0, kind), strict=True)))
+        seen[-1] |= {place: places[place] for place in told}
+    text = xml({0.0: seen, 0.1: seen})
     if ending == "csv":
-        text = [",".join(["timestep_time", *(f"vehicle_{name}" for name in rows[0][1])])]
-        text += [",".join(map(str, [time, *seen.values()])) for time, seen in rows]
-    else:
-        tags = [" ".join(f'{name}="{value}"' for name, value in seen.items()) for _, seen in rows]
-        steps = [f"<vehicle {tag}/>" for tag in tags]
-        text = ["<fcd-export>", '<timestep time="0">', *steps[:6], "</timestep>"]
-        text += ['<timestep time="0.1">', *steps[6:], "</timestep>", "</fcd-export>"]
-    path, noted = write(tmp_path / f"a.{ending}", "\n".join(text)), Noted()
+        rows = [["timestep_time", *(f"vehicle_{name}" for name in seen[0])]]
+        rows += [[time, *one.values()] for time in (0.0, 0.1) for one in seen]
+        text = "\n".join(",".join(map(str, row)) for row in rows)
+    path, noted = write(tmp_path / f"a.{ending}", text), Noted()
     lengths = lengths_given(["bike=1.6x0.65", "truck=12x2.5"])
     (chunk,) = read_traces([path], LogColumns(), lengths, noted=noted)
     assert set(chunk.names) == BEHIND
