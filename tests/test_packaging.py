@@ -221,17 +221,6 @@ print(machine.n_states, sys.modules["evofsm"].__file__)
 
 
 @pytest.mark.slow
-def test_without_the_cli_extra_the_command_names_it_in_one_line(fresh):
-    environment = {**os.environ, "PYTHONPATH": ""}
-    finished = subprocess.run(
-        [fresh / "evofsm"], capture_output=True, text=True, check=False, env=environment
-    )
-    assert finished.returncode != 0
-    (line,) = (finished.stdout + finished.stderr).strip().splitlines()
-    assert "pip install 'evofsm[cli]'" in line
-
-
-@pytest.mark.slow
 def test_an_editor_sees_through_the_faces_of_the_wheel(fresh, tmp_path):
     """Mypy stands for it: of names that load on first use it knows the types."""
     program = """

@@ -5,9 +5,7 @@ import json
 import logging
 import math
 import os
-import signal
 import sys
-import time
 from contextlib import contextmanager
 from functools import partial
 from hashlib import sha256
@@ -688,36 +686,3 @@ def test_a_child_that_lives_on_does_not_keep_a_log_that_its_parent_closed(tmp_pa
         os.waitpid(child, 0)
         os.close(reading)
         os.close(writing)
-
-
-@forks
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_log_can_be_audited_while_it_is_written_and_after_its_writer_was_killed(tmp_path):
-    path = tmp_path / "log"
-    with AuditLog(path) as log:
-        drive(cars(log))
-
-    def write():
-        with AuditLog(path, sync="episode") as log:
-            guard = cars(log)
-            while True:
-                drive(guard)
-
-    for _ in range(5):
-        child = os.fork()
-        if child == 0:
-            try:
-                write()
-            finally:
-                os._exit(1)
-        until = time.monotonic() + 1.0
-        try:
-            while time.monotonic() < until:
-                assert verified(path).finding is None
-        finally:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-        with AuditLog(path) as log:
-            pass
-        assert audit(path, log.head).is_good
