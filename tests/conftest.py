@@ -1,6 +1,5 @@
 import faulthandler
 import hashlib
-import io
 import json
 import re
 import shutil
@@ -12,6 +11,7 @@ import hypothesis
 import numpy as np
 import pytest
 
+import one_machine
 from evofsm.fsm.machine import EvolvingFSM
 
 # The same examples in every run, so that a red build is red again on the next machine.
@@ -82,13 +82,7 @@ def compiled():
 @pytest.fixture(scope="session")
 def snapshot():
     """Everything a machine holds, byte for byte: what it would write to a file."""
-
-    def take(machine):
-        file = io.BytesIO()
-        machine.save(file)
-        return file.getvalue()
-
-    return take
+    return one_machine.saved
 
 
 @pytest.fixture(scope="session")
