@@ -28,13 +28,6 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "own_driver", raising=False)
 
 
-def test_a_class_in_the_folder_is_checked(evofsm, folder):
-    result = evofsm("check", "own_driver:Hasty")
-    assert result.exit_code == 0, result.output
-    assert "contract of a controller" in result.output
-    assert "2 checks: 2 passed, 0 failed" in result.output
-
-
 def test_it_ends_with_1_and_says_what_is_wrong(evofsm, folder):
     result = evofsm("check", "own_driver:confused", "--json")
     assert result.exit_code == 1

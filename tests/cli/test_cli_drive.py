@@ -156,7 +156,6 @@ def test_learning_that_is_stopped_goes_on_bit_for_bit(tmp_path, snapshot, monkey
     [
         ({"seed": 1}, "seed was 0 and is now 1;"),
         ({"reviser": "rss"}, 'reviser was "none" and is now "rss";'),
-        ({"tolerance": 0.1}, "tolerance was 0.02 and is now 0.1;"),
         ({"family": EMERGENCY.with_switches(["noise"])}, "switches was [] and is now"),
         ({"learn": True}, "learn was false and is now true"),
     ],
