@@ -187,9 +187,9 @@ class TrafficRisk(ActionJudge):
     >>> scene = Scene(Object("me", 0.0, 0.0, 14.0), [lorry, bike])
     >>> revision = guard.decide(scene.rows(most=4), proposal=1.0)
     >>> round(revision.executed, 2)
-    -3.7
+    -1.8
     >>> revision.reason.partition("; ")[2]
-    'nothing can, the least risky that who is behind survives'
+    'none can gently, the least braking that regains a safe gap in time'
     """
 
     fallback = Fallback(0.0, "keeping the speed")
