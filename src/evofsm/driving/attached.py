@@ -716,10 +716,10 @@ class Attachment:
         for car in here.intersection(self.cars):
             self._cars.remove(car)
         self._cars.cars.clear()
+        self._ride.forget(self._known)
         self._known.clear()
         self._met.clear()
         self._seeing.look_up()
-        self._ride.forget(list(self._ride._latest))
         if self.guarding is not None:
             self.guarding.begin_anew()
 
