@@ -447,8 +447,15 @@ def _kinematic(guard: Guard, code: dict[str, int], number: dict[str, float]) -> 
     )
     if trial is not None:
         why += f"; {trial.unknown}, {f'so {trial.how}' if reviser.acts else trial.assumed}"
-    least = "the closest that can" if code["reason"] == 1 else "nothing can, the least risky"
-    return why if code["reason"] == 5 else f"{why}; {least}"
+    return why if code["reason"] == 5 else f"{why}; {_CHOSEN[code['reason']]}"
+
+
+_CHOSEN = {
+    1: "the closest that can",
+    3: "nothing can, the least risky",
+    7: "it regains a safe gap in time",
+    8: "none can gently, the least braking that regains a safe gap in time",
+}
 
 
 class Driven(NamedTuple):

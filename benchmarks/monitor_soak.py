@@ -88,7 +88,7 @@ def plain_answer(guard: Guard, row: dict[str, float]) -> tuple[object, ...]:
     revision = guard.decide([row[k] for k in guard.variables], row["proposal"], row["time"])
     return (
         *(revision.executed, revision.advised, revision.risk_proposed, revision.risk_executed),
-        *(*revision.interval, revision.evidence, revision.reason, revision.risk_proposed > 0.02),
+        *(*revision.interval, revision.evidence, revision.reason),
     )
 
 
@@ -99,7 +99,6 @@ def answered(answer: Answer) -> tuple[object, ...]:
         *(answer[name] for name in names),
         answer["evidence"],
         answer["reason"],
-        answer["alarm"],
     )
 
 

@@ -35,7 +35,6 @@ import one_machine
 from evofsm import store
 from evofsm.cli import driving as driving_module
 from evofsm.cli.driving import GUARD, Results, Setup, drive_in_turn, make_guard
-from evofsm.cli.learning import Checkpoint, learn_traces
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.state import State
 from evofsm.cli.monitor.transports import Server, Stream
@@ -43,12 +42,10 @@ from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.families import load_family
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.world import KinematicWorld
-from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.arrays import MACHINE
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.guard import Guard, warm
-from evofsm.io.logs import Chunk, read_traces
 
 #: What must not happen, in the order in which it is printed.
 WRONG = (
@@ -78,47 +75,19 @@ _MORE, _SPARE = 2.0, 1 << 20
 
 @dataclass(frozen=True)
 class Work:
-    """Something that learns, with a checkpoint wherever it can have one."""
+    """Something that learns, and goes on from what it kept."""
 
-    name: str
-    run: Callable[[Path], bytes]  #: from the path of a checkpoint to all that came of it
+    run: Callable[[Path], bytes]  #: from the folder of what it keeps to all that came of it
     expected: bytes  #: what came of it when nothing stopped it
     seconds: float  #: that it took then
 
 
-def works(folder: Path) -> list[Work]:
-    """Learning from files, and driving, each run once before to be warm."""
-    logs = [_write_log(folder / f"log{k}.csv", seed=k) for k in range(8)]
-    found = []
-    chunks = list(read_traces(logs))  # not in a process that is forked: polars has threads
-    for name, run in (("learn", lambda path: _learn(logs, chunks, path)), ("drive", _drive)):
-        run(folder / f"{name}.warm")
-        began = time.perf_counter()
-        expected = run(folder / f"{name}.whole")
-        found.append(Work(name, run, expected, time.perf_counter() - began))
-    return found
-
-
-def _write_log(path: Path, seed: int, rows: int = 250) -> str:
-    random = np.random.default_rng(seed)
-    lines = ["time,gap,v_follower,v_leader,a_follower"]
-    gap, speed, leader_speed = 30.0, 20.0, 20.0
-    for k in range(rows):
-        action = float(random.normal())
-        lines.append(f"{k / 10},{gap:.4f},{speed:.4f},{leader_speed:.4f},{action:.4f}")
-        gap = max(1.0, gap + 0.1 * (leader_speed - speed))
-        speed = max(0.0, speed + 0.5 * action)
-        leader_speed = max(0.0, leader_speed + 0.5 * float(random.normal()))
-    path.write_text("\n".join([*lines, ""]))
-    return str(path)
-
-
-def _learn(logs: Sequence[str], chunks: Sequence[Chunk], path: Path) -> bytes:
-    actions = IntervalActions(-2.5, 2.5, 1.0, outside="clip")
-    checkpoint = Checkpoint(path / GUARD, {"files": list(logs)}, every=0.0)
-    path.mkdir(exist_ok=True)
-    learning = learn_traces(chunks, EvolvingFSM(actions.n_actions), actions, checkpoint=checkpoint)
-    return _saved(learning.machine) + repr((learning.read, learning.skills)).encode()
+def driving(folder: Path) -> Work:
+    """Driving and learning, done once before to be warm."""
+    _drive(folder / "warm")
+    began = time.perf_counter()
+    expected = _drive(folder / "whole")
+    return Work(_drive, expected, time.perf_counter() - began)
 
 
 def _drive(path: Path) -> bytes:
@@ -136,17 +105,17 @@ def _saved(learnt: Any) -> bytes:
     return file.getvalue()
 
 
-def _fork(work: Work, checkpoint: Path, result: Path, room: int | None) -> int:
+def _fork(work: Work, kept: Path, result: Path, room: int | None) -> int:
     """Do the work in another process, with so much room for a file; answers its number."""
     if (child := os.fork()) > 0:
         return child
     code = _CRASHED
     try:
-        logging.disable()  # that a checkpoint could not be written is what is tried here
+        logging.disable()  # that a guard could not be written is what is tried here
         if room is not None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
-        came = work.run(checkpoint)
+        came = work.run(kept)
         if room is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
         result.write_bytes(came)
@@ -162,10 +131,7 @@ def _is_broken(folder: Path) -> bool:
     if not file.exists():
         return False  # it was stopped before there was anything to keep
     try:
-        if store.read_header(file).kind == "guard":
-            Guard.load(file)
-        else:
-            store.read(file, MACHINE)
+        Guard.load(file)
     except (ValueError, OSError):
         return True
     return False
@@ -176,16 +142,16 @@ def kill(work: Work, times: int, folder: Path, random: np.random.Generator) -> C
     found: Counter[str] = Counter()
     while found["kills"] < times:
         with tempfile.TemporaryDirectory(dir=folder) as name:
-            checkpoint, result = Path(name) / "checkpoint", Path(name) / "result"
+            kept, result = Path(name) / "kept", Path(name) / "result"
             while not result.exists() and not found["crashes"]:
-                child = _fork(work, checkpoint, result, None)
+                child = _fork(work, kept, result, None)
                 if found["kills"] < times:
                     time.sleep(random.uniform(0.0, 0.5 * work.seconds))
                     os.kill(child, signal.SIGKILL)
                 _, status = os.waitpid(child, 0)
                 found["kills"] += os.WIFSIGNALED(status)
                 found["crashes"] += os.WIFEXITED(status) and os.WEXITSTATUS(status) != 0
-                found["broken files"] += _is_broken(checkpoint)
+                found["broken files"] += _is_broken(kept)
                 if os.WIFSIGNALED(status) and result.exists():
                     result.unlink()  # perhaps half of it
             if found["crashes"]:
@@ -197,23 +163,23 @@ def kill(work: Work, times: int, folder: Path, random: np.random.Generator) -> C
 
 
 def fill(work: Work, times: int, folder: Path, random: np.random.Generator) -> Counter[str]:
-    """Let the disk be full at some size of a checkpoint, then make room and go on."""
+    """Let the disk be full at some size of what is kept, then make room and go on."""
     found: Counter[str] = Counter()
     with tempfile.TemporaryDirectory(dir=folder) as name:
         work.run(whole := Path(name) / "whole")
         size = (whole / GUARD).stat().st_size
     for _ in range(times):
         with tempfile.TemporaryDirectory(dir=folder) as name:
-            checkpoint, result = Path(name) / "checkpoint", Path(name) / "result"
+            kept, result = Path(name) / "kept", Path(name) / "result"
             for room in (int(random.integers(1, size)), None):
                 result.unlink(missing_ok=True)
-                _, status = os.waitpid(_fork(work, checkpoint, result, room), 0)
+                _, status = os.waitpid(_fork(work, kept, result, room), 0)
                 code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else _CRASHED
                 # Where what was done cannot be kept it says so, and ends.
                 refused = code == _REFUSED and room is not None
                 found["refused"] += refused
                 found["crashes"] += code != 0 and not refused
-                found["broken files"] += _is_broken(checkpoint)
+                found["broken files"] += _is_broken(kept)
                 if code == 0:
                     found["results"] += 1
                     found["results that differ"] += result.read_bytes() != work.expected
@@ -722,14 +688,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     total: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        learn, drive = works(folder)
-        for work in (learn, drive):
-            print(f"{work.name}, not stopped: {work.seconds:.2f} s", flush=True)
+        work = driving(folder)
+        print(f"driving, not stopped: {work.seconds:.2f} s", flush=True)
         for title, run in (
-            ("killed while learning", partial(kill, learn, kills * 3 // 4)),
-            ("killed while driving", partial(kill, drive, kills // 4)),
-            ("disk full while learning", partial(fill, learn, disks * 3 // 4)),
-            ("disk full while driving", partial(fill, drive, disks // 4)),
+            ("killed while learning", partial(kill, work, kills)),
+            ("disk full while learning", partial(fill, work, disks)),
             ("two threads on one file", partial(share, False, loads)),
             ("two processes on one file", partial(share, True, loads)),
             ("monitors that refuse ends", partial(restart, starts)),

@@ -22,6 +22,7 @@ STUDIES = {
     "tasks": "judges:Tasks",
     "forecasts": "forecasts:ForecastStudy",
     "sensitivity": "sensitivity:Sensitivity",
+    "traffic": "traffic:Traffic",
     "real": "real:Real",
     "leaders": "real:Leaders",
 }

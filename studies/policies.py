@@ -75,6 +75,9 @@ class RiskByState:
         self.why, self.trial = risk.why, risk.trial
         self.effective, self.refuse_unfit = risk.effective, risk.refuse_unfit
 
+    def choose(self, *_: object) -> None:
+        """Leave it to the reviser."""
+
     def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
         """Latent risk of each acceleration."""
         taking_part = np.flatnonzero(situation.belief >= _LEAST_BELIEF)

@@ -1,6 +1,5 @@
 import faulthandler
 import hashlib
-import io
 import json
 import re
 import shutil
@@ -12,6 +11,7 @@ import hypothesis
 import numpy as np
 import pytest
 
+import one_machine
 from evofsm.fsm.machine import EvolvingFSM
 
 # The same examples in every run, so that a red build is red again on the next machine.
@@ -82,13 +82,7 @@ def compiled():
 @pytest.fixture(scope="session")
 def snapshot():
     """Everything a machine holds, byte for byte: what it would write to a file."""
-
-    def take(machine):
-        file = io.BytesIO()
-        machine.save(file)
-        return file.getvalue()
-
-    return take
+    return one_machine.saved
 
 
 @pytest.fixture(scope="session")
@@ -180,11 +174,6 @@ class Page(HTMLParser):
         body = re.sub(r'<span class="unseen">.*?</span>', "", body)
         body = re.sub(r"</t[hd]>|<small>", " ", body)
         return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", "", body)))
-
-    @property
-    def verdict(self) -> str:
-        """The answer at the top, as markup."""
-        return re.search(r'<div class="verdict.*?</div>', self.html, flags=re.DOTALL)[0]
 
     def is_sound(self) -> None:
         """Fails where it loads anything, a link leads nowhere, or a name is given twice."""

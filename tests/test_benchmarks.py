@@ -8,24 +8,10 @@ import pytest
 import fsm_rows
 import speed
 from evofsm import EvolvingFSM
-from fsm_rows import LATTICE_RULE, LATTICES, PAPER_ROUND, lattice_stream, pair, paper_stream
-from timing import Row, compare, judged, shown, worsened
+from fsm_rows import LATTICE_RULE, LATTICES, PAPER_ROUND, lattice_stream, paper_stream
+from timing import Row, compare, judged, worsened
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.mark.parametrize("n_states", [7, 64])
-def test_ours_and_the_loop_are_taught_alike(n_states):
-    machine, reference, stream = pair(n_states, 50)
-    for z, action in zip(stream.observations, stream.actions.tolist(), strict=True):
-        step = machine.learn_one(z, action)
-        state, belief, surprise = reference.observe(z)
-        reference.act(action)
-        assert step.state == state
-        np.testing.assert_allclose(step.belief, belief, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(step.surprise, surprise, rtol=0, atol=1e-9)
-    assert machine.n_states == n_states
-    np.testing.assert_allclose(machine.transition_matrices, reference.matrices, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("n_states", LATTICES)
@@ -66,22 +52,6 @@ def measured(ours, reference):
 
 
 FASTER, COST = Row(None, ">=", 10.0), Row(None, "<=", 1.25)
-
-
-@pytest.mark.parametrize(
-    ("row", "ours", "ratio", "reached"),
-    [
-        (FASTER, 1.0, 10.0, True),
-        (FASTER, 1.1, 10 / 1.1, False),
-        (COST, 12.5, 1.25, True),
-        (COST, 13.0, 1.3, False),
-        (Row(None, ">="), 20.0, 0.5, True),
-    ],
-)
-def test_a_target_is_reached_or_missed(row, ours, ratio, reached):
-    result = judged("row", row, measured(ours, 10.0))
-    assert (result["ratio"], result["reached"]) == (pytest.approx(ratio), reached)
-    assert ("missed" in shown(result, None)) is not reached
 
 
 @pytest.mark.parametrize(
@@ -127,7 +97,8 @@ def test_the_harness_writes_what_it_prints_and_says_what_is_missed_or_worse(harn
     good, bad = made_up(">=", 5.0, 1.0), made_up("<=", 0.5, 6.0)
     status, out, written = harness({"good": good, "bad": bad})
     assert status == 0
-    assert [result["id"] for result in written] == ["good", "bad"]
+    found = [(result["id"], result["ratio"], result["reached"]) for result in written]
+    assert found == [("good", 10.0, True), ("bad", 0.6, False)]
     assert {"id", "ours_s", "reference", "reference_s", "ratio"} <= written[0].keys()
     assert out.count("missed") == 1
     last = tmp_path / "last.json"

@@ -13,12 +13,10 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-import evofsm
-
 ROOT = Path(__file__).parent.parent
 HEAVY = {
     *("numba", "scipy", "libsumo", "matplotlib", "jinja2", "river", "sklearn", "mcap"),
-    *("polars", "pyarrow", "pandas", "typer", "rich", "gymnasium", "highway_env", "distributed"),
+    *("polars", "pyarrow", "pandas", "typer", "rich", "gymnasium", "highway_env"),
 }
 
 
@@ -58,10 +56,6 @@ def test_importing_the_package_costs_little_more_than_importing_numpy():
             )
             measured.append(float(run(sys.executable, "-c", program)))
     assert min(seconds["evofsm"]) <= 1.5 * min(seconds["numpy"])
-
-
-def test_the_version_is_that_of_the_distribution():
-    assert evofsm.__version__ == distribution("evofsm").version
 
 
 # -- What is told of it ------------------------------------------------------------------------
@@ -224,17 +218,6 @@ print(machine.n_states, sys.modules["evofsm"].__file__)
     n_states, origin = run(fresh / "python", "-I", "-c", program, cwd=tmp_path).split()
     assert int(n_states) == 2
     assert Path(origin).is_relative_to(fresh.parent)
-
-
-@pytest.mark.slow
-def test_without_the_cli_extra_the_command_names_it_in_one_line(fresh):
-    environment = {**os.environ, "PYTHONPATH": ""}
-    finished = subprocess.run(
-        [fresh / "evofsm"], capture_output=True, text=True, check=False, env=environment
-    )
-    assert finished.returncode != 0
-    (line,) = (finished.stdout + finished.stderr).strip().splitlines()
-    assert "pip install 'evofsm[cli]'" in line
 
 
 @pytest.mark.slow

@@ -197,7 +197,6 @@ HARMFUL = {
     "more in the header": (header_with(pickle="cos"), "pickle"),
     "null": (settings_with(n_kinds=None), "lacks n_kinds"),
     "negative": (settings_with(n_kinds=-1), "n_kinds of -1 cannot be right"),
-    "a fraction": (settings_with(n_kinds=2.5), "n_kinds holds a fraction"),
     "a float": (settings_with(n_kinds=2.0), "n_kinds holds a fraction; it must be an integer"),
     "another type": (settings_with(told=1), "told is 1; it must be of type bool"),
     "none of two types": (settings_with(name=[]), r"name is \[\]; it must be of type str | None"),

@@ -5,7 +5,7 @@ under ``tool.importlinter``, their budgets under ``tool.house``. It fails where 
 one above it or uses its private names, where modules import in a circle, where a class name stands
 in three rooms, and where a room has more lines, files or public names than its budget. With
 ``--draw`` the picture in CONTRIBUTING.md is drawn anew; with ``--lower`` budgets fall to what is
-there and 3 %.
+there and 2 %, as at each release.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PACKAGE = ROOT / "src" / "evofsm"
 PAGE = ROOT / "CONTRIBUTING.md"
 PROJECT = ROOT / "pyproject.toml"
 BEGIN, END = "<!-- house: begin -->", "<!-- house: end -->"
-SLACK = 1.03
+SLACK = 1.02
 
 # Of named tuples; with an underscore lest they hide a field.
 _PUBLIC = {"_asdict", "_fields", "_make", "_replace"}
@@ -266,7 +266,7 @@ def counted() -> dict[str, dict[str, int]]:
 
 
 def lower(found: Mapping[str, Mapping[str, int]], budgets: Mapping[str, Mapping[str, int]]) -> None:
-    """Write budgets that fall to what is there and 3 %; none is raised."""
+    """Write budgets that fall to what is there and 2 %; none is raised."""
     text = PROJECT.read_text("utf-8")
     for table, entries in budgets.items():
         for name, budget in entries.items():

@@ -137,7 +137,7 @@ class Kind(NamedTuple):
 class Header(NamedTuple):
     """What a file says of itself."""
 
-    kind: str  #: such as ``"machine"``, ``"model"``, ``"guard"`` or ``"checkpoint"``
+    kind: str  #: such as ``"machine"``, ``"model"`` or ``"guard"``
     version: int  #: of the format
     library: str  #: version of evofsm that wrote it
     settings: dict[str, Any]

@@ -137,7 +137,9 @@ def test_rows_are_sorted_and_logs_learnt_apart_as_it_is_advised(evofsm):
     frame.sort(found.groups()).write_csv("drive.csv")
     assert evofsm("learn", "drive.csv", *asked).exit_code == 0
     frame.with_columns(time=polars.col("time") * 3).sort("car", "time").write_csv("slow.csv")
-    assert "or learn them apart" in said(evofsm("learn", "drive.csv", "slow.csv", *asked))
+    told = said(evofsm("learn", "drive.csv", "slow.csv", *asked))
+    assert re.search("slow.csv has a row every 0.3 s.*drive.csv has one every 0.1 s", told)
+    assert "or learn them apart" in told
     assert evofsm("learn", "slow.csv", *asked).exit_code == 0
 
 

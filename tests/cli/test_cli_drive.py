@@ -107,12 +107,10 @@ def test_a_judge_that_is_given_nothing_but_failures_is_driven_saved_and_gone_on_
         (("emergency", "--tolerance", "2"), "tolerance"),
         (("emergency", "--learn", "a", "--workers", "2"), "one after the other"),
         (("emergency", "--mcap", "a", "--workers", "2"), "workers send no decisions"),
-        (("emergency", "--foxglove", "0", "--audit", "log"), "exclude each other"),
-        (("emergency", "--cluster", "tcp://127.0.0.1:1"), "no Dask scheduler answers"),
+        (("emergency", "--learn", "a", "--frozen", "b"), "exclude each other"),
     ],
 )
-def test_what_cannot_be_driven_is_refused_in_one_line(refused, words, says, monkeypatch):
-    monkeypatch.setattr("evofsm.cli.driving._PATIENCE", 0.5)
+def test_what_cannot_be_driven_is_refused_in_one_line(refused, words, says):
     assert says in refused("drive", *words, "--episodes", 1)
 
 
@@ -158,7 +156,6 @@ def test_learning_that_is_stopped_goes_on_bit_for_bit(tmp_path, snapshot, monkey
     [
         ({"seed": 1}, "seed was 0 and is now 1;"),
         ({"reviser": "rss"}, 'reviser was "none" and is now "rss";'),
-        ({"tolerance": 0.1}, "tolerance was 0.02 and is now 0.1;"),
         ({"family": EMERGENCY.with_switches(["noise"])}, "switches was [] and is now"),
         ({"learn": True}, "learn was false and is now true"),
     ],
@@ -264,7 +261,14 @@ def test_killed_workers_and_a_killed_parent_change_nothing(tmp_path, undisturbed
     ) as process:
         wait_for(journal, 2, process)
         os.kill(workers_of(process)[0], signal.SIGKILL)
-        wait_for(journal, lines(journal) + 60, process)
+        assert process.wait() == 2
+        assert b"a worker died (out of memory?" in process.stderr.read()
+    done = lines(journal)
+    assert done <= EPISODES
+    with subprocess.Popen(
+        command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        wait_for(journal, done + 60, process)
         workers = workers_of(process)
         process.kill()
     assert workers
@@ -276,40 +280,6 @@ def test_killed_workers_and_a_killed_parent_change_nothing(tmp_path, undisturbed
     assert again.returncode == 0, again.stderr
     assert results_of(tmp_path) == results_of(undisturbed)
     assert json.loads(again.stdout)["episodes"] == EPISODES
-
-
-@pytest.mark.slow
-def test_a_killed_worker_of_a_cluster_changes_nothing(tmp_path, undisturbed):
-    pytest.importorskip("distributed")
-    where, started = tmp_path / "scheduler.json", []
-
-    def start(module, *options):
-        words = [sys.executable, "-m", f"distributed.cli.{module}", "--scheduler-file", where]
-        with open(tmp_path / f"{len(started)}.log", "wb") as log:
-            started.append(
-                subprocess.Popen([*words, "--no-dashboard", *options], stdout=log, stderr=log)
-            )
-
-    out = tmp_path / "out"
-    try:
-        start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-show")
-        for name in ("one", "two"):
-            local = ("--no-nanny", "--host", "127.0.0.1", "--local-directory", tmp_path / name)
-            start("dask_worker", "--nthreads", "1", *local)
-        wait_until(lambda: where.exists() and where.stat().st_size)
-        address = json.loads(where.read_text())["address"]
-        words = unrevised(out, "--cluster", address, "--workers", 2)
-        with subprocess.Popen(
-            command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE
-        ) as process:
-            wait_for(out / "episodes.jsonl", 2, process)
-            started[1].kill()
-            assert process.wait() == 0, process.stderr.read()
-    finally:
-        for process in started:
-            process.kill()
-            process.wait()
-    assert results_of(out) == results_of(undisturbed)
 
 
 @pytest.mark.slow
@@ -325,25 +295,3 @@ def test_an_interruption_is_quiet_and_says_how_to_go_on(tmp_path):
     assert "the same command goes on from there" in said
     assert len(said.strip().splitlines()) == 1
     assert lines(tmp_path / "episodes.jsonl") > 1
-
-
-def fatal(numbers):
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-@pytest.mark.slow
-def test_episodes_that_kill_every_worker_are_named(monkeypatch):
-    from evofsm.cli.driving import _in_processes
-
-    with pytest.raises(ChildProcessError, match="5 times a worker died over episodes 3 to 4"):
-        list(_in_processes(fatal, [[3, 4]], 1))
-
-
-def test_in_foxglove_a_run_waits_for_whoever_looks_on(evofsm, monkeypatch):
-    foxglove = pytest.importorskip("evofsm.io.foxglove")
-    looks = iter([False, True])
-    monkeypatch.setattr(foxglove.FoxgloveSink, "await_someone", lambda sink, _: next(looks))
-    told = evofsm("drive", "emergency", "--episodes", 1, "--foxglove", 0)
-    assert told.exit_code == 0
-    assert "open ws://" in told.stderr
-    assert list(looks) == []

@@ -154,16 +154,11 @@ def test_own_names_are_let_in_at_any_port(page, name, rewrites):
                 looking_on(page, origin=f"http://{origin}", host=host, port=port)
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1"])
-def test_pages_of_other_origins_may_not_open_the_socket(page, origin):
-    with pytest.raises(InvalidStatus) as refused:
-        looking_on(page, origin=origin)
-    assert refused.value.response.status_code == 403
-
-
-def test_a_socket_needs_the_token_and_an_origin(page):
-    with pytest.raises(InvalidStatus):
-        looking_on(page, token="A" * 32)
+def test_a_socket_needs_the_token_and_an_origin_of_its_own(page):
+    for wrong in ({"token": "A" * 32}, {"origin": "null"}, {"origin": "https://127.0.0.1"}):
+        with pytest.raises(InvalidStatus) as refused:
+            looking_on(page, **wrong)
+        assert refused.value.response.status_code == 403
     with pytest.raises(InvalidStatus):
         connect(f"ws://127.0.0.1:{page.port}/{page.token}/socket", proxy=None)
 
@@ -249,25 +244,17 @@ _JUNK = [
 ]
 
 
-@pytest.mark.parametrize("junk", _JUNK)
-def test_what_is_no_command_closes_the_socket_and_says_so(page, junk):
-    with looking_on(page) as client:
-        told(client, "start")
-        client.send(junk)
-        with pytest.raises(ConnectionClosed) as closed:
-            told(client, "nothing")
-    assert closed.value.rcvd.code == 1008
-    assert "command" in closed.value.rcvd.reason
-
-
-@pytest.mark.parametrize(("junk", "code"), [(b"\x00\x01", 1003), ("x" * 10_000, 1009)])
-def test_bytes_and_long_messages_close_it_too(page, junk, code):
+@pytest.mark.parametrize(
+    ("junk", "code"), [*((one, 1008) for one in _JUNK), (b"\x00\x01", 1003), ("x" * 10_000, 1009)]
+)
+def test_what_is_no_command_closes_the_socket_and_says_so(page, junk, code):
     with looking_on(page) as client:
         told(client, "start")
         client.send(junk)
         with pytest.raises(ConnectionClosed) as closed:
             told(client, "nothing")
     assert closed.value.rcvd.code == code
+    assert code != 1008 or "command" in closed.value.rcvd.reason
 
 
 def test_junk_on_the_wire_is_survived(page):

@@ -8,10 +8,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from evofsm.driving import LatentRisk, attach, guard_for_cars, guard_for_traffic
+from evofsm.driving import (
+    EnvelopeReviser,
+    LatentRisk,
+    attach,
+    guard_for_cars,
+    guard_for_traffic,
+    measures,
+)
 from evofsm.driving.attached import choose
 from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 from evofsm.driving.traffic import Role
+from evofsm.fsm import IntervalActions
+from evofsm.guard import Guard
 
 libsumo = pytest.importorskip("libsumo")
 
@@ -64,6 +73,66 @@ def drive(sumo, seconds, brakes_at=15.0):
     return speeds
 
 
+def test_a_mesoscopic_simulation_has_nobody_to_see_and_is_refused(road):
+    with pytest.raises(ValueError, match="--mesosim"):
+        attach(road("--mesosim"), "all")
+
+
+def test_guards_that_never_decide_say_so(road):
+    sumo = road(
+        others='<flow id="car" type="calm" route="along" begin="1" number="12" period="9"/>'
+    )
+    guards = attach(sumo, "all")
+    guards.guarding._seeing.ahead = lambda *_: None  # as where nobody shares a lane
+    with pytest.warns(RuntimeWarning, match="a guard decided in none"):
+        drive(sumo, 115.0, brakes_at=np.inf)
+    assert "microseconds" not in guards.summary()
+    guards.detach()
+
+
+def test_a_type_that_a_script_changed_for_one_car_is_the_type(road):
+    sumo = road()
+    guards = attach(sumo, "type:hasty")
+    drive(sumo, 0.1)
+    sumo.vehicle.setAccel("ego", 3.0)
+    assert sumo.vehicle.getTypeID("ego") == "hasty@ego"
+    assert choose("type:hasty")(sumo, "ego")
+    assert not choose("type:hast")(sumo, "ego")
+    assert guards.cars == ["ego"]
+    guards.detach()
+
+
+def test_what_a_guard_made_a_car_do_is_not_learnt_as_what_leaders_do(road):
+    behind = '<vehicle id="last" type="calm" route="along" depart="0" departPos="20"/>'
+    sumo = road(*NO_GAP, others=behind)
+    told = []
+    guards = attach(sumo, "all", report=told.append)
+    drive(sumo, 25.0)
+    assert min(one.deed for one in told if one.car == "ego") < -4.5  # which "last" follows
+    by_lead, *by_drivers = sorted(guards.guarding.leaders.decels, reverse=True)
+    assert by_lead == pytest.approx(8.0, abs=0.1)
+    assert max(by_drivers, default=0.0) < 4.5  # no car of these brakes harder by itself
+    guards.detach()
+
+
+def test_the_summary_says_what_guards_cost(road):
+    alone, guarded = {}, {}
+    for mode, found in (("watch", alone), ("act", guarded)):
+        watch = attach(sumo := road(*NO_GAP), ["ego"], mode=mode)
+        speeds = np.array(drive(sumo, 25.0))
+        found |= watch.summary()
+        watch.detach()
+        accelerations = np.diff(speeds) / 0.1
+        hard = accelerations < -5.0
+        assert found["hard_brakes"] == hard[0] + (hard[1:] & ~hard[:-1]).sum()
+        assert found["speed"] == pytest.approx(speeds.mean())
+        assert found["time_lost"] == pytest.approx(0.1 * (1.0 - speeds / 20.0).clip(0.0).sum())
+    assert (alone["collisions"], guarded["collisions"]) == (1, 0)
+    assert guarded["cars"] == alone["cars"] == 1
+    assert "decisions" not in alone
+    assert guarded["decisions"] > guarded["limited"] > guarded["revised"] >= 0
+
+
 def test_shadow_changes_nothing(road):
     alone = drive(road(*NO_GAP), 25.0)
     sumo = road(*NO_GAP)
@@ -75,6 +144,30 @@ def test_shadow_changes_nothing(road):
     np.testing.assert_allclose([one.wish for one in told], [one.deed for one in told], atol=1e-9)
 
 
+@pytest.mark.parametrize("step", [0.1, 1.0])  # where it lasts as long as they keep, at the edge
+def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step):
+    usual = (
+        '<vType id="usual" decel="4.5" speedDev="0.1"/><flow id="car" type="usual" route="along" '
+        'begin="1" end="60" period="2" departSpeed="max" departPos="0"/>'
+    )
+    found = []
+    for mode in ("watch", "act"):
+        sumo = road(others=usual)
+        sumo.load([*road.options[:-1], str(step), "--seed", "1"])
+        sumo.simulationStep()
+        sumo.vehicle.setType("ego", "usual")  # nobody is hasty
+        cars = attach(sumo, "type:usual", mode=mode)
+        drive(sumo, 60.0, brakes_at=np.inf)
+        sumo.vehicle.setMaxSpeed("lead", 3.0)
+        drive(sumo, 60.0, brakes_at=np.inf)
+        found.append(cars.summary())
+        cars.detach()
+    alone, guarded = found
+    assert guarded["collisions"] == alone["collisions"] == 0
+    assert guarded["hard_brakes"] <= alone["hard_brakes"] + 1
+    assert guarded["speed"] >= 0.995 * alone["speed"]
+
+
 @pytest.mark.parametrize("ballistic", ["true", "false"])
 @pytest.mark.parametrize("options", [NO_GAP, ()])
 def test_a_guarded_car_does_not_collide(road, options, ballistic):
@@ -84,8 +177,8 @@ def test_a_guarded_car_does_not_collide(road, options, ballistic):
     speeds = drive(sumo, 25.0)
     assert guards.collisions == []
     assert speeds[-1] == 0.0
-    assert 0 < guards.guarding.revised < guards.guarding.decisions
-    held = [one for one in told if one.deed < one.wish - 1e-6]
+    assert 0 < guards.guarding.limited < guards.guarding.decisions
+    held = [one for one in told if one.revision.executed < 3.5]
     assert {(one.other, one.role) for one in held} == {("lead", Role.AHEAD)}
     assert list(guards.guarding.leaders.decels) == [pytest.approx(8.0, abs=0.1)]
     for one in held:
@@ -93,15 +186,24 @@ def test_a_guarded_car_does_not_collide(road, options, ballistic):
         assert stands or one.deed <= one.revision.executed + 1e-6
 
 
+def test_where_sumo_says_0_of_whatever_is_nearer_than_min_gap_the_car_stops(road):
+    sumo = road(*NO_GAP)
+    guards = attach(sumo, ["ego"])
+    drive(sumo, 1.0)
+    guards._seeing._vehicle = SimpleNamespace(**vars(sumo.vehicle))
+    guards._seeing._vehicle.getLeader = lambda car, _: ("lead", 0.0)  # as at a junction
+    assert drive(sumo, 8.0, brakes_at=0.0)[-1] < 0.3
+
+
 def test_a_car_is_taken_over_only_where_it_has_to_be_and_handed_back(road):
     sumo = road(*NO_GAP)
     guards = attach(sumo, ["ego"])
-    modes = set()
-    for _ in range(160):
+    modes = [31]  # as SUMO has it
+    while modes[-1] == 31:
         drive(sumo, 0.1)
-        modes.add(sumo.vehicle.getSpeedMode("ego"))
-    assert modes == {31, 31 & ~4}  # as SUMO has it, and with harder braking allowed
-    assert sumo.vehicle.getSpeedMode("ego") != 31
+        modes.append(sumo.vehicle.getSpeedMode("ego"))
+    assert len(modes) > 2
+    assert modes[-1] == 31 & ~4  # with harder braking allowed
     guards.detach()
     assert sumo.vehicle.getSpeedMode("ego") == 31
     assert guards.cars == []
@@ -139,8 +241,11 @@ def test_cars_come_and_go(road):
     assert guards.cars == ["late"]
 
 
+REACTS = measures.ResponsibilitySensitiveSafety(0.1, 3.5, 4.5, 9.0)
+ACTIONS = IntervalActions(-9.0, 3.5, 0.3, outside="clip")
 OWN = {
     "of a scene": guard_for_traffic(-9.0, 3.5, 4.5, interval=0.2),
+    "of a formula": Guard.of(EnvelopeReviser(REACTS, ACTIONS, 0.1), interval=0.1, learn=False),
     "of one leader": guard_for_cars(
         -4.5, 3.5, interval=0.1, judge=LatentRisk.given(-4.5, 4.5, 9.0, 0.1)
     ),
@@ -154,8 +259,8 @@ def test_a_guard_of_ones_own_is_copied_and_left_as_it_was(road, mine):
     drive(sumo, 25.0)
     assert guards.collisions == []
     assert guards.guarding.decisions <= 25.0 / mine.interval
-    judge = mine.reviser.risk
-    assert len(getattr(judge, "ahead", judge).manoeuvres) == 0
+    if judge := getattr(mine.reviser, "risk", None):
+        assert len(getattr(judge, "ahead", judge).manoeuvres) == 0
 
 
 def test_a_guard_that_knows_gentler_cars_does_not_hold_back_on_a_free_road(road):

@@ -5,7 +5,7 @@ import pytest
 
 from evofsm.driving import LatentRisk, Object, Scene, TrafficRisk, guard_for_traffic
 from evofsm.driving.traffic import Role
-from evofsm.guard import Situation
+from evofsm.guard import Mode, Situation
 
 LOW, HIGH, DECEL, INTERVAL = -9.0, 2.5, 4.5, 0.1
 ME = Object("me", x=100.0, y=0.0, vx=20.0)
@@ -35,22 +35,22 @@ ACTIONS = np.array([2.5, 0.0, -4.5, -9.0])
 )
 def test_whom_one_may_meet_is_a_pair(other, pair):
     found = Scene(ME, [other]).pairs()
-    assert found == ([] if pair is None else [pair])
+    assert [one[:5] for one in found] == ([] if pair is None else [pair])
 
 
 def test_rows_hold_the_closest_and_zeros_where_there_is_none():
     far, near = Object("far", 180.0, 0.0, 20.0), Object("near", 120.0, 0.0, 20.0)
     assert [pair.gap for pair in Scene(ME, [far, near]).pairs()] == [15.0, 75.0]
-    rows = Scene(ME, [far, near]).rows(most=1).reshape(2, 7)
-    assert rows[1].tolist() == [1.0, 120.0, 0.0, 20.0, 0.0, 5.0, 1.8]
-    assert not Scene(ME).rows(most=3)[7:].any()
+    rows = Scene(ME, [far, near]).rows(most=1).reshape(2, 8)
+    assert rows[1].tolist() == [1.0, 120.0, 0.0, 20.0, 0.0, 5.0, 1.8, 0.0]
+    assert not Scene(ME).rows(most=3)[8:].any()
 
 
 # -- The judge ---------------------------------------------------------------------------------
 
 
-def judge(low=LOW):
-    return TrafficRisk(LatentRisk.given(-DECEL, DECEL, 9.0, INTERVAL), low, HIGH)
+def judge():
+    return TrafficRisk(LatentRisk.given(-DECEL, DECEL, 9.0, INTERVAL))
 
 
 def scene(*others):
@@ -83,7 +83,7 @@ def test_one_leader_is_judged_as_by_the_kinematic_judge():
 
 def test_an_empty_road_has_no_risk_nor_has_what_is_not_seen_whole():
     half_seen = scene(ahead(3.0, 0.0))
-    half_seen[8] = np.nan
+    half_seen[9] = np.nan
     for rows in (scene(), half_seen):
         assert not judge().judge(at(rows), ACTIONS).risk.any()
 
@@ -114,31 +114,28 @@ def test_a_proposal_is_kept_or_changed_as_little_as_it_can_be():
     assert judge().judge(at(rows), [revision.executed + 0.3]).risk[0] > 0.018
 
 
-def test_once_revising_a_proposal_is_kept_again_below_nine_tenths_of_the_tolerance_only():
-    one, rows = judge(), scene(ahead(14.0, 15))
-    one.ahead.manoeuvres.remember(*np.linspace(2.5, 9.0, 1000))
-    grid = np.linspace(LOW, HIGH, 2000)
-    risks = one.judge(at(rows), grid).risk
-    wanted = grid[np.flatnonzero((risks > 0.018) & (risks <= 0.02))[0]]
-    kept = [
-        one.search(at(rows), wanted, tolerance=0.02, revising=revising).best == 0
-        for revising in (False, True)
-    ]
-    assert kept == [True, False]
-
-
 def test_braking_that_would_be_hit_from_behind_is_as_risky():
     risk = judge().judge(at(scene(behind(6.0, 15.0))), ACTIONS).risk
     assert risk.tolist() == [0.0, 0.0, 1.0, 1.0]
     assert not judge().judge(at(scene(behind(60.0, 15.0))), ACTIONS).risk.any()
 
 
+def test_a_gap_that_is_not_safe_is_regained_in_proportion():
+    cut_in = [decide(scene(ahead(5.0, v)), 0.0).executed for v in (22.0, 15.0, 10.0, 7.0)]
+    assert cut_in[0] == 0.0  # it opens the gap again by itself
+    assert -3.0 < cut_in[1] < 0.0  # safe again in 2 s
+    assert cut_in[2] == pytest.approx(-3.0)  # not so soon: as hard as is comfortable
+    assert cut_in[3] < -3.0  # what avoids a collision that is foreseen
+    braking = [(14.0, 0.0), (14.0, 4.0), (14.0, 9.0), (4.0, 9.0)]
+    seen = [Object("ahead", gap, 0.0, 15.0, ax=-a) for gap, a in braking]
+    gentle, comfortable, hard, hardest = (decide(scene(one), 0.0).executed for one in seen)
+    assert gentle > comfortable > hard > hardest == LOW  # no harder than avoids it, held on
+
+
 def test_one_brakes_no_harder_than_who_is_behind_survives():
-    alone, followed = (
-        decide(scene(ahead(9.0, 15), *others)) for others in ([], [behind(14.0, 15)])
-    )
-    assert alone.executed == LOW  # a leader who brakes in full could not be survived
-    assert LOW < followed.executed < 0.0
+    one = Object("ahead", 14.0, 0.0, 15.0, ax=-8.0)
+    alone, followed = (decide(scene(one, *others)) for others in ([], [behind(8.0, 15)]))
+    assert alone.executed < followed.executed < 0.0
     assert "who is behind survives" in followed.reason
 
 
@@ -150,19 +147,16 @@ def test_where_who_is_behind_cannot_be_spared_one_brakes_as_softly_as_one_can():
     revision = decide(scene(ahead(27.0, 0.0), behind(0.5, 15)))
     assert -DECEL <= revision.executed < 0.0
     assert "the softest for ahead" in revision.reason
-    softer = judge().ahead.judge(at([27.0, 15.0, 0.0]), [revision.executed + 0.25])
-    assert softer.risk[0] > 0.02
 
 
-@pytest.mark.parametrize(
-    ("make", "why"),
-    [
-        (lambda: judge(0.0), "around 0"),
-        (lambda: judge(-np.inf), "around 0"),
-        (lambda: guard_for_traffic(-5.0, HIGH, DECEL, INTERVAL, judge=judge()), "looks at"),
-        (lambda: decide([1.0, 2.0]), "no rows of 7"),
-    ],
-)
-def test_what_it_cannot_work_with_is_refused(make, why):
-    with pytest.raises(ValueError, match=why):
-        make()
+def test_who_stands_and_goes_on_standing_is_not_changed():
+    guard = guard_for_traffic(LOW, HIGH, DECEL, INTERVAL, mode=Mode.SHADOW)
+    rows = Scene(Object("me", 0.0, 0.0, 0.0), [ahead(0.2, 0.0)]).rows(most=2)
+    assert guard.decide(rows, 0.0).advised == 0.0
+
+
+def test_what_it_cannot_work_with_is_refused():
+    with pytest.raises(ValueError, match="counts on braking"):
+        guard_for_traffic(-4.0, HIGH, DECEL, INTERVAL, judge=judge())
+    with pytest.raises(ValueError, match="no rows of 8"):
+        decide([1.0, 2.0])

@@ -77,7 +77,6 @@ def test_an_interval_that_does_not_exist_is_refused(i):
     ("value", "words"),
     [
         ("abc", "action is 'abc'"),
-        ("0.5", "action is '0.5'"),
         (None, "action is None"),
         (1j, "action is 1j"),
         (["0.5", "1"], "action has dtype <U3"),
@@ -95,11 +94,9 @@ def test_an_action_that_is_no_number_is_named(value, words):
     [
         ({"low": math.nan}, "low is nan"),
         ({"high": math.inf}, "high is inf"),
-        ({"width": math.inf}, "width is inf"),
         ({"width": 0.0}, "width is 0.0"),
         ({"width": -0.3}, "width is -0.3"),
         ({"low": 2.5}, "low must be below high"),
-        ({"low": 3.0}, "low must be below high"),
         ({"outside": "ignore"}, "outside is 'ignore'"),
         ({"low": 0.0, "high": 1e-10, "width": 1e-11}, "larger unit"),
     ],

@@ -102,21 +102,6 @@ def test_without_a_compiler_all_runs_in_python():
     subprocess.run([sys.executable, "-W", "error", "-c", WARMED], env=environment, check=True)
 
 
-@pytest.mark.slow
-def test_a_machine_without_a_limit_compiles_nothing_that_merges_states():
-    """What is rare stays out of the kernel of every step: it takes as long to compile as a step."""
-    code = (
-        "import numpy as np, evofsm, evofsm.fsm.transitions as kernels\n"
-        "evofsm.EvolvingFSM(1).observe(np.zeros(2))\n"
-        "print(len(kernels.merge_closest.signatures))"
-    )
-    fresh = {**os.environ, "NUMBA_CACHE_DIR": tempfile.mkdtemp()}
-    finished = subprocess.run(
-        [sys.executable, "-c", code], env=fresh, capture_output=True, text=True, check=True
-    )
-    assert finished.stdout.split() == ["0"]
-
-
 def test_compiling_is_announced_once(caplog):
     told = kernels._Announcement()
     for _ in range(2):

@@ -114,27 +114,6 @@ def crash():
     return machine, Labels(actions, VARIABLES, UNITS, 0.5)
 
 
-def test_an_explanation_tells_where_how_often_what_came_of_it_and_what_was_better(crash):
-    machine, labels = crash
-    model = machine.model(
-        actions=labels.actions, names=labels.names, units=labels.units, dt=labels.dt
-    )
-    found = model.explain(1, action=1)
-    assert str(found) == (
-        "#2: close (5 m), at medium speed (20 m/s), at equal speeds. "
-        "12 episodes came here (24 observations); 8 of 12 (43 to 85 %) failed within 1 s, "
-        "and 8 of 9 (62 to 98 %) after a(2) ≥ 0 m/s². "
-        "Better after a(1) < 0 m/s²: 0 of 3 (at most 48 %). "
-        "Most often reached from #1: 12 of 12 times."
-    )
-    assert (found.here, found.action, found.after_better) == (
-        Tally(8, 12),
-        Tally(8, 9),
-        Tally(0, 3),
-    )
-    assert (found.state, found.visits, found.reached_from, found.better) == (1, 24, 0, 0)
-
-
 def test_what_is_new_is_said_to_be(crash):
     machine, labels = crash
     machine.start_episode()

@@ -1,6 +1,5 @@
 """The whole public life of a machine, in any order."""
 
-import io
 import tempfile
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from hypothesis.stateful import (
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.rules import Novelty, Paper
+from one_machine import saved as everything
 
 M, Q = 2, 3
 ROUNDING = 1e-9
@@ -37,13 +37,6 @@ QUESTIONS = (
     *("marginal_matrix", "joint_frequency", "origin_frequency", "decisions", "failures"),
     *("endings", "nbytes"),
 )
-
-
-def everything(machine):
-    """All that a machine holds, byte for byte; room for what is to come is no part of it."""
-    file = io.BytesIO()
-    machine.save(file)
-    return file.getvalue()
 
 
 def assert_distributions(rows):
@@ -173,8 +166,6 @@ class Life(RuleBasedStateMachine):
         copy = self.machine.copy()
         copy.learn_many(np.ones((4, M)), [0] * 4)  # what becomes of a copy is its own
         self.machine = self.machine.copy()
-
-    # Of what length an observation is, is only known once there was one.
 
     # -- What holds always ---------------------------------------------------------------------
 

@@ -175,11 +175,6 @@ def test_it_is_saved_and_loaded_and_goes_on_learning(snapshot, rule, tmp_path):
         ([EvolvingFSM(2), EvolvingFSM(3)], ValueError, "n_actions of machine 1 is 3, but 2"),
         ([EvolvingFSM(2), EvolvingFSM(2, max_states=4)], ValueError, "max_states of machine 1"),
         (
-            [EvolvingFSM(2), EvolvingFSM(2, learning_rate=0.1)],
-            ValueError,
-            "learning_rate of machine 1 is 0.1",
-        ),
-        (
             [EvolvingFSM(2), EvolvingFSM(2), EvolvingFSM(2, rule=Edges())],
             ValueError,
             "rule of machine 2 is Edges",

@@ -155,9 +155,3 @@ def test_equal_observations_make_one_state_that_is_certain(value, rows):
     assert machine.centers.tolist() == [[value, value]]
     assert not trace.event[1:].any()  # as dense as the centre is not denser
     assert (trace.surprise[1:] == 0.0).all()
-
-
-def test_two_tiny_apart_observations_still_give_a_belief():
-    machine = EvolvingFSM(n_actions=1)
-    machine.observe([0.0])
-    assert machine.observe([1e-160]).belief.tolist() == [1.0]

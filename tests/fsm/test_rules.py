@@ -102,12 +102,6 @@ def test_a_state_is_created_at_the_edges_where_the_papers_rule_creates_none():
     assert machine.centers[-3:].tolist() == [[3.0, 0.0], [6.0, 0.0], [9.0, 0.0]]
 
 
-def test_an_edge_within_the_radius_of_a_centre_founds_none():
-    machine, _ = outward(Edges())
-    assert machine.observe([10.0, 0.0]).event == Event.NONE  # at exactly the radius
-    assert machine.observe([10.1, 0.0]).event == Event.CREATED
-
-
 # -- Novelty ---------------------------------------------------------------------------------------
 
 

@@ -56,7 +56,7 @@ def _read(path):
 def seeds(name):
     """The inputs that a search begins with."""
     if name in ("osi", "mcap"):
-        return list(osi_traces()) if name == "osi" else [_mcap()]
+        return list(osi_traces()) if name == "osi" else [osi_mcap()]
     return [path.read_bytes() for path in sorted((CORPUS / name).iterdir())]
 
 
@@ -100,16 +100,22 @@ def osi_traces(**leader):
         yield b"".join(len(one).to_bytes(4, "little") + one for one in messages)
 
 
-def _mcap():
+def osi_mcap(kind="GroundTruth", place=0, **how):
+    """Bytes of such messages in MCAP, beside all that may stand there; options of its writer."""
     from mcap.writer import Writer
 
     file = io.BytesIO()
-    writer = Writer(file)
+    writer = Writer(file, **how)
     writer.start(profile="", library="another")
-    schema = writer.register_schema("osi3.GroundTruth", "protobuf", b"")
+    schema = writer.register_schema(f"osi3.{kind}", "protobuf", b"")
+    other = writer.register_schema("foxglove.Log", "jsonschema", b"{}")
+    data = writer.register_channel("data", "json", other)
     channel = writer.register_channel("truth", "protobuf", schema)
+    writer.add_attachment(0, 0, "picture", "image/png", b"\xff" * 99)
+    writer.add_metadata("drive", {"driver": "none"})
     for k in range(5):
-        writer.add_message(channel, k, osi_messages(k)[0], k)
+        writer.add_message(data, k, b"\xff", k)
+        writer.add_message(channel, k, osi_messages(k)[place], k)
     writer.finish()
     return file.getvalue()
 

@@ -18,6 +18,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete  # noqa: E402
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper  # noqa: E402
 
+import evofsm.guard  # noqa: E402
 from evofsm.driving import CarFollowing, guard_for_cars  # noqa: E402
 from evofsm.fsm import Labels, Missing  # noqa: E402
 from evofsm.guard import (  # noqa: E402
@@ -414,7 +415,6 @@ def test_what_is_no_function_is_refused(failed):
     [
         lambda info: info["failed"],
         lambda info: info.get("failed"),
-        lambda info: "failed" in info,
         lambda step: step.info["crashed"],
     ],
 )
@@ -767,7 +767,6 @@ def test_what_each_meets_is_learnt_whole_and_nothing_across_a_reset(name, steps,
     before = len(ended)
     revised.reset(seed=9)  # those under way end as they are
     assert len(guard.judge.episodes) == before + 3
-    envs.close()
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -786,7 +785,6 @@ def test_infos_are_arrays_with_masks(mode):
         assert infos["reviser/reason"].dtype == object
     assert resets == (2 if mode is NEXT_STEP else 0)
     assert all(revision.executed[0] <= 0.5 for revision in revised.revisions)
-    envs.close()
 
 
 def test_a_step_that_only_resets_is_no_decision_and_costs_nothing():
@@ -802,7 +800,6 @@ def test_a_step_that_only_resets_is_no_decision_and_costs_nothing():
         assert infos["reviser/executed_action"] == pytest.approx(executed)
         assert infos["reviser/penalty"] == pytest.approx((2.0 - executed) / 2.0)
         assert not resets or rewards == [0.0]
-    envs.close()
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -821,7 +818,6 @@ def test_a_failure_is_told_by_the_environments_own_info(mode):
     assert all("_length" not in step.info and step.reward == 1.0 for step in asked)
     last = [tuple(map(float, step.observation)) for step in asked if step.terminated]
     assert last == [seen for _, seen, terminated in ended if terminated]
-    envs.close()
 
 
 class Bare(VectorWrapper):
@@ -865,7 +861,6 @@ def test_what_the_documents_call_optional_may_be_absent(mode, without):
     if mode is SAME_STEP and "final_obs" in without:
         ended = [(rows, None, failed) for rows, _, failed in ended]
     assert guard.judge.episodes == ended
-    envs.close()
 
 
 @pytest.mark.parametrize("width", [1, 2])
@@ -896,7 +891,6 @@ def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
     executed = [revised.step(full)[-1]["reviser/executed_action"].ravel() for _ in range(8)]
     assert (np.array(executed[:4]) == 2.0).all()
     assert (np.array(executed[4:]) <= 0.5).all()
-    envs.close()
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -914,7 +908,6 @@ def test_with_one_environment_it_comes_to_the_same_bit_for_bit(mode, snapshot):
         many_said = [np.asarray(infos[name][0]).tolist() for infos in told]
         assert repr(many_said) == repr([np.asarray(info[name]).tolist() for info in alone]), name
     assert snapshot(many.guard.machine) == snapshot(one.guard.machine)
-    envs.close()
 
 
 def test_a_frozen_guard_learns_from_none_of_them():
@@ -980,13 +973,11 @@ def drive_agents(env, wanted):
 
 @pytest.mark.parametrize("named", [2, 1, 0])  # agents that the environment knows beforehand
 def test_the_guard_learns_each_agents_episode_whole_and_info_says_what_was_done(crowd, named):
-    from evofsm.guard import RevisedAgents
-
     guard, agents = guard_for(ONE, Spy(above_half)), crowd(2, 4)
     del agents.possible_agents[named:]
     if not named:
         del agents.possible_agents
-    env = RevisedAgents(agents, guard, penalty=2.0)
+    env = evofsm.guard.RevisedAgents(agents, guard, penalty=2.0)
     first, *_, last = drive_agents(env, 2.5)
     size = first[4]["a0"]["reviser/penalty"]
     assert size > 0.5
@@ -1005,8 +996,6 @@ def test_the_guard_learns_each_agents_episode_whole_and_info_says_what_was_done(
 
 @pytest.mark.parametrize("silent", ["infos", "rewards", "observations", "all"])
 def test_what_an_agent_is_not_told_is_optional(crowd, silent):
-    from evofsm.guard import RevisedAgents
-
     class Silent(crowd):
         def step(self, actions):
             said = dict(
@@ -1024,7 +1013,9 @@ def test_what_an_agent_is_not_told_is_optional(crowd, silent):
 
     guard = guard_for(ONE)
     steps = []
-    env = RevisedAgents(Silent(2, 4), guard, failed=lambda step: steps.append(step) or False)
+    env = evofsm.guard.RevisedAgents(
+        Silent(2, 4), guard, failed=lambda step: steps.append(step) or False
+    )
     drive_agents(env, 0.0)
     last = None if silent in ("observations", "all") else tuple(NEAR)
     assert [(len(rows), end) for rows, end, _ in guard.judge.episodes] == [(1, last), (3, last)]
@@ -1033,14 +1024,12 @@ def test_what_an_agent_is_not_told_is_optional(crowd, silent):
 
 
 def test_what_an_agent_meets_after_a_step_without_an_action_is_no_consequence(crowd):
-    from evofsm.guard import RevisedAgents
-
     class Turns(crowd):
         def step(self, actions):
             return super().step({one: actions.get(one, [0.0]) for one in self.agents})
 
     guard = guard_for(ONE)
-    env = RevisedAgents(Turns(6, 6), guard)
+    env = evofsm.guard.RevisedAgents(Turns(6, 6), guard)
     env.reset()
     for acting in (["a0", "a1"], ["a0"], ["a0", "a1"], ["a0", "a1"], ["a0", "a1"]):
         env.step({agent: np.array([0.0]) for agent in acting})
@@ -1053,8 +1042,6 @@ def test_what_an_agent_meets_after_a_step_without_an_action_is_no_consequence(cr
 
 @pytest.mark.parametrize("name", [None, "final_obs"])
 def test_agents_whose_environment_begins_again_by_itself_are_learnt(crowd, name):
-    from evofsm.guard import RevisedAgents
-
     class Once(crowd):
         def step(self, actions):
             if not self.agents:
@@ -1068,7 +1055,7 @@ def test_agents_whose_environment_begins_again_by_itself_are_learnt(crowd, name)
             return seen, *said, infos
 
     guard = guard_for(ONE)
-    env = RevisedAgents(Once(4, 4), guard)
+    env = evofsm.guard.RevisedAgents(Once(4, 4), guard)
     env.reset()
     for _ in range(12):
         env.step({agent: np.array([0.0]) for agent in ("a0", "a1")})
@@ -1077,8 +1064,6 @@ def test_agents_whose_environment_begins_again_by_itself_are_learnt(crowd, name)
 
 
 def test_of_a_masked_agent_only_what_is_allowed_is_executed(crowd):
-    from evofsm.guard import RevisedAgents
-
     class Masked(crowd):
         one, possible_agents = Barred("observation"), ("a",)
 
@@ -1093,7 +1078,9 @@ def test_of_a_masked_agent_only_what_is_allowed_is_executed(crowd):
         def step(self, actions):
             return tuple({"a": it} for it in self.one.step(actions["a"]))
 
-    env = RevisedAgents(Masked(), guard_for(Discrete(3), Spy(lambda action: action < 2)))
+    env = evofsm.guard.RevisedAgents(
+        Masked(), guard_for(Discrete(3), Spy(lambda action: action < 2))
+    )
     env.reset()
     executed = [env.step({"a": 0})[4]["a"]["reviser/executed_action"] for _ in range(20)]
     assert {0, 2} <= set(executed)
@@ -1102,18 +1089,16 @@ def test_of_a_masked_agent_only_what_is_allowed_is_executed(crowd):
 def test_agents_that_take_turns_are_told_of_the_parallel_interface(crowd):
     from pettingzoo.utils import aec_to_parallel, parallel_to_aec
 
-    from evofsm.guard import RevisedAgents
-
     crowd.metadata = {"name": "crowd", "is_parallelizable": True}
     turns = parallel_to_aec(crowd(4))
     for wrong in (
-        lambda: RevisedAgents(turns, guard_for(ONE)),
+        lambda: evofsm.guard.RevisedAgents(turns, guard_for(ONE)),
         lambda: RevisedActions(turns, guard_for(ONE)),
     ):
         with pytest.raises(TypeError, match=r"PettingZoo, as parallel_env\(\).*aec_to_parallel"):
             wrong()
     guard = guard_for(ONE)  # as it was advised, and around again
-    turns = parallel_to_aec(RevisedAgents(aec_to_parallel(turns), guard))
+    turns = parallel_to_aec(evofsm.guard.RevisedAgents(aec_to_parallel(turns), guard))
     turns.reset()
     for _ in turns.agent_iter(9):
         turns.step(None if turns.last()[2] else np.array([0.0]))
@@ -1121,12 +1106,10 @@ def test_agents_that_take_turns_are_told_of_the_parallel_interface(crowd):
 
 
 def test_pettingzoo_finds_nothing_to_complain_of(crowd):
-    from evofsm.guard import RevisedAgents
-
     with warnings.catch_warnings():  # its tests import what it has deprecated itself
         warnings.simplefilter("ignore", DeprecationWarning)
         from pettingzoo.test import parallel_api_test
-    parallel_api_test(RevisedAgents(crowd(9, 30), guard_for(ONE)), num_cycles=60)
+    parallel_api_test(evofsm.guard.RevisedAgents(crowd(9, 30), guard_for(ONE)), num_cycles=60)
 
 
 # -- Extras and examples -----------------------------------------------------------------------

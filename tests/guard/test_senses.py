@@ -183,11 +183,6 @@ def test_whatever_is_seen_is_decided_in_time_or_refused_by_name(kind, data, ends
         twin.end(failed=True)
 
 
-def test_rejecting_is_an_error_that_names_the_variables():
-    with pytest.raises(ValueError, match=r"variables \[0, 2\] of the observation at 0 s"):
-        guard(missing=Missing.REJECT).decide([NAN, 10.0, NAN], 0.0)
-
-
 def test_the_reviser_keeps_its_promise_with_a_gap_sensor_that_fails_half_the_time():
     hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
     leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=8.0, brake_time=12.0)

@@ -4,9 +4,9 @@ import json
 import math
 import re
 import struct
-import threading
 import time
 import tracemalloc
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -266,11 +266,10 @@ def decide(guard):
 
 
 def test_a_file_holds_every_decision_and_what_happened_with_the_channels_of_a_run(tmp_path, log):
-    guard, began = guard_for_cars(low=-4.0, high=2.5), time.monotonic()
-    with FoxgloveSink(None, tmp_path / "run.mcap", speed=10.0) as guard.audit:
+    guard = guard_for_cars(low=-4.0, high=2.5)
+    with FoxgloveSink(None, tmp_path / "run.mcap") as guard.audit:
         decide(guard)
         decide(guard)
-    assert time.monotonic() - began >= 2 * 0.25 * (len(ROWS) - 1) / 10.0  # it was held back
     found = messages(tmp_path / "run.mcap")
     assert len(found["/risk"]) == len(found["/decision"]) == len(found["/belief"]) == 16
     assert [one["gap"] for _, one in found["/observation"][:2]] == [30.0, 28.0]
@@ -304,7 +303,6 @@ def test_whoever_connects_sees_the_decisions_as_they_are_made():
     guard = guard_for_cars(low=-4.0, high=2.5)
     with FoxgloveSink(0) as sink:
         guard.audit = sink
-        assert not sink.await_someone(0.01)
         with connect(sink.address, subprotocols=["foxglove.sdk.v1"], proxy=None) as client:
             channel = None
             while channel is None:
@@ -313,11 +311,13 @@ def test_whoever_connects_sees_the_decisions_as_they_are_made():
                     channel = one["id"] if one["topic"] == "/decision" else channel
             asked = {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel}]}
             client.send(json.dumps(asked))
-            assert sink.await_someone(10.0)
-            threading.Thread(target=decide, args=[guard]).start()
-            data = client.recv(timeout=60)
-            while not isinstance(data, bytes):
-                data = client.recv(timeout=60)
+            data, tries = "", 0
+            while not isinstance(data, bytes):  # until the server has heard that somebody listens
+                tries += 1
+                assert tries < 600
+                decide(guard)
+                with suppress(TimeoutError):
+                    data = client.recv(timeout=0.1)
     opcode, subscription, at = struct.unpack("<BIQ", data[:13])
     assert (opcode, subscription) == (1, 7)
     assert abs(at - time.time_ns()) < 60e9
@@ -340,7 +340,5 @@ def test_what_cannot_be_shown_is_refused(tmp_path):
         FoxgloveSink(None)
     with pytest.raises(FileExistsError, match="it was left alone"):
         FoxgloveSink(None, tmp_path / "there.mcap")
-    with pytest.raises(ValueError, match="speed"):
-        FoxgloveSink(0, speed=0.0)
     with FoxgloveSink(0) as sink, pytest.raises(RuntimeError):
         FoxgloveSink(int(sink.address.rpartition(":")[2]))

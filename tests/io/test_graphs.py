@@ -77,8 +77,6 @@ def test_what_cannot_be_drawn_or_is_no_process_is_refused(model):
     assert "s1" not in to_dot(empty.model())
     with pytest.raises(ValueError, match="counted no decisions"):
         to_prism(empty.model())
-    with pytest.raises(ValueError, match="evidence is 0"):
-        to_prism(model, evidence=0.0)
     empty.learn_many([[0.0], [1.0]], [0, 0])
     assert "NO DECISION FAILED" in to_prism(empty.model())
 

@@ -64,6 +64,13 @@ def refusal(*paths, **columns):
     return str(caught.value)
 
 
+@pytest.fixture(params=[1, 1 << 20])
+def pieces(request, monkeypatch):
+    """Files are read row by row, or at once."""
+    monkeypatch.setattr(tables, "_CSV_BYTES", request.param)
+    monkeypatch.setattr(tables, "_PARQUET_ROWS", request.param)
+
+
 # -- What is read ---------------------------------------------------------------------------------
 
 
@@ -154,18 +161,6 @@ def test_any_table_is_read_as_python_s_own_reader_reads_it(
     assert [t for piece in pieces for t in piece.texts["a text"]] == [row[1] for row in wanted]
 
 
-def test_a_discrete_column_gets_a_coordinate_for_each_value(tmp_path):
-    path = write(tmp_path / "a.csv", ["0,5,red,1", "1,6,green,1"], "time,gap,light,a")
-    encoder = ObservationEncoder("gap", Category("light", ("red", "green"), distance=2.0))
-    (chunk,) = read(path, observe=encoder, action="a")
-    assert chunk.observations[0] == pytest.approx([5.0, np.sqrt(2.0), 0.0])
-    assert np.array_equal(chunk.observations[1], encoder.encode({"gap": 6.0, "light": "green"}))
-    path = write(tmp_path / "b.csv", ["0,5,red,1", "1,6,amber,1"], "time,gap,light,a")
-    message = refusal(path, observe=encoder, action="a")
-    assert "line 3, column 'light': 'amber' is none of the values" in message
-    assert "red, green" in message
-
-
 def test_every_file_begins_an_episode_and_columns_that_tell_them_apart_may_be_named(tmp_path):
     path = write(tmp_path / "a.csv", [*log(3), *log(3, "other", start=0.3)])
     assert [chunk.starts.tolist() for chunk in read(path, path)] == [[0, 3], [0, 3]]
@@ -242,21 +237,6 @@ def test_a_bad_value_is_named_with_its_line_and_column(tmp_path, value, cause, c
     assert cause in message
 
 
-@pytest.mark.parametrize(
-    ("columns", "missing", "option"),
-    [
-        ({"observe": ObservationEncoder("gap", "speed")}, "speed", "--observe"),
-        ({"action": "accel"}, "accel", "--action"),
-        ({"time": "t"}, "t", "--time"),
-        ({"episode": ["run", "driver"]}, "driver", "--episode"),
-        ({"failed": "hit"}, "hit", "--failed"),
-    ],
-)
-def test_a_missing_column_names_those_there_are_and_the_option(tmp_path, columns, missing, option):
-    message = refusal(write(tmp_path / "a.csv", log(3)), **columns)
-    assert f"no column {missing!r}; it has {HEADER.replace(',', ', ')} ({option}" in message
-
-
 def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, monkeypatch):
     """Each block would be an episode of its own, and no row would look wrong."""
     lines = [row for k in range(8) for pair in ("v1", "v2") for row in log(10, pair, start=k)]
@@ -265,13 +245,6 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, monkeypat
     assert "sort the file by run, pair, segment and then by time" in message
     monkeypatch.setattr(tables, "_CSV_BYTES", 1)
     assert "a.csv, line 22: the episode r, v1, 0" in refusal(write(tmp_path / "a.csv", lines))
-
-
-def test_all_files_have_the_step_of_the_first(tmp_path):
-    slow = write(tmp_path / "slow.csv", log(9, step=1.0))
-    message = refusal(write(tmp_path / "fast.csv", log(9)), slow)
-    assert "slow.csv has a row every 1 s" in message
-    assert "fast.csv has one every 0.1 s" in message
 
 
 @pytest.mark.parametrize(
@@ -355,13 +328,11 @@ def test_a_name_that_looks_like_an_address_is_a_file_like_any_other(name, tmp_pa
 
 BAD_ROWS = {
     "twice": (["p,0.3,3,10,11,-0.5,0"], "line 6: time goes from 0.3 to 0.3 within", [0]),
-    "a time twice": (["p,0.3,9,10,11,-0.5,0"], "line 6: time goes from 0.3 to 0.3 within", [0]),
     "time goes back": (["p,0.1,9,10,11,-0.5,0"] * 2, "line 6: time goes from 0.3 to 0.1", [0]),
     "cut off": (["p,0.4,4,10"], "line 6: 4 fields, but the header names 7", [0, 4]),
     "too long": (["p,0.4,4,10,11,-0.5,0,0,0"], "line 6: 9 fields, but", [0, 4]),
     "a text": (["p,0.4,far,10,11,-0.5,0"], "line 6, column 'gap': 'far' is no number", [0, 4]),
     "missing": (["p,0.4,4,,11,-0.5,0"], "line 6, column 'v_follower': the field is empty", [0, 4]),
-    "infinite": (["p,0.4,4,10,11,inf,0"], "line 6, column 'a_follower': inf cannot", [0, 4]),
     "no time": (["p,later,4,10,11,-0.5,0"], "line 6, column 'time': 'later' is no", [0, 4]),
     "a quote": (['p,"0"4,4,10,11,-0.5,0'], "line 6: ',' expected after '\"'", [0, 4]),
     "zeros": (["\0" * 99], "line 6: 1 fields", [0, 4]),
@@ -370,11 +341,7 @@ BAD_ROWS = {
 
 
 @pytest.mark.parametrize(("bad", "said", "starts"), BAD_ROWS.values(), ids=BAD_ROWS.keys())
-@pytest.mark.parametrize("at_once", [1, 1 << 20])
-def test_bad_rows_are_left_out_and_counted_up_to_a_number(
-    tmp_path, monkeypatch, bad, said, starts, at_once
-):
-    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
+def test_bad_rows_are_left_out_and_counted_up_to_a_number(tmp_path, pieces, bad, said, starts):
     good = list(short([7, 1, 2, 3, 4, 5, 6, 7]))
     after = good[5:] if starts == [0, 4] else good[4:]  # in place of a row, or beside it
     path, noted = write(tmp_path / "a.csv", [*good[:4], *bad, *after], SHORT), Noted()
@@ -417,22 +384,16 @@ def test_a_failure_at_a_time_that_is_there_twice_is_one(tmp_path):
     assert together(path, failed="crash") == ([3, 2, 1], [0], [2])
 
 
-def test_a_missing_action_is_counted_where_another_row_follows(tmp_path):
+def test_a_missing_action_is_counted_where_another_row_follows(tmp_path, pieces):
     lines = [
         f"{p},{k / 10:.1f},{k},10,11,{'' if k in (2, 3) else 1},0" for p in "pq" for k in range(4)
     ]
-    for size in (1, 1 << 20):
-        tables._CSV_BYTES, usual = size, tables._CSV_BYTES
-        try:
-            noted = Noted()
-            chunks = read(write(tmp_path / "a.csv", lines, SHORT), noted=noted)
-        finally:
-            tables._CSV_BYTES = usual
-        actions = np.concatenate([chunk.actions for chunk in chunks])
-        assert np.isnan(actions).tolist() == [False, False, True, True] * 2
-        (warning,) = warnings_of(noted)
-        assert "2 rows have no action" in warning
-        assert "line 4, column 'a_follower'" in warning
+    chunks = read(write(tmp_path / "a.csv", lines, SHORT), noted=(noted := Noted()))
+    actions = np.concatenate([chunk.actions for chunk in chunks])
+    assert np.isnan(actions).tolist() == [False, False, True, True] * 2
+    (warning,) = warnings_of(noted)
+    assert "2 rows have no action" in warning
+    assert "line 4, column 'a_follower'" in warning
 
 
 ABOVE = {
@@ -467,9 +428,7 @@ def test_names_may_stand_below_comments_or_behind_a_mark(tmp_path, above):
     assert f"line {header.count(chr(10)) + 5}, column 'gap'" in refusal(bad)
 
 
-@pytest.mark.parametrize("at_once", [1, 1 << 20])
-def test_what_was_appended_is_read_by_its_own_names(tmp_path, monkeypatch, at_once):
-    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
+def test_what_was_appended_is_read_by_its_own_names(tmp_path, pieces):
     other = "note,v_leader,v_follower,gap,time,a_follower,pair"
     more = [f"x,21,20,{gap},{gap / 10},1,p" for gap in (1, 2, 3)]
     path = write(tmp_path / "a.csv", [*short([7, 8]), SHORT, *short([9]), other, *more], SHORT)
@@ -582,23 +541,12 @@ def test_signals_of_several_clocks_are_held_at_the_times_of_actions(
     assert [21, 10, 30] not in seen.tolist()  # of 0.17 s before
 
 
-def test_one_signal_that_comes_less_often_is_held_where_it_is_asked_for(tmp_path):
-    lines = [f"p,{k / 10:.1f},{k if k % 5 == 0 else ''},10,11,1,0" for k in range(60)]
-    path = write(tmp_path / "a.csv", lines, SHORT)
-    with pytest.raises(ValueError, match=r"several clocks in one table\? --hold 0.5 holds"):
-        read(path)
-    assert together(path, hold=0.5)[:2] == ([k // 5 * 5 for k in range(60)], [0])
-
-
 # -- Failures, and rows without a leader -----------------------------------------------------------
 
 
 @pytest.mark.parametrize("condition", [" gap <= 0 ", "gap<1e-9", "crash", "crash==1"])
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
-@pytest.mark.parametrize("at_once", [1, 1 << 16])
-def test_the_first_row_in_which_it_holds_ends_the_episode(
-    tmp_path, monkeypatch, condition, ending, at_once
-):
+def test_the_first_row_in_which_it_holds_ends_the_episode(tmp_path, pieces, condition, ending):
     hole = [f"s,{t},{gap},1,1,0,{hit}" for t, gap, hit in ((0, 1, 0), (0.1, 0, 1), (9, 0, 1))]
     lines = [*short([3, 1, 0, -1, -1, 2, 0]), *short([-1, 4], "q"), "r,0,5,1,1,0,0", *hole]
     path = write(tmp_path / "a.csv", lines, SHORT)
@@ -607,8 +555,6 @@ def test_the_first_row_in_which_it_holds_ends_the_episode(
         frame = polars.read_csv(path).with_columns(polars.col("crash").cast(kind))
         path = str(tmp_path / "a.parquet")
         frame.write_parquet(path)
-    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
-    monkeypatch.setattr(tables, "_PARQUET_ROWS", at_once)
     noted = Noted()
     gaps, starts, failures = together(path, noted=noted, failed=condition)
     assert gaps == [3, 1, 0, 2, 0, -1, 4, 5, 1, 0]
@@ -628,9 +574,7 @@ def test_what_only_tells_of_failures_may_be_infinite_but_must_be_there(tmp_path)
 
 
 @pytest.mark.parametrize("nothing", ["", "nan", "NA", "inf", " "])
-@pytest.mark.parametrize("at_once", [1, 1 << 20])
-def test_rows_without_a_leader_end_an_episode(tmp_path, monkeypatch, nothing, at_once):
-    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
+def test_rows_without_a_leader_end_an_episode(tmp_path, pieces, nothing):
     lines = short([nothing, 1, 2, nothing, nothing, 3], crash=[0] * 6)
     path, noted = write(tmp_path / "a.csv", lines, SHORT), Noted()
     assert together(path, noted=noted, no_leader="end")[:2] == ([1, 2, 3], [0, 2])
@@ -653,10 +597,6 @@ def test_a_number_may_stand_for_no_leader(tmp_path):
     assert found[:2] == ([5, 4, 3, 2], [0, 2])
     assert (noted.leaderless, noted.failed, warnings_of(noted)) == (3, 0, [])
     assert "(--no-leader names the right one" in refusal(path, no_leader="lead==0")
-    noted = Noted()
-    read(path, noted=noted, failed="gap<=0")
-    assert "1 of 2 failed episodes fail with their first row, and gap is 0" in warnings_of(noted)[0]
-    assert "--no-leader gap==0 " in warnings_of(noted)[0]
 
 
 @pytest.mark.parametrize(("nobody", "warns"), [((-1, -1), True), ((-1, -2), False)])
@@ -744,14 +684,9 @@ def test_dates_that_are_none_are_refused(tmp_path, texts, says):
 def test_units_are_converted_before_anything_is_learnt(tmp_path):
     lines = [f"p,{100 * k},{1000 * k},36,72,0,0" for k in range(4)]
     units = units_given(["v=km/h", "v_l=m/s", "time=ms", "gap=cm"])  # the longest name counts
-    path, noted = write(tmp_path / "a.csv", lines, SHORT), Noted()
-    (chunk,) = read(path, units=units)
+    (chunk,) = read(write(tmp_path / "a.csv", lines, SHORT), units=units)
     assert chunk.observations[1] == pytest.approx([10.0, 10.0, 72.0])
     assert chunk.dt == 0.1
-    read(path, noted=noted)
-    speed, step = warnings_of(noted)
-    assert re.search("v_leader reaches 72 m/s.*--unit v_leader=km/h", speed)
-    assert re.search("a row every 100 s.*--unit time=ms", step)
 
 
 @pytest.mark.parametrize("row", ["-,[s],m,km/h,kph,m/s^2,", ",ms,cm,m/s,mps,g,-"])

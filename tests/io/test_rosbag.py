@@ -1,6 +1,7 @@
 """Bags of ROS 2 that the library rosbags wrote, read as rows of one clock."""
 
 import re
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -125,18 +126,16 @@ def test_topics_that_nobody_asked_for_may_hold_anything(tmp_path, plugin):
         read(path, told)
 
 
-def test_mcap_that_was_merged_with_others_is_read_by_its_topics(tmp_path):
+@contextmanager
+def mcap_of_a_drive(path, **how):
+    """The writer of a file of MCAP, to which the drive is added in the end."""
     writing = pytest.importorskip("mcap.writer")
-    path = tmp_path / "merged.mcap"
     with path.open("wb") as file:
-        writer = writing.Writer(file)
+        writer = writing.Writer(file, **how)
         writer.start(profile="", library="another")
-        for name, language in (("foxglove.Log", "protobuf"), ("x", "jsonschema"), ("y", "flat")):
-            schema = writer.register_schema(name, language, b"\xff\xfe")
-            writer.add_message(writer.register_channel(name, language, schema), 0, b"\xff", 0)
-        writer.add_message(writer.register_channel("/none", "json", 0), 0, b"{}", 0)
+        yield writer
         topics = {}
-        for time, topic, message in drive():
+        for time, topic, message in sorted(drive(), key=lambda one: one[0]):
             kind = message.__msgtype__
             if topic not in topics:
                 told = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
@@ -145,6 +144,15 @@ def test_mcap_that_was_merged_with_others_is_read_by_its_topics(tmp_path):
             at, data = round((100.0 + time) * SECOND), bytes(STORE.serialize_cdr(message, kind))
             writer.add_message(topics[topic], at, data, at)
         writer.finish()
+
+
+def test_mcap_that_was_merged_with_others_is_read_by_its_topics(tmp_path):
+    path = tmp_path / "merged.mcap"
+    with mcap_of_a_drive(path) as writer:
+        for name, language in (("foxglove.Log", "protobuf"), ("x", "jsonschema"), ("y", "flat")):
+            schema = writer.register_schema(name, language, b"\xff\xfe")
+            writer.add_message(writer.register_channel(name, language, schema), 0, b"\xff", 0)
+        writer.add_message(writer.register_channel("/none", "json", 0), 0, b"{}", 0)
     (plain,) = read(write(tmp_path / "plain", drive(), MCAP))
     assert (read(str(path))[0].observations == plain.observations).all()
 
@@ -257,19 +265,9 @@ TF = "/tf.transforms[{}].transform.translation.x"
 
 @pytest.mark.parametrize("chunked", [True, False])
 def test_of_mcap_that_ends_early_the_beginning_is_read(tmp_path, chunked):
-    writing, path, noted = pytest.importorskip("mcap.writer"), tmp_path / "cut.mcap", Noted()
-    with path.open("wb") as file:
-        writer = writing.Writer(file, chunk_size=4000, use_chunking=chunked)
-        writer.start(profile="ros2", library="another")
-        kind = "nav_msgs/msg/Odometry"
-        told = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
-        schema, topics = writer.register_schema(kind, "ros2msg", told), {}
-        for time, topic, message in sorted(drive(), key=lambda one: one[0]):
-            if topic not in topics:
-                topics[topic] = writer.register_channel(topic, "cdr", schema)
-            at, data = round((100.0 + time) * SECOND), bytes(STORE.serialize_cdr(message, kind))
-            writer.add_message(topics[topic], at, data, at)
-        writer.finish()
+    path, noted = tmp_path / "cut.mcap", Noted()
+    with mcap_of_a_drive(path, chunk_size=4000, use_chunking=chunked):
+        pass
     (whole,) = read(str(path))
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 4 // 10])
     (chunk,) = read_traces([str(path)], topics=Topics.of(TOLD), noted=noted)

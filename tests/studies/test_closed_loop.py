@@ -96,15 +96,6 @@ def test_brakes_that_weaken_are_noticed_while_unchanged_constants_collide():
     assert collisions["rss-unchanged", 0] > 15
 
 
-@pytest.mark.slow
-def test_the_same_model_revises_alike_in_both_worlds():
-    pytest.importorskip("libsumo")
-    sumo, closed = closed_loop._drive_both_worlds(ClosedLoop(side_train=8, world_test=4))["worlds"]
-    assert sumo["collisions"] == closed["collisions"] == 0
-    assert sumo["mean_speed"] == pytest.approx(closed["mean_speed"], rel=1e-6)
-    assert sumo["intervention_rate"] == pytest.approx(closed["intervention_rate"])
-
-
 # -- The tables, of rows that are made up ---------------------------------------------------------
 
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-from typing import Annotated, Any
+from typing import Annotated
 
-from evofsm.cli.options import Json, argument, imported, option
+from evofsm.cli.options import Json, argument, imported
 from evofsm.cli.show import print_json, say, show
 
 
 def check(
     name: Annotated[str, argument("module:Class, module:instance, or a function that makes one.")],
-    make: Annotated[str | None, option("How to make it, as in: 'MyRule(radius=2.0)'.")] = None,
     as_json: Json = False,
 ) -> int:
     """Check a class of your own against the contract of its kind.
@@ -24,14 +22,7 @@ def check(
 
     from evofsm.guard.check import check_results, kind_of
 
-    part: Any = imported(name)
-    if make is not None:
-        code = compile(make, "--make", "eval")
-        names = vars(sys.modules[name.partition(":")[0]])
-
-        def part() -> Any:
-            return eval(code, names)
-
+    part = imported(name)
     kind, results = kind_of(part), check_results(part)
     failed = sum(not one.passed for one in results)
     if as_json:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import asdict, replace
@@ -30,7 +29,7 @@ from evofsm.cli.show import facts, print_json, progress, say, show, warn
 if TYPE_CHECKING:
     from evofsm.cli.driving import Driving, Results, Setup
     from evofsm.guard import Guard
-    from evofsm.io.foxglove import FoxgloveSink, RunWriter
+    from evofsm.io.foxglove import RunWriter
 
 
 def drive(
@@ -60,9 +59,6 @@ def drive(
     workers: Annotated[
         int | None, option("Drive held-out draws in so many processes; learn nothing.", min=1)
     ] = None,
-    cluster: Annotated[
-        str | None, option("The same by Dask's workers; its scheduler: tcp://10.0.0.1:8786.")
-    ] = None,
     out: Annotated[
         Path | None, option("Folder of what was learnt and driven; nothing is driven again.")
     ] = None,
@@ -71,18 +67,13 @@ def drive(
         str, option("Of a SUMO configuration: all, a share, type:NAME, or ids with commas.")
     ] = "10%",
     mcap: Annotated[Path | None, option("Log every episode for Foxglove and watch.")] = None,
-    foxglove: Annotated[
-        int | None,
-        option("Serve decisions to Foxglove at this port (8765 is usual).", min=0, max=65535),
-    ] = None,
     as_json: Json = False,
 ) -> int | None:
     """Drive scenarios under a safety filter, which learns on the way.
 
-    A machine and its judge learn from every episode, from the first on, unless --frozen, --workers
-    or --cluster is given: then draws are held out, and thousands of episodes are driven on all
-    cores or on many computers. The summary compares with the controller left to itself in the same
-    draws.
+    A machine and its judge learn from every episode, from the first on, unless --frozen or
+    --workers is given: then draws are held out, and thousands of episodes are driven on all cores.
+    The summary compares with the controller left to itself in the same draws.
 
     With --out, the same command goes on where it was stopped, whatever stopped it, and comes to the
     same result; with more --episodes, it goes on to these.
@@ -90,9 +81,8 @@ def drive(
     A SUMO configuration (my.sumocfg) is run as it is, once, with guards in the cars that --vehicles
     names; of all else only --mode (act or shadow), --tolerance and --json hold then.
     """
-    at_once = workers is not None or cluster is not None
-    given = {"learn": learn, "frozen": frozen, "workers": workers, "cluster": cluster}
-    given |= {"out": out, "audit": audit, "mcap": mcap, "foxglove": foxglove}
+    given = {"learn": learn, "frozen": frozen, "workers": workers}
+    given |= {"out": out, "audit": audit, "mcap": mcap}
     given = {name: value for name, value in given.items() if value is not None}
     if family.endswith(".sumocfg"):
         if given:
@@ -104,9 +94,8 @@ def drive(
         run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
     _refuse_pairs(given)
-    require_world(world, **({"polars": "tables"} if out is not None and not at_once else {}))
+    require_world(world, **({"polars": "tables"} if out is not None and workers is None else {}))
     require(**({} if mcap is None else {"mcap": "mcap"}))
-    require(**({} if foxglove is None else {"foxglove": "foxglove"}))
     from evofsm.cli.driving import GUARD, Results, Setup, drive_at_once, load_guard, make_guard
     from evofsm.guard import Mode
 
@@ -118,7 +107,7 @@ def drive(
         tolerance,
         seed,
         world,
-        learn=frozen is None and not at_once,
+        learn=frozen is None and workers is None,
     )
     before = None
     if (start := learn or frozen) is not None:
@@ -130,12 +119,11 @@ def drive(
             found = f"{out} has {len(results.rows):,} episodes already; name another folder"
             raise ValueError(f"--mcap holds what one run drives, but {found}")
         try:
-            if at_once:
-                count = workers or (1 if cluster else os.cpu_count() or 1)
+            if workers is not None:
                 with _shown(episodes) as move:
-                    driving = drive_at_once(results, episodes, count, cluster, move)
+                    driving = drive_at_once(results, episodes, workers, move)
             else:
-                driving = _drive_in_turn(results, episodes, audit, mcap, foxglove)
+                driving = _drive_in_turn(results, episodes, audit, mcap)
         except KeyboardInterrupt:
             if out is None:
                 raise
@@ -155,19 +143,15 @@ def drive(
 
 def _refuse_pairs(given: dict[str, Any]) -> None:
     """Raise where two options exclude each other."""
-    many = ("workers", "cluster")
     why = {
-        "whoever learns drives episodes one after the other": [("learn", one) for one in many],
-        "workers send no decisions": [
-            (one, other) for one in ("audit", "mcap", "foxglove") for other in many
-        ],
-        "a guard has one decision logger": [("foxglove", "audit")],
-        "whoever is frozen learns nothing": [("learn", "frozen")],
+        ("learn", "workers"): "whoever learns drives episodes one after the other",
+        ("audit", "workers"): "workers send no decisions",
+        ("mcap", "workers"): "workers send no decisions",
+        ("learn", "frozen"): "whoever is frozen learns nothing",
     }
-    for reason, pairs in why.items():
-        for one, other in pairs:
-            if one in given and other in given:
-                raise ValueError(f"--{one} and --{other} exclude each other: {reason}")
+    for (one, other), reason in why.items():
+        if one in given and other in given:
+            raise ValueError(f"--{one} and --{other} exclude each other: {reason}")
 
 
 # -- Driving --------------------------------------------------------------------------------------
@@ -178,7 +162,6 @@ def _drive_in_turn(
     episodes: int,
     audit: Path | None,
     mcap: Path | None,
-    foxglove: int | None,
 ) -> Driving:
     from evofsm.cli.driving import drive_in_turn
     from evofsm.driving import learners_of
@@ -190,11 +173,10 @@ def _drive_in_turn(
         AuditLog(audit) if audit else nullcontext() as log,
         open_world(setup.world) as place,
         _recording(setup, episodes, mcap) as run,
-        _live(foxglove) as live,
         _shown(episodes) as move,
     ):
         record = None if run is None else run.add
-        driving = drive_in_turn(results, episodes, place, move, log or live, record)
+        driving = drive_in_turn(results, episodes, place, move, log, record)
         if run is not None:
             run.attach(learners_of(driving.guard)[0].model(**setup.family.labels._asdict()))
     if log is not None:
@@ -223,22 +205,6 @@ def _recording(
     from evofsm.io.foxglove import recording
 
     return recording(mcap, setup.settings | {"first": setup.first, "episodes": episodes})
-
-
-@contextmanager
-def _live(port: int | None) -> Iterator[FoxgloveSink | None]:
-    """A view in Foxglove, where one is asked for, once somebody looks on."""
-    if port is None:
-        yield None
-        return
-    from evofsm.io.foxglove import FOXGLOVE_LAYOUT, FoxgloveSink
-
-    with FoxgloveSink(port, speed=1.0) as sink:
-        told = f"open {sink.address} in Foxglove or Lichtblick (Ctrl-C ends it)"
-        warn(f"{told}; a layout to import: {FOXGLOVE_LAYOUT}")
-        while not sink.await_someone(1.0):  # as Ctrl-C would not end a wait without an end
-            pass
-        yield sink
 
 
 # -- What came of it ------------------------------------------------------------------------------

@@ -60,8 +60,6 @@ _ALIASES = {"rss": "rss-r157", "aeb": "aeb-ttc"}
 _EVERY = 60.0
 # So many episodes are one task of a worker: some 500 ms.
 _BATCH = 20
-# So often may workers die over the same episodes, and so long may a scheduler take [s].
-_LIVES, _PATIENCE = 5, 15
 
 Outcomes = dict[str, Any]
 Show = Callable[[int, int], None]
@@ -291,7 +289,6 @@ def drive_at_once(
     results: Results,
     episodes: int,
     workers: int,
-    cluster: str | None = None,
     show: Show = lambda done, collisions: None,
 ) -> Driving:
     """Drive those held-out episodes that the results lack, by many workers.
@@ -304,11 +301,7 @@ def drive_at_once(
     missing = [number for number in range(episodes) if number not in results.rows]
     size = max(1, min(_BATCH, len(missing) // (8 * workers)))
     batches = [missing[place : place + size] for place in range(0, len(missing), size)]
-    drive = partial(_drive_batch, trial)
-    if cluster is None:
-        driven = _in_processes(drive, batches, workers)
-    else:
-        driven = _on_cluster(drive, batches, cluster, workers)
+    driven = _in_processes(partial(_drive_batch, trial), batches, workers)
     for rows in chain([[]], driven):  # first what was driven before
         for row in rows:
             results.add(row)
@@ -324,28 +317,19 @@ Drive = Callable[[Sequence[int]], list[Outcomes]]
 
 
 def _in_processes(drive: Drive, batches: list[list[int]], workers: int) -> Iterator[list[Outcomes]]:
-    """What comes of batches, as it comes; those of a worker that is killed are driven again."""
-    lives = _LIVES
-    while batches:
-        before = len(batches)
-        # Forking a process that has started threads may hang; a fresh one costs a second.
-        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_work)
-        try:
-            futures = {pool.submit(drive, batch): batch for batch in batches}
-            for future in as_completed(futures):
-                rows = future.result()
-                batches.remove(futures[future])
-                yield rows
-        except BrokenExecutor:
-            lives = _LIVES if len(batches) < before else lives - 1
-            if lives == 0:
-                which = f"episodes {batches[0][0]} to {batches[0][-1]}"
-                raise ChildProcessError(
-                    f"{_LIVES} times a worker died over {which}, or over others that were driven "
-                    "meanwhile (out of memory?)"
-                ) from None
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    """What comes of batches, as it comes."""
+    # Forking a process that has started threads may hang; a fresh one costs a second.
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_work)
+    try:
+        for future in as_completed([pool.submit(drive, batch) for batch in batches]):
+            yield future.result()
+    except BrokenExecutor:
+        raise ChildProcessError(
+            "a worker died (out of memory? fewer --workers need less); with --out what was driven "
+            "is kept, and the same command goes on from there"
+        ) from None
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _begin_work() -> None:
@@ -359,31 +343,3 @@ def _begin_work() -> None:
         os._exit(1)
 
     Thread(target=end_with_parent, daemon=True).start()
-
-
-def _on_cluster(
-    drive: Drive, batches: list[list[int]], address: str, workers: int
-) -> Iterator[list[Outcomes]]:
-    """The same by the workers of a Dask scheduler, which gives tasks of the dead to others."""
-    with needs("distributed", "cluster", "--cluster"):
-        import distributed
-    try:
-        client = distributed.Client(address, timeout=_PATIENCE)  # type: ignore[no-untyped-call]
-    except (OSError, ValueError) as error:
-        raise ConnectionError(f"no Dask scheduler answers at {address}: {error}") from error
-    with client:
-        try:
-            client.wait_for_workers(workers, timeout=_PATIENCE)
-        except TimeoutError:
-            raise ConnectionError(
-                f"fewer than {workers} workers have joined {address}; start them with: dask worker "
-                f"{address} --nthreads 1"
-            ) from None
-        try:
-            futures = client.map(drive, batches, pure=False)
-            for _, rows in distributed.as_completed(  # type: ignore[no-untyped-call]
-                futures, with_results=True
-            ):
-                yield rows
-        except distributed.KilledWorker as error:
-            raise ChildProcessError(f"workers died over a task again and again: {error}") from error

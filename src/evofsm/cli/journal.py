@@ -29,8 +29,6 @@ from evofsm.guard.audit_log import lines
 _SEAL = b',"crc":"'
 # A record has at most so many bytes.
 _LONGEST = 1 << 20
-# So many settings that differ are named in an error.
-_NAMED = 4
 
 Record = Mapping[str, Any]
 
@@ -152,13 +150,11 @@ def _record(line: bytes) -> dict[str, Any] | None:
 def differences(before: Record, now: Record) -> str:
     """In which settings two pieces of work differ, in words; empty where in none."""
     now = json.loads(msgspec.json.encode(now))  # as the other was read
-    found = [
+    return ", ".join(
         f"{name} was {_shown(before.get(name))} and is now {_shown(now.get(name))}"
         for name in {**before, **now}
         if before.get(name) != now.get(name)
-    ]
-    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
-    return ", ".join(found[:_NAMED]) + more
+    )
 
 
 def _shown(value: Any) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,28 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 from evofsm.cli.inspect import model_document, tables_of
 from evofsm.cli.options import (
     BRAKES,
-    SKIPPED,
     TOLERANCE,
-    ActionColumn,
     Brakes,
-    EpisodeColumns,
-    Failed,
-    Hold,
     Json,
     Judge,
-    Lengths,
-    NoLeader,
-    Observed,
-    SkipBad,
-    Step,
-    TimeColumn,
+    Reading,
     Tolerance,
-    TopicsFile,
-    Units,
     argument,
     imported,
     option,
-    reading_of,
+    reads_logs,
 )
 from evofsm.cli.show import facts, print_json, progress, say, show, table, warn
 
@@ -57,6 +44,7 @@ _MOST_ACTIONS = 1000
 _UNCERTAIN = 0.45
 
 
+@reads_logs
 def learn(
     files: Annotated[
         list[str],
@@ -65,21 +53,11 @@ def learn(
             "traces of ASAM OSI (.osi, MCAP), bags of ROS 2 (folder, MCAP, db3)."
         ),
     ],
-    observe: Observed = "gap,v_follower,v_leader",
-    action: ActionColumn = "a_follower",
+    reading: Reading,
     action_range: Annotated[
-        str, option("Its intervals, LOW:HIGH:WIDTH; what lies beyond goes into the end ones.")
+        str,
+        option("Intervals of --action, LOW:HIGH:WIDTH; what lies beyond goes into the end ones."),
     ] = "-2.5:2.5:0.3",
-    time: TimeColumn = "time",
-    episode: EpisodeColumns = None,
-    dt: Step = None,
-    failed: Failed = None,
-    unit: Units = None,
-    topics: TopicsFile = None,
-    no_leader: NoLeader = None,
-    hold: Hold = None,
-    skip_bad: SkipBad = SKIPPED,
-    vehicle_length: Lengths = None,
     rule: Annotated[
         str,
         option(
@@ -120,9 +98,6 @@ def learn(
     ] = None,
     brakes: Brakes = BRAKES,
     tolerance: Tolerance = TOLERANCE,
-    checkpoint: Annotated[
-        Path | None, option("Save what was learnt every minute; where it exists, go on from it.")
-    ] = None,
     as_json: Json = False,
 ) -> None:
     """Learn a state machine from logs of your own, of any size, row by row.
@@ -139,18 +114,8 @@ def learn(
     Without --failed nobody knows what failed, and evofsm explain says so.
 
     With --guard, a guard in shadow mode then goes through all rows and learns from them too.
-
-    With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
-    to the same result. The file stays at the end: run again, the command prints it at once.
     """
-    from evofsm.cli.learning import (
-        Checkpoint,
-        guard_of_log,
-        learn_traces,
-        refusing,
-        teach,
-        warnings_of,
-    )
+    from evofsm.cli.learning import guard_of_log, learn_traces, refusing, teach, warnings_of
     from evofsm.driving.naming import UNITS, VARIABLES
     from evofsm.io import read_traces
     from evofsm.io.logs import Noted
@@ -161,52 +126,29 @@ def learn(
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
     actions = _actions(action_range)
-    columns, lengths, known_topics = reading_of(
-        *(observe, action, time, episode, dt, failed, unit, topics, no_leader),
-        *(hold, skip_bad, vehicle_length),
-    )
+    columns, lengths, topics = reading
     encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
     kind = None if guard is None else _judge_of(judge, columns)
     noted = Noted()
     known = [{"name": file, "bytes": _size(file)} for file in files]
-    keeper = None
-    if checkpoint is not None:
-        _check_apart(checkpoint, [out, guard], files)
-        names = ("action", "time", "failed", "dt", "no_leader", "hold", "skip_bad")
-        settings = {name: getattr(columns, name) for name in names}
-        settings |= {"observe": observe, "episode": columns.episode, "units": unit or []}
-        settings |= {f"bytes of {file['name']}": file["bytes"] for file in known}
-        settings |= {"actions": action_range, "lengths": vehicle_length or []}
-        settings |= {"machine": repr(machine), "topics": topics and topics.read_text("utf-8")}
-        keeper = Checkpoint(checkpoint, settings)
-    units = dict(zip(VARIABLES, UNITS, strict=True))
+
+    def units_read() -> list[str]:
+        told = {**dict(zip(VARIABLES, UNITS, strict=True)), **noted.units}
+        units = [told.get(name, "") for name in encoder.names]
+        return [SI.get(unit, unit) for unit in units]
+
     with progress("Learning", sum(file["bytes"] for file in known)) as move:  # type: ignore[misc]
         chunks = read_traces(
-            files, columns, lengths, lambda count: move(advance=count), noted, known_topics
+            files, columns, lengths, lambda count: move(advance=count), noted, topics
         )
-        learning = learn_traces(
-            chunks,
-            machine,
-            actions,
-            encoder.names,
-            keeper,
-            lambda: {
-                "noted": asdict(noted),
-                "lengths": str(lengths) if lengths.seen else "",
-                "units": [
-                    SI.get(noted.units.get(name, ""), noted.units.get(name, units.get(name, "")))
-                    for name in encoder.names
-                ],
-            },
-        )
-    noted = Noted(**learning.read.notes["noted"])
-    provenance = _provenance(learning, known, action, failed, unit)
+        learning = learn_traces(chunks, machine, actions, encoder.names, units_read)
+    provenance = _provenance(learning, known, columns)
     warnings = warnings_of(noted, columns)
     for warning in warnings:
         warn(f"warning: {warning}")
     if out is not None:
-        _save(learning, out, provenance, checkpoint)
+        learning.model.save(out, provenance)
     taught = None
     if guard is not None:
         assert kind is not None
@@ -214,7 +156,7 @@ def learn(
         reckoned = kind, learning.model.dt, brakes, tolerance
         taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
         with progress("Teaching the guard", learning.read.rows) as move:
-            rows = read_traces(files, columns, lengths, topics=known_topics)
+            rows = read_traces(files, columns, lengths, topics=topics)
             share = teach(taught, rows, lambda count: move(count))
         if refused := refusing(share):
             warn(f"warning: in the later half of the log the guard {refused}")
@@ -223,9 +165,9 @@ def learn(
         told = {"files": files, "saved": out, "guard": guard, **_document(learning, provenance)}
         print_json({**told, "noted": noted, "warnings": warnings})
         return
-    read = [*_read(learning, action), *_read_otherwise(noted, columns, learning)]
-    if assumed := learning.read.notes["lengths"]:
-        read.append(("vehicle lengths", f"assumed, for FCD has none: {assumed}"))
+    read = [*_read(learning, columns.action), *_read_otherwise(noted, columns, learning)]
+    if lengths.seen:
+        read.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
     show(facts("What was read", read), *tables_of(learning.model))
     blind = 1.0 / learning.model.n_states
     if learning.certainty - blind < _UNCERTAIN * (1.0 - blind):
@@ -358,27 +300,19 @@ def _check_out(out: Path | None, option: str = "--out") -> None:
             raise ValueError(f"{option} {out}: {what}") from None
 
 
-def _check_apart(checkpoint: Path, outs: Sequence[Path | None], files: Sequence[str]) -> None:
-    """Refuse a checkpoint that would take the place of something else."""
-    others = [*files, *(str(out) for out in outs if out is not None)]
-    if checkpoint.resolve() in {Path(other).resolve() for other in others}:
-        raise ValueError(f"--checkpoint {checkpoint} is named twice; give it a file of its own")
-
-
 # -- What came of it ------------------------------------------------------------------------------
 
 
-def _provenance(
-    learning: Learning, files: list[Any], action: str, failed: str | None, unit: list[str] | None
-) -> dict[str, Any]:
+def _provenance(learning: Learning, files: list[Any], columns: LogColumns) -> dict[str, Any]:
     """What the model's file says of where it comes from."""
     read = learning.read
     provenance = {"files": files, "rows": read.rows, "episodes": read.episodes}
-    provenance |= {"transitions": learning.transitions, "action": action}
-    if failed is not None:
-        provenance |= {"failed": failed, "failures": read.failures}
-    if unit:
-        provenance["units converted"] = ", ".join(unit)
+    provenance |= {"transitions": learning.transitions, "action": columns.action}
+    if columns.failed is not None:
+        provenance |= {"failed": columns.failed, "failures": read.failures}
+    if columns.units:
+        units = (f"{name}={unit}" for name, unit in columns.units.items())
+        provenance["units converted"] = ", ".join(units)
     return provenance
 
 
@@ -398,19 +332,6 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     yield f"It judges{nothing}: {guard.judge.told_by_experience}."
     if beyond:
         yield f"It knows no action beyond --action-range, where {beyond:.1%} of the log's are."
-
-
-def _save(
-    learning: Learning, out: Path, provenance: Mapping[str, Any], checkpoint: Path | None
-) -> None:
-    try:
-        learning.model.save(out, provenance)
-    except OSError as error:
-        what = "the result is lost with it; --checkpoint FILE would have saved it"
-        if checkpoint is not None:
-            what = f"the result is in {checkpoint}: make room, and run the same command again"
-        error.add_note(what)
-        raise
 
 
 def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,22 +8,16 @@ that came is measured by the Jensen-Shannon divergence.
 
 from __future__ import annotations
 
-import logging
 import re
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
 from shlex import quote
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm import store
-from evofsm.cli.journal import differences
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
@@ -36,8 +30,6 @@ from evofsm.io import Chunk, episodes_of
 from evofsm.io.logs import Condition, LogColumns, Noted
 from evofsm.io.tables import SI, TIMES, UNITS
 
-_log = logging.getLogger(__name__)
-
 Beliefs = NDArray[np.float64]
 
 #: How far ahead the longer forecast looks [s].
@@ -45,8 +37,6 @@ HORIZON = 1.0
 
 # Blocks grow from so many rows to so many; of each so many are scored at most.
 _FIRST_BLOCK, _LARGEST_BLOCK, _SCORED = 64, 8192, 256
-# A checkpoint is written so often [s].
-_EVERY = 60.0
 # A unit at the end of a column's name, behind another letter or as a word of its own.
 _WORD = "(?:^|[^A-Za-z]|(?<=[a-z])(?=[A-Z]))"
 _CALLED = re.compile(_WORD + "((?i:km[/_ ]?p?h|kph|mph|knots|feet|ft|cm|mm|km))[^A-Za-z]*$")
@@ -75,10 +65,10 @@ class Skill(NamedTuple):
     skill: float  #: 1 perfect, 0 as good as persistence, negative worse; NaN: nothing ever moved
 
 
-class Progress(msgspec.Struct):
-    """How far it has come; for JSON."""
+@dataclass
+class Progress:
+    """How far it has come."""
 
-    chunks: int = 0
     blocks: int = 0
     rows: int = 0  #: observations
     episodes: int = 0
@@ -88,14 +78,12 @@ class Progress(msgspec.Struct):
     jumps: int = 0  #: episodes that began because of a hole in time
     failures: int = 0  #: episodes that ended in failure
     dt: float | None = None  #: usual time between two rows [s]
-    last_time: float | None = None
-    finished: bool = False
+    last_time: float = np.nan  #: of the latest row [s]
     scored: int = 0  #: rows of which forecasts were scored
     certainty: float = 0.0  #: sum over them of the share that the most probable state has
-    notes: dict[str, Any] = msgspec.field(default_factory=dict)  #: of whoever read the rows
     #: number, divergence of persistence, and of forecasts: one step, and `HORIZON`
-    one_step: list[float] = msgspec.field(default_factory=lambda: [0.0] * 3)
-    ahead: list[float] = msgspec.field(default_factory=lambda: [0.0] * 3)
+    one_step: list[float] = field(default_factory=lambda: [0.0] * 3)
+    ahead: list[float] = field(default_factory=lambda: [0.0] * 3)
 
 
 @dataclass(frozen=True)
@@ -110,74 +98,18 @@ class Learning:
     skills: tuple[Skill, ...]  #: of one step, then of `HORIZON`
 
 
-class Checkpoint:
-    """A machine in a file, with how far it has come, to be gone on from."""
-
-    def __init__(self, path: Path, settings: Mapping[str, Any], every: float = _EVERY) -> None:
-        self.path, self.settings, self.every = path, dict(settings), every
-        self._latest = time.monotonic()
-
-    def begin(self, machine: EvolvingFSM) -> tuple[EvolvingFSM, Progress]:
-        """What was learnt, and how far it has come."""
-        if not self.path.exists():
-            self.save(machine, Progress(), first=True)
-            return machine, Progress()
-        kept = store.read_header(self.path).provenance.get("learning")
-        if kept is None:
-            raise ValueError(f"{self.path} is no checkpoint; name another file")
-        if found := differences(kept["settings"], self.settings):
-            raise ValueError(
-                f"{self.path} is the checkpoint of other work: {found}; run it with those, name "
-                "another file, or delete this one to begin anew"
-            )
-        loaded = EvolvingFSM.load(self.path)
-        store.sweep(self.path)  # what may be whole where that is not
-        return loaded, msgspec.convert(kept["read"], Progress)
-
-    def offer(self, machine: EvolvingFSM, read: Progress) -> None:
-        """Save, if that was not done for a while."""
-        if time.monotonic() - self._latest >= self.every:
-            self.save(machine, read)
-
-    def save(self, machine: EvolvingFSM, read: Progress, *, first: bool = False) -> None:
-        """Replace the file; where that fails, the work goes on, with a warning."""
-        kept = {"settings": self.settings, "read": msgspec.to_builtins(read)}
-        try:
-            machine.save(self.path, {"learning": kept})
-        except OSError as error:
-            if first:
-                raise
-            _log.warning("%s cannot be written (%s): the work goes on", self.path, error)
-        self._latest = time.monotonic()
-
-
 def learn_traces(
     chunks: Iterable[Chunk],
     machine: EvolvingFSM,
     actions: IntervalActions,
     names: Sequence[str] = (),
-    checkpoint: Checkpoint | None = None,
-    notes: Callable[[], dict[str, Any]] = dict,
+    units: Callable[[], Sequence[str]] = tuple,
 ) -> Learning:
-    """Learn all chunks in their order, each row once; notes are taken once they are read.
-
-    Their ``units`` are those of the variables.
-    """
+    """Learn all chunks in their order, each row once; units are known once they are read."""
     machine, read = machine.copy(), Progress()
-    if checkpoint is not None:
-        machine, read = checkpoint.begin(machine)
-    if not read.finished:
-        coming = _ahead(chunks)
-        _pass_over(coming, read)
-        for chunk in coming:
-            _learn(machine, actions, chunk, read)
-            if checkpoint is not None:
-                checkpoint.offer(machine, read)
-        read.finished, read.notes = True, notes()
-        if checkpoint is not None:
-            checkpoint.save(machine, read)
-    units = read.notes.get("units", ())
-    model = machine.model(actions=actions, names=names, units=units, dt=read.dt)
+    for chunk in _ahead(chunks):
+        _learn(machine, actions, chunk, read)
+    model = machine.model(actions=actions, names=names, units=units(), dt=read.dt)
     if (transitions := int(model.uses.sum())) == 0:
         raise ValueError(
             "no transition could be learnt: no row with an action is followed by another row of "
@@ -322,16 +254,6 @@ def _ahead(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
             yield chunk
 
 
-def _pass_over(coming: Iterator[Chunk], read: Progress) -> None:
-    """Leave out the chunks that were learnt before."""
-    rows = sum(len(next(coming).times) for _ in range(read.chunks))
-    if rows != read.rows:
-        raise ValueError(
-            f"the checkpoint has learnt {read.rows:,} rows, where there are {rows:,} now; the "
-            "files were changed: delete it to begin anew"
-        )
-
-
 def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: Progress) -> None:
     """Learn a chunk block by block, and score the forecasts of each before."""
     read.dt = None if np.isnan(chunk.dt) else chunk.dt
@@ -351,12 +273,10 @@ def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: P
         if before is not None:
             _score(before, trace, block, taken, read)
         first, read.blocks = end, read.blocks + 1
-    last = np.nan if read.last_time is None else read.last_time
-    steps = np.diff(chunk.times, prepend=last)
+    steps = np.diff(chunk.times, prepend=read.last_time)
     steps[chunk.starts] = 0.0
     read.last_time = float(chunk.times[-1])
     read.seconds += float(steps.sum())
-    read.chunks += 1
     read.rows += len(steps)
     read.episodes += len(chunk.starts)
     read.jumps += chunk.jumps

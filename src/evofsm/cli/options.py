@@ -5,10 +5,12 @@ from __future__ import annotations
 import importlib
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import wraps
 from importlib.util import find_spec
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
@@ -17,10 +19,6 @@ from evofsm.extras import install
 if TYPE_CHECKING:
     from evofsm.driving import Family
     from evofsm.io import LogColumns, Topics, VehicleLengths
-
-    # How a log is read.
-    Reading = tuple[LogColumns, VehicleLengths, Topics | None]
-
 
 #: Where to drive.
 World = Literal["sumo", "kinematic"]
@@ -208,19 +206,27 @@ def family_of(name: str, switches: str) -> Family:
     return load_family(name).with_switches(split_names(switches))
 
 
+class Reading(NamedTuple):
+    """How a log is read."""
+
+    columns: LogColumns
+    lengths: VehicleLengths
+    topics: Topics | None
+
+
 def reading_of(
-    observe: str,
-    action: str,
-    time: str,
-    episode: str | None,
-    dt: float | None,
-    failed: str | None,
-    unit: list[str] | None,
-    topics: Path | None,
-    no_leader: str | None,
-    hold: float | None,
-    skip_bad: int,
-    vehicle_length: list[str] | None,
+    observe: Observed = "gap,v_follower,v_leader",
+    action: ActionColumn = "a_follower",
+    time: TimeColumn = "time",
+    episode: EpisodeColumns = None,
+    dt: Step = None,
+    failed: Failed = None,
+    unit: Units = None,
+    topics: TopicsFile = None,
+    no_leader: NoLeader = None,
+    hold: Hold = None,
+    skip_bad: SkipBad = SKIPPED,
+    vehicle_length: Lengths = None,
 ) -> Reading:
     """How a log is read, from the options of those names."""
     from evofsm.driving.naming import VARIABLES
@@ -256,7 +262,25 @@ def reading_of(
         skip_bad=skip_bad,
     )
     lengths = lengths_given(vehicle_length or ())
-    return columns, lengths, None if topics is None else Topics.load(topics)
+    return Reading(columns, lengths, None if topics is None else Topics.load(topics))
+
+
+def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
+    """A command that has the options of `reading_of` in place of its parameter ``reading``."""
+    options = signature(reading_of, eval_str=True).parameters
+
+    @wraps(command)
+    def run(**given: Any) -> Any:
+        reading = reading_of(**{name: given.pop(name) for name in options})
+        return command(**given, reading=reading)
+
+    taken = list[Parameter]()
+    for one in signature(command, eval_str=True).parameters.values():
+        taken += options.values() if one.name == "reading" else [one]
+    taken = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in taken]
+    run.__dict__["__signature__"] = Signature(taken)
+    run.__annotations__ = {one.name: one.annotation for one in taken}
+    return run
 
 
 def units_given(texts: Iterable[str]) -> dict[str, str]:

@@ -13,25 +13,20 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
-
-
-def screen() -> Console:
-    """Standard output: 80 columns in a pipe, and nothing in a text from a file is markup."""
-    from rich.console import Console
-
-    return Console(markup=False, highlight=False, emoji=False)
+    from rich.console import RenderableType
 
 
 def show(*parts: RenderableType) -> None:
     """Print texts and tables, without the spaces that fill lines up.
 
-    A table may be wider than the terminal: no number is ever cut in two.
+    A table may be wider than the terminal (80 columns in a pipe): no number is ever cut in two.
+    Nothing in a text from a file is markup.
     """
+    from rich.console import Console
     from rich.measure import Measurement
 
     for part in parts:
-        out = screen()
+        out = Console(markup=False, highlight=False, emoji=False)
         any_width = out.options.update(max_width=10_000)
         out.width = max(out.width, Measurement.get(out, any_width, part).minimum)
         with out.capture() as printed:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from evofsm.cli.options import split_names
-from evofsm.cli.show import facts, print_json, progress, show
+from evofsm.cli.show import print_json, progress, show, table
 from evofsm.driving import attach
 from evofsm.extras import needs
 
@@ -24,8 +24,13 @@ def run_configuration(
         came = drive_configuration(file, vehicles, mode, tolerance, move)
     if as_json:
         print_json(came)
-    else:
-        show(facts("What came of the simulation", _facts(came)))
+        return
+    title, alone = f"What came of {came['seconds']:,.0f} s", came["alone"]
+    runs = (came,) if alone is None else (alone, came)
+    rows = [(name, *map(tell, runs)) for name, tell in _TOLD.items()]
+    rows = [row for row in rows if any(row[1:])]
+    header = ("", "in shadow") if alone is None else ("", "alone", "guarded")
+    show(table(title, header, rows))
 
 
 def drive_configuration(
@@ -35,40 +40,51 @@ def drive_configuration(
     tolerance: float,
     move: Callable[..., None] = lambda **_: None,
 ) -> dict[str, Any]:
-    """What came of it: cars, collisions, speed, and what guarding did."""
+    """What came of it, as `Attachment.summary` has it; where guards act, without them as well."""
     by_ids = not (vehicles == "all" or vehicles.startswith("type:") or vehicles.endswith("%"))
-    with _running(file) as (sumo, steps):
-        chosen = split_names(vehicles) if by_ids else vehicles
-        guards = attach(sumo, chosen, mode=mode, tolerance=tolerance)
-        distance, drives = 0.0, 0
-        for seconds in steps:
-            distance += sum(map(sumo.vehicle.getSpeed, guards.cars))
-            drives += len(guards.cars)
-            if seconds == int(seconds):
-                move(description=f"Driving ({seconds:,.0f} s, {len(guards.collisions)} collisions)")
-        seconds, kinds = float(sumo.simulation.getTime()), sumo.vehicletype.getIDList()
-    if not guards.ever:
-        own = ", ".join(kind for kind in kinds if not kind.startswith("DEFAULT_"))
-        raise ValueError(
-            f"--vehicles {vehicles}: in {seconds:,.0f} s there was no such car, so nothing was "
-            f"guarded; types are {own or 'those of SUMO alone'}"
-        )
-    met, guarded, guarding = guards.collisions, guards.ever, guards.guarding
-    assert guarding is not None
-    return {
-        "configuration": str(file),
-        "vehicles": vehicles,
-        "mode": mode,
-        "seconds": seconds,
-        "guarded": len(guarded),
-        "collisions": len(met),  # of all cars
-        "of_guarded": sum(one.collider in guarded for one in met),  # which ran into another one
-        "into_guarded": sum(one.victim in guarded and one.collider not in guarded for one in met),
-        "speed": distance / drives if drives else 0.0,  # mean of the guarded cars [m/s]
-        "decisions": guarding.decisions,
-        "revised": guarding.revised,
-        "microseconds": 1e6 * guards.seconds / max(1, guarding.decisions),  # for a decision, in all
-    }
+    chosen = split_names(vehicles) if by_ids else vehicles
+
+    def driven(how: str) -> dict[str, Any]:
+        with _running(file) as (sumo, steps):
+            cars = attach(sumo, chosen, mode=how, tolerance=tolerance)
+            for seconds in steps:
+                if seconds == int(seconds):
+                    met = f"{len(cars.collisions)} collisions"
+                    move(description=f"Driving, {how} ({seconds:,.0f} s, {met})")
+            seconds, kinds = float(sumo.simulation.getTime()), sumo.vehicletype.getIDList()
+        if not cars.ever:
+            own = ", ".join(kind for kind in kinds if not kind.startswith("DEFAULT_"))
+            raise ValueError(
+                f"--vehicles {vehicles}: in {seconds:,.0f} s there was no such car, so nothing was "
+                f"guarded; types are {own or 'those of SUMO alone'}"
+            )
+        return {"seconds": seconds, **cars.summary()}
+
+    alone = driven("watch") if mode == "act" else None
+    told = {"configuration": str(file), "vehicles": vehicles, "mode": mode}
+    return {**told, **driven(mode), "alone": alone}
+
+
+def _share(what: str) -> Callable[[Mapping[str, Any]], str]:
+    """How many of the decisions; empty where nobody decided."""
+    return lambda came: f"{came[what] / came['decisions']:.1%}" if "decisions" in came else ""
+
+
+# What is told of a simulation, by what it is called.
+_TOLD: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "cars chosen": lambda came: f"{came['cars']:,}",
+    "collisions": lambda came: f"{came['collisions']:,}",
+    "  by chosen cars": lambda came: f"{came['of_guarded']:,}",
+    "  into chosen cars": lambda came: f"{came['into_guarded']:,}",
+    "hard brakes": lambda came: f"{came['hard_brakes']:,}",
+    "mean speed [m/s]": lambda came: f"{came['speed']:.2f}",
+    "time lost [s]": lambda came: f"{came['time_lost']:,.0f}",
+    "RMS jerk [m/s³]": lambda came: f"{came['jerk']:.2f}",
+    "decisions": lambda came: f"{came['decisions']:,}" if "decisions" in came else "",
+    "  speed limited": _share("limited"),
+    "  driving changed": _share("revised"),
+    "  µs each": lambda came: f"{came['microseconds']:.0f}" if "decisions" in came else "",
+}
 
 
 def trace_configuration(
@@ -117,16 +133,3 @@ def _running(file: Path, *options: str) -> Iterator[tuple[Any, Iterator[float]]]
         yield sumo, steps()
     finally:
         sumo.close()
-
-
-def _facts(came: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    acts = came["mode"] == "act"
-    yield "simulation", f"{came['configuration']}, {came['seconds']:,.0f} s"
-    yield "guarded", f"{came['guarded']:,} cars ({came['vehicles']}), {came['mode']}"
-    by, into = f"{came['of_guarded']:,} by guarded cars", f"{came['into_guarded']:,} by others"
-    yield "collisions", f"{came['collisions']:,}: {by}, {into} into them"
-    yield "mean speed", f"{came['speed']:.2f} m/s of guarded cars"
-    share = came["revised"] / max(1, came["decisions"])
-    what = "held back" if acts else "would have held back"
-    yield "guards", f"{what} {share:.1%} of {came['decisions']:,} decisions"
-    yield "overhead", f"{came['microseconds']:.0f} µs a decision"

@@ -37,7 +37,7 @@ def guard_of_monitor(
 
 def guard_of_traffic(interval: float, brakes: float, tolerance: float = TOLERANCE) -> Guard:
     """The same among any number of objects, who is behind included; it learns nothing."""
-    judge = TrafficRisk(_ahead(interval, brakes), -brakes, HIGHEST)
+    judge = TrafficRisk(_ahead(interval, brakes))
     settings: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW}
     return guard_for_traffic(-brakes, HIGHEST, brakes, interval, judge=judge, **settings)
 
@@ -48,7 +48,7 @@ def assumptions(brakes: float, tolerance: float) -> str:
     return (
         f"assumed: the own car brakes with {brakes:g} m/s² (--brakes), {share:.0%} of leaders' "
         f"hard brakes are in full ({_FULL:g} m/s²), the others as in public drives; "
-        f"alarm above a risk of {tolerance:.3g} (--tolerance)"
+        f"a risk of {tolerance:.3g} is accepted (--tolerance)"
     )
 
 

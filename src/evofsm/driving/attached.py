@@ -18,25 +18,32 @@ import time as clock
 import warnings
 import weakref
 import zlib
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving.judge import LatentRisk
+from evofsm.driving.judge import REGAIN, SLIGHT, LatentRisk
 from evofsm.driving.leaders import BrakeWatch, Manoeuvres
 from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 from evofsm.driving.naming import VARIABLES
 from evofsm.driving.scenarios import steps_between
-from evofsm.driving.traffic import COLUMNS, LEADER_DECEL, Role, TrafficRisk, guard_for_traffic
+from evofsm.driving.traffic import COLUMNS, Role, TrafficRisk, guard_for_traffic
 from evofsm.guard import TOLERANCE, ActionJudge, ActionReviser, Guard, Mode, Revision
 
 # What is done with the chosen cars.
 _MODES = ("act", "shadow", "watch")
 _TYPE = "type:"
+# Leaders are taken to brake so hard, until enough was seen [m/s²]: SUMO's usual ``decel``. In an
+# emergency they brake harder, and so does whoever follows.
+_LEADER_DECEL = 4.5
+# What is seen is so exact [m/s²].
+_EXACT = 0.05
+# Braking harder than this is hard [m/s²].
+_HARD = 5.0
 # Clocks of SUMO count thousandths; two times that differ by less are one [s].
 _TICK = 5e-4
 _SKIPPED = (
@@ -49,6 +56,14 @@ _OVERRULED = (
 )
 # So much faster than was set [m/s], in so many steps.
 _FASTER, _OFTEN = 0.05, 5
+_MESOSCOPIC = (
+    "this is SUMO's mesoscopic simulation (--mesosim), in which no car has a leader, so that a "
+    "guard would see nobody. Attach to a microscopic one, without --mesosim"
+)
+_DEAF = (
+    "{} cars were attached to in {} steps, and a guard decided in none: SUMO told nobody ahead or "
+    "behind of any. Do they share lanes?"
+)
 _NUMBERS = itertools.count()
 _ATTACHED: weakref.WeakSet[Attachment] = weakref.WeakSet()
 # Two that touched within this time before still do [s].
@@ -56,8 +71,14 @@ _SAME_COLLISION = 5.0
 # How far one looks at least [m]; further by what it takes to stop.
 _NEAR, _GENTLE = 30.0, 3.0
 _WIDTH = 1.8
-# A speed that is lower by no more is what the driver wanted [m/s].
-_SAME = 1e-6
+# Nobody is nearer in what is judged [m]. SUMO keeps minGap itself: what is kept beside it [m].
+_NEAREST, _MARGIN = 0.05, 0.1
+# Limits are as coarse as that [m/s²], and so far a driver may want more.
+_COARSE = 0.3
+# Slower than this a car stands, and a speed that differs by no more is the same [m/s].
+_STANDS, _SAME = 0.1, 1e-6
+# So many cars in so many steps without a decision are no accident.
+_MANY_CARS, _MANY_STEPS = 10, 2000
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
 # and 1), but braking as hard as it has to (bit 2). Red lights and right of way stay as they were.
 _ON, _OFF = 0b011, 0b100
@@ -81,6 +102,7 @@ class _Facts(NamedTuple):
     length: float  #: [m]
     min_gap: float  #: [m]
     decel: float  #: [m/s²]
+    late: bool  #: whether it decides less often than in each step, and goes on in between
 
 
 class Seeing:
@@ -88,12 +110,15 @@ class Seeing:
 
     def __init__(self, sumo: Any) -> None:
         self._vehicle, self._simulation = sumo.vehicle, sumo.simulation
+        self._kinds = sumo.vehicletype
         self._bodies: dict[str, _Facts] = {}
         self.look_up()
 
     def look_up(self) -> None:
         """Look up what holds in this simulation; no car of another one is known."""
         simulation = self._simulation
+        if str(simulation.getOption("mesosim")).lower() in ("true", "1"):
+            raise ValueError(_MESOSCOPIC)
         factor = float(simulation.getOption("collision.mingap-factor"))
         # Share of minGap that SUMO wants kept; below 0 each model has its own, at most all of it.
         self._factor = factor if factor >= 0.0 else 1.0
@@ -101,12 +126,20 @@ class Seeing:
         self.dt = float(simulation.getDeltaT())
         ballistic = str(simulation.getOption("step-method.ballistic")).lower() in ("true", "1")
         # In SUMO's Euler step a car drives all of it at the speed of its end. Against what is
-        # rehearsed, a slower follower is nearer by half a step's worth of the difference; and
-        # whoever brakes to a standstill within a step gets further by up to an eighth of its
-        # braking over the square of the step. What the Euler step adds to the gap is not counted:
-        # with an actionStepLength in any type SUMO steps ballistically, and no option says so.
+        # rehearsed, a faster follower gets less far by half a step's worth of the difference, and a
+        # slower one further; whoever brakes to a standstill within a step, too, by up to an eighth
+        # of its braking over the square of the step.
         self._euler = 0.0 if ballistic else self.dt
+        self._known: set[str] = set()
         self._bodies.clear()
+
+    def look_at_kinds(self) -> None:
+        """With an actionStepLength in any type SUMO steps ballistically, and no option says so."""
+        if self._euler and self._kinds.getIDCount() != len(self._known):
+            new = set(self._kinds.getIDList()) - self._known
+            self._known |= new
+            if any(self._kinds.getActionStepLength(each) > self.dt + _TICK for each in new):
+                self._euler = 0.0
 
     def forget(self, car: str) -> None:
         """It has left."""
@@ -117,7 +150,8 @@ class Seeing:
         body = self._bodies.get(car)
         if body is None:
             vehicle = self._vehicle
-            facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car)
+            late = vehicle.getActionStepLength(car) > self.dt + _TICK
+            facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car), late
             body = self._bodies[car] = _Facts(*facts)
         return body
 
@@ -158,8 +192,11 @@ class Seeing:
 
     def _room(self, gap: float, follower: _Facts, closing: float) -> float:
         euler = self._euler
-        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * min(0.0, closing)
-        return gap + (1.0 - self._factor) * follower.min_gap - late
+        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * closing
+        # Who is nearer than SUMO lets anybody be stands in a queue, or beside, where lanes merge.
+        # Across a junction SUMO says 0 of all that is nearer than minGap.
+        kept = (1.0 - self._factor) * follower.min_gap if gap else 0.0
+        return max(gap + kept - late, _NEAREST)
 
     def rows(
         self, car: str, speed: float, ahead: Neighbour | None, behind: Neighbour | None
@@ -167,11 +204,12 @@ class Seeing:
         """The scene as `Scene.rows` has it, x counted from the front bumper of the car."""
         rows = np.zeros((3, len(COLUMNS)))  # oneself, ahead and behind
         length = self.body(car).length
-        rows[0] = 1.0, -0.5 * length, 0.0, speed, 0.0, length, _WIDTH
+        rows[0] = 1.0, -0.5 * length, 0.0, speed, 0.0, length, _WIDTH, 0.0
         for row, one, from_, way in ((rows[1], ahead, 0.0, 1.0), (rows[2], behind, -length, -1.0)):
             if one is not None:
-                its = self.body(one.id).length
-                row[:] = 1.0, from_ + way * (one.room + 0.5 * its), 0.0, one.speed, 0.0, its, _WIDTH
+                its, ax = self.body(one.id).length, self._vehicle.getAcceleration(one.id)
+                x = from_ + way * (one.room + 0.5 * its)
+                row[:] = 1.0, x, 0.0, one.speed, 0.0, its, _WIDTH, ax
         return rows.ravel()
 
 
@@ -220,22 +258,24 @@ class Guarding:
         seeing: Seeing,
         guard: Guard | None,
         acts: bool,
-        tolerance: float,
+        settings: Mapping[str, float],
         learn: bool,
         report: Callable[[GuardedStep], None] | None,
     ) -> None:
-        self._vehicle, self._seeing, self._acts, self._report = sumo.vehicle, seeing, acts, report
-        self._template, self._tolerance, self._learn = guard, tolerance, learn
+        self._sumo, self._vehicle, self._seeing = sumo, sumo.vehicle, seeing
+        self._acts, self._report = acts, report
+        self._template, self._settings, self._learn = guard, settings, learn
         self._judges: dict[tuple[float, float, float], TrafficRisk] = {}
         self.cars: dict[str, _Car] = {}  #: by id
         self._watches: dict[str, BrakeWatch] = {}
-        self.leaders = _leaders_of(guard)  #: how hard they were seen to brake
-        if guard is not None:
-            self._tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
+        #: How hard they were seen to brake.
+        self.leaders = _leaders_of(guard, settings["leader_decel"])
         self.begin_anew()
         self.decisions = 0
-        #: Steps in which a car drove slower than its driver wanted; in shadow, would have.
+        #: Steps in which a car braked harder, or accelerated less, than its driver wanted by more
+        #: than 0.1 m/s²; in shadow, would have. Who stands, and goes on standing, is not counted.
         self.revised = 0
+        self.limited = 0  #: steps in which a guard set a limit to the speed of a car
         self.overruled = 0  #: steps in which a car drove faster than its guard had set
 
     def begin_anew(self) -> None:
@@ -284,7 +324,7 @@ class Guarding:
     def _look(self, one: _Car, speed: float, time: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
         ahead = self._seeing.ahead(one.id, speed)
-        scene = isinstance(one.guard.reviser.risk, TrafficRisk)  # type: ignore[attr-defined]
+        scene = isinstance(_judge(one.guard), TrafficRisk)
         # Who is behind matters only where one brakes: if acting, because somebody is ahead.
         alone = ahead is None and self._acts
         behind = self._seeing.behind(one.id, speed) if scene and not alone else None
@@ -306,7 +346,7 @@ class Guarding:
         assert one.seen is not None
         one.revision = one.guard.decide(one.seen, proposal)
         self.decisions += 1
-        judge = one.guard.reviser.risk  # type: ignore[attr-defined]
+        judge = _judge(one.guard)
         if isinstance(judge, TrafficRisk) and judge.worst is not None:
             other = one.around[judge.worst.number - 1]
             one.about = ("" if other is None else other.id, judge.worst.role)
@@ -319,13 +359,18 @@ class Guarding:
         if revision is None or revision.executed >= one.high:
             self._hand_back(one)
             return
-        if one.mode is None:
-            one.mode = self._vehicle.getSpeedMode(one.id)
-            self._vehicle.setSpeedMode(one.id, one.mode & ~_OFF | _ON)
         reached = max(0.0, speed + float(revision.executed) * self._seeing.dt)
         # Nor faster than it would drive on a free road.
         one.limit = min(reached, self._vehicle.getAllowedSpeed(one.id))
         one.wish = self._seeing.wish(one.id, speed, one.around[0])
+        late = self._seeing.body(one.id).late
+        if not late and one.wish <= one.limit + _COARSE * self._seeing.dt:
+            self._hand_back(one)  # it drives as it would by itself, with its imperfections
+            return
+        if one.mode is None:
+            one.mode = self._vehicle.getSpeedMode(one.id)
+            self._vehicle.setSpeedMode(one.id, one.mode & ~_OFF | _ON)
+        self.limited += 1
         self._vehicle.setSpeed(one.id, one.limit)
 
     def _hand_back(self, one: _Car) -> None:
@@ -350,16 +395,21 @@ class Guarding:
             self._decide(one, wish)
         revision = one.revision
         assert revision is not None
-        if self._acts:
-            self.revised += speed < wanted - _SAME
-        else:
-            self.revised += bool(revision.advised < wish - _SAME)
+        stands = max(one.speed, speed, wanted) < _STANDS
+        allowed = deed if self._acts else float(revision.advised)
+        self.revised += not stands and allowed < wish - SLIGHT
         if self._report is not None:
             self._report(GuardedStep(one.time, one.id, wish, deed, revision, *one.about))
 
     def _watch(self, speeds: dict[str, float]) -> None:
-        """Learn how hard leaders brake, each by itself, whoever follows it."""
+        """Learn how hard leaders brake, each by itself, whoever follows it.
+
+        What a guard makes a car do is not what leaders do: it is not learnt.
+        """
         ended = []
+        for held in _held_back(self._sumo):
+            speeds.pop(held, None)
+            self._watches.pop(held, None)
         for leader, speed in speeds.items():
             if leader not in self._watches:
                 self._watches[leader] = BrakeWatch(self.interval)
@@ -375,48 +425,55 @@ class Guarding:
         if self._template is None:
             decel = self._vehicle.getDecel(car)
             limits = -max(self._vehicle.getEmergencyDecel(car), decel), high, decel
-            how: dict[str, Any] = {"tolerance": self._tolerance, "mode": mode}
-            return guard_for_traffic(*limits, self.interval, judge=self._judge_for(*limits), **how)
+            how: dict[str, Any] = {"tolerance": self._settings["tolerance"], "mode": mode}
+            return guard_for_traffic(*limits, self.interval, judge=self._judge_for(limits), **how)
         guard = self._template.copy()
         guard.freeze()
-        reviser = guard.reviser
-        assert isinstance(reviser, ActionReviser)
-        reviser.mode = mode
-        latent = _latent(reviser.risk)
-        if isinstance(latent, LatentRisk):
+        if isinstance(guard.reviser, ActionReviser):
+            guard.reviser.mode = mode
+        if isinstance(latent := _of_pair(_judge(guard)), LatentRisk):
             latent.manoeuvres = self.leaders
         return guard
 
-    def _judge_for(self, low: float, high: float, decel: float) -> TrafficRisk:
+    def _judge_for(self, limits: tuple[float, float, float]) -> TrafficRisk:
         """One for all cars that can do the same: it remembers nothing of any."""
-        judge = self._judges.get((low, high, decel))
+        judge = self._judges.get(limits)
         if judge is None:
-            ahead = LatentRisk.given(-decel, decel, LEADER_DECEL, self.interval)
-            ahead.manoeuvres = self.leaders
-            judge = TrafficRisk(ahead, low, high)
-            self._judges[low, high, decel] = judge
+            decel, settings = limits[2], self._settings
+            how = {"margin": _MARGIN, "regain": settings["regain"]}
+            given = -decel, decel, settings["leader_decel"], self.interval
+            judge = self._judges[limits] = TrafficRisk(LatentRisk.given(*given, **how))
+            judge.ahead.manoeuvres = self.leaders
         return judge
 
 
-def _latent(judge: ActionJudge) -> ActionJudge:
+def _held_back(sumo: Any) -> set[str]:
+    """Cars that a guard makes drive otherwise now, whoever attached it."""
+    guarding = [one.guarding for one in _ATTACHED if one._sumo is sumo and one.guarding]
+    return {car for one in guarding for car, each in one.cars.items() if each.mode is not None}
+
+
+def _judge(guard: Guard) -> ActionJudge | None:
+    """Who judges actions; None where a formula alone decides, as in an `EnvelopeReviser`."""
+    return getattr(guard.reviser, "risk", None)
+
+
+def _of_pair(judge: ActionJudge | None) -> ActionJudge | None:
     """Who judges a pair, in which it is a `LatentRisk` that learns how hard leaders brake."""
     return judge.ahead if isinstance(judge, TrafficRisk) else judge
 
 
-def _leaders_of(guard: Guard | None) -> Manoeuvres:
+def _leaders_of(guard: Guard | None, leader_decel: float) -> Manoeuvres:
     """What a guard knows of leaders; what is assumed without one."""
-    if guard is None:
-        return Manoeuvres(LEADER_DECEL)
-    if not isinstance(guard.reviser, ActionReviser):
-        raise TypeError(f"the guard has a {type(guard.reviser).__name__}; it needs a judge")
-    judge = _latent(guard.reviser.risk)
-    if judge.labels.names != VARIABLES:
+    judge = None if guard is None else _of_pair(_judge(guard))
+    if judge is not None and judge.labels.names != VARIABLES:
         raise ValueError(
             f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must be a "
             f"TrafficRisk, or observe {', '.join(VARIABLES)}"
         )
-    known = judge.manoeuvres if isinstance(judge, LatentRisk) else Manoeuvres(LEADER_DECEL)
-    return copy.deepcopy(known)
+    # How hard SUMO's cars brake is exactly known, and has an end.
+    assumed = Manoeuvres(leader_decel, width=_EXACT)
+    return copy.deepcopy(judge.manoeuvres if isinstance(judge, LatentRisk) else assumed)
 
 
 # -- Which cars, and what came of them ------------------------------------------------------------
@@ -428,7 +485,8 @@ def choose(vehicles: str | float | Iterable[str], seed: int = 0) -> Callable[[An
         return lambda sumo, car: True
     if isinstance(vehicles, str) and vehicles.startswith(_TYPE):
         kind = vehicles.removeprefix(_TYPE)
-        return lambda sumo, car: sumo.vehicle.getTypeID(car) == kind
+        # A type of which a script changed anything for one car is called NAME@car.
+        return lambda sumo, car: f"{sumo.vehicle.getTypeID(car)}@".startswith(f"{kind}@")
     if isinstance(vehicles, (str, int, float)):
         text = str(vehicles)
         try:
@@ -481,6 +539,47 @@ class Watching:
             self.highest_drac[car] = max(drac, self.highest_drac.get(car, drac))
 
 
+@dataclass
+class _Ride:
+    """How some cars drove: what guards cost, or what happened without them."""
+
+    dt: float
+    seconds: float = 0.0  # summed over the cars
+    metres: float = 0.0
+    lost: float = 0.0  # of that time, against the speed that each would drive on a free road [s]
+    hard_brakes: int = 0
+    jerks: float = 0.0  # sum of squares
+    _latest: dict[str, tuple[float, float]] = field(default_factory=dict)  # speed, acceleration
+
+    def see(self, car: str, speed: float, free: float) -> None:
+        """Take in the speed of a car after a step, and that on a free road [m/s]."""
+        dt = self.dt
+        self.seconds += dt
+        self.metres += speed * dt
+        self.lost += dt * max(0.0, 1.0 - speed / free) if free > 0.0 else 0.0
+        before, was = self._latest.get(car, (speed, 0.0))
+        acceleration = (speed - before) / dt
+        self.hard_brakes += acceleration < -_HARD <= was
+        self.jerks += (acceleration - was) ** 2 / dt
+        self._latest[car] = speed, acceleration
+
+    def forget(self, cars: Iterable[str]) -> None:
+        """These have left."""
+        for car in cars:
+            self._latest.pop(car, None)
+
+    def told(self) -> dict[str, float]:
+        """What it came to, by name."""
+        seconds = self.seconds or math.nan
+        return {
+            "car_seconds": self.seconds,
+            "speed": self.metres / seconds,  # [m/s]
+            "hard_brakes": self.hard_brakes,  # harder than 5 m/s²
+            "jerk": math.sqrt(self.jerks / seconds),  # root of the mean square [m/s³]
+            "time_lost": self.lost,  # [s]
+        }
+
+
 class Collision(NamedTuple):
     """A collision, told once for the two."""
 
@@ -508,9 +607,11 @@ class Attachment:
         self._known: set[str] = set()
         self._met: dict[tuple[str, str], float] = {}
         self._listener: int | None = None
+        self._was_deaf = False
         self.collisions: list[Collision] = []  #: of the whole simulation, other cars included
         self.ever: set[str] = set()  #: vehicles that were guarded, or watched, at any time
         self.looked = 0  #: cars that were looked at, summed over the steps
+        self._ride = _Ride(seeing.dt)
         self.seconds = 0.0  #: that the attachment took
 
     @property
@@ -562,12 +663,49 @@ class Attachment:
                 warnings.warn(_SKIPPED, RuntimeWarning, stacklevel=2)
             self._begin_anew()
         self._now = now
+        self._seeing.look_at_kinds()
         self._count_cars()
         self._count_collisions(now)
         self.looked += len(self._cars.cars)
+        vehicle = self._sumo.vehicle
+        for car in self._cars.cars:
+            self._ride.see(car, vehicle.getSpeed(car), vehicle.getAllowedSpeed(car))
         self._cars.step(now)
+        self._say_if_deaf()
         self.seconds += clock.perf_counter() - begin
         return True
+
+    def _say_if_deaf(self) -> None:
+        guarding = self.guarding
+        is_many = self.looked > _MANY_STEPS and len(self.ever) >= _MANY_CARS
+        if is_many and not self._was_deaf and guarding is not None and not guarding.decisions:
+            self._was_deaf = True
+            said = _DEAF.format(len(self.ever), f"{self.looked:,}")
+            warnings.warn(said, RuntimeWarning, stacklevel=4)
+
+    def summary(self) -> dict[str, float]:
+        """What came of the cars that are, or were, guarded or watched; numbers by name.
+
+        ``cars``; ``car_seconds`` that they drove, in all; ``collisions`` of all cars,
+        ``of_guarded`` those in which one of them ran into another, ``into_guarded`` those in which
+        another ran into one of them; mean ``speed`` [m/s]; ``hard_brakes``, each harder than 5 m/s²
+        and counted once; RMS ``jerk`` [m/s³]; ``time_lost`` against driving on a free road [s].
+        Where guards decided, ``decisions``, ``limited`` (steps with a limit to the speed),
+        ``revised`` (those that changed what the driver wanted, `Guarding.revised`), and
+        ``microseconds`` for each decision, all that guarding takes.
+        """
+        met, ours, guarding = self.collisions, self.ever, self.guarding
+        told = {
+            "cars": len(ours),
+            "collisions": len(met),
+            "of_guarded": sum(one.collider in ours for one in met),
+            "into_guarded": sum(one.victim in ours and one.collider not in ours for one in met),
+            **self._ride.told(),
+        }
+        if guarding is not None and guarding.decisions:
+            told |= {name: getattr(guarding, name) for name in ("decisions", "limited", "revised")}
+            told["microseconds"] = 1e6 * self.seconds / guarding.decisions
+        return told
 
     def _is_new(self) -> bool:
         return bool(self._sumo.simulation.getParameter("", self._key) != "1")
@@ -578,6 +716,7 @@ class Attachment:
         for car in here.intersection(self.cars):
             self._cars.remove(car)
         self._cars.cars.clear()
+        self._ride.forget(self._known)
         self._known.clear()
         self._met.clear()
         self._seeing.look_up()
@@ -591,6 +730,7 @@ class Attachment:
             if self._chosen(self._sumo, car):
                 self._cars.add(car)
                 self.ever.add(car)
+        self._ride.forget(self._known - here)
         for car in self._known - here:
             self._cars.cars.pop(car, None)
             self._seeing.forget(car)
@@ -611,6 +751,8 @@ def attach(
     guard: Guard | None = None,
     mode: str = "act",
     tolerance: float = TOLERANCE,
+    leader_decel: float = _LEADER_DECEL,
+    regain: float = REGAIN,
     learn: bool = True,
     seed: int = 0,
     report: Callable[[GuardedStep], None] | None = None,
@@ -629,13 +771,20 @@ def attach(
         ``"all"``, ``"type:NAME"``, a share such as 0.1 or ``"10%"``, or ids; those to come as well.
     guard : Guard, optional
         Each car gets a copy, frozen. It observes scenes (`guard_for_traffic`) or gap and speeds
-        (`guard_for_cars`). Without one, each knows the car's own limits: it counts on SUMO's
-        ``decel`` and brakes up to ``emergencyDecel`` where it has to.
+        (`guard_for_cars`, or `Guard.of` an `EnvelopeReviser`). Without one, each knows the car's
+        own limits: it counts on SUMO's ``decel`` and brakes up to ``emergencyDecel`` where it has
+        to.
     mode : {"act", "shadow", "watch"}
         Whether guards act, only say what they would do, or there are none: then only time to
         collision and needed deceleration are measured.
     tolerance : float
-        Highest risk that is accepted; a ``guard`` has its own.
+        Highest risk that is accepted. A ``guard`` has its own, and so it has the next two.
+    leader_decel : float
+        Until enough was seen, leaders are assumed to brake so hard [m/s²]. SUMO's cars brake by
+        4.5 m/s² unless in an emergency, in which whoever follows brakes harder, too.
+    regain : float
+        Within this time a gap that is not safe, such as after a lane change, is to be safe again
+        [s], by no more braking than that takes; see `LatentRisk`.
     learn : bool
         Whether the guards learn how hard leaders brake, all of them from what each sees.
     seed : int
@@ -646,10 +795,8 @@ def attach(
     Raises
     ------
     ValueError
-        If there is no such mode or choice of vehicles, or the guard decides at other times than
-        those of steps, or observes something else.
-    TypeError
-        If the guard has no judge.
+        If there is no such mode or choice of vehicles, the simulation is mesoscopic, or the guard
+        decides at other times than those of steps, or observes something else.
 
     Notes
     -----
@@ -677,7 +824,8 @@ def attach(
     chosen, seeing = choose(vehicles, seed), Seeing(sumo)
     cars: Guarding | Watching = Watching(seeing)
     if mode != "watch":
-        cars = Guarding(sumo, seeing, guard, mode == "act", tolerance, learn, report)
+        settings = {"tolerance": tolerance, "leader_decel": leader_decel, "regain": regain}
+        cars = Guarding(sumo, seeing, guard, mode == "act", settings, learn, report)
     attachment = Attachment(sumo, chosen, seeing, cars)
     attachment.listen()
     return attachment

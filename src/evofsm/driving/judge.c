@@ -109,17 +109,18 @@ static void be_cautious(const evofsm_state *s, double cautious[3]) {
 
 /* -- Rehearsal: survives and critical_decelerations ---------------------------------------------- */
 
-/* Distance covered in an interval; the speed is changed. No one drives backwards. */
-static double drive_on(double *speed, double acceleration) {
-  const double was = *speed, reached = was + acceleration * EVOFSM_INTERVAL;
+/* Distance covered in a time; the speed is changed. No one drives backwards. */
+static double drive_on(double *speed, double acceleration, double dt) {
+  const double was = *speed, reached = was + acceleration * dt;
   *speed = reached >= 0.0 ? reached : 0.0;
-  return reached >= 0.0 ? 0.5 * (was + reached) * EVOFSM_INTERVAL : -0.5 * was * was / acceleration;
+  return reached >= 0.0 ? 0.5 * (was + reached) * dt : -0.5 * was * was / acceleration;
 }
 
-/* Whether no collision comes of an acceleration and full braking after it. */
-static int survives(const double here[3], double acceleration, double before, double leader_decel) {
+/* Whether no collision comes of an acceleration and full braking after it, for a smallest gap. */
+static int survives(const double here[3], double acceleration, double before, double leader_decel,
+                    double clearance) {
   const double caution = -DECEL;
-  double gap = here[0] - CLEARANCE, speed = greater(here[1], 0.0), leader = greater(here[2], 0.0);
+  double gap = here[0] - clearance, speed = greater(here[1], 0.0), leader = greater(here[2], 0.0);
   double asked = greater(acceleration, caution), last = greater(before, caution);
   double left, closing;
   int t;
@@ -127,8 +128,8 @@ static int survives(const double here[3], double acceleration, double before, do
     return here[0] > 0.0;
   }
   for (t = 0; t < 2 && gap > 0.0 && !(asked == caution && last == caution); t++) {
-    const double driven = drive_on(&speed, LAG * last + (1.0 - LAG) * asked);
-    gap += drive_on(&leader, -leader_decel) - driven;
+    const double driven = drive_on(&speed, LAG * last + (1.0 - LAG) * asked, EVOFSM_INTERVAL);
+    gap += drive_on(&leader, -leader_decel, EVOFSM_INTERVAL) - driven;
     last = asked;
     asked = caution;
   }
@@ -144,21 +145,55 @@ static int survives(const double here[3], double acceleration, double before, do
 static double critical_of(const double here[3], double acceleration, double before) {
   double low = 0.0, high = HARDEST;
   int i;
-  if (survives(here, acceleration, before, high)) {
+  if (survives(here, acceleration, before, high, CLEARANCE)) {
     return HARDEST;
   }
-  if (!survives(here, acceleration, before, low)) {
+  if (!survives(here, acceleration, before, low, CLEARANCE)) {
     return 0.0;
   }
   for (i = 0; i < HALVINGS; i++) {
     const double between = 0.5 * (low + high);
-    if (survives(here, acceleration, before, between)) {
+    if (survives(here, acceleration, before, between, CLEARANCE)) {
       low = between;
     } else {
       high = between;
     }
   }
   return low;
+}
+
+/* foresee: whether full braking after an acceleration avoids what is seen, and whether it, held for
+   a time, has regained a safe gap. */
+static int avoids(const double here[3], double acceleration, double before, double braking) {
+  double near[3];
+  near[0] = greater(here[0], TOUCHING);
+  near[1] = here[1];
+  near[2] = here[2];
+  return survives(near, acceleration, before, braking, lesser(CLEARANCE, 0.5 * near[0]));
+}
+
+static int regains(const double here[3], double acceleration, double braking) {
+  double then[3];
+  then[1] = greater(here[1], 0.0);
+  then[2] = greater(here[2], 0.0);
+  then[0] = here[0] + drive_on(&then[2], -braking, REGAIN);
+  then[0] -= drive_on(&then[1], acceleration, REGAIN);
+  return survives(then, -DECEL, -DECEL, WORST, CLEARANCE);
+}
+
+/* LatentRisk._leader_braking: since the observation before, if it is the same leader. */
+static double leader_braking(const evofsm_state *s) {
+  const double *was = s->mean, *now = s->here, dt = EVOFSM_INTERVAL;
+  double expected_gap;
+  if (!s->is_located) {
+    return 0.0;
+  }
+  expected_gap = was[0] + 0.5 * dt * (was[2] + now[2] - was[1] - now[1]);
+  if (fabs(now[2] - was[2]) > HARDEST * dt + ANOTHER_SPEED ||
+      fabs(now[0] - expected_gap) > ANOTHER_GAP) {
+    return 0.0;
+  }
+  return greater((was[2] - now[2]) / dt, 0.0);
 }
 
 /* _interpolated: how likely a leader brakes harder, by the table. At most TABLE halvings. */
@@ -193,26 +228,49 @@ static void bounds(double share, double *low, double *high) {
 
 /* -- The reviser: ActionReviser._decide ---------------------------------------------------------- */
 
-/* Of options whose risk is tolerated the closest to an action, of equals the first; -1: none is. */
-static int closest(const evofsm_state *s, double action, double tolerated) {
+/* Of options not below an action whose risk is tolerated the closest to another one, of equals the
+   first; -1: none is. */
+static int closest(const evofsm_state *s, double action, double tolerated, double lowest) {
   int i, best = -1;
   for (i = 0; i < EVOFSM_OPTIONS; i++) {
     const double off = fabs(s->options[i] - action);
-    if (s->risk[i] <= tolerated && (best < 0 || off < fabs(s->options[best] - action))) {
+    if (s->options[i] >= lowest && s->risk[i] <= tolerated && (best < 0 || off < fabs(s->options[best] - action))) {
       best = i;
     }
   }
   return best;
 }
 
-static int decide_by_risk(evofsm_state *s, int *reason) {
+/* in_proportion: the closest tolerable one that is gentle, else the least braking that avoids what
+   is seen and regains a safe gap; -1: none. */
+static int in_proportion(const evofsm_state *s, const double here[3], double limit, int *reason) {
+  const double braking = lesser(leader_braking(s), WORST), wanted = s->options[0];
+  const double gentle = lesser(-COMFORT, wanted);
+  int i, best = closest(s, wanted, limit, gentle);
+  best = best < 0 ? closest(s, wanted, TOLERANCE, gentle) : best;
+  if (best >= 0) {
+    return best;
+  }
+  *reason = EVOFSM_REGAINED;
+  for (i = 0; i < EVOFSM_OPTIONS; i++) {
+    const double option = s->options[i];
+    if (option <= wanted && (best < 0 || option > s->options[best]) &&
+        avoids(here, option, s->commanded, braking) &&
+        (option <= -COMFORT || regains(here, option, braking))) {
+      best = i;
+    }
+  }
+  return best;
+}
+
+static int decide_by_risk(evofsm_state *s, const double here[3], int *reason) {
   const double limit = TOLERANCE * (s->revising ? RELEASE : 1.0);
   int i, least = 0, best;
   *reason = EVOFSM_TRIED;
   if (s->tries > 0 && !KNOWN) {
     s->tries--;
     *reason = EVOFSM_TRYING;
-    return closest(s, LOWEST, INFINITY);
+    return closest(s, LOWEST, INFINITY, -INFINITY);
   }
   if (s->risk[0] <= limit) {
     s->revising = 0;
@@ -222,11 +280,18 @@ static int decide_by_risk(evofsm_state *s, int *reason) {
   s->revising = 1;
   if (!KNOWN && ACTS) {
     s->tries = TRIAL;
-    return closest(s, LOWEST, INFINITY);
+    return closest(s, LOWEST, INFINITY, -INFINITY);
   }
   *reason = EVOFSM_CHANGED;
-  best = closest(s, s->options[0], limit);
-  best = best < 0 ? closest(s, s->options[0], TOLERANCE) : best;
+  best = is_whole(here) ? in_proportion(s, here, limit, reason) : -1;
+  if (best >= 0) {
+    s->revising = best != 0;
+    *reason = best != 0 ? *reason : EVOFSM_REGAINS;
+    return best;
+  }
+  *reason = EVOFSM_CHANGED;
+  best = closest(s, s->options[0], limit, -INFINITY);
+  best = best < 0 ? closest(s, s->options[0], TOLERANCE, -INFINITY) : best;
   if (best >= 0) {
     return best;
   }
@@ -262,7 +327,7 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
     s->critical[i] = is_whole(here) ? critical_of(here, s->options[i], s->commanded) : 0.0;
     s->risk[i] = is_whole(here) ? harder_than(s->critical[i]) : 1.0;
   }
-  best = decide_by_risk(s, &out->reason);
+  best = decide_by_risk(s, here, &out->reason);
   s->best[0] = s->options[best];
   out->evidence = EVIDENCE;
   out->risk_proposed = s->risk[0];

@@ -7,6 +7,10 @@ and too late. What leads to it can be learnt from every ordinary minute: how har
 leader that still ends well is the critical deceleration, and the latent risk is the probability
 that the leader brakes harder than that. A situation is a dead end where, if the leader braked hard
 now, even braking in full at once would be too late; while it does not, that can still be left.
+
+It is left *in proportion*. What could begin is answered by a comfortable deceleration at most.
+Harder braking answers what is seen: it is the least that avoids the collision that is foreseen if
+the leader goes on as it does. A gap that is not safe is to be safe again within a stated time.
 """
 
 from __future__ import annotations
@@ -20,12 +24,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
-from evofsm.driving import perception, rehearsal
+from evofsm.driving import leaders, perception, rehearsal
 from evofsm.driving.brakes import OwnBrakes, hardest_seen
-from evofsm.driving.leaders import BrakeWatch, LeaderBrakes, Manoeuvres
+from evofsm.driving.leaders import BrakeWatch, LeaderBrakes, Manoeuvres, is_another
 from evofsm.driving.naming import LABELS, RANGES
-from evofsm.driving.perception import Perception, is_whole
-from evofsm.driving.rehearsal import HARDEST, Body, Three, critical_decelerations
+from evofsm.driving.perception import Estimate, Perception, is_whole
+from evofsm.driving.rehearsal import HARDEST, Body, Three, critical_decelerations, foresee
 from evofsm.driving.revisers import GENTLE_BRAKE
 from evofsm.fsm.kernels import compiled, inner_kernel
 from evofsm.fsm.machine import EvolvingFSM
@@ -51,6 +55,11 @@ if TYPE_CHECKING:
     from evofsm.guard import ActionReviser
     from evofsm.guard.export import Part
 
+#: Braking that needs no collision to be foreseen [m/s²], and the time in which a gap that is not
+#: safe is to be safe again [s], as the study ``traffic`` chose them.
+COMFORT, REGAIN = 3.0, 1.0
+#: An acceleration that differs by no more is the same to whoever drives [m/s²].
+SLIGHT = 0.1
 # Slower than this a car stands, though a sensor may show that it moves [m/s].
 _STANDS = 0.1
 # Where a situation is not sure, it may be worse by so many standard deviations.
@@ -80,7 +89,8 @@ _RISK = Kind(
     {
         "lowest": Numbers(least=-_ASKED, most=-SMALLEST),
         "dt": Numbers(least=_SHORTEST, most=_LONGEST),
-        **dict.fromkeys(("leader_decel", "hard"), _ACCELERATION),
+        **dict.fromkeys(("leader_decel", "hard", "comfort"), _ACCELERATION),
+        "regain": Numbers(least=0.0, most=60.0),
         "own_brakes": Numbers(least=SMALLEST, most=10.0),
         "margin": SIZE,
     },
@@ -115,6 +125,12 @@ class LatentRisk(Retraced):
     hard : float
         Leaders' manoeuvres from which on it learns how hard they brake [m/s²]. Softer ones, of
         which everyday traffic is full, must not water down the hard ones.
+    comfort : float
+        Braking that needs no collision to be foreseen [m/s²]. Adaptive cruise control may brake by
+        3.5 m/s² at 20 m/s and above (ISO 15622).
+    regain : float
+        Within this time a gap that is not safe, such as after a cut-in, is to be safe again [s].
+        Longer is gentler, and riskier if the leader brakes meanwhile.
     leaders : LeaderBrakes, optional
         Leaders' brakes to begin with, as if they had been seen; `leaders.REAL_DRIVES` are those
         of public drives. Without them it begins with the assumption alone.
@@ -140,6 +156,8 @@ class LatentRisk(Retraced):
         own_brakes: float = 0.6,
         margin: float = 0.5,
         hard: float = 2.5,
+        comfort: float = COMFORT,
+        regain: float = REGAIN,
         leaders: LeaderBrakes | None = None,
     ) -> None:
         if not -math.inf < lowest < 0.0:
@@ -150,6 +168,7 @@ class LatentRisk(Retraced):
         self.own_brakes = positive("own_brakes", own_brakes)
         self.margin = positive("margin", margin)
         self.hard = positive("hard", hard)
+        self.comfort, self.regain = positive("comfort", comfort), positive("regain", regain)
         _RISK.refuse_others(self._settings)
         self.manoeuvres = Manoeuvres(leader_decel, hard)
         if leaders is not None:
@@ -168,15 +187,15 @@ class LatentRisk(Retraced):
         decel: float,
         leader_decel: float,
         dt: float = 0.25,
-        *,
-        leaders: LeaderBrakes | None = None,
+        **settings: Any,
     ) -> Self:
         """Given the limits instead of learning them: the best that could be learnt.
 
         ``decel`` and ``leader_decel`` are the hardest braking of the follower and of leaders
-        [m/s²], positive; with a table of ``leaders``, not each is taken to be the hardest.
+        [m/s²], positive; with a table of ``leaders``, not each is taken to be the hardest. Other
+        ``settings`` are those of the class.
         """
-        risk = cls(lowest, dt, leader_decel=leader_decel, leaders=leaders)
+        risk = cls(lowest, dt, leader_decel=leader_decel, **settings)
         risk.brakes.trust(positive("decel", decel))
         return risk
 
@@ -330,9 +349,48 @@ class LatentRisk(Retraced):
 
     def effective(self, situation: Situation, actions: NDArray[np.float64]) -> NDArray[np.float64]:
         """What actions come to here: where the car stands, to stay is enough."""
-        if situation.observation[1] < _STANDS:
-            return np.maximum(actions, min(float(actions[0]), 0.0))
-        return actions
+        return effective(situation.observation[1], actions)
+
+    def choose(
+        self,
+        situation: Situation,
+        options: NDArray[np.float64],
+        judged: Judgement,
+        tolerances: tuple[float, float],
+    ) -> tuple[int, str] | None:
+        """Index of the option that is in proportion, and why; None where none avoids a collision.
+
+        The closest tolerable one down to ``comfort``; else the least braking that `foresee` says
+        regains a safe gap within ``regain``, or ``comfort`` where none does, but always what avoids
+        the collision that is foreseen.
+        """
+        here = self._cautious(situation.observation)
+        if not is_whole(here):
+            return None
+        foreseen = self.foreseen(here, self._leader_braking(situation), options, tolerances[-1])
+        return in_proportion(options, judged.risk, tolerances, self.comfort, *foreseen)
+
+    def foreseen(
+        self,
+        observation: Three,
+        braking: float,
+        options: NDArray[np.float64],
+        tolerance: float,
+        hardest: float = 0.0,
+    ) -> NDArray[np.bool_]:
+        """(2, k) whether options avoid what is seen, and regain a safe gap, as `foresee` has it."""
+        worst = self.manoeuvres.exceeded_by(tolerance)
+        found = np.empty((2, len(options)), np.bool_)
+        seen = min(braking, worst), options, self._commands[1], self.body
+        foresee(observation, *seen, self.dt, worst, self.regain, hardest, found)
+        return found
+
+    def _leader_braking(self, situation: Situation) -> float:
+        """How hard the leader brakes since the observation before [m/s²]."""
+        now, before = self._estimate(situation.observation).mean, self.perception.latest
+        if before is None or is_another(before.mean, now, self.dt):
+            return 0.0
+        return max(0.0, (before.mean[2] - now[2]) / self.dt)
 
     def refuse_unfit(self, low: Action, high: Action) -> None:
         """Raise a ValueError if it counts on harder braking than there is."""
@@ -356,13 +414,16 @@ class LatentRisk(Retraced):
 
     def _cautious(self, observation: ArrayLike) -> Three:
         """The situation as it most likely is, but closer by what is not sure about it."""
-        seen = _three_finite(observation, whole=False)
-        here = self.perception.estimate(seen, self._expected, sure=self.brakes.known)
+        here = self._estimate(observation)
         gap, speed, leader_speed = here.mean
         # What is wrong about a speed adds up while both brake.
         decel = self.brakes.decel
         doubt = here.deviation((1.0, -speed / decel, leader_speed / decel))
         return gap - _CAUTION * doubt, speed, leader_speed
+
+    def _estimate(self, observation: ArrayLike) -> Estimate:
+        seen = _three_finite(observation, whole=False)
+        return self.perception.estimate(seen, self._expected, sure=self.brakes.known)
 
     def critical(
         self, observation: ArrayLike, accelerations: ArrayLike, margin: float | None = None
@@ -405,6 +466,9 @@ class LatentRisk(Retraced):
             **{"DECEL": self.brakes.decel, "LAG": self.brakes.lag, "LIKELY": self.brakes._likely},
             **{"KNOWN": self.brakes.known, "LOWEST": self.lowest, "CLEARANCE": self.margin},
             **{"HARDEST": HARDEST, "HALVINGS": rehearsal._HALVINGS, "STANDS": _STANDS},
+            **{"COMFORT": self.comfort, "REGAIN": self.regain, "TOUCHING": rehearsal._TOUCHING},
+            "WORST": self.manoeuvres.exceeded_by(reviser.tolerance),
+            **{"ANOTHER_GAP": leaders._ANOTHER_GAP, "ANOTHER_SPEED": leaders._ANOTHER_SPEED},
             **{"LEADER": perception._LEADER, "UNEVEN": perception._UNEVEN, "CAUTION": _CAUTION},
             "DOUBT": perception._OWN if self.brakes.known else perception._OWN_UNKNOWN,
             **{"ANOTHER": perception._ANOTHER_LEADER, "EXACT": not any(self.perception.noise)},
@@ -447,7 +511,7 @@ class LatentRisk(Retraced):
     @property
     def _settings(self) -> dict[str, float]:
         names = ("lowest", "dt", "leader_decel", "own_brakes", "margin", "hard")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in (*names, "comfort", "regain")}
 
     def _learnt(self) -> dict[str, NDArray[np.float64]]:
         return {
@@ -460,6 +524,37 @@ class LatentRisk(Retraced):
             "doubts_brought": self.brakes.brought.rows.reshape(-1),
             "doubts_shortfalls": self.brakes.shortfalls.rows.reshape(-1),
         }
+
+
+def effective(speed: float, actions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(k,) what accelerations come to at a speed [m/s], the first of which is the proposal."""
+    return np.maximum(actions, min(float(actions[0]), 0.0)) if speed < _STANDS else actions
+
+
+def in_proportion(
+    options: NDArray[np.float64],
+    risk: NDArray[np.float64],
+    tolerances: tuple[float, float],
+    comfort: float,
+    avoids: NDArray[np.bool_],
+    regains: NDArray[np.bool_],
+) -> tuple[int, str] | None:
+    """Index of the acceleration that `LatentRisk.choose` speaks of, and why it is it.
+
+    All arrays have an entry for each option (k,); the first option is the proposal.
+    """
+    change = np.abs(options - options[0])
+    gentle = options >= min(-comfort, options[0])
+    for tolerated in tolerances:
+        if (tolerable := np.flatnonzero((risk <= tolerated) & gentle)).size:
+            return int(tolerable[change[tolerable].argmin()]), "the closest that can"
+    enough = avoids & (regains | (options <= -comfort)) & (options <= options[0])
+    if not enough.any():
+        return None
+    best = int(np.where(enough, options, -np.inf).argmax())
+    if best == 0:
+        return 0, "it regains a safe gap in time"
+    return best, "none can gently, the least braking that regains a safe gap in time"
 
 
 # -- Of states ----------------------------------------------------------------------------------

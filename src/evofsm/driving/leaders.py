@@ -17,7 +17,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving.rehearsal import HARDEST
+from evofsm.driving.rehearsal import HARDEST, Three
 from evofsm.fsm.validation import positive
 
 # Of a manoeuvre the hardest second counts; it shows in the latest half, and takes at least three
@@ -83,11 +83,17 @@ REAL_DRIVES = LeaderBrakes(
 
 
 class Manoeuvres:
-    """The decelerations of the latest ``memory`` manoeuvres, and how likely harder ones are."""
+    """The decelerations of the latest ``memory`` manoeuvres, and how likely harder ones are.
 
-    def __init__(self, assumed: float, hard: float = 2.5, memory: int = 500) -> None:
+    ``width`` is that of the kernel [m/s²]; without it Silverman's.
+    """
+
+    def __init__(
+        self, assumed: float, hard: float = 2.5, memory: int = 500, width: float | None = None
+    ) -> None:
         self.assumed = positive("assumed", assumed)
         self.hard = positive("hard", hard)
+        self.width = width
         self.gentle = 0
         self.decels: deque[float] = deque(maxlen=memory)
         self._tabulate()
@@ -130,7 +136,7 @@ class Manoeuvres:
         if self.decels:
             seen = np.array(self.decels)
             # Silverman's rule; where few were seen their spread says little.
-            width = max(_NARROWEST, 2.34 * seen.std() * len(seen) ** -0.2)
+            width = self.width or max(_NARROWEST, 2.34 * seen.std() * len(seen) ** -0.2)
             offset = np.clip((seen - grid[:, None]) / width, -1.0, 1.0)
             harder += (0.5 + offset * (0.75 - 0.25 * offset * offset)).sum(axis=1)
         harder[grid >= HARDEST] = 0.0
@@ -163,7 +169,7 @@ class BrakeWatch:
         ``noise`` is the standard deviation of that on the difference of two speeds [m/s].
         """
         now = gap, speed, leader_speed
-        if self._recent and self._is_another(now):
+        if self._recent and is_another(self._recent[-1], now, self.dt):
             ended = self.end()
             self.clear()
             self._recent.append(now)
@@ -202,9 +208,14 @@ class BrakeWatch:
         """So many decisions, or more if noise blurs a deceleration over them."""
         return max(span, round(self._noise / (blur * self.dt)))
 
-    def _is_another(self, now: tuple[float, float, float]) -> bool:
-        gap, speed, leader_speed = self._recent[-1]
-        expected = gap + 0.5 * self.dt * (leader_speed + now[2] - speed - now[1])
-        if abs(now[2] - leader_speed) > HARDEST * self.dt + _ANOTHER_SPEED:
-            return True
-        return abs(now[0] - expected) > _ANOTHER_GAP
+
+def is_another(before: Three, now: Three, dt: float) -> bool:
+    """Whether another leader is ahead: its speed or the gap changed by more than driving does.
+
+    Gap [m] and both speeds [m/s], ``dt`` [s] apart.
+    """
+    gap, speed, leader_speed = before
+    expected = gap + 0.5 * dt * (leader_speed + now[2] - speed - now[1])
+    if abs(now[2] - leader_speed) > HARDEST * dt + _ANOTHER_SPEED:
+        return True
+    return abs(now[0] - expected) > _ANOTHER_GAP

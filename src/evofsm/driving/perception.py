@@ -75,7 +75,8 @@ class Perception:
 
     def clear(self) -> None:
         """An episode begins: nothing is known of where one is; the noise is that of before."""
-        self._latest: Estimate | None = None
+        #: At the observation before.
+        self.latest: Estimate | None = None
         self._seen: Three | None = None
         self._changes = nan, nan  # of both speeds, beyond what was expected
 
@@ -95,17 +96,17 @@ class Perception:
                 self._learn(self._seen, now, realised)
             self._seen = now
         if is_whole(estimate.mean):
-            self._latest = estimate
+            self.latest = estimate
         return estimate
 
     def estimate(self, now: Three, realised: float, *, sure: bool = True) -> Estimate:
         """What `see` would answer; nothing changes. NaN stays where nothing was seen before."""
         if self.noise == _NOTHING and is_whole(now):
             return Estimate(now, _EXACT)
-        if self._latest is None:
+        if self.latest is None:
             return Estimate(now, _diagonal(self.noise))
         doubt = _OWN if sure else _OWN_UNKNOWN
-        return Estimate(*_filtered(*self._latest, now, self.noise, realised, doubt, self.dt))
+        return Estimate(*_filtered(*self.latest, now, self.noise, realised, doubt, self.dt))
 
     def _learn(self, before: Three, now: Three, realised: float) -> None:
         """Take in what kinematics do not explain; of who may stand nothing."""

@@ -4,6 +4,9 @@ The follower does what is asked of it for one decision interval and then brakes 
 brakes from now on until it stands. The *critical deceleration* is the hardest braking of the leader
 that ends without a collision. Asking for the fixed cautious policy, and not for the best of many
 uncertain answers, keeps luck out of the estimate.
+
+What leaders could do is not what they do. `foresee` asks what comes of an action if the leader goes
+on as it is seen, and whether the gap is safe again some seconds later.
 """
 
 from __future__ import annotations
@@ -18,6 +21,8 @@ from evofsm.fsm.kernels import compiled, kernel
 #: A leader who brakes harder is beyond physics; no critical deceleration is higher [m/s²].
 HARDEST = 15.0
 
+# Cars that touch, or overlap in what a sensor says, are taken to be so far apart [m].
+_TOUCHING = 0.1
 # Halvings of [0, HARDEST] in search of the critical deceleration: to 0.015 m/s².
 _HALVINGS = 10
 
@@ -61,6 +66,40 @@ def critical_decelerations(
             else:
                 high = middle
         critical[k] = low
+
+
+@compiled
+def foresee(
+    observation: Three | NDArray[np.float64],
+    braking: float,
+    accelerations: NDArray[np.float64],
+    before: float,
+    body: Body,
+    dt: float,
+    worst: float,
+    regain: float,
+    hardest: float,
+    found: NDArray[np.bool_],
+) -> None:
+    """Write what comes of accelerations if the leader goes on as it is seen: ``found`` (2, k).
+
+    First whether full braking after each, if need be, avoids a collision with a leader that goes on
+    ``braking`` so hard [m/s²]: whether the gap stays above the margin, or where it is smaller
+    already, does not shrink to half of it. Up to ``hardest`` full braking is as hard as what is
+    asked, if that is harder. Then whether each, held for ``regain`` [s], has regained a gap in
+    which full braking survives a leader that brakes by ``worst`` [m/s²].
+    """
+    gap, speed, leader_speed = observation[0], max(observation[1], 0.0), max(observation[2], 0.0)
+    room = max(gap, _TOUCHING)
+    near, kept = (room, speed, leader_speed), min(body.margin, 0.5 * room)
+    leader_distance, reached_by_leader = _drive_on(leader_speed, -braking, regain)
+    for k in range(len(accelerations)):
+        full = max(body.decel, min(-accelerations[k], hardest))
+        careful = Body(full, body.lag, kept)
+        found[0, k] = survives(near, accelerations[k], before, careful, braking, dt)
+        distance, reached = _drive_on(speed, accelerations[k], regain)
+        then = (gap + leader_distance - distance, reached, reached_by_leader)
+        found[1, k] = survives(then, -body.decel, -body.decel, body, worst, dt)
 
 
 @kernel

@@ -16,35 +16,34 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving.judge import LatentRisk
+from evofsm.driving.judge import LatentRisk, effective, in_proportion
 from evofsm.driving.naming import SPEEDS
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.validation import real_array
 from evofsm.guard.actions import Action
-from evofsm.guard.api import TOLERANCE, ActionJudge, Fallback, Judgement, Search, Situation
+from evofsm.guard.api import TOLERANCE, ActionJudge, Fallback, Judgement, Situation
 from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser, Mode
 
 _Floats = NDArray[np.float64]
 
 #: What a row of a scene holds; the first is 1 where the row is in use.
-COLUMNS = ("present", "x", "y", "vx", "vy", "length", "width")
-#: Nothing on a road is farther away, or larger [m].
-PLACES, SIZES = (-1e9, 1e9), (0.0, 1e3)
+COLUMNS = ("present", "x", "y", "vx", "vy", "length", "width", "ax")
+#: Nothing on a road is farther away, or larger [m], nor changes its speed faster [m/s²].
+PLACES, SIZES, RATES = (-1e9, 1e9), (0.0, 1e3), (-1e3, 1e3)
 
 # Who will be in one's path within this time at the present lateral speed cuts in, or crosses [s].
 _AHEAD = 2.0
-# Between two accelerations that are looked at [m/s²]; width of an interval of them [m/s²].
-_STEP, _WIDTH = 0.25, 0.3
+# Width of an interval of accelerations, of which one is looked at [m/s²].
+_WIDTH = 0.3
 # So hard leaders brake at most, unless told or seen otherwise: SUMO's emergencyDecel [m/s²].
 LEADER_DECEL = 9.0
 # So hard those behind brake [m/s²], once they have kept their speed for so long [s].
 _BEHIND, _REACTION = 4.5, 1.0
-# Once it revises, a proposal is kept again below this share of the tolerance.
-_RELEASE = 0.9
-_KEPT = "risk is within the tolerance"
 _COASTING, _ONE = np.zeros(1), np.ones(1)
+# Where one's own speed stands in the rows of a scene.
+_SPEED = COLUMNS.index("vx")
 
 
 # -- Scenes -------------------------------------------------------------------------------------
@@ -60,6 +59,7 @@ class Object(NamedTuple):
     vy: float = 0.0  #: [m/s]
     length: float = 5.0  #: along its heading [m]
     width: float = 1.8  #: [m]
+    ax: float = 0.0  #: [m/s²]
     lane: str | None = None  #: for people; who is in whose way depends on y
 
 
@@ -80,11 +80,12 @@ class Pair(NamedTuple):
     gap: float  #: from bumper to bumper [m]; 0 or less where they touch
     v_follower: float  #: [m/s]
     v_leader: float  #: [m/s]
+    braking: float = 0.0  #: of the leader [m/s²]
 
     @property
     def observation(self) -> NDArray[np.float64]:
         """(3,) ndarray: gap [m], speed of the follower and of the leader [m/s]."""
-        return np.array(self[2:])
+        return np.array(self[2:5])
 
 
 class Scene:
@@ -116,10 +117,10 @@ class Scene:
         return pairs_of(self.rows(len(self.objects) - 1))
 
     def rows(self, most: int) -> NDArray[np.float64]:
-        """((most + 1) * 7,) ndarray: `COLUMNS` of oneself and the closest others; zeros else."""
+        """((most + 1) * 8,) ndarray: `COLUMNS` of oneself and the closest others; zeros else."""
         rows = np.zeros((most + 1, len(COLUMNS)))
         for row, each in zip(rows, self.objects, strict=False):
-            row[:] = 1.0, *each[1:7]
+            row[:] = 1.0, *each[1:8]
         return rows.ravel()
 
 
@@ -139,7 +140,7 @@ def pairs_of(rows: ArrayLike) -> list[Pair]:
 
 
 def _pair(own: list[float], other: list[float], index: int) -> Pair | None:
-    _, x, y, vx, vy, length, width = other
+    _, x, y, vx, vy, length, width, ax = other
     apart, aside = x - own[1], y - own[2]
     crosses = abs(vy) > abs(vx)
     along, across = (width, length) if crosses else (length, width)
@@ -152,7 +153,8 @@ def _pair(own: list[float], other: list[float], index: int) -> Pair | None:
         # Who moves across behind is none of one's business.
         return None if crosses else Pair(Role.BEHIND, index, gap, vx, own[3])
     role = Role.AHEAD if free < 0.0 else Role.CUTTING_IN
-    return Pair(Role.CROSSING if crosses else role, index, gap, own[3], max(vx, 0.0))
+    braking = max(-ax, 0.0) if vx > 0.0 else 0.0
+    return Pair(Role.CROSSING if crosses else role, index, gap, own[3], max(vx, 0.0), braking)
 
 
 # -- The judge ----------------------------------------------------------------------------------
@@ -169,19 +171,13 @@ class TrafficRisk(ActionJudge):
     ahead : LatentRisk
         Judges each pair in which oneself is the follower. The braking it counts on may be softer
         than what is possible, so that one brakes early.
-    low, high : float
-        The hardest braking, negative, and the hardest acceleration [m/s²].
-
-    Raises
-    ------
-    ValueError
-        If low and high are no range around 0.
 
     Notes
     -----
-    Where no action is tolerable for all, it is the one that the car behind survives and that is
-    least risky ahead. Where a leader who merely keeps its speed would be hit then, it is the
-    softest braking that is tolerable ahead; the hardest if none is.
+    Where no action down to ``ahead.comfort`` is tolerable for all, it is the one in proportion
+    (`LatentRisk.choose`) that the car behind survives. Where none avoids a collision that is
+    foreseen, it is the least risky ahead of those that the car behind survives; where a leader who
+    merely keeps its speed would be hit then, the softest that avoids it, or the hardest.
 
     Examples
     --------
@@ -191,84 +187,88 @@ class TrafficRisk(ActionJudge):
     >>> scene = Scene(Object("me", 0.0, 0.0, 14.0), [lorry, bike])
     >>> revision = guard.decide(scene.rows(most=4), proposal=1.0)
     >>> round(revision.executed, 2)
-    -3.7
+    -1.8
     >>> revision.reason.partition("; ")[2]
-    'nothing can, the least risky that who is behind survives'
+    'none can gently, the least braking that regains a safe gap in time'
     """
 
     fallback = Fallback(0.0, "keeping the speed")
-    ranges = (0.0, 1.0), PLACES, PLACES, SPEEDS, SPEEDS, SIZES, SIZES
+    ranges = (0.0, 1.0), PLACES, PLACES, SPEEDS, SPEEDS, SIZES, SIZES, RATES
 
-    def __init__(self, ahead: LatentRisk, low: float, high: float) -> None:
-        if not -math.inf < low < 0.0 < high < math.inf:
-            raise ValueError(f"low is {low} and high is {high}; they must lie around 0")
+    def __init__(self, ahead: LatentRisk) -> None:
         self.ahead = ahead
-        self.low, self.high = float(low), float(high)
         # Judges the one that follows, of which oneself is the leader.
         self._behind = LatentRisk.given(-_BEHIND, _BEHIND, _BEHIND, _REACTION)
         self.labels = Labels(dt=ahead.dt)
-        steps = max(2, round((self.high - self.low) / _STEP) + 1)
-        self._grid = np.linspace(self.low, self.high, steps)
         #: The worst pair of the first action that was judged last; None where there is none.
         self.worst: Pair | None = None
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each acceleration [m/s²]: the highest of all pairs."""
-        given = np.ascontiguousarray(actions, np.float64)
-        return self._judge(pairs_of(situation.observation), given)[0]
-
-    def _judge(self, pairs: list[Pair], actions: _Floats) -> tuple[Judgement, _Floats, _Floats]:
-        """Of all pairs; and the risk ahead and that from behind alone."""
+        actions = np.ascontiguousarray(actions, np.float64)
         nothing = np.zeros(len(actions))
         worst: Judgement | None = None
         self.worst, hardest, survived = None, -float(actions.min()), math.inf
         follower = None
-        for pair in pairs:
+        for pair in pairs_of(situation.observation):
             if pair.role is Role.BEHIND:
                 # Who does not brake is hit by nobody that it has to mind.
                 its = self._survived(pair) if hardest > 0.0 else math.inf
                 if its < survived:
                     survived, follower = its, pair
                 continue
-            judged = self.ahead.judge(
-                Situation(pair.observation, _ONE, None, math.nan, 0.0), actions
-            )
+            here = Situation(pair.observation, _ONE, None, math.nan, 0.0)
+            judged = self.ahead.judge(here, actions)
             if worst is None or judged.risk[0] > worst.risk[0]:
                 self.worst = pair
             worst = judged if worst is None else _worse(worst, judged)
         if worst is None:
             worst = Judgement(nothing, nothing, nothing, nothing + math.inf, 0.0)
         if hardest <= survived:
-            return worst, worst.risk, nothing
+            return worst
         hit = np.where(actions < -survived, 1.0, 0.0)
         if self.worst is None or hit[0] > worst.risk[0]:
             self.worst = follower
-        from_behind = Judgement(hit, hit, hit, nothing + math.inf, 0.0)
-        return _worse(worst, from_behind), worst.risk, hit
+        return _worse(worst, Judgement(hit, hit, hit, nothing + math.inf, 0.0))
 
     def _survived(self, pair: Pair) -> float:
         """The hardest braking of oneself that who is behind survives [m/s²]."""
         return float(self._behind.critical(pair.observation, _COASTING)[0])
 
-    def search(
-        self, situation: Situation, wanted: Action, *, tolerance: float, revising: bool
-    ) -> Search:
-        """The acceleration closest to ``wanted`` that is tolerable ahead and behind [m/s²].
+    def choose(
+        self,
+        situation: Situation,
+        options: _Floats,
+        judged: Judgement,
+        tolerances: tuple[float, float],
+    ) -> tuple[int, str] | None:
+        """Index of the acceleration that is in proportion ahead and survived behind, and why."""
+        avoids, regains = np.ones((2, len(options)), np.bool_)
+        survived = math.inf
+        for pair in pairs_of(situation.observation):
+            if pair.role is Role.BEHIND:
+                survived = min(survived, self._survived(pair))
+                continue
+            seen = pair[2:5], pair.braking, options, tolerances[-1]
+            two = self.ahead.foreseen(*seen, hardest=-float(options.min()))
+            avoids, regains = avoids & two[0], regains & two[1]
+        avoids &= options <= options[0]
+        bearable = options >= -survived
+        asked = options, judged.risk, tolerances, self.ahead.comfort, avoids & bearable, regains
+        if (found := in_proportion(*asked)) is not None:
+            return found
+        if bearable.any() and judged.critical[bearable].max() > 0.0:
+            # Of several that are survived as well the hardest braking.
+            rank = np.lexsort((options, -judged.critical, ~bearable))
+            return int(rank[0]), "nothing can, the least risky that who is behind survives"
+        if avoids.any():
+            softest = int(np.where(avoids, options, -np.inf).argmax())
+            return softest, "nothing can, the softest for ahead"
+        return int(options.argmin()), "nothing can, the hardest braking"
 
-        ``revising`` says that the proposal before was not kept.
-        """
-        pairs = pairs_of(situation.observation)
-        options = np.concatenate([[wanted], self._grid])
-        limit = tolerance * (_RELEASE if revising else 1.0)
-        if not revising:  # most proposals are kept: look at this one first
-            judged, _, _ = self._judge(pairs, options[:1])
-            if judged.risk[0] <= limit:
-                return Search(options[:1], judged, 0, _KEPT)
-        judged, ahead, behind = self._judge(pairs, options)
-        if judged.risk[0] <= limit:
-            return Search(options, judged, 0, _KEPT)
-        best, what = _best(options, judged, ahead, behind, (limit, tolerance))
-        return Search(options, judged, best, f"{self.why(judged)}; {what}")
+    def effective(self, situation: Situation, actions: _Floats) -> _Floats:
+        """What actions come to here: where the car stands, to stay is enough."""
+        return effective(situation.observation[_SPEED], actions)
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, and who it is."""
@@ -283,11 +283,6 @@ class TrafficRisk(ActionJudge):
     def refuse_unfit(self, low: Action, high: Action) -> None:
         """Raise a ValueError if it counts on harder braking than there is."""
         self.ahead.refuse_unfit(low, high)
-        if self.low < low or self.high > high:
-            raise ValueError(
-                f"the judge looks at accelerations from {self.low:g} to {self.high:g}, but the set "
-                f"of actions is [{low}, {high}]"
-            )
 
 
 def _worse(one: Judgement, other: Judgement) -> Judgement:
@@ -295,30 +290,6 @@ def _worse(one: Judgement, other: Judgement) -> Judgement:
     risk, low, high = map(np.maximum, one[:3], other[:3])
     critical = np.minimum(one.critical, other.critical)
     return Judgement(risk, low, high, critical, max(one.evidence, other.evidence))
-
-
-def _best(
-    options: _Floats,
-    judged: Judgement,
-    ahead: _Floats,
-    behind: _Floats,
-    tolerances: tuple[float, float],
-) -> tuple[int, str]:
-    """Index of the best option, and what it is; the first option is the proposal."""
-    change = np.abs(options - options[0])
-    for tolerated in tolerances:
-        tolerable = np.flatnonzero(judged.risk <= tolerated)
-        if len(tolerable):
-            return int(tolerable[change[tolerable].argmin()]), "the closest that can"
-    survived = np.flatnonzero(behind <= tolerances[-1])
-    if len(survived) and judged.critical[survived].max() > 0.0:
-        # Of several that are least risky the hardest braking.
-        rank = np.lexsort((options[survived], ahead[survived]))
-        return int(survived[rank[0]]), "nothing can, the least risky that who is behind survives"
-    tolerable = np.flatnonzero(ahead <= tolerances[-1])
-    if len(tolerable):
-        return int(tolerable[options[tolerable].argmax()]), "nothing can, the softest for ahead"
-    return int(options.argmin()), "nothing can, the hardest braking"
 
 
 def guard_for_traffic(
@@ -355,7 +326,7 @@ def guard_for_traffic(
     >>> guard.decide(alone.rows(most=4), proposal=1.0).executed
     1.0
     """
-    judge = judge or TrafficRisk(LatentRisk.given(-decel, decel, LEADER_DECEL, interval), low, high)
+    judge = judge or TrafficRisk(LatentRisk.given(-decel, decel, LEADER_DECEL, interval))
     actions = IntervalActions(low, high, _WIDTH, outside="clip")
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, learn=False)

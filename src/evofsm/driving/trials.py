@@ -233,7 +233,7 @@ def try_out(
 
 @dataclass(frozen=True)
 class Trial:
-    """Episodes of a family by their number: a function for any ``map``, of threads to clusters."""
+    """Episodes of a family by their number: a function for any ``map``, of threads or processes."""
 
     family: Family
     guard: Guard  #: frozen, no episode depends on another one

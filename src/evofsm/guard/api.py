@@ -167,6 +167,21 @@ class ActionJudge(Protocol):
         """What actions come to here, where some of them would change nothing."""
         return actions
 
+    def choose(
+        self,
+        situation: Situation,
+        options: NDArray[np.float64],
+        judged: Judgement,
+        tolerances: tuple[float, float],
+        /,
+    ) -> tuple[int, str] | None:
+        """Index of the best option where the first, the proposal, is not tolerable, and why it is.
+
+        None leaves it to the reviser: the closest that is tolerable, else the least risky. Of the
+        ``tolerances`` the first is asked for before the second is.
+        """
+        return None
+
     def refuse_unfit(self, low: Action, high: Action, /) -> None:
         """Raise a ValueError if it counts on actions outside ``low`` to ``high``."""
 

@@ -29,7 +29,9 @@ enum {
   EVOFSM_NOTHING_PASSES = 3, /* the one that lasts longest, or is least risky */
   EVOFSM_NOTHING_SEEN = 4,   /* nothing of this episode was observed yet: the proposal */
   EVOFSM_TRIED = 5,          /* cars: own brakes are not known yet, so it brakes in full */
-  EVOFSM_TRYING = 6          /* and goes on with it for a while */
+  EVOFSM_TRYING = 6,         /* and goes on with it for a while */
+  EVOFSM_REGAINS = 7,        /* cars: the proposal regains a safe gap in time */
+  EVOFSM_REGAINED = 8        /* cars: none passes gently; the least braking that regains one */
 };
 
 /* What had to be done to a proposal. */

@@ -52,6 +52,7 @@ _TRIAL = 4
 _RELEASE = 0.9
 # States that were seen for a shorter time are new [s].
 _NEW = 0.5
+_KEPT = "risk is within the tolerance"
 #: Done without a usable proposal where nobody says what is better.
 NOTHING = Fallback(0.0, "doing nothing")
 
@@ -231,11 +232,16 @@ class ActionReviser:
             options = options[np.append(True, mask)]
         if not acts:
             options = self.risk.effective(situation, options)
+        if self.risk.trial() is None:  # most proposals are kept: this one is looked at first
+            judged = self.risk.judge(situation, options[:1])
+            if judged.risk[0] <= self.tolerance * (_RELEASE if self._revising else 1.0):
+                self._revising = False
+                return Search(options[:1], judged, 0, _KEPT)
         judged = self.risk.judge(situation, options)
-        return Search(options, judged, *self._decide(options, judged, acts))
+        return Search(options, judged, *self._decide(situation, options, judged, acts))
 
     def _decide(
-        self, options: NDArray[np.float64], judged: Judgement, acts: bool
+        self, situation: Situation, options: NDArray[np.float64], judged: Judgement, acts: bool
     ) -> tuple[int, str]:
         """Index of the best option, and why."""
         limit = self.tolerance * (_RELEASE if self._revising else 1.0)
@@ -246,7 +252,7 @@ class ActionReviser:
         if not judged.risk[0] > limit:
             self._revising = False
             known = judged.risk[0] <= limit
-            return 0, "risk is within the tolerance" if known else "its risk is not known yet"
+            return 0, _KEPT if known else "its risk is not known yet"
         self._revising = True
         why = self.risk.why(judged)
         if trial is not None:
@@ -256,6 +262,10 @@ class ActionReviser:
                 return tried, f"{why}; {trial.unknown}, so {trial.how}"
             why = f"{why}; {trial.unknown}, {trial.assumed}"
         # Once revising, what is safe by the margin; else whatever is tolerable.
+        chosen = self.risk.choose(situation, options, judged, (limit, self.tolerance))
+        if chosen is not None:
+            self._revising = chosen[0] != 0
+            return chosen[0], f"{why}; {chosen[1]}"
         change = distances(self.actions, options, options[0])
         # Of several that are least risky the lowest, in a box that of the least change.
         rank = change if isinstance(self.actions, BoxActions) else options

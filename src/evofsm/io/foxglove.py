@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -25,7 +24,6 @@ from evofsm.driving import Episode
 from evofsm.driving.naming import VARIABLES
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.validation import positive
 from evofsm.guard import Decision, Guard, Proposal, Revision, Situation
 from evofsm.guard.actions import same_action
 from evofsm.io.runs import (
@@ -43,7 +41,6 @@ with needs("foxglove-sdk", "mcap", "writing MCAP, and a live view in Foxglove"):
     from foxglove.channels import LogChannel
     from foxglove.mcap import MCAPWriteOptions
     from foxglove.messages import Log, LogLevel, Timestamp
-    from foxglove.websocket import ServerListener
 
 #: A layout of cars, to be imported: *Layouts, Import from file*.
 FOXGLOVE_LAYOUT = Path(__file__).with_name("foxglove_layout.json")
@@ -254,17 +251,6 @@ class RunWriter:
 # -- Live -----------------------------------------------------------------------------------------
 
 
-class _Arrivals(ServerListener):
-    """Knows whether anybody has subscribed to anything."""
-
-    def __init__(self) -> None:
-        self.someone = threading.Event()
-
-    def on_subscribe(self, client: Any, channel: Any) -> None:
-        """Somebody looks on."""
-        self.someone.set()
-
-
 class FoxgloveSink:
     """Shows what a guard sees and decides: ``guard.audit = FoxgloveSink()``.
 
@@ -279,16 +265,13 @@ class FoxgloveSink:
         Write an MCAP file as well, or instead.
     names, units : sequence of str
         Of the variables of an observation; without them those of a car that follows another.
-    speed : float, optional
-        Hold the run back to so many times real time, as a simulation would be over before anyone
-        looks. Without it nothing waits.
     host : str
         Who may look on; only this computer, unless told otherwise.
 
     Raises
     ------
     ValueError
-        If there is neither a port nor a file, or ``speed`` is not positive.
+        If there is neither a port nor a file.
     RuntimeError
         If the port is taken.
     FileExistsError
@@ -319,14 +302,11 @@ class FoxgloveSink:
         *,
         names: Sequence[str] = VARIABLES,
         units: Sequence[str] = (),
-        speed: float | None = None,
         host: str = "127.0.0.1",
     ) -> None:
         if port is None and file is None:
             raise ValueError("a sink needs a port, a file, or both")
-        self._speed = None if speed is None else positive("speed", speed)
         self._channels = _Channels(names, units)
-        self._arrivals = _Arrivals()
         self._open = ExitStack()
         if file is not None:
             try:
@@ -338,22 +318,14 @@ class FoxgloveSink:
         self.address: str | None = None
         if port is not None:
             server = foxglove.start_server(
-                name="evofsm",
-                host=host,
-                port=port,
-                context=self._channels.context,
-                server_listener=self._arrivals,
+                name="evofsm", host=host, port=port, context=self._channels.context
             )
             self._open.callback(server.stop)
             self.address = f"ws://{host}:{server.port}"
             self._channels.begin = time.time_ns()  # live, a message is now; in a file time is 0
         self._time = 0.0  # of the latest decision, in its episode [s]
         self._observation: NDArray[np.float64] = np.full(len(names), math.nan)
-        self._due = math.nan  # when time 0 of the episode was, on the clock of this computer [s]
-
-    def await_someone(self, timeout: float | None = None) -> bool:
-        """Wait until somebody looks on, at most so long [s]; returns whether somebody does."""
-        return self._arrivals.someone.wait(timeout)
+        self._begun = False
 
     def close(self) -> None:
         """Stop serving, and end the file."""
@@ -369,14 +341,13 @@ class FoxgloveSink:
 
     def begin(self, guard: Guard) -> None:
         """An episode begins."""
-        self._time, self._due = 0.0, math.nan
+        self._time, self._begun = 0.0, False
 
     def seen(self, observation: NDArray[np.float64], time: float) -> None:
         """An observation came in."""
-        first = math.isnan(self._due)
         self._time, self._observation = time, observation
-        self._keep_pace()
-        if first:
+        if not self._begun:
+            self._begun = True
             self._channels.event("episode started", time, observation)
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
@@ -389,12 +360,3 @@ class FoxgloveSink:
             self._observation = observation
         kind = "collision" if self._channels.is_of_cars else "failure"
         self._channels.end(self._time, self._observation, [kind] if failed else [])
-
-    def _keep_pace(self) -> None:
-        """Wait for what is to be shown now."""
-        now = time.monotonic()
-        speed = self._speed or math.inf
-        if math.isnan(self._due):
-            self._due = now - self._time / speed
-        if self._speed is not None:
-            time.sleep(max(0.0, self._due + self._time / speed - now))

@@ -249,12 +249,12 @@ def readable(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
     """Turn whatever a library runs into in a damaged file into one error that names the file."""
     try:
         yield
-    except (OSError, ModuleNotFoundError):
+    except (OSError, ModuleNotFoundError, KeyboardInterrupt, GeneratorExit):
         raise
     except RefusedError as error:
         raise ValueError(f"{os.fspath(path)}: {error}") from None
-    except Exception as error:
-        why = str(error)[:300] or type(error).__name__
+    except BaseException as error:  # a panic of polars is no Exception
+        why = str(error).partition("\n")[0][:300] or type(error).__name__
         if why.startswith(os.fspath(path)):
             raise
         raise ValueError(f"{os.fspath(path)} cannot be read as {kind}: {why}") from error
@@ -626,6 +626,9 @@ class CsvTable(Table):
             ) from error
 
 
+_AS_PARQUET = "Parquet (was a copy or a download interrupted?)"
+
+
 class ParquetTable(Table):
     """A Parquet file; read with polars because pyarrow cannot be imported beside libsumo."""
 
@@ -636,7 +639,7 @@ class ParquetTable(Table):
         self._on_read = on_read
         # polars takes other paths for addresses on the network, or of somebody's home.
         self._scan = polars.scan_parquet(os.path.abspath(path), glob=False)
-        with self._readable():
+        with readable(self.path, _AS_PARQUET):
             self._types = self._scan.collect_schema()
             self._rows = int(self._scan.select(polars.len()).collect().item())
         self.columns = list(self._types)
@@ -645,7 +648,7 @@ class ParquetTable(Table):
         """The first of its values."""
         if name not in self.columns:
             return ""
-        with self._readable():
+        with readable(self.path, _AS_PARQUET):
             found = self._scan.select(name).drop_nulls().head(1).collect()
         return str(found.item()) if len(found) else ""
 
@@ -659,7 +662,7 @@ class ParquetTable(Table):
         part = self._scan.select(wanted.all)
         # Not collect_batches: it reads ahead of a slow consumer without bound (polars #28569).
         for first in range(0, self._rows, _PARQUET_ROWS):
-            with self._readable():
+            with readable(self.path, _AS_PARQUET):
                 frame = part.slice(first, _PARQUET_ROWS).collect()
             found = {name: frame[name] for name in wanted.all}
             yield wanted.piece(found, partial(self._find, frame, first), self.skips)
@@ -670,18 +673,6 @@ class ParquetTable(Table):
     ) -> tuple[str, str]:
         value = None if name is None else frame[name][row]
         return f"{self.path}, row {first + row + 1}", "" if value is None else str(value)
-
-    @contextmanager
-    def _readable(self) -> Iterator[None]:
-        import polars
-
-        try:
-            yield
-        # A panic is what polars makes of some damaged files; it is no Exception.
-        except (polars.exceptions.PolarsError, polars.exceptions.PanicException) as error:
-            cause = str(error).partition("\n")[0][:300]
-            why = "(was a copy or a download interrupted?)"
-            raise ValueError(f"{self.path} cannot be read as Parquet {why}: {cause}") from error
 
 
 # -- Fields ---------------------------------------------------------------------------------------

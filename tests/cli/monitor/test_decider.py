@@ -29,9 +29,33 @@ def test_it_decides_as_the_guard_does():
             revision.advised,
             revision.reason,
         )
-        assert answer["alarm"] == (revision.risk_proposed > 0.02)
+        risky = revision.risk_proposed > 0.02
+        assert answer["alarm"] == risky == (revision.advised < 0.4)
     assert answer["n"] == 80
     assert answer["alarm"]
+
+
+def test_an_alarm_begins_where_something_would_be_changed_and_lasts_until_the_risk_is_tolerable():
+    decider = Decider(made())
+
+    def seen(gap, own, leader, proposal):
+        row = {"gap": gap, "v_follower": own, "v_leader": leader, "proposal": proposal}
+        return decider.answer(line(row | {"time": 0.1 * decider.n}))
+
+    def opens(proposal=0.0):  # the gap is not safe, but will be soon
+        answer = seen(4.0, 20.0, 24.0, proposal)
+        assert answer["risk_proposed"] > 0.02
+        assert answer["advised"] == proposal
+        return answer["alarm"]
+
+    assert not opens()
+    least = seen(12.0, 20.0, 20.0, 2.0)["advised"]
+    decider.answer(b'{"end": true}')
+    assert not seen(12.0, 20.0, 20.0, least + 0.05)["alarm"]  # too little to be felt
+    assert seen(12.0, 20.0, 20.0, least + 0.3)["alarm"]
+    assert opens()
+    assert not seen(60.0, 20.0, 24.0, 0.0)["alarm"]
+    assert not opens()
 
 
 @pytest.mark.parametrize(

@@ -20,22 +20,31 @@ def made(learn=True, mode=Mode.SHADOW):
     return guard
 
 
-def opened(path, settings=SETTINGS, episode=700, learn=True, fresh=made):
-    state = State(path, settings)
-    try:
-        guard = state.guard(fresh)
-    except ValueError:
-        state.close()
-        raise
-    guard.learn = learn
-    decider = Decider(guard, episode=episode)
-    state.begin(decider)
-    return decider, state
-
-
 def abandoned(state):
     """As the death of the process leaves it: nothing is written, the lock is gone."""
     state._journal._file.close()
+
+
+@pytest.fixture
+def opened(tmp_path):
+    """Opens a state as a monitor does; in the end all are abandoned."""
+    states = []
+
+    def open_state(path=tmp_path / "state.evofsm", learn=True, fresh=made):
+        states.append(state := State(path, SETTINGS))
+        try:
+            guard = state.guard(fresh)
+        except ValueError:
+            state.close()
+            raise
+        guard.learn = learn
+        decider = Decider(guard, episode=700)
+        state.begin(decider)
+        return decider, state
+
+    yield open_state
+    for state in states:
+        abandoned(state)
 
 
 @pytest.mark.parametrize(
@@ -46,35 +55,19 @@ def abandoned(state):
         pytest.param(True, Mode.ACT, marks=pytest.mark.slow),
     ],
 )
-def test_it_goes_on_bit_for_bit_wherever_it_is_killed(tmp_path, learn, mode):
+def test_it_goes_on_bit_for_bit_wherever_it_is_killed(opened, learn, mode):
     plain = Decider(made(learn, mode), episode=700)
-    decider, state = opened(tmp_path / "state.evofsm", learn=learn, fresh=lambda: made(learn, mode))
+    decider, state = opened(learn=learn, fresh=lambda: made(learn, mode))
     for k, row in enumerate(traffic(1600)):
         if k in (3, 4, 690, 701, 1399, 1400, 1402):
             abandoned(state)
-            decider, state = opened(tmp_path / "state.evofsm", learn=learn)
+            decider, state = opened(learn=learn)
         if k % 50 == 0:
             assert decider.answer(JUNK[k // 50 % len(JUNK)])["kind"] == "error"
         assert decider.answer(line(row)) == plain.answer(line(row)), k
-    state.close()
 
 
-def test_a_row_that_was_taken_in_but_not_answered_is_answered_when_it_is_sent_again(tmp_path):
-    rows = [line(row) for row in traffic(30)]
-    plain = Decider(made())
-    expected = [plain.answer(row) for row in rows]
-    decider, state = opened(tmp_path / "state.evofsm")
-    for row in rows[:20]:
-        decider.answer(row)
-    decider.answer(rows[20])  # which nobody heard: it is killed
-    abandoned(state)
-    decider, state = opened(tmp_path / "state.evofsm")
-    assert decider.n == 21
-    assert [decider.answer(row) for row in rows[20:]] == expected[20:]
-    state.close()
-
-
-def test_a_saved_guard_is_gone_on_from_and_keeps_where_it_came_from(tmp_path):
+def test_a_saved_guard_is_gone_on_from_and_keeps_where_it_came_from(tmp_path, opened):
     path = tmp_path / "guard.evofsm"
     made().save(path, {"drive": "Monday"})
     decider, state = opened(path)
@@ -83,22 +76,20 @@ def test_a_saved_guard_is_gone_on_from_and_keeps_where_it_came_from(tmp_path):
     assert read_header(path).provenance["drive"] == "Monday"
     decider, state = opened(path)
     assert decider.n == 1
-    state.close()
 
 
-def test_a_last_record_that_was_half_written_is_left_out(tmp_path):
-    decider, state = opened(tmp_path / "state.evofsm")
+def test_a_last_record_that_was_half_written_is_left_out(opened):
+    decider, state = opened()
     for row in traffic(5):
         decider.answer(line(row))
     journal = state._journal.path
     abandoned(state)
     journal.write_bytes(journal.read_bytes()[:-10])
-    decider, state = opened(tmp_path / "state.evofsm")
+    decider, state = opened()
     assert decider.n == 4
-    state.close()
 
 
-def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path):
+def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path, opened):
     path = tmp_path / "state.evofsm"
     decider, state = opened(path)
     for row in traffic(5):
@@ -116,20 +107,19 @@ def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path)
     journal.write_bytes(whole)
     guard = path.read_bytes()
     path.unlink()
-    with pytest.raises(ValueError, match=r"state\.evofsm is missing, but"):
+    with pytest.raises(ValueError, match=r"a guard that is not in .*state\.evofsm; put"):
         opened(path)
     path.write_bytes(guard)
     decider, state = opened(path)
     assert decider.n == 5
-    state.close()
 
 
 @pytest.mark.parametrize("moment", ["before the guard is saved", "after it"])
-def test_killed_as_the_guard_is_saved_it_goes_on(tmp_path, moment, monkeypatch):
+def test_killed_as_the_guard_is_saved_it_goes_on(opened, moment, monkeypatch):
     rows = [line(row) for row in traffic(702)]
     plain = Decider(made(), episode=700)
     expected = [plain.answer(row) for row in rows]
-    decider, state = opened(tmp_path / "state.evofsm")
+    decider, state = opened()
 
     def killed(*_):
         raise SystemExit
@@ -139,34 +129,32 @@ def test_killed_as_the_guard_is_saved_it_goes_on(tmp_path, moment, monkeypatch):
     with pytest.raises(SystemExit):
         any(decider.answer(row) is None for row in rows)
     abandoned(state)
-    decider, state = opened(tmp_path / "state.evofsm")
+    decider, state = opened()
     assert [decider.answer(row) for row in rows[699:]] == expected[699:]
-    state.close()
 
 
-def test_rows_in_flight_across_an_end_are_decided_once_though_it_is_killed(tmp_path):
+def test_rows_in_flight_across_an_end_are_decided_once_though_it_is_killed(opened):
     rows = [line(row) for row in traffic(720)]
     messages = [*rows[:700], b'{"end": true, "failed": true}', *rows[700:]]
     plain = Decider(made())
     expected = [plain.answer(message) for message in messages]
-    decider, state = opened(tmp_path / "state.evofsm")
+    decider, state = opened()
     for lost in (5, 695, 699, 702):  # the guard is written with message 700
         for message in messages[max(0, lost - 9) : lost + 9]:
             decider.answer(message)
         abandoned(state)
-        decider, state = opened(tmp_path / "state.evofsm")
+        decider, state = opened()
         assert [decider.answer(m) for m in messages[lost : lost + 9]] == expected[lost : lost + 9]
         for message in messages[lost + 9 : 690]:
             decider.answer(message)
-    state.close()
 
 
-def test_rows_that_a_sender_does_not_wait_with_are_decided_once_though_it_is_killed(tmp_path):
+def test_rows_that_a_sender_does_not_wait_with_are_decided_once_though_it_is_killed(opened):
     rows = [line(row) for row in traffic(620)]
     plain, answers = Decider(made()), []
     expected = [msgspec.json.decode(msgspec.json.encode(plain.answer(row))) for row in rows]
     for count in (400, 619, 999):  # with so many it is killed, before the last is answered
-        decider, state = opened(tmp_path / "state.evofsm")
+        decider, state = opened()
         keep, pieces = decider.keep, iter([b"".join(row + b"\n" for row in rows[len(answers) :])])
 
         def kept(told, keep=keep, decider=decider, count=count):
@@ -185,23 +173,20 @@ def test_rows_that_a_sender_does_not_wait_with_are_decided_once_though_it_is_kil
     assert decider.n == 620
 
 
-def test_a_refused_end_stops_no_restart(tmp_path):
-    decider, state = opened(
-        tmp_path / "state.evofsm", fresh=lambda: Guard(n_actions=2, interval=0.1)
-    )
+def test_a_refused_end_stops_no_restart(opened):
+    decider, state = opened(fresh=lambda: Guard(n_actions=2, interval=0.1))
     for k, seen in enumerate(("[3.4e38]", "[1, 2, 3]", "[1e100, 1]", "[null]")):
         row = {"time": 0.1 * k, "observation": [1.0, 2.0], "proposal": 0}
         assert decider.answer(line(row))["kind"] == "decision"
         end = f'{{"end": true, "failed": true, "observation": {seen}}}'
         assert decider.answer(end.encode())["kind"] == "error"
         abandoned(state)
-        decider, state = opened(tmp_path / "state.evofsm")
+        decider, state = opened()
         assert (decider.n, decider.rows) == (k + 1, k + 1)
-    state.close()
 
 
-def test_what_cannot_be_taken_in_again_is_left_out_and_said(tmp_path, monkeypatch, caplog):
-    decider, state = opened(tmp_path / "state.evofsm")
+def test_what_cannot_be_taken_in_again_is_left_out_and_said(opened, monkeypatch, caplog):
+    decider, state = opened()
     for message in [*(line(row) for row in traffic(3)), b'{"end": true}']:
         decider.answer(message)
     abandoned(state)
@@ -210,33 +195,31 @@ def test_what_cannot_be_taken_in_again_is_left_out_and_said(tmp_path, monkeypatc
         raise RuntimeError("another version")
 
     monkeypatch.setattr(Guard, "end", fails)
-    decider, state = opened(tmp_path / "state.evofsm")
+    decider, state = opened()
     assert (decider.n, decider.rows) == (3, 3)
     assert "a message is left out: another version" in caplog.text
-    state.close()
 
 
-def test_a_guard_that_was_replaced_is_not_taken_for_that_of_the_journal(tmp_path):
-    decider, state = opened(tmp_path / "state.evofsm")
+def test_a_guard_that_was_replaced_is_not_taken_for_that_of_the_journal(tmp_path, opened):
+    decider, state = opened()
     decider.answer(line(next(traffic(1))))
     state.close()
     made().save(tmp_path / "state.evofsm")
-    with pytest.raises(ValueError, match="holds what came after another guard"):
-        opened(tmp_path / "state.evofsm")
+    with pytest.raises(ValueError, match="holds what came after a guard that is not in"):
+        opened()
 
 
-def test_two_monitors_do_not_keep_themselves_in_one_place(tmp_path):
-    _, state = opened(tmp_path / "state.evofsm")
+def test_two_monitors_do_not_keep_themselves_in_one_place(tmp_path, opened):
+    opened()
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "link.evofsm").symlink_to(tmp_path / "state.evofsm")
     for path in (tmp_path / "state.evofsm", tmp_path / "elsewhere" / "link.evofsm"):
         with pytest.raises(ValueError, match="is being written by another process"):
             opened(path)
-    state.close()
 
 
-def test_where_it_can_not_be_kept_it_goes_on_and_says_so(tmp_path, monkeypatch):
-    decider, state = opened(tmp_path / "state.evofsm")
+def test_where_it_can_not_be_kept_it_goes_on_and_says_so(opened, monkeypatch):
+    decider, state = opened()
 
     def full(*_, **__):
         raise OSError(28, "No space left on device")
@@ -247,15 +230,13 @@ def test_where_it_can_not_be_kept_it_goes_on_and_says_so(tmp_path, monkeypatch):
         assert decider.answer(first)["kind"] == "decision"
     assert decider.answer(second)["kind"] == "decision"
     assert "No space left" in state.failure
-    state.close()
 
 
-def test_scenes_and_ends_are_kept(tmp_path):
+def test_scenes_and_ends_are_kept(opened):
     plain = Decider(made())
     messages = [*scenes(5), b'{"end": true}', *scenes(9)][:12]
-    decider, state = opened(tmp_path / "state.evofsm")
+    decider, state = opened()
     for message in messages:
         abandoned(state)
-        decider, state = opened(tmp_path / "state.evofsm")
+        decider, state = opened()
         assert decider.answer(message) == plain.answer(message)
-    state.close()

@@ -60,7 +60,8 @@ def monitor(
         ),
     ] = None,
     tolerance: Annotated[
-        float | None, option(f"It alarms above this risk. [default: of --guard, or {TOLERANCE:g}]")
+        float | None,
+        option(f"Highest risk that is accepted. [default: of --guard, or {TOLERANCE:g}]"),
     ] = None,
     traffic: Annotated[
         bool, option("Judge all objects of scenes, who is behind included.", "--traffic")
@@ -123,7 +124,7 @@ def monitor(
     saved.
 
     With --summary it reads FILE, such lines or a log as evofsm learn reads it (by the options from
-    --observe to --vehicle-length), and prints how often it would have alarmed, by tolerance.
+    --observe to --vehicle-length), and prints how often it would have alarmed and how risky it was.
     """
     if sum(one is not None for one in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
@@ -263,8 +264,8 @@ def _prepare(
 def _of_saved(path: Path, guard: Guard) -> str:
     """What a guard that was saved reckons with, in a line."""
     tolerance = getattr(guard.reviser, "tolerance", None)
-    alarm = "" if tolerance is None else f"; alarm above a risk of {tolerance:.3g} (--tolerance)"
-    return f"assumed: what {path} was given and has learnt{alarm}"
+    risk = "" if tolerance is None else f"; a risk of {tolerance:.3g} is accepted (--tolerance)"
+    return f"assumed: what {path} was given and has learnt{risk}"
 
 
 def _transport(

@@ -14,10 +14,22 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
 from evofsm.cli.show import plain
-from evofsm.guard import ActionReviser, BoxActions, Guard, Mode, Revision, SearchingJudge, is_spoken
+from evofsm.driving.judge import SLIGHT, LatentRisk
+from evofsm.driving.traffic import COLUMNS, TrafficRisk
+from evofsm.guard import (
+    ActionReviser,
+    BoxActions,
+    Guard,
+    Mode,
+    Proposal,
+    Revision,
+    is_spoken,
+    make_usable,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -31,6 +43,7 @@ _FAST = 60.0
 _LATE = 1.0
 #: A gap in time, and rows that come too often, in intervals.
 HOLE, _OFTEN = 1.5, 0.5
+_VX, _AX = COLUMNS.index("vx"), COLUMNS.index("ax")
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
 
 Answer = dict[str, Any]
@@ -58,10 +71,9 @@ class Decider:
         self._next: int | None = None  # of the recent ones, where they are being sent again
         self._said_often = self._said_fast = self._has_failed = False
         reviser = guard.reviser
-        self._units = reviser.risk.labels.units if isinstance(reviser, ActionReviser) else ()
-        self.has_margin = isinstance(reviser, ActionReviser) and not isinstance(
-            reviser.risk, SearchingJudge
-        )
+        judge = reviser.risk if isinstance(reviser, ActionReviser) else None
+        self._units = () if judge is None else judge.labels.units
+        self._drives = isinstance(judge, LatentRisk | TrafficRisk)
 
     @property
     def mode(self) -> Mode:
@@ -230,7 +242,9 @@ class Decider:
         proposal: Any = row.proposal
         if isinstance(self.guard.actions, BoxActions) and proposal is not None:
             proposal = np.array(proposal)
-        seen: Any = _numbers(row.observation)
+        seen: Any = (
+            _accelerating(row, self.latest) if self.form.scenes else _numbers(row.observation)
+        )
         return self._without_lost_audit(lambda: self.guard.decide(seen, proposal, row.time))
 
     def _without_lost_audit(self, call: Callable[[], _T]) -> _T:
@@ -245,11 +259,19 @@ class Decider:
             return call()
 
     def _is_alarm(self, revision: Revision) -> bool:
-        """Whether the proposal is too risky, or, where that alone does not decide, is not kept."""
+        """Whether the proposal is not kept, or too risky.
+
+        Cars brake in proportion: an alarm begins where a proposal is not kept, but for a little,
+        and lasts until its risk is tolerable.
+        """
         reviser: Any = self.guard.reviser
-        if self.has_margin:
-            return bool(revision.risk_proposed > reviser.tolerance)
-        return is_spoken(reviser, revision)
+        if not self._drives:
+            return is_spoken(reviser, revision)
+        if self.rows > 1 and self._recent[-1][1].get("alarm"):
+            return bool(reviser.refuses or revision.risk_proposed > reviser.tolerance)
+        wanted = make_usable(Proposal(revision.proposed), reviser.actions, reviser.fallback).action
+        change = abs(float(revision.advised) - float(wanted))
+        return bool(reviser.refuses and not 0.0 < change <= SLIGHT)
 
     # -- Its end, and its beginning -------------------------------------------------------------
 
@@ -282,6 +304,20 @@ def _refuse_stale(row: Row, latest: Row) -> None:
     if latest.time - _LATE <= row.time < latest.time:
         what = f"{row.time:g} s comes after {latest.time:g} s: late rows are left out"
         raise MessageError("time", what, row.time)
+
+
+def _accelerating(row: Row, before: Message | None) -> NDArray[np.float64]:
+    """A scene with the accelerations that were not sent: since the scene before, else 0."""
+    rows = np.array(_numbers(row.observation)).reshape(-1, len(COLUMNS))
+    latest, step = {}, math.nan
+    if isinstance(before, Row) and before.time < row.time:
+        step = row.time - before.time
+        seen = np.array(_numbers(before.observation)).reshape(-1, len(COLUMNS))
+        latest = dict(zip(("", *before.objects), seen[:, _VX].tolist(), strict=False))
+    for name, one in zip(("", *row.objects), rows, strict=False):
+        if math.isnan(one[_AX]):
+            one[_AX] = (one[_VX] - latest[name]) / step if name in latest else 0.0
+    return rows.ravel()
 
 
 def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None:

@@ -7,6 +7,7 @@ checks types and ranges; here the key and the value are added to what it says.
 from __future__ import annotations
 
 import json
+import math
 import re
 from operator import itemgetter
 from typing import Annotated, Any, Literal
@@ -17,7 +18,7 @@ from msgspec import UNSET, Meta, UnsetType
 
 from evofsm.driving import Object, Scene, TrafficRisk
 from evofsm.driving.naming import SPEEDS, VARIABLES
-from evofsm.driving.traffic import PLACES, SIZES
+from evofsm.driving.traffic import PLACES, RATES, SIZES
 from evofsm.fsm.naming import visible
 from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
 from evofsm.store import LARGEST_OBSERVATION
@@ -36,6 +37,7 @@ _WIDTH = 1.8
 _Number = Annotated[float, Meta(ge=-LARGEST_OBSERVATION, le=LARGEST_OBSERVATION)]
 _Place = Annotated[float, Meta(ge=PLACES[0], le=PLACES[1])]
 _Speed = Annotated[float, Meta(ge=SPEEDS[0], le=SPEEDS[1])]
+_Rate = Annotated[float, Meta(ge=RATES[0], le=RATES[1])]
 _Size = Annotated[float, Meta(ge=SIZES[0], le=SIZES[1])]
 _Seen = _Number | None
 _Name = Annotated[str, Meta(max_length=_SHOWN)] | Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -84,6 +86,7 @@ class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     lane: _Number | _Name | UnsetType = UNSET
     vy: _Speed = 0.0
     width: _Size = _WIDTH
+    ax: _Rate | UnsetType = UNSET
 
 
 class Form:
@@ -174,7 +177,8 @@ class Form:
             others = [_object(one, f"objects[{k}]", along) for k, one in enumerate(told.objects)]
             scene = Scene(_object(ego, "ego", along), others)
             names = tuple(each.id for each in scene.objects[1 : _MOST + 1])
-            return Row(told.time, tuple(scene.rows(_MOST).tolist()), proposal, objects=names)
+            rows = (None if math.isnan(z) else z for z in scene.rows(_MOST).tolist())
+            return Row(told.time, tuple(rows), proposal, objects=names)
         ahead = _nearest_ahead(ego, told.objects, along)
         if ahead is None:
             return Row(told.time, None, proposal)
@@ -239,7 +243,8 @@ def _object(one: _Vehicle, where: str, along: str) -> Object:
         raise MessageError(f"{where}.y", "is missing; it says who is in whose way")
     name = where if one.id is UNSET else str(one.id)
     place: float = getattr(one, along)
-    return Object(name, place, one.y, one.vx, one.vy, one.length, one.width)
+    ax = math.nan if one.ax is UNSET else one.ax
+    return Object(name, place, one.y, one.vx, one.vy, one.length, one.width, ax)
 
 
 def _nearest_ahead(

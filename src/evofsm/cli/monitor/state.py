@@ -48,23 +48,17 @@ class State:
 
     def guard(self, fresh: Callable[[], Guard]) -> Guard:
         """The guard as it was saved; a fresh one where there is none."""
-        journal = self._journal
-        if not self.path.exists():
-            if journal.records:
-                raise ValueError(
-                    f"{self.path} is missing, but {journal.path} holds what came after it; put it "
-                    "back, or delete the journal to begin anew"
-                )
-            return fresh()
-        self._provenance = dict(store.read_header(self.path).provenance)
+        journal, is_there = self._journal, self.path.exists()
+        if is_there:
+            self._provenance = dict(store.read_header(self.path).provenance)
         saved = self._provenance.pop(_PROVENANCE, None)
         if saved is None:
             if journal.records:
                 raise ValueError(
-                    f"{journal.path} holds what came after another guard than {self.path}; put "
+                    f"{journal.path} holds what came after a guard that is not in {self.path}; put "
                     "that back, or delete the journal to begin anew"
                 )
-            return Guard.load(self.path)
+            return Guard.load(self.path) if is_there else fresh()
         if found := differences(saved["settings"], self.settings):
             raise ValueError(
                 f"{self.path} was saved with other settings: {found}; go on with those, or name "

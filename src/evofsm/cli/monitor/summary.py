@@ -1,4 +1,4 @@
-"""What a monitor says of all that was recorded: alarms by tolerance, and what was worst."""
+"""What a monitor says of all that was recorded: alarms, how risky it was, and what was worst."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 # A line of more bytes is of another kind of file; one that is longer than a message is refused.
 _LONGEST = 1 << 20
-# Beside the guard's own.
-_TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+# Beside the guard's own tolerance.
+_RISKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 # So many moments and variables are shown; without an alarm a moment lasts so long [s].
 _WORST, _SHOWN, _MOMENT = 10, 4, 5.0
 
@@ -94,12 +94,12 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
         pairs.append(("refused", f"{len(refused):,} messages, the first because {refused[0]}"))
     yield facts(title, pairs)
     own = getattr(decider.guard.reviser, "tolerance", None)
-    known = sorted({*(_TOLERANCES if decider.has_margin else ()), *([] if own is None else [own])})
-    lines = [(f"{t:g}", *counted(alarms > 0.0 if t == own else risks > t)) for t in known]
-    bold = [place for place, tolerance in enumerate(known) if tolerance == own]
-    header = ("tolerance", "alarms", "an hour", "of the time")
-    asked = "" if decider.has_margin else " (others: --tolerance)"  # not the risk alone
-    yield table(f"\nBy tolerance{asked}", header, lines, bold=bold)
+    known = sorted({*_RISKS, *([] if own is None else [own])})
+    lines = [(f"{risk:g}", *counted(risks > risk)) for risk in known]
+    bold = [place for place, risk in enumerate(known) if risk == own]
+    # Whether it would alarm with another tolerance, one pass does not say.
+    header = ("above", "times", "an hour", "of the time")
+    yield table("\nBy risk of what was proposed", header, lines, bold=bold)
     order = np.lexsort((-risks, moments))
     highest = order[np.unique(moments[order], return_index=True)[1]]
     ranked = np.lexsort((-long[highest], -risks[highest]))[:_WORST]

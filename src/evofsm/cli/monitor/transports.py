@@ -28,8 +28,8 @@ from evofsm.fsm.naming import visible
 
 # So much is read at once [byte].
 _CHUNK = 1 << 16
-# So many lines may come in one datagram or sample, and so many peers may be connected.
-_MOST_LINES, _MOST_PEERS = 100, 100
+# So many lines may come in one datagram or sample.
+_MOST_LINES = 100
 # What would block is tried again after so long [s].
 _POLL = 0.005
 # A signal that another thread took is seen after so long [s].
@@ -197,9 +197,6 @@ class SocketTransport:
                 peer, _ = self._socket.accept()
             except OSError:  # gone already, or no more files may be open
                 time.sleep(0.1)
-                continue
-            if len(self._peers) >= _MOST_PEERS:
-                peer.close()
                 continue
             self._peers[peer] = threading.Lock()
             threading.Thread(target=self._attend, args=(peer, server), daemon=True).start()

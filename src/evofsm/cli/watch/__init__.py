@@ -12,37 +12,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.options import (
     BRAKES,
-    SKIPPED,
     TOLERANCE,
-    ActionColumn,
     Brakes,
     ByJudge,
-    EpisodeColumns,
-    Failed,
-    Hold,
     InWorld,
     Judge,
-    Lengths,
-    NoLeader,
-    Observed,
+    Reading,
     Seed,
-    SkipBad,
-    Step,
-    TimeColumn,
     Tolerance,
-    TopicsFile,
-    Units,
     World,
     argument,
     option,
-    reading_of,
+    reads_logs,
     require,
     require_world,
 )
 from evofsm.cli.show import progress, say, warn
 
 if TYPE_CHECKING:
-    from evofsm.cli.options import Reading
     from evofsm.cli.watch.recorded import Recording
     from evofsm.cli.watch.session import Session
 
@@ -52,6 +39,7 @@ _LEARNT = b'{"__metadata__"'
 _SECONDS, _ENOUGH = 600.0, 100_000
 
 
+@reads_logs
 def watch(
     what: Annotated[
         str,
@@ -77,18 +65,8 @@ def watch(
     seed: Seed = 0,
     learn_first: Annotated[int, option("Episodes to learn from before, at most.", min=0)] = 60,
     brakes: Brakes = BRAKES,
-    observe: Observed = "gap,v_follower,v_leader",
-    action: ActionColumn = "a_follower",
-    time: TimeColumn = "time",
-    episode: EpisodeColumns = None,
-    dt: Step = None,
-    failed: Failed = None,
-    unit: Units = None,
-    topics: TopicsFile = None,
-    no_leader: NoLeader = None,
-    hold: Hold = None,
-    skip_bad: SkipBad = SKIPPED,
-    vehicle_length: Lengths = None,
+    *,
+    reading: Reading,
     port: Annotated[int, option("Of the page; 0 for any that is free.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
 ) -> None:
@@ -107,17 +85,18 @@ def watch(
     begins when the page is first opened. Ctrl-C ends it.
     """
     require(websockets="watch")
+    from evofsm.io import VehicleLengths
 
     is_log = _is_log(what)
-    if not is_log and any((episode, dt, failed, unit, topics, no_leader, vehicle_length)):
+    columns, lengths, topics = reading
+    given = columns.episode, columns.dt, columns.failed, columns.units, columns.no_leader
+    if not is_log and (any(given) or topics or lengths != VehicleLengths()):
         raise ValueError(f"options of columns are for a log, and {what} is none")
     is_recorded = is_log or what.endswith(".mcap")
     opened: AbstractContextManager[Session | Recording]
     if is_recorded:
         require(scipy="study", mcap="mcap")
-        asked = observe, action, time, episode, dt, failed, unit, topics, no_leader, hold, skip_bad
-        reading = reading_of(*asked, vehicle_length) if is_log else None
-        opened = _recorded(what, case, judge, tolerance, brakes, reading)
+        opened = _recorded(what, case, judge, tolerance, brakes, reading if is_log else None)
     else:
         opened = _driven(what, case or 1, world, judge, tolerance, seed, learn_first)
     with suppress(KeyboardInterrupt), opened as watched:

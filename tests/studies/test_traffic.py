@@ -1,0 +1,33 @@
+"""Guards in SUMO's traffic, beside the same traffic without them."""
+
+import pytest
+from studies import traffic
+from studies.lib import frame_of
+from studies.traffic import ALONE, OURS, Traffic, beside_alone, simulate
+
+pytest.importorskip("libsumo")
+
+
+def test_late_drivers_are_simulated_beside_themselves_without_guards():
+    alone, guarded = (
+        simulate("road", "late", policy, 0, seconds=70.0)[0] for policy in (ALONE, OURS)
+    )
+    again = simulate("road", "late", ALONE, 0, ("all", "10%"), 70.0)
+    assert again[0] == alone  # nobody who only looks changes anything
+    assert again[1] == {**alone, "share": "10%"}
+    assert alone["emergencies"] > guarded["emergencies"] == 0
+    assert alone["hard"] > guarded["hard"]
+    assert alone["limited"] is None
+    assert guarded["limited"] > 0
+    (beside,) = beside_alone(frame_of([guarded]), frame_of([alone])).to_dicts()
+    assert beside["more"] == -alone["emergencies"]
+    assert beside["hard_alone"] == pytest.approx(1000.0 * alone["hard"] / alone["kilometres"])
+    assert beside["speed"] == pytest.approx(guarded["speed"] / alone["speed"])
+    assert beside["bound"] == pytest.approx(3.69, abs=0.01)  # of none in one simulation
+
+
+def test_without_sumos_demos_they_are_left_out_and_others_refused(monkeypatch):
+    monkeypatch.setattr(traffic, "demos", lambda: None)
+    assert Traffic(worlds="A10KW,drop").there == ["drop"]
+    with pytest.raises(ValueError, match="no network nowhere; there are drop, road, grid"):
+        Traffic(worlds="nowhere").run()
