@@ -190,13 +190,13 @@ def disturbances(
     starts = np.arange(0, max(1, T - 4), max(1, (T - 1) // settings.n_starts))
     rest = np.vstack([np.zeros((1, m)), rest, np.zeros((H, m))])
     new = rest[1 + np.arange(H)[:, None] + starts].transpose(0, 2, 1)
+    ends = np.empty((0, 0))
     if looks:
-        new = np.concatenate([np.zeros((H, m, 1)), new], 2)
+        with_none = np.concatenate([np.zeros((H, m, 1)), new], 2)
         some = S[random.permutation(len(S))[:_TRIED_IN]]
-        ends = worst(known, some, state.policies[:1], new, 1.0)
-        starts = starts[np.unique(ends.argmin(1))] if len(ends) else starts[:0]
-    else:
-        starts = starts[_sizes(new, state)[:_LARGEST]]
+        ends = worst(known, some, state.policies[:1], with_none, 1.0)
+    harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_LARGEST]
+    starts = starts[harmful]
     longest = settings.horizon_max + 2
     windows, lengths, of = list(state.windows), state.lengths.tolist(), state.seen_in.tolist()
     for t in starts:
