@@ -274,8 +274,8 @@ def look_ahead(
     refuted = len(episode.lost) > H and episode.lost[:-H].any()
     T, believed = state.time_to_failure, state.believed
     if refuted and not episode.failed:  # it sees less far than it looks
-        T *= s.refuted
-        believed = max(T, s.horizon_min / s.ahead)
+        T = max(s.refuted * T, s.horizon_min / s.ahead)
+        believed = T
     else:
         believed = min(believed / s.latest, float(s.horizon_max))
         longest = max(s.latest * T, min(episode.fails_after, believed))

@@ -19,6 +19,8 @@ _STEPS, _LARGE = 5000.0, 6.0
 _SAME = 1e-9
 # Changes of an episode that tell how large residuals are; how much the latest of them counts.
 _SOME, _LATEST = 5, 0.2
+# What rests at an end, and was expected to go on by so many scales, is held there.
+_STOPS = 4.0
 # Episodes before it may move otherwise, and after it did, in which it is learnt how; transitions
 # that a correction needs, and how it is held to 0.
 _LEARNT, _FEW, _HELD = 20, 15.0, 0.3
@@ -76,11 +78,9 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: Setting
     if not seen.any():
         return state
     rest, jumped = model.residuals(known, z, u, state.unit), model.are_jumps(z, state.unit)
-    to, after = z[1:-1] + phi @ known.weights, z[2:]
-    held = ((after <= state.lowest[0]) & (to <= after)) | (
-        (after >= state.highest[0]) & (to >= after)
-    )
-    weight = np.where(jumped | ((after == z[1:-1]) & held).any(1), 0.0, 1.0)
+    after, rests = z[2:], z[2:] == z[1:-1]
+    held = _held(state, z[1:-1] + phi @ known.weights, after).any(0)
+    weight = np.where(jumped | (rests & held).any(1), 0.0, 1.0)
     is_known = bool(state.scale.any())
     if is_known:
         off = np.abs(rest) / np.maximum(state.scale, model.FLOOR * state.unit + 1e-300)
@@ -89,15 +89,16 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: Setting
         ordinary = ((change >= state.least) & (change <= state.most)).all(1)
         rows = seen & free & ordinary
         state = _drifted(state, known, phi[rows], change[rows], np.diff(z, axis=0), settings)
-    phi, change, weight = phi[seen], change[seen], weight[seen]
+    rows, weight = phi[seen], weight[seen]
     state = state._replace(
-        squares=state.squares + phi.T @ (weight[:, None] * phi),
-        products=state.products + phi.T @ (weight[:, None] * change),
+        squares=state.squares + rows.T @ (weight[:, None] * rows),
+        products=state.products + rows.T @ (weight[:, None] * change[seen]),
     )
-    moved = seen[:, None] & (after != z[1:-1])
+    moved = seen[:, None] & ~rests
     if (here := moved.any(1)).sum() < _SOME:
         return state
-    rest = np.abs(model.residuals(model_of(state, settings), z, u, state.unit))
+    now = model_of(state, settings)
+    rest = np.abs(model.residuals(now, z, u, state.unit))
     size = [
         1.4826 * np.median(r[h]) if h.sum() >= _SOME else 0.0
         for r, h in zip(rest.T, moved.T, strict=True)
@@ -105,7 +106,17 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: Setting
     share = _LATEST if is_known else 1.0
     scale = (1.0 - share) * state.scale + share * np.array(size)
     noise = (1.0 - share) * state.noise + share * (rest[here] ** 2).mean(0)
-    return state._replace(scale=np.maximum(scale, model.FLOOR * state.unit), noise=noise)
+    scale = np.maximum(scale, model.FLOOR * state.unit)
+    to = z[1:-1] + phi @ now.weights
+    stops = _held(state, to, after) & rests & seen[:, None] & (np.abs(to - after) > _STOPS * scale)
+    reached = np.where(stops.any(1).T & is_known, np.maximum(state.reached, 2.0), state.reached)
+    return state._replace(scale=scale, noise=noise, reached=reached)
+
+
+def _held(state: State, to: Floats, after: Floats) -> Flags:
+    """(2, T, m) what came to the lowest or highest, and was expected to go on, or as far."""
+    low, high = state.lowest[0], state.highest[0]
+    return np.array([(after <= low) & (to <= after), (after >= high) & (to >= after)])
 
 
 def _drifted(
