@@ -265,25 +265,30 @@ def look_ahead(
     """Look as far ahead as it takes to fail where nothing helps, and half as far again.
 
     Farther after an episode that failed although it was certified not to; less far after one that
-    went on for the whole horizon from where nothing seemed to help. What the model says of failure
-    farther away than that is believed again little by little.
+    went on for the whole horizon from where nothing seemed to help, but not as far as was too short
+    lately. What the model says of failure farther away than that is believed again little by
+    little.
     """
     H, s = state.horizon, settings
     ends = value_of(known, state.situations, state.policies[: s.n_asked], rest)
     after = float(ends[ends < 0.0].max(initial=-1.0 - H) + 1 + H)
     refuted = len(episode.lost) > H and episode.lost[:-H].any()
     T, believed = state.time_to_failure, state.believed
+    too_short = s.latest * state.too_short
     if refuted and not episode.failed:  # it sees less far than it looks
-        T = max(s.refuted * T, s.horizon_min / s.ahead)
+        T = max(s.refuted * T, s.horizon_min / s.ahead, state.too_short)
         believed = T
     else:
         believed = min(believed / s.latest, float(s.horizon_max))
         longest = max(s.latest * T, min(episode.fails_after, believed))
         if episode.failed and episode.certified.any():  # it did not look far enough
+            too_short = max(too_short, min(s.ahead * T, s.horizon_max / s.ahead))
             longest = min(s.ahead * longest, s.horizon_max / s.ahead)
             believed = max(believed, longest)
         T = max(min(after, believed), longest)
     each = known.weights.size * (1 + s.n_disturbances)
     farthest = min(s.horizon_max, s.work / each / s.n_asked)  # less where a rollout costs more
     horizon = int(max(min(s.ahead * T, farthest), s.horizon_min))
-    return state._replace(time_to_failure=T, believed=believed, horizon=horizon)
+    return state._replace(
+        time_to_failure=T, believed=believed, horizon=horizon, too_short=too_short
+    )

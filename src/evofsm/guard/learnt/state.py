@@ -188,6 +188,7 @@ class State(NamedTuple):
     margin: Annotated[float, _ABOVE_0]  #: [typical steps]
     time_to_failure: Annotated[float, _ABOVE_0]  #: [steps]
     believed: Annotated[float, _ABOVE_0]  #: [steps]
+    too_short: Annotated[float, _ABOVE_0]  #: [steps] before a failure that was certified not to be
     horizon: Annotated[int, COUNT._replace(least=1.0, most=1e4)]  #: [steps]
 
     @classmethod
@@ -239,6 +240,7 @@ class State(NamedTuple):
             margin=settings.margin,
             time_to_failure=settings.horizon / settings.ahead,
             believed=float(settings.horizon_max),
+            too_short=0.0,
             horizon=settings.horizon if horizon is None else horizon,
         )
 
