@@ -89,10 +89,10 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: Setting
         ordinary = ((change >= state.least) & (change <= state.most)).all(1)
         rows = seen & free & ordinary
         state = _drifted(state, known, phi[rows], change[rows], np.diff(z, axis=0), settings)
-    rows, weight = phi[seen], weight[seen]
+    some, weighed = phi[seen], weight[seen, None]
     state = state._replace(
-        squares=state.squares + rows.T @ (weight[:, None] * rows),
-        products=state.products + rows.T @ (weight[:, None] * change[seen]),
+        squares=state.squares + some.T @ (weighed * some),
+        products=state.products + some.T @ (weighed * change[seen]),
     )
     moved = seen[:, None] & ~rests
     if (here := moved.any(1)).sum() < _SOME:
