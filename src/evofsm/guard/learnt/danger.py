@@ -90,8 +90,19 @@ def explained(state: State, *, failed: bool, bends: bool = True) -> State:
         rows = failure.explain(FAILS, failures, known, blur)
     rows[:, HELD] = failure.inside(rows, failures).sum(1)
     forms = np.concatenate([ends, crashes, rows])
-    changed = failed or _shape(was) != _shape(rows)  # one of two explanations is refuted
+    if state.held < 0 and failed and not _foreseen(state, table, known):
+        return state._replace(forms=forms, held=0, wrong=state.wrong + 1)
+    changed = state.held >= 0 and (failed or _shape(was) != _shape(rows))
     return state._replace(forms=forms, held=0 if changed else state.held)
+
+
+def _foreseen(state: State, table: Floats, known: Survived) -> bool:
+    """Whether rivals of a table hold the latest failure, too."""
+    rows, latest = failure.rivals(table, state.failures[:-1], known), state.failures[-1:]
+    fails, ends, crashes = (
+        failure.inside(rows[rows[:, SAYS] == says], latest).any() for says in (FAILS, ENDS, CRASHES)
+    )
+    return bool(fails or (ends and crashes))
 
 
 def _shape(table: Floats) -> tuple[list[list[float]], int]:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evofsm.guard.learnt.rollout import CRASHES, FAILS, FLAT, GROWN, Flags, Floats, Ints
+from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, FLAT, GROWN, Flags, Floats, Ints
 
 #: Columns of a form: what it says, variables i and j, from where each is counted, the inverse of
 #: its unit, coefficients of 1, x, y, x x, x y, y y; how many failures it holds.
@@ -42,6 +42,8 @@ _FITS, _UNLIKELY, _WORST = 3, 2.0, 100
 # Variables of which all pairs are tried; pairs of which two forms are, and rounds of dealing
 # failures out between two.
 _SCREENED, _IN_TWO, _ROUNDS = 6, 3, 3
+# A rival of a threshold holds less than so much of what was survived.
+_RARE = 0.5
 # Which of x, y, x x, x y, y y a form of one variable has, a line, and a form of two variables.
 _KINDS = np.array([[1, 0, 1, 0, 0], [1, 1, 0, 0, 0], [1, 1, 1, 1, 1]], np.float64)
 
@@ -116,6 +118,72 @@ def halfway(table: Floats, failures: Floats) -> Floats:
     within = np.where(form > 0.0, form, np.inf).min(1, initial=np.inf)
     new[:, C] -= 0.5 * np.where(np.isfinite(within), within, 2.0 * GROWN)
     return new
+
+
+def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
+    """Fit the smallest forms that still hold all failures, to try whether larger ones are true.
+
+    Parameters
+    ----------
+    table : (r, SIZE) ndarray
+    failures : (k, m) ndarray
+    survived : Survived
+
+    Returns
+    -------
+    (s, SIZE) ndarray
+        In place of a bent form an ellipse around its failures. In place of a threshold that it
+        *ends* there, and fails only beyond the innermost failure in that other variable in which
+        failures are rarest among what was survived, if one is rare.
+    """
+    rows: list[Floats] = []
+    for row, is_side, holds in zip(table, are_sides(table), inside(table, failures), strict=True):
+        own = failures[holds]
+        if row[SAYS] != FAILS or not len(own) or not len(survived.rows):
+            rows.append(row)
+        elif is_side:
+            rows += _as_failed(row, own, survived)
+        else:
+            rows.append(_ellipse(row, own, survived))
+    return np.array(rows).reshape(-1, SIZE)
+
+
+def _ellipse(row: Floats, own: Floats, survived: Survived) -> Floats:
+    """One around failures that a form holds, without what was survived; or the form as it is."""
+    pair = row[[I, J]].astype(int)
+    unit, centre = survived.unit[pair], own[:, pair].mean(0)
+    x, y = ((rows[:, pair] - centre) / unit for rows in (own, survived.rows))
+    shape = np.linalg.inv(2.0 * x.T @ x / len(x) + np.eye(2))
+    most, least = (
+        float(f(np.einsum("ni,ij,nj->n", v, shape, v))) for f, v in ((np.max, x), (np.min, y))
+    )
+    size = min(max(1.0, 1.1 * most), 0.99 * least)
+    if size < most:
+        return row
+    new = row.copy()
+    new[AT:ONE], new[ONE:C] = centre, 1.0 / unit
+    new[C:HELD] = size, 0.0, 0.0, -shape[0, 0], -2.0 * shape[0, 1], -shape[1, 1]
+    return new
+
+
+def _as_failed(row: Floats, own: Floats, survived: Survived) -> list[Floats]:
+    """That it ends beyond a threshold, and fails only as it did; or the threshold as it is."""
+    i, m, rows = int(row[I]), len(survived.unit), survived.rows
+    low, high = own.min(0) - BLUR * survived.unit, own.max(0) + BLUR * survived.unit
+    share = np.concatenate([(rows >= low).mean(0), (rows <= high).mean(0)])
+    share[np.tile((survived.spread == 0.0) | (np.arange(m) == i), 2)] = np.inf
+    k = int(share.argmin())
+    if share[k] >= _RARE:
+        return [row]
+    end, crash, at = row.copy(), row.copy(), np.concatenate([low, high])[k]
+    end[SAYS], crash[SAYS] = ENDS, CRASHES
+    crash[[I, J, AT, TO]] = k % m, k % m, at, at
+    crash[[ONE, OTHER, B]] = (
+        1.0 / survived.unit[k % m],
+        1.0 / survived.unit[k % m],
+        (-1.0, 1.0)[k < m],
+    )
+    return [end, crash]
 
 
 # -- Which forms there are ------------------------------------------------------------------------

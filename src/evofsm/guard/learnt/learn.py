@@ -9,10 +9,9 @@ from collections.abc import Callable, Set
 
 import numpy as np
 
-from evofsm.guard.learnt import danger, failure, model, motion
+from evofsm.guard.learnt import danger, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups
-from evofsm.guard.learnt.failure import SAYS
-from evofsm.guard.learnt.rollout import FAILS, Flags, Floats, Model, value_of
+from evofsm.guard.learnt.rollout import Flags, Floats, Model, value_of
 from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
 
 # Actions of an episode that says how a system moves, at least; situations from which on
@@ -125,14 +124,12 @@ def disturbance_scale(state: State, settings: Settings) -> float:
 
 
 def doubted(state: State, episode: Episode, settings: Settings) -> State:
-    """Doubt forms that hardly any failure tells, if they refuse nearly all for long."""
+    """Doubt forms that refused for long without a failure: rivals are tried (`failure.rivals`)."""
     if state.held < 0:
-        return state._replace(held=state.held - 1)
-    s, table = settings, state.forms
-    bent = (~failure.are_sides(table) & (table[:, SAYS] == FAILS)).any()
-    most, patience = (s.less, s.sooner) if bent else (s.refused, s.patience)
-    little = episode.refused.sum() > most * len(episode.actions) and not episode.failed
-    held = state.held + 1 if little else 0
+        return state._replace(held=state.held - (not episode.failed))
+    much = episode.refused.sum() > settings.refused * len(episode.actions)
+    held = state.held + bool(much and not episode.failed)
+    patience = settings.patience * settings.again**state.wrong
     return state._replace(held=-1 if held >= patience else held)
 
 

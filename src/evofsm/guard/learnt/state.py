@@ -9,7 +9,7 @@ import numpy as np
 
 from evofsm.guard.learnt import failure, model
 from evofsm.guard.learnt.failure import SAYS, B, I, Survived
-from evofsm.guard.learnt.rollout import CRASHES, FAILS, Flags, Floats, Model, n_features
+from evofsm.guard.learnt.rollout import CRASHES, FAILS, Floats, Model, n_features
 from evofsm.store import COUNT, FLAG, SHARE, Numbers
 
 # What files hold of a field: observations, what is not negative, and ends that may be infinite.
@@ -64,14 +64,10 @@ class Settings:
     drift, drift_fade : float
         It moves otherwise from so much gained log likelihood on (Page 1954); of the latest episodes
         what is left an episode later.
-    patience, refused : float
-        Doubt begins after so many episodes without failure of which more than this share was
-        refused.
-    sooner, less : float
-        The same where a form of two variables is known.
-    few, settled : int
-        In doubt forms are left out that hold fewer failures, once there was none in so many
-        episodes also where nothing is learnt: one wrong label is outlived.
+    refused, patience, again, settled : float
+        What refuses more than this share of proposals, in so many episodes without failure, is
+        doubted: while it learns its smallest rival is tried, ``again`` times as late each time that
+        was wrong; for good from so many episodes of it without failure on.
     work, work_rate : float
         Products in the rollouts of a decision at most: altogether, and in a second of the interval.
 
@@ -111,11 +107,9 @@ class Settings:
     outlier: float = 4.0
     drift: float = 30.0
     drift_fade: float = 0.95
-    patience: int = 8
-    refused: float = 0.75
-    sooner: int = 4
-    less: float = 0.33
-    few: int = 6
+    refused: float = 0.1
+    patience: int = 6
+    again: int = 4
     settled: int = 20
     work: float = 7e6
     work_rate: float = 8.75e8
@@ -169,8 +163,9 @@ class State(NamedTuple):
     ended: Annotated[Floats, _SEEN.of("ended", "m")]  #: where episodes ended without failing
     forms: Annotated[Floats, Numbers(("forms", failure.SIZE))]  #: where it fails or ends
     differs: Annotated[float, SHARE]  #: of what was asked, where a given function says otherwise
-    #: episodes in which little passed; below 0 those of doubt
+    #: episodes without failure in which much was refused; below 0 those of doubt
     held: Annotated[int, COUNT._replace(least=-COUNT.most)]
+    wrong: Annotated[int, COUNT]  #: how often a rival was wrong
     # dead ends
     centres: Annotated[Floats, _SEEN.of("dead_ends", "m")]
     radii: Annotated[Floats, _ABOVE_0.of("dead_ends")]
@@ -227,6 +222,7 @@ class State(NamedTuple):
             forms=e((0, failure.SIZE)),
             differs=0.0,
             held=0,
+            wrong=0,
             centres=e((0, m)),
             radii=e(0),
             counts=e(0),
@@ -283,7 +279,7 @@ def model_of(state: State, settings: Settings, *, daring: bool = False) -> Model
         table = table.copy()
         table[crash] = failure.halfway(table[crash], state.failures)
     if state.held < (0 if daring else -settings.settled):
-        table = table[~weak(table, state.failures, settings.few)]
+        table = failure.rivals(table, state.failures, sizes(state))
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) if len(spread) else 1.0
     share = state.noise / np.where(state.power > 0.0, state.power, 1.0)
     noisy = np.where(state.scale > 0.0, share.clip(1e-3, 1.0), 1.0)
@@ -305,18 +301,6 @@ def model_of(state: State, settings: Settings, *, daring: bool = False) -> Model
         inverse=inverse,
         choices=state.choices,
     )
-
-
-def weak(table: Floats, failures: Floats, few: int) -> Flags:
-    """(r,) which forms hardly any failure tells, and few beside the form that most tell.
-
-    As long as there is no bent form, of sides those that explain nothing that another does not.
-    """
-    held, sides = failure.inside(table, failures), failure.are_sides(table)
-    fails, count = table[:, SAYS] == FAILS, held.sum(1)
-    most = count[fails].max(initial=0)
-    alone = (held & (held[fails & sides].sum(0) < 2)).any(1) & sides & ~(fails & ~sides).any()
-    return np.asarray(fails & (count < few) & ((2 * count <= most) | (most <= 2)) & ~alone)
 
 
 def residuals_of(state: State, known: Model, steps: int) -> Floats:
