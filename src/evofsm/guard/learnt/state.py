@@ -30,7 +30,7 @@ _END = Numbers(least=-np.inf, most=np.inf)
 
 @dataclass(frozen=True)
 class LearntSettings:
-    """Numbers of the learnt judge; `python -m studies judges --quick` says what each is worth.
+    """Numbers of the learnt judge.
 
     Parameters
     ----------
