@@ -114,7 +114,7 @@ class Wall:
 
 
 class NoisyWall(Wall):
-    """The same with a noisy sensor, so that there is an observer."""
+    """The same with a noisy sensor."""
 
     noise = np.array([0.01, 0.004])
 

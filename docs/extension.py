@@ -343,6 +343,7 @@ def _as_written(
     if what == "method" and parameters and parameters[0].name == "self":
         signature = signature.replace(parameters=parameters[1:])
     written = stringify_signature(signature, show_return_annotation=False)
+    written = re.sub(r"Annotated\[(\w+), [^\[\]]*\]", r"\1", written)  # what files hold of it
     if inspect.isclass(thing) or signature.return_annotation is signature.empty:
         return written, None
     return written, str(signature.return_annotation)

@@ -31,9 +31,7 @@ from typer import Option
 from evofsm.cli import imported
 from evofsm.driving import guard_for_family
 from evofsm.fsm import EvolvingFSM
-from evofsm.guard import Guard, LearntRisk, SceneRisk, run_episode
-from evofsm.guard.learnt.judge import JUDGE_PARTS
-from evofsm.guard.learnt.state import Settings
+from evofsm.guard import Guard, LearntRisk, LearntSettings, SceneRisk, run_episode
 from evofsm.paper import Figure, Page, Table
 from studies import benchmark, lib
 from studies.lib import ALL, FIRST, Frames, Study, Target, at_least, at_most, frame_of
@@ -65,7 +63,7 @@ PARTS: dict[str, str] = {
 _GONE: dict[str, dict[str, Any]] = {
     "lags": {"lags": 1e12},
     "products": {"shy": 1e12},
-    "shy": {"shy": Settings().prior},
+    "shy": {"shy": LearntSettings().prior},
     "outliers": {"outlier": math.inf},
     "drift": {"drift": math.inf},
     "caution": {"caution": 0.0},
@@ -166,9 +164,9 @@ def learnt_guard(
 
     Without ``harm`` no episode is driven in shadow.
     """
-    parts = [part for part in without if part in JUDGE_PARTS]
+    parts = [part for part in without if part in LearntRisk.PARTS]
     gone = [_GONE[part] for part in without if part in _GONE]
-    settings = Settings(**{name: value for one in gone for name, value in one.items()})
+    settings = LearntSettings(**{name: value for one in gone for name, value in one.items()})
     told |= {"horizon": horizon, "seed": seed}
     judge = LearntRisk(interval, **told, without=parts, settings=settings)
     guard = Guard(**told, interval=interval, judge=judge, failed=failed)

@@ -202,13 +202,13 @@ def test_columns_that_are_named_in_another_order_are_what_they_are_called(evofsm
 
 
 def test_a_guard_that_refuses_most_of_the_time_is_said_to(evofsm, tmp_path):
-    """A tank whose inlet, which nobody sees, opens and closes as it likes."""
+    """A tank whose inlet, which nobody sees, opens and closes now and then."""
     path, guard, chance = tmp_path / "tank.csv", tmp_path / "tank.evofsm", random.Random(3)
     rows = ["run,time,level,pump"]
     for run in range(30):
         level, inlet = chance.uniform(0.2, 0.6), False
         for k in range(200):
-            pump, inlet = chance.random(), inlet != (chance.random() < 0.03)
+            pump, inlet = chance.random(), inlet != (chance.random() < 0.1)
             rows.append(f"{run},{k / 2},{level:.4f},{pump:.3f}")
             if level >= 0.9:
                 break

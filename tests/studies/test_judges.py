@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from studies import judges
+from studies import benchmark, judges
 from studies.judges import PARTS, Judges, Tasks, make_judge, run, summary, trial
 from studies.rivals import Rival
 from studies.systems import Start, make_system
@@ -136,10 +136,19 @@ def test_the_failure_function_is_told_where_an_observation_shows_it(made):
         make_judge("told", make_system("reactor"))
 
 
+def test_the_benchmark_names_what_is_less_than_was_accepted():
+    rows = benchmark.accepted().with_columns(without=pl.lit(""))
+    assert (benchmark.compared(rows)["missed"] == "").all()
+    worse = pl.when(pl.col("system") == "disc").then(pl.col("failed") + 1).otherwise("failed")
+    missed = benchmark.compared(rows.with_columns(failed=worse)).filter(pl.col("missed") != "")
+    assert set(missed["system"]) == {"disc"}
+    assert set(missed["missed"]) == {"failed"}
+
+
 def test_parts_are_named_or_refused():
     assert Judges().parts == tuple(PARTS)
     assert Judges(without="none").parts == Judges().shortened().parts == ()
-    assert Judges(without="lags, jumps, lags").parts == ("lags", "jumps")
+    assert Judges(without="lags, shy, lags").parts == ("lags", "shy")
     with pytest.raises(ValueError, match="no part 'wheels'; there are stretches"):
         _ = Judges(without="wheels").parts
 

@@ -13,7 +13,6 @@ from .api import Reviser as Reviser
 from .api import Revision as Revision
 from .api import RiskMeasure as RiskMeasure
 from .api import Search as Search
-from .api import SearchingJudge as SearchingJudge
 from .api import Situation as Situation
 from .audit_log import AuditLog as AuditLog
 from .audit_log import Head as Head
@@ -25,6 +24,7 @@ from .gym import RevisedActions as RevisedActions
 from .gym import RevisedVectorActions as RevisedVectorActions
 from .learnt.judge import LearntRisk as LearntRisk
 from .learnt.merge import merge_judges as merge_judges
+from .learnt.state import LearntSettings as LearntSettings
 from .loop import Decision as Decision
 from .loop import run_episode as run_episode
 from .pettingzoo import RevisedAgents as RevisedAgents

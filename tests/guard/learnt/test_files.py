@@ -7,8 +7,8 @@ import pytest
 
 from evofsm import Guard, store
 from evofsm.guard.guard import KIND as GUARD
-from evofsm.guard.learnt.files import KIND
 from evofsm.guard.learnt.judge import LearntRisk
+from evofsm.guard.learnt.state import KIND
 
 
 def assert_goes_on_alike(point, guard, exactly, content):

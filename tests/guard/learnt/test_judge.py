@@ -103,11 +103,9 @@ def test_features_grow_with_the_number_of_variables_or_it_is_refused(m, a, box):
 @pytest.mark.parametrize("places", [7, 20, 32])
 def test_many_variables_are_learnt_of_in_a_few_episodes_too(points, places, content):
     many = replace(points["box"], places=places)
-    guard = many.taught(4, shadow=False)
-    assert guard.judge.parts is not None
+    guard = many.guard(shadow=False)
+    assert sum(many.play(guard, k)[1] for k in range(6)) <= 2
     assert Guard.load(BytesIO(content(guard))).judge.n_variables == 2 * places
-    guard.shadow = False
-    assert not many.play(guard, 99)[1]
 
 
 @pytest.mark.parametrize("m", [65, 500, 21_168])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from evofsm.guard import LearntSettings
 from evofsm.guard.learnt.backups import evolved, first_backups
 from evofsm.guard.learnt.rollout import (
     CHANGED,
@@ -21,7 +22,6 @@ from evofsm.guard.learnt.rollout import (
     search,
     value_of,
 )
-from evofsm.guard.learnt.state import Settings
 
 STEPS, WALL = 20, 100.0
 ACTION = 3  # index of the first one among the features: after 1, the variable, its latest change
@@ -228,7 +228,7 @@ def test_feedback_evolves_where_no_constant_action_survives():
     pushed, random = np.zeros((STEPS, 1, 3)), np.random.default_rng(1)
     pushed[:, 0, 1], pushed[:, 0, 2] = 0.5, -0.5
     situations = np.array([[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    given = model, situations, pushed, 1.0, Settings(), random
+    given = model, situations, pushed, 1.0, LearntSettings(), random
     for _ in range(10):
         policies, linear = evolved(policies, linear, *given)
     assert linear[0]

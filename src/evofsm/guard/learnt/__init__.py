@@ -1,1 +1,1 @@
-"""A judge that was told nothing but which episodes failed: see `risk.LearntRisk`."""
+"""A judge that was told nothing but which episodes failed: see `judge.LearntRisk`."""

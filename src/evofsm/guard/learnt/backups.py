@@ -17,7 +17,7 @@ from itertools import product
 import numpy as np
 
 from evofsm.guard.learnt.rollout import Floats, Ints, Model, rollout
-from evofsm.guard.learnt.state import Settings
+from evofsm.guard.learnt.state import LearntSettings
 
 # Of mutants the share that are of the best, the share of numbers that differ, by a size of 10 to a
 # power between these.
@@ -69,7 +69,7 @@ def evolved(
     situations: Floats,
     residuals: Floats,
     scale: float,
-    settings: Settings,
+    settings: LearntSettings,
     random: np.random.Generator,
 ) -> tuple[Floats, Floats]:
     """Backups that are worth more, in the order in which they are asked."""

@@ -14,7 +14,7 @@ import numpy as np
 from evofsm.guard.learnt import failure, model
 from evofsm.guard.learnt.failure import HELD, SAYS, B, I, Survived
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, Floats, Model
-from evofsm.guard.learnt.state import Episode, Settings, State, sizes
+from evofsm.guard.learnt.state import Episode, LearntSettings, State, sizes
 
 # Episodes of which the end tells where there are any; observations so near the last one [typical
 # steps] cannot be told from it.
@@ -35,7 +35,7 @@ def fails(
     state: State,
     z: Floats,
     episode: Episode,
-    settings: Settings,
+    settings: LearntSettings,
     without: Set[str],
     given: Callable[[Floats], bool] | None,
 ) -> State:

@@ -25,7 +25,7 @@ from evofsm.fsm.validation import action_name, positive, real_array, refuse_unus
 from evofsm.guard.actions import Mask
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import SETTINGS, Harm
-from evofsm.guard.learnt import files, words
+from evofsm.guard.learnt import words
 from evofsm.guard.learnt.backups import basis
 from evofsm.guard.learnt.failure import AT, SAYS, B, I, are_sides
 from evofsm.guard.learnt.learn import disturbance_scale, ends_of, learn
@@ -42,12 +42,19 @@ from evofsm.guard.learnt.rollout import (
     survives,
     value_of,
 )
-from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
+from evofsm.guard.learnt.state import (
+    KIND,
+    Episode,
+    LearntSettings,
+    State,
+    model_of,
+    packed,
+    residuals_of,
+    unpacked,
+)
 from evofsm.guard.learnt.words import Remembered
 from evofsm.store import Place
 
-#: Parts that can be left out, to see what each is worth.
-JUDGE_PARTS = ("margin", "backups", "dead-ends", "stretches", "regions", "rivals")
 # Rows of an episode that are learnt from before it ends.
 _LONGEST = 1024
 # No horizon that is given has more steps: memory and the time of a decision grow with it.
@@ -67,7 +74,7 @@ class Parts(NamedTuple):
     scale: float  #: how much harder than they were disturbances are taken to be
 
     @classmethod
-    def of(cls, state: State, settings: Settings) -> Parts | None:
+    def of(cls, state: State, settings: LearntSettings) -> Parts | None:
         """Make them; None as long as there are no backups."""
         if not len(state.policies):
             return None
@@ -101,10 +108,10 @@ class LearntRisk(ActionJudge):
     seed : int
         Of the draws with which backups evolve and situations are chosen.
     without : sequence of str
-        Parts of `JUDGE_PARTS` that are left out.
+        Parts of `PARTS` that are left out.
     names, units : sequence of str
         Of the variables, for what people read; nothing is decided by them.
-    settings : Settings, optional
+    settings : LearntSettings, optional
         Its numbers.
 
     Raises
@@ -137,6 +144,9 @@ class LearntRisk(ActionJudge):
     LearntRisk(dt=0.02, seed=0)
     """
 
+    #: Parts that can be left out, to see what each is worth.
+    PARTS = ("margin", "backups", "dead-ends", "stretches", "regions", "rivals")
+
     # Of the present episode.
     _at: Floats | None  # the situation in which one was last, by all that was seen
     _action: Floats  # what was done there
@@ -166,7 +176,7 @@ class LearntRisk(ActionJudge):
         without: Sequence[str] = (),
         names: Sequence[str] = (),
         units: Sequence[str] = (),
-        settings: Settings | None = None,
+        settings: LearntSettings | None = None,
     ) -> None:
         self.dt = positive("dt", dt)
         self.given_horizon = None if horizon is None else positive("horizon", horizon)
@@ -177,10 +187,10 @@ class LearntRisk(ActionJudge):
                 f"looks at most {_MAX_STEPS:,} ahead (is it in seconds?)"
             )
         self.seed = operator.index(seed)
-        if unknown := set(without) - set(JUDGE_PARTS):
-            raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(JUDGE_PARTS)}")
+        if unknown := set(without) - set(self.PARTS):
+            raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(self.PARTS)}")
         self.without = frozenset(without)
-        self.settings = Settings() if settings is None else settings
+        self.settings = LearntSettings() if settings is None else settings
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.dt)
         #: Number of actions; 0 where the action is a box.
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
@@ -640,7 +650,7 @@ class LearntRisk(ActionJudge):
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
-        numbers, arrays = files.packed(self.state)
+        numbers, arrays = packed(self.state)
         settings = {
             **{name: getattr(self, name) for name in ("dt", "seed", "given_horizon", "n_violated")},
             **{name: getattr(self, name).tolist() for name in ("low", "high")},
@@ -652,21 +662,21 @@ class LearntRisk(ActionJudge):
             "state": numbers,
         }
         arrays["harm"] = np.array(self.harm.outcomes, np.float64).reshape(-1, 4)
-        store.write(path, files.KIND, settings, arrays, provenance)
+        store.write(path, KIND, settings, arrays, provenance)
 
     @classmethod
     def load(cls, path: Place) -> Self:
         """Read what was learnt, between two episodes; a ValueError if the file is damaged."""
-        settings, arrays = store.read(path, files.KIND)
+        settings, arrays = store.read(path, KIND)
         with store.explained(path):
             names = ("n_actions", "seed", "without", "names", "units")
             given = {name: settings[name] for name in names}
             if given["n_actions"] is None:
                 given |= {"low": settings["low"], "high": settings["high"]}
             given |= {"horizon": settings["given_horizon"]}
-            judge = cls(settings["dt"], settings=Settings(**settings["settings"]), **given)
+            judge = cls(settings["dt"], settings=LearntSettings(**settings["settings"]), **given)
             of = judge.choices, judge.size, judge.settings
-            judge.state = files.unpacked(settings["state"], arrays, *of)
+            judge.state = unpacked(settings["state"], arrays, *of)
             judge.harm = Harm.restored(settings["harm"], arrays["harm"])
             judge.n_violated = settings["n_violated"]
             judge.remake()

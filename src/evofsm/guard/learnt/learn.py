@@ -12,7 +12,7 @@ import numpy as np
 from evofsm.guard.learnt import danger, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups
 from evofsm.guard.learnt.rollout import Flags, Floats, Model, value_of
-from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
+from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
 
 # Actions of an episode that says how a system moves, at least; situations from which on
 # disturbances are looked for and backups evolve; those that are drawn to look for some;
@@ -31,7 +31,7 @@ _LOW, _HIGH = -0.6, 0.6
 def learn(
     state: State,
     episode: Episode,
-    settings: Settings,
+    settings: LearntSettings,
     *,
     seed: int = 0,
     without: Set[str] = frozenset(),
@@ -45,11 +45,11 @@ def learn(
     state : State
         What was known before it.
     episode : Episode
-    settings : Settings
+    settings : LearntSettings
     seed : int
         Of what is drawn, together with the number of the episode.
     without : set of str
-        Parts that are left out (`evofsm.guard.learnt.judge.JUDGE_PARTS`).
+        Parts that are left out (`LearntRisk.PARTS`).
     has_horizon : bool
         Whether it was given how far to look ahead.
     failed : callable, optional
@@ -117,13 +117,13 @@ def ends_of(u: Floats, choices: int) -> Floats:
     return np.array([(u < lowest).sum(0), (u > _HIGH).sum(0)], np.float64).T
 
 
-def disturbance_scale(state: State, settings: Settings) -> float:
+def disturbance_scale(state: State, settings: LearntSettings) -> float:
     """How much harder than they were disturbances are taken to be, while little was seen."""
     most = settings.caution_again if len(state.drifts) else settings.caution_max
     return 1.0 + min(most, settings.caution / max(1, state.n_scanned))
 
 
-def doubted(state: State, episode: Episode, settings: Settings) -> State:
+def doubted(state: State, episode: Episode, settings: LearntSettings) -> State:
     """Doubt forms that refused for long without a failure: rivals are tried (`failure.rivals`)."""
     if state.held < 0:
         return state._replace(held=state.held - (not episode.failed))
@@ -141,7 +141,7 @@ def noted(
     z: Floats,
     u: Floats,
     episode: Episode,
-    settings: Settings,
+    settings: LearntSettings,
     random: np.random.Generator,
 ) -> State:
     """Note situations, on which disturbances and backups are tried: of all in their turn.
@@ -172,7 +172,7 @@ def disturbances(
     known: Model,
     z: Floats,
     u: Floats,
-    settings: Settings,
+    settings: LearntSettings,
     random: np.random.Generator,
     *,
     looks: bool,
@@ -257,7 +257,7 @@ def chosen(ends: Floats, most: int) -> list[int]:
 
 
 def look_ahead(
-    state: State, known: Model, rest: Floats, episode: Episode, settings: Settings
+    state: State, known: Model, rest: Floats, episode: Episode, settings: LearntSettings
 ) -> State:
     """Look as far ahead as it takes to fail where nothing helps, and half as far again.
 

@@ -20,7 +20,7 @@ from evofsm.guard.learnt.danger import dead_ends, explained
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.learn import chosen, disturbance_scale, kept, worst
 from evofsm.guard.learnt.rollout import Floats, crossed, pairs
-from evofsm.guard.learnt.state import Episode, Settings, State, model_of, residuals_of
+from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
 
 
 def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
@@ -73,7 +73,7 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     return merged
 
 
-def merge(parts: Sequence[State], settings: Settings, seed: int) -> State:
+def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
     """Merge what was learnt apart of systems of one kind, counted from the origin of the first."""
 
     def of(name: str) -> Floats:

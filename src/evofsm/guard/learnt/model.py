@@ -86,7 +86,7 @@ def solve(
     a : int
         How many numbers an action has.
     prior : tuple of float
-        `Settings.prior`, ``shy`` and ``lags``.
+        `LearntSettings.prior`, ``shy`` and ``lags``.
     """
     n, size, m = max(1.0, float(squares[0, 0])), np.diag(squares), len(noisy)
     variance = np.maximum(size - squares[0] ** 2 / n, _LEAST * size)

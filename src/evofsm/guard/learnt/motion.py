@@ -11,7 +11,7 @@ import numpy as np
 
 from evofsm.guard.learnt import model
 from evofsm.guard.learnt.rollout import Flags, Floats, Model, lags
-from evofsm.guard.learnt.state import Settings, State, model_of
+from evofsm.guard.learnt.state import LearntSettings, State, model_of
 
 # Changes of which the typical step is learnt; a larger one counts as so many times that.
 _STEPS, _LARGE = 5000.0, 6.0
@@ -68,7 +68,7 @@ def _extremes(known: Floats, new: Floats, close: Floats) -> tuple[Floats, Flags]
     return np.array([np.where(is_new, new, known[0]), second]), is_new
 
 
-def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: Settings) -> State:
+def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntSettings) -> State:
     """Learn the model of observations (T + 1, m) and actions (T, a); NaN was not seen.
 
     Outliers of the model ``known`` weigh less; jumps, and what is held at an end of a variable, are
@@ -120,7 +120,7 @@ def _held(state: State, to: Floats, after: Floats) -> Flags:
 
 
 def _drifted(
-    state: State, known: Model, phi: Floats, change: Floats, moves: Floats, settings: Settings
+    state: State, known: Model, phi: Floats, change: Floats, moves: Floats, settings: LearntSettings
 ) -> State:
     """Correct the model, where it is otherwise now, by features and changes of an episode.
 
@@ -158,7 +158,7 @@ def _drifted(
     return _anew(state, settings) if len(begun) else state
 
 
-def _anew(state: State, settings: Settings) -> State:
+def _anew(state: State, settings: LearntSettings) -> State:
     """Trust model and disturbances as little as at first: it may take longer to fail, too."""
     longer = settings.ahead * max(state.time_to_failure, settings.horizon / settings.ahead)
     return state._replace(

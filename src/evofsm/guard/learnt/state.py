@@ -1,16 +1,26 @@
-"""All that a learnt judge knows, as one frozen tuple, and what rollouts take of it."""
+"""All that a learnt judge knows, as one frozen tuple; what rollouts, and files, take of it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
+from evofsm.guard.harm import OUTCOMES, SETTINGS
 from evofsm.guard.learnt import failure, model
-from evofsm.guard.learnt.failure import SAYS, B, I, Survived
-from evofsm.guard.learnt.rollout import CRASHES, FAILS, Floats, Model, n_features
-from evofsm.store import COUNT, FLAG, SHARE, Numbers
+from evofsm.guard.learnt.failure import HELD, ONE, OTHER, SAYS, B, I, J, Survived
+from evofsm.guard.learnt.rollout import (
+    CRASHES,
+    FAILS,
+    Floats,
+    Model,
+    n_features,
+    refuse_too_many,
+)
+from evofsm.store import COUNT, FLAG, FROM_1, SHARE, SIZE, SMALLEST, Kind, Numbers
 
 # What files hold of a field: observations, what is not negative, and ends that may be infinite.
 _SEEN, _ABOVE_0 = Numbers(least=-1e30, most=1e30), Numbers(least=0.0)
@@ -18,8 +28,8 @@ _END = Numbers(least=-np.inf, most=np.inf)
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Numbers of the learnt judge; `python -m studies judges --quick` says what each is worth.
+class LearntSettings:
+    """Numbers of the learnt judge.
 
     Parameters
     ----------
@@ -187,7 +197,9 @@ class State(NamedTuple):
     horizon: Annotated[int, COUNT._replace(least=1.0, most=1e4)]  #: [steps]
 
     @classmethod
-    def none(cls, m: int, a: int, choices: int, settings: Settings, horizon: int | None) -> State:
+    def none(
+        cls, m: int, a: int, choices: int, settings: LearntSettings, horizon: int | None
+    ) -> State:
         """Before anything was learnt."""
         p, e = n_features(m, a, box=not choices), np.empty
         return cls(
@@ -254,13 +266,13 @@ def _spread(state: State) -> Floats:
     return np.asarray(rows.std(0) if len(rows) else np.zeros(len(state.origin)))
 
 
-def model_of(state: State, settings: Settings, *, daring: bool = False) -> Model:
+def model_of(state: State, settings: LearntSettings, *, daring: bool = False) -> Model:
     """Make what rollouts take.
 
     Parameters
     ----------
     state : State
-    settings : Settings
+    settings : LearntSettings
     daring : bool
         Whether to leave out what is doubted, and to come closer to where it crashes: so it is tried
         while it learns.
@@ -317,3 +329,74 @@ def residuals_of(state: State, known: Model, steps: int) -> Floats:
         rest[:, state.drifts[state.drifts[:, 1] > episode, 0].astype(int)] = 0.0
         found[: len(rest), :, k] = rest
     return found
+
+
+# -- In a file -----------------------------------------------------------------------------------
+
+# What a field holds: its type, and which numbers.
+_FIELDS = {
+    name: get_args(hint) for name, hint in get_type_hints(State, include_extras=True).items()
+}
+_ARRAYS = {name: numbers for name, (kind, numbers) in _FIELDS.items() if kind == Floats}
+_NUMBERS = {name: numbers for name, (_, numbers) in _FIELDS.items() if name not in _ARRAYS}
+_SETTING = {int: COUNT._replace(most=1e6), float: Numbers(least=SMALLEST)}
+KIND = Kind(
+    "learntrisk",
+    {"harm": OUTCOMES, **_ARRAYS},
+    {
+        "dt": SIZE,
+        "given_horizon": SIZE._replace(optional=True),
+        "n_actions": FROM_1._replace(optional=True),
+        **dict.fromkeys(("low", "high"), Numbers(("ends",), -1e100, 1e100)),
+        **dict.fromkeys(("seed", "n_violated"), COUNT),
+        **dict.fromkeys(("names", "units", "without"), list[str]),
+        "harm": SETTINGS,
+        "settings": {name: _SETTING[kind] for name, kind in get_type_hints(LearntSettings).items()},
+        "state": _NUMBERS,
+    },
+)
+
+
+def packed(state: State) -> tuple[dict[str, Any], dict[str, Floats]]:
+    """Numbers and arrays of a state, by name."""
+    fields = state._asdict()
+    return {name: fields[name] for name in _NUMBERS}, {name: fields[name] for name in _ARRAYS}
+
+
+def unpacked(
+    numbers: Mapping[str, Any],
+    arrays: Mapping[str, NDArray[Any]],
+    choices: int,
+    size: int,
+    settings: LearntSettings,
+) -> State:
+    """Make a state of what `packed` gave.
+
+    Raises
+    ------
+    ValueError
+        If sizes or indices contradict each other, or the actions: kernels take them on trust.
+    """
+    fields: dict[str, Any] = {**numbers, **{name: arrays[name] for name in _ARRAYS}}
+    state = State(**fields)
+    m, a = len(state.origin), len(state.used)
+    if (state.choices, a) != (choices, size):
+        raise ValueError(f"it is of actions of {a} numbers, but they have {size}")
+    refuse_too_many(m, a, box=not choices)
+    for name, array in State.none(m, a, choices, settings, None)._asdict().items():
+        shape, rows = np.shape(getattr(state, name)), int(name != "squares")
+        if shape[rows:] != np.shape(array)[rows:]:
+            raise ValueError(
+                f"{name} has shape {shape}, not one of {m} variables and actions of {a} numbers"
+            )
+    forms, steps = state.forms, state.windows.shape[1]
+    which = forms[:, [SAYS, I, J]]
+    if ((which != np.rint(which)) | (which < 0.0) | (which >= [CRASHES + 1, m, m])).any():
+        raise ValueError("forms are of variables that there are not")
+    if (forms[:, [ONE, OTHER]] <= 0.0).any() or (forms[:, HELD] < 0.0).any():
+        raise ValueError("forms have units that are not positive")
+    if (state.drifts[:, 0] >= m).any():
+        raise ValueError("drifts are of variables that there are not")
+    if ((state.lengths < 3.0) | (state.lengths > steps)).any():
+        raise ValueError(f"windows have other than 3 to {steps} steps")
+    return state
