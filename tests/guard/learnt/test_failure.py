@@ -20,7 +20,7 @@ from evofsm.guard.learnt.failure import (
     explain,
     inside,
 )
-from evofsm.guard.learnt.rollout import FAILS
+from evofsm.guard.learnt.rollout import ENDS, FAILS
 
 SHAPES = {
     "disc": lambda z: np.hypot(z[..., 0], z[..., 2]) < 0.8,
@@ -175,7 +175,36 @@ def test_a_disc_is_learnt_said_and_no_threshold(taught):
     assert sum(failed for _, failed in held) <= 1
 
 
-def test_thresholds_that_one_failure_tells_are_doubted_where_nearly_all_is_refused_for_long():
+def test_what_refused_for_long_without_a_failure_is_tried_by_its_smallest_rival():
+    """A craft that sinks fails if it touches fast, and ends if slowly, which it did never yet."""
+    guard = Guard(0.0, 1.0, interval=0.1)
+
+    def fly(throttle):
+        z = np.array([3.0, 0.0])
+        for _ in range(150):
+            u = float(np.squeeze(guard.decide(z, throttle(z)).executed))
+            v = z[1] + 0.1 * (2.0 * u - 1.0)
+            z = np.array([z[0] + 0.1 * v, v])
+            if z[0] <= 0.0:
+                break
+        touched, fast = bool(z[0] <= 0.0), bool(z[1] < -0.6)
+        guard.end(touched and fast, z, terminated=touched and not fast)
+        return touched and not fast
+
+    def softly(z):
+        return np.clip(0.5 + 2.0 * (-0.25 - 0.15 * z[0] - z[1]), 0.0, 1.0)
+
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        fly(lambda z: rng.uniform(0.0, 0.9))
+    assert "while it learns it tries whether it only fails if it ends where" in str(guard)
+    assert sum(fly(softly) for _ in range(9)) >= 7
+    assert (guard.judge.state.forms[:, SAYS] == ENDS).any()  # it is known now
+    guard.freeze()
+    assert sum(fly(softly) for _ in range(9)) == 9
+
+
+def test_a_rival_that_was_wrong_is_tried_later_the_next_time():
     guard = Guard(-np.ones(1), np.ones(1), interval=0.1, horizon=2.0)
     rng = np.random.default_rng(0)
 
@@ -186,23 +215,21 @@ def test_thresholds_that_one_failure_tells_are_doubted_where_nearly_all_is_refus
             z = z + 0.02 + 0.002 * rng.normal(size=2)
         guard.end(failed, z)
 
-    for k in range(4):
-        play(1.0 if k == 3 else 0.5, k == 3)
-    assert len(guard.judge.parts.model.forms) == 2  # of one failure it may be either
-    for _ in range(8):  # nearly all is refused
-        assert len(guard.judge.parts.daring.forms) == 2
+    def wait():
         for _ in range(60):
             guard.decide(0.95 + 0.02 * rng.normal(size=2), np.ones(1))
         guard.end(False)
-    assert not len(guard.judge.parts.daring.forms)
-    assert len(guard.judge.parts.model.forms) == 2
-    assert "so it is doubted" in guard.decide(np.zeros(2), np.ones(1)).reason
-    guard.freeze()
-    guard.decide(np.zeros(2), np.ones(1))
-    assert "is doubted" not in guard.decide(np.zeros(2), np.ones(1)).reason
-    guard.learn = True
-    play(1.0, failed=True)
-    assert len(guard.judge.parts.daring.forms) >= 1
+
+    for k in range(4):
+        play(1.0 if k == 3 else 0.5, k == 3)
+    for _ in range(8):
+        wait()
+    assert guard.judge.state.held < 0
+    play(0.98, failed=True)  # not as it did
+    assert (guard.judge.state.held, guard.judge.state.wrong) == (0, 1)
+    for _ in range(8):
+        wait()
+    assert guard.judge.state.held == 8
 
 
 def saved(guard):

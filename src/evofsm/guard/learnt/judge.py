@@ -298,8 +298,6 @@ class LearntRisk(ActionJudge):
         if not len(self.state.forms):
             return Search(one, _unjudged(1), 0, self._no_threshold)
         model = parts.daring if self.learning else parts.model
-        if not len(model.forms):
-            return Search(one, _unjudged(1), 0, words.DOUBTED)
         proposal, scale, margin = self.encode(wanted), parts.scale, self.state.margin
         few, most = self.effort
         remembered, ranks = self.remembered, self._ranks[:few]

@@ -22,6 +22,9 @@ from evofsm.guard.learnt.learn import chosen, disturbance_scale, kept, worst
 from evofsm.guard.learnt.rollout import Floats, crossed, pairs
 from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
 
+# Numbers of which the largest counts.
+_LARGEST = "margin", "time_to_failure", "believed", "too_short"
+
 
 def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     """Merge judges that learnt apart, between episodes, into one that shares nothing with them.
@@ -95,7 +98,7 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
     drifts = [one.drifts + np.array([0, k, k]) for one, k in zip(parts, after, strict=True)]
     fields: dict[str, Any] = {
         **{name: int(of(name).sum()) for name in ("n_failed", "n_scanned", "n_seen", "n_moves")},
-        **{name: float(of(name).max()) for name in ("margin", "time_to_failure", "believed")},
+        **{name: float(of(name).max()) for name in _LARGEST},
         **{name: _average(of(name), moves) for name in ("unit", "power")},
         **{name: _average(of(name), moves * of("scale").any(1)) for name in ("scale", "noise")},
         **{name: rows(name, settings.max_failures) for name in ("failures", "brinks", "ended")},
@@ -117,7 +120,7 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
         "survived_in": seen_in[::every],
         "situations": rows("situations", settings.n_situations),
         "used": of("used").sum(0),
-        "horizon": int(of("horizon").max()),
+        **{name: int(of(name).max()) for name in ("horizon", "wrong")},
     }
     merged = State.none(m, a, first.choices, settings, None)._replace(**fields)
     merged = explained(merged, failed=True)

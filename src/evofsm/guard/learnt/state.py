@@ -74,10 +74,11 @@ class LearntSettings:
     drift, drift_fade : float
         It moves otherwise from so much gained log likelihood on (Page 1954); of the latest episodes
         what is left an episode later.
-    refused, patience, again, settled : float
+    refused, patience, again, settled, few : float
         What refuses more than this share of proposals, in so many episodes without failure, is
         doubted: while it learns its smallest rival is tried, ``again`` times as late each time that
-        was wrong; for good from so many episodes of it without failure on.
+        was wrong; for good from so many episodes of it without failure on, if it is told by fewer
+        than ``few`` failures: one wrong label is outlived.
     work, work_rate : float
         Products in the rollouts of a decision at most: altogether, and in a second of the interval.
 
@@ -121,6 +122,7 @@ class LearntSettings:
     patience: int = 6
     again: int = 4
     settled: int = 20
+    few: int = 3
     work: float = 7e6
     work_rate: float = 8.75e8
 
@@ -291,7 +293,8 @@ def model_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
         table = table.copy()
         table[crash] = failure.halfway(table[crash], state.failures)
     if state.held < (0 if daring else -settings.settled):
-        table = failure.rivals(table, state.failures, sizes(state))
+        few = np.inf if daring else settings.few
+        table = failure.rivals(table, state.failures, sizes(state), few)
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) if len(spread) else 1.0
     share = state.noise / np.where(state.power > 0.0, state.power, 1.0)
     noisy = np.where(state.scale > 0.0, share.clip(1e-3, 1.0), 1.0)

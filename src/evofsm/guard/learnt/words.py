@@ -36,16 +36,13 @@ from evofsm.guard.harm import Harm, Outcome
 from evofsm.guard.learnt import failure
 from evofsm.guard.learnt.failure import HELD, SAYS, I
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, Floats, Model
-from evofsm.guard.learnt.state import State
+from evofsm.guard.learnt.state import State, sizes
 
 #: Said as long as there is nothing to judge by.
 NOTHING_LEARNT = "nothing was learnt yet"
 NOTHING_SEEN = "nothing of this episode was observed yet"
 NO_FAILURE = "no failure is known yet, so nothing is refused"
 #: Said while it is tried whether what one or two failures tell is true.
-DOUBTED = (
-    "what few failures taught refused nearly all for long, so it is doubted until it fails again"
-)
 #: What is done where all backups look alike and another action was hardly used.
 TRIED = "no action passes; what this one does is hardly known, so it is tried"
 
@@ -148,27 +145,36 @@ def no_threshold(n_failed: int, *, is_given: bool) -> str:
 
 def experience(state: State, remembered: Remembered, names: Sequence[str], nothing: str) -> str:
     """What was learnt so far; what is said of failure where that is not known is ``nothing``."""
-    said: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: []}
-    sides = []
-    for row, is_side in zip(state.forms, failure.are_sides(state.forms), strict=True):
-        told = region(names, row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])])
-        if is_side and row[SAYS] == FAILS:
-            sides.append(told.removeprefix("where ").partition(" (")[0])
-        else:
-            said[int(row[SAYS])].append(told)
+    there, ends = _where(state.forms, names)
     latest = {int(j): int(since) + 1 for j, since, _ in state.drifts}
     more = "".join(f"; since episode {k} {names[j]} moves otherwise" for j, k in latest.items())
-    if said[ENDS]:
-        more += f"; ends by itself {' or '.join(said[ENDS])}"
-    there = [f"where {' or '.join(sides)}"] if sides else []
-    there += said[FAILS] + [f"if it ends {one}" for one in said[CRASHES]]
+    if ends:
+        more += f"; ends by itself {' or '.join(ends)}"
     if not there:
         return nothing + more
     if state.differs:
         more += f"; failed= says otherwise in {state.differs:.1%} of the states around, where this "
         more += "decides"
+    if state.held < 0:
+        tried, _ = _where(failure.rivals(state.forms, state.failures, sizes(state)), names)
+        more += "; much was refused without a failure: while it learns it tries whether it only "
+        more += f"fails {' or '.join(tried)}"
     them = f"{remembered}, to be survived by {changes(state.margin)}"
     return f"fails {' or '.join(there)}; {them}{more}{dead_ends(state.counts.astype(int).tolist())}"
+
+
+def _where(table: Floats, names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Where it fails, and where it ends by itself, by a table of forms."""
+    said: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: []}
+    sides = []
+    for row, is_side in zip(table, failure.are_sides(table), strict=True):
+        told = region(names, row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])])
+        if is_side and row[SAYS] == FAILS:
+            sides.append(told.removeprefix("where ").partition(" (")[0])
+        else:
+            said[int(row[SAYS])].append(told)
+    there = [f"where {' or '.join(sides)}"] if sides else []
+    return there + said[FAILS] + [f"if it ends {one}" for one in said[CRASHES]], said[ENDS]
 
 
 def here(
