@@ -360,9 +360,9 @@ class LatentRisk(Retraced):
     ) -> tuple[int, str] | None:
         """Index of the option that is in proportion, and why; None where none avoids a collision.
 
-        The closest tolerable one down to ``comfort``; else the least braking that `foresee` says
-        regains a safe gap within ``regain``, or ``comfort`` where none does, but always what avoids
-        the collision that is foreseen.
+        The closest one down to ``comfort`` that is tolerable, or that `foresee` says regains a safe
+        gap within ``regain``; ``comfort`` where there is none, and harder only as far as it takes
+        to avoid the collision that is foreseen. In a smaller gap one never brakes less.
         """
         here = self._cautious(situation.observation)
         if not is_whole(here):
@@ -543,18 +543,16 @@ def in_proportion(
 
     All arrays have an entry for each option (k,); the first option is the proposal.
     """
-    change = np.abs(options - options[0])
-    gentle = options >= min(-comfort, options[0])
-    for tolerated in tolerances:
-        if (tolerable := np.flatnonzero((risk <= tolerated) & gentle)).size:
-            return int(tolerable[change[tolerable].argmin()]), "the closest that can"
-    enough = avoids & (regains | (options <= -comfort)) & (options <= options[0])
-    if not enough.any():
-        return None
-    best = int(np.where(enough, options, -np.inf).argmax())
-    if best == 0:
-        return 0, "it regains a safe gap in time"
-    return best, "none can gently, the least braking that regains a safe gap in time"
+    gentle, lower = options >= min(-comfort, options[0]), avoids & (options <= options[0])
+    passing = [gentle & ((risk <= tolerated) | (lower & regains)) for tolerated in tolerances]
+    for each in (*passing, lower & (options <= -comfort)):
+        if each.any():
+            best = int(np.where(each, np.abs(options - options[0]), np.inf).argmin())
+            if risk[best] <= tolerances[-1]:
+                return best, "the closest that can"
+            least = "the least braking that regains a safe gap in time"
+            return best, least if best else "it regains a safe gap in time"
+    return None
 
 
 # -- Of states ----------------------------------------------------------------------------------

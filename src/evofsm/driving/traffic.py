@@ -174,8 +174,7 @@ class TrafficRisk(ActionJudge):
 
     Notes
     -----
-    Where no action down to ``ahead.comfort`` is tolerable for all, it is the one in proportion
-    (`LatentRisk.choose`) that the car behind survives. Where none avoids a collision that is
+    Chosen is the action in proportion (`LatentRisk.choose`) that the car behind survives. Where none avoids a collision that is
     foreseen, it is the least risky ahead of those that the car behind survives; where a leader who
     merely keeps its speed would be hit then, the softest that avoids it, or the hardest.
 
@@ -189,7 +188,7 @@ class TrafficRisk(ActionJudge):
     >>> round(revision.executed, 2)
     -1.8
     >>> revision.reason.partition("; ")[2]
-    'none can gently, the least braking that regains a safe gap in time'
+    'the least braking that regains a safe gap in time'
     """
 
     fallback = Fallback(0.0, "keeping the speed")
