@@ -249,9 +249,9 @@ static int in_proportion(const evofsm_state *s, const double here[3], double lim
     const double option = s->options[i], off = fabs(option - wanted);
     const int is_gentle = option >= lesser(-COMFORT, wanted);
     const int is_lower = option <= wanted && avoids(here, option, s->commanded, braking);
-    const int is_soon = is_lower && regains(here, option, braking);
-    passes[0] = is_gentle && (s->risk[i] <= limit || is_soon);
-    passes[1] = is_gentle && (s->risk[i] <= TOLERANCE || is_soon);
+    const int is_soon = is_gentle && is_lower && regains(here, option, braking);
+    passes[0] = is_soon || (is_gentle && s->risk[i] <= limit);
+    passes[1] = is_soon || (is_gentle && s->risk[i] <= TOLERANCE);
     passes[2] = is_lower && option <= -COMFORT;
     for (k = 0; k < 3; k++) {
       best[k] = passes[k] && (best[k] < 0 || off < fabs(s->options[best[k]] - wanted)) ? i : best[k];

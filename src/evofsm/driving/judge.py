@@ -10,7 +10,8 @@ now, even braking in full at once would be too late; while it does not, that can
 
 It is left *in proportion*. What could begin is answered by a comfortable deceleration at most.
 Harder braking answers what is seen: it is the least that avoids the collision that is foreseen if
-the leader goes on as it does. A gap that is not safe is to be safe again within a stated time.
+the leader goes on as it does. A gap is safe where one may keep the speed for a decision; one that
+is not is to be so within a stated time.
 """
 
 from __future__ import annotations
@@ -129,8 +130,8 @@ class LatentRisk(Retraced):
         Braking that needs no collision to be foreseen [m/s²]. Adaptive cruise control may brake by
         3.5 m/s² at 20 m/s and above (ISO 15622).
     regain : float
-        Within this time a gap that is not safe, such as after a cut-in, is to be safe again [s].
-        Longer is gentler, and riskier if the leader brakes meanwhile.
+        Within this time a gap that is not safe, such as after a cut-in, is to be safe again [s],
+        if ``comfort`` is enough. Longer is gentler, and riskier if the leader brakes meanwhile.
     leaders : LeaderBrakes, optional
         Leaders' brakes to begin with, as if they had been seen; `leaders.REAL_DRIVES` are those
         of public drives. Without them it begins with the assumption alone.
