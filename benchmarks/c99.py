@@ -455,7 +455,7 @@ _CHOSEN = {
     1: "the closest that can",
     3: "nothing can, the least risky",
     7: "it regains a safe gap in time",
-    8: "none can gently, the least braking that regains a safe gap in time",
+    8: "the least braking that regains a safe gap in time",
 }
 
 

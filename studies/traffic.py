@@ -280,8 +280,9 @@ class Traffic(Study):
         tasks, curve = [], []
         for k, (world, drivers, seconds) in product(range(self.seeds), kinds):
             one = partial(simulate, world, drivers, seed=self.seed + k, seconds=seconds)
-            tasks.append(partial(one, ALONE, shares=SHARES))
-            tasks += [partial(one, OURS, shares=(share,)) for share in SHARES]
+            # As many look at it alone as guarded: in `ramp`, who merges first hangs on that.
+            for policy, share in product((ALONE, OURS), SHARES):
+                tasks.append(partial(one, policy, shares=(share,)))
             tasks += [partial(one, formula) for formula in FORMULAS]
             if k == 0 and world in {DRIVERS[0]: _HARM, DRIVERS[2]: _RISK}.get(drivers, ()):
                 curve += [partial(one, OURS, regain=regain) for regain in self.regains]

@@ -9,6 +9,8 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+from evofsm import driving
+from evofsm.driving import IDM, Leader, Scenario, guard_for_cars
 from evofsm.driving.judge import LatentRisk, assess_states
 from evofsm.driving.leaders import REAL_DRIVES
 from evofsm.driving.measures import is_dead_end
@@ -28,6 +30,8 @@ DECEL_TOLERANCE = 0.05
 GAPS = st.floats(0.05, 120.0)
 SPEEDS = st.one_of(st.just(0.0), st.floats(0.0, 40.0))
 ACTIONS = st.floats(-5.0, 3.0)
+STEADY = IDM(1.2, 20.0, 1.0, 1.0, 2.5)
+HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
 DECELS = st.floats(1.0, 9.0)
 LAGS = st.one_of(st.just(0.0), st.floats(0.0, 1.0))
 
@@ -250,6 +254,47 @@ def test_bad_input_is_named_and_changes_nothing(taught, snapshot, observation, a
 def test_settings_that_cannot_be_right_are_refused(name, wrong):
     with pytest.raises(ValueError, match="must be"):
         LatentRisk(**{"lowest": -2.5, name: wrong})
+
+
+# -- In proportion ----------------------------------------------------------------------------
+
+
+def cars(worst):
+    return guard_for_cars(low=-4.0, high=2.5, judge=LatentRisk.given(-4.0, 4.0, worst))
+
+
+@pytest.mark.parametrize("ahead", [18.0, 20.0, 22.0])
+@pytest.mark.parametrize("proposal", [0.0, 1.0])
+def test_in_a_smaller_gap_one_never_brakes_less(proposal, ahead):
+    gaps = np.arange(0.5, 45.0, 0.5)
+    found = [cars(6.0).decide([gap, 20.0, ahead], proposal).executed for gap in gaps]
+    assert (np.diff(found) >= 0.0).all()
+    assert found[-1] == proposal
+    assert -3.3 < found[4] < 0.0  # nothing is foreseen: as hard as is comfortable, to an option
+
+
+def collides(gap, speed, ahead, brakes_at, worst, waves=()):
+    """Behind a leader that goes on as it is, or in waves, and then brakes as hard as is assumed."""
+    leader = Leader(STEADY, worst, brake_time=brakes_at, initial_speed=ahead, waves=waves)
+    drive = Scenario(leader, initial_gap=gap, initial_speed=speed)
+    return driving.drive(cars(worst), drive, controller=HASTY).collided
+
+
+@pytest.mark.parametrize("gap", [3.0, 10.0, 18.0, 25.0, 32.0])
+def test_after_some_seconds_a_gap_survives_what_is_assumed_of_leaders(gap):
+    assert collides(gap, 20.0, 20.0, 0.0, 9.0)  # too small at first
+    assert not collides(gap, 20.0, 20.0, 8.0, 9.0)
+
+
+@given(SPEEDS, st.floats(5.0, 30.0), st.floats(0.0, 12.0), st.data())
+@settings(max_examples=40)
+def test_who_keeps_to_a_gap_that_is_safe_survives_whatever_the_leader_does(speed, ahead, at, data):
+    more = [(float(k), data.draw(st.floats(-2.0, 2.0))) for k in range(12)]
+    speed = min(speed, ahead + 3.0)
+    gap = GAP_TOLERANCE + MARGIN
+    while critical(gap, speed, ahead, 0.0) < 6.0:
+        gap += 0.25
+    assert not collides(gap, speed, ahead, at, 6.0, tuple(more))
 
 
 # -- In files ----------------------------------------------------------------------------------

@@ -178,7 +178,7 @@ static int regains(const double here[3], double acceleration, double braking) {
   then[2] = greater(here[2], 0.0);
   then[0] = here[0] + drive_on(&then[2], -braking, REGAIN);
   then[0] -= drive_on(&then[1], acceleration, REGAIN);
-  return survives(then, -DECEL, -DECEL, WORST, CLEARANCE);
+  return survives(then, 0.0, acceleration, WORST, CLEARANCE);
 }
 
 /* LatentRisk._leader_braking: since the observation before, if it is the same leader. */
@@ -228,39 +228,40 @@ static void bounds(double share, double *low, double *high) {
 
 /* -- The reviser: ActionReviser._decide ---------------------------------------------------------- */
 
-/* Of options not below an action whose risk is tolerated the closest to another one, of equals the
-   first; -1: none is. */
-static int closest(const evofsm_state *s, double action, double tolerated, double lowest) {
+/* Of options whose risk is tolerated the closest to an action, of equals the first; -1: none is. */
+static int closest(const evofsm_state *s, double action, double tolerated) {
   int i, best = -1;
   for (i = 0; i < EVOFSM_OPTIONS; i++) {
     const double off = fabs(s->options[i] - action);
-    if (s->options[i] >= lowest && s->risk[i] <= tolerated && (best < 0 || off < fabs(s->options[best] - action))) {
+    if (s->risk[i] <= tolerated && (best < 0 || off < fabs(s->options[best] - action))) {
       best = i;
     }
   }
   return best;
 }
 
-/* in_proportion: the closest tolerable one that is gentle, else the least braking that avoids what
-   is seen and regains a safe gap; -1: none. */
+/* in_proportion: the closest gentle one that is tolerable or regains a safe gap, else the least
+   braking beyond that avoids what is seen; -1: none. */
 static int in_proportion(const evofsm_state *s, const double here[3], double limit, int *reason) {
   const double braking = lesser(leader_braking(s), WORST), wanted = s->options[0];
-  const double gentle = lesser(-COMFORT, wanted);
-  int i, best = closest(s, wanted, limit, gentle);
-  best = best < 0 ? closest(s, wanted, TOLERANCE, gentle) : best;
-  if (best >= 0) {
-    return best;
-  }
-  *reason = EVOFSM_REGAINED;
+  int i, k, passes[3], best[3] = {-1, -1, -1};
   for (i = 0; i < EVOFSM_OPTIONS; i++) {
-    const double option = s->options[i];
-    if (option <= wanted && (best < 0 || option > s->options[best]) &&
-        avoids(here, option, s->commanded, braking) &&
-        (option <= -COMFORT || regains(here, option, braking))) {
-      best = i;
+    const double option = s->options[i], off = fabs(option - wanted);
+    const int is_gentle = option >= lesser(-COMFORT, wanted);
+    const int is_lower = option <= wanted && avoids(here, option, s->commanded, braking);
+    const int is_soon = is_gentle && is_lower && regains(here, option, braking);
+    passes[0] = is_soon || (is_gentle && s->risk[i] <= limit);
+    passes[1] = is_soon || (is_gentle && s->risk[i] <= TOLERANCE);
+    passes[2] = is_lower && option <= -COMFORT;
+    for (k = 0; k < 3; k++) {
+      best[k] = passes[k] && (best[k] < 0 || off < fabs(s->options[best[k]] - wanted)) ? i : best[k];
     }
   }
-  return best;
+  i = best[0] >= 0 ? best[0] : best[1] >= 0 ? best[1] : best[2];
+  if (i >= 0 && !(s->risk[i] <= TOLERANCE)) {
+    *reason = i ? EVOFSM_REGAINED : EVOFSM_REGAINS;
+  }
+  return i;
 }
 
 static int decide_by_risk(evofsm_state *s, const double here[3], int *reason) {
@@ -270,7 +271,7 @@ static int decide_by_risk(evofsm_state *s, const double here[3], int *reason) {
   if (s->tries > 0 && !KNOWN) {
     s->tries--;
     *reason = EVOFSM_TRYING;
-    return closest(s, LOWEST, INFINITY, -INFINITY);
+    return closest(s, LOWEST, INFINITY);
   }
   if (s->risk[0] <= limit) {
     s->revising = 0;
@@ -280,18 +281,16 @@ static int decide_by_risk(evofsm_state *s, const double here[3], int *reason) {
   s->revising = 1;
   if (!KNOWN && ACTS) {
     s->tries = TRIAL;
-    return closest(s, LOWEST, INFINITY, -INFINITY);
+    return closest(s, LOWEST, INFINITY);
   }
   *reason = EVOFSM_CHANGED;
   best = is_whole(here) ? in_proportion(s, here, limit, reason) : -1;
   if (best >= 0) {
     s->revising = best != 0;
-    *reason = best != 0 ? *reason : EVOFSM_REGAINS;
     return best;
   }
-  *reason = EVOFSM_CHANGED;
-  best = closest(s, s->options[0], limit, -INFINITY);
-  best = best < 0 ? closest(s, s->options[0], TOLERANCE, -INFINITY) : best;
+  best = closest(s, s->options[0], limit);
+  best = best < 0 ? closest(s, s->options[0], TOLERANCE) : best;
   if (best >= 0) {
     return best;
   }

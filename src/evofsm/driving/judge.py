@@ -10,7 +10,8 @@ now, even braking in full at once would be too late; while it does not, that can
 
 It is left *in proportion*. What could begin is answered by a comfortable deceleration at most.
 Harder braking answers what is seen: it is the least that avoids the collision that is foreseen if
-the leader goes on as it does. A gap that is not safe is to be safe again within a stated time.
+the leader goes on as it does. A gap is safe where one may keep the speed for a decision; one that
+is not is to be so within a stated time.
 """
 
 from __future__ import annotations
@@ -129,8 +130,8 @@ class LatentRisk(Retraced):
         Braking that needs no collision to be foreseen [m/s²]. Adaptive cruise control may brake by
         3.5 m/s² at 20 m/s and above (ISO 15622).
     regain : float
-        Within this time a gap that is not safe, such as after a cut-in, is to be safe again [s].
-        Longer is gentler, and riskier if the leader brakes meanwhile.
+        Within this time a gap that is not safe, such as after a cut-in, is to be safe again [s],
+        if ``comfort`` is enough. Longer is gentler, and riskier if the leader brakes meanwhile.
     leaders : LeaderBrakes, optional
         Leaders' brakes to begin with, as if they had been seen; `leaders.REAL_DRIVES` are those
         of public drives. Without them it begins with the assumption alone.
@@ -360,9 +361,9 @@ class LatentRisk(Retraced):
     ) -> tuple[int, str] | None:
         """Index of the option that is in proportion, and why; None where none avoids a collision.
 
-        The closest tolerable one down to ``comfort``; else the least braking that `foresee` says
-        regains a safe gap within ``regain``, or ``comfort`` where none does, but always what avoids
-        the collision that is foreseen.
+        The closest one down to ``comfort`` that is tolerable, or that `foresee` says regains a safe
+        gap within ``regain``; ``comfort`` where there is none, and harder only as far as it takes
+        to avoid the collision that is foreseen. In a smaller gap one never brakes less.
         """
         here = self._cautious(situation.observation)
         if not is_whole(here):
@@ -543,18 +544,16 @@ def in_proportion(
 
     All arrays have an entry for each option (k,); the first option is the proposal.
     """
-    change = np.abs(options - options[0])
-    gentle = options >= min(-comfort, options[0])
-    for tolerated in tolerances:
-        if (tolerable := np.flatnonzero((risk <= tolerated) & gentle)).size:
-            return int(tolerable[change[tolerable].argmin()]), "the closest that can"
-    enough = avoids & (regains | (options <= -comfort)) & (options <= options[0])
-    if not enough.any():
-        return None
-    best = int(np.where(enough, options, -np.inf).argmax())
-    if best == 0:
-        return 0, "it regains a safe gap in time"
-    return best, "none can gently, the least braking that regains a safe gap in time"
+    gentle, lower = options >= min(-comfort, options[0]), avoids & (options <= options[0])
+    passing = [gentle & ((risk <= tolerated) | (lower & regains)) for tolerated in tolerances]
+    for each in (*passing, lower & (options <= -comfort)):
+        if each.any():
+            best = int(np.where(each, np.abs(options - options[0]), np.inf).argmin())
+            if risk[best] <= tolerances[-1]:
+                return best, "the closest that can"
+            least = "the least braking that regains a safe gap in time"
+            return best, least if best else "it regains a safe gap in time"
+    return None
 
 
 # -- Of states ----------------------------------------------------------------------------------

@@ -87,7 +87,7 @@ def foresee(
     ``braking`` so hard [m/s²]: whether the gap stays above the margin, or where it is smaller
     already, does not shrink to half of it. Up to ``hardest`` full braking is as hard as what is
     asked, if that is harder. Then whether each, held for ``regain`` [s], has regained a gap in
-    which full braking survives a leader that brakes by ``worst`` [m/s²].
+    which who keeps the speed survives a leader that brakes by ``worst`` [m/s²].
     """
     gap, speed, leader_speed = observation[0], max(observation[1], 0.0), max(observation[2], 0.0)
     room = max(gap, _TOUCHING)
@@ -99,7 +99,7 @@ def foresee(
         found[0, k] = survives(near, accelerations[k], before, careful, braking, dt)
         distance, reached = _drive_on(speed, accelerations[k], regain)
         then = (gap + leader_distance - distance, reached, reached_by_leader)
-        found[1, k] = survives(then, -body.decel, -body.decel, body, worst, dt)
+        found[1, k] = survives(then, 0.0, accelerations[k], body, worst, dt)
 
 
 @kernel

@@ -174,10 +174,10 @@ class TrafficRisk(ActionJudge):
 
     Notes
     -----
-    Where no action down to ``ahead.comfort`` is tolerable for all, it is the one in proportion
-    (`LatentRisk.choose`) that the car behind survives. Where none avoids a collision that is
-    foreseen, it is the least risky ahead of those that the car behind survives; where a leader who
-    merely keeps its speed would be hit then, the softest that avoids it, or the hardest.
+    Chosen is the action in proportion (`LatentRisk.choose`) that the car behind survives. Where
+    none avoids a collision that is foreseen, it is the least risky ahead of those that the car
+    behind survives; where a leader who merely keeps its speed would be hit then, the softest that
+    avoids it, or the hardest.
 
     Examples
     --------
@@ -187,9 +187,9 @@ class TrafficRisk(ActionJudge):
     >>> scene = Scene(Object("me", 0.0, 0.0, 14.0), [lorry, bike])
     >>> revision = guard.decide(scene.rows(most=4), proposal=1.0)
     >>> round(revision.executed, 2)
-    -1.8
+    -2.1
     >>> revision.reason.partition("; ")[2]
-    'none can gently, the least braking that regains a safe gap in time'
+    'the least braking that regains a safe gap in time'
     """
 
     fallback = Fallback(0.0, "keeping the speed")

@@ -31,7 +31,7 @@ enum {
   EVOFSM_TRIED = 5,          /* cars: own brakes are not known yet, so it brakes in full */
   EVOFSM_TRYING = 6,         /* and goes on with it for a while */
   EVOFSM_REGAINS = 7,        /* cars: the proposal regains a safe gap in time */
-  EVOFSM_REGAINED = 8        /* cars: none passes gently; the least braking that regains one */
+  EVOFSM_REGAINED = 8        /* cars: the least braking that regains one */
 };
 
 /* What had to be done to a proposal. */
