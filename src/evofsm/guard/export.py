@@ -241,7 +241,7 @@ def _learnt(reviser: ActionReviser) -> Part:
     if parts is None or not len(state.forms):
         raise ValueError(f"there is nothing to export yet: {risk.told_by_experience}")
     model, rest = parts.model, parts.residuals  # frozen, it doubts nothing
-    (steps, m, count), (p, _), a = rest.shape, model.weights.shape, risk.size
+    (steps, rows, count), (p, m), a = rest.shape, model.weights.shape, risk.size
     if count > _MOST_DISTURBANCES:
         raise ValueError(f"at most {_MOST_DISTURBANCES} disturbances are exported, not {count}")
     lanes = -(-count // _LANES) * _LANES
@@ -264,7 +264,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "EVIDENCE": float(remembered.number),
         **{name.strip("_"): getattr(rollout, name) for name in _OF_ROLLOUTS},
         **{name: getattr(model, name) for name in _OF_MODEL},
-        "residuals": np.pad(rest, [(0, 0), (0, 0), (0, lanes - count)]),
+        "residuals": rest[:, :, [*range(count), *[0] * (lanes - count)]],  # others are undisturbed
         "policies": state.policies,
         "risks": [risk._risk(one, soon) for one in (math.inf, *map(float, range(count)))],
         "middle": risk.middle,
@@ -278,7 +278,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         f"rollouts of {steps} steps, each of {p} x {m} products in {lanes} lanes\n"
     )
     sizes = {"NUMBERS": a, "FEATURES": p, "LANES": lanes, "BACKUPS": len(names)}
-    sizes["DEAD_ENDS"] = len(model.dead_ends)
+    sizes["DEAD_ENDS"], sizes["LANDS"] = len(model.dead_ends), int(rows > m)
     return Part(Path(rollout.__file__).with_suffix(".c"), m, sizes, constants, about)
 
 

@@ -183,13 +183,14 @@ def disturbances(
     the largest ones.
     """
     H, S, (T, a), m = state.horizon, state.situations, u.shape, z.shape[1]
-    rest = model.residuals(known, z, u, state.unit)
     starts = np.arange(0, max(1, T - 4), max(1, (T - 1) // settings.n_starts))
-    rest = np.vstack([np.zeros((1, m)), rest, np.zeros((H, m))])
-    new = rest[1 + np.arange(H)[:, None] + starts].transpose(0, 2, 1)
+    rest = model.undisturbed(len(u) + H, m, 1)[..., 0]
+    rest[: T - 1] = model.disturbed(known, z, u, state.unit)
+    new = model.packed(rest[np.arange(H)[:, None] + starts].transpose(0, 2, 1))
     ends = np.empty((0, 0))
     if looks:
-        with_none = np.concatenate([np.zeros((H, m, 1)), new], 2)
+        none = model.undisturbed(H, m, 1)[:, : new.shape[1]]
+        with_none = np.concatenate([none, new], 2)
         some = S[random.permutation(len(S))[:_TRIED_IN]]
         ends = worst(known, some, state.policies[:1], with_none, 1.0)
     harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_LARGEST]
@@ -229,8 +230,10 @@ def kept(state: State, keep: list[int]) -> State:
 
 
 def _sizes(rest: Floats, state: State) -> list[int]:
-    """Of residuals (H, m, K) the largest first."""
-    size = np.abs(rest / (state.unit[:, None] + 1e-300)).sum((0, 1))
+    """Of residuals (H, m, K), and landings, the largest first."""
+    m = len(state.unit)
+    size = np.abs(rest[:, :m] / (state.unit[:, None] + 1e-300)).sum((0, 1))
+    size += model.JUMP * np.isfinite(rest[:, m:]).sum((0, 1))
     return [int(k) for k in np.argsort(-size, kind="stable")]
 
 

@@ -222,7 +222,10 @@ static void step(evofsm_state *s, int t, double harder) {
     for (l = 0; l < L; l++) {
       const double y = s->move[j][l] + harder * residuals[t][j][l];
       const double to = s->z[j][l] + lesser(greater(y, low), high);
-      const double after = lesser(greater(to, lowest[j]), highest[j]);
+      double after = lesser(greater(to, lowest[j]), highest[j]);
+#if EVOFSM_LANDS
+      after = residuals[t][M + j][l] < INFINITY ? residuals[t][M + j][l] : after;
+#endif
       s->change[j][l] = after - s->z[j][l];
       s->z[j][l] = after;
     }

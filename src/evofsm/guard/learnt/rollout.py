@@ -305,7 +305,7 @@ def _rollout(
     assigned: that takes a second of compiling each.
     """
     m, (a, _), p = len(model.origin), policy.shape, len(model.weights)
-    steps, _, each = residuals.shape
+    steps, rows, each = residuals.shape
     count = len(situations) * each
     n = lanes(count)
     z, change, move = np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
@@ -344,6 +344,9 @@ def _rollout(
             for l in range(n):
                 y = move[j, l] + scale * residuals[t, j, which[l]]
                 y = min(max(z[j, l] + min(max(y, low), high), lowest), highest)
+                if rows > m:  # it jumps
+                    to = residuals[t, m + j, which[l]]
+                    y = to if to < np.inf else y
                 change[j, l] = y - z[j, l]
                 z[j, l] = y
         for i in range(a):
@@ -402,8 +405,8 @@ def rollout(
     situations : (S, 2m + a) ndarray
     policy : (a, 1 + m) ndarray
         A backup, which is followed after the plan.
-    residuals : (H, m, K) ndarray
-        Of each disturbance; number 0 is none at all.
+    residuals : (H, m, K) or (H, 2m, K) ndarray
+        Of each disturbance; number 0 is none at all. Then where variables land that jump, else inf.
     scale : float
         How much harder than they were disturbances are taken to be.
     plan : (T, a) ndarray, optional

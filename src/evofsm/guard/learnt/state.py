@@ -322,16 +322,16 @@ def residuals_of(state: State, known: Model, steps: int) -> Floats:
     """(H, m, 1 + K) residuals of disturbances as they are seen now; number 0 is none.
 
     Of a variable that moves otherwise since, nothing is known: what was not expected of it was
-    seen with the model of then.
+    seen with the model of then. Where some variable jumps, also where it lands, (H, 2m, 1 + K).
     """
     m = len(state.origin)
-    found = np.zeros((steps, m, 1 + len(state.windows)))
+    found = model.undisturbed(steps, m, 1 + len(state.windows))
     rows = zip(state.windows, state.lengths.astype(int), state.seen_in, strict=True)
     for k, (window, n, episode) in enumerate(rows, 1):
-        rest = model.residuals(known, window[:n, :m], window[: n - 1, m:], state.unit)[:steps]
+        rest = model.disturbed(known, window[:n, :m], window[: n - 1, m:], state.unit)[:steps]
         rest[:, state.drifts[state.drifts[:, 1] > episode, 0].astype(int)] = 0.0
         found[: len(rest), :, k] = rest
-    return found
+    return model.packed(found)
 
 
 # -- In a file -----------------------------------------------------------------------------------
