@@ -690,14 +690,20 @@ def test_only_what_the_environment_allows_is_executed(host, how, judge):
 
 
 def test_a_guard_counts_on_nothing_that_is_barred():
-    env = RevisedActions(wrappers.TimeLimit(Barred(), 60), Guard(n_actions=3, interval=0.1))
+    guard = Guard(n_actions=3, interval=0.1)
+    env = RevisedActions(wrappers.TimeLimit(Barred(), 60), guard)
     env.action_space.seed(0)
-    ends = [
-        drive(env, lambda seen, info: env.action_space.sample(info["action_mask"]), seed=k)[-1][2]
-        for k in range(14)
-    ]
-    assert sum(ends[:4]) >= 1
-    assert sum(ends[4:]) <= 1
+
+    def propose(seen, info):
+        return env.action_space.sample(info["action_mask"])
+
+    ends = []
+    for k in range(24):
+        if k == 14:
+            guard.freeze()
+        ends.append(drive(env, propose, seed=k)[-1][2])
+    assert 1 <= sum(ends[:14]) <= 4
+    assert not any(ends[14:])
 
 
 # -- Many at once ------------------------------------------------------------------------------
