@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping
-from typing import Any, SupportsFloat, SupportsIndex, TypeAlias
+from typing import Any, SupportsFloat, SupportsIndex, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.store import LARGEST_OBSERVATION
 
 Floats: TypeAlias = NDArray[np.float64]
+_F = TypeVar("_F")
 
 # Cases, and failures among them.
 _OUTCOMES = (("decisions", "failures"), ("episodes", "failed_soon"), ("tried", "failed_after"))
@@ -58,6 +59,13 @@ def check_action(i: Any, n_actions: int) -> int:
 
 
 # -- Settings and numbers -------------------------------------------------------------------------
+
+
+def function(name: str, value: _F, such_as: str) -> _F:
+    """The function, or None; a TypeError for anything else."""
+    if value is not None and not callable(value):
+        raise TypeError(f"{name} is {value!r}; it must be a function, such as {name}={such_as}")
+    return value
 
 
 def positive(name: str, value: SupportsFloat) -> float:

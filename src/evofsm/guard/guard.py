@@ -28,7 +28,7 @@ from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.sharing import Rollback, alone, share, transaction
-from evofsm.fsm.validation import positive, real_array
+from evofsm.fsm.validation import function, positive, real_array
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -168,6 +168,14 @@ class Guard:
         From an observation to whether it is a failure; asked as an episode ends. A learnt judge
         also asks it around what was survived: so it knows of failures before the first. It decides
         by how it explains them, and `told_by_experience` says where the function says otherwise.
+    model : callable, optional
+        From an observation and an action to the next observation: how it moves, as far as that is
+        known. A learnt judge asks it, after each episode, as often as that had decisions, around
+        where it was; what is seen corrects it. Like `backup` it is code, and in no file: what it
+        said stays learnt.
+    backup : callable, optional
+        From an observation to an action that is thought to save. A learnt judge fits linear
+        feedback to it, and tries that as one backup of several.
     horizon : float, optional
         How far ahead a learnt judge looks, and what the machine's explanations call soon [s].
         Without it a learnt judge looks as far as it finds that it has to.
@@ -234,6 +242,8 @@ class Guard:
         interval: float,
         judge: ActionJudge | None = None,
         failed: Callable[[NDArray[np.float64]], bool] | None = None,
+        model: Callable[[NDArray[np.float64], Any], ArrayLike] | None = None,
+        backup: Callable[[NDArray[np.float64]], ArrayLike] | None = None,
         horizon: float | None = None,
         tolerance: float = TOLERANCE,
         mode: Mode = Mode.ACT,
@@ -247,8 +257,12 @@ class Guard:
         actions = _actions(low, high, n_actions)
         interval = positive("interval", interval)
         soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
+        given: dict[str, Any] = {"model": model, "backup": backup}
         if judge is None:
-            judge = LearntRisk(interval, low, high, n_actions=n_actions, horizon=horizon, seed=seed)
+            known = {"n_actions": n_actions, "horizon": horizon, "seed": seed, **given}
+            judge = LearntRisk(interval, low, high, **known)
+        elif any(given.values()):
+            raise ValueError(f"{type(judge).__name__} asks no model and no backup: leave them out")
         if machine is None:
             machine = EvolvingFSM(
                 actions.n_actions,
@@ -316,11 +330,7 @@ class Guard:
         n_episodes: int = 0,
         n_failed: int = 0,
     ) -> None:
-        if failed is not None and not callable(failed):
-            raise TypeError(
-                f"failed is {failed!r}; it must be a function of an observation, such as "
-                "failed=lambda z: z[0] <= 0"
-            )
+        function("failed", failed, "lambda z: z[0] <= 0")
         share(self)
         self.process = os.getpid()  #: in which it was made; a copy elsewhere learns for itself
         self.actions = reviser.actions

@@ -12,12 +12,13 @@ function (Nemhauser, Wolsey & Fisher 1978).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 
 import numpy as np
 
 from evofsm.guard.learnt.rollout import Floats, Ints, Model, rollout
-from evofsm.guard.learnt.state import LearntSettings
+from evofsm.guard.learnt.state import LearntSettings, State
 
 # Of mutants the share that are of the best, the share of numbers that differ, by a size of 10 to a
 # power between these.
@@ -26,6 +27,8 @@ _OF_BEST, _CHANGED, _SIZES = 0.8, 0.6, (-1.5, 0.7)
 _BY_ITSELF = 0.01
 # Decimals beyond which numbers are equal; what a choice is preferred by to the next one.
 _ROUNDED, _PREFERRED = 9, 1e-9
+# Observations to which a given backup is fitted, or some more.
+_FITTED = 200
 # Boxes of more dimensions have an action along each axis, not one in each corner.
 _MAX_CORNERS = 3
 
@@ -50,6 +53,19 @@ def first_backups(u: Floats, m: int, choices: int, n_linear: int) -> tuple[Float
     if choices:  # of equals the first in that order, whatever its index
         policies[:, order, 0] -= _PREFERRED * np.arange(a)
     return policies, np.append(np.zeros(len(ends)), np.ones(n_linear))
+
+
+def fitted(state: State, model: Model, backup: Callable[[Floats], Floats]) -> State:
+    """Fit linear feedback to a given backup, from an observation to an encoded action (a,)."""
+    every = max(1, len(state.survived) // _FITTED)
+    z = state.survived[::every]
+    x = np.column_stack([np.ones(len(z)), (z - model.mean) * model.inverse])
+    weights, *_ = np.linalg.lstsq(x, np.array([backup(row) for row in z]), rcond=None)
+    others = state.linear != 2.0
+    return state._replace(
+        policies=np.concatenate([weights.T[None], state.policies[others]]),
+        linear=np.append(2.0, state.linear[others]),
+    )
 
 
 def basis(rows: Floats, choices: int = 0) -> tuple[Ints, Floats]:
@@ -80,7 +96,8 @@ def evolved(
         found = rollout(model, situations, policy, residuals, scale).worth
         return np.asarray(found.reshape(-1, each).mean(1))
 
-    values, those = np.array([worth(policy) for policy in policies]), np.flatnonzero(linear)
+    values = np.array([worth(policy) for policy in policies])
+    those = np.flatnonzero(linear == 1.0)
     shape, m = policies.shape[1:], len(model.origin)
     variables, flips = basis((situations[:, :m] - model.mean) * model.inverse)
     actions, turns = basis(situations[:, 2 * m :], model.choices)

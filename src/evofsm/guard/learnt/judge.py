@@ -21,14 +21,21 @@ from evofsm import store
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.sharing import Rollback
-from evofsm.fsm.validation import action_name, positive, real_array, refuse_unusable, whole
+from evofsm.fsm.validation import (
+    action_name,
+    function,
+    positive,
+    real_array,
+    refuse_unusable,
+    whole,
+)
 from evofsm.guard.actions import Mask
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import words
 from evofsm.guard.learnt.backups import basis
 from evofsm.guard.learnt.failure import AT, SAYS, B, I, are_sides
-from evofsm.guard.learnt.learn import disturbance_scale, ends_of, learn
+from evofsm.guard.learnt.learn import Given, disturbance_scale, ends_of, learn
 from evofsm.guard.learnt.rollout import (
     CUT_SHORT,
     FAILS,
@@ -113,6 +120,8 @@ class LearntRisk(ActionJudge):
         Of the variables, for what people read; nothing is decided by them.
     settings : LearntSettings, optional
         Its numbers.
+    model, backup : callable, optional
+        As in `Guard`.
 
     Raises
     ------
@@ -177,6 +186,8 @@ class LearntRisk(ActionJudge):
         names: Sequence[str] = (),
         units: Sequence[str] = (),
         settings: LearntSettings | None = None,
+        model: Callable[[Floats, Any], ArrayLike] | None = None,
+        backup: Callable[[Floats], ArrayLike] | None = None,
     ) -> None:
         self.dt = positive("dt", dt)
         self.given_horizon = None if horizon is None else positive("horizon", horizon)
@@ -191,6 +202,8 @@ class LearntRisk(ActionJudge):
             raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(self.PARTS)}")
         self.without = frozenset(without)
         self.settings = LearntSettings() if settings is None else settings
+        self.model = function("model", model, "lambda z, u: z + 0.1 * u")
+        self.backup = function("backup", backup, "lambda z: -1.0")
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.dt)
         #: Number of actions; 0 where the action is a box.
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
@@ -473,8 +486,10 @@ class LearntRisk(ActionJudge):
     def backup_text(self, backup: int, policies: Floats | None = None) -> str:
         """What a backup does, by its number."""
         policies = self.state.policies if policies is None else policies
-        if self.state.linear[backup]:
-            return f"feedback {int(self.state.linear[: backup + 1].sum())}"
+        if self.state.linear[backup] == 2.0:
+            return "the given backup"
+        if self.state.linear[backup] == 1.0:
+            return f"feedback {int((self.state.linear[: backup + 1] == 1.0).sum())}"
         action = self.decode(policies[backup, :, 0])
         if self.choices:
             return f"always {action_name(int(action[0]))}"
@@ -565,6 +580,30 @@ class LearntRisk(ActionJudge):
         self._study(failed=failed, terminated=terminated and not failed)
         self._forget()
 
+    @property
+    def _given(self) -> Given:
+        """What was given, of encoded actions."""
+        move, act, m = self.model, self.backup, self.n_variables
+
+        def model(z: Floats, inner: Floats) -> Floats:
+            assert move is not None
+            action = self.decode(inner)
+            after = np.array(move(z, action if len(action) > 1 else action[0]), np.float64)
+            if after.shape != (m,) or not np.isfinite(after).all():
+                raise ValueError(
+                    f"model gave {after} after {z} and {action}; it has to give {m} finite numbers"
+                )
+            return after
+
+        def backup(z: Floats) -> Floats:
+            assert act is not None
+            action = np.atleast_1d(np.array(act(z), np.float64))
+            if action.shape != ((1,) if self.choices else (self.size,)):
+                raise ValueError(f"backup gave {action} at {z}; it has to give an action")
+            return self.encode(action[0] if self.choices else np.clip(action, self.low, self.high))
+
+        return Given(self.failed, move and model, act and backup)
+
     def _study(self, *, failed: bool, terminated: bool) -> None:
         """Learn from the rows of an episode, and forget them."""
         z, n = np.array(self._z), max(0, len(self._z) - 1)
@@ -590,7 +629,7 @@ class LearntRisk(ActionJudge):
             seed=self.seed,
             without=self.without,
             has_horizon=self.given_horizon is not None,
-            failed=self.failed,
+            given=self._given,
         )
         self.parts = Parts.of(self.state, self.settings)
 

@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Set
+from typing import NamedTuple
 
 import numpy as np
 
 from evofsm.guard.learnt import danger, model, motion
-from evofsm.guard.learnt.backups import evolved, first_backups
+from evofsm.guard.learnt.backups import evolved, first_backups, fitted
 from evofsm.guard.learnt.rollout import Flags, Floats, Model, value_of
 from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
 
@@ -28,6 +29,17 @@ _LARGEST, _BEFORE, _EARLIER = 3, 3, 2
 _LOW, _HIGH = -0.6, 0.6
 
 
+class Given(NamedTuple):
+    """Functions that a user gives, None where it is learnt; actions are encoded, (a,)."""
+
+    failed: Callable[[Floats], bool] | None = None  #: of an observation
+    model: Callable[[Floats, Floats], Floats] | None = None  #: next one, of it and an action
+    backup: Callable[[Floats], Floats] | None = None  #: action, of an observation
+
+
+NOTHING_GIVEN = Given()
+
+
 def learn(
     state: State,
     episode: Episode,
@@ -36,7 +48,7 @@ def learn(
     seed: int = 0,
     without: Set[str] = frozenset(),
     has_horizon: bool = False,
-    failed: Callable[[Floats], bool] | None = None,
+    given: Given = NOTHING_GIVEN,
 ) -> State:
     """Learn from an episode, or from a part of a long one.
 
@@ -52,8 +64,8 @@ def learn(
         Parts that are left out (`LearntRisk.PARTS`).
     has_horizon : bool
         Whether it was given how far to look ahead.
-    failed : callable, optional
-        From an observation to whether it is a failure, where that was given.
+    given : Given
+        What need not be learnt alone.
 
     Returns
     -------
@@ -79,8 +91,10 @@ def learn(
     moves = len(u) >= _SHORTEST
     if moves:
         state = motion.dynamics(state, model_of(state, settings), safe, u, settings)
+        if given.model is not None:
+            state = motion.told(state, model_of(state, settings), safe, given.model, random)
     # Failure
-    state = danger.fails(state, z, episode, settings, without, failed)
+    state = danger.fails(state, z, episode, settings, without, given.failed)
     if "dead-ends" not in without and len(state.forms):
         state = danger.dead_ends(state, model_of(state, settings), safe, episode)
     if not moves:
@@ -90,7 +104,7 @@ def learn(
         policies, linear = first_backups(u, m, state.choices, settings.n_linear)
         state = state._replace(policies=policies, linear=linear)
     state = noted(state, safe, u, episode, settings, random)
-    if "rivals" not in without and failed is None:
+    if "rivals" not in without and given.failed is None:
         state = doubted(state, episode, settings)
     # Disturbances
     known, fails = model_of(state, settings), len(state.forms) > 0
@@ -102,11 +116,13 @@ def learn(
     if looks and not has_horizon:
         state = look_ahead(state, known, rest, episode, settings)
     # Backups
+    if given.backup is not None:
+        state = fitted(state, known, given.backup)
     if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
         some = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
-        amid = np.ascontiguousarray(rest[:, :, some])
-        given = known, state.situations, amid, disturbance_scale(state, settings), settings, random
-        policies, linear = evolved(state.policies, state.linear, *given)
+        rest, scale = np.ascontiguousarray(rest[:, :, some]), disturbance_scale(state, settings)
+        asked = known, state.situations, rest, scale, settings, random
+        policies, linear = evolved(state.policies, state.linear, *asked)
         state = state._replace(policies=policies, linear=linear)
     return state._replace(n_episodes=state.n_episodes + 1)
 

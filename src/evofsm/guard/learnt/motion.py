@@ -7,10 +7,12 @@ of a heavy-tailed residual), the system moves otherwise now, and the model is co
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from evofsm.guard.learnt import model
-from evofsm.guard.learnt.rollout import Flags, Floats, Model, lags
+from evofsm.guard.learnt.rollout import Flags, Floats, Model, features, lags
 from evofsm.guard.learnt.state import LearntSettings, State, model_of
 
 # Changes of which the typical step is learnt; a larger one counts as so many times that.
@@ -111,6 +113,42 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
     stops = _held(state, to, after) & rests & seen[:, None] & (np.abs(to - after) > _STOPS * scale)
     reached = np.where(stops.any(1).T & is_known, np.maximum(state.reached, 2.0), state.reached)
     return state._replace(scale=scale, noise=noise, reached=reached)
+
+
+def told(
+    state: State,
+    known: Model,
+    z: Floats,
+    move: Callable[[Floats, Floats], Floats],
+    random: np.random.Generator,
+) -> State:
+    """Learn what a given model says of observations (T + 1, m), each under an action that is drawn.
+
+    Parameters
+    ----------
+    state : State
+    known : Model
+        For its features.
+    z : (T + 1, m) ndarray
+    move : callable
+        From an observation and an encoded action (a,) to the next observation.
+    random : numpy.random.Generator
+    """
+    latest = np.diff(z, axis=0)
+    rows = np.flatnonzero(np.isfinite(latest).all(1))
+    shape = len(rows), len(state.used)
+
+    def drawn() -> Floats:
+        if state.choices:
+            return np.asarray(np.eye(shape[1])[random.integers(shape[1], size=shape[0])])
+        return random.uniform(-1.0, 1.0, shape)
+
+    at, before, u = z[rows + 1], drawn(), drawn()
+    phi = features(known, at, random.permutation(latest[rows]), before, u)
+    change = np.array([move(*each) for each in zip(at, u, strict=True)]).reshape(at.shape) - at
+    return state._replace(
+        squares=state.squares + phi.T @ (1.0 * phi), products=state.products + phi.T @ change
+    )
 
 
 def _held(state: State, to: Floats, after: Floats) -> Flags:

@@ -20,7 +20,7 @@ from evofsm.guard.learnt.rollout import (
     n_features,
     refuse_too_many,
 )
-from evofsm.store import COUNT, FLAG, FROM_1, SHARE, SIZE, SMALLEST, Kind, Numbers
+from evofsm.store import COUNT, FROM_1, SHARE, SIZE, SMALLEST, Kind, Numbers
 
 # What files hold of a field: observations, what is not negative, and ends that may be infinite.
 _SEEN, _ABOVE_0 = Numbers(least=-1e30, most=1e30), Numbers(least=0.0)
@@ -190,7 +190,8 @@ class State(NamedTuple):
     situations: Annotated[Floats, _SEEN.of("situations", "situation")]
     # backups
     policies: Annotated[Floats, Numbers(("policies", "a", "policy"))]  #: in their order
-    linear: Annotated[Floats, FLAG.of("policies")]  #: 1 of those that evolve
+    #: 1 of those that evolve, 2 of the one that was given
+    linear: Annotated[Floats, COUNT._replace(most=2.0).of("policies")]
     used: Annotated[Floats, COUNT.of("a", 2)]
     margin: Annotated[float, _ABOVE_0]  #: [typical steps]
     time_to_failure: Annotated[float, _ABOVE_0]  #: [steps]
@@ -285,9 +286,7 @@ def model_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
     highest = np.where(state.reached[:, 1] >= 2, state.highest[0], np.inf)
     fails = table[:, SAYS] == FAILS
     for j, sign in table[failure.are_sides(table) & fails][:, [I, B]].tolist():
-        (lowest if sign < 0.0 else highest)[int(j)] = (
-            sign * np.inf
-        )  # nothing is held where it fails
+        (lowest if sign < 0.0 else highest)[int(j)] = sign * np.inf  # nothing is held there
     if daring:
         crash = table[:, SAYS] == CRASHES
         table = table.copy()

@@ -1,0 +1,82 @@
+"""What is known need not be learnt: a model, where it fails, a backup."""
+
+import numpy as np
+import pytest
+
+from evofsm import Guard
+from evofsm.guard.learnt.rollout import action_of
+
+WALL, BRAKE = 60.0, -4.0
+
+
+def move(z, u):
+    """Brakes are weaker than actions say."""
+    speed = max(0.0, z[1] + 0.1 * max(-0.8, float(u)))
+    return np.array([z[0] - 0.1 * speed, speed])
+
+
+def drive(guard, seed, start=WALL):
+    """Towards a wall, by a driver who does not see it; whether it was hit."""
+    rng = np.random.default_rng(seed)
+    z = np.array([start, rng.uniform(4.0, 8.0)])
+    for _ in range(150):
+        z = move(z, np.squeeze(guard.decide(z, rng.uniform(-1.0, 2.0)).executed))
+        if z[0] <= 0.0:
+            break
+    guard.end(bool(z[0] <= 0.0), z)
+    return z[0] <= 0.0
+
+
+def taught(**given):
+    guard = Guard(BRAKE, 2.0, interval=0.1, failed=lambda z: z[0] <= 0.0, seed=1, **given)
+    for k in range(6):  # far away from the wall, and no hard braking
+        drive(guard, k, start=WALL + 400.0)
+    return guard
+
+
+def test_a_given_model_knows_of_brakes_that_were_never_tried():
+    without, told = (
+        sum(drive(guard, 100 + k) for k in range(8))
+        for guard in (taught(), taught(model=move, backup=lambda z: BRAKE))
+    )
+    assert without >= 6
+    assert told <= 3  # it is fitted, not copied
+
+
+def test_what_is_wrong_with_a_given_function_is_said_and_nothing_is_learnt():
+    guard = Guard(-1.0, 1.0, interval=0.1, model=lambda z, u: [0.0])
+    for k in range(5):
+        guard.decide([1.0 + 0.1 * k, 2.0], 0.5)
+    before = str(guard)
+    with pytest.raises(ValueError, match=r"model gave \[0\.\] after .*2 finite numbers"):
+        guard.end(False)
+    assert str(guard) == before
+    with pytest.raises(TypeError, match="backup is 3; it must be a function, such as"):
+        Guard(-1.0, 1.0, interval=0.1, backup=3)
+    with pytest.raises(ValueError, match="LearntRisk asks no model and no backup"):
+        Guard(-1.0, 1.0, interval=0.1, judge=guard.judge, model=move)
+
+
+@pytest.mark.parametrize("n_actions", [2, None])
+def test_a_given_backup_is_fitted_for_choices_and_for_many_numbers(n_actions):
+    m = 2
+    how = {"n_actions": 2} if n_actions else {"low": [-1.0] * m, "high": [1.0] * m}
+
+    def backup(z):
+        return int(z[0] > 0.0) if n_actions else np.clip(-z, -1.0, 1.0)
+
+    guard, rng = Guard(interval=0.1, backup=backup, **how), np.random.default_rng(0)
+    for k in range(3):
+        z = rng.normal(size=m)
+        for _ in range(30):
+            guard.decide(z, int(rng.integers(2)) if n_actions else rng.uniform(-1.0, 1.0, m))
+            z = 0.9 * z + 0.3 * rng.normal(size=m)
+        guard.end(k == 0, z)
+    state, model = guard.judge.state, guard.judge.parts.model
+    given = state.policies[state.linear == 2.0]
+    assert len(given) == 1
+    for z in ([1.5, 0.0], [-1.5, 0.0]):
+        does = guard.judge.decode(action_of(model, given[0], np.array(z)))
+        assert np.sign(does[0] - 0.5 if n_actions else does[0]) == np.sign(
+            z[0] if n_actions else -z[0]
+        )
