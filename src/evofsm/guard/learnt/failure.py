@@ -120,7 +120,7 @@ def halfway(table: Floats, failures: Floats) -> Floats:
     return new
 
 
-def rivals(table: Floats, failures: Floats, survived: Survived, few: float = np.inf) -> Floats:
+def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
     """Fit the smallest forms that still hold all failures, to try whether larger ones are true.
 
     Parameters
@@ -128,8 +128,6 @@ def rivals(table: Floats, failures: Floats, survived: Survived, few: float = np.
     table : (r, SIZE) ndarray
     failures : (k, m) ndarray
     survived : Survived
-    few : float
-        Forms that hold as many failures have none.
 
     Returns
     -------
@@ -141,7 +139,7 @@ def rivals(table: Floats, failures: Floats, survived: Survived, few: float = np.
     rows: list[Floats] = []
     for row, is_side, holds in zip(table, are_sides(table), inside(table, failures), strict=True):
         own = failures[holds]
-        if row[SAYS] != FAILS or not 0 < len(own) < few or not len(survived.rows):
+        if row[SAYS] != FAILS or not len(own) or not len(survived.rows):
             rows.append(row)
         elif is_side:
             rows += _as_failed(row, own, survived)

@@ -13,7 +13,14 @@ import numpy as np
 from evofsm.guard.learnt import danger, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups, fitted
 from evofsm.guard.learnt.rollout import Flags, Floats, Model, value_of
-from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
+from evofsm.guard.learnt.state import (
+    Episode,
+    LearntSettings,
+    State,
+    jumps_add,
+    model_of,
+    residuals_of,
+)
 
 # Actions of an episode that says how a system moves, at least; situations from which on
 # disturbances are looked for and backups evolve; those that are drawn to look for some;
@@ -201,7 +208,7 @@ def disturbances(
     H, S, (T, a), m = state.horizon, state.situations, u.shape, z.shape[1]
     starts = np.arange(0, max(1, T - 4), max(1, (T - 1) // settings.n_starts))
     rest = model.undisturbed(len(u) + H, m, 1)[..., 0]
-    rest[: T - 1] = model.disturbed(known, z, u, state.unit)
+    rest[: T - 1] = model.disturbed(known, z, u, state.unit, jumps_add(state))
     new = model.packed(rest[np.arange(H)[:, None] + starts].transpose(0, 2, 1))
     ends = np.empty((0, 0))
     if looks:

@@ -15,6 +15,7 @@ from evofsm.guard.learnt.failure import HELD, ONE, OTHER, SAYS, B, I, J, Survive
 from evofsm.guard.learnt.rollout import (
     CRASHES,
     FAILS,
+    Flags,
     Floats,
     Model,
     n_features,
@@ -74,11 +75,10 @@ class LearntSettings:
     drift, drift_fade : float
         It moves otherwise from so much gained log likelihood on (Page 1954); of the latest episodes
         what is left an episode later.
-    refused, patience, again, settled, few : float
+    refused, patience, again : float
         What refuses more than this share of proposals, in so many episodes without failure, is
         doubted: while it learns its smallest rival is tried, ``again`` times as late each time that
-        was wrong; for good from so many episodes of it without failure on, if it is told by fewer
-        than ``few`` failures: one wrong label is outlived.
+        was wrong.
     work, work_rate : float
         Products in the rollouts of a decision at most: altogether, and in a second of the interval.
 
@@ -121,8 +121,6 @@ class LearntSettings:
     refused: float = 0.1
     patience: int = 6
     again: int = 4
-    settled: int = 20
-    few: int = 3
     work: float = 7e6
     work_rate: float = 8.75e8
 
@@ -291,9 +289,8 @@ def model_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
         crash = table[:, SAYS] == CRASHES
         table = table.copy()
         table[crash] = failure.halfway(table[crash], state.failures)
-    if state.held < (0 if daring else -settings.settled):
-        few = np.inf if daring else settings.few
-        table = failure.rivals(table, state.failures, sizes(state), few)
+    if daring and state.held < 0:
+        table = failure.rivals(table, state.failures, sizes(state))
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) if len(spread) else 1.0
     share = state.noise / np.where(state.power > 0.0, state.power, 1.0)
     noisy = np.where(state.scale > 0.0, share.clip(1e-3, 1.0), 1.0)
@@ -317,6 +314,13 @@ def model_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
     )
 
 
+def jumps_add(state: State) -> Flags:
+    """(m,) of which variables jumps that are remembered add to where they are."""
+    m = len(state.origin)
+    rows = [w[: int(n), :m] for w, n in zip(state.windows, state.lengths, strict=True)]
+    return model.jumps_add(rows, state.unit)
+
+
 def residuals_of(state: State, known: Model, steps: int) -> Floats:
     """(H, m, 1 + K) residuals of disturbances as they are seen now; number 0 is none.
 
@@ -327,7 +331,8 @@ def residuals_of(state: State, known: Model, steps: int) -> Floats:
     found = model.undisturbed(steps, m, 1 + len(state.windows))
     rows = zip(state.windows, state.lengths.astype(int), state.seen_in, strict=True)
     for k, (window, n, episode) in enumerate(rows, 1):
-        rest = model.disturbed(known, window[:n, :m], window[: n - 1, m:], state.unit)[:steps]
+        seen = window[:n, :m], window[: n - 1, m:], state.unit
+        rest = model.disturbed(known, *seen, jumps_add(state))[:steps]
         rest[:, state.drifts[state.drifts[:, 1] > episode, 0].astype(int)] = 0.0
         found[: len(rest), :, k] = rest
     return model.packed(found)
