@@ -136,7 +136,7 @@ def draw(guards: dict[int, Guard], tried: dict[int, Trial]) -> Figure:
     return figure
 
 
-def main(path: str = "disc.png", seed: int = 1, held_out: int = 50) -> dict[int, Trial]:
+def main(path: str = "disc.png", seed: int = 2, held_out: int = 50) -> dict[int, Trial]:
     """Learn, try, print and draw."""
     guards = learn(seed, LEARNT)
     low, high = -np.ones(2), np.ones(2)
