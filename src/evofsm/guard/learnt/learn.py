@@ -17,7 +17,6 @@ from evofsm.guard.learnt.state import (
     Episode,
     LearntSettings,
     State,
-    jumps_add,
     model_of,
     residuals_of,
 )
@@ -208,7 +207,7 @@ def disturbances(
     H, S, (T, a), m = state.horizon, state.situations, u.shape, z.shape[1]
     starts = np.arange(0, max(1, T - 4), max(1, (T - 1) // settings.n_starts))
     rest = model.undisturbed(len(u) + H, m, 1)[..., 0]
-    rest[: T - 1] = model.disturbed(known, z, u, state.unit, jumps_add(state))
+    rest[: T - 1] = model.disturbed(known, z, u, state.unit)
     new = model.packed(rest[np.arange(H)[:, None] + starts].transpose(0, 2, 1))
     ends = np.empty((0, 0))
     if looks:

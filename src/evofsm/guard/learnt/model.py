@@ -10,8 +10,6 @@ rests at an end of a variable, are no dynamics; outliers weigh less.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from evofsm.guard.learnt.rollout import Flags, Floats, Model, features, lags
@@ -162,28 +160,10 @@ def landings(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
     return np.where(jumped, z[2:], np.inf)
 
 
-def disturbed(model: Model, z: Floats, u: Floats, unit: Floats, adds: Flags) -> Floats:
-    """(T, 2m) residuals, and landings, of observations (T + 2, m).
-
-    Of variables whose jumps ``add`` (m,) to where they are, the change, with a residual of 1.
-    """
+def disturbed(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
+    """(T, 2m) residuals, and landings, of observations (T + 2, m)."""
     given = model, z, u, unit
-    rest, to = residuals(*given), landings(*given)
-    shifts = np.isfinite(to) & adds
-    return np.hstack([np.where(shifts, 1.0, rest), np.where(shifts, to - z[1:-1], to)])
-
-
-def jumps_add(windows: Sequence[Floats], unit: Floats) -> Flags:
-    """(m,) whether jumps in windows (T, m) differ less in how far they lead than in where to."""
-    jumped = [jumps(np.diff(z, axis=0), unit) for z in windows]
-    adds = np.zeros(len(unit), bool)
-    for j in range(len(unit)):
-        to, by = (
-            np.concatenate([x[at[:, j], j] for x, at in zip(some, jumped, strict=True)] or [[]])
-            for some in ([z[1:] for z in windows], [np.diff(z, axis=0) for z in windows])
-        )
-        adds[j] = len(to) > 1 and by.std() < to.std()
-    return adds
+    return np.hstack([residuals(*given), landings(*given)])
 
 
 def undisturbed(steps: int, m: int, count: int) -> Floats:

@@ -224,9 +224,7 @@ static void step(evofsm_state *s, int t, double harder) {
       const double to = s->z[j][l] + lesser(greater(y, low), high);
       double after = lesser(greater(to, lowest[j]), highest[j]);
 #if EVOFSM_LANDS
-      if (residuals[t][M + j][l] < INFINITY) {
-        after = residuals[t][M + j][l] + residuals[t][j][l] * s->z[j][l];
-      }
+      after = residuals[t][M + j][l] < INFINITY ? residuals[t][M + j][l] : after;
 #endif
       s->change[j][l] = after - s->z[j][l];
       s->z[j][l] = after;

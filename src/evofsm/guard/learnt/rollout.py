@@ -346,7 +346,7 @@ def _rollout(
                 y = min(max(z[j, l] + min(max(y, low), high), lowest), highest)
                 if rows > m:  # it jumps
                     to = residuals[t, m + j, which[l]]
-                    y = to + residuals[t, j, which[l]] * z[j, l] if to < np.inf else y
+                    y = to if to < np.inf else y
                 change[j, l] = y - z[j, l]
                 z[j, l] = y
         for i in range(a):
@@ -406,8 +406,7 @@ def rollout(
     policy : (a, 1 + m) ndarray
         A backup, which is followed after the plan.
     residuals : (H, m, K) or (H, 2m, K) ndarray
-        Of each disturbance; number 0 is none at all. Then where variables land that jump, else inf:
-        there the residual is the share of where a variable is that is added, 0 or 1.
+        Of each disturbance; number 0 is none at all. Then where variables land that jump, else inf.
     scale : float
         How much harder than they were disturbances are taken to be.
     plan : (T, a) ndarray, optional

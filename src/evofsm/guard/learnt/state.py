@@ -15,7 +15,6 @@ from evofsm.guard.learnt.failure import HELD, ONE, OTHER, SAYS, B, I, J, Survive
 from evofsm.guard.learnt.rollout import (
     CRASHES,
     FAILS,
-    Flags,
     Floats,
     Model,
     n_features,
@@ -75,10 +74,10 @@ class LearntSettings:
     drift, drift_fade : float
         It moves otherwise from so much gained log likelihood on (Page 1954); of the latest episodes
         what is left an episode later.
-    refused, patience, again : float
+    refused, patience, again, settled : float
         What refuses more than this share of proposals, in so many episodes without failure, is
         doubted: while it learns its smallest rival is tried, ``again`` times as late each time that
-        was wrong.
+        was wrong. After so many episodes of it without failure it counts, also frozen.
     work, work_rate : float
         Products in the rollouts of a decision at most: altogether, and in a second of the interval.
 
@@ -121,6 +120,7 @@ class LearntSettings:
     refused: float = 0.1
     patience: int = 6
     again: int = 4
+    settled: int = 20
     work: float = 7e6
     work_rate: float = 8.75e8
 
@@ -289,7 +289,7 @@ def model_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
         crash = table[:, SAYS] == CRASHES
         table = table.copy()
         table[crash] = failure.halfway(table[crash], state.failures)
-    if daring and state.held < 0:
+    if state.held < (0 if daring else -settings.settled):
         table = failure.rivals(table, state.failures, sizes(state))
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) if len(spread) else 1.0
     share = state.noise / np.where(state.power > 0.0, state.power, 1.0)
@@ -314,13 +314,6 @@ def model_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
     )
 
 
-def jumps_add(state: State) -> Flags:
-    """(m,) of which variables jumps that are remembered add to where they are."""
-    m = len(state.origin)
-    rows = [w[: int(n), :m] for w, n in zip(state.windows, state.lengths, strict=True)]
-    return model.jumps_add(rows, state.unit)
-
-
 def residuals_of(state: State, known: Model, steps: int) -> Floats:
     """(H, m, 1 + K) residuals of disturbances as they are seen now; number 0 is none.
 
@@ -332,7 +325,7 @@ def residuals_of(state: State, known: Model, steps: int) -> Floats:
     rows = zip(state.windows, state.lengths.astype(int), state.seen_in, strict=True)
     for k, (window, n, episode) in enumerate(rows, 1):
         seen = window[:n, :m], window[: n - 1, m:], state.unit
-        rest = model.disturbed(known, *seen, jumps_add(state))[:steps]
+        rest = model.disturbed(known, *seen)[:steps]
         rest[:, state.drifts[state.drifts[:, 1] > episode, 0].astype(int)] = 0.0
         found[: len(rest), :, k] = rest
     return model.packed(found)
