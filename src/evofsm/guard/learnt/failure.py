@@ -175,14 +175,10 @@ def _as_failed(row: Floats, own: Floats, survived: Survived) -> list[Floats]:
     k = int(share.argmin())
     if share[k] >= _RARE:
         return [row]
-    end, crash, at = row.copy(), row.copy(), np.concatenate([low, high])[k]
+    end, crash = row.copy(), row.copy()
     end[SAYS], crash[SAYS] = ENDS, CRASHES
-    crash[[I, J, AT, TO]] = k % m, k % m, at, at
-    crash[[ONE, OTHER, B]] = (
-        1.0 / survived.unit[k % m],
-        1.0 / survived.unit[k % m],
-        (-1.0, 1.0)[k < m],
-    )
+    crash[[I, J]], crash[[AT, TO]] = k % m, np.concatenate([low, high])[k]
+    crash[[ONE, OTHER]], crash[B] = 1.0 / survived.unit[k % m], 1.0 if k < m else -1.0
     return [end, crash]
 
 

@@ -54,6 +54,7 @@ from evofsm.guard.learnt.state import (
     Episode,
     LearntSettings,
     State,
+    forms_of,
     model_of,
     packed,
     residuals_of,
@@ -86,7 +87,7 @@ class Parts(NamedTuple):
         if not len(state.policies):
             return None
         model = model_of(state, settings)
-        daring = model_of(state, settings, daring=True)
+        daring = model._replace(forms=forms_of(state, settings, daring=True))
         rest = residuals_of(state, model, state.horizon)
         return cls(model, daring, rest, disturbance_scale(state, settings))
 

@@ -208,7 +208,7 @@ def disturbances(
     starts = np.arange(0, max(1, T - 4), max(1, (T - 1) // settings.n_starts))
     rest = model.undisturbed(len(u) + H, m, 1)[..., 0]
     rest[: T - 1] = model.disturbed(known, z, u, state.unit)
-    new = model.packed(rest[np.arange(H)[:, None] + starts].transpose(0, 2, 1))
+    new = model.trimmed(rest[np.arange(H)[:, None] + starts].transpose(0, 2, 1))
     ends = np.empty((0, 0))
     if looks:
         none = model.undisturbed(H, m, 1)[:, : new.shape[1]]

@@ -143,37 +143,32 @@ def residuals(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
     It is 0 where something was not seen, nothing moved, a variable jumped, or is expected beyond
     where it saturates and stays there: how far it would have gone is not known.
     """
+    return disturbed(model, z, u, unit)[:, : len(unit)]
+
+
+def disturbed(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
+    """(T, 2m) `residuals`, and where variables landed that jumped unexpectedly, else inf."""
     phi, change, known = rows_of(model, z, u)
-    to, after = z[1:-1] + phi @ model.weights, z[2:]
+    move, after = phi @ model.weights, z[2:]
+    to = z[1:-1] + move
     held = ((to < model.lowest) & (after <= model.lowest)) | (
         (to > model.highest) & (after >= model.highest)
     )
     none = ~known | (change == 0.0).all(1) | are_jumps(z, unit)
-    return np.where(held | none[:, None], 0.0, after - to)
-
-
-def landings(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
-    """(T, m) where variables landed that jumped unexpectedly, as `residuals` counts; else inf."""
-    phi, change, known = rows_of(model, z, u)
-    off = np.abs(change - phi @ model.weights)
-    jumped = jumps(np.diff(z, axis=0), unit)[1:] & known[:, None] & (off > 0.5 * np.abs(change))
-    return np.where(jumped, z[2:], np.inf)
-
-
-def disturbed(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
-    """(T, 2m) residuals, and landings, of observations (T + 2, m)."""
-    given = model, z, u, unit
-    return np.hstack([residuals(*given), landings(*given)])
+    jumped = jumps(np.diff(z, axis=0), unit)[1:] & known[:, None]
+    jumped &= np.abs(change - move) > 0.5 * np.abs(change)
+    rest = np.where(held | none[:, None], 0.0, after - to)
+    return np.hstack([rest, np.where(jumped, after, np.inf)])
 
 
 def undisturbed(steps: int, m: int, count: int) -> Floats:
     """(T, 2m, K) no residuals, no landings."""
-    return np.repeat(np.append(np.zeros(m), np.full(m, np.inf))[None, :, None], steps, 0).repeat(
-        count, 2
-    )
+    found = np.zeros((steps, 2 * m, count))
+    found[:, m:] = np.inf
+    return found
 
 
-def packed(found: Floats) -> Floats:
+def trimmed(found: Floats) -> Floats:
     """(H, m, K) residuals where no variable lands anywhere, else also landings, (H, 2m, K)."""
     m = found.shape[1] // 2
     return found if np.isfinite(found[:, m:]).any() else np.ascontiguousarray(found[:, :m])

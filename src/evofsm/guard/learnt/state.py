@@ -267,17 +267,29 @@ def _spread(state: State) -> Floats:
     return np.asarray(rows.std(0) if len(rows) else np.zeros(len(state.origin)))
 
 
-def model_of(state: State, settings: LearntSettings, *, daring: bool = False) -> Model:
-    """Make what rollouts take.
+def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) -> Floats:
+    """(r, 13) forms as rollouts take them (`failure.prepared`).
 
     Parameters
     ----------
     state : State
     settings : LearntSettings
     daring : bool
-        Whether to leave out what is doubted, and to come closer to where it crashes: so it is tried
+        Whether rivals of what is doubted are tried, and it comes closer to where it crashes: so
         while it learns.
     """
+    table = state.forms
+    if daring:
+        crash = table[:, SAYS] == CRASHES
+        table = table.copy()
+        table[crash] = failure.halfway(table[crash], state.failures)
+    if state.held < (0 if daring else -settings.settled):
+        table = failure.rivals(table, state.failures, sizes(state))
+    return failure.prepared(table)
+
+
+def model_of(state: State, settings: LearntSettings) -> Model:
+    """Make what rollouts take."""
     spread, table = _spread(state), state.forms
     inverse = 1.0 / np.where(spread > 0.0, spread, 1.0)
     lowest = np.where(state.reached[:, 0] >= 2, state.lowest[0], -np.inf)
@@ -285,12 +297,6 @@ def model_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
     fails = table[:, SAYS] == FAILS
     for j, sign in table[failure.are_sides(table) & fails][:, [I, B]].tolist():
         (lowest if sign < 0.0 else highest)[int(j)] = sign * np.inf  # nothing is held there
-    if daring:
-        crash = table[:, SAYS] == CRASHES
-        table = table.copy()
-        table[crash] = failure.halfway(table[crash], state.failures)
-    if state.held < (0 if daring else -settings.settled):
-        table = failure.rivals(table, state.failures, sizes(state))
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) if len(spread) else 1.0
     share = state.noise / np.where(state.power > 0.0, state.power, 1.0)
     noisy = np.where(state.scale > 0.0, share.clip(1e-3, 1.0), 1.0)
@@ -304,7 +310,7 @@ def model_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
         highest=highest,
         least=state.least,
         most=state.most,
-        forms=failure.prepared(table),
+        forms=forms_of(state, settings),
         dead_ends=np.column_stack(
             [state.centres, state.radii, np.full(len(state.radii), 1.0 / (typical + 1e-300))]
         ),
@@ -328,7 +334,7 @@ def residuals_of(state: State, known: Model, steps: int) -> Floats:
         rest = model.disturbed(known, *seen)[:steps]
         rest[:, state.drifts[state.drifts[:, 1] > episode, 0].astype(int)] = 0.0
         found[: len(rest), :, k] = rest
-    return model.packed(found)
+    return model.trimmed(found)
 
 
 # -- In a file -----------------------------------------------------------------------------------

@@ -42,7 +42,6 @@ from evofsm.guard.learnt.state import State, sizes
 NOTHING_LEARNT = "nothing was learnt yet"
 NOTHING_SEEN = "nothing of this episode was observed yet"
 NO_FAILURE = "no failure is known yet, so nothing is refused"
-#: Said while it is tried whether what one or two failures tell is true.
 #: What is done where all backups look alike and another action was hardly used.
 TRIED = "no action passes; what this one does is hardly known, so it is tried"
 
