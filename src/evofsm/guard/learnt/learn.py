@@ -112,6 +112,9 @@ def learn(
     state = noted(state, safe, u, episode, settings, random)
     if "rivals" not in without and given.failed is None:
         state = doubted(state, episode, settings)
+    refuted = 1 + np.flatnonzero(episode.lost[1 : max(1, len(safe) - state.horizon)])
+    if len(refuted):
+        state = motion.misled(state, safe, u, refuted, settings, failed=episode.failed)
     # Disturbances
     known, fails = model_of(state, settings), len(state.forms) > 0
     looks = fails and len(state.situations) > _ENOUGH

@@ -22,6 +22,8 @@ FLOOR = 1e-3
 # The least variance of a feature, and what all weights are held to 0 by, of its mean square: far
 # more than rounding, so that features that did not vary yet share what they explain alike.
 _LEAST, _ALL_ALIKE = 1e-6, 1e-10
+# What leaves a feature out.
+_NEVER = 1e15
 # From so many features on BLAS would call threads, which wait where other processes are busy.
 _LARGE = 100
 
@@ -94,7 +96,7 @@ def solve(
     is_plain = np.zeros(len(size), bool)
     is_plain[: 1 + m] = is_plain[1 + 2 * m : 1 + 2 * m + a] = True
     times = np.ones(len(size))
-    times[lags(m, a)] = prior[2]
+    times[lags(m, a)] = min(prior[2], _NEVER)
     weights = np.empty_like(products)
     for j, share in enumerate(noisy):
         held = np.where(is_plain, 1e-6 + share * prior[0] / n, 30e-6 + share * prior[1] / n)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from evofsm.guard.learnt import model
-from evofsm.guard.learnt.rollout import Flags, Floats, Model, features, lags
+from evofsm.guard.learnt.rollout import Flags, Floats, Ints, Model, features, lags
 from evofsm.guard.learnt.state import LearntSettings, State, model_of
 
 # Changes of which the typical step is learnt; a larger one counts as so many times that.
@@ -26,6 +26,8 @@ _STOPS = 4.0
 # Episodes before it may move otherwise, and after it did, in which it is learnt how; transitions
 # that a correction needs, and how it is held to 0.
 _LEARNT, _FEW, _HELD = 20, 15.0, 0.3
+# Steps from which it is tried how much lags foresee.
+_STARTS = 12
 
 
 def steps(state: State, z: Floats) -> State:
@@ -113,6 +115,42 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
     stops = _held(state, to, after) & rests & seen[:, None] & (np.abs(to - after) > _STOPS * scale)
     reached = np.where(stops.any(1).T & is_known, np.maximum(state.reached, 2.0), state.reached)
     return state._replace(scale=scale, noise=noise, reached=reached)
+
+
+def misled(
+    state: State, z: Floats, u: Floats, starts: Ints, settings: LearntSettings, *, failed: bool
+) -> State:
+    """Ask whether more had been foreseen without lags, where failure did not come as foreseen.
+
+    A feature may help one step ahead, and mislead over many.
+
+    Parameters
+    ----------
+    state : State
+    z : (T + 1, m) ndarray
+    u : (T, a) ndarray
+    starts : (k,) ndarray
+        Steps from which it went on for the whole horizon although nothing seemed to help.
+    settings : LearntSettings
+    failed : bool
+        Whether it failed in the end: then lags are not exonerated.
+    """
+    some = starts[np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))]
+    ahead = some[:, None] + np.arange(-1, state.horizon + 1)
+    if not np.isfinite(z[ahead]).all():
+        return state
+    missed = []
+    for doubt in (0.0, settings.misled):
+        known = model_of(state._replace(misled=doubt), settings)
+        at, before, total = z[ahead[:, 1]], z[ahead[:, 0]], 0.0
+        for now in ahead[:, 1:-1].T:
+            phi = features(known, at, at - before, u[now - 1], u[now])
+            move = np.clip(phi @ known.weights, known.least, known.most)
+            at, before = np.clip(at + move, known.lowest, known.highest), at
+            total += np.log1p(((at - z[now + 1]) / state.unit) ** 2).sum(1).mean()
+        missed.append(total / state.horizon)
+    worse = np.clip(missed[0] - missed[1], 0.0 if failed else -1.0, 1.0)
+    return state._replace(misled=max(0.0, state.misled + float(worse)))
 
 
 def told(

@@ -69,6 +69,9 @@ class LearntSettings:
     prior, shy, lags : float
         By how many observations weights are held to 0, those of bends and products, and so many
         times more those of the latest change and the action before.
+    misled : float
+        Those are left out where they foresaw failures that did not come: from so much on that was
+        missed more with them [ln(1 + square in typical steps)].
     outlier : float
         From so many scales on residuals weigh less (Huber 1964).
     drift, drift_fade : float
@@ -114,6 +117,7 @@ class LearntSettings:
     prior: float = 0.01
     shy: float = 20.0
     lags: float = 10.0
+    misled: float = 1.0
     outlier: float = 4.0
     drift: float = 30.0
     drift_fade: float = 0.95
@@ -176,6 +180,7 @@ class State(NamedTuple):
     #: episodes without failure in which much was refused; below 0 those of doubt
     held: Annotated[int, COUNT._replace(least=-COUNT.most)]
     wrong: Annotated[int, COUNT]  #: how often a rival was wrong
+    misled: Annotated[float, _ABOVE_0]  #: how much more was missed with lags than without
     # dead ends
     centres: Annotated[Floats, _SEEN.of("dead_ends", "m")]
     radii: Annotated[Floats, _ABOVE_0.of("dead_ends")]
@@ -236,6 +241,7 @@ class State(NamedTuple):
             differs=0.0,
             held=0,
             wrong=0,
+            misled=0.0,
             centres=e((0, m)),
             radii=e(0),
             counts=e(0),
@@ -300,7 +306,8 @@ def model_of(state: State, settings: LearntSettings) -> Model:
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) if len(spread) else 1.0
     share = state.noise / np.where(state.power > 0.0, state.power, 1.0)
     noisy = np.where(state.scale > 0.0, share.clip(1e-3, 1.0), 1.0)
-    held = settings.prior, settings.shy, settings.lags
+    lags = settings.lags if state.misled < settings.misled else np.inf
+    held = settings.prior, settings.shy, lags
     weights = model.solve(state.squares, state.products, noisy, len(state.used), held)
     return Model(
         weights=weights if np.isfinite(weights).all() else np.zeros_like(weights),
