@@ -156,10 +156,10 @@ def test_variables_of_known_environments_have_names():
         assert len({*_names_of(env)}) == size * is_known
 
 
-def test_a_guard_that_is_no_better_than_the_controller_alone_says_so():
+def test_a_guard_that_was_not_shown_to_help_says_so():
     judge = read_simulated("CartPole-v1").guard.judge
     judge.state = State.none(4, judge.size, judge.choices, judge.settings, None)
-    for steps, said in ((30, ""), (10, "no better than the controller alone: 5 of 5 guarded")):
+    for steps, said in ((30, ""), (10, "it was not shown to help: guarded episodes failed")):
         ends = [(20, False)] * 5 + [(steps, True)] * 5
         outcomes = [Outcome(k + 1, n, True, guarded) for k, (n, guarded) in enumerate(ends)]
         judge.harm = Harm(tuple(outcomes), len(ends))
@@ -226,9 +226,9 @@ MODES = [
     ("off", "least-risk", "was off", False),
     ("act", "none", "was off", False),
     ("act", "rss", "", False),
-    ("act", "passing", "might have done harm, so what was proposed passed", True),
+    ("act", "passing", "was not shown to help, so what was proposed passed", True),
     ("live", "on", "", True),
-    ("live", "passing", "may do harm, so what is proposed passes", True),
+    ("live", "passing", "was not shown to help yet, so what is proposed passes", True),
     ("live", "off", "the reviser is off", True),
 ]
 

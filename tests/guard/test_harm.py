@@ -1,8 +1,7 @@
-"""A guard that makes things worse notices, steps back and says so."""
+"""A guard drives where guarded episodes end better than those alone, and says so."""
 
 import math
 from io import BytesIO
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ import pytest
 from evofsm.guard import AuditLog, Guard, LearntRisk, Mode, audit, merge_judges
 from evofsm.guard.api import Search
 from evofsm.guard.export import write_c99
-from evofsm.guard.harm import Harm, Outcome, chance_of, earlier
+from evofsm.guard.harm import Harm, Outcome, better
 from evofsm.guard.learnt.judge import _unjudged
 
 _ALONE = 0.05  # what the controller wants: so it fails after 20 steps
@@ -48,31 +47,30 @@ def make(**settings):
     return Guard(-1.0, 1.0, interval=0.1, **settings)
 
 
-def test_it_steps_back_within_fifteen_episodes_and_says_so(wrong):
+def test_a_guard_under_which_it_fails_sooner_hardly_drives_and_says_so(wrong):
     guard = make()
-    rows = drive(guard, 15)
-    assert {why for _, why in rows[:8]} == {"", "shadow"}
-    since = guard.judge.harm.since
-    assert 0 < since < 15
-    assert f"steps back since episode {since}" in {why for steps, why in rows if steps > 15}
-    said = f"steps back since episode {since}: guarded episodes failed after 1 steps in the median"
-    assert said in guard.judge.told_by_experience
+    rows = drive(guard, 40)
+    assert {why for _, why in rows} == {"", "shadow"}
+    assert sum(steps == 1 for steps, _ in rows) <= 8
+    said = "it was not shown to help: guarded episodes failed after 1 steps in the median"
     assert said in str(guard)
+    assert "the controller alone failed after 20 steps" in guard.judge.told_by_experience
     assert "it must" in guard.decide([0.0], _ALONE).reason
 
 
-def test_frozen_it_stays_back_and_warns(wrong, tmp_path):
+@pytest.mark.parametrize("n", [3, 15])
+def test_frozen_so_it_does_not_act_and_warns(wrong, tmp_path, n):
     guard = make()
-    drive(guard, 15)
-    with pytest.warns(UserWarning, match="steps back since episode"):
+    drive(guard, n)
+    with pytest.warns(UserWarning, match="was not shown to help: frozen so, proposals pass"):
         guard.freeze()
-    assert {why.split(" since")[0] for _, why in drive(guard, 12)} == {"steps back"}
+    assert {why for _, why in drive(guard, 12)} == {"was not shown to help"}
     file = BytesIO()
     guard.save(file)
     again = Guard.load(BytesIO(file.getvalue()))
     assert drive(again, 3) == drive(guard, 3)
     with (
-        pytest.warns(UserWarning, match="steps back"),
+        pytest.warns(UserWarning, match="was not shown to help"),
         pytest.raises(ValueError, match="would let all proposals pass"),
     ):
         write_c99(guard, tmp_path)
@@ -80,32 +78,13 @@ def test_frozen_it_stays_back_and_warns(wrong, tmp_path):
     assert drive(guard)[0] == (1, "")
 
 
-def test_frozen_early_it_does_not_act_where_it_failed_sooner_so_far(wrong):
-    guard = make()
-    drive(guard, 3)  # once alone, twice guarded
-    with pytest.warns(UserWarning, match="this guard may do harm: frozen so, proposals pass"):
-        guard.freeze()
-    assert {why for _, why in drive(guard, 3)} == {"may do harm"}
-    assert "it may do harm: guarded episodes failed after 1 steps in the median (2 of 2)" in str(
-        guard
-    )
-
-
 def test_it_is_tried_again_and_acts_once_that_lasts(wrong):
     guard = make()
-    drive(guard, 12)
+    drive(guard, 8)
     wrong[0] = 0.0
-    rows = drive(guard, 20)
-    assert not guard.judge.harm.since
-    assert rows[-1] == (60, "")
-    assert "steps back" not in str(guard)
-
-
-def test_what_goes_on_failing_is_tried_ever_more_rarely(wrong):
-    guard = make()
-    rows = drive(guard, 45)
-    tried = [n for n, (steps, _) in enumerate(rows, 1) if steps == 1][-4:]
-    assert np.diff([guard.judge.harm.since - 1, *tried]).tolist() == [3, 5, 9, 11]
+    rows = drive(guard, 60)
+    assert sum(row == (60, "") for row in rows[-20:]) >= 16
+    assert "not shown to help" not in str(guard)
 
 
 def test_without_shadow_it_is_never_told_to_pass_which_is_said(wrong):
@@ -115,11 +94,11 @@ def test_without_shadow_it_is_never_told_to_pass_which_is_said(wrong):
     assert not guard.copy().shadow
 
 
-def test_a_guard_that_saves_is_never_driven_in_shadow(wrong):
+def test_a_guard_that_saves_drives_nearly_always(wrong):
     wrong[0] = 0.0
     guard = make()
-    rows = drive(guard, 12)
-    assert rows[1:] == [(60, "")] * 11
+    rows = drive(guard, 40)
+    assert sum(row == (60, "") for row in rows[1:]) >= 37
     assert "in shadow where in doubt" in str(guard)
     assert "it replaces the controller: 0% of proposals are kept; that is no filter" in str(guard)
 
@@ -134,6 +113,8 @@ def test_saved_copied_and_replayed_from_a_log_it_goes_on_the_same(wrong, tmp_pat
         rows = drive(guard, 8)
         guard.shadow = False
         drive(guard, 2)
+        guard.decide([0.0], 0.0)
+        guard.end(score=-3.5)
     assert "shadow" in {why for _, why in rows}
     assert all(drive(twin, 8) == rows for twin in twins)
     found = audit(tmp_path / "log", log.head)
@@ -145,62 +126,88 @@ def test_where_someone_else_acts_the_controller_is_alone(wrong):
     guard = make(mode=Mode.SHADOW)
     drive(guard, 5)
     assert [one.guarded for one in guard.judge.harm.outcomes] == [False] * 5
+    guard.freeze()  # it was never tried
     guard.reviser.mode = Mode.ACT
-    assert drive(guard, 2) == [(1, ""), (20, "shadow")]
-    assert guard.judge.harm.chance == 1.0 / 7.0  # one of seven ways to choose one
+    assert drive(guard, 2) == [(1, "")] * 2
 
 
 def test_merged_it_is_said_of_all_episodes(wrong):
     guards = make(), make(seed=1)
     for guard in guards:
         drive(guard, 7)
-        assert not guard.judge.harm.since
-    assert merge_judges([guard.judge for guard in guards]).harm.since == 15
+    merged = merge_judges([guard.judge for guard in guards]).harm
+    assert len(merged.outcomes) == merged.n_episodes == 14
+    assert not merged.helps
 
 
-# -- The test ------------------------------------------------------------------------------------
+def test_a_score_that_is_no_number_is_refused_and_nothing_ends():
+    guard = make()
+    guard.decide([0.0], 0.0)
+    for score in (math.nan, "much"):
+        with pytest.raises((TypeError, ValueError), match="score"):
+            guard.end(score=score)
+    guard.end(score=1)
+    assert guard.n_episodes == 1
 
 
-def outcomes(*steps, guarded=False):
-    """Of steps, negative where an episode did not fail."""
-    return [Outcome(n, abs(k), k > 0, guarded) for n, k in enumerate(steps, 1)]
+# -- Which is better -----------------------------------------------------------------------------
 
 
-def test_its_chance_is_that_of_all_ways_to_deal_the_episodes_out():
-    guarded, alone = outcomes(5, 9, -9, 40, 7), outcomes(9, 30, -60, 12)
-    pooled, found = [*guarded, *alone], earlier(guarded, alone)
-    dealt = [
-        earlier([pooled[i] for i in some], [pooled[i] for i in range(9) if i not in some])
-        for some in combinations(range(9), 5)
-    ]
-    assert found > 0
-    assert chance_of(guarded, alone) == pytest.approx(np.mean(np.array(dealt) >= found))
+def arms(guarded, alone):
+    """A record of episodes: steps, ``f`` if it failed, ``e`` if it ended by itself, and a score."""
+    known = Harm().after((5, 0, 4), failed=False)._replace(outcomes=())
+    for number, (steps, how, score) in enumerate([*guarded, *alone]):
+        driven = (steps, 0, 0) if number < len(guarded) else (0, steps, 0)
+        known = known.after(driven, failed=how == "f", ended=how == "e", score=score)
+    return known
 
 
 @pytest.mark.parametrize(
-    ("guarded", "alone"),
+    ("guarded", "alone", "helps"),
     [
-        ((-5, -4, -6, -5), (20, 30, 25)),  # goals that were reached sooner
-        ((50, 60, 70, 80), (20, 30, 25)),
-        ((), (20,)),
+        ((90, "f", None), (30, "f", None), True),  # it fails later
+        ((30, "f", None), (90, "f", None), False),
+        ((60, "", None), (90, "f", None), True),  # cut off before the other failed: nobody knows
+        ((90, "", None), (60, "f", None), True),
+        ((40, "e", None), (60, "f", None), True),  # reached its goal sooner
+        ((60, "", None), (40, "e", None), False),  # hovers where the other lands
+        ((60, "", None), (60, "", None), True),  # nothing went wrong
+        ((60, "", -200.0), (40, "", 200.0), False),  # costs what the other earns
+        ((60, "", 199.0), (40, "e", 200.0), False),
+        ((60, "", 250.0), (40, "e", 200.0), True),
+        ((60, "f", 900.0), (90, "", 1.0), False),  # failure counts before all scores
     ],
 )
-def test_what_fails_later_or_not_at_all_is_no_harm(guarded, alone):
-    assert chance_of(outcomes(*guarded), outcomes(*alone)) == 1.0
+def test_frozen_it_acts_where_episodes_ended_better(guarded, alone, helps):
+    assert arms([guarded] * 3, [alone] * 3).helps == helps
 
 
-@pytest.mark.parametrize(("better", "most"), [(1.0, 4), (3.0, 0)])
-def test_it_seldom_steps_back_without_harm(better, most):
-    chance, stepped = np.random.default_rng(0), 0
-    for _ in range(40):
-        harm = Harm().after((30, 0, 30), failed=True)
-        for _ in range(30):
-            passes = bool(harm.passing(learning=True))
-            after = chance.exponential(100.0 if passes else 100.0 * better)
-            steps = 1 + int(min(after, 299.0))
-            driven = (0, steps, 0) if passes else (steps, 0, 0)
-            harm = harm.after(driven, failed=after < 299.0)
-            stepped += bool(harm.since)
-            if harm.since:
-                break
-    assert stepped <= most
+def test_the_arm_that_is_better_is_drawn_ever_more_often():
+    """By simulation: failure after times that differ by a factor, cut off at 300 steps."""
+    for better_by, least, most in ((3.0, 0.7, 1.0), (1.0, 0.2, 0.8), (1 / 3, 0.0, 0.25)):
+        chance, guarded = np.random.default_rng(0), 0
+        for _ in range(20):
+            harm = Harm().after((30, 0, 29), failed=True)
+            for _ in range(40):
+                drives = not harm.passing(learning=True)
+                after = chance.exponential(100.0 * (better_by if drives else 1.0))
+                steps = 1 + int(min(after, 299.0))
+                driven = (steps, 0, 0) if drives else (0, steps, 0)
+                harm = harm.after(driven, failed=after < 299.0)
+                guarded += drives
+        assert least <= guarded / 800 <= most
+
+
+def test_a_controller_that_became_good_is_found_out():
+    harm = arms([(60, "", None)] * 20, [(20, "f", None)] * 20)
+    alone = 0
+    for _ in range(300):
+        drives = not harm.passing(learning=True)
+        harm = harm.after((60, 0, 0) if drives else (0, 40, 0), failed=False, ended=not drives)
+        alone += not drives
+    assert alone > 150
+
+
+def test_of_two_which_failed_at_once_none_is_better():
+    some = [Outcome(1, 30, True, True)]
+    assert not better(some, some).any()

@@ -60,7 +60,7 @@ FIELDS: Mapping[str, set[str]] = {
     "decision": {"before", "belief", "interval", "mask", "observation", "time", *_TOLD},
     "quiet": {"before"},
     "settings": {"settings"},
-    "end": {"before", "failed", "learnt", "observation", "terminated"},
+    "end": {"before", "failed", "learnt", "observation", "score", "terminated"},
 }
 
 
@@ -381,7 +381,9 @@ class AuditLog:
             if len(self._before) >= _MOST_QUIET:
                 self._flush()
 
-    def ended(self, observation: Any, *, failed: bool, terminated: bool) -> None:
+    def ended(
+        self, observation: Any, *, failed: bool, terminated: bool, score: float | None
+    ) -> None:
         """The episode ended; an OSError if something could not be written since it began."""
         if self._guard is None:
             return
@@ -389,7 +391,7 @@ class AuditLog:
         self._learnt = sums_of(self._guard)
         last = None if observation is None else observation.tolist()
         before = self._take_before()
-        how = {"failed": bool(failed), "terminated": terminated}
+        how = {"failed": bool(failed), "terminated": terminated, "score": score}
         self._write("end", before=before, learnt=self._learnt, observation=last, **how)
         self._force()
         self._guard = None

@@ -79,7 +79,7 @@ def write_c99(guard: Guard, folder: Path, prefix: str = "evofsm") -> None:
 
     With another prefix, files and all names in them begin with that: two guards in one program need
     two. A ValueError if its reviser or judge is of someone's own class, it judges nothing (mode
-    off), nothing was learnt yet by which it could decide, or it steps back or may do harm.
+    off), nothing was learnt yet by which it could decide, or it was not shown to help.
     """
     is_name = re.fullmatch("[A-Za-z](_?[A-Za-z0-9])*(?<!_t)", prefix)
     if not is_name or prefix.lower() in _TAKEN.split():

@@ -28,7 +28,7 @@ from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.sharing import Rollback, alone, share, transaction
-from evofsm.fsm.validation import function, positive, real_array
+from evofsm.fsm.validation import function, positive, real_array, refuse_unusable
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -114,7 +114,9 @@ class DecisionLogger(Protocol):
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
         """A decision was made."""
 
-    def ended(self, observation: Any, *, failed: bool, terminated: bool) -> None:
+    def ended(
+        self, observation: Any, *, failed: bool, terminated: bool, score: float | None
+    ) -> None:
         """The episode ended."""
 
 
@@ -195,9 +197,9 @@ class Guard:
     missing : Missing
         What to do where a variable was not observed (NaN).
     shadow : bool
-        Whether proposals pass in some episodes while a learnt judge learns and may do harm, and in
-        all once it fails sooner than the controller alone (`evofsm.guard.harm`). Without it, one
-        that does harm is not noticed.
+        Whether proposals pass in some episodes while a learnt judge learns, as long as it was not
+        shown to help, and in all where it is frozen so (`evofsm.guard.harm`). Without it, one that
+        does harm is not noticed.
 
     Raises
     ------
@@ -387,7 +389,7 @@ class Guard:
         self._under_way, self._passing, self._learn = False, "", True
         self._begun = self._decisions = self._acted = self._watched = self._kept = 0
         self._lacking: NDArray[Any] | None = None  # since an observation was whole
-        #: Whether episodes may be driven in shadow, or it may step back, where it may do harm.
+        #: Whether proposals pass in some or all episodes where it was not shown to help.
         self.shadow = bool(shadow)
         self.learn = learn
 
@@ -734,6 +736,7 @@ class Guard:
         observation: ArrayLike | None = None,
         *,
         terminated: bool = False,
+        score: float | None = None,
         episode: int | None = None,
     ) -> None:
         """End the episode, and learn from how it ended.
@@ -748,19 +751,26 @@ class Guard:
         terminated : bool
             Whether it ended by itself, as where a goal is reached, and was not cut off: a learnt
             judge learns where, and looks no further. As in Gymnasium; what failed has failed.
+        score : float, optional
+            How well the episode went, more is better, as the sum of rewards: a guard under which
+            episodes that do not fail get less than those of the controller alone does not help.
         episode : int, optional
             As in `decide`; of one that was broken off nothing is left to end.
 
         Raises
         ------
         TypeError, ValueError
-            If ``failed`` or ``terminated`` is neither True nor False, or as in `decide`.
+            If ``failed`` or ``terminated`` is neither True nor False, ``score`` is no finite
+            number, or as in `decide`.
         OSError
             If the audit log cannot be written. Give the guard another, or none, and end it then.
         """
         if episode not in (None, self._begun):
             return
         failed, terminated = _truth("failed", failed), _truth("terminated", terminated)
+        if score is not None:
+            refuse_unusable("score", real_array("score", [score], 1))
+            score = float(score)
         z = None if observation is None else self._checked(observation)
         if not self._under_way:
             self._begin()
@@ -792,12 +802,12 @@ class Guard:
         self._under_way = False
         if self._learn:
             if (judge := self._observing) is not None:
-                driven, how = (self._acted, self._watched, self._kept), {"tests": self.shadow}
-                judge.harm = judge.harm.after(driven, failed=failed, ended=terminated, **how)
+                driven = self._acted, self._watched, self._kept
+                judge.harm = judge.harm.after(driven, failed=failed, ended=terminated, score=score)
             self.n_episodes += 1
             self.n_failed += failed
         if self.audit is not None:
-            self.audit.ended(z, failed=failed, terminated=terminated)
+            self.audit.ended(z, failed=failed, terminated=terminated, score=score)
 
     @alone
     def __str__(self) -> str:

@@ -342,11 +342,12 @@ class Lane:
         self._seen: _Seen = None
         self._mask: Mask | None = None
         self._past: list[tuple[NDArray[np.float64], Proposal, Action]] = []
+        self._score = 0.0
 
     def begin(self, observation: Any, info: Mapping[str, Any]) -> None:
         """An episode of the environment begins."""
         _LANES.setdefault(self.terms.guard, WeakSet()).add(self)
-        self.is_open = True
+        self.is_open, self._score = True, 0.0
         self._look(observation, info)
 
     def _look(self, observation: Any, info: Mapping[str, Any]) -> None:
@@ -406,14 +407,16 @@ class Lane:
             info = step.info.get("final_info", step.info)
             step = replace(step, observation=last[0] if last else None, info=info)
         failed = self.terms.failed(step)
+        self._score += np.sum(step.reward)
         self._look(step.observation, step.info)
         if failed or over or self._seen is None:
-            self.end(failed=failed, terminated=step.terminated)
+            score = float(self._score) if over and np.isfinite(self._score) else None
+            self.end(failed=failed, terminated=step.terminated, score=score)
         self.is_open = not over
         if resets:
             self.begin(now.observation, now.info)
 
-    def end(self, *, failed: bool, terminated: bool = False) -> None:
+    def end(self, *, failed: bool, terminated: bool = False, score: float | None = None) -> None:
         """The guard's episode ends, if one is under way."""
         decider, guard = self._guard, self.terms.guard
         if decider is not None and decider is not guard and guard.learn:
@@ -422,7 +425,8 @@ class Lane:
                 situation = guard.recognise(seen, step * guard.interval)
                 guard.take_in(situation, proposal, executed)
         if decider is guard or (decider is not None and guard.learn):
-            guard.end(failed, self._seen, terminated=terminated, episode=self._episode)
+            which = self._episode
+            guard.end(failed, self._seen, terminated=terminated, score=score, episode=which)
         self._guard, self._past = None, []
 
 

@@ -1,23 +1,24 @@
-"""Whether a guard does harm: time to failure, guarded against the controller alone.
+"""Who drives an episode: the guard, or the controller alone, by how episodes of both ended.
 
-A guard that learns may be wrong, and then fail sooner than the controller would alone. It compares
-steps to failure, in rank: of each pair of a guarded episode and one of the controller alone, which
-failed surely before the other (an episode that did not fail only says that it would have been
-later: a goal that is reached sooner is no harm). The sum over all pairs is Gehan's statistic
-(Biometrika 52, 1965); how often chance alone makes it as large is counted exactly, over all ways to
-deal the episodes out. Ranks assume nothing about how failures are distributed, and judge by a few.
+A guard that learns may be wrong, and what it refuses keeps away the only evidence against it. So
+there are two arms, *guarded* and *alone*, each with a record of its latest episodes. Of two
+episodes the better one is found by rank, which assumes nothing about how failures are distributed:
 
-Episodes before anything was refused are those of the controller alone. Later ones are driven in
-*shadow* (proposals pass) only while there is doubt: where guarded episodes fail sooner, and chance
-alone would have it so in at most one case of four; or where all of the latest five failed, and
-fewer than three of the controller alone are known. Where they do not fail, nothing has to be
-tested; where they fail sooner, what is known says that the controller alone would last longer, so
-that a shadow episode is not expected to cost anything. In doubt every second episode is one.
+1. One that failed while the other went on is worse (Gehan, Biometrika 52, 1965). What was cut off
+   before the other failed says nothing; what ended by itself without failure never fails.
+2. Where neither failed, the higher score is better, if both are told and differ by more than 5 %;
+   else what ended by itself, as at a goal, is better than what was cut off.
 
-From a chance of one in a hundred on the guard *steps back*: proposals pass, and now and then an
-episode is tried guarded, after 2, 4, 8 and then 10 of the controller alone. One that lasts no
-shorter than half of those has the next one tried, too; two such in succession, and it acts again.
-Frozen it acts only if guarded episodes of late did not fail sooner, by chance or not.
+While it learns, who drives an episode is drawn by Thompson sampling with a Bayesian bootstrap
+(Eckles & Kaptein 2014): each episode of an arm gets a random weight, of the gamma distribution, and
+the guard drives if then it wins no fewer pairs than it loses. What is older weighs less, as guards
+and controllers change. Each arm begins with a part of an episode that ended well, so that it is
+tried. The controller drives alone, in *shadow*, only where that costs little: after an episode that
+failed, where it does better by what is known, or every tenth time, as it may have become better;
+and in the first case three draws have to agree, unless the latest three guarded episodes failed.
+
+Frozen, it acts unless its record says that it harms: that it loses more pairs than it wins. A
+guard, or a controller, that was never tried has no record, and then it acts.
 """
 
 from __future__ import annotations
@@ -29,17 +30,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.store import COUNT, SHARE, Numbers
+from evofsm.store import COUNT, Numbers
 
-# Episodes of each kind that are compared, the latest: a guard that learns gets better.
-_KEPT = 20
-# So many are known of the controller alone, or there is doubt once that many guarded ones failed.
-_KNOWN, _ALL_FAILED = 3, 5
-# Chances of so much sooner failures, below which it is not frozen to act; from which on there is
-# doubt; and it steps back.
-_EVEN, _DOUBT, _SURE = 0.5, 0.25, 0.01
-# Most episodes of the controller alone between two that are tried; so many that last bring it back.
-_RARELY, _LASTING = 10, 2
+# Episodes of each arm that are kept, the latest; what is left of the weight of one an episode
+# later; and the weights of those that ended well, with which guarded and alone begin: who drives
+# alone until the first refusal is known already.
+_KEPT, _FADES, _HOPES = 20, 0.98, (0.25, 0.05)
+# So many episodes after the latest of the controller alone one is drawn, and then as often.
+_RARELY = 10
+# Scores that differ by less than this share are equal.
+_ALIKE = 0.05
+# The latest guarded episodes, if all failed, are reason enough for one draw to decide; else it
+# takes as many that agree.
+_CAREFUL = 3
+# Draws by which it is said how often the guard drives; below that it is said at all.
+_DRAWS, _SAID = 300, 0.9
 # Decisions over which the share of proposals that are kept is counted, and at least for a word.
 _DECISIONS, _SOME = 500, 100
 # Steps of who never fails.
@@ -53,26 +58,27 @@ class Outcome(NamedTuple):
     steps: int
     failed: bool
     guarded: bool  #: or the controller drove alone
+    ended: bool = False  #: by itself, without failing
+    score: float = math.nan  #: NaN where it was not told
 
 
-#: What a file holds of it: outcomes, a row each, and numbers.
-OUTCOMES = COUNT.of("h", 4)
+#: What a file holds of it: a row for each outcome, the score last and before it whether it was
+#: told; and numbers.
+OUTCOMES = Numbers().of("h", 7)
 SETTINGS = {
-    **dict.fromkeys(("n_episodes", "since"), COUNT),
+    "n_episodes": COUNT,
     "refuses": bool,
-    "chance": SHARE,
     **dict.fromkeys(("decided", "kept"), Numbers(least=0.0, most=COUNT.most)),
 }
+_WELL = Outcome(0, _FOREVER, failed=False, guarded=False, ended=True)
 
 
 class Harm(NamedTuple):
-    """How episodes ended, guarded and alone, and what follows from it."""
+    """How episodes ended, guarded and alone, and who drives the next."""
 
     outcomes: tuple[Outcome, ...] = ()
     n_episodes: int = 0
     refuses: bool = False  #: whether anything was refused yet: before, it is no guard
-    chance: float = 1.0  #: of guarded episodes that fail so much sooner, were there no harm
-    since: int = 0  #: the episode, from 1, from which on it steps back; 0: it does not
     decided: float = 0.0  #: decisions of late in which it could refuse
     kept: float = 0.0  #: and of these proposals that were kept
 
@@ -83,69 +89,111 @@ class Harm(NamedTuple):
 
     @property
     def guarded(self) -> list[Outcome]:
-        """Of the guard that acts; while it steps back, those that were tried since."""
-        return [one for one in self.outcomes if one.guarded and one.episode >= self.since]
-
-    def in_doubt(self, *, learning: bool) -> bool:
-        """Whether guarded episodes fail sooner, perhaps by chance.
-
-        While it learns, also if all of them fail, and little is known of the controller alone.
-        """
-        if self.since or not learning or self.chance <= _DOUBT:
-            return not self.since and self.chance < _EVEN
-        latest, alone = self.guarded[-_ALL_FAILED:], self.alone
-        fails = len(latest) == _ALL_FAILED and all(one.failed for one in latest)
-        long_ago = len(alone) < _KNOWN or self.n_episodes - alone[-1].episode >= _RARELY - 1
-        return fails and long_ago
+        """Of the guard that acts."""
+        return [one for one in self.outcomes if one.guarded]
 
     @property
     def replaces(self) -> bool:
         """Whether hardly a proposal is kept."""
         return self.decided >= _SOME and self.kept < 0.05 * self.decided
 
-    @classmethod
-    def restored(cls, settings: Mapping[str, Any], outcomes: NDArray[Any]) -> Harm:
-        """As it was in a file, whose rows and settings hold to what is declared."""
-        rows = outcomes[-2 * _KEPT :].tolist()
-        return cls(tuple(Outcome(int(n), int(k), f > 0, g > 0) for n, k, f, g in rows), **settings)
+    @property
+    def helps(self) -> bool:
+        """Whether guarded episodes end no worse than those alone, or of one kind none is known."""
+        guarded, alone = self.guarded, self.alone
+        won = self._weights(guarded) @ better(guarded, alone) @ self._weights(alone)
+        return not guarded or not alone or bool(won >= 0.0)
 
-    @classmethod
-    def merged(cls, parts: Sequence[Harm]) -> Harm:
-        """Of guards that learnt apart: the newest outcomes of each, from which it is said anew."""
-        outcomes, n_episodes = list[Outcome](), 0
-        each = max(1, _KEPT // len(parts))
-        for part in parts:
-            newest = part.alone[-each:] + [one for one in part.outcomes if one.guarded][-each:]
-            outcomes += (one._replace(episode=one.episode + n_episodes) for one in newest)
-            n_episodes += part.n_episodes
-        refuses = any(part.refuses for part in parts)
-        return cls(tuple(sorted(outcomes)), n_episodes, refuses)._concluded()
+    def drives(self, draws: int) -> float:
+        """In how many of some draws the guard would drive the next episode, as a share.
+
+        The same for the same record.
+        """
+        arms = [[*self.guarded, _WELL], [*self.alone, _WELL]]
+        random = np.random.default_rng([self.n_episodes, draws])
+        some, others = (
+            random.gamma(np.append(self._weights(arm[:-1]), hope), size=(draws, len(arm)))
+            for arm, hope in zip(arms, _HOPES, strict=True)
+        )
+        won = np.einsum("ni,ij,nj->n", some, better(*arms), others)
+        return float((won >= 0.0).mean())
+
+    def _weights(self, outcomes: Sequence[Outcome]) -> NDArray[np.float64]:
+        return _FADES ** np.array([self.n_episodes - one.episode for one in outcomes], np.float64)
 
     def passing(self, *, learning: bool) -> str:
         """Why proposals pass in the episode to come; empty where they are revised."""
-        if self.since:
-            tried = self.guarded
-            again = bool(tried) and self._lasted(tried[-1])
-            alone = self.n_episodes - (tried[-1].episode if tried else self.since - 1)
-            is_tried = again or alone >= min(_RARELY, 2 ** (1 + len(tried)))
-            return "" if learning and is_tried else f"steps back since episode {self.since}"
         if not learning:
-            return "may do harm" if self.in_doubt(learning=False) else ""
-        is_next = bool(self.outcomes) and self.outcomes[-1].guarded
-        return "shadow" if is_next and self.in_doubt(learning=True) else ""
+            return "" if self.helps else "was not shown to help"
+        fails = any(one.failed for one in self.outcomes[-1:])
+        asked = self.refuses and (fails or self._long_ago or not self.helps)
+        return "shadow" if asked and not self.drives(self._draws) else ""
 
-    def _lasted(self, one: Outcome) -> bool:
-        """Whether an episode failed no sooner than half of those of the controller alone."""
-        return earlier([one], self.alone) <= 0
+    @property
+    def _long_ago(self) -> bool:
+        """Whether it is long ago that the controller drove alone."""
+        return not (self.n_episodes - (self.alone[-1].episode if self.alone else 0)) % _RARELY
+
+    @property
+    def _draws(self) -> int:
+        """The guard drives if it does in one of so many draws."""
+        latest = self.guarded[-_CAREFUL:]
+        return 1 if self._long_ago or all(one.failed for one in latest) else _CAREFUL
+
+    def told(self, *, learning: bool) -> str:
+        """How both arms ended, where it is not beyond doubt that the guard helps; else nothing."""
+        guarded, alone = self.guarded, self.alone
+        if not guarded or not alone:
+            return ""
+        share = float(self.helps)
+        if learning:
+            share = 1.0 - (1.0 - self.drives(_DRAWS)) ** self._draws
+        if share >= _SAID:
+            return ""
+        how = f"the guard drives some {share:.0%} of episodes" if learning else "proposals pass"
+        found = f"guarded episodes {_ended(guarded)}, the controller alone {_ended(alone)}"
+        return f"it was not shown to help: {found}; {how}"
+
+    @classmethod
+    def restored(cls, settings: Mapping[str, Any], outcomes: NDArray[Any]) -> Harm:
+        """As it was in a file, whose rows and settings hold to what is declared."""
+        rows = [
+            Outcome(int(n), int(k), f > 0, g > 0, e > 0, score if told else math.nan)
+            for n, k, f, g, e, told, score in outcomes[-2 * _KEPT :].tolist()
+        ]
+        return cls(tuple(rows), **settings)
+
+    @property
+    def rows(self) -> NDArray[np.float64]:
+        """(h, 7) outcomes, as a file holds them."""
+        rows = np.array(self.outcomes, np.float64).reshape(-1, 6)
+        return np.nan_to_num(np.insert(rows, 5, np.isfinite(rows[:, 5]), axis=1))
+
+    @classmethod
+    def merged(cls, parts: Sequence[Harm]) -> Harm:
+        """Of guards that learnt apart: the newest outcomes of each."""
+        outcomes, n_episodes = list[Outcome](), 0
+        each = max(1, _KEPT // len(parts))
+        for part in parts:
+            newest = part.alone[-each:] + part.guarded[-each:]
+            outcomes += (one._replace(episode=one.episode + n_episodes) for one in newest)
+            n_episodes += part.n_episodes
+        refuses = any(part.refuses for part in parts)
+        return cls(tuple(sorted(outcomes, key=lambda one: one.episode)), n_episodes, refuses)
 
     def after(
-        self, driven: tuple[int, int, int], *, failed: bool, ended: bool = False, tests: bool = True
+        self,
+        driven: tuple[int, int, int],
+        *,
+        failed: bool,
+        ended: bool = False,
+        score: float | None = None,
     ) -> Harm:
         """What it is after an episode.
 
         Of its decisions there were so many in which proposals could be refused (``driven``), in
         which they could not, and of the first in which they were kept. With both it is of neither
-        kind, and is left out. One that ``ended`` by itself without failing never fails.
+        kind, and is left out.
         """
         acted, watched, kept = driven
         refuses, n = self.refuses or kept < acted, self.n_episodes + 1
@@ -154,59 +202,45 @@ class Harm(NamedTuple):
             now = now._replace(decided=fades * self.decided + acted, kept=fades * self.kept + kept)
         if bool(acted) == bool(watched):
             return now
-        steps = _FOREVER if ended else acted + watched
-        new = Outcome(n, steps, failed, refuses and acted > 0)
+        told = math.nan if score is None else score
+        new = Outcome(n, acted + watched, failed, refuses and acted > 0, ended, told)
         alike = [one for one in self.outcomes if one.guarded == new.guarded]
         gone = alike[: max(0, len(alike) - _KEPT + 1)]
-        now = now._replace(outcomes=(*(one for one in self.outcomes if one not in gone), new))
-        return now._concluded() if tests else now
-
-    def _concluded(self) -> Harm:
-        """Whether it steps back, or acts again."""
-        guarded, alone = self.guarded, self.alone
-        if not self.since:
-            chance = chance_of(guarded, alone)
-            return self._replace(chance=chance, since=self.n_episodes + 1 if chance <= _SURE else 0)
-        if len(latest := guarded[-_LASTING:]) < _LASTING or not all(map(self._lasted, latest)):
-            return self
-        outcomes = tuple(one for one in self.outcomes if not one.guarded or one in latest)
-        return self._replace(outcomes=outcomes, since=0, chance=chance_of(latest, alone))
+        return now._replace(outcomes=(*(one for one in self.outcomes if one not in gone), new))
 
 
-def earlier(some: Sequence[Outcome], others: Sequence[Outcome]) -> int:
-    """Pairs in which one of ``some`` failed surely before one of ``others``, less the reverse."""
-    return int(_before(some, others).sum() - _before(others, some).sum())
-
-
-def _before(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.bool_]:
-    """(s, o) whether each of some failed while the other went on; of a tie both, which cancels."""
-    fails = np.array([one.steps if one.failed else math.inf for one in some])
-    return fails[:, None] <= np.array([one.steps for one in others])
-
-
-def chance_of(guarded: Sequence[Outcome], alone: Sequence[Outcome]) -> float:
-    """How likely it is that guarded episodes fail so much sooner, or more, if there is no harm.
-
-    Where the controller was never seen alone, it is taken not to have failed once.
+def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.float64]:
+    """(s, o) 1 where one of ``some`` ended better than one of ``others``, -1 where worse; else 0.
 
     Examples
     --------
-    >>> guarded = [Outcome(n, steps, True, True) for n, steps in enumerate((7, 3, 12))]
-    >>> alone = [Outcome(n, steps, True, False) for n, steps in enumerate((104, 109))]
-    >>> chance_of(guarded, alone)  # one of the ten ways to choose two of five
-    0.1
+    >>> failed, later = Outcome(1, 30, True, False), Outcome(2, 90, True, False)
+    >>> cut_off, landed = Outcome(3, 60, False, True), Outcome(4, 40, False, True, ended=True)
+    >>> better([cut_off, landed], [failed, later, landed])
+    array([[ 1.,  0., -1.],
+           [ 1.,  1.,  0.]])
     """
-    alone = alone or [Outcome(0, _FOREVER, False, False)]
-    found = earlier(guarded, alone)
-    if found <= 0:
-        return 1.0
-    pooled = [*guarded, *alone]
-    before = _before(pooled, pooled)
-    scores = before.sum(1) - before.sum(0)
-    # Ways to choose so many (rows) with such a sum (columns).
-    middle = len(pooled) ** 2
-    ways = np.zeros((1 + len(guarded), 1 + 2 * middle))
-    ways[0, middle] = 1.0
-    for score in scores.tolist():
-        ways[1:] += np.roll(ways[:-1], score, 1)
-    return float(ways[-1, middle + found :].sum() / ways[-1].sum())
+    (s_steps, s_fails, s_well, s_score), (o_steps, o_fails, o_well, o_score) = (
+        np.array([(one.steps, one.failed, one.ended, one.score) for one in arm]).reshape(-1, 4).T
+        for arm in (some, others)
+    )
+    s_last, o_last = np.where(s_well > 0, np.inf, s_steps), np.where(o_well > 0, np.inf, o_steps)
+    worse = (s_fails[:, None] > 0) & (s_steps[:, None] <= o_last)
+    best = (o_fails > 0) & (o_steps <= s_last[:, None])
+    more, size = s_score[:, None] - o_score, np.maximum(np.abs(s_score)[:, None], np.abs(o_score))
+    scored = np.where(np.abs(more) > _ALIKE * size, np.sign(more), 0.0)
+    neither = np.where(scored != 0.0, scored, s_well[:, None] - o_well)
+    fails = (s_fails[:, None] > 0) | (o_fails > 0)
+    return np.where(fails, best.astype(float) - worse, neither)
+
+
+def _ended(outcomes: Sequence[Outcome]) -> str:
+    """After how many steps episodes failed, and how those ended that did not."""
+    steps = [one.steps for one in outcomes if one.failed]
+    n, well = len(outcomes), sum(one.ended for one in outcomes)
+    said = f"did not fail in {n}"
+    if steps:
+        said = f"failed after {np.median(steps):g} steps in the median ({len(steps)} of {n})"
+    scores = [one.score for one in outcomes if one.score == one.score]
+    said += f", {well} ended by themselves" if well else ""
+    return said + (f", median score {np.median(scores):.3g}" if any(scores) else "")

@@ -90,7 +90,7 @@ def run_episode(
     number, allowed = guard.begin(), action_masks(environment)
     # Who else has a guard's methods may not count episodes.
     feeding: Any = {} if number is None else {"episode": number}
-    held, count, over, failed = _whole(observation, None), 0, False, False
+    held, count, score, over, failed = _whole(observation, None), 0, 0.0, False, False
     while not over:
         time = info.get("time", count * guard.interval)
         proposal = _asked(propose, held, time) or Proposal(no_action(guard.actions))
@@ -100,11 +100,12 @@ def run_episode(
         revision = guard.decide(np.ravel(observation), proposal, time, **feeding)
         seconds, situation = perf_counter() - begin, guard.situation
         observation, reward, terminated, truncated, info = environment.step(revision.executed)
-        held, count = _whole(observation, held), count + 1
+        held, count, score = _whole(observation, held), count + 1, score + float(reward)
         over, failed = bool(terminated or truncated), bool(info.get("failed", terminated))
         if over:
-            last, how = np.ravel(observation), bool(terminated)
-            guard.end(failed, last, terminated=how, **feeding)
+            if feeding:
+                feeding["score"] = score
+            guard.end(failed, np.ravel(observation), terminated=bool(terminated), **feeding)
         realised = float(info.get("realised", math.nan))
         yield Decision(situation, revision, realised, float(reward), failed, seconds)
 

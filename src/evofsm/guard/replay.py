@@ -288,7 +288,8 @@ class _Player:
         for name, said in how.items():
             if not isinstance(said, bool):
                 raise ValueError(f"{name} is {said!r}")
-        guard.end(observation=None if last is None else _floats(last), **how)
+        score = None if content["score"] is None else _number(content["score"])
+        guard.end(observation=None if last is None else _floats(last), score=score, **how)
         self._is_under_way = False
         if fields := _differing(content["learnt"], sums_of(guard)):
             raise _DiffersError("something else was learnt until its end", fields)

@@ -354,7 +354,9 @@ class FoxgloveSink:
         """A decision was made."""
         self._channels.decision(Decision(situation, revision))
 
-    def ended(self, observation: Any, *, failed: bool, terminated: bool) -> None:
+    def ended(
+        self, observation: Any, *, failed: bool, terminated: bool, score: float | None
+    ) -> None:
         """The episode ended."""
         if observation is not None:
             self._observation = observation

@@ -31,6 +31,7 @@ def taught(**given):
     guard = Guard(BRAKE, 2.0, interval=0.1, failed=lambda z: z[0] <= 0.0, seed=1, **given)
     for k in range(6):  # far away from the wall, and no hard braking
         drive(guard, k, start=WALL + 400.0)
+    guard.shadow = False  # nobody drives alone near the wall
     return guard
 
 
@@ -39,8 +40,8 @@ def test_a_given_model_knows_of_brakes_that_were_never_tried():
         sum(drive(guard, 100 + k) for k in range(8))
         for guard in (taught(), taught(model=move, backup=lambda z: BRAKE))
     )
-    assert without >= 6
-    assert told <= 3  # it is fitted, not copied
+    assert without >= 4
+    assert told <= 2  # it is fitted, not copied
 
 
 def test_what_is_wrong_with_a_given_function_is_said_and_nothing_is_learnt():

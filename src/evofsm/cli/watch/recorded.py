@@ -51,7 +51,7 @@ _IDLE = {
     "advise": "the reviser only advised",
 }
 _ACTIONS = ("proposed", "executed", "advised")
-_PASSED = "the guard might have done harm, so what was proposed passed"
+_PASSED = "the guard was not shown to help, so what was proposed passed"
 # So many of a log's episodes can be chosen among.
 _MOST_EPISODES = 500
 _NONE = -1

@@ -414,8 +414,8 @@ class Session:
         if not self.revising:
             return "the reviser is off"
         passing: str = self._reviser.passing  # type: ignore[attr-defined]
-        harm = "may do harm" if passing == "shadow" else passing
-        return passing and f"the guard {harm}, so what is proposed passes"
+        why = "was not shown to help yet" if passing == "shadow" else passing
+        return passing and f"the guard {why}, so what is proposed passes"
 
     def restart(self, case: int | None = None) -> Start:
         """Begin a run anew, or another one; one that is under way is broken off."""

@@ -14,7 +14,6 @@ from evofsm.driving.measures import TimeHeadway, TimeToCollision
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.guard import LearningJudge, LearntRisk
-from evofsm.guard.harm import Harm
 from evofsm.guard.learnt.failure import SAYS, SIZE, B, I, J, are_sides, inside, telling
 from evofsm.guard.learnt.rollout import FAILS
 from evofsm.guard.learnt.state import State
@@ -28,8 +27,8 @@ _MOST_BELIEVED, _LEAST_BELIEF = 12, 0.002
 # Of each state so many ways out are shown, and none that is rarer.
 _MOST_WAYS, _LEAST_SHARE = 3, 0.02
 
-# Observations of what was survived that are shown; of fewer failures nothing is said.
-_MOST_SURVIVED, _FEW = 500, 4
+# Observations of what was survived that are shown.
+_MOST_SURVIVED = 500
 
 #: A run that is driven now (`Start.mode`).
 LIVE = "live"
@@ -238,7 +237,6 @@ def known_of(judge: LearningJudge) -> Known:
         return Known()
     learnt, survived = judge.state, judge.state.survived
     said = harm(judge.harm, learning=judge.learning).removeprefix("; ")
-    said = said or _no_better(judge.harm)
     fails = learnt.forms[learnt.forms[:, SAYS] == FAILS]
     spread = survived.std(0) if len(survived) else np.zeros(judge.n_variables)
     return Known(
@@ -266,17 +264,6 @@ def _kinds(known: Known, seen: Sequence[float] | None = None) -> set[tuple[float
         forms = forms[inside(forms, np.array([seen]))[:, 0]]
     columns = np.where(are_sides(forms)[:, None], forms[:, [I, B]], forms[:, [I, J]])
     return {(i, j) for i, j in columns.tolist()}
-
-
-def _no_better(known: Harm) -> str:
-    """Where guarded episodes fail as often as those of the controller alone, and as soon."""
-    each = [[one.steps for one in some if one.failed] for some in (known.guarded, known.alone)]
-    (guarded, alone), n, of = each, len(known.guarded), len(known.alone)
-    if not alone or len(guarded) < _FEW or len(guarded) * of < len(alone) * n:
-        return ""
-    if np.median(guarded) > np.median(alone):
-        return ""
-    return f"no better than the controller alone: {len(guarded)} of {n} guarded episodes failed"
 
 
 def _plane(learnt: State, fails: Any) -> tuple[int, int]:

@@ -683,7 +683,7 @@ class LearntRisk(ActionJudge):
             "violated": float(self.n_violated),
             "backups": float(self.state.policies.sum()),
             "disturbances": float(self.state.windows.sum()),
-            "harm": self.harm.chance + self.harm.kept + self.harm.n_episodes,
+            "harm": self.harm.kept + self.harm.n_episodes,
         }
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
@@ -699,7 +699,7 @@ class LearntRisk(ActionJudge):
             "settings": asdict(self.settings),
             "state": numbers,
         }
-        arrays["harm"] = np.array(self.harm.outcomes, np.float64).reshape(-1, 4)
+        arrays["harm"] = self.harm.rows
         store.write(path, KIND, settings, arrays, provenance)
 
     @classmethod

@@ -27,12 +27,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from statistics import median
 from typing import NamedTuple
 
 import numpy as np
 
-from evofsm.guard.harm import Harm, Outcome
+from evofsm.guard.harm import Harm
 from evofsm.guard.learnt import failure
 from evofsm.guard.learnt.failure import HELD, SAYS, I
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, Floats, Model
@@ -245,26 +244,13 @@ def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "
 
 
 def harm(known: Harm, *, learning: bool) -> str:
-    """What is said of a guard that may do harm, or that is none any more."""
-    said = ""
-    if known.since or known.in_doubt(learning=learning):
-        before = [one for one in known.outcomes if one.guarded and one.episode < known.since]
-        how, what = "it may do harm", "some are driven in shadow" if learning else "proposals pass"
-        if known.since:
-            how, what = f"steps back since episode {known.since}", "proposals pass"
-        guarded, alone = _ended(before or known.guarded), _ended(known.alone)
-        said = f"; {how}: guarded episodes {guarded}, the controller alone {alone}; {what}"
+    """What is said of a guard that was not shown to help, or that is no filter any more."""
+    said = known.told(learning=learning)
+    said = f"; {said}" if said else ""
     if known.replaces:
         share = f"{known.kept / known.decided:.0%}"
         said += f"; it replaces the controller: {share} of proposals are kept; that is no filter"
     return said
-
-
-def _ended(outcomes: Sequence[Outcome]) -> str:
-    """After how many steps episodes failed."""
-    if not (steps := [one.steps for one in outcomes if one.failed]):
-        return f"did not fail in {len(outcomes)}"
-    return f"failed after {median(steps):g} steps in the median ({len(steps)} of {len(outcomes)})"
 
 
 def constant(values: Sequence[float]) -> str:
