@@ -27,7 +27,7 @@ from evofsm.fsm.model import FSMModel
 from evofsm.fsm.step import Trace
 from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
 from evofsm.io import Chunk, episodes_of
-from evofsm.io.logs import Condition, LogColumns, Noted
+from evofsm.io.logs import LogColumns, Noted
 from evofsm.io.tables import SI, TIMES, UNITS
 
 Beliefs = NDArray[np.float64]
@@ -149,12 +149,17 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         for name, unit in called.items()
     ]
     if columns.failed and not noted.failing:
-        column, goes = Condition.parse(columns.failed).column, ""
-        if noted.compared:
-            (low, high), unit = noted.compared, SI.get(noted.units.get(column, ""), "")
-            goes = f": {column}, as compared, goes from {low:.6g} to {high:.6g} {unit}".rstrip()
-        found.append(f"no row meets --failed {quote(columns.failed)}{goes}")
-    if (step := noted.longest_step) > 0.0 and time not in called:
+        goes = []
+        for column, seen in noted.compared.items():
+            numbers = [one for one in seen if isinstance(one, float)]
+            if numbers:
+                ends = f"from {min(numbers):.6g} to {max(numbers):.6g}"
+                unit = SI.get(noted.units.get(column, ""), "")
+                goes.append(f"{column}, as compared, goes {ends} {unit}".rstrip())
+            elif seen:
+                goes.append(f"{column} is {', '.join(map(repr, seen))}")
+        found.append(": ".join([f"no row meets --failed {quote(columns.failed)}", *goes]))
+    if (step := noted.longest_step) > 0.0 and time in noted.untold and time not in called:
         unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
         cause = f"is the time in {unit}? --unit {time}={unit} converts it"
         found.append(f"there is a row every {step:,.6g} s: {cause}")

@@ -82,8 +82,11 @@ _NOTHING = ("", "na", "n/a", "null", "none")
 # What no text holds.
 _CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
+# The day first, as only dots tell; whether its year has a century, and whether seconds follow.
+_DAY_FIRST = re.compile(r"\d\d?\.\d\d?\.(?:(\d{4})|\d\d),?[T ]+\d\d?:\d\d(:)?")
 _DATE_LIKE = re.compile(r"\s*\d{1,4}([.:/-])\d\d?\1\d")
-_ISO = "in ISO 8601, such as 2026-03-14T09:26:53.5+01:00"
+_ISO = "in ISO 8601, such as 2026-03-14T09:26:53.5+01:00, or as 14.03.2026 09:26:53"
+_SAYS_HOW = "; --unit 'COLUMN=%m/%d/%Y %I:%M:%S %p' says how others are written"
 
 
 def unit_of(text: str) -> str:
@@ -349,13 +352,13 @@ class Wanted(NamedTuple):
 
     numbers: Sequence[str]
     texts: Sequence[str] = ()
-    date: str | None = None  #: comes as a number, of microseconds
+    dates: Sequence[str] = ()  #: which together come as a number, of microseconds
+    form: str = ""  #: how dates are written, as `strftime` has it; else as they look
 
     @property
     def all(self) -> list[str]:
         """Columns that are read, each once."""
-        dates = [self.date] if self.date else []
-        return list(dict.fromkeys([*self.numbers, *self.texts, *dates]))
+        return list(dict.fromkeys([*self.numbers, *self.texts, *self.dates]))
 
     def piece(
         self, found: Mapping[str, polars.Series], find: Find, skips: Skips, anew: Sequence[int] = ()
@@ -376,8 +379,12 @@ class Wanted(NamedTuple):
         for name in self.texts:
             texts = found[name].cast(polars.String)
             piece.texts[name] = texts.fill_null("") if texts.null_count() else texts
-        if self.date is not None:
-            piece.numbers[self.date] = _microseconds(piece, self.date, found[self.date])
+        if self.dates:
+            dates = found[self.dates[0]]
+            for name in self.dates[1:]:  # the time of day, behind the date
+                dates = dates.cast(polars.String) + " " + found[name].cast(polars.String)
+            numbers = _microseconds(piece, self.dates[0], dates, self.form)
+            piece.numbers[",".join(self.dates)] = numbers
         return piece
 
 
@@ -701,13 +708,13 @@ def explained(text: str, hint: str = "") -> str:
     if is_number(text.replace(",", ".")):
         return f"{text[:40]!r} is no number (a decimal comma? write 1.5)"
     if _DATE_LIKE.match(text):
-        return f"{text[:40]!r} is no number (a date? it has to be {_ISO})"
+        return f"{text[:40]!r} is no number (a date? it has to be {_ISO}{_SAYS_HOW})"
     return f"{text[:40]!r} is no number (a text, a date, or a unit behind the number?)"
 
 
 def is_date(text: str) -> bool:
-    """Whether it is, or is meant to be, a time of ISO 8601."""
-    return _DATE.match(text) is not None
+    """Whether it is, or is meant to be, a time of ISO 8601, or one that begins with the day."""
+    return (_DATE.match(text) or _DAY_FIRST.match(text.strip())) is not None
 
 
 def is_number(text: str) -> bool:
@@ -719,17 +726,24 @@ def is_number(text: str) -> bool:
     return True
 
 
-def _microseconds(piece: Piece, name: str, dates: polars.Series) -> NDArray[np.float64]:
+def _microseconds(
+    piece: Piece, name: str, dates: polars.Series, form: str = ""
+) -> NDArray[np.float64]:
     """Microseconds since 1970, exactly; without a zone a date is taken as UTC."""
     import polars
 
     why = f"{{!r}} is not read as a date; all must be {_ISO}, and all have a zone, or none"
     if dates.dtype == polars.String:
-        texts = dates.str.strip_chars().str.replace(",", ".", literal=True)
+        texts = dates.str.strip_chars()
+        if not form and (found := _DAY_FIRST.match(str(texts.first()))):
+            texts = texts.str.replace(", ", " ", literal=True)
+            form = f"%d.%m.%{'Y' if found[1] else 'y'} %H:%M{':%S%.f' if found[2] else ''}"
+        if "," not in form:
+            texts = texts.str.replace(",", ".", literal=True)
         try:
-            dates = texts.str.to_datetime(strict=False)
+            dates = texts.str.to_datetime(form or None, strict=False)
         except polars.exceptions.ComputeError:  # it knows no form from the first one
             dates = polars.Series(name, [None] * len(texts), polars.Datetime("us"))
     if dates.null_count():
-        piece.leave_out(name, dates.is_null().to_numpy(), why)
+        piece.leave_out(name, dates.is_null().to_numpy(), f"{why}{_SAYS_HOW}")
     return dates.dt.epoch("us").cast(polars.Float64).to_numpy()
