@@ -42,6 +42,12 @@ _MOST_ACTIONS = 1000
 # With a smaller share of what lies between a blind guess and certainty, the most probable state is
 # hardly told apart from the others.
 _UNCERTAIN = 0.45
+# What is said of an option that a log seems to need.
+_UNASKED = {
+    "--resample": "some steps are longer or shorter, and begin an episode each",
+    "--where": "the machine seems to stand still in some rows",
+    "--failed": "nothing says what failed; perhaps",
+}
 
 
 @reads_logs
@@ -114,6 +120,8 @@ def learn(
     Without --failed nobody knows what failed, and evofsm explain says so.
 
     With --guard, a guard in shadow mode then goes through all rows and learns from them too.
+
+    Of a log whose columns nobody named, evofsm learn LOG prints what is in it, and what to ask.
     """
     from evofsm.cli.learning import guard_of_log, learn_traces, refusing, teach, warnings_of
     from evofsm.driving.naming import UNITS, VARIABLES
@@ -123,6 +131,7 @@ def learn(
 
     _check_out(out)
     _check_out(guard, "--guard")
+    _look_first(files[0], reading)
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
     actions = _actions(action_range)
@@ -300,6 +309,33 @@ def _check_out(out: Path | None, option: str = "--out") -> None:
             raise ValueError(f"{option} {out}: {what}") from None
 
 
+def _look_first(file: str, reading: Reading) -> None:
+    """Say what a log holds that was not asked for, before the long work."""
+    from evofsm.cli.look import look_at
+    from evofsm.io.logs import open_table
+    from evofsm.io.tables import CsvTable, ParquetTable, Skips, silent
+
+    columns = reading.columns
+    table = open_table(file, columns, reading.lengths, silent, reading.topics, Skips(), [])
+    if not isinstance(table, CsvTable | ParquetTable):
+        return
+    found, options = look_at(table)
+    if not set(columns.observe.names) & set(table.columns) and options:
+        show(facts(f"What {file} holds", found), "\nA way to learn from it:")
+        to_file = "--guard" if "--failed" in dict(options) else "--out"
+        options.append((to_file, f"{to_file[2:]}.evofsm"))
+        command = [
+            f"evofsm learn {quote(file)}",
+            *(f"{one} {quote(text)}" for one, text in options),
+        ]
+        print("  " + " \\\n      ".join(command), flush=True)
+        raise ValueError(f"{file}: nothing says what its columns mean; see above")
+    said = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
+    for (name, why), value in zip(_UNASKED.items(), said, strict=True):
+        if value is None and name in (could := dict(options)):
+            warn(f"{why}: {name} {quote(could[name])}")
+
+
 # -- What came of it ------------------------------------------------------------------------------
 
 
@@ -354,8 +390,6 @@ def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     together = f"{read.seconds:.1f} s" if minutes < 2.0 else f"{minutes:,.1f} min"
     yield "episodes", f"{read.episodes:,}, together {together}"
     yield "transitions", f"{learning.transitions:,}"
-    if read.jumps:
-        yield "time jumps", f"{read.jumps:,}; each begins an episode"
     assert actions is not None
     text = f"{actions.n_actions} intervals of {action} from {actions.low:g} to {actions.high:g}"
     if clipped := read.clipped_below + read.clipped_above:
@@ -403,11 +437,25 @@ def _read_otherwise(
         text = f"{learning.read.failures:,} episode{several} ended with {columns.failed}"
         left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
         yield "failures", text + (left_out if noted.after_failure else "")
+    hole = columns.longest_hole
+    if columns.resample:
+        step, ways = columns.resample
+        others = "".join(f", the {way} of {name}" for name, way in ways.items())
+        what = f"{noted.resampled:,} became means of {step:g} s{others}"
+        yield "resampled", f"{what} (--resample {step:g}s,NAME=max: others are min, last)"
+    if noted.crossed:
+        yield "holes", f"{noted.crossed:,} of at most {hole:g} s (--hole) cost a transition each"
+    if jumps := learning.read.jumps:
+        yield "time jumps", f"{jumps:,}; each begins an episode (a longer --hole bridges them)"
     if noted.leaderless:
         why = "a number is missing" + f", or {columns.no_leader}" * (
             columns.no_leader not in (None, "end")
         )
-        yield "left out", f"{noted.leaderless:,} rows: {why}; there an episode ends"
+        ends = "" if hole and not columns.no_leader else "; there an episode ends"
+        yield "left out", f"{noted.leaderless:,} rows: {why}{ends}"
+    if noted.elsewhere:
+        why = f"--where {columns.where} does not hold; there an episode ends"
+        yield "left out", f"{noted.elsewhere:,} rows: {why}"
     told = {name: unit for name, unit in noted.units.items() if UNITS.get(unit, 1.0) != 1.0}
     if told:
         given = (f"{name} from {one}" for name, one in told.items())

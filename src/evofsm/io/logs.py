@@ -415,7 +415,7 @@ def read_traces(
         clock.open(path)
         rows, left_out = 0, noted.leaderless + noted.elsewhere
         skips = Skips(columns.skip_bad, noted.skipped)
-        table = _open(path, columns, lengths, on_read, topics, skips, noted.told)
+        table = open_table(path, columns, lengths, on_read, topics, skips, noted.told)
         these = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
         chunks = _Reader(table, these, clock, noted).chunks()
         if these.longest_hole:
@@ -598,7 +598,7 @@ def _become(values: NDArray[np.float64], first: NDArray[np.int64], how: str) -> 
         return np.asarray(np.add.reduceat(np.where(there, values, 0.0), first) / counts)
 
 
-def _open(
+def open_table(
     path: str,
     columns: LogColumns,
     lengths: VehicleLengths,

@@ -18,14 +18,17 @@ from evofsm.cli.options import (
     ActionColumn,
     Failed,
     Hold,
+    Hole,
     Lengths,
     ModeName,
     NoLeader,
+    Resampled,
     SkipBad,
     Step,
     TimeColumn,
     TopicsFile,
     Units,
+    Where,
     argument,
     option,
     reading_of,
@@ -41,6 +44,8 @@ if TYPE_CHECKING:
     from evofsm.guard import Guard
     from evofsm.io import Chunk
 
+# Share by which the step of a log may differ from that of the guard.
+_SAME_STEP = 0.05
 # What other files end with is read as JSON lines.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
 
@@ -112,6 +117,9 @@ def monitor(
     hold: Hold = None,
     skip_bad: SkipBad = SKIPPED,
     vehicle_length: Lengths = None,
+    where: Where = None,
+    resample: Resampled = None,
+    hole: Hole = None,
 ) -> int | None:
     """Decide alongside a stack of your own: rows in, decisions out, a JSON line each.
 
@@ -124,7 +132,7 @@ def monitor(
     saved.
 
     With --summary it reads FILE, such lines or a log as evofsm learn reads it (by the options from
-    --observe to --vehicle-length), and prints how often it would have alarmed and how risky it was.
+    --observe to --hole), and prints how often it would have alarmed and how risky it was.
     """
     if sum(one is not None for one in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
@@ -166,8 +174,11 @@ def monitor(
                 if observe is None or set(split_names(observe)) == set(own):  # in its own order
                     observe = ",".join(f'"{name}"' for name in own)
                 asked = observe, action, time, episode, dt, failed, unit, topics, no_leader
-                reading = reading_of(*asked, hold, skip_bad, vehicle_length)
-                chunks, interval = _episodes(file, reading)
+                more = hold, skip_bad, vehicle_length, where, resample, hole
+                chunks, interval = _episodes(file, reading_of(*asked, *more))
+                if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
+                    what = f"{file} has a row every {interval:g} s, and {guard} decides each"
+                    warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
             used = used or fresh()
             _prepare(used, mode, tolerance, None, stack, learn=learn)
             warn(_of_saved(guard, used) if guard else assumptions(reckoned, tolerated))

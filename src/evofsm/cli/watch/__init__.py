@@ -77,7 +77,7 @@ def watch(
     actions are random), failed(step) (else an episode that is terminated has failed), and
     variables, their names. The guard of an environment is given nothing but which episodes failed.
 
-    A log is read with the options of evofsm learn, from --observe to --vehicle-length; its gap,
+    A log is read with the options of evofsm learn, from --observe to --hole; its gap,
     own speed and leader's speed are named in this order.
 
     The page shows what happens, what is known of failure, how risky each action is, and what was

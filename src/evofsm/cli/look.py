@@ -1,0 +1,155 @@
+"""A first look at a log, before anybody said what its columns mean: what is in it, what to ask."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import polars
+from numpy.typing import NDArray
+
+from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
+from evofsm.io.tables import Skips, Table, Wanted, is_date, is_number
+
+# So many fields and rows are looked at; columns of more texts are no list of states.
+_MOST_FIELDS, _MOST_ROWS, _FEW = 20_000_000, 1_000_000, 12
+# A larger share of steps, and so many, that are no usual one make no clock.
+_ODD, _MANY = 0.001, 10
+_TIME = re.compile("(t|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
+_SET = re.compile("acc|action|valve|ventil|soll|set|^u$|cmd|throttle|drehz", re.IGNORECASE)
+_FAILURE = re.compile(
+    "st(ö|oe)r|fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|aus$|emergency",
+    re.IGNORECASE,
+)
+_LONG = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+_NICE = [(n * s, f"{n}{unit}") for unit, s in _LONG.items() for n in (1, 2, 5, 10, 20, 30, 100)]
+
+
+class Look(NamedTuple):
+    """What was found."""
+
+    facts: list[tuple[str, str]]  #: by column, and of all rows
+    options: list[tuple[str, str]]  #: what could be asked of it
+
+
+def look_at(table: Table) -> Look:
+    """Look at the first million rows, or fewer of many columns."""
+    firsts = {name: table.first(name).strip() for name in table.columns}
+    pairs = zip(firsts, [*firsts][1:], strict=False)
+    together = (f"{a},{b}" for a, b in pairs if is_date(f"{firsts[a]} {firsts[b]}"))
+    dated = [name for name, text in firsts.items() if is_date(text)]
+    clock = next(iter(dated), "") or next(together, "")
+    dates = clock.split(",") if clock else []
+    numbers = [name for name, text in firsts.items() if is_number(text.replace(",", "."))]
+    texts = [name for name in firsts if name not in {*numbers, *dated, *dates}]
+    table.skips, frame = Skips(1 << 60), polars.DataFrame()
+    for piece in table.pieces(Wanted(numbers, texts, dates)):
+        frame.vstack(polars.DataFrame({**piece.numbers, **piece.texts}), in_place=True)
+        if len(frame) >= min(_MOST_ROWS, _MOST_FIELDS // len(firsts)):
+            break
+    rows, values = len(frame), {name: frame[name].to_numpy() for name in numbers if len(frame)}
+    values = {name: z for name, z in values.items() if np.isfinite(z).any()}
+    clock = clock or next((name for name in values if _TIME.match(name)), "")
+    shown = {name: f"{np.nanmin(z):.5g} to {np.nanmax(z):.5g}" for name, z in values.items()}
+    shown |= {name: _told(frame[name]) for name in texts} | dict.fromkeys([*dated, *dates], "dates")
+    facts, options = [(name, shown.get(name, "nothing")) for name in firsts], []
+    steps = np.diff(frame[clock].to_numpy() if clock and rows else [])
+    steps = steps[steps > 0.0] * (1e-6 if dates else 1.0)
+    usual = float(np.median(steps)) if len(steps) else math.nan
+    odd = int(((steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)).sum())
+    every = f"{rows:,}, one every {usual:g} s" if clock else f"{rows:,}; no column is a clock"
+    facts.append(("rows looked at", every))
+    if odd >= _MANY and odd > _ODD * rows:
+        facts.append(("other steps", f"{odd:,}, the longest {steps.max():,.0f} s"))
+        step = next((one for one in _NICE if one[0] >= 4.0 * usual), _NICE[-1])
+        hole = next((one for one in _NICE if one[0] >= 10.0 * step[0]), _NICE[-1])
+        options += [("--resample", step[1]), ("--hole", hole[1])]
+    values.pop(clock, None)
+    runs, still = np.ones(rows, np.bool_), next(filter(lambda n: _stands(values[n]), values), "")
+    if still:
+        limit = float(f"{0.1 * np.nanquantile(np.abs(values[still]), 0.95):.0e}")
+        runs = values[still] > limit
+        options.append(("--where", f"{_named(still, '<>=!')}>{limit:g}"))
+        facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
+    rare = [*_rare(frame, texts, values)]
+    rare = [one for one in rare if _FAILURE.search(f"{one[1]}")] or rare
+    for _, text, told in rare:
+        facts.append(("a failure?", f"{text} {told}"))
+    options += [("--failed", text) for _, text, _ in rare[:1]]
+    groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
+    if group := next((name for name in groups if _is_in_blocks(frame[name])), ""):
+        facts.append(("an episode?", f"each {group}"))
+        options.append(("--episode", _named(group, ",")))
+    ends = {n: np.nanquantile(z[runs], (0.02, 0.98)) for n, z in values.items()}
+    not_seen = {group, *(name for name, *_ in rare)}
+    moved = {n: _round(high - low) for n, (low, high) in ends.items() if high > low}
+    moved = {name: apart for name, apart in moved.items() if name not in not_seen}
+    if moved:
+        action = next((n for n in moved if n == still or _SET.search(n)), [*moved][-1])
+        width = _round(moved[action] / 4.0)
+        low, high = math.floor(ends[action][0] / width), math.ceil(ends[action][1] / width)
+        span = f"{low * width:.6g}:{high * width:.6g}:{width:g}"
+        seen = [name for name in moved if name != action] or [action]
+        scales = [f"{_named(name, '=')}={_round(moved[name] / 4.0):g}" for name in seen]
+        options[:0] = [
+            ("--observe", ",".join(_named(name, ",=") for name in seen)),
+            ("--action", _named(action, "")),
+            ("--action-range", span),
+            ("--time", clock) if clock else ("--dt", "1"),
+        ]
+        options += [("--rule", "novelty"), *(("--scale", one) for one in scales)]
+    return Look(facts, options)
+
+
+def _round(number: float) -> float:
+    return float(f"{number:.0e}")
+
+
+def _named(name: str, signs: str) -> str:
+    """A column's name as options take it, in double quotes where one of these is in it."""
+    quoted = '"' + name.replace('"', '""') + '"'
+    return quoted if set(name) & {*signs, '"'} else name
+
+
+def _stands(z: NDArray[np.float64]) -> bool:
+    """Whether numbers are near 0 for a while, and else far from it."""
+    size = np.abs(z[np.isfinite(z)])
+    low, mid = (float(np.mean(size < x * np.quantile(size, 0.95))) for x in (0.05, 0.5))
+    return 0.01 < low < 0.9 and mid - low < 0.02 and len(np.unique(size)) > 2
+
+
+def _rare(
+    frame: polars.DataFrame, texts: list[str], numbers: dict[str, NDArray[np.float64]]
+) -> Iterator[tuple[str, str, str]]:
+    """Columns, conditions that hold of few of their rows, and how often: a text, or 1 beside 0."""
+    is_so = [
+        (name, text, (frame[name] == text).to_numpy())
+        for name in texts
+        if frame[name].n_unique() <= _FEW
+        for text in filter(None, frame[name].unique(maintain_order=True))
+    ]
+    flags = (name for name, z in numbers.items() if {*np.unique(z[~np.isnan(z)])} == {0.0, 1.0})
+    for name, text, here in [*is_so, *((name, "1", numbers[name] == 1.0) for name in flags)]:
+        if 0.0 < here.mean() < 0.25:
+            times = int(here[0]) + int((here[1:] & ~here[:-1]).sum())
+            is_plain = re.fullmatch(r"[^\W\d]\w*|1", text)
+            value = text if is_plain else f"'{text}'"
+            told = f"({'once' if times == 1 else f'{times:,} times'}, {here.mean():.2%} of rows)"
+            yield name, f"{_named(name, '<>=!')}=={value}", told
+
+
+def _is_in_blocks(values: polars.Series) -> bool:
+    """Whether the rows of each of several values stand together, some of them at least."""
+    blocks = int(str(values.rle_id().max())) + 1
+    return 1 < values.n_unique() == blocks <= len(values) / 10
+
+
+def _told(texts: polars.Series) -> str:
+    """The texts of a column, in words."""
+    if (n := texts.n_unique()) > _FEW:
+        return f"{n:,} different texts, such as {texts[0]!r}"
+    counts = texts.value_counts(sort=True, name="rows").rows()
+    return ", ".join(f"{text or 'nothing'} {n / len(texts):.2%}" for text, n in counts)
