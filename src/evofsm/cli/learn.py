@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from evofsm.fsm.model import FSMModel
     from evofsm.fsm.observations import ObservationEncoder
     from evofsm.guard import Guard
-    from evofsm.io import LogColumns
+    from evofsm.io import Chunk, LogColumns
     from evofsm.io.logs import Noted
 
 
@@ -131,7 +131,7 @@ def learn(
 
     _check_out(out)
     _check_out(guard, "--guard")
-    _look_first(files[0], reading)
+    lacking = _look_first(files[0], reading)
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
     actions = _actions(action_range)
@@ -151,7 +151,9 @@ def learn(
         chunks = read_traces(
             files, columns, lengths, lambda count: move(advance=count), noted, topics
         )
-        learning = learn_traces(chunks, machine, actions, encoder.names, units_read)
+        learning = learn_traces(
+            _saying(chunks, lacking), machine, actions, encoder.names, units_read
+        )
     provenance = _provenance(learning, known, columns)
     warnings = warnings_of(noted, columns)
     for warning in warnings:
@@ -309,31 +311,37 @@ def _check_out(out: Path | None, option: str = "--out") -> None:
             raise ValueError(f"{option} {out}: {what}") from None
 
 
-def _look_first(file: str, reading: Reading) -> None:
-    """Say what a log holds that was not asked for, before the long work."""
+def _look_first(file: str, reading: Reading) -> list[str]:
+    """What a log seems to need that was not asked for; where nothing was, a way to learn."""
     from evofsm.cli.look import look_at
+    from evofsm.driving.naming import VARIABLES
     from evofsm.io.logs import open_table
     from evofsm.io.tables import CsvTable, ParquetTable, Skips, silent
 
     columns = reading.columns
     table = open_table(file, columns, reading.lengths, silent, reading.topics, Skips(), [])
     if not isinstance(table, CsvTable | ParquetTable):
-        return
+        return []
     found, options = look_at(table)
-    if not set(columns.observe.names) & set(table.columns) and options:
-        show(facts(f"What {file} holds", found), "\nA way to learn from it:")
-        to_file = "--guard" if "--failed" in dict(options) else "--out"
+    could = dict(options)
+    if columns.observe.names == VARIABLES and not {*VARIABLES} & {*table.columns} and options:
+        to_file = "--guard" if "--failed" in could else "--out"
         options.append((to_file, f"{to_file[2:]}.evofsm"))
-        command = [
-            f"evofsm learn {quote(file)}",
-            *(f"{one} {quote(text)}" for one, text in options),
-        ]
+        command = [f"evofsm learn {quote(file)}", *(f"{a} {quote(b)}" for a, b in options)]
+        show(facts(f"What {file} holds", found), "\nA way to learn from it:")
         print("  " + " \\\n      ".join(command), flush=True)
         raise ValueError(f"{file}: nothing says what its columns mean; see above")
     said = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
-    for (name, why), value in zip(_UNASKED.items(), said, strict=True):
-        if value is None and name in (could := dict(options)):
-            warn(f"{why}: {name} {quote(could[name])}")
+    asked = zip(_UNASKED.items(), said, strict=True)
+    return [f"{why}: {a} {quote(could[a])}" for (a, why), b in asked if b is None and a in could]
+
+
+def _saying(chunks: Iterable[Chunk], lines: list[str]) -> Iterator[Chunk]:
+    """The same chunks; lines are said once it is known that something can be read."""
+    for chunk in chunks:
+        while lines:
+            warn(lines.pop(0))
+        yield chunk
 
 
 # -- What came of it ------------------------------------------------------------------------------

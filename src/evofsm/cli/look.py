@@ -11,6 +11,7 @@ import numpy as np
 import polars
 from numpy.typing import NDArray
 
+from evofsm.cli.options import seconds
 from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
 from evofsm.io.tables import Skips, Table, Wanted, is_date, is_number
 
@@ -24,8 +25,8 @@ _FAILURE = re.compile(
     "st(ö|oe)r|fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|aus$|emergency",
     re.IGNORECASE,
 )
-_LONG = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
-_NICE = [(n * s, f"{n}{unit}") for unit, s in _LONG.items() for n in (1, 2, 5, 10, 20, 30, 100)]
+_LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 30min 1h 5h 10h 1d"
+_NICE = [(seconds("", text), text) for text in _LONG.split()]
 
 
 class Look(NamedTuple):
@@ -60,11 +61,11 @@ def look_at(table: Table) -> Look:
     steps = steps[steps > 0.0] * (1e-6 if dates else 1.0)
     usual = float(np.median(steps)) if len(steps) else math.nan
     odd = int(((steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)).sum())
-    every = f"{rows:,}, one every {usual:g} s" if clock else f"{rows:,}; no column is a clock"
+    every = f"{rows:,}, one every {usual:.2g} s" if clock else f"{rows:,}; no column is a clock"
     facts.append(("rows looked at", every))
     if odd >= _MANY and odd > _ODD * rows:
         facts.append(("other steps", f"{odd:,}, the longest {steps.max():,.0f} s"))
-        step = next((one for one in _NICE if one[0] >= 4.0 * usual), _NICE[-1])
+        step = next((one for one in _NICE if one[0] >= 3.5 * usual), _NICE[-1])
         hole = next((one for one in _NICE if one[0] >= 10.0 * step[0]), _NICE[-1])
         options += [("--resample", step[1]), ("--hole", hole[1])]
     values.pop(clock, None)

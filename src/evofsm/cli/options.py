@@ -299,16 +299,16 @@ def reading_of(
         skip_bad=skip_bad,
         where=where,
         resample=None if resample is None else _resampled(resample, encoder, action),
-        hole=None if hole is None else _seconds("--hole", hole),
+        hole=None if hole is None else seconds("--hole", hole),
     )
     lengths = lengths_given(vehicle_length or ())
     return Reading(columns, lengths, None if topics is None else Topics.load(topics))
 
 
-def _seconds(name: str, text: str) -> float:
+def seconds(name: str, text: str) -> float:
     """How long a text says it is [s].
 
-    >>> _seconds("--hole", "10min"), _seconds("--hole", "0.5")
+    >>> seconds("--hole", "10min"), seconds("--hole", "0.5")
     (600.0, 0.5)
     """
     from evofsm.fsm.validation import positive
@@ -338,7 +338,7 @@ def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
                 f"numbers are {names}"
             )
         how[name] = become
-    return Resample(_seconds("--resample", "".join(step)), how)
+    return Resample(seconds("--resample", "".join(step)), how)
 
 
 def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:

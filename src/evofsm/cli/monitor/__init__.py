@@ -177,7 +177,7 @@ def monitor(
                 more = hold, skip_bad, vehicle_length, where, resample, hole
                 chunks, interval = _episodes(file, reading_of(*asked, *more))
                 if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
-                    what = f"{file} has a row every {interval:g} s, and {guard} decides each"
+                    what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
                     warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
             used = used or fresh()
             _prepare(used, mode, tolerance, None, stack, learn=learn)
