@@ -51,6 +51,8 @@ _LEFT_OUT = {
     "action": "rows have no action, and what leads on from them was not learnt",
     "cut": "file ends early, and what is whole was read",
 }
+# What reaches so far is no car's speed in any unit [m/s]: revolutions, perhaps.
+_NO_SPEED = 500.0
 # Numbers that stand for nobody in many recordings.
 _NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
 
@@ -140,7 +142,7 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
         f"mph? --unit {quote(f'{name}=km/h')} converts it"
         for name, fastest in noted.fastest.items()
-        if name not in called
+        if name not in called and fastest < _NO_SPEED
     ]
     found += [
         f"{name} is called as if it were in {unit}, and was read as one of the SI: --unit "

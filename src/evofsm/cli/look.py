@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from evofsm.cli.options import seconds
 from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
-from evofsm.io.tables import Skips, Table, Wanted, is_date, is_number
+from evofsm.io.tables import Skips, Table, Wanted, is_date
 
 # So many fields and rows are looked at; columns of more texts are no list of states.
 _MOST_FIELDS, _MOST_ROWS, _FEW = 20_000_000, 1_000_000, 12
+_SHOWN = 40  # columns
 # A larger share of steps, and so many, that are no usual one make no clock.
 _ODD, _MANY = 0.001, 10
 _TIME = re.compile("(t|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
@@ -25,6 +26,7 @@ _FAILURE = re.compile(
     "st(ö|oe)r|fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|aus$|emergency",
     re.IGNORECASE,
 )
+_CODE = re.compile(f"{_FAILURE.pattern}|stat|zustand|code", re.IGNORECASE)
 _LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 30min 1h 5h 10h 1d"
 _NICE = [(seconds("", text), text) for text in _LONG.split()]
 
@@ -38,29 +40,41 @@ class Look(NamedTuple):
 
 def look_at(table: Table) -> Look:
     """Look at the first million rows, or fewer of many columns."""
-    firsts = {name: table.first(name).strip() for name in table.columns}
+    firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
     pairs = zip(firsts, [*firsts][1:], strict=False)
     together = (f"{a},{b}" for a, b in pairs if is_date(f"{firsts[a]} {firsts[b]}"))
     dated = [name for name, text in firsts.items() if is_date(text)]
     clock = next(iter(dated), "") or next(together, "")
     dates = clock.split(",") if clock else []
-    numbers = [name for name, text in firsts.items() if is_number(text.replace(",", "."))]
+    numbers = [name for name in firsts if table.holds(name) == "number"]
     texts = [name for name in firsts if name not in {*numbers, *dated, *dates}]
     table.skips, frame = Skips(1 << 60), polars.DataFrame()
     for piece in table.pieces(Wanted(numbers, texts, dates)):
         frame.vstack(polars.DataFrame({**piece.numbers, **piece.texts}), in_place=True)
         if len(frame) >= min(_MOST_ROWS, _MOST_FIELDS // len(firsts)):
             break
-    rows, values = len(frame), {name: frame[name].to_numpy() for name in numbers if len(frame)}
+    if not (rows := len(frame)):
+        return Look([], [])
+    values = {name: frame[name].to_numpy() for name in numbers}
     values = {name: z for name, z in values.items() if np.isfinite(z).any()}
+    if form := "" if clock else next(filter(None, map(_form, (frame[name] for name in texts))), ""):
+        clock, dates = form.partition("=")[0], [form]
+        at = frame[clock].str.to_datetime(form.partition("=")[2], strict=False)
+        frame = frame.with_columns(at.dt.epoch("us").alias(clock))
+        texts.remove(clock)
     clock = clock or next((name for name in values if _TIME.match(name)), "")
     shown = {name: f"{np.nanmin(z):.5g} to {np.nanmax(z):.5g}" for name, z in values.items()}
-    shown |= {name: _told(frame[name]) for name in texts} | dict.fromkeys([*dated, *dates], "dates")
-    facts, options = [(name, shown.get(name, "nothing")) for name in firsts], []
-    steps = np.diff(frame[clock].to_numpy() if clock and rows else [])
+    shown |= {name: _told(frame[name]) for name in texts} | dict.fromkeys(
+        [*dated, *dates, clock], "the clock"
+    )
+    facts, options = [(name, shown.get(name, "nothing")) for name in firsts][:_SHOWN], []
+    if (more := len(firsts) - len(facts)) > 0:
+        facts.append(("...", f"and {more:,} more columns"))
+    steps = np.diff(frame[clock].to_numpy() if clock else [])
+    same = int((steps == 0.0).sum())
     steps = steps[steps > 0.0] * (1e-6 if dates else 1.0)
     usual = float(np.median(steps)) if len(steps) else math.nan
-    odd = int(((steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)).sum())
+    odd = same + int(((steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)).sum())
     every = f"{rows:,}, one every {usual:.2g} s" if clock else f"{rows:,}; no column is a clock"
     facts.append(("rows looked at", every))
     if odd >= _MANY and odd > _ODD * rows:
@@ -100,9 +114,20 @@ def look_at(table: Table) -> Look:
             ("--action", _named(action, "")),
             ("--action-range", span),
             ("--time", clock) if clock else ("--dt", "1"),
+            *([("--unit", form)] if form else []),
         ]
         options += [("--rule", "novelty"), *(("--scale", one) for one in scales)]
     return Look(facts, options)
+
+
+def _form(texts: polars.Series) -> str:
+    """How dates with slashes are written, as --unit takes it; of others nothing."""
+    found = re.match(r"\d\d?/\d\d?/\d{4} \d\d?:\d\d(:\d\d)?( [AP]M)?$", texts[0] or "")
+    if not found:
+        return ""
+    is_usual = found[2] or int(str(texts.str.extract(r"/(\d\d?)/").cast(polars.Int8).max())) > 12
+    day, hour = "%m/%d" if is_usual else "%d/%m", "%I:%M" if found[2] else "%H:%M"
+    return f"{texts.name}={day}/%Y {hour}{':%S' if found[1] else ''}{' %p' if found[2] else ''}"
 
 
 def _round(number: float) -> float:
@@ -125,18 +150,21 @@ def _stands(z: NDArray[np.float64]) -> bool:
 def _rare(
     frame: polars.DataFrame, texts: list[str], numbers: dict[str, NDArray[np.float64]]
 ) -> Iterator[tuple[str, str, str]]:
-    """Columns, conditions that hold of few of their rows, and how often: a text, or 1 beside 0."""
+    """Columns, conditions that hold of few of their rows, and how often: by a text, or a code."""
     is_so = [
         (name, text, (frame[name] == text).to_numpy())
         for name in texts
         if frame[name].n_unique() <= _FEW
         for text in filter(None, frame[name].unique(maintain_order=True))
     ]
-    flags = (name for name, z in numbers.items() if {*np.unique(z[~np.isnan(z)])} == {0.0, 1.0})
-    for name, text, here in [*is_so, *((name, "1", numbers[name] == 1.0) for name in flags)]:
+    for name, z in numbers.items():
+        codes = np.unique(z[np.isfinite(z)]) if _CODE.search(name) else np.arange(2)
+        if len(codes) <= _FEW and not (z % 1.0).any() and np.isin(z, codes).all():
+            is_so += [(name, f"{code:g}", z == code) for code in codes.tolist() if code]
+    for name, text, here in is_so:
         if 0.0 < here.mean() < 0.25:
             times = int(here[0]) + int((here[1:] & ~here[:-1]).sum())
-            is_plain = re.fullmatch(r"[^\W\d]\w*|1", text)
+            is_plain = re.fullmatch(r"[^\W\d]\w*", text) or name in numbers
             value = text if is_plain else f"'{text}'"
             told = f"({'once' if times == 1 else f'{times:,} times'}, {here.mean():.2%} of rows)"
             yield name, f"{_named(name, '<>=!')}=={value}", told
