@@ -152,15 +152,14 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
     ]
     if columns.failed and not noted.failing:
         goes = []
-        for column, seen in noted.compared.items():
-            numbers = [one for one in seen if isinstance(one, float)]
-            if numbers:
-                ends = f"from {min(numbers):.6g} to {max(numbers):.6g}"
-                unit = SI.get(noted.units.get(column, ""), "")
-                goes.append(f"{column}, as compared, goes {ends} {unit}".rstrip())
-            elif seen:
-                goes.append(f"{column} is {', '.join(map(repr, seen))}")
-        found.append(": ".join([f"no row meets --failed {quote(columns.failed)}", *goes]))
+        for name, (seen, *more) in ((k, v) for k, v in noted.compared.items() if v):
+            if isinstance(seen, str):
+                goes.append(f"{name} is {', '.join(map(repr, [seen, *more]))}")
+            else:
+                told = f"{name}, as compared, goes from {seen:.6g} to {more[0]:.6g} "
+                goes.append(told + SI.get(noted.units.get(name, ""), ""))
+        told = ": ".join([f"no row meets --failed {quote(columns.failed)}", *goes])
+        found.append(told.rstrip())
     if (step := noted.longest_step) > 0.0 and time in noted.untold and time not in called:
         unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
         cause = f"is the time in {unit}? --unit {time}={unit} converts it"

@@ -331,12 +331,8 @@ def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
     for quoted, rest in told:
         name, _, become = f"{quoted}{rest}".rpartition("=")
         if name not in (*encoder.variables, action) or become not in BECOME:
-            may = f"NAME=HOW with one of {', '.join(BECOME)}"
-            names = ", ".join((*encoder.names, action))
-            raise ValueError(
-                f"--resample is {text!r}; write 30s, or 30s and behind commas {may}; read as "
-                f"numbers are {names}"
-            )
+            may = f"NAME=HOW with one of {', '.join(BECOME)}, of a number that is read"
+            raise ValueError(f"--resample is {text!r}; write 30s, or 30s and behind commas {may}")
         how[name] = become
     return Resample(seconds("--resample", "".join(step)), how)
 

@@ -11,7 +11,7 @@ from functools import partial
 from itertools import chain, pairwise
 from operator import attrgetter
 from shlex import quote
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +70,7 @@ _NO_LEADER = (
     " (a missing or failed measurement, or no leader? --no-leader end leaves such rows out; or "
     + _HELD
 )
-# So many texts of a column are shown, or a few more.
+# So many texts of a column are shown.
 _MANY_TEXTS = 10
 #: What the values of a step may become.
 BECOME = ("mean", "last", "max", "min")
@@ -135,7 +135,7 @@ class Noted:
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
     failing: int = 0  #: rows that meet what tells of failures
     #: By column compared for that, what was there: the ends of its range in SI, or texts.
-    compared: dict[str, list[float] | list[str]] = field(default_factory=dict)
+    compared: dict[str, list[Any]] = field(default_factory=dict)
     fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
     longest_step: float = 0.0  #: the usual one, beyond belief [s]
     #: By variable, the number that it is below 0 (0 where there are several), and in how many rows.
@@ -537,27 +537,23 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
     said = columns.resample.how if columns.resample else {}
     variables, names = columns.observe.variables, columns.observe.names
     hows = [said.get(name, "mean") if name in variables else "last" for name in names]
-    waiting: list[Chunk] = []
+    rest: Chunk | None = None
     for chunk in chain(chunks, [None]):
-        if chunk is not None:
-            waiting.append(chunk)
-            noted.resampled += len(chunk.times)
-        if not waiting:
+        parts = [one for one in (rest, chunk) if one is not None]
+        if not parts:
             return
-        whole = _joined(waiting)
-        fails = np.zeros(len(whole.times), np.bool_)
+        noted.resampled += 0 if chunk is None else len(chunk.times)
+        whole = _joined(parts)
+        times, fails = whole.times, np.zeros(len(whole.times), np.bool_)
         fails[[] if whole.failures is None else whole.failures] = True
-        begins = fails.copy()  # the row that failed stays as it is
+        begins = fails | (not step)  # the row that failed stays as it is
         begins[whole.starts] = begins[0] = True
-        times = whole.times
         if step:
             ticks = np.floor(times / step + 1e-9)
             begins[1:] |= ticks[1:] != ticks[:-1]
             later = np.append(False, fails[1:] & (ticks[1:] == ticks[:-1]))
             later[whole.starts] = False
             times = step * (ticks + later)
-        else:
-            begins[:] = True
         first = np.flatnonzero(begins)
         steps = np.diff(times[first])
         lost = (steps > LONGEST_STEP * whole.dt) | (steps < whole.dt / LONGEST_STEP)
@@ -574,22 +570,18 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
             failures=None if whole.failures is None else np.searchsorted(first, whole.failures),
         )
         keeps = len(first) - (chunk is not None and not fails[-1])
-        noted.crossed += int(lost[: max(0, keeps)].sum())
-        waiting = [] if keeps == len(first) else [whole.rows(int(first[-1]), len(fails))]
-        waiting = [one._replace(jumps=0) for one in waiting]
+        noted.crossed += int(lost[:keeps].sum())
+        rest = None
+        if keeps < len(first):
+            rest = whole.rows(int(first[-1]), len(fails))._replace(jumps=0)
         if keeps:
             yield made.rows(0, keeps)
-        if chunk is None:
-            return
 
 
 def _become(values: NDArray[np.float64], first: NDArray[np.int64], how: str) -> NDArray[np.float64]:
     """What the values of each step become; those that are missing do not count."""
-    if len(first) == len(values):
-        return values.copy()
-    ends = np.append(first[1:], len(values))
     if how == "last":
-        return np.asarray(values[ends - 1])
+        return np.asarray(values[np.append(first[1:], len(values)) - 1])
     if how != "mean":
         return np.asarray((np.fmax if how == "max" else np.fmin).reduceat(values, first))
     there = ~np.isnan(values)
@@ -697,10 +689,8 @@ class _Clock:
         """Mark rows after a hole in time within an episode, and those that bring nothing later."""
         late = np.zeros(piece.rows, np.bool_)
         if self._longest:  # a row without a time costs no more than itself
-            there = np.maximum.accumulate(
-                np.where(np.isnan(times), 0, np.arange(1, len(times) + 1))
-            )
-            times = np.append(self._last, times)[there]
+            rows = np.where(np.isnan(times), 0, np.arange(1, len(times) + 1))
+            times = np.append(self._last, times)[np.maximum.accumulate(rows)]
         steps = np.diff(times, prepend=self._last)
         steps[starts] = np.nan
         if ((steps < 0.0) | ((steps == 0.0) & ~piece.bad & (not self._resampled))).any():
@@ -710,10 +700,8 @@ class _Clock:
             steps[starts] = np.nan
             times = np.append(self._last, times[on])
         self._last = times[-1]
-        if self._resampled:
-            return np.asarray(steps > self._longest), late
         first = steps[:_FIRST_ROWS]
-        if np.isnan(self._usual) and not np.isnan(first).all():
+        if np.isnan(self._usual) and not (np.isnan(first).all() or self._resampled):
             exact = -math.log10(np.spacing(np.nanmax(abs(times))))  # digits that times can have
             self._settle(round(float(np.nanmedian(first)), min(9, int(exact))))
         if self._longest:
@@ -766,12 +754,8 @@ class _Reader:
         usual = [name for name in USUAL_EPISODE if name in table.columns]
         self._episode = usual if columns.episode is None else list(columns.episode)
         told = {"--failed": columns.failed, "--where": columns.where}
-        told["--no-leader"] = None if columns.no_leader == "end" else columns.no_leader
-        self._conditions = {
-            option: Condition.parse(text, option)
-            for option, text in told.items()
-            if text is not None
-        }
+        told |= {} if columns.no_leader == "end" else {"--no-leader": columns.no_leader}
+        self._conditions = {o: Condition.parse(t, o) for o, t in told.items() if t is not None}
         self._failed = self._conditions.get("--failed")
         self._before = 0  # rows
         self._first_date = np.nan
@@ -1008,7 +992,7 @@ class _Reader:
             piece.leave_out_unusable(name, ~gone, "", span, why)
         unknown = np.isnan(piece.numbers[action])
         piece.leave_out_unusable(action, ~gone & ~unknown)
-        if not self._table.derives:
+        if not (self._table.derives or columns.resample):
             self._count_unknown(piece, unknown & ~gone, starts)
         for term in failed.terms if failed else ():
             if term.of_number and term.column not in self._observed:
@@ -1048,16 +1032,14 @@ class _Reader:
 
     def _note_compared(self, piece: Piece, failed: Condition) -> None:
         """What stands in the columns that tell of failures, should no row meet what is asked."""
-        compared = self._noted.compared
         for term in failed.terms:
-            seen = compared.get(term.column, [])
+            seen: list[Any] = self._noted.compared.setdefault(term.column, [])
             if term.of_number:
                 values = piece.numbers[term.column]
-                values = np.append(values[np.isfinite(values)], seen)
-                if len(values):
-                    compared[term.column] = [float(values.min()), float(values.max())]
-            elif term.sign and len(seen) < _MANY_TEXTS:
-                compared[term.column] = sorted({*seen, *piece.texts[term.column].unique()})
+                values = np.append(seen, values[np.isfinite(values)])
+                seen[:] = [values.min(), values.max()] if len(values) else []
+            elif term.sign:
+                seen[:] = sorted({*seen, *piece.texts[term.column].unique()})[:_MANY_TEXTS]
 
     def _count_unknown(
         self, piece: Piece, unknown: NDArray[np.bool_], starts: NDArray[np.bool_]

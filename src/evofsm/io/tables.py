@@ -486,7 +486,7 @@ class CsvTable(Table):
         rows = [at for at in rows if not lines[at].startswith("sep=")]
         counts = [len(_fields(lines[at], _separator(lines[at]))) for at in rows]
         usual = max(counts, key=counts.count, default=0)  # titles above have fewer fields
-        first = next((at for at, n in zip(rows, counts, strict=True) if n == usual), 0)
+        first = next((at for at, n in zip(rows, counts, strict=True) if n >= usual), 0)
         separator = _separator(lines[first])
         above, row = (_fields(lines[at], separator) for at in (max(first - 1, 0), first))
         return first - 1 if first and is_number(row[0]) and len(above) == len(row) else first
