@@ -76,7 +76,8 @@ Observed = Annotated[
     ),
 ]
 ActionColumn = Annotated[
-    str, option("Column of the action taken from a row to the next.", "--action")
+    str,
+    option("Column of the action taken from a row to the next; '': nobody acts.", "--action"),
 ]
 TimeColumn = Annotated[
     str, option("Column of the time, in seconds or as dates of ISO 8601.", "--time")
@@ -212,6 +213,7 @@ class Reading(NamedTuple):
     columns: LogColumns
     lengths: VehicleLengths
     topics: Topics | None
+    acts: bool = True  #: whether somebody acts; else the action is any column, and means nothing
 
 
 def reading_of(
@@ -251,7 +253,7 @@ def reading_of(
         raise ValueError(f"--observe {observe}: {error}") from None
     columns = LogColumns(
         observe=encoder,
-        action="".join(quoted_name(action)),
+        action="".join(quoted_name(action)) or encoder.names[0],
         time="".join(quoted_name(time)),
         episode=None if episode is None else split_names(episode),
         dt=None if dt is None else positive("--dt", dt),
@@ -262,7 +264,21 @@ def reading_of(
         skip_bad=skip_bad,
     )
     lengths = lengths_given(vehicle_length or ())
-    return Reading(columns, lengths, None if topics is None else Topics.load(topics))
+    given = None if topics is None else Topics.load(topics)
+    return Reading(columns, lengths, given, acts=action != "")
+
+
+Horizon = Annotated[
+    float | None,
+    option(
+        "Where nobody acts: an alarm is right if a failure comes within so long [s]. [default: a "
+        "twentieth of the median episode]",
+        min=0.0,
+    ),
+]
+Persist = Annotated[
+    float, option("Where nobody acts: how long a limit is passed before it alarms [s].", min=0.0)
+]
 
 
 def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -312,15 +312,50 @@ class Foresight(LearningJudge):
 
     def told(self, limit: Floats) -> str:
         """Where a limit is passed, in words."""
+        return " ".join(self._words(limit))
+
+    def _words(self, limit: Floats) -> tuple[str, str]:
         v, when, sign, at = int(limit[_OF]), int(limit[_WHEN]), limit[_SIGN], limit[_AT]
         soon = f" in {span(_AHEAD[when] * self.horizon * self.dt)} at its rate" * (when > 0)
-        m = len(self.labels.names)
+        names, m = self.labels.names, len(self.labels.names)
         if v < m:
-            return f"{self.labels.names[v]}{soon} {'above' if sign > 0.0 else 'below'} {at:.4g}"
+            return names[v], f"{'above' if sign > 0.0 else 'below'} {at:.4g}{soon}"
         row = self.forms[v - m]
-        there = region(self.labels.names, row[failure.I : failure.HELD].tolist(), int(row[-1]))
-        where = "beyond" if at > 0.0 else "within"
-        return f"{where} {abs(at):.3g} typical steps{soon} of the edge {there}"
+        there = region(names, row[failure.I : failure.HELD].tolist(), int(row[failure.HELD]))
+        beyond = "beyond" if at > 0.0 else "within"
+        return "it", f"{beyond} {abs(at):.2g} typical steps of where it fails{soon}: {there}"
+
+    def passed(self, rows: Floats) -> Floats:
+        """(n, 6) the limits that the last row of an episode so far, (T, m), passes."""
+        columns = self._columns(rows, np.zeros(1, np.int64))
+        return self._limits[self._passed(columns[:, -1:], self._limits)[:, 0]]
+
+    def reason(self, rate: int, z: Floats, passed: Floats) -> str:
+        """Why an alarm is on at an observation (m,), with the limits (n, 6) that are passed."""
+        alarms, right, _ = self.held_out[rate].tolist()
+        mine, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
+        if len(mine):
+            v, (name, there) = int(mine[0, _OF]), self._words(mine[0])
+            why = f"{name} {z[v]:.4g}: {there}" if v < len(z) else f"{name} is {there}"
+        within = span(self.horizon * self.dt)
+        return f"{why}; after {right:.0f} of {alarms:.0f} such alarms it failed within {within}"
+
+    @property
+    def shares(self) -> Floats:
+        """(rates,) of the alarms those that were right; 0 where nothing foresees a failure."""
+        share = self.held_out[:, 1] / np.maximum(self.held_out[:, 0], 1.0)
+        return np.where(self.held_out[:, 2] == _NONE, 0.0, share)
+
+    def rate_of(self, tolerance: float) -> int | None:
+        """Which of `RATES` the alarm is for, more of which are right; None if there is none."""
+        fit = np.flatnonzero(self.shares > tolerance)
+        return int(fit[-1]) if len(fit) else None
+
+    def tolerance_of(self, rate: float) -> float:
+        """The tolerance with which there are at most so many false alarms a day, if it can be."""
+        k = max(int(np.searchsorted(RATES, rate, "right")) - 1, 0)
+        more = float(self.shares[k + 1 :].max(initial=0.0))
+        return float(np.clip(0.5 * (self.shares[k] + more), 0.01, 0.99))
 
     @property
     def told_by_experience(self) -> str:
@@ -366,28 +401,14 @@ class Foresight(LearningJudge):
         mask: Any = None,
     ) -> Search:
         """Keep what is proposed, as nobody acts; the risk is that of the alarm that is on."""
-        share = self.held_out[:, 1] / np.maximum(self.held_out[:, 0], 1.0)
-        share = np.where(self.held_out[:, 2] == _NONE, 0.0, share)
-        z, risk, reason = situation.observation, 0.0, "no alarm is on"
-        passed, (*_, on) = self._next(z)
-        fit = np.flatnonzero(share > tolerance)
-        if len(fit) and on[fit[-1]]:
-            rate = int(fit[-1])
-            risk, (alarms, right, _) = float(share[rate]), self.held_out[rate].tolist()
-            which = np.flatnonzero(passed & (self._limits[:, _RATE] == rate))
-            reason = "the alarm stays on for a while"
-            if len(which):
-                limit = self._limits[which[0]]
-                v = int(limit[_OF])
-                seen = f"{self.labels.names[v]} is {z[v]:.4g}, " if v < len(z) else ""
-                reason = f"{seen}{self.told(limit)}"
-            reason += (
-                f": {right:.0f} of {alarms:.0f} such alarms were followed by a failure within "
-            )
-            reason += span(self.horizon * self.dt)
-        alarms = float(self.held_out[fit[-1], 0]) if len(fit) else 0.0
-        low, high = wilson_bounds(risk, alarms) if risk else (0.0, 1.0)
-        judged = Judgement(*np.array([[risk], [low], [high], [np.nan]]), evidence=alarms)
+        passed, (*_, on) = self._next(situation.observation)
+        rate, risk, reason = self.rate_of(tolerance), 0.0, "no alarm is on"
+        evidence = 0.0 if rate is None else float(self.held_out[rate, 0])
+        if rate is not None and on[rate]:
+            risk = float(self.shares[rate])
+            reason = self.reason(rate, situation.observation, self._limits[passed])
+        low, high = wilson_bounds(risk, evidence) if risk else (0.0, 1.0)
+        judged = Judgement(*np.array([[risk], [low], [high], [np.nan]]), evidence=evidence)
         return Search(np.array([float(wanted)]), judged, 0, reason)
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
