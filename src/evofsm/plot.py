@@ -31,9 +31,10 @@ with needs("matplotlib", "plot", "plotting"):
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
     from matplotlib.text import Annotation
 
-__all__ = ["COLORS", "belief", "experience", "graph", "risk", "states"]
+__all__ = ["COLORS", "belief", "experience", "graph", "history", "risk", "states"]
 
 Look = dict[str, Any]  # how something is drawn, as matplotlib is told
 States = Collection[int]  # indices
@@ -337,6 +338,81 @@ def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = No
     ax.set(ylim=(-0.03, 1.03), xlabel="time [s]", ylabel="latent risk")
     _explain(ax)
     return ax
+
+
+def history(
+    figure: Figure,
+    time: ArrayLike,
+    rows: ArrayLike,
+    names: Sequence[str],
+    risk: ArrayLike,
+    failed: ArrayLike,
+    tolerance: float,
+    *,
+    model: FSMModel | None = None,
+    place: tuple[int, int] = (0, 1),
+) -> list[Axes]:
+    """What was seen over time, above the risk, with alarms as bands and failures as crosses.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+    time, risk, failed : (T,) array_like
+        When each row was [s], the risk then, and whether a failure came with it. A step of more
+        than three usual ones is left blank.
+    rows : (T, m) array_like
+    names : sequence of m str
+    tolerance : float
+        There is an alarm where the risk is above it.
+    model : FSMModel, optional
+        The states of which are shown as well.
+    place : (int, int)
+        Which of so many columns of the figure it takes.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from evofsm import plot
+    >>> figure = Figure()
+    >>> panels = plot.history(figure, [0, 1, 2], [[5], [6], [7]], ["heat"], [0, 0, 0.9], [0, 0, 1], 0.5)
+    >>> [panel.get_ylabel() for panel in panels]
+    ['heat', 'risk']
+    """
+    when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
+    said, crosses = np.asarray(risk, np.float64), when[np.asarray(failed, np.bool_)]
+    steps = np.diff(when, prepend=when[:1])
+    blank = steps > 3.0 * np.median(steps)
+    unit, size = ("days", 86400.0) if np.ptp(when) > 2e5 else ("hours", 3600.0)
+    unit, size = (unit, size) if np.ptp(when) > 7200.0 else ("minutes", 60.0)
+    x, crosses = (when - when[0]) / size, (crosses - when[0]) / size
+    count = z.shape[1] + (model is not None) + 1
+    panels: list[Axes] = []
+    for k in range(count):
+        at = (count, place[1], k * place[1] + place[0] + 1)
+        panels.append(figure.add_subplot(*at, sharex=panels[0] if panels else None))
+    edges = np.flatnonzero(np.diff(said > tolerance, prepend=False, append=False))
+    for ax in panels:
+        for first, end in edges.reshape(-1, 2):
+            band: Look = {"color": COLORS["follower"], "alpha": 0.25, "linewidth": 1.0}
+            ax.axvspan(x[first], x[end - 1], **band)
+        for cross in crosses:
+            ax.axvline(cross, color=COLORS["dead end"], linewidth=0.8, linestyle="--")
+        ax.tick_params(labelbottom=ax is panels[-1])
+    for ax, name, values in zip(panels, names, z.T, strict=False):
+        ax.plot(x, np.where(blank, np.nan, values), color=ink(), linewidth=0.6)
+        ax.set_ylabel(name)
+    if model is not None:
+        some = np.arange(0, len(z), max(len(z) // 2000, 1))
+        seen = [model.nearest(row).state for row in z[some]]
+        panels[-2].plot(x[some], seen, ".", markersize=1.5, color=COLORS["leader"])
+        label_states(panels[-2].yaxis, model.n_states)
+        panels[-2].set_ylabel("state")
+    panels[-1].step(x, np.where(blank, np.nan, said), where="post", color=COLORS["follower"])
+    panels[-1].axhline(tolerance, color=ink(), linewidth=0.8, linestyle=":")
+    look: Look = {"linestyle": "none", "marker": "X", "color": COLORS["dead end"], "clip_on": False}
+    panels[-1].plot(crosses, np.ones(len(crosses)), **look)
+    panels[-1].set(ylim=(-0.03, 1.03), ylabel="risk", xlabel=f"time [{unit}]")
+    return panels
 
 
 def _explain(ax: Axes, handles: Sequence[Line2D] | None = None) -> None:

@@ -14,8 +14,10 @@ from evofsm.cli.options import (
     BRAKES,
     TOLERANCE,
     Brakes,
+    Horizon,
     Json,
     Judge,
+    Persist,
     Reading,
     Tolerance,
     argument,
@@ -104,6 +106,8 @@ def learn(
     ] = None,
     brakes: Brakes = BRAKES,
     tolerance: Tolerance = TOLERANCE,
+    horizon: Horizon = None,
+    persist: Persist = 0.0,
     as_json: Json = False,
 ) -> None:
     """Learn a state machine from logs of your own, of any size, row by row.
@@ -119,13 +123,16 @@ def learn(
 
     Without --failed nobody knows what failed, and evofsm explain says so.
 
-    With --guard, a guard in shadow mode then goes through all rows and learns from them too.
+    With --guard, a guard in shadow mode then goes through all rows and learns from them too. Where
+    nobody acts (--action ''), it learns alarms, with 0.3 false ones a day unless --tolerance says
+    how risky it may be.
 
     Of a log whose columns nobody named, evofsm learn LOG prints what is in it, and what to ask.
     """
+    from evofsm.cli.foreseen import guard_where_nobody_acts
     from evofsm.cli.learning import guard_of_log, learn_traces, refusing, teach, warnings_of
     from evofsm.driving.naming import UNITS, VARIABLES
-    from evofsm.io import read_traces
+    from evofsm.io import episodes_of, read_traces
     from evofsm.io.logs import Noted
     from evofsm.io.tables import SI
 
@@ -134,11 +141,11 @@ def learn(
     lacking = _look_first(files[0], reading)
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
-    actions = _actions(action_range)
-    columns, lengths, topics = reading
+    actions = _actions(action_range if reading.acts else "0:1:1")
+    columns, lengths, topics, acts = reading
     encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
-    kind = None if guard is None else _judge_of(judge, columns)
+    kind = None if guard is None else _judge_of(judge if acts else "learnt", columns)
     noted = Noted()
     known = [{"name": file, "bytes": _size(file)} for file in files]
 
@@ -151,6 +158,8 @@ def learn(
         chunks = read_traces(
             files, columns, lengths, lambda count: move(advance=count), noted, topics
         )
+        if not acts:  # before a hole the action is unknown still
+            chunks = (one._replace(actions=0.0 * one.actions) for one in chunks)
         learning = learn_traces(
             _saying(chunks, lacking), machine, actions, encoder.names, units_read
         )
@@ -164,19 +173,28 @@ def learn(
     if guard is not None:
         assert kind is not None
         assert learning.model.dt is not None
-        reckoned = kind, learning.model.dt, brakes, tolerance
-        taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
-        with progress("Teaching the guard", learning.read.rows) as move:
-            rows = read_traces(files, columns, lengths, topics=topics)
-            share = teach(taught, rows, lambda count: move(count))
-        if refused := refusing(share):
-            warn(f"warning: in the later half of the log the guard {refused}")
+        named = encoder.names, learning.model.units
+        rows = read_traces(files, columns, lengths, topics=topics)
+        if acts:
+            reckoned = kind, learning.model.dt, brakes, tolerance
+            taught = guard_of_log(*reckoned, actions, machine, *named)
+            with progress("Teaching the guard", learning.read.rows) as move:
+                share = teach(taught, rows, lambda count: move(count))
+            if refused := refusing(share):
+                warn(f"warning: in the later half of the log the guard {refused}")
+        else:
+            given = {"horizon": horizon, "persist": persist, "machine": learning.machine}
+            given |= {"tolerance": None if tolerance == TOLERANCE else tolerance}
+            taught = guard_where_nobody_acts(list(episodes_of(rows)), *named, **given)
         taught.save(guard, provenance)
     if as_json:
         told = {"files": files, "saved": out, "guard": guard, **_document(learning, provenance)}
         print_json({**told, "noted": noted, "warnings": warnings})
         return
-    read = [*_read(learning, columns.action), *_read_otherwise(noted, columns, learning)]
+    read = [
+        *_read(learning, columns.action if acts else ""),
+        *_read_otherwise(noted, columns, learning),
+    ]
     if lengths.seen:
         read.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
     show(facts("What was read", read), *tables_of(learning.model))
@@ -362,13 +380,18 @@ def _provenance(learning: Learning, files: list[Any], columns: LogColumns) -> di
 
 def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
     """Where it is, what it takes, and what it reckons with."""
-    from evofsm.guard import LearntRisk
+    from evofsm.guard import Foresight, LearntRisk
 
     assert guard.judge is not None
     names = map(guard.judge.labels.variable, range(len(guard.variables)))
     keys = ", ".join(["time [s]", *names])
-    takes = f"evofsm monitor --guard {path} takes rows of {keys}, and proposal, the action."
+    also = "" if isinstance(guard.judge, Foresight) else ", and proposal, the action"
+    takes = f"evofsm monitor --guard {path} takes rows of {keys}{also}."
     yield f"The guard was saved to {path}. {takes}"
+    if isinstance(guard.judge, Foresight):
+        yield f"It alarms where more than {guard.reviser.tolerance:.0%} of such alarms were right."
+        yield f"Held out: {guard.judge.told_by_experience}."
+        return
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
         return
@@ -403,7 +426,8 @@ def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     if clipped := read.clipped_below + read.clipped_above:
         text += f"; {read.clipped_below:,} below and {read.clipped_above:,} above "
         text += f"({clipped / read.rows:.1%} of rows) were put into the end intervals"
-    yield "actions", text if clipped else f"{text}; none was beyond"
+    text = text if clipped else f"{text}; none was beyond"
+    yield "actions", text if action else "none: nobody acts (--action '')"
     settings = describe_rule(learning.machine.rule)
     for name in ("radius", "spread"):  # which the rule may have itself
         settings.setdefault(name, learning.machine.settings[name])

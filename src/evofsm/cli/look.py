@@ -21,7 +21,7 @@ _SHOWN = 40  # columns
 # A larger share of steps, and so many, that are no usual one make no clock.
 _ODD, _MANY = 0.001, 10
 _TIME = re.compile("(t|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
-_SET = re.compile("acc|action|valve|ventil|soll|set|^u$|cmd|throttle|drehz", re.IGNORECASE)
+_SET = re.compile("acc|action|valve|ventil|soll|set|^u$|cmd|throttle", re.IGNORECASE)
 _FAILURE = re.compile(
     "st(ö|oe)r|fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|aus$|emergency",
     re.IGNORECASE,
@@ -100,19 +100,22 @@ def look_at(table: Table) -> Look:
         options.append(("--episode", _named(group, ",")))
     ends = {n: np.nanquantile(z[runs], (0.02, 0.98)) for n, z in values.items()}
     not_seen = {group, *(name for name, *_ in rare)}
+    if still and ends[still][1] < 1.1 * ends[still][0]:  # as it runs it is always the same
+        not_seen.add(still)
     moved = {n: _round(high - low) for n, (low, high) in ends.items() if high > low}
     moved = {name: apart for name, apart in moved.items() if name not in not_seen}
     if moved:
-        action = next((n for n in moved if n == still or _SET.search(n)), [*moved][-1])
-        width = _round(moved[action] / 4.0)
-        low, high = math.floor(ends[action][0] / width), math.ceil(ends[action][1] / width)
-        span = f"{low * width:.6g}:{high * width:.6g}:{width:g}"
+        action = next(filter(_SET.search, moved), "")  # else nobody acts
         seen = [name for name in moved if name != action] or [action]
         scales = [f"{_named(name, '=')}={_round(moved[name] / 4.0):g}" for name in seen]
+        acts = [("--action", _named(action, ""))]
+        if action:
+            width = _round(moved[action] / 4.0)
+            low, high = math.floor(ends[action][0] / width), math.ceil(ends[action][1] / width)
+            acts.append(("--action-range", f"{low * width:.6g}:{high * width:.6g}:{width:g}"))
         options[:0] = [
             ("--observe", ",".join(_named(name, ",=") for name in seen)),
-            ("--action", _named(action, "")),
-            ("--action-range", span),
+            *acts,
             ("--time", clock) if clock else ("--dt", "1"),
             *([("--unit", form)] if form else []),
         ]

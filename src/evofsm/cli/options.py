@@ -78,7 +78,8 @@ Observed = Annotated[
     ),
 ]
 ActionColumn = Annotated[
-    str, option("Column of the action taken from a row to the next.", "--action")
+    str,
+    option("Column of the action taken from a row to the next; '': nobody acts.", "--action"),
 ]
 TimeColumn = Annotated[
     str,
@@ -245,6 +246,7 @@ class Reading(NamedTuple):
     columns: LogColumns
     lengths: VehicleLengths
     topics: Topics | None
+    acts: bool = True  #: whether somebody acts; else the action is any column, and means nothing
 
 
 def reading_of(
@@ -271,8 +273,8 @@ def reading_of(
     from evofsm.io import LogColumns, Topics
     from evofsm.io.tables import quoted_name
 
-    for name, given in {"--hold": hold, "--resample": resample, "--hole": hole}.items():
-        if given is not None and dt is not None:
+    for name, value in {"--hold": hold, "--resample": resample, "--hole": hole}.items():
+        if value is not None and dt is not None:
             raise ValueError(f"{name} goes by a clock, and --dt stands in for one; give one")
 
     def variable(quoted: str, rest: str) -> str | Category:
@@ -288,7 +290,7 @@ def reading_of(
         raise ValueError(f"--observe {observe}: {error}") from None
     columns = LogColumns(
         observe=encoder,
-        action="".join(quoted_name(action)),
+        action="".join(quoted_name(action)) or encoder.names[0],
         time=",".join(split_names(time)),
         episode=None if episode is None else split_names(episode),
         dt=None if dt is None else positive("--dt", dt),
@@ -302,7 +304,21 @@ def reading_of(
         hole=None if hole is None else seconds("--hole", hole),
     )
     lengths = lengths_given(vehicle_length or ())
-    return Reading(columns, lengths, None if topics is None else Topics.load(topics))
+    given = None if topics is None else Topics.load(topics)
+    return Reading(columns, lengths, given, acts=action != "")
+
+
+Horizon = Annotated[
+    float | None,
+    option(
+        "Where nobody acts: an alarm is right if a failure comes within so long [s]. [default: a "
+        "twentieth of the median episode]",
+        min=0.0,
+    ),
+]
+Persist = Annotated[
+    float, option("Where nobody acts: how long a limit is passed before it alarms [s].", min=0.0)
+]
 
 
 def seconds(name: str, text: str) -> float:

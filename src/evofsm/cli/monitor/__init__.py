@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from hashlib import sha256
 from itertools import chain
@@ -19,9 +19,12 @@ from evofsm.cli.options import (
     Failed,
     Hold,
     Hole,
+    Horizon,
+    Json,
     Lengths,
     ModeName,
     NoLeader,
+    Persist,
     Resampled,
     SkipBad,
     Step,
@@ -35,7 +38,7 @@ from evofsm.cli.options import (
     require,
     split_names,
 )
-from evofsm.cli.show import show, warn
+from evofsm.cli.show import print_json, show, warn
 
 if TYPE_CHECKING:
     from evofsm.cli.monitor.decider import Decider
@@ -120,6 +123,10 @@ def monitor(
     where: Where = None,
     resample: Resampled = None,
     hole: Hole = None,
+    horizon: Horizon = None,
+    persist: Persist = 0.0,
+    plot: Annotated[Path | None, option("Of --summary, where nobody acts: a picture.")] = None,
+    as_json: Json = False,
 ) -> int | None:
     """Decide alongside a stack of your own: rows in, decisions out, a JSON line each.
 
@@ -133,6 +140,8 @@ def monitor(
 
     With --summary it reads FILE, such lines or a log as evofsm learn reads it (by the options from
     --observe to --hole), and prints how often it would have alarmed and how risky it was.
+    Where nobody acts (--action ''), alarms stand beside plain thresholds: failures foreseen, how
+    far ahead, false ones a day. Without --guard the first 60 % of the log are learnt from.
     """
     if sum(one is not None for one in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
@@ -147,7 +156,7 @@ def monitor(
     from evofsm.driving.assumed import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
     from evofsm.fsm.validation import positive
-    from evofsm.guard import Guard
+    from evofsm.guard import Foresight, Guard
 
     if guard is not None and brakes is not None:
         raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
@@ -169,16 +178,24 @@ def monitor(
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
 
             used = fresh() if guard else None
+            alone = action == "" or isinstance(used and used.judge, Foresight)
+            if (as_json or plot) and not (is_log and alone):
+                raise ValueError("--json and --plot are for logs where nobody acts: --action ''")
             if is_log:
                 own = used.variables if used else VARIABLES
                 if observe is None or set(split_names(observe)) == set(own):  # in its own order
                     observe = ",".join(f'"{name}"' for name in own)
-                asked = observe, action, time, episode, dt, failed, unit, topics, no_leader
-                more = hold, skip_bad, vehicle_length, where, resample, hole
-                chunks, interval = _episodes(file, reading_of(*asked, *more))
+                asked = observe, "" if alone else action, time, episode, dt, failed, unit, topics
+                more = no_leader, hold, skip_bad, vehicle_length, where, resample, hole
+                reading = reading_of(*asked, *more)
+                chunks, interval = _episodes(file, reading)
                 if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
                     what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
                     warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
+            if is_log and alone:
+                asked_of = reading.columns.observe.names, horizon, persist, tolerance
+                _foreseen(file, list(chunks), used, *asked_of, plot, as_json=as_json)
+                return None
             used = used or fresh()
             _prepare(used, mode, tolerance, None, stack, learn=learn)
             warn(_of_saved(guard, used) if guard else assumptions(reckoned, tolerated))
@@ -231,7 +248,7 @@ def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
     from evofsm.io import episodes_of, read_traces
     from evofsm.io.logs import Noted
 
-    columns, lengths, topics = reading
+    columns, lengths, topics, _ = reading
     noted = Noted()
     chunks = read_traces([str(file)], columns, lengths, noted=noted, topics=topics)
     episodes = (one for one in episodes_of(chunks) if len(one.times) > 1)
@@ -244,6 +261,42 @@ def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
             warn(f"warning: {warning}")
 
     return all_of_them(), first.dt
+
+
+def _foreseen(
+    file: Path,
+    chunks: list[Chunk],
+    guard: Guard | None,
+    names: Sequence[str],
+    horizon: float | None,
+    persist: float,
+    tolerance: float | None,
+    plot: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Say what came of alarms where nobody acts; without a guard the first part of the log makes
+    one."""
+    from evofsm.cli import foreseen
+
+    title = str(file)
+    if guard is None:
+        learnt, chunks = foreseen.split(chunks)
+        if not (learnt and chunks):
+            raise ValueError(f"{file}: it takes two episodes at least, to learn and to judge")
+        given = {"horizon": horizon, "persist": persist, "tolerance": tolerance}
+        guard = foreseen.guard_where_nobody_acts(learnt, names, (), **given)
+        title += f": learnt from its first {len(learnt):,} episodes, judged by the rest"
+    elif tolerance is not None:
+        guard.reviser.tolerance = tolerance  # type: ignore[attr-defined]
+    told = foreseen.told_by(chunks)
+    found = foreseen.document(guard, told)
+    if plot is not None:
+        foreseen.draw(guard, told, plot)
+    if as_json:
+        print_json({"file": file, **found})
+        return
+    show(*foreseen.tables_of(found, told, title))
 
 
 def _prepare(

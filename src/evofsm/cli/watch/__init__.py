@@ -88,7 +88,7 @@ def watch(
     from evofsm.io import VehicleLengths
 
     is_log = _is_log(what)
-    columns, lengths, topics = reading
+    columns, lengths, topics, _ = reading
     given = columns.episode, columns.dt, columns.failed, columns.units, columns.no_leader
     if not is_log and (any(given) or topics or lengths != VehicleLengths()):
         raise ValueError(f"options of columns are for a log, and {what} is none")
