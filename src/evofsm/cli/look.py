@@ -18,12 +18,13 @@ from evofsm.io.tables import Skips, Table, Wanted, is_date
 # So many fields and rows are looked at; columns of more texts are no list of states.
 _MOST_FIELDS, _MOST_ROWS, _FEW = 20_000_000, 1_000_000, 12
 _SHOWN = 40  # columns
+_SIGNS = "<>=! "  # what in a name of a condition is ambiguous
 # A larger share of steps, and so many, that are no usual one make no clock.
 _ODD, _MANY = 0.001, 10
 _TIME = re.compile("(t|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
 _SET = re.compile("acc|action|valve|ventil|soll|set|^u$|cmd|throttle", re.IGNORECASE)
 _FAILURE = re.compile(
-    "st(ö|oe)r|fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|aus$|emergency",
+    "st(ö|oe)r|fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|not-?aus|emergency",
     re.IGNORECASE,
 )
 _CODE = re.compile(f"{_FAILURE.pattern}|stat|zustand|code", re.IGNORECASE)
@@ -40,11 +41,52 @@ class Look(NamedTuple):
 
 def look_at(table: Table) -> Look:
     """Look at the first million rows, or fewer of many columns."""
+    frame, clock, form = _first_rows(table)
+    if not len(frame):
+        return Look([], [])
+    numbers = [name for name, kind in frame.schema.items() if kind.is_numeric() and name != clock]
+    values = {name: frame[name].to_numpy() for name in numbers}
+    values = {name: z for name, z in values.items() if np.isfinite(z).any()}
+    texts = [name for name in frame.columns if frame[name].dtype == polars.String]
+    shown = {name: f"{np.nanmin(z):.5g} to {np.nanmax(z):.5g}" for name, z in values.items()}
+    shown |= {name: _told(frame[name]) for name in texts}
+    facts = [*shown.items()][:_SHOWN]
+    if more := len(shown) - len(facts):
+        facts.append(("...", f"and {more:,} more columns"))
+    facts.append(("the clock", clock or "no column (--dt)"))
+    facts.append(("rows looked at", f"{len(frame):,}"))
+    options = [("--time", clock) if clock else ("--dt", "1"), *([("--unit", form)] if form else [])]
+    options += _of_steps(frame[clock].to_numpy(), facts) if clock else []
+    runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
+    if still:
+        limit = _round(0.1 * float(np.nanquantile(np.abs(values[still]), 0.95)))
+        runs = values[still] > limit
+        options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
+        facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
+    rare = [*_rare(frame, texts, values)]
+    rare = [one for one in rare if _FAILURE.search(one[1])] or rare
+    facts += [("a failure?", f"{text} {told}") for _, text, told in rare]
+    options += [("--failed", text) for _, text, _ in rare[:1]]
+    groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
+    if group := next((name for name in groups if _is_in_blocks(frame[name])), ""):
+        facts.append(("an episode?", f"each {group}"))
+        options.append(("--episode", _named(group, ",")))
+    told_by = {group, *(name for name, *_ in rare)}
+    ends = {n: np.nanquantile(z[runs], (0.02, 0.98)) for n, z in values.items() if n not in told_by}
+    if still in ends and ends[still][1] < 1.1 * ends[still][0]:  # as it runs it is always the same
+        del ends[still]
+    return Look(
+        facts, _of_numbers({n: e.tolist() for n, e in ends.items() if e[1] > e[0]}, options)
+    )
+
+
+def _first_rows(table: Table) -> tuple[polars.DataFrame, str, str]:
+    """Their columns, the clock in seconds, which one that is, and how it is written if oddly."""
     firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
     pairs = zip(firsts, [*firsts][1:], strict=False)
     together = (f"{a},{b}" for a, b in pairs if is_date(f"{firsts[a]} {firsts[b]}"))
     dated = [name for name, text in firsts.items() if is_date(text)]
-    clock = next(iter(dated), "") or next(together, "")
+    clock, form = next(iter(dated), "") or next(together, ""), ""
     dates = clock.split(",") if clock else []
     numbers = [name for name in firsts if table.holds(name) == "number"]
     texts = [name for name in firsts if name not in {*numbers, *dated, *dates}]
@@ -53,74 +95,48 @@ def look_at(table: Table) -> Look:
         frame.vstack(polars.DataFrame({**piece.numbers, **piece.texts}), in_place=True)
         if len(frame) >= min(_MOST_ROWS, _MOST_FIELDS // len(firsts)):
             break
-    if not (rows := len(frame)):
-        return Look([], [])
-    values = {name: frame[name].to_numpy() for name in numbers}
-    values = {name: z for name, z in values.items() if np.isfinite(z).any()}
-    if form := "" if clock else next(filter(None, map(_form, (frame[name] for name in texts))), ""):
-        clock, dates = form.partition("=")[0], [form]
-        at = frame[clock].str.to_datetime(form.partition("=")[2], strict=False)
+    if not clock and (form := next(filter(None, map(_form, map(frame.get_column, texts))), "")):
+        clock, _, written = form.partition("=")
+        at = frame[clock].str.to_datetime(written, strict=False)
         frame = frame.with_columns(at.dt.epoch("us").alias(clock))
-        texts.remove(clock)
-    clock = clock or next((name for name in values if _TIME.match(name)), "")
-    shown = {name: f"{np.nanmin(z):.5g} to {np.nanmax(z):.5g}" for name, z in values.items()}
-    shown |= {name: _told(frame[name]) for name in texts} | dict.fromkeys(
-        [*dated, *dates, clock], "the clock"
-    )
-    facts, options = [(name, shown.get(name, "nothing")) for name in firsts][:_SHOWN], []
-    if (more := len(firsts) - len(facts)) > 0:
-        facts.append(("...", f"and {more:,} more columns"))
-    steps = np.diff(frame[clock].to_numpy() if clock else [])
-    same = int((steps == 0.0).sum())
-    steps = steps[steps > 0.0] * (1e-6 if dates else 1.0)
-    usual = float(np.median(steps)) if len(steps) else math.nan
-    odd = same + int(((steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)).sum())
-    every = f"{rows:,}, one every {usual:.2g} s" if clock else f"{rows:,}; no column is a clock"
-    facts.append(("rows looked at", every))
-    if odd >= _MANY and odd > _ODD * rows:
-        facts.append(("other steps", f"{odd:,}, the longest {steps.max():,.0f} s"))
-        step = next((one for one in _NICE if one[0] >= 3.5 * usual), _NICE[-1])
-        hole = next((one for one in _NICE if one[0] >= 10.0 * step[0]), _NICE[-1])
-        options += [("--resample", step[1]), ("--hole", hole[1])]
-    values.pop(clock, None)
-    runs, still = np.ones(rows, np.bool_), next(filter(lambda n: _stands(values[n]), values), "")
-    if still:
-        limit = float(f"{0.1 * np.nanquantile(np.abs(values[still]), 0.95):.0e}")
-        runs = values[still] > limit
-        options.append(("--where", f"{_named(still, '<>=!')}>{limit:g}"))
-        facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
-    rare = [*_rare(frame, texts, values)]
-    rare = [one for one in rare if _FAILURE.search(f"{one[1]}")] or rare
-    for _, text, told in rare:
-        facts.append(("a failure?", f"{text} {told}"))
-    options += [("--failed", text) for _, text, _ in rare[:1]]
-    groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
-    if group := next((name for name in groups if _is_in_blocks(frame[name])), ""):
-        facts.append(("an episode?", f"each {group}"))
-        options.append(("--episode", _named(group, ",")))
-    ends = {n: np.nanquantile(z[runs], (0.02, 0.98)) for n, z in values.items()}
-    not_seen = {group, *(name for name, *_ in rare)}
-    if still and ends[still][1] < 1.1 * ends[still][0]:  # as it runs it is always the same
-        not_seen.add(still)
-    moved = {n: _round(high - low) for n, (low, high) in ends.items() if high > low}
-    moved = {name: apart for name, apart in moved.items() if name not in not_seen}
-    if moved:
-        action = next(filter(_SET.search, moved), "")  # else nobody acts
-        seen = [name for name in moved if name != action] or [action]
-        scales = [f"{_named(name, '=')}={_round(moved[name] / 4.0):g}" for name in seen]
-        acts = [("--action", _named(action, ""))]
-        if action:
-            width = _round(moved[action] / 4.0)
-            low, high = math.floor(ends[action][0] / width), math.ceil(ends[action][1] / width)
-            acts.append(("--action-range", f"{low * width:.6g}:{high * width:.6g}:{width:g}"))
-        options[:0] = [
-            ("--observe", ",".join(_named(name, ",=") for name in seen)),
-            *acts,
-            ("--time", clock) if clock else ("--dt", "1"),
-            *([("--unit", form)] if form else []),
-        ]
-        options += [("--rule", "novelty"), *(("--scale", one) for one in scales)]
-    return Look(facts, options)
+    if clock and len(frame):
+        frame = frame.with_columns(frame[clock] * 1e-6)
+    return frame, clock or next(filter(_TIME.match, numbers), ""), form
+
+
+def _of_steps(times: NDArray[np.float64], facts: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """What makes one clock of such steps."""
+    steps = np.diff(times)
+    later = steps[steps > 0.0]
+    usual = float(np.median(later)) if len(later) else math.nan
+    odd = (steps == 0.0) | (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
+    facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {usual:.2g} s"
+    if odd.sum() < max(_MANY, _ODD * len(steps)):
+        return []
+    facts.append(("other steps", f"{odd.sum():,}, the longest {later.max():,.0f} s"))
+    least = max(usual, 3.5 * float(np.median(steps)))  # of few digits many times are the same
+    step = next((one for one in _NICE if one[0] >= least), _NICE[-1])
+    hole = next((one for one in _NICE if one[0] >= 10.0 * step[0]), _NICE[-1])
+    return [("--resample", step[1]), ("--hole", hole[1])]
+
+
+def _of_numbers(
+    ends: dict[str, list[float]], options: list[tuple[str, str]]
+) -> list[tuple[str, str]]:
+    """With what to observe of numbers that go from here to there, and what somebody sets."""
+    if not ends:
+        return []
+    action = next(filter(_SET.search, ends), "")  # else nobody acts
+    seen = [name for name in ends if name != action] or [action]
+    apart = {name: _round((high - low) / 4.0) for name, (low, high) in ends.items()}
+    acts = [("--action", _named(action, ""))]
+    if action:
+        width, (low, high) = apart[action], ends[action]
+        low, high = math.floor(low / width) * width, math.ceil(high / width) * width
+        acts.append(("--action-range", f"{low:.6g}:{high:.6g}:{width:g}"))
+    scales = [("--scale", f"{_named(name, '=')}={apart[name]:g}") for name in seen]
+    observed = ",".join(_named(name, ",=") for name in seen)
+    return [("--observe", observed), *acts, *options, ("--rule", "novelty"), *scales]
 
 
 def _form(texts: polars.Series) -> str:
@@ -170,7 +186,7 @@ def _rare(
             is_plain = re.fullmatch(r"[^\W\d]\w*", text) or name in numbers
             value = text if is_plain else f"'{text}'"
             told = f"({'once' if times == 1 else f'{times:,} times'}, {here.mean():.2%} of rows)"
-            yield name, f"{_named(name, '<>=!')}=={value}", told
+            yield name, f"{_named(name, _SIGNS)}=={value}", told
 
 
 def _is_in_blocks(values: polars.Series) -> bool:
