@@ -64,7 +64,8 @@ def look_at(table: Table) -> Look:
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
     rare = [*_rare(frame, texts, values)]
-    rare = [one for one in rare if _FAILURE.search(one[1])] or rare
+    likely = [one for one in rare if _FAILURE.search(one[1])]
+    rare = likely or [one for one in rare if one[0] in values]
     facts += [("a failure?", f"{text} {told}") for _, text, told in rare]
     options += [("--failed", text) for _, text, _ in rare[:1]]
     groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
