@@ -137,7 +137,7 @@ class Foresight(LearningJudge):
     def learn_log(
         cls,
         episodes: Sequence[ArrayLike],
-        failed: Sequence[bool],
+        failed: ArrayLike,
         *,
         dt: float,
         horizon: float,
@@ -150,7 +150,7 @@ class Foresight(LearningJudge):
         ``horizon`` and ``hold`` are in seconds: how long before a failure an alarm is true, and how
         long a limit has to be passed.
         """
-        ahead, held = max(round(positive("horizon", horizon) / dt), 1), max(round(hold / dt), 1)
+        ahead, held = max(round(positive("horizon", horizon) / dt), 1), 1 + round(hold / dt)
         log = runs_of(episodes, failed)
         names = names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
         if not log.failed.any():
@@ -280,7 +280,8 @@ class Foresight(LearningJudge):
         memory = np.full((2, len(x)), np.nan) if memory is None else memory
         keeps, found = np.exp(-1.0 / (_SMOOTHED * self.horizon)), np.empty((len(_AHEAD), *x.shape))
         _look_ahead(x, starts, keeps, np.array(_AHEAD) * self.horizon, memory, found)
-        return found.reshape(-1, len(rows))
+        columns: Floats = found.reshape(-1, len(rows))
+        return columns
 
     def _passed(self, columns: Floats, limits: Floats) -> Flags:
         """(n, T) which limits are passed."""
@@ -291,21 +292,19 @@ class Foresight(LearningJudge):
     def of_rate(self, rate: int, *, plain: bool | None = None) -> Floats:
         """The limits of an alarm, by default of the kind that did better on what was held out."""
         kind = self.held_out[rate, 2] if plain is None else _PLAIN if plain else _LEARNT
-        return self.limits[(self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)]
+        which = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
+        return np.asarray(self.limits[which])
 
     def tally(
         self, log: Runs, rate: int, *, plain: bool | None = None, hold: float | None = None
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,)."""
-        on = self._passed(self._columns(log.rows, log.starts), self.of_rate(rate, plain=plain)).any(
-            0
-        )
-        rows = self.hold if hold is None else max(round(hold / self.dt), 1)
-        leads, given = (
-            np.zeros(len(log.starts)),
-            (np.zeros(len(on)), 1.0, log.starts, log.failed),
-        )
-        false = _tally(on, *given, self.horizon, rows, self._stays, leads, on)
+        limits = self.of_rate(rate, plain=plain)
+        on = np.asarray(self._passed(self._columns(log.rows, log.starts), limits).any(axis=0))
+        rows = self.hold if hold is None else 1 + round(hold / self.dt)
+        leads, nothing = np.zeros(len(log.starts)), np.zeros(len(on))
+        given = on, nothing, 1.0, log.starts, log.failed, self.horizon, rows
+        false = _tally(*given, self._stays, leads, on)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
         lead = float(leads.sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
@@ -408,13 +407,15 @@ class Foresight(LearningJudge):
             risk = float(self.shares[rate])
             reason = self.reason(rate, situation.observation, self._limits[passed])
         low, high = wilson_bounds(risk, evidence) if risk else (0.0, 1.0)
-        judged = Judgement(*np.array([[risk], [low], [high], [np.nan]]), evidence=evidence)
+        risks, lows, highs, none = np.array([[risk], [low], [high], [np.nan]])
+        judged = Judgement(risks, lows, highs, none, evidence)
         return Search(np.array([float(wanted)]), judged, 0, reason)
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
         """The risk, whatever would be done."""
         found = self.search(situation, 0.0, tolerance=0.0, revising=False).judged
-        return Judgement(*(np.repeat(one, np.size(actions)) for one in found[:4]), found.evidence)
+        every = [np.repeat(one, np.size(actions)) for one in found[:4]]
+        return Judgement(every[0], every[1], every[2], every[3], found.evidence)
 
     def why(self, judged: Judgement, /) -> str:
         """Why it is dangerous."""
@@ -450,10 +451,11 @@ class Foresight(LearningJudge):
         """Read what was learnt; a ValueError if the file is damaged."""
         settings, arrays = store.read(path, KIND)
         with store.explained(path):
-            return cls(**settings, **arrays)
+            known: dict[str, Any] = {**settings, **arrays}
+            return cls(**known)
 
 
-def runs_of(episodes: Sequence[ArrayLike], failed: Sequence[bool]) -> Runs:
+def runs_of(episodes: Sequence[ArrayLike], failed: ArrayLike) -> Runs:
     """Episodes one after the other, (T,) or (T, m) each."""
     rows = [np.asarray(one, np.float64).reshape(len(np.asarray(one)), -1) for one in episodes]
     lengths = np.array([len(one) for one in rows])

@@ -120,6 +120,7 @@ class Noted:
     leaderless: int = 0  #: rows without a leader, or in which a number is missing, left out
     after_failure: int = 0  #: rows left out because the failure before them still held
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
+    began: float = 0.0  #: time 0, where that is a date, since 1970 [s]
     failing: int = 0  #: rows that meet what tells of failures
     compared: tuple[float, float] | None = None  #: range of the column compared for that, in SI
     fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
@@ -741,6 +742,7 @@ class _Reader:
             return times
         if np.isnan(self._first_date):
             self._first_date = times[np.argmin(np.isnan(times))]
+            self._noted.began = float(self._first_date) * _MICROSECOND
         return (times - self._first_date) * _MICROSECOND
 
     def _compare_dt(self, piece: Piece) -> None:

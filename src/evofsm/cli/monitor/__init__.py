@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.options import (
     BRAKES,
@@ -263,7 +263,7 @@ def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
 
 def _foreseen(
     file: Path,
-    chunks: list[Chunk],
+    chunks: Sequence[Chunk],
     guard: Guard | None,
     names: Sequence[str],
     horizon: float | None,
@@ -273,8 +273,7 @@ def _foreseen(
     *,
     as_json: bool,
 ) -> None:
-    """Say what came of alarms where nobody acts; without a guard the first part of the log makes
-    one."""
+    """Say what came of alarms where nobody acts, of a guard or of the first part of the log."""
     from evofsm.cli import foreseen
 
     title = str(file)
@@ -282,7 +281,7 @@ def _foreseen(
         learnt, chunks = foreseen.split(chunks)
         if not (learnt and chunks):
             raise ValueError(f"{file}: it takes two episodes at least, to learn and to judge")
-        given = {"horizon": horizon, "persist": persist, "tolerance": tolerance}
+        given: dict[str, Any] = {"horizon": horizon, "persist": persist, "tolerance": tolerance}
         guard = foreseen.guard_where_nobody_acts(learnt, names, (), **given)
         title += f": learnt from its first {len(learnt):,} episodes, judged by the rest"
     elif tolerance is not None:
