@@ -15,6 +15,7 @@ that were held out of it, a third of the log at a time.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -69,10 +70,14 @@ class Runs(NamedTuple):
     starts: Ints  #: (E,) at which row each begins
     failed: Flags  #: (E,) which of them ended in failure
 
+    @property
+    def lengths(self) -> Ints:
+        """(E,) rows of each."""
+        return np.diff(self.starts, append=len(self.rows))
+
     def part(self, which: Flags) -> Runs:
         """Some of the episodes."""
-        lengths = np.diff(self.starts, append=len(self.rows))
-        rows, lengths = self.rows[np.repeat(which, lengths)], lengths[which]
+        rows, lengths = self.rows[np.repeat(which, self.lengths)], self.lengths[which]
         return Runs(rows, np.cumsum(lengths) - lengths, self.failed[which])
 
 
@@ -155,9 +160,8 @@ class Foresight(LearningJudge):
         names = names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
         if not log.failed.any():
             raise ValueError("no episode failed, so there is nothing to foresee")
-        fresh = cls(
-            dt, ahead, held, np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 3))
-        )
+        nothing = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 3))
+        fresh = cls(dt, ahead, held, *nothing)
         number = np.arange(len(log.failed)) * _PARTS // len(log.failed)
         tallies = np.zeros((2, len(RATES), 3))  # of both kinds: warned, foreseen, false
         for k in range(_PARTS):
@@ -170,28 +174,21 @@ class Foresight(LearningJudge):
         judge = fresh._fitted(log)
         kind = (tallies[1, :, 0] >= _BETTER * tallies[0, :, 0]).astype(int)
         _, right, false = tallies[kind, np.arange(len(RATES))].T
-        chance = log.failed.sum() * ahead / len(log.rows)
-        for k in range(len(RATES)):  # no better than an alarm at any time
-            if (
-                not right[k]
-                or wilson_bounds(right[k] / (right + false)[k], (right + false)[k])[0] < chance
-            ):
+        alarms, chance = right + false, log.failed.sum() * ahead / len(log.rows)
+        for k in range(len(RATES)):  # whether it is better than an alarm at any time
+            if not (right[k] and wilson_bounds(right[k] / alarms[k], alarms[k])[0] > chance):
                 kind[k] = _NONE
-        told = np.column_stack([right + false, right, kind])
+        told = np.column_stack([alarms, right, kind])
         return cls(dt, ahead, held, judge.forms, judge.limits, told, names, units)
 
     def _fitted(self, log: Runs) -> Self:
         """With forms and limits of both kinds, for all rates."""
         last = np.append(log.starts[1:], len(log.rows)) - 1
-        survived = np.ones(len(log.rows), np.bool_)
-        survived[last[log.failed]] = False
-        rows = log.rows[survived]
+        rows, failed = np.delete(log.rows, last[log.failed], 0), log.rows[last[log.failed]]
         unit = np.median(np.abs(np.diff(log.rows, axis=0)), axis=0) + 1e-12
-        box = np.sort(rows, axis=0)
-        seen = failure.Survived(
-            rows[:: max(len(rows) // _ROWS, 1)], box[:2], box[:-3:-1], unit, rows.std(0)
-        )
-        forms = failure.explain(FAILS, log.rows[~survived], seen)
+        box, some = np.sort(rows, axis=0), rows[:: max(len(rows) // _ROWS, 1)]
+        survived = failure.Survived(some, box[:2], box[:-3:-1], unit, rows.std(0))
+        forms = failure.explain(FAILS, failed, survived)
         judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
         columns = judge._columns(log.rows, log.starts)
         limits = [judge._searched(columns, log, plain=plain) for plain in (False, True)]
@@ -201,78 +198,58 @@ class Foresight(LearningJudge):
     def _searched(self, columns: Floats, log: Runs, *, plain: bool) -> Floats:
         """The limits that warn longest, of each rate."""
         m, of = log.rows.shape[1], len(columns) // len(_AHEAD)
-        asked = [
-            (v, when, sign)
-            for when in range(1 if plain else len(_AHEAD))
-            for v in range(m if plain else of)
-            for sign in ((1, -1) if v < m else (1,))
-        ]
-        shares = 1.0 - np.geomspace(0.3, max(3.0 / len(log.rows), 1e-5), _TRIED)
-        tried = [np.quantile(s * columns[v + of * w], shares) for v, w, s in asked]
+        above = product(range(1 if plain else len(_AHEAD)), range(m if plain else of), (1, -1))
+        asked = [(v, when, sign) for when, v, sign in above if v < m or sign > 0]
         # Rows are looked at by blocks, in which it is enough that one of them is beyond.
         size = max(self.horizon // _BLOCKS, 1)
-        lengths = np.diff(log.starts, append=len(log.rows))
-        inside = np.arange(len(log.rows)) - np.repeat(log.starts, lengths)
-        blocks = np.flatnonzero(inside % size == 0)
-        x = [np.maximum.reduceat(s * columns[v + of * w], blocks) for v, w, s in asked]
-        starts = np.searchsorted(blocks, log.starts)
-        horizon, hold, stays = (
-            max(one // size, 1) for one in (self.horizon, self.hold, self._stays)
-        )
-        best: dict[tuple[Any, ...], Floats] = {}
-        leads, none = np.zeros(len(log.starts)), np.empty(0, np.bool_)
-        days, n = len(log.rows) * self.dt / _DAY, max(log.failed.sum(), 1)
+        since = np.arange(len(log.rows)) - np.repeat(log.starts, log.lengths)
+        blocks = np.flatnonzero(since % size == 0)
+        shares = 1.0 - np.geomspace(0.3, max(3.0 / len(log.rows), 1e-5), _TRIED)
+        signed = [sign * columns[v + of * when] for v, when, sign in asked]
+        tried = [np.quantile(x, shares) for x in signed]
+        x = [np.maximum.reduceat(x, blocks) for x in signed]
+        spans = np.maximum(self._spans // size, 1)
+        starts, leads = np.searchsorted(blocks, log.starts), np.zeros(len(log.starts))
+        most = spans[0] * log.failed.sum(), len(log.rows) * self.dt / _DAY
+        known: dict[tuple[tuple[int, int], ...], Floats] = {}
 
-        def table(rule: tuple[Any, ...]) -> Floats:
+        def more(rule: tuple[tuple[int, int], ...]) -> Floats:
             """(limits, thresholds, 2) share that is warned, and false alarms a day, of one more."""
-            if rule not in best:
+            if rule not in known:
                 on, found = np.zeros(len(blocks), np.bool_), np.zeros((len(asked), _TRIED, 2))
-                for k, at in rule:
-                    on |= x[k] > at
+                for k, j in rule:
+                    on |= x[k] > tried[k][j]
                 for k in range(len(asked)):
-                    given = on, x[k], tried[k], starts, log.failed, horizon, hold, stays
-                    _try(*given, leads, none, found[k])
-                best[rule] = found / (horizon * n, days)
-            return best[rule]
+                    _try(on, x[k], tried[k], starts, log.failed, spans, leads, found[k])
+                known[rule] = found / most
+            return known[rule]
 
-        rules: dict[tuple[Any, ...], tuple[float, float]] = {}
+        rules: dict[tuple[tuple[int, int], ...], Floats] = {(): np.zeros(2)}
         for price in _PRICES:
-            rule, worth = tuple[Any, ...](), 0.0
+            rule, worth = tuple[tuple[int, int], ...](), 0.0
             while len(rule) < _MOST:
-                gain = table(rule) @ (1.0, -price)
-                k, j = divmod(int(gain.argmax()), _TRIED)
-                if gain[k, j] <= worth + _WORTH:
+                gain = more(rule) @ (1.0, -price)
+                best = divmod(int(gain.argmax()), _TRIED)
+                if gain[best] <= worth + _WORTH:
                     break
-                worth, told = gain[k, j], table(rule)[k, j]
-                rule = (*rule, (k, tried[k][j]))
-                for place in range(len(rule) - 1):  # those of before, once more
-                    others = rule[:place] + rule[place + 1 :]
-                    k = rule[place][0]
-                    gain = table(others)[k] @ (1.0, -price)
-                    j = int(gain.argmax())
-                    if gain[j] > worth:
-                        worth, told = gain[j], table(others)[k, j]
-                        rule = (*rule[:place], (k, tried[k][j]), *rule[place + 1 :])
-                rules[rule] = tuple(told)
-        first = table(())
-        rows = []
-        for rate, most in enumerate(RATES):
-            fit = [(warned, rule) for rule, (warned, false) in rules.items() if false <= most]
-            alone = np.where(first[..., 1] <= most, first[..., 0], 0.0)
-            k, j = divmod(int(alone.argmax()), _TRIED)
-            warned, rule = max([*fit, (alone[k, j], ((k, tried[k][j]),))], key=lambda one: one[0])
-            rows += [
-                (rate, plain, *asked[k], asked[k][2] * at)
-                for k, at in (rule if warned > 0.0 else ())
-            ]
+                worth, told, rule = gain[best], more(rule)[best], (*rule, best)
+                rules[rule] = told
+        rows, alone = [], more(())
+        for rate, false in enumerate(RATES):
+            fitting = np.where(alone[..., 1] <= false, alone[..., 0], -1.0)
+            best = divmod(int(fitting.argmax()), _TRIED)
+            rules[(best,)] = alone[best]
+            fit = [one for one in rules if rules[one][1] <= false]
+            best_rule = max(fit, key=lambda one: float(rules[one][0]))
+            rows += [(rate, plain, *asked[k], asked[k][2] * tried[k][j]) for k, j in best_rule]
         return np.array(rows, np.float64).reshape(-1, 6)
 
     # -- Telling --------------------------------------------------------------------------------
 
     @property
-    def _stays(self) -> int:
-        """How long an alarm stays on [rows]."""
-        return max(round(_STAYS * self.horizon), 1)
+    def _spans(self) -> Ints:
+        """The horizon, how long a limit has to be passed, and how long an alarm stays on [rows]."""
+        return np.array([self.horizon, self.hold, max(round(_STAYS * self.horizon), 1)])
 
     def _columns(self, rows: Floats, starts: Ints, memory: Floats | None = None) -> Floats:
         """(3 v, T) variables and nearness to forms: now, and as far ahead as `_AHEAD` says."""
@@ -301,10 +278,9 @@ class Foresight(LearningJudge):
         """What came of the alarm for one of `RATES`, and when it was on (T,)."""
         limits = self.of_rate(rate, plain=plain)
         on = np.asarray(self._passed(self._columns(log.rows, log.starts), limits).any(axis=0))
-        rows = self.hold if hold is None else 1 + round(hold / self.dt)
-        leads, nothing = np.zeros(len(log.starts)), np.zeros(len(on))
-        given = on, nothing, 1.0, log.starts, log.failed, self.horizon, rows
-        false = _tally(*given, self._stays, leads, on)
+        spans, leads = self._spans, np.zeros(len(log.starts))
+        spans[1] = self.hold if hold is None else 1 + round(hold / self.dt)
+        false = _tally(on, np.zeros(len(on)), 1.0, log.starts, log.failed, spans, leads, on)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
         lead = float(leads.sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
@@ -386,7 +362,7 @@ class Foresight(LearningJudge):
         passed = self._passed(columns, self._limits)[:, 0]
         above = np.bincount(self._limits[passed, _RATE].astype(int), minlength=len(up)) > 0
         up, down = np.where(above, up + 1, 0), np.where(above, 0, down + 1)
-        on = (up >= self.hold) | ((on > 0) & (down < self._stays))
+        on = (up >= self.hold) | ((on > 0) & (down < self._spans[2]))
         return passed, (memory, up, down, on)
 
     def search(
@@ -507,18 +483,15 @@ def _tally(
     at: float,
     starts: Ints,
     failed: Flags,
-    horizon: int,
-    hold: int,
-    stays: int,
+    spans: Ints,
     leads: Floats,
     on: Flags,
 ) -> int:
     """False alarms, while ``above`` or x is beyond a threshold; leads (E,) and on (T,) are set."""
-    false = 0
+    false, horizon, hold, stays = 0, spans[0], spans[1], spans[2]
     for e in range(len(starts)):
         end = starts[e + 1] if e + 1 < len(starts) else len(x)
         up, down, begun = 0, 0, -1
-        leads[e] = 0.0
         for t in range(starts[e], end):
             if above[t] or x[t] > at:
                 up, down = up + 1, 0
@@ -531,13 +504,12 @@ def _tally(
                     begun = -1
             if len(on):
                 on[t] = begun >= 0
-        if begun >= 0:
-            lasted = end - 1 - begun
-            if failed[e]:
-                leads[e] = min(lasted, horizon)
-                false += (max(lasted - horizon, 0) + horizon - 1) // horizon
-            else:
-                false += lasted // horizon + 1
+        lasted = end - 1 - begun if begun >= 0 else 0
+        leads[e] = min(lasted, horizon) if failed[e] else 0.0
+        if failed[e]:
+            false += (max(lasted - horizon, 0) + horizon - 1) // horizon
+        elif begun >= 0:
+            false += lasted // horizon + 1
     return false
 
 
@@ -548,17 +520,11 @@ def _try(
     tried: Floats,
     starts: Ints,
     failed: Flags,
-    horizon: int,
-    hold: int,
-    stays: int,
+    spans: Ints,
     leads: Floats,
-    none: Flags,
     found: Floats,
 ) -> None:
     """(n, 2) rows warned, and false alarms, with each threshold."""
     for k in range(len(tried)):
-        false = _tally(above, x, tried[k], starts, failed, horizon, hold, stays, leads, none)
-        warned = 0.0
-        for e in range(len(leads)):
-            warned += leads[e]
-        found[k, 0], found[k, 1] = warned, false
+        found[k, 1] = _tally(above, x, tried[k], starts, failed, spans, leads, above[:0])
+        found[k, 0] = leads.sum()
