@@ -209,6 +209,8 @@ def experience(
     sizes = 2.0 * known.radii[:, None] * known.survived.std(0)[pair]
     for centre, (wide, high) in zip(known.centres[:, pair], sizes, strict=True):
         ax.add_patch(Ellipse(centre, wide, high, fill=False, edgecolor=red, zorder=3.0))
+    centers = np.empty((0, 2)) if guard.machine is None else guard.machine.centers[:, pair]
+    ax.update_datalim(centers)
     ax.autoscale_view()
     limits = ax.axis()
     x, y = np.meshgrid(np.linspace(*limits[:2], _GRID), np.linspace(*limits[2:], _GRID))
@@ -219,8 +221,7 @@ def experience(
         form = forms(here, z)[0].max(0).reshape(x.shape)
         ax.contourf(x, y, form, [0.0, np.inf], colors=[red], alpha=0.15, zorder=0.5)
         ax.contour(x, y, form, [0.0], colors=[red], linewidths=1.2, zorder=2.0)
-    if guard.machine is not None:
-        draw_centers(ax, guard.machine.centers[:, pair], (), 10.0)
+    draw_centers(ax, centers, (), 10.0)
     ax.axis(limits)
     ring: Look = {"marker": "o", "fillstyle": "none"}
     looks: dict[str, Look] = {

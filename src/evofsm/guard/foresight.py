@@ -295,10 +295,16 @@ class Foresight(LearningJudge):
         names, m = self.labels.names, len(self.labels.names)
         if v < m:
             return names[v], f"{'above' if sign > 0.0 else 'below'} {at:.4g}{soon}"
-        row = self.forms[v - m]
-        there = region(names, row[failure.I : failure.HELD].tolist(), int(row[failure.HELD]))
-        beyond = "beyond" if at > 0.0 else "within"
-        return "it", f"{beyond} {abs(at):.2g} typical steps of where it fails{soon}: {there}"
+        row = self.forms[v - m].copy()
+        is_flat = not row[failure.P : failure.HELD].any()
+        if is_flat:  # then a limit of nearness is one of the form
+            row[failure.C] -= at * np.hypot(row[failure.B], row[failure.D])
+        there = region(names, row[failure.I : failure.HELD].tolist(), 0).rpartition(" (")[0]
+        if is_flat:
+            what, _, beyond = there.removeprefix("where ").partition(" is ")
+            return what, f"{beyond}{soon}"
+        how = "beyond" if at > 0.0 else "within"
+        return "it", f"{how} {abs(at):.2g} typical steps of where it fails{soon}: {there}"
 
     def passed(self, rows: Floats) -> Floats:
         """(n, 6) the limits that the last row of an episode so far, (T, m), passes."""
@@ -311,7 +317,7 @@ class Foresight(LearningJudge):
         mine, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
         if len(mine):
             v, (name, there) = int(mine[0, _OF]), self._words(mine[0])
-            why = f"{name} {z[v]:.4g}: {there}" if v < len(z) else f"{name} is {there}"
+            why = f"{name} {z[v]:.4g}: {there}" if v < len(z) else f"{name} {there}"
         within = span(self.horizon * self.dt)
         return f"{why}; after {right:.0f} of {alarms:.0f} such alarms it failed within {within}"
 

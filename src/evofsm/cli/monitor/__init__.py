@@ -189,7 +189,7 @@ def monitor(
                     no_leader,
                 )
                 reading = reading_of(*asked, hold, skip_bad, vehicle_length)
-                chunks, interval = _episodes(file, reading)
+                chunks, interval = _episodes(file, reading, dated=alone)
             if is_log and alone:
                 asked_of = reading.columns.observe.names, horizon, persist, tolerance
                 _foreseen(file, list(chunks), used, *asked_of, plot, as_json=as_json)
@@ -240,8 +240,10 @@ def monitor(
     return None
 
 
-def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
-    """The episodes of a log, and the time between two rows [s]."""
+def _episodes(
+    file: Path, reading: Reading, *, dated: bool = False
+) -> tuple[Iterator[Chunk], float]:
+    """The episodes of a log, with dates where they are wanted, and the time of a step [s]."""
     from evofsm.cli.learning import warnings_of
     from evofsm.io import episodes_of, read_traces
     from evofsm.io.logs import Noted
@@ -254,7 +256,8 @@ def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
         raise ValueError(f"{file}: no episode has two rows")
 
     def all_of_them() -> Iterator[Chunk]:
-        yield from chain([first], episodes)
+        for one in chain([first], episodes):
+            yield one._replace(times=one.times + noted.began) if dated else one
         for warning in warnings_of(noted, columns):
             warn(f"warning: {warning}")
 
