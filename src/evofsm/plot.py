@@ -209,6 +209,8 @@ def experience(
     sizes = 2.0 * known.radii[:, None] * known.survived.std(0)[pair]
     for centre, (wide, high) in zip(known.centres[:, pair], sizes, strict=True):
         ax.add_patch(Ellipse(centre, wide, high, fill=False, edgecolor=red, zorder=3.0))
+    centers = np.empty((0, 2)) if guard.machine is None else guard.machine.centers[:, pair]
+    ax.update_datalim(centers)
     ax.autoscale_view()
     limits = ax.axis()
     x, y = np.meshgrid(np.linspace(*limits[:2], _GRID), np.linspace(*limits[2:], _GRID))
@@ -219,8 +221,7 @@ def experience(
         form = forms(here, z)[0].max(0).reshape(x.shape)
         ax.contourf(x, y, form, [0.0, np.inf], colors=[red], alpha=0.15, zorder=0.5)
         ax.contour(x, y, form, [0.0], colors=[red], linewidths=1.2, zorder=2.0)
-    if guard.machine is not None:
-        draw_centers(ax, guard.machine.centers[:, pair], (), 10.0)
+    draw_centers(ax, centers, (), 10.0)
     ax.axis(limits)
     ring: Look = {"marker": "o", "fillstyle": "none"}
     looks: dict[str, Look] = {
@@ -352,7 +353,7 @@ def history(
     model: FSMModel | None = None,
     place: tuple[int, int] = (0, 1),
 ) -> list[Axes]:
-    """What was seen over time, above the risk, with alarms as bands and failures as crosses.
+    """What was seen over time, above the risk; bands are alarms, crosses failures.
 
     Parameters
     ----------
@@ -374,7 +375,8 @@ def history(
     >>> from matplotlib.figure import Figure
     >>> from evofsm import plot
     >>> figure = Figure()
-    >>> panels = plot.history(figure, [0, 1, 2], [[5], [6], [7]], ["heat"], [0, 0, 0.9], [0, 0, 1], 0.5)
+    >>> seen = [0, 1, 2], [[5], [6], [7]], ["heat"]
+    >>> panels = plot.history(figure, *seen, [0, 0, 0.9], [False, False, True], 0.5)
     >>> [panel.get_ylabel() for panel in panels]
     ['heat', 'risk']
     """
@@ -393,8 +395,8 @@ def history(
     edges = np.flatnonzero(np.diff(said > tolerance, prepend=False, append=False))
     for ax in panels:
         for first, end in edges.reshape(-1, 2):
-            band: Look = {"color": COLORS["follower"], "alpha": 0.25, "linewidth": 1.0}
-            ax.axvspan(x[first], x[end - 1], **band)
+            look: Look = {"color": COLORS["follower"], "alpha": 0.25, "linewidth": 1.0}
+            ax.axvspan(x[first], x[end - 1], **look)
         for cross in crosses:
             ax.axvline(cross, color=COLORS["dead end"], linewidth=0.8, linestyle="--")
         ax.tick_params(labelbottom=ax is panels[-1])
@@ -408,9 +410,13 @@ def history(
         label_states(panels[-2].yaxis, model.n_states)
         panels[-2].set_ylabel("state")
     panels[-1].step(x, np.where(blank, np.nan, said), where="post", color=COLORS["follower"])
-    panels[-1].axhline(tolerance, color=ink(), linewidth=0.8, linestyle=":")
-    look: Look = {"linestyle": "none", "marker": "X", "color": COLORS["dead end"], "clip_on": False}
-    panels[-1].plot(crosses, np.ones(len(crosses)), **look)
+    look = {"color": ink(), "linewidth": 0.8, "linestyle": ":", "label": "tolerance"}
+    panels[-1].axhline(tolerance, **look)
+    look = {"linestyle": "none", "marker": "X", "color": COLORS["dead end"], "clip_on": False}
+    panels[-1].plot(crosses, np.ones(len(crosses)), markersize=4.5, label="failure", **look)
+    alarm: Look = {"marker": "s", "linestyle": "none", "alpha": 0.25, "color": COLORS["follower"]}
+    panels[-1].plot([], [], label="alarm", **alarm)
+    _explain(panels[-1])
     panels[-1].set(ylim=(-0.03, 1.03), ylabel="risk", xlabel=f"time [{unit}]")
     return panels
 

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 RATE = 0.3
 #: The share of a log that is learnt from, where the rest is to judge it.
 LEARNT = 0.6
-# Hold times that are compared [horizons]; alarms that are listed; times from here on are dates [s].
-_HOLDS, _LISTED, _DATES = (0.0, 1 / 10), 12, 1e8
+# Alarms that are listed; times from here on are dates [s].
+_LISTED, _DATES = 12, 1e8
 
 
 class Told(NamedTuple):
@@ -73,7 +73,13 @@ def guard_where_nobody_acts(
     told, dt = told_by(chunks), float(chunks[0].dt)
     median = float(np.median([len(one.times) for one in chunks])) * dt
     ahead = horizon or max(median / 20.0, 10.0 * dt)
-    named = {"names": names, "units": units, "horizon": ahead, "hold": persist, "dt": dt}
+    named: dict[str, Any] = {
+        "names": names,
+        "units": units,
+        "horizon": ahead,
+        "hold": persist,
+        "dt": dt,
+    }
     judge = Foresight.learn_log([one.observations for one in chunks], told.runs.failed, **named)
     accepted = judge.tolerance_of(RATE) if tolerance is None else tolerance
     reviser = ActionReviser(judge, Choices(1), tolerance=accepted, mode=Mode.SHADOW)
@@ -87,15 +93,14 @@ def document(guard: Guard, told: Told) -> dict[str, Any]:
     assert isinstance(reviser, ActionReviser)
     chosen, rows = judge.rate_of(reviser.tolerance), []
     for rate, stated in enumerate(RATES):
-        for hold in sorted(
-            {judge.hold * judge.dt, *(h * judge.horizon * judge.dt for h in _HOLDS)}
-        ):
+        for rows_held in sorted({judge.hold, max(judge.hold, judge.horizon // 10)}):
+            hold = (rows_held - 1) * judge.dt
             both = [judge.tally(told.runs, rate, plain=p, hold=hold)[0] for p in (None, True)]
             rows.append(
                 {
                     "stated": stated,
                     "hold": hold,
-                    "is_own": rate == chosen and hold == judge.hold * judge.dt,
+                    "is_own": rate == chosen and rows_held == judge.hold,
                     **dict(zip(("learnt", "plain"), (_told(one) for one in both), strict=True)),
                 }
             )
@@ -194,8 +199,8 @@ def tables_of(found: dict[str, Any], told: Told, title: str) -> Iterator[Rendera
             )
             for one in latest
         ]
-        header = ("episode", "time", "lasts", "failed", "why")
-        yield table(f"\nThe last of {len(found['listed'])} alarms", header, cells, left=(0, 4))
+        title = f"\nThe last of {len(found['listed'])} alarms"
+        yield table(title, ("episode", "time", "lasts", "failed", "why"), cells, left=(0, 4))
 
 
 def _cells(one: dict[str, Any]) -> tuple[str, ...]:

@@ -183,9 +183,14 @@ def learn(
             if refused := refusing(share):
                 warn(f"warning: in the later half of the log the guard {refused}")
         else:
-            given = {"horizon": horizon, "persist": persist, "machine": learning.machine}
-            given |= {"tolerance": None if tolerance == TOLERANCE else tolerance}
-            taught = guard_where_nobody_acts(list(episodes_of(rows)), *named, **given)
+            taught = guard_where_nobody_acts(
+                [one for one in episodes_of(rows) if len(one.times) > 1],
+                *named,
+                horizon=horizon,
+                persist=persist,
+                tolerance=None if tolerance == TOLERANCE else tolerance,
+                machine=learning.machine,
+            )
         taught.save(guard, provenance)
     if as_json:
         told = {"files": files, "saved": out, "guard": guard, **_document(learning, provenance)}
@@ -389,8 +394,9 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     takes = f"evofsm monitor --guard {path} takes rows of {keys}{also}."
     yield f"The guard was saved to {path}. {takes}"
     if isinstance(guard.judge, Foresight):
-        yield f"It alarms where more than {guard.reviser.tolerance:.0%} of such alarms were right."
-        yield f"Held out: {guard.judge.told_by_experience}."
+        tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
+        yield f"It alarms where more than {tolerance:.0%} of such alarms were right, held out."
+        yield f"What it learnt: {guard.judge.told_by_experience}."
         return
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."

@@ -15,6 +15,7 @@ that were held out of it, a third of the log at a time.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -69,10 +70,14 @@ class Runs(NamedTuple):
     starts: Ints  #: (E,) at which row each begins
     failed: Flags  #: (E,) which of them ended in failure
 
+    @property
+    def lengths(self) -> Ints:
+        """(E,) rows of each."""
+        return np.diff(self.starts, append=len(self.rows))
+
     def part(self, which: Flags) -> Runs:
         """Some of the episodes."""
-        lengths = np.diff(self.starts, append=len(self.rows))
-        rows, lengths = self.rows[np.repeat(which, lengths)], lengths[which]
+        rows, lengths = self.rows[np.repeat(which, self.lengths)], self.lengths[which]
         return Runs(rows, np.cumsum(lengths) - lengths, self.failed[which])
 
 
@@ -137,7 +142,7 @@ class Foresight(LearningJudge):
     def learn_log(
         cls,
         episodes: Sequence[ArrayLike],
-        failed: Sequence[bool],
+        failed: ArrayLike,
         *,
         dt: float,
         horizon: float,
@@ -150,14 +155,13 @@ class Foresight(LearningJudge):
         ``horizon`` and ``hold`` are in seconds: how long before a failure an alarm is true, and how
         long a limit has to be passed.
         """
-        ahead, held = max(round(positive("horizon", horizon) / dt), 1), max(round(hold / dt), 1)
+        ahead, held = max(round(positive("horizon", horizon) / dt), 1), 1 + round(hold / dt)
         log = runs_of(episodes, failed)
         names = names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
         if not log.failed.any():
             raise ValueError("no episode failed, so there is nothing to foresee")
-        fresh = cls(
-            dt, ahead, held, np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 3))
-        )
+        nothing = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 3))
+        fresh = cls(dt, ahead, held, *nothing)
         number = np.arange(len(log.failed)) * _PARTS // len(log.failed)
         tallies = np.zeros((2, len(RATES), 3))  # of both kinds: warned, foreseen, false
         for k in range(_PARTS):
@@ -170,28 +174,21 @@ class Foresight(LearningJudge):
         judge = fresh._fitted(log)
         kind = (tallies[1, :, 0] >= _BETTER * tallies[0, :, 0]).astype(int)
         _, right, false = tallies[kind, np.arange(len(RATES))].T
-        chance = log.failed.sum() * ahead / len(log.rows)
-        for k in range(len(RATES)):  # no better than an alarm at any time
-            if (
-                not right[k]
-                or wilson_bounds(right[k] / (right + false)[k], (right + false)[k])[0] < chance
-            ):
+        alarms, chance = right + false, log.failed.sum() * ahead / len(log.rows)
+        for k in range(len(RATES)):  # whether it is better than an alarm at any time
+            if not (right[k] and wilson_bounds(right[k] / alarms[k], alarms[k])[0] > chance):
                 kind[k] = _NONE
-        told = np.column_stack([right + false, right, kind])
+        told = np.column_stack([alarms, right, kind])
         return cls(dt, ahead, held, judge.forms, judge.limits, told, names, units)
 
     def _fitted(self, log: Runs) -> Self:
         """With forms and limits of both kinds, for all rates."""
         last = np.append(log.starts[1:], len(log.rows)) - 1
-        survived = np.ones(len(log.rows), np.bool_)
-        survived[last[log.failed]] = False
-        rows = log.rows[survived]
+        rows, failed = np.delete(log.rows, last[log.failed], 0), log.rows[last[log.failed]]
         unit = np.median(np.abs(np.diff(log.rows, axis=0)), axis=0) + 1e-12
-        box = np.sort(rows, axis=0)
-        seen = failure.Survived(
-            rows[:: max(len(rows) // _ROWS, 1)], box[:2], box[:-3:-1], unit, rows.std(0)
-        )
-        forms = failure.explain(FAILS, log.rows[~survived], seen)
+        box, some = np.sort(rows, axis=0), rows[:: max(len(rows) // _ROWS, 1)]
+        survived = failure.Survived(some, box[:2], box[:-3:-1], unit, rows.std(0))
+        forms = failure.explain(FAILS, failed, survived)
         judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
         columns = judge._columns(log.rows, log.starts)
         limits = [judge._searched(columns, log, plain=plain) for plain in (False, True)]
@@ -201,78 +198,58 @@ class Foresight(LearningJudge):
     def _searched(self, columns: Floats, log: Runs, *, plain: bool) -> Floats:
         """The limits that warn longest, of each rate."""
         m, of = log.rows.shape[1], len(columns) // len(_AHEAD)
-        asked = [
-            (v, when, sign)
-            for when in range(1 if plain else len(_AHEAD))
-            for v in range(m if plain else of)
-            for sign in ((1, -1) if v < m else (1,))
-        ]
-        shares = 1.0 - np.geomspace(0.3, max(3.0 / len(log.rows), 1e-5), _TRIED)
-        tried = [np.quantile(s * columns[v + of * w], shares) for v, w, s in asked]
+        above = product(range(1 if plain else len(_AHEAD)), range(m if plain else of), (1, -1))
+        asked = [(v, when, sign) for when, v, sign in above if v < m or sign > 0]
         # Rows are looked at by blocks, in which it is enough that one of them is beyond.
         size = max(self.horizon // _BLOCKS, 1)
-        lengths = np.diff(log.starts, append=len(log.rows))
-        inside = np.arange(len(log.rows)) - np.repeat(log.starts, lengths)
-        blocks = np.flatnonzero(inside % size == 0)
-        x = [np.maximum.reduceat(s * columns[v + of * w], blocks) for v, w, s in asked]
-        starts = np.searchsorted(blocks, log.starts)
-        horizon, hold, stays = (
-            max(one // size, 1) for one in (self.horizon, self.hold, self._stays)
-        )
-        best: dict[tuple[Any, ...], Floats] = {}
-        leads, none = np.zeros(len(log.starts)), np.empty(0, np.bool_)
-        days, n = len(log.rows) * self.dt / _DAY, max(log.failed.sum(), 1)
+        since = np.arange(len(log.rows)) - np.repeat(log.starts, log.lengths)
+        blocks = np.flatnonzero(since % size == 0)
+        shares = 1.0 - np.geomspace(0.3, max(3.0 / len(log.rows), 1e-5), _TRIED)
+        signed = [sign * columns[v + of * when] for v, when, sign in asked]
+        tried = [np.quantile(x, shares) for x in signed]
+        x = [np.maximum.reduceat(x, blocks) for x in signed]
+        spans = np.maximum(self._spans // size, 1)
+        starts, leads = np.searchsorted(blocks, log.starts), np.zeros(len(log.starts))
+        most = spans[0] * log.failed.sum(), len(log.rows) * self.dt / _DAY
+        known: dict[tuple[tuple[int, int], ...], Floats] = {}
 
-        def table(rule: tuple[Any, ...]) -> Floats:
+        def more(rule: tuple[tuple[int, int], ...]) -> Floats:
             """(limits, thresholds, 2) share that is warned, and false alarms a day, of one more."""
-            if rule not in best:
+            if rule not in known:
                 on, found = np.zeros(len(blocks), np.bool_), np.zeros((len(asked), _TRIED, 2))
-                for k, at in rule:
-                    on |= x[k] > at
+                for k, j in rule:
+                    on |= x[k] > tried[k][j]
                 for k in range(len(asked)):
-                    given = on, x[k], tried[k], starts, log.failed, horizon, hold, stays
-                    _try(*given, leads, none, found[k])
-                best[rule] = found / (horizon * n, days)
-            return best[rule]
+                    _try(on, x[k], tried[k], starts, log.failed, spans, leads, found[k])
+                known[rule] = found / most
+            return known[rule]
 
-        rules: dict[tuple[Any, ...], tuple[float, float]] = {}
+        rules: dict[tuple[tuple[int, int], ...], Floats] = {(): np.zeros(2)}
         for price in _PRICES:
-            rule, worth = tuple[Any, ...](), 0.0
+            rule, worth = tuple[tuple[int, int], ...](), 0.0
             while len(rule) < _MOST:
-                gain = table(rule) @ (1.0, -price)
-                k, j = divmod(int(gain.argmax()), _TRIED)
-                if gain[k, j] <= worth + _WORTH:
+                gain = more(rule) @ (1.0, -price)
+                best = divmod(int(gain.argmax()), _TRIED)
+                if gain[best] <= worth + _WORTH:
                     break
-                worth, told = gain[k, j], table(rule)[k, j]
-                rule = (*rule, (k, tried[k][j]))
-                for place in range(len(rule) - 1):  # those of before, once more
-                    others = rule[:place] + rule[place + 1 :]
-                    k = rule[place][0]
-                    gain = table(others)[k] @ (1.0, -price)
-                    j = int(gain.argmax())
-                    if gain[j] > worth:
-                        worth, told = gain[j], table(others)[k, j]
-                        rule = (*rule[:place], (k, tried[k][j]), *rule[place + 1 :])
-                rules[rule] = tuple(told)
-        first = table(())
-        rows = []
-        for rate, most in enumerate(RATES):
-            fit = [(warned, rule) for rule, (warned, false) in rules.items() if false <= most]
-            alone = np.where(first[..., 1] <= most, first[..., 0], 0.0)
-            k, j = divmod(int(alone.argmax()), _TRIED)
-            warned, rule = max([*fit, (alone[k, j], ((k, tried[k][j]),))], key=lambda one: one[0])
-            rows += [
-                (rate, plain, *asked[k], asked[k][2] * at)
-                for k, at in (rule if warned > 0.0 else ())
-            ]
+                worth, told, rule = gain[best], more(rule)[best], (*rule, best)
+                rules[rule] = told
+        rows, alone = [], more(())
+        for rate, false in enumerate(RATES):
+            fitting = np.where(alone[..., 1] <= false, alone[..., 0], -1.0)
+            best = divmod(int(fitting.argmax()), _TRIED)
+            rules[(best,)] = alone[best]
+            fit = [one for one in rules if rules[one][1] <= false]
+            best_rule = max(fit, key=lambda one: float(rules[one][0]))
+            rows += [(rate, plain, *asked[k], asked[k][2] * tried[k][j]) for k, j in best_rule]
         return np.array(rows, np.float64).reshape(-1, 6)
 
     # -- Telling --------------------------------------------------------------------------------
 
     @property
-    def _stays(self) -> int:
-        """How long an alarm stays on [rows]."""
-        return max(round(_STAYS * self.horizon), 1)
+    def _spans(self) -> Ints:
+        """The horizon, how long a limit has to be passed, and how long an alarm stays on [rows]."""
+        return np.array([self.horizon, self.hold, max(round(_STAYS * self.horizon), 1)])
 
     def _columns(self, rows: Floats, starts: Ints, memory: Floats | None = None) -> Floats:
         """(3 v, T) variables and nearness to forms: now, and as far ahead as `_AHEAD` says."""
@@ -280,7 +257,8 @@ class Foresight(LearningJudge):
         memory = np.full((2, len(x)), np.nan) if memory is None else memory
         keeps, found = np.exp(-1.0 / (_SMOOTHED * self.horizon)), np.empty((len(_AHEAD), *x.shape))
         _look_ahead(x, starts, keeps, np.array(_AHEAD) * self.horizon, memory, found)
-        return found.reshape(-1, len(rows))
+        columns: Floats = found.reshape(-1, len(rows))
+        return columns
 
     def _passed(self, columns: Floats, limits: Floats) -> Flags:
         """(n, T) which limits are passed."""
@@ -291,21 +269,18 @@ class Foresight(LearningJudge):
     def of_rate(self, rate: int, *, plain: bool | None = None) -> Floats:
         """The limits of an alarm, by default of the kind that did better on what was held out."""
         kind = self.held_out[rate, 2] if plain is None else _PLAIN if plain else _LEARNT
-        return self.limits[(self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)]
+        which = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
+        return np.asarray(self.limits[which])
 
     def tally(
         self, log: Runs, rate: int, *, plain: bool | None = None, hold: float | None = None
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,)."""
-        on = self._passed(self._columns(log.rows, log.starts), self.of_rate(rate, plain=plain)).any(
-            0
-        )
-        rows = self.hold if hold is None else max(round(hold / self.dt), 1)
-        leads, given = (
-            np.zeros(len(log.starts)),
-            (np.zeros(len(on)), 1.0, log.starts, log.failed),
-        )
-        false = _tally(on, *given, self.horizon, rows, self._stays, leads, on)
+        limits = self.of_rate(rate, plain=plain)
+        on = np.asarray(self._passed(self._columns(log.rows, log.starts), limits).any(axis=0))
+        spans, leads = self._spans, np.zeros(len(log.starts))
+        spans[1] = self.hold if hold is None else 1 + round(hold / self.dt)
+        false = _tally(on, np.zeros(len(on)), 1.0, log.starts, log.failed, spans, leads, on)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
         lead = float(leads.sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
@@ -320,10 +295,16 @@ class Foresight(LearningJudge):
         names, m = self.labels.names, len(self.labels.names)
         if v < m:
             return names[v], f"{'above' if sign > 0.0 else 'below'} {at:.4g}{soon}"
-        row = self.forms[v - m]
-        there = region(names, row[failure.I : failure.HELD].tolist(), int(row[failure.HELD]))
-        beyond = "beyond" if at > 0.0 else "within"
-        return "it", f"{beyond} {abs(at):.2g} typical steps of where it fails{soon}: {there}"
+        row = self.forms[v - m].copy()
+        is_flat = not row[failure.P : failure.HELD].any()
+        if is_flat:  # then a limit of nearness is one of the form
+            row[failure.C] -= at * np.hypot(row[failure.B], row[failure.D])
+        there = region(names, row[failure.I : failure.HELD].tolist(), 0).rpartition(" (")[0]
+        if is_flat:
+            what, _, beyond = there.removeprefix("where ").partition(" is ")
+            return what, f"{beyond}{soon}"
+        how = "beyond" if at > 0.0 else "within"
+        return "it", f"{how} {abs(at):.2g} typical steps of where it fails{soon}: {there}"
 
     def passed(self, rows: Floats) -> Floats:
         """(n, 6) the limits that the last row of an episode so far, (T, m), passes."""
@@ -336,7 +317,7 @@ class Foresight(LearningJudge):
         mine, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
         if len(mine):
             v, (name, there) = int(mine[0, _OF]), self._words(mine[0])
-            why = f"{name} {z[v]:.4g}: {there}" if v < len(z) else f"{name} is {there}"
+            why = f"{name} {z[v]:.4g}: {there}" if v < len(z) else f"{name} {there}"
         within = span(self.horizon * self.dt)
         return f"{why}; after {right:.0f} of {alarms:.0f} such alarms it failed within {within}"
 
@@ -387,7 +368,7 @@ class Foresight(LearningJudge):
         passed = self._passed(columns, self._limits)[:, 0]
         above = np.bincount(self._limits[passed, _RATE].astype(int), minlength=len(up)) > 0
         up, down = np.where(above, up + 1, 0), np.where(above, 0, down + 1)
-        on = (up >= self.hold) | ((on > 0) & (down < self._stays))
+        on = (up >= self.hold) | ((on > 0) & (down < self._spans[2]))
         return passed, (memory, up, down, on)
 
     def search(
@@ -408,13 +389,15 @@ class Foresight(LearningJudge):
             risk = float(self.shares[rate])
             reason = self.reason(rate, situation.observation, self._limits[passed])
         low, high = wilson_bounds(risk, evidence) if risk else (0.0, 1.0)
-        judged = Judgement(*np.array([[risk], [low], [high], [np.nan]]), evidence=evidence)
+        risks, lows, highs, none = np.array([[risk], [low], [high], [np.nan]])
+        judged = Judgement(risks, lows, highs, none, evidence)
         return Search(np.array([float(wanted)]), judged, 0, reason)
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
         """The risk, whatever would be done."""
         found = self.search(situation, 0.0, tolerance=0.0, revising=False).judged
-        return Judgement(*(np.repeat(one, np.size(actions)) for one in found[:4]), found.evidence)
+        every = [np.repeat(one, np.size(actions)) for one in found[:4]]
+        return Judgement(every[0], every[1], every[2], every[3], found.evidence)
 
     def why(self, judged: Judgement, /) -> str:
         """Why it is dangerous."""
@@ -450,10 +433,11 @@ class Foresight(LearningJudge):
         """Read what was learnt; a ValueError if the file is damaged."""
         settings, arrays = store.read(path, KIND)
         with store.explained(path):
-            return cls(**settings, **arrays)
+            known: dict[str, Any] = {**settings, **arrays}
+            return cls(**known)
 
 
-def runs_of(episodes: Sequence[ArrayLike], failed: Sequence[bool]) -> Runs:
+def runs_of(episodes: Sequence[ArrayLike], failed: ArrayLike) -> Runs:
     """Episodes one after the other, (T,) or (T, m) each."""
     rows = [np.asarray(one, np.float64).reshape(len(np.asarray(one)), -1) for one in episodes]
     lengths = np.array([len(one) for one in rows])
@@ -505,18 +489,15 @@ def _tally(
     at: float,
     starts: Ints,
     failed: Flags,
-    horizon: int,
-    hold: int,
-    stays: int,
+    spans: Ints,
     leads: Floats,
     on: Flags,
 ) -> int:
     """False alarms, while ``above`` or x is beyond a threshold; leads (E,) and on (T,) are set."""
-    false = 0
+    false, horizon, hold, stays = 0, spans[0], spans[1], spans[2]
     for e in range(len(starts)):
         end = starts[e + 1] if e + 1 < len(starts) else len(x)
         up, down, begun = 0, 0, -1
-        leads[e] = 0.0
         for t in range(starts[e], end):
             if above[t] or x[t] > at:
                 up, down = up + 1, 0
@@ -529,13 +510,12 @@ def _tally(
                     begun = -1
             if len(on):
                 on[t] = begun >= 0
-        if begun >= 0:
-            lasted = end - 1 - begun
-            if failed[e]:
-                leads[e] = min(lasted, horizon)
-                false += (max(lasted - horizon, 0) + horizon - 1) // horizon
-            else:
-                false += lasted // horizon + 1
+        lasted = end - 1 - begun if begun >= 0 else 0
+        leads[e] = min(lasted, horizon) if failed[e] else 0.0
+        if failed[e]:
+            false += (max(lasted - horizon, 0) + horizon - 1) // horizon
+        elif begun >= 0:
+            false += lasted // horizon + 1
     return false
 
 
@@ -546,17 +526,11 @@ def _try(
     tried: Floats,
     starts: Ints,
     failed: Flags,
-    horizon: int,
-    hold: int,
-    stays: int,
+    spans: Ints,
     leads: Floats,
-    none: Flags,
     found: Floats,
 ) -> None:
     """(n, 2) rows warned, and false alarms, with each threshold."""
     for k in range(len(tried)):
-        false = _tally(above, x, tried[k], starts, failed, horizon, hold, stays, leads, none)
-        warned = 0.0
-        for e in range(len(leads)):
-            warned += leads[e]
-        found[k, 0], found[k, 1] = warned, false
+        found[k, 1] = _tally(above, x, tried[k], starts, failed, spans, leads, above[:0])
+        found[k, 0] = leads.sum()

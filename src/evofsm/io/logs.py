@@ -133,6 +133,7 @@ class Noted:
     crossed: int = 0  #: transitions that nobody knows, across holes within an episode
     after_failure: int = 0  #: rows left out because the failure before them still held
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
+    began: float = 0.0  #: time 0, where that is a date, since 1970 [s]
     failing: int = 0  #: rows that meet what tells of failures
     #: By column compared for that, what was there: the ends of its range in SI, or texts.
     compared: dict[str, list[Any]] = field(default_factory=dict)
@@ -919,6 +920,7 @@ class _Reader:
             return times
         if np.isnan(self._first_date):
             self._first_date = times[np.argmin(np.isnan(times))]
+            self._noted.began = float(self._first_date) * _MICROSECOND
         return (times - self._first_date) * _MICROSECOND
 
     def _compare_dt(self, piece: Piece) -> None:

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.options import (
     BRAKES,
@@ -188,7 +188,7 @@ def monitor(
                 asked = observe, "" if alone else action, time, episode, dt, failed, unit, topics
                 more = no_leader, hold, skip_bad, vehicle_length, where, resample, hole
                 reading = reading_of(*asked, *more)
-                chunks, interval = _episodes(file, reading)
+                chunks, interval = _episodes(file, reading, dated=alone)
                 if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
                     what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
                     warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
@@ -242,8 +242,10 @@ def monitor(
     return None
 
 
-def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
-    """The episodes of a log, and the time between two rows [s]."""
+def _episodes(
+    file: Path, reading: Reading, *, dated: bool = False
+) -> tuple[Iterator[Chunk], float]:
+    """The episodes of a log, with dates where they are wanted, and the time of a step [s]."""
     from evofsm.cli.learning import warnings_of
     from evofsm.io import episodes_of, read_traces
     from evofsm.io.logs import Noted
@@ -256,7 +258,8 @@ def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
         raise ValueError(f"{file}: no episode has two rows")
 
     def all_of_them() -> Iterator[Chunk]:
-        yield from chain([first], episodes)
+        for one in chain([first], episodes):
+            yield one._replace(times=one.times + noted.began) if dated else one
         for warning in warnings_of(noted, columns):
             warn(f"warning: {warning}")
 
@@ -265,7 +268,7 @@ def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
 
 def _foreseen(
     file: Path,
-    chunks: list[Chunk],
+    chunks: Sequence[Chunk],
     guard: Guard | None,
     names: Sequence[str],
     horizon: float | None,
@@ -275,8 +278,7 @@ def _foreseen(
     *,
     as_json: bool,
 ) -> None:
-    """Say what came of alarms where nobody acts; without a guard the first part of the log makes
-    one."""
+    """Say what came of alarms where nobody acts, of a guard or of the first part of the log."""
     from evofsm.cli import foreseen
 
     title = str(file)
@@ -284,7 +286,7 @@ def _foreseen(
         learnt, chunks = foreseen.split(chunks)
         if not (learnt and chunks):
             raise ValueError(f"{file}: it takes two episodes at least, to learn and to judge")
-        given = {"horizon": horizon, "persist": persist, "tolerance": tolerance}
+        given: dict[str, Any] = {"horizon": horizon, "persist": persist, "tolerance": tolerance}
         guard = foreseen.guard_where_nobody_acts(learnt, names, (), **given)
         title += f": learnt from its first {len(learnt):,} episodes, judged by the rest"
     elif tolerance is not None:

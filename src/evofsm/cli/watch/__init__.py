@@ -177,7 +177,7 @@ def _recorded(
                 )
                 if is_cut:
                     warn(f"watched are the first {written:,.0f} s of the simulation")
-            stretches, more = record_log(log, run, *reading, **settings, show=move)
+            stretches, more = record_log(log, run, *reading[:3], **settings, show=move)
             if more:
                 warn(f"watched are the first {MOST_ROWS:,} rows; there are more")
             recording = Recording(run, stretches)
