@@ -13,6 +13,7 @@ polars = pytest.importorskip("polars")
 pytest.importorskip("typer")
 
 VIBRATION, BEARING = "Schwingung, mm/s", "Lagertemperatur °C"
+FORMS = "german", "two columns", "english", "american", "parquet", "codes"
 FIRST = datetime(2025, 3, 10, 6, 0, 11)
 
 
@@ -49,16 +50,21 @@ def written(form="german"):
     frame = pump()
     dates = [FIRST + timedelta(seconds=round(at, 3)) for at in frame["Zeit"]]
     if form == "parquet":
-        frame.with_columns(Zeit=polars.Series(dates)).write_parquet(path)
+        frame.with_columns(Zeit=polars.Series(dates)).with_row_index().write_parquet(path)
         return str(path)
-    comma = {"german": True, "two columns": True, "english": False}[form]
+    if form == "codes":  # a clock in ms, codes, and a comma within the names
+        of = polars.col("Status").replace_strict({"Betrieb": 1, "Störung": 4}, default=0)
+        epoch = (polars.col("Zeit") * 1e3 + 1.74e12).cast(polars.Int64)
+        frame.select("Drehzahl", VIBRATION, BEARING, t=epoch, code=of).write_csv(path)
+        return str(path)
+    comma = form in ("german", "two columns")
     header = [*frame.columns]
     if form == "two columns":
         header = ["Datum", "Uhrzeit", *header[1:]]
     lines = []
     for date, (_, *numbers, status) in zip(dates, frame.rows(), strict=True):
-        when = date.isoformat(" ", "milliseconds") if form == "english" else None
-        when = when or date.strftime("%d.%m.%Y %H:%M:%S")
+        when = date.strftime("%d.%m.%Y %H:%M:%S" if comma else "%m/%d/%Y %I:%M:%S %p")
+        when = date.isoformat(" ", "milliseconds") if form == "english" else when
         when = when.replace(" ", ";") if form == "two columns" else when
         shown = [f"{x:.3f}".replace(".", "," if comma else ".") for x in numbers]
         lines.append((";" if comma else ",").join([when, *shown, status]))
@@ -68,14 +74,17 @@ def written(form="german"):
     return str(path)
 
 
-@pytest.mark.parametrize("form", ["german", "two columns", "english", "parquet"])
+@pytest.mark.parametrize(
+    "form", ["german", "two columns", "english", "american", "parquet", "codes"]
+)
 def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, form):
     path = written(form)
     first = evofsm("learn", path)
     assert first.exit_code == 2
     assert "nothing says what its columns mean" in first.stderr
     found = " ".join(first.stdout.split())
-    for part in (f"What {path} holds", "one every 5 s", "by Drehzahl", "Status==Störung (7 times"):
+    failed = "code==4" if form == "codes" else "Status==Störung"
+    for part in (f"What {path} holds", "one every 5 s", "by Drehzahl", f"{failed} (7 times"):
         assert part in found
     (command,) = re.findall(r"^  evofsm (learn .*)", first.stdout.replace("\\\n", ""), re.M | re.S)
     learnt = evofsm(*shlex.split(command))
@@ -84,7 +93,7 @@ def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, for
     for part in (
         "one every 20 s",
         "episodes 14,",
-        "7 episodes ended with Status==Störung",
+        f"7 episodes ended with {failed}",
         "became means of 20 s (--resample 20s,NAME=max",
         "of at most 300 s (--hole) cost a transition each",
         "840 rows: --where Drehzahl>100 does not hold; there an episode ends",
@@ -103,7 +112,7 @@ def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, for
     assert "has a row every 5 s, and guard.evofsm decides each 20 s: --resample 20s" in other.stderr
 
 
-READ = "--action", "--time", "--where", "--failed", "--resample", "--hole"
+READ = "--action", "--time", "--unit", "--where", "--failed", "--resample", "--hole"
 
 
 def test_what_a_log_seems_to_need_is_said_before_the_work(evofsm, refused):

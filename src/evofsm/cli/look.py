@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from evofsm.cli.options import seconds
 from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
-from evofsm.io.tables import Skips, Table, Wanted, is_date
+from evofsm.io.tables import TIMES, Skips, Table, Wanted, is_date
 
 # So many fields and rows are looked at; columns of more texts are no list of states.
 _MOST_FIELDS, _MOST_ROWS, _FEW = 20_000_000, 1_000_000, 12
+_EPOCHS = {"ns": 1e17, "us": 1e14, "ms": 1e11}  # times since 1970 are larger
 _SHOWN = 40  # columns
 _SIGNS = "<>=! "  # what in a name of a condition is ambiguous
 # A larger share of steps, and so many, that are no usual one make no clock.
@@ -76,9 +77,9 @@ def look_at(table: Table) -> Look:
     ends = {n: np.nanquantile(z[runs], (0.02, 0.98)) for n, z in values.items() if n not in told_by}
     if still in ends and ends[still][1] < 1.1 * ends[still][0]:  # as it runs it is always the same
         del ends[still]
-    return Look(
-        facts, _of_numbers({n: e.tolist() for n, e in ends.items() if e[1] > e[0]}, options)
-    )
+    # What goes on by the same from row to row is a count of them.
+    moved = {n: e.tolist() for n, e in ends.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
+    return Look(facts, _of_numbers(moved, options))
 
 
 def _first_rows(table: Table) -> tuple[polars.DataFrame, str, str]:
@@ -100,9 +101,14 @@ def _first_rows(table: Table) -> tuple[polars.DataFrame, str, str]:
         clock, _, written = form.partition("=")
         at = frame[clock].str.to_datetime(written, strict=False)
         frame = frame.with_columns(at.dt.epoch("us").alias(clock))
+    scale = 1e-6
+    if not clock and (clock := next(filter(_TIME.match, numbers), "")) and len(frame):
+        since = frame[clock].abs().max()  # 1970, if it is large
+        unit = next((one for one, least in _EPOCHS.items() if float(str(since)) > least), "s")
+        form, scale = "" if unit == "s" else f"{_named(clock, '=')}={unit}", TIMES[unit]
     if clock and len(frame):
-        frame = frame.with_columns(frame[clock] * 1e-6)
-    return frame, clock or next(filter(_TIME.match, numbers), ""), form
+        frame = frame.with_columns(frame[clock] * scale)
+    return frame, clock, form
 
 
 def _of_steps(times: NDArray[np.float64], facts: list[tuple[str, str]]) -> list[tuple[str, str]]:
