@@ -115,6 +115,10 @@ def _document(judge: Foresight, tolerance: float, told: Told) -> dict[str, Any]:
         row = {"stated": stated, "kind": kind, "share_right": float(judge.shares[rate])}
         for name, plain in (("learnt", None), ("plain", True)):
             row[name] = " or ".join(map(judge.told, judge.of_rate(rate, plain=plain))) or "none"
+        row["thresholds"] = [
+            {"variable": judge.labels.names[int(v)], "above" if sign > 0.0 else "below": at}
+            for *_, v, _, sign, at in judge.of_rate(rate, plain=True).tolist()
+        ]
         limits.append(row)
     head: dict[str, Any] = {"rows": len(told.times), "episodes": len(told.runs.starts)}
     head |= {"failures": int(told.runs.failed.sum()), "seconds": len(told.times) * judge.dt}
