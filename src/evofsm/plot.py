@@ -31,7 +31,6 @@ with needs("matplotlib", "plot", "plotting"):
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
-    from matplotlib.figure import Figure
     from matplotlib.text import Annotation
 
 __all__ = ["COLORS", "belief", "experience", "graph", "history", "risk", "states"]
@@ -342,7 +341,7 @@ def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = No
 
 
 def history(
-    figure: Figure,
+    axes: Sequence[Axes],
     time: ArrayLike,
     rows: ArrayLike,
     names: Sequence[str],
@@ -351,13 +350,13 @@ def history(
     tolerance: float,
     *,
     model: FSMModel | None = None,
-    place: tuple[int, int] = (0, 1),
-) -> list[Axes]:
+) -> None:
     """What was seen over time, above the risk; bands are alarms, crosses failures.
 
     Parameters
     ----------
-    figure : matplotlib.figure.Figure
+    axes : sequence of matplotlib.axes.Axes
+        One for each variable, then one for the states if there is a model, and one for the risk.
     time, risk, failed : (T,) array_like
         When each row was [s], the risk then, and whether a failure came with it. A step of more
         than three usual ones is left blank.
@@ -366,18 +365,14 @@ def history(
     tolerance : float
         There is an alarm where the risk is above it.
     model : FSMModel, optional
-        The states of which are shown as well.
-    place : (int, int)
-        Which of so many columns of the figure it takes.
 
     Examples
     --------
     >>> from matplotlib.figure import Figure
     >>> from evofsm import plot
-    >>> figure = Figure()
-    >>> seen = [0, 1, 2], [[5], [6], [7]], ["heat"]
-    >>> panels = plot.history(figure, *seen, [0, 0, 0.9], [False, False, True], 0.5)
-    >>> [panel.get_ylabel() for panel in panels]
+    >>> axes, seen = Figure().subplots(2), ([0, 1, 2], [[5], [6], [7]], ["heat"])
+    >>> plot.history(axes, *seen, [0, 0, 0.9], [False, False, True], 0.5)
+    >>> [ax.get_ylabel() for ax in axes]
     ['heat', 'risk']
     """
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
@@ -387,38 +382,31 @@ def history(
     unit, size = ("days", 86400.0) if np.ptp(when) > 2e5 else ("hours", 3600.0)
     unit, size = (unit, size) if np.ptp(when) > 7200.0 else ("minutes", 60.0)
     x, crosses = (when - when[0]) / size, (crosses - when[0]) / size
-    count = z.shape[1] + (model is not None) + 1
-    panels: list[Axes] = []
-    for k in range(count):
-        at = (count, place[1], k * place[1] + place[0] + 1)
-        panels.append(figure.add_subplot(*at, sharex=panels[0] if panels else None))
     edges = np.flatnonzero(np.diff(said > tolerance, prepend=False, append=False))
-    for ax in panels:
+    for ax in axes:
         for first, end in edges.reshape(-1, 2):
             look: Look = {"color": COLORS["follower"], "alpha": 0.25, "linewidth": 1.0}
             ax.axvspan(x[first], x[end - 1], **look)
         for cross in crosses:
             ax.axvline(cross, color=COLORS["dead end"], linewidth=0.8, linestyle="--")
-        ax.tick_params(labelbottom=ax is panels[-1])
-    for ax, name, values in zip(panels, names, z.T, strict=False):
+    for ax, name, values in zip(axes, names, z.T, strict=False):
         ax.plot(x, np.where(blank, np.nan, values), color=ink(), linewidth=0.6)
         ax.set_ylabel(name)
     if model is not None:
         some = np.arange(0, len(z), max(len(z) // 2000, 1))
         seen = [model.nearest(row).state for row in z[some]]
-        panels[-2].plot(x[some], seen, ".", markersize=1.5, color=COLORS["leader"])
-        label_states(panels[-2].yaxis, model.n_states)
-        panels[-2].set_ylabel("state")
-    panels[-1].step(x, np.where(blank, np.nan, said), where="post", color=COLORS["follower"])
+        axes[-2].plot(x[some], seen, ".", markersize=1.5, color=COLORS["leader"])
+        label_states(axes[-2].yaxis, model.n_states)
+        axes[-2].set_ylabel("state")
+    axes[-1].step(x, np.where(blank, np.nan, said), where="post", color=COLORS["follower"])
     look = {"color": ink(), "linewidth": 0.8, "linestyle": ":", "label": "tolerance"}
-    panels[-1].axhline(tolerance, **look)
+    axes[-1].axhline(tolerance, **look)
     look = {"linestyle": "none", "marker": "X", "color": COLORS["dead end"], "clip_on": False}
-    panels[-1].plot(crosses, np.ones(len(crosses)), markersize=4.5, label="failure", **look)
+    axes[-1].plot(crosses, np.ones(len(crosses)), markersize=4.5, label="failure", **look)
     alarm: Look = {"marker": "s", "linestyle": "none", "alpha": 0.25, "color": COLORS["follower"]}
-    panels[-1].plot([], [], label="alarm", **alarm)
-    _explain(panels[-1])
-    panels[-1].set(ylim=(-0.03, 1.03), ylabel="risk", xlabel=f"time [{unit}]")
-    return panels
+    axes[-1].plot([], [], label="alarm", **alarm)
+    _explain(axes[-1])
+    axes[-1].set(ylim=(-0.03, 1.03), ylabel="risk", xlabel=f"time [{unit}]")
 
 
 def _explain(ax: Axes, handles: Sequence[Line2D] | None = None) -> None:

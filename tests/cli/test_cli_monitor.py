@@ -336,6 +336,7 @@ def test_where_nobody_acts_a_summary_judges_alarms_on_what_they_did_not_learn_fr
     assert "plain thresholds do as well, so it is heat above" in printed
     assert picture.stat().st_size > 10_000
     found = json.loads(evofsm(log, "--summary", *options, "--json").stdout)
+    assert [*found["limits"][1]["thresholds"][0]] == ["variable", "above"]
     own = next(one["learnt"] for one in found["alarms"] if one["is_own"])
     assert own["failures"] == own["foreseen"] == found["failures"] == 5
     assert [one["failed"] for one in found["listed"]].count(True) == 5

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from evofsm.cli.options import require
-from evofsm.cli.show import facts, table
-from evofsm.fsm.machine import EvolvingFSM
+from evofsm.cli.show import facts, print_json, show, table
+from evofsm.fsm import EvolvingFSM, Labels
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
-from evofsm.guard.foresight import RATES, Runs, Tally, runs_of, span
+from evofsm.guard.foresight import RATES, Runs, runs_of, span
 from evofsm.io import Chunk
 
 if TYPE_CHECKING:
@@ -27,6 +27,16 @@ RATE = 0.3
 LEARNT = 0.6
 # Alarms that are listed; times from here on are dates [s].
 _LISTED, _DATES = 12, 1e8
+_CAME = ("ahead", "false/day")
+_HEADER = ("stated", "hold", "foreseen", *_CAME, "thresholds", *_CAME)
+
+
+class Asked(NamedTuple):
+    """What alarms are to be."""
+
+    horizon: float | None = None  #: [s]; a twentieth of the median episode
+    persist: float = 0.0  #: [s]
+    tolerance: float | None = None  #: such that there are `RATE` false alarms a day
 
 
 class Told(NamedTuple):
@@ -35,94 +45,86 @@ class Told(NamedTuple):
     runs: Runs
     times: NDArray[np.float64]  #: (T,) [s]
 
-    def date(self, row: int) -> str:
-        """When a row was."""
-        time = float(self.times[row])
-        return (
-            f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M}"
-            if time > _DATES
-            else f"{time:.10g}"
-        )
-
-
-def told_by(chunks: Sequence[Chunk]) -> Told:
-    """The episodes of chunks."""
-    failed = [one.failures is not None and len(one.failures) > 0 for one in chunks]
-    runs = runs_of([one.observations for one in chunks], failed)
-    return Told(runs, np.concatenate([one.times for one in chunks]))
-
-
-def split(chunks: Sequence[Chunk]) -> tuple[Sequence[Chunk], Sequence[Chunk]]:
-    """The episodes of the first part of a log, and the others."""
-    rows = np.cumsum([len(one.times) for one in chunks])
-    first = int((rows <= LEARNT * rows[-1]).sum())
-    return chunks[:first], chunks[first:]
+    @classmethod
+    def of(cls, chunks: Sequence[Chunk]) -> Told:
+        """The episodes that are chunks."""
+        failed = [one.failures is not None and len(one.failures) > 0 for one in chunks]
+        runs = runs_of([one.observations for one in chunks], failed)
+        return cls(runs, np.concatenate([one.times for one in chunks]))
 
 
 def guard_where_nobody_acts(
-    chunks: Sequence[Chunk],
-    names: Sequence[str],
-    units: Sequence[str],
-    *,
-    horizon: float | None,
-    persist: float,
-    tolerance: float | None,
-    machine: EvolvingFSM | None = None,
+    chunks: Sequence[Chunk], labels: Labels, asked: Asked, machine: EvolvingFSM | None = None
 ) -> Guard:
     """A guard that alarms before failures, as it was learnt from the episodes of a log."""
-    told, dt = told_by(chunks), float(chunks[0].dt)
-    median = float(np.median([len(one.times) for one in chunks])) * dt
-    ahead = horizon or max(median / 20.0, 10.0 * dt)
-    named: dict[str, Any] = {
-        "names": names,
-        "units": units,
-        "horizon": ahead,
-        "hold": persist,
-        "dt": dt,
-    }
-    judge = Foresight.learn_log([one.observations for one in chunks], told.runs.failed, **named)
-    accepted = judge.tolerance_of(RATE) if tolerance is None else tolerance
-    reviser = ActionReviser(judge, Choices(1), tolerance=accepted, mode=Mode.SHADOW)
+    rows, dt = [one.observations for one in chunks], float(chunks[0].dt)
+    horizon = asked.horizon or max(float(np.median([*map(len, rows)])) / 20.0, 10.0) * dt
+    given: dict[str, Any] = {"dt": dt, "horizon": horizon, "hold": asked.persist}
+    given |= {"names": labels.names, "units": labels.units}
+    judge = Foresight.learn_log(rows, Told.of(chunks).runs.failed, **given)
+    tolerance = judge.tolerance_of(RATE) if asked.tolerance is None else asked.tolerance
+    reviser = ActionReviser(judge, Choices(1), tolerance=tolerance, mode=Mode.SHADOW)
     return Guard.of(reviser, interval=dt, machine=machine, learn=False)
 
 
-def document(guard: Guard, told: Told) -> dict[str, Any]:
-    """What came of all alarms in a log, beside plain thresholds; rows count from 0."""
-    judge, reviser = guard.judge, guard.reviser
-    assert isinstance(judge, Foresight)
+def show_foreseen(
+    file: Path,
+    chunks: Sequence[Chunk],
+    guard: Guard | None,
+    labels: Labels,
+    asked: Asked,
+    plot: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Say what came of the alarms of a guard, or of one that learns from the log's first part."""
+    title = str(file)
+    if guard is None:
+        rows = np.cumsum([len(one.times) for one in chunks])
+        first = int((rows <= LEARNT * rows[-1]).sum())
+        if not 0 < first < len(chunks):
+            raise ValueError(f"{file}: it takes two episodes at least, to learn and to judge")
+        guard, chunks = guard_where_nobody_acts(chunks[:first], labels, asked), chunks[first:]
+        title += f": learnt from its first {first:,} episodes, judged by the rest"
+    reviser = guard.reviser
     assert isinstance(reviser, ActionReviser)
-    chosen, rows = judge.rate_of(reviser.tolerance), []
+    assert isinstance(reviser.risk, Foresight)
+    reviser.tolerance = reviser.tolerance if asked.tolerance is None else asked.tolerance
+    told, judge = Told.of(chunks), reviser.risk
+    found = _document(judge, reviser.tolerance, told)
+    if plot is not None:
+        _draw(judge, reviser.tolerance, guard.machine, told, plot)
+    if as_json:
+        print_json({"file": file, **found})
+    else:
+        show(*_tables(found, title))
+
+
+def _document(judge: Foresight, tolerance: float, told: Told) -> dict[str, Any]:
+    """What came of all alarms in a log, beside plain thresholds; rows count from 0."""
+    chosen, rows, limits = judge.rate_of(tolerance), [], []
     for rate, stated in enumerate(RATES):
-        for rows_held in sorted({judge.hold, max(judge.hold, judge.horizon // 10)}):
-            hold = (rows_held - 1) * judge.dt
-            both = [judge.tally(told.runs, rate, plain=p, hold=hold)[0] for p in (None, True)]
-            rows.append(
-                {
-                    "stated": stated,
-                    "hold": hold,
-                    "is_own": rate == chosen and rows_held == judge.hold,
-                    **dict(zip(("learnt", "plain"), (_told(one) for one in both), strict=True)),
-                }
-            )
-    limits = [
-        {
-            "stated": stated,
-            "share_right": float(judge.shares[rate]),
-            "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 2])],
-            "learnt": list(map(judge.told, judge.of_rate(rate))),
-            "plain": list(map(judge.told, judge.of_rate(rate, plain=True))),
-        }
-        for rate, stated in enumerate(RATES)
-    ]
+        for held in sorted({judge.hold, max(judge.hold, judge.horizon // 10)}):
+            row: dict[str, Any] = {"stated": stated, "hold": (held - 1) * judge.dt}
+            row["is_own"] = rate == chosen and held == judge.hold
+            for kind, plain in (("learnt", None), ("plain", True)):
+                came, _ = judge.tally(told.runs, rate, plain=plain, hold=row["hold"])
+                row[kind] = {**came._asdict(), "false_a_day": came.rate}
+            rows.append(row)
+        kind = ("learnt", "plain", "none")[int(judge.held_out[rate, 2])]
+        row = {"stated": stated, "kind": kind, "share_right": float(judge.shares[rate])}
+        for name, plain in (("learnt", None), ("plain", True)):
+            row[name] = " or ".join(map(judge.told, judge.of_rate(rate, plain=plain))) or "none"
+        row["thresholds"] = [
+            {"variable": judge.labels.names[int(v)], "above" if sign > 0.0 else "below": at}
+            for *_, v, _, sign, at in judge.of_rate(rate, plain=True).tolist()
+        ]
+        limits.append(row)
+    head: dict[str, Any] = {"rows": len(told.times), "episodes": len(told.runs.starts)}
+    head |= {"failures": int(told.runs.failed.sum()), "seconds": len(told.times) * judge.dt}
+    head |= {"horizon": judge.horizon * judge.dt, "tolerance": tolerance}
     own = [] if chosen is None else list(_listed(judge, chosen, told))
-    seconds = len(told.times) * judge.dt
-    head = {"rows": len(told.times), "episodes": len(told.runs.starts), "seconds": seconds}
-    head |= {"failures": int(told.runs.failed.sum()), "horizon": judge.horizon * judge.dt}
-    return {**head, "tolerance": reviser.tolerance, "alarms": rows, "limits": limits, "listed": own}
-
-
-def _told(found: Tally) -> dict[str, Any]:
-    return {**found._asdict(), "false_a_day": found.rate}
+    return {**head, "alarms": rows, "limits": limits, "listed": own}
 
 
 def _listed(judge: Foresight, rate: int, told: Told) -> Iterator[dict[str, Any]]:
@@ -141,45 +143,28 @@ def _listed(judge: Foresight, rate: int, told: Told) -> Iterator[dict[str, Any]]
             yield {**where, "reason": "no alarm was on", "failed": True}
 
 
-def tables_of(found: dict[str, Any], told: Told, title: str) -> Iterator[RenderableType]:
+def _tables(found: dict[str, Any], title: str) -> Iterator[RenderableType]:
     """The same for people."""
-    ahead = span(found["horizon"])
     days = f"{found['seconds'] / 86400.0:.3g} days"
+    soon = f"an alarm is right if one comes within {span(found['horizon'])}"
     pairs = [("rows", f"{found['rows']:,} in {found['episodes']:,} episodes, {days}")]
-    pairs += [("failures", f"{found['failures']:,}; an alarm is right if one comes within {ahead}")]
-    own = next((one for one in found["alarms"] if one["is_own"]), None)
-    if own is None:
-        pairs.append(("alarms", "none: on episodes held out, no alarm was better than chance"))
-    else:
-        one = own["learnt"]
-        text = (
-            f"{one['foreseen']} of {one['failures']} failures foreseen, {span(one['lead'])} ahead"
-        )
-        pairs.append(("alarms", f"{text} (mean; not foreseen: 0), {one['false']:,} false"))
-    yield facts(title, pairs)
-    rows = [
-        (f"{one['stated']:g}", span(one["hold"]), *_cells(one["learnt"]), *_cells(one["plain"]))
-        for one in found["alarms"]
-    ]
-    header = (
-        "stated",
-        "hold",
-        *("foreseen", "ahead", "false/day"),
-        "thresholds",
-        "ahead",
-        "false/day",
-    )
+    pairs += [("failures", f"{found['failures']:,}; {soon}")]
+    text = "none: on episodes held out, no alarm was better than chance"
+    for one in (one["learnt"] for one in found["alarms"] if one["is_own"]):
+        text = f"{_share(one)} failures foreseen, {span(one['lead'])} ahead (mean; not foreseen: 0)"
+        text += f", {one['false']:,} false"
+    yield facts(title, [*pairs, ("alarms", text)])
+    rows = []
+    for one in found["alarms"]:
+        each = ((_share(o), span(o["lead"]), f"{o['false_a_day']:.2g}") for o in _both(one))
+        rows.append((f"{one['stated']:g}", span(one["hold"]), *chain(*each)))
     bold = [k for k, one in enumerate(found["alarms"]) if one["is_own"]]
-    yield table(
-        "\nAlarms by the false ones a day that were stated, and plain thresholds",
-        header,
-        rows,
-        bold=bold,
-    )
+    title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
+    yield table(title, _HEADER, rows, bold=bold)
     said = []
     for one in found["limits"]:
-        plain = " or ".join(one["plain"]) or "none"
-        text = f"{' or '.join(one['learnt'])} ({one['share_right']:.0%} were right, held out)"
+        ours, plain = _both(one)
+        text = f"{ours} ({one['share_right']:.0%} were right, held out)"
         if one["kind"] == "plain":
             text = f"plain thresholds do as well, so it is {text}"
         elif one["kind"] == "none":
@@ -188,27 +173,31 @@ def tables_of(found: dict[str, Any], told: Told, title: str) -> Iterator[Rendera
             text += f"; plain thresholds would be {plain}"
         said.append((f"{one['stated']:g}", text))
     yield facts("\nWhere they alarm, by false alarms a day", said)
-    if latest := found["listed"][-_LISTED:]:
-        cells = [
-            (
-                f"{one['episode'] + 1}",
-                told.date(one["row"]),
-                span(one["lasts"]),
-                "yes" if one["failed"] else "no",
-                one["reason"].partition(";")[0],
-            )
-            for one in latest
-        ]
-        title = f"\nThe last of {len(found['listed'])} alarms"
-        yield table(title, ("episode", "time", "lasts", "failed", "why"), cells, left=(0, 4))
+    rows = []
+    for one in found["listed"][-_LISTED:]:
+        failed, why = "yes" if one["failed"] else "no", one["reason"].partition(";")[0]
+        rows.append((f"{one['episode'] + 1}", _date(one["time"]), span(one["lasts"]), failed, why))
+    title = f"\nThe last of {len(found['listed'])} alarms"
+    yield table(title, ("episode", "time", "lasts", "failed", "why"), rows, left=(0, 4))
 
 
-def _cells(one: dict[str, Any]) -> tuple[str, ...]:
-    ahead = span(one["lead"])
-    return f"{one['foreseen']} of {one['failures']}", ahead, f"{one['false_a_day']:.2g}"
+def _both(one: dict[str, Any]) -> tuple[Any, Any]:
+    return one["learnt"], one["plain"]
 
 
-def draw(guard: Guard, told: Told, out: Path) -> None:
+def _share(one: dict[str, Any]) -> str:
+    return f"{one['foreseen']} of {one['failures']}"
+
+
+def _date(time: float) -> str:
+    return (
+        f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M}" if time > _DATES else f"{time:.10g}"
+    )
+
+
+def _draw(
+    judge: Foresight, tolerance: float, machine: EvolvingFSM | None, told: Told, out: Path
+) -> None:
     """Variables, states, risk, alarms and failures over time: all of it, and the last failure."""
     require(matplotlib="plot")
     from matplotlib.figure import Figure
@@ -216,20 +205,22 @@ def draw(guard: Guard, told: Told, out: Path) -> None:
 
     from evofsm import plot
 
-    judge, reviser, runs = guard.judge, guard.reviser, told.runs
-    assert isinstance(judge, Foresight)
-    assert isinstance(reviser, ActionReviser)
-    on = [judge.tally(runs, rate)[1] * judge.shares[rate] for rate in range(len(RATES))]
-    risk = np.max(on, axis=0)
-    ends = np.append(runs.starts[1:], len(risk)) - 1
-    last = int(ends[runs.failed][-1]) if runs.failed.any() else len(risk) - 1
+    runs, chosen = told.runs, judge.rate_of(tolerance)
+    on = np.array([judge.tally(runs, rate)[1] for rate in range(len(RATES))])
+    if chosen is not None:
+        on[judge.shares > tolerance] &= on[chosen]
+    risk = np.max(on * judge.shares[:, None], axis=0)
+    failed, ends = np.zeros(len(risk), np.bool_), runs.starts + runs.lengths - 1
+    failed[ends[runs.failed]] = True
+    last = int(np.flatnonzero(failed)[-1]) if failed.any() else len(risk) - 1
     near = max(int(runs.starts[runs.starts <= last][-1]), last - 4 * judge.horizon)
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
-    model = None if guard.machine is None or not guard.machine.n_states else guard.machine.model()
+    model = None if machine is None or not machine.n_states else machine.model()
     with context(["default", "evofsm.paper.house"]):
-        figure = Figure((10.0, 1.3 * (len(names) + 2)), layout="constrained")
-        for column, part in enumerate((slice(0, len(risk)), slice(near, last + 1))):
-            z, failed = runs.rows[part], np.isin(np.arange(len(risk)), ends[runs.failed])[part]
-            given = told.times[part], z, names, risk[part], failed
-            plot.history(figure, *given, reviser.tolerance, model=model, place=(column, 2))
+        count = len(names) + 1 + (model is not None)
+        figure = Figure((10.0, 1.3 * count), layout="constrained")
+        axes = figure.subplots(count, 2, sharex="col")
+        for column, part in zip(axes.T, (slice(None), slice(near, last + 1)), strict=True):
+            seen = told.times[part], runs.rows[part], names, risk[part], failed[part]
+            plot.history(column, *seen, tolerance, model=model)
         figure.savefig(out)

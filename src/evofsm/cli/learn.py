@@ -129,9 +129,10 @@ def learn(
 
     Of a log whose columns nobody named, evofsm learn LOG prints what is in it, and what to ask.
     """
-    from evofsm.cli.foreseen import guard_where_nobody_acts
+    from evofsm.cli.foreseen import Asked, guard_where_nobody_acts
     from evofsm.cli.learning import guard_of_log, learn_traces, refusing, teach, warnings_of
     from evofsm.driving.naming import UNITS, VARIABLES
+    from evofsm.fsm import Labels
     from evofsm.io import episodes_of, read_traces
     from evofsm.io.logs import Noted
     from evofsm.io.tables import SI
@@ -164,6 +165,8 @@ def learn(
             _saying(chunks, lacking), machine, actions, encoder.names, units_read
         )
     provenance = _provenance(learning, known, columns)
+    if not acts:
+        provenance["action"] = "none: nobody acts"
     warnings = warnings_of(noted, columns)
     for warning in warnings:
         warn(f"warning: {warning}")
@@ -173,33 +176,25 @@ def learn(
     if guard is not None:
         assert kind is not None
         assert learning.model.dt is not None
-        named = encoder.names, learning.model.units
         rows = read_traces(files, columns, lengths, topics=topics)
         if acts:
             reckoned = kind, learning.model.dt, brakes, tolerance
-            taught = guard_of_log(*reckoned, actions, machine, *named)
+            taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
             with progress("Teaching the guard", learning.read.rows) as move:
                 share = teach(taught, rows, lambda count: move(count))
             if refused := refusing(share):
                 warn(f"warning: in the later half of the log the guard {refused}")
         else:
-            taught = guard_where_nobody_acts(
-                [one for one in episodes_of(rows) if len(one.times) > 1],
-                *named,
-                horizon=horizon,
-                persist=persist,
-                tolerance=None if tolerance == TOLERANCE else tolerance,
-                machine=learning.machine,
-            )
+            asked = Asked(horizon, persist, None if tolerance == TOLERANCE else tolerance)
+            episodes = [one for one in episodes_of(rows) if len(one.times) > 1]
+            labels = Labels(names=encoder.names, units=learning.model.units)
+            taught = guard_where_nobody_acts(episodes, labels, asked, learning.machine)
         taught.save(guard, provenance)
     if as_json:
         told = {"files": files, "saved": out, "guard": guard, **_document(learning, provenance)}
         print_json({**told, "noted": noted, "warnings": warnings})
         return
-    read = [
-        *_read(learning, columns.action if acts else ""),
-        *_read_otherwise(noted, columns, learning),
-    ]
+    read = [*_read(learning, columns.action * acts), *_read_otherwise(noted, columns, learning)]
     if lengths.seen:
         read.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
     show(facts("What was read", read), *tables_of(learning.model))
@@ -353,7 +348,8 @@ def _look_first(file: str, reading: Reading) -> list[str]:
         command = [f"evofsm learn {quote(file)}", *(f"{a} {quote(b)}" for a, b in options)]
         show(facts(f"What {file} holds", found), "\nA way to learn from it:")
         print("  " + " \\\n      ".join(command), flush=True)
-        raise ValueError(f"{file}: nothing says what its columns mean; see above")
+        what = f"{file} has no column {VARIABLES[0]!r}; a way to read it stands above"
+        raise ValueError(f"{what} (--observe names the right ones)")
     said = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
     asked = zip(_UNASKED.items(), said, strict=True)
     return [f"{why}: {a} {quote(could[a])}" for (a, why), b in asked if b is None and a in could]

@@ -433,6 +433,12 @@ class Foresight(LearningJudge):
         """Read what was learnt; a ValueError if the file is damaged."""
         settings, arrays = store.read(path, KIND)
         with store.explained(path):
+            count = len(settings["names"]) + len(arrays["forms"])
+            which, most = arrays["limits"][:, :_SIGN], (len(RATES), _NONE, count, len(_AHEAD))
+            if not ((which >= 0) & (which < most) & (which % 1.0 == 0.0)).all():
+                raise ValueError("a limit is of no variable, or of no rate")
+            if not (np.isin(arrays["forms"][:, [failure.I, failure.J]], range(count))).all():
+                raise ValueError("a form is of no variable")
             known: dict[str, Any] = {**settings, **arrays}
             return cls(**known)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import (
     BRAKES,
@@ -38,7 +38,7 @@ from evofsm.cli.options import (
     require,
     split_names,
 )
-from evofsm.cli.show import print_json, show, warn
+from evofsm.cli.show import show, warn
 
 if TYPE_CHECKING:
     from evofsm.cli.monitor.decider import Decider
@@ -175,7 +175,9 @@ def monitor(
     rows = EPISODE if episode is None or is_log else int(episode)
     with ExitStack() as stack:
         if summary and file is not None:
+            from evofsm.cli.foreseen import Asked, show_foreseen
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
+            from evofsm.fsm import Labels
 
             used = fresh() if guard else None
             alone = action == "" or isinstance(used and used.judge, Foresight)
@@ -185,7 +187,8 @@ def monitor(
                 own = used.variables if used else VARIABLES
                 if observe is None or set(split_names(observe)) == set(own):  # in its own order
                     observe = ",".join(f'"{name}"' for name in own)
-                asked = observe, "" if alone else action, time, episode, dt, failed, unit, topics
+                action = "" if alone else action
+                asked = observe, action, time, episode, dt, failed, unit, topics
                 more = no_leader, hold, skip_bad, vehicle_length, where, resample, hole
                 reading = reading_of(*asked, *more)
                 chunks, interval = _episodes(file, reading, dated=alone)
@@ -193,8 +196,11 @@ def monitor(
                     what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
                     warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
             if is_log and alone:
-                asked_of = reading.columns.observe.names, horizon, persist, tolerance
-                _foreseen(file, list(chunks), used, *asked_of, plot, as_json=as_json)
+                wanted = (
+                    Labels(names=reading.columns.observe.names),
+                    Asked(horizon, persist, tolerance),
+                )
+                show_foreseen(file, list(chunks), used, *wanted, plot, as_json=as_json)
                 return None
             used = used or fresh()
             _prepare(used, mode, tolerance, None, stack, learn=learn)
@@ -264,41 +270,6 @@ def _episodes(
             warn(f"warning: {warning}")
 
     return all_of_them(), first.dt
-
-
-def _foreseen(
-    file: Path,
-    chunks: Sequence[Chunk],
-    guard: Guard | None,
-    names: Sequence[str],
-    horizon: float | None,
-    persist: float,
-    tolerance: float | None,
-    plot: Path | None,
-    *,
-    as_json: bool,
-) -> None:
-    """Say what came of alarms where nobody acts, of a guard or of the first part of the log."""
-    from evofsm.cli import foreseen
-
-    title = str(file)
-    if guard is None:
-        learnt, chunks = foreseen.split(chunks)
-        if not (learnt and chunks):
-            raise ValueError(f"{file}: it takes two episodes at least, to learn and to judge")
-        given: dict[str, Any] = {"horizon": horizon, "persist": persist, "tolerance": tolerance}
-        guard = foreseen.guard_where_nobody_acts(learnt, names, (), **given)
-        title += f": learnt from its first {len(learnt):,} episodes, judged by the rest"
-    elif tolerance is not None:
-        guard.reviser.tolerance = tolerance  # type: ignore[attr-defined]
-    told = foreseen.told_by(chunks)
-    found = foreseen.document(guard, told)
-    if plot is not None:
-        foreseen.draw(guard, told, plot)
-    if as_json:
-        print_json({"file": file, **found})
-        return
-    show(*foreseen.tables_of(found, told, title))
 
 
 def _prepare(
