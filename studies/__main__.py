@@ -21,6 +21,7 @@ STUDIES = {
     "judges": "judges:Judges",
     "tasks": "judges:Tasks",
     "forecasts": "forecasts:ForecastStudy",
+    "machines": "machines:Machines",
     "sensitivity": "sensitivity:Sensitivity",
     "traffic": "traffic:Traffic",
     "real": "real:Real",

@@ -203,3 +203,18 @@ def test_in_the_example_another_controller_is_kept_out(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "examples")
     tried = importlib.import_module("disc").main(tmp_path / "disc.png")
     assert (tried[0].failed > 20, tried[40].failed, tried[40].arrived >= 40) == (True, 0, True)
+
+
+def test_a_history_marks_alarms_and_failures_and_leaves_holes_blank():
+    when = np.array([0.0, 60.0, 120.0, 9000.0, 9060.0, 9120.0])
+    risk, failed = [0, 0, 0.2, 0, 0.9, 0.9], [False] * 5 + [True]
+    axes = Figure().subplots(2)
+    plot.history(axes, when, when[:, None], ["heat"], risk, failed, 0.5)
+    heat, said = axes
+    assert np.isnan(heat.lines[-1].get_ydata()).tolist() == [False] * 3 + [True] + [False] * 2
+    (band,) = heat.patches
+    assert band.get_x() == pytest.approx(9060.0 / 3600.0)
+    assert band.get_x() + band.get_width() == pytest.approx(9120.0 / 3600.0)
+    assert said.get_xlabel() == "time [hours]"
+    labels = [text.get_text() for text in said.get_legend().get_texts()]
+    assert labels == ["tolerance", "failure", "alarm"]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.text import Annotation
 
-__all__ = ["COLORS", "belief", "experience", "graph", "risk", "states"]
+__all__ = ["COLORS", "belief", "experience", "graph", "history", "risk", "states"]
 
 Look = dict[str, Any]  # how something is drawn, as matplotlib is told
 States = Collection[int]  # indices
@@ -208,6 +208,8 @@ def experience(
     sizes = 2.0 * known.radii[:, None] * known.survived.std(0)[pair]
     for centre, (wide, high) in zip(known.centres[:, pair], sizes, strict=True):
         ax.add_patch(Ellipse(centre, wide, high, fill=False, edgecolor=red, zorder=3.0))
+    centers = np.empty((0, 2)) if guard.machine is None else guard.machine.centers[:, pair]
+    ax.update_datalim(centers)
     ax.autoscale_view()
     limits = ax.axis()
     x, y = np.meshgrid(np.linspace(*limits[:2], _GRID), np.linspace(*limits[2:], _GRID))
@@ -218,8 +220,7 @@ def experience(
         form = forms(here, z)[0].max(0).reshape(x.shape)
         ax.contourf(x, y, form, [0.0, np.inf], colors=[red], alpha=0.15, zorder=0.5)
         ax.contour(x, y, form, [0.0], colors=[red], linewidths=1.2, zorder=2.0)
-    if guard.machine is not None:
-        draw_centers(ax, guard.machine.centers[:, pair], (), 10.0)
+    draw_centers(ax, centers, (), 10.0)
     ax.axis(limits)
     ring: Look = {"marker": "o", "fillstyle": "none"}
     looks: dict[str, Look] = {
@@ -337,6 +338,75 @@ def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = No
     ax.set(ylim=(-0.03, 1.03), xlabel="time [s]", ylabel="latent risk")
     _explain(ax)
     return ax
+
+
+def history(
+    axes: Sequence[Axes],
+    time: ArrayLike,
+    rows: ArrayLike,
+    names: Sequence[str],
+    risk: ArrayLike,
+    failed: ArrayLike,
+    tolerance: float,
+    *,
+    model: FSMModel | None = None,
+) -> None:
+    """What was seen over time, above the risk; bands are alarms, crosses failures.
+
+    Parameters
+    ----------
+    axes : sequence of matplotlib.axes.Axes
+        One for each variable, then one for the states if there is a model, and one for the risk.
+    time, risk, failed : (T,) array_like
+        When each row was [s], the risk then, and whether a failure came with it. A step of more
+        than three usual ones is left blank.
+    rows : (T, m) array_like
+    names : sequence of m str
+    tolerance : float
+        There is an alarm where the risk is above it.
+    model : FSMModel, optional
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from evofsm import plot
+    >>> axes, seen = Figure().subplots(2), ([0, 1, 2], [[5], [6], [7]], ["heat"])
+    >>> plot.history(axes, *seen, [0, 0, 0.9], [False, False, True], 0.5)
+    >>> [ax.get_ylabel() for ax in axes]
+    ['heat', 'risk']
+    """
+    when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
+    said, crosses = np.asarray(risk, np.float64), when[np.asarray(failed, np.bool_)]
+    steps = np.diff(when, prepend=when[:1])
+    blank = steps > 3.0 * np.median(steps)
+    unit, size = ("days", 86400.0) if np.ptp(when) > 2e5 else ("hours", 3600.0)
+    unit, size = (unit, size) if np.ptp(when) > 7200.0 else ("minutes", 60.0)
+    x, crosses = (when - when[0]) / size, (crosses - when[0]) / size
+    edges = np.flatnonzero(np.diff(said > tolerance, prepend=False, append=False))
+    for ax in axes:
+        for first, end in edges.reshape(-1, 2):
+            look: Look = {"color": COLORS["follower"], "alpha": 0.25, "linewidth": 1.0}
+            ax.axvspan(x[first], x[end - 1], **look)
+        for cross in crosses:
+            ax.axvline(cross, color=COLORS["dead end"], linewidth=0.8, linestyle="--")
+    for ax, name, values in zip(axes, names, z.T, strict=False):
+        ax.plot(x, np.where(blank, np.nan, values), color=ink(), linewidth=0.6)
+        ax.set_ylabel(name)
+    if model is not None:
+        some = np.arange(0, len(z), max(len(z) // 2000, 1))
+        seen = [model.nearest(row).state for row in z[some]]
+        axes[-2].plot(x[some], seen, ".", markersize=1.5, color=COLORS["leader"])
+        label_states(axes[-2].yaxis, model.n_states)
+        axes[-2].set_ylabel("state")
+    axes[-1].step(x, np.where(blank, np.nan, said), where="post", color=COLORS["follower"])
+    look = {"color": ink(), "linewidth": 0.8, "linestyle": ":", "label": "tolerance"}
+    axes[-1].axhline(tolerance, **look)
+    look = {"linestyle": "none", "marker": "X", "color": COLORS["dead end"], "clip_on": False}
+    axes[-1].plot(crosses, np.ones(len(crosses)), markersize=4.5, label="failure", **look)
+    alarm: Look = {"marker": "s", "linestyle": "none", "alpha": 0.25, "color": COLORS["follower"]}
+    axes[-1].plot([], [], label="alarm", **alarm)
+    _explain(axes[-1])
+    axes[-1].set(ylim=(-0.03, 1.03), ylabel="risk", xlabel=f"time [{unit}]")
 
 
 def _explain(ax: Axes, handles: Sequence[Line2D] | None = None) -> None:

@@ -18,7 +18,7 @@ from evofsm.cli.learning import warnings_of
 from evofsm.cli.options import reading_of, units_given
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import tables
-from evofsm.io.logs import LogColumns, Noted, episodes_of, read_traces, rows_of
+from evofsm.io.logs import LogColumns, Noted, Resample, episodes_of, read_traces, rows_of
 from evofsm.io.tables import CsvTable, Wanted
 
 polars = pytest.importorskip("polars")
@@ -639,6 +639,110 @@ def test_what_no_car_can_do_is_refused_unless_it_stands_for_nobody(tmp_path, row
     assert together(path, no_leader=nobody)[0] == [9, 8, 7]
 
 
+# -- Clocks of machines ---------------------------------------------------------------------------
+
+
+def taken(tmp_path, rows, noted=None, **columns):
+    """Of each episode times, values and actions, and where it failed; fields end at a space."""
+    lines = [row.replace(" ", ";") for row in rows]
+    path = write(tmp_path / "a.csv", lines, "time;x;u;Status")
+    settings = {"observe": ObservationEncoder("x"), "action": "u", **columns}
+    return [
+        (
+            *(one.tolist() for one in (e.times, e.observations[:, 0], e.actions)),
+            [] if e.failures is None else e.failures.tolist(),
+        )
+        for e in episodes_of(read(path, noted=noted, **settings))
+    ]
+
+
+JITTERED = (
+    "0 1 0 on",
+    "4 2 2 on",
+    "11 4 1 on",
+    "19,5 6 1 on",
+    "30 7 1 on",
+    "38 9 1 off",
+    "41 3 1 off",
+)
+
+
+@pytest.mark.parametrize(
+    ("how", "seen", "did"),
+    [
+        ({}, [1.5, 5.0, 7.0, 9.0], [1.0, 1.0, 1.0, 1.0]),
+        ({"x": "last", "u": "max"}, [2.0, 6.0, 7.0, 9.0], [2.0, 1.0, 1.0, 1.0]),
+        ({"x": "min", "u": "min"}, [1.0, 4.0, 7.0, 9.0], [0.0, 1.0, 1.0, 1.0]),
+    ],
+)
+def test_rows_of_a_step_become_one_and_the_row_that_failed_stays(tmp_path, pieces, how, seen, did):
+    noted = Noted()
+    rows = *JITTERED, "41 3 1 off"  # still so
+    step = Resample(10.0, how)
+    ((*found, failed),) = taken(tmp_path, rows, noted, resample=step, failed="Status==off")
+    did[1] = pytest.approx(np.nan, nan_ok=True)  # before a hole
+    assert (found, failed) == ([[0.0, 10.0, 30.0, 40.0], seen, did], [3])
+    assert (noted.resampled, noted.crossed) == (6, 1)
+
+
+def test_of_equal_times_and_rows_that_lack_a_number_nothing_is_lost_but_them(tmp_path, pieces):
+    rows = "0 1 0 on", "0 3 0 on", "7  0 on", "11 4 0 on", "x 9 0 on", "12 ? 0 on", "19 6 0 on"
+    noted = Noted()
+    assert taken(tmp_path, rows, noted, resample=Resample(10.0)) == [([0, 10], [2, 5], [0, 0], [])]
+    assert (noted.leaderless, noted.skipped["field"][0]) == (2, 2)
+
+
+@pytest.mark.parametrize(("hole", "episodes"), [(None, [4, 2, 2]), (1.0, [6, 2]), (60.0, [8])])
+def test_a_hole_costs_a_transition_and_a_longer_one_an_episode(tmp_path, pieces, hole, episodes):
+    times = 0.0, 0.1, 0.2, 0.3, 1.3, 1.4, 9.0, 9.1
+    rows, noted = [f"{time} {k} 1 on" for k, time in enumerate(times)], Noted()
+    found = taken(tmp_path, rows, noted, hole=hole)
+    assert [len(times) for times, *_ in found] == episodes
+    unknown = [np.isnan(actions).sum() for _, _, actions, _ in found]
+    assert sum(unknown) == noted.crossed == (3 - len(episodes) if hole else 0)
+
+
+STOPS = ["0 1 1 on", "1 2 9 on", "2 3 9 on", "3 4 0 on", "4 5 0 off", "5 6 9 on", "6 7 9 off"]
+
+
+@pytest.mark.parametrize(
+    ("status", "failures"),
+    [("on on on off off on on", [[1], []]), ("on on on on off on off", [[], [1]])],
+)
+def test_rows_that_are_not_chosen_end_an_episode_in_failure_if_it_begins_with_them(
+    tmp_path, pieces, status, failures
+):
+    rows = [
+        f"{row.rpartition(' ')[0]} {one}" for row, one in zip(STOPS, status.split(), strict=True)
+    ]
+    noted = Noted()
+    found = taken(tmp_path, rows, noted, where="u>5", failed="Status==off")
+    assert [values for _, values, *_ in found] == [[2, 3], [6, 7]]
+    assert [fails for *_, fails in found] == failures
+    assert (noted.elsewhere, noted.unplaced) == (3, sum(not fails for fails in failures[:1]))
+
+
+@pytest.mark.parametrize(
+    ("condition", "fails"),
+    [
+        ("Status=='off'", [4]),
+        ("Status=off", [4]),
+        ('Status!="on"', [4]),
+        ("x>2.5 and Status==on", [2]),
+        ("x>3.5 or u<1", [3]),
+        ("Status=='a or b' or x>=7", [6]),
+        ("Status==nothing", []),
+    ],
+)
+def test_conditions_may_compare_texts_and_be_joined(tmp_path, condition, fails):
+    noted = Noted()
+    ((_, values, *_, failed), *_) = taken(tmp_path, STOPS, noted, failed=condition)
+    assert (failed, len(values)) == (fails, fails[0] + 1 if fails else 7)
+    columns = LogColumns(failed=condition)
+    said = [one for one in warnings_of(noted, columns) if "no row meets" in one]
+    assert said == [] if fails else said[0].endswith("Status is 'off', 'on'")
+
+
 # -- Dates and units -------------------------------------------------------------------------------
 
 
@@ -666,13 +770,36 @@ def test_times_may_be_dates(tmp_path, texts, point):
 
 
 @pytest.mark.parametrize(
+    ("text", "time", "form"),
+    [
+        ("31.03.2025 23:59:5{}", "time", ""),
+        ("1.4.25 6:00:0{}", "time", ""),
+        ("31.03.2025, 06:00:0{},000", "time", ""),
+        ("31.03.2025;06:00:0{}", "day,time", ""),
+        ("2025-03-31;06:00:0{}", "day,time", ""),
+        ("12/31/2025 6:00:0{} PM", "time", "%m/%d/%Y %I:%M:%S %p"),
+        ("20251231_06000{}", "time", "%Y%m%d_%H%M%S"),
+    ],
+)
+def test_dates_may_begin_with_the_day_stand_in_two_columns_or_be_described(
+    tmp_path, text, time, form
+):
+    rows = [f"{text.format(k)};{k},5;10;11;0" for k in range(4)]
+    header = f"{time.replace(',', ';')};gap;v_follower;v_leader;a_follower"
+    units = units_given([f"time={form}"] if form else [])
+    (chunk,) = read(write(tmp_path / "a.csv", rows, header), time=time, units=units)
+    assert chunk.times.tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
     ("texts", "says"),
     [
         (["2026-03-14T09:26:53", "later"], "line 3, column 'time': 'later'.*ISO 8601"),
         (["2026-03-14T09:26:53", "2026-03-14T09:26:54Z"], "line 3.*have a zone, or none"),
         (["2026-03-14T09:26:53", "2026-03-14T09:26:52"], "must run forward"),
         (["09:26:53", "09:26:54"], "line 2, column 'time': '09:26:53' is no number"),
-        (["10.03.2025 06:00:00,000"], "'10.03.2025 06:00:00,000' is no number.*in ISO 8601"),
+        (["03/10/2025 06:00:00"], "'03/10/2025 06:00:00' is no number.*--unit 'COLUMN=%m/%d/%Y"),
+        (["10.03.2025 06:00:00", "32.03.2025 06:00:01"], "line 3, .*'32.03.2025 06:00:01' is not"),
         (["2026-03-14 09:26:53 CET"], "line 2.*'2026-03-14 09:26:53 CET' is not read as a date"),
     ],
 )

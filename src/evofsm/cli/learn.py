@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,8 +14,10 @@ from evofsm.cli.options import (
     BRAKES,
     TOLERANCE,
     Brakes,
+    Horizon,
     Json,
     Judge,
+    Persist,
     Reading,
     Tolerance,
     argument,
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
     from evofsm.fsm.model import FSMModel
     from evofsm.fsm.observations import ObservationEncoder
     from evofsm.guard import Guard
-    from evofsm.io import LogColumns
+    from evofsm.io import Chunk, LogColumns
     from evofsm.io.logs import Noted
 
 
@@ -42,6 +44,12 @@ _MOST_ACTIONS = 1000
 # With a smaller share of what lies between a blind guess and certainty, the most probable state is
 # hardly told apart from the others.
 _UNCERTAIN = 0.45
+# What is said of an option that a log seems to need.
+_UNASKED = {
+    "--resample": "some steps are longer or shorter, and begin an episode each",
+    "--where": "the machine seems to stand still in some rows",
+    "--failed": "nothing says what failed; perhaps",
+}
 
 
 @reads_logs
@@ -98,6 +106,8 @@ def learn(
     ] = None,
     brakes: Brakes = BRAKES,
     tolerance: Tolerance = TOLERANCE,
+    horizon: Horizon = None,
+    persist: Persist = 0.0,
     as_json: Json = False,
 ) -> None:
     """Learn a state machine from logs of your own, of any size, row by row.
@@ -113,23 +123,30 @@ def learn(
 
     Without --failed nobody knows what failed, and evofsm explain says so.
 
-    With --guard, a guard in shadow mode then goes through all rows and learns from them too.
+    With --guard, a guard in shadow mode then goes through all rows and learns from them too. Where
+    nobody acts (--action ''), it learns alarms, with 0.3 false ones a day unless --tolerance says
+    how risky it may be.
+
+    Of a log whose columns nobody named, evofsm learn LOG prints what is in it, and what to ask.
     """
+    from evofsm.cli.foreseen import Asked, guard_where_nobody_acts
     from evofsm.cli.learning import guard_of_log, learn_traces, refusing, teach, warnings_of
     from evofsm.driving.naming import UNITS, VARIABLES
-    from evofsm.io import read_traces
+    from evofsm.fsm import Labels
+    from evofsm.io import episodes_of, read_traces
     from evofsm.io.logs import Noted
     from evofsm.io.tables import SI
 
     _check_out(out)
     _check_out(guard, "--guard")
+    lacking = _look_first(files[0], reading)
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
-    actions = _actions(action_range)
-    columns, lengths, topics = reading
+    actions = _actions(action_range if reading.acts else "0:1:1")
+    columns, lengths, topics, acts = reading
     encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
-    kind = None if guard is None else _judge_of(judge, columns)
+    kind = None if guard is None else _judge_of(judge if acts else "learnt", columns)
     noted = Noted()
     known = [{"name": file, "bytes": _size(file)} for file in files]
 
@@ -142,8 +159,14 @@ def learn(
         chunks = read_traces(
             files, columns, lengths, lambda count: move(advance=count), noted, topics
         )
-        learning = learn_traces(chunks, machine, actions, encoder.names, units_read)
+        if not acts:  # before a hole the action is unknown still
+            chunks = (one._replace(actions=0.0 * one.actions) for one in chunks)
+        learning = learn_traces(
+            _saying(chunks, lacking), machine, actions, encoder.names, units_read
+        )
     provenance = _provenance(learning, known, columns)
+    if not acts:
+        provenance["action"] = "none: nobody acts"
     warnings = warnings_of(noted, columns)
     for warning in warnings:
         warn(f"warning: {warning}")
@@ -153,19 +176,25 @@ def learn(
     if guard is not None:
         assert kind is not None
         assert learning.model.dt is not None
-        reckoned = kind, learning.model.dt, brakes, tolerance
-        taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
-        with progress("Teaching the guard", learning.read.rows) as move:
-            rows = read_traces(files, columns, lengths, topics=topics)
-            share = teach(taught, rows, lambda count: move(count))
-        if refused := refusing(share):
-            warn(f"warning: in the later half of the log the guard {refused}")
+        rows = read_traces(files, columns, lengths, topics=topics)
+        if acts:
+            reckoned = kind, learning.model.dt, brakes, tolerance
+            taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
+            with progress("Teaching the guard", learning.read.rows) as move:
+                share = teach(taught, rows, lambda count: move(count))
+            if refused := refusing(share):
+                warn(f"warning: in the later half of the log the guard {refused}")
+        else:
+            asked = Asked(horizon, persist, None if tolerance == TOLERANCE else tolerance)
+            episodes = [one for one in episodes_of(rows) if len(one.times) > 1]
+            labels = Labels(names=encoder.names, units=learning.model.units)
+            taught = guard_where_nobody_acts(episodes, labels, asked, learning.machine)
         taught.save(guard, provenance)
     if as_json:
         told = {"files": files, "saved": out, "guard": guard, **_document(learning, provenance)}
         print_json({**told, "noted": noted, "warnings": warnings})
         return
-    read = [*_read(learning, columns.action), *_read_otherwise(noted, columns, learning)]
+    read = [*_read(learning, columns.action * acts), *_read_otherwise(noted, columns, learning)]
     if lengths.seen:
         read.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
     show(facts("What was read", read), *tables_of(learning.model))
@@ -300,6 +329,40 @@ def _check_out(out: Path | None, option: str = "--out") -> None:
             raise ValueError(f"{option} {out}: {what}") from None
 
 
+def _look_first(file: str, reading: Reading) -> list[str]:
+    """What a log seems to need that was not asked for; where nothing was, a way to learn."""
+    from evofsm.cli.look import look_at
+    from evofsm.driving.naming import VARIABLES
+    from evofsm.io.logs import open_table
+    from evofsm.io.tables import CsvTable, ParquetTable, Skips, silent
+
+    columns = reading.columns
+    table = open_table(file, columns, reading.lengths, silent, reading.topics, Skips(), [])
+    if not isinstance(table, CsvTable | ParquetTable):
+        return []
+    found, options = look_at(table)
+    could = dict(options)
+    if columns.observe.names == VARIABLES and not {*VARIABLES} & {*table.columns} and options:
+        to_file = "--guard" if "--failed" in could else "--out"
+        options.append((to_file, f"{to_file[2:]}.evofsm"))
+        command = [f"evofsm learn {quote(file)}", *(f"{a} {quote(b)}" for a, b in options)]
+        show(facts(f"What {file} holds", found), "\nA way to learn from it:")
+        print("  " + " \\\n      ".join(command), flush=True)
+        what = f"{file} has no column {VARIABLES[0]!r}; a way to read it stands above"
+        raise ValueError(f"{what} (--observe names the right ones)")
+    said = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
+    asked = zip(_UNASKED.items(), said, strict=True)
+    return [f"{why}: {a} {quote(could[a])}" for (a, why), b in asked if b is None and a in could]
+
+
+def _saying(chunks: Iterable[Chunk], lines: list[str]) -> Iterator[Chunk]:
+    """The same chunks; lines are said once it is known that something can be read."""
+    for chunk in chunks:
+        while lines:
+            warn(lines.pop(0))
+        yield chunk
+
+
 # -- What came of it ------------------------------------------------------------------------------
 
 
@@ -318,13 +381,19 @@ def _provenance(learning: Learning, files: list[Any], columns: LogColumns) -> di
 
 def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
     """Where it is, what it takes, and what it reckons with."""
-    from evofsm.guard import LearntRisk
+    from evofsm.guard import Foresight, LearntRisk
 
     assert guard.judge is not None
     names = map(guard.judge.labels.variable, range(len(guard.variables)))
     keys = ", ".join(["time [s]", *names])
-    takes = f"evofsm monitor --guard {path} takes rows of {keys}, and proposal, the action."
+    also = "" if isinstance(guard.judge, Foresight) else ", and proposal, the action"
+    takes = f"evofsm monitor --guard {path} takes rows of {keys}{also}."
     yield f"The guard was saved to {path}. {takes}"
+    if isinstance(guard.judge, Foresight):
+        tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
+        yield f"It alarms where more than {tolerance:.0%} of such alarms were right, held out."
+        yield f"What it learnt: {guard.judge.told_by_experience}."
+        return
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
         return
@@ -354,14 +423,13 @@ def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     together = f"{read.seconds:.1f} s" if minutes < 2.0 else f"{minutes:,.1f} min"
     yield "episodes", f"{read.episodes:,}, together {together}"
     yield "transitions", f"{learning.transitions:,}"
-    if read.jumps:
-        yield "time jumps", f"{read.jumps:,}; each begins an episode"
     assert actions is not None
     text = f"{actions.n_actions} intervals of {action} from {actions.low:g} to {actions.high:g}"
     if clipped := read.clipped_below + read.clipped_above:
         text += f"; {read.clipped_below:,} below and {read.clipped_above:,} above "
         text += f"({clipped / read.rows:.1%} of rows) were put into the end intervals"
-    yield "actions", text if clipped else f"{text}; none was beyond"
+    text = text if clipped else f"{text}; none was beyond"
+    yield "actions", text if action else "none: nobody acts (--action '')"
     settings = describe_rule(learning.machine.rule)
     for name in ("radius", "spread"):  # which the rule may have itself
         settings.setdefault(name, learning.machine.settings[name])
@@ -403,11 +471,25 @@ def _read_otherwise(
         text = f"{learning.read.failures:,} episode{several} ended with {columns.failed}"
         left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
         yield "failures", text + (left_out if noted.after_failure else "")
+    hole = columns.longest_hole
+    if columns.resample:
+        step, ways = columns.resample
+        others = "".join(f", the {way} of {name}" for name, way in ways.items())
+        what = f"{noted.resampled:,} became means of {step:g} s{others}"
+        yield "resampled", f"{what} (--resample {step:g}s,NAME=max: others are min, last)"
+    if noted.crossed:
+        yield "holes", f"{noted.crossed:,} of at most {hole:g} s (--hole) cost a transition each"
+    if jumps := learning.read.jumps:
+        yield "time jumps", f"{jumps:,}; each begins an episode (a longer --hole bridges them)"
     if noted.leaderless:
         why = "a number is missing" + f", or {columns.no_leader}" * (
             columns.no_leader not in (None, "end")
         )
-        yield "left out", f"{noted.leaderless:,} rows: {why}; there an episode ends"
+        ends = "" if hole and not columns.no_leader else "; there an episode ends"
+        yield "left out", f"{noted.leaderless:,} rows: {why}{ends}"
+    if noted.elsewhere:
+        why = f"--where {columns.where} does not hold; there an episode ends"
+        yield "left out", f"{noted.elsewhere:,} rows: {why}"
     told = {name: unit for name, unit in noted.units.items() if UNITS.get(unit, 1.0) != 1.0}
     if told:
         given = (f"{name} from {one}" for name, one in told.items())

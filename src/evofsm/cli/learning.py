@@ -27,7 +27,7 @@ from evofsm.fsm.model import FSMModel
 from evofsm.fsm.step import Trace
 from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
 from evofsm.io import Chunk, episodes_of
-from evofsm.io.logs import Condition, LogColumns, Noted
+from evofsm.io.logs import LogColumns, Noted
 from evofsm.io.tables import SI, TIMES, UNITS
 
 Beliefs = NDArray[np.float64]
@@ -51,6 +51,8 @@ _LEFT_OUT = {
     "action": "rows have no action, and what leads on from them was not learnt",
     "cut": "file ends early, and what is whole was read",
 }
+# What reaches so far is no car's speed in any unit [m/s]: revolutions, perhaps.
+_NO_SPEED = 500.0
 # Numbers that stand for nobody in many recordings.
 _NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
 
@@ -140,7 +142,7 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
         f"mph? --unit {quote(f'{name}=km/h')} converts it"
         for name, fastest in noted.fastest.items()
-        if name not in called
+        if name not in called and fastest < _NO_SPEED
     ]
     found += [
         f"{name} is called as if it were in {unit}, and was read as one of the SI: --unit "
@@ -149,12 +151,16 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         for name, unit in called.items()
     ]
     if columns.failed and not noted.failing:
-        column, goes = Condition.parse(columns.failed).column, ""
-        if noted.compared:
-            (low, high), unit = noted.compared, SI.get(noted.units.get(column, ""), "")
-            goes = f": {column}, as compared, goes from {low:.6g} to {high:.6g} {unit}".rstrip()
-        found.append(f"no row meets --failed {quote(columns.failed)}{goes}")
-    if (step := noted.longest_step) > 0.0 and time not in called:
+        goes = []
+        for name, (seen, *more) in ((k, v) for k, v in noted.compared.items() if v):
+            if isinstance(seen, str):
+                goes.append(f"{name} is {', '.join(map(repr, [seen, *more]))}")
+            else:
+                told = f"{name}, as compared, goes from {seen:.6g} to {more[0]:.6g} "
+                goes.append(told + SI.get(noted.units.get(name, ""), ""))
+        told = ": ".join([f"no row meets --failed {quote(columns.failed)}", *goes])
+        found.append(told.rstrip())
+    if (step := noted.longest_step) > 0.0 and time in noted.untold and time not in called:
         unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
         cause = f"is the time in {unit}? --unit {time}={unit} converts it"
         found.append(f"there is a row every {step:,.6g} s: {cause}")

@@ -18,7 +18,9 @@ from evofsm.extras import install
 
 if TYPE_CHECKING:
     from evofsm.driving import Family
+    from evofsm.fsm.observations import ObservationEncoder
     from evofsm.io import LogColumns, Topics, VehicleLengths
+    from evofsm.io.logs import Resample
 
 #: Where to drive.
 World = Literal["sumo", "kinematic"]
@@ -76,10 +78,16 @@ Observed = Annotated[
     ),
 ]
 ActionColumn = Annotated[
-    str, option("Column of the action taken from a row to the next.", "--action")
+    str,
+    option("Column of the action taken from a row to the next; '': nobody acts.", "--action"),
 ]
 TimeColumn = Annotated[
-    str, option("Column of the time, in seconds or as dates of ISO 8601.", "--time")
+    str,
+    option(
+        "Column of the time, in seconds or as dates: ISO 8601, or 14.03.2026 09:26:53. Of date and "
+        "time of day with a comma between.",
+        "--time",
+    ),
 ]
 EpisodeColumns = Annotated[
     str | None,
@@ -93,16 +101,18 @@ Step = Annotated[float | None, option("From a row to the next [s], without a clo
 Failed = Annotated[
     str | None,
     option(
-        "What failed: a column of truth values, or a comparison, in SI units, such as 'gap<=0'. "
-        "The row with which it becomes true ends the episode in failure.",
+        "What failed: a column of truth values, or a comparison, in SI units, such as 'gap<=0' or "
+        "\"Status=='off'\", with 'and' or 'or' between several. The row with which it becomes true "
+        "ends the episode in failure.",
         "--failed",
     ),
 ]
 Units = Annotated[
     list[str] | None,
     option(
-        "Of a column, or of all that begin so: v=km/h, time=ms. May be repeated. [default: of a "
-        "row of units below the names, if there is one]",
+        "Of a column, or of all that begin so: v=km/h, time=ms; of a date how it is written, "
+        "'time=%m/%d/%Y %H:%M'. May be repeated. [default: of a row of units below the names, if "
+        "there is one]",
         "--unit",
     ),
 ]
@@ -126,6 +136,30 @@ Hold = Annotated[
         "than this [s]; rows are those with an action. [default: 0.5 where no row is whole]",
         "--hold",
         min=0.0,
+    ),
+]
+Where = Annotated[
+    str | None,
+    option(
+        "A condition, as of --failed, for rows that count: 'Speed>100', or \"Mode!='service'\". "
+        "Others are left out, and end an episode, but not in failure.",
+        "--where",
+    ),
+]
+Resampled = Annotated[
+    str | None,
+    option(
+        "Rows of so long a time become one, their mean, or of some columns another: 30s, or "
+        "30s,Speed=last,Vibration=max.",
+        "--resample",
+    ),
+]
+Hole = Annotated[
+    str | None,
+    option(
+        "So long a hole in time costs a transition, and no episode: 10min. [default: 1.5 usual "
+        "steps; 10 of --resample]",
+        "--hole",
     ),
 ]
 SkipBad = Annotated[
@@ -212,6 +246,7 @@ class Reading(NamedTuple):
     columns: LogColumns
     lengths: VehicleLengths
     topics: Topics | None
+    acts: bool = True  #: whether somebody acts; else the action is any column, and means nothing
 
 
 def reading_of(
@@ -227,6 +262,9 @@ def reading_of(
     hold: Hold = None,
     skip_bad: SkipBad = SKIPPED,
     vehicle_length: Lengths = None,
+    where: Where = None,
+    resample: Resampled = None,
+    hole: Hole = None,
 ) -> Reading:
     """How a log is read, from the options of those names."""
     from evofsm.driving.naming import VARIABLES
@@ -235,8 +273,9 @@ def reading_of(
     from evofsm.io import LogColumns, Topics
     from evofsm.io.tables import quoted_name
 
-    if hold is not None and dt is not None:
-        raise ValueError("--hold goes by a clock, and --dt stands in for one; give one of them")
+    for name, value in {"--hold": hold, "--resample": resample, "--hole": hole}.items():
+        if value is not None and dt is not None:
+            raise ValueError(f"{name} goes by a clock, and --dt stands in for one; give one")
 
     def variable(quoted: str, rest: str) -> str | Category:
         name, discrete, values = rest.partition("=")
@@ -251,8 +290,8 @@ def reading_of(
         raise ValueError(f"--observe {observe}: {error}") from None
     columns = LogColumns(
         observe=encoder,
-        action="".join(quoted_name(action)),
-        time="".join(quoted_name(time)),
+        action="".join(quoted_name(action)) or encoder.names[0],
+        time=",".join(split_names(time)),
         episode=None if episode is None else split_names(episode),
         dt=None if dt is None else positive("--dt", dt),
         failed=failed,
@@ -260,9 +299,58 @@ def reading_of(
         no_leader=no_leader,
         hold=hold,
         skip_bad=skip_bad,
+        where=where,
+        resample=None if resample is None else _resampled(resample, encoder, action),
+        hole=None if hole is None else seconds("--hole", hole),
     )
     lengths = lengths_given(vehicle_length or ())
-    return Reading(columns, lengths, None if topics is None else Topics.load(topics))
+    given = None if topics is None else Topics.load(topics)
+    return Reading(columns, lengths, given, acts=action != "")
+
+
+Horizon = Annotated[
+    float | None,
+    option(
+        "Where nobody acts: an alarm is right if a failure comes within so long [s]. [default: a "
+        "twentieth of the median episode]",
+        min=0.0,
+    ),
+]
+Persist = Annotated[
+    float, option("Where nobody acts: how long a limit is passed before it alarms [s].", min=0.0)
+]
+
+
+def seconds(name: str, text: str) -> float:
+    """How long a text says it is [s].
+
+    >>> seconds("--hole", "10min"), seconds("--hole", "0.5")
+    (600.0, 0.5)
+    """
+    from evofsm.fsm.validation import positive
+    from evofsm.io.tables import TIMES
+
+    found = re.fullmatch(r"\s*([0-9.]+)\s*([a-z]*)\s*", text)
+    try:
+        assert found is not None
+        return positive(name, float(found[1])) * (TIMES | {"d": 86400.0})[found[2] or "s"]
+    except (AssertionError, ValueError, KeyError):
+        raise ValueError(f"{name} is {text!r}; write how long, such as 30s, 10min or 1h") from None
+
+
+def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
+    """How rows of a step become one."""
+    from evofsm.io.logs import BECOME, Resample
+
+    step, *told = _named(text) or [("", "")]
+    how = {}
+    for quoted, rest in told:
+        name, _, become = f"{quoted}{rest}".rpartition("=")
+        if name not in (*encoder.variables, action) or become not in BECOME:
+            may = f"NAME=HOW with one of {', '.join(BECOME)}, of a number that is read"
+            raise ValueError(f"--resample is {text!r}; write 30s, or 30s and behind commas {may}")
+        how[name] = become
+    return Resample(seconds("--resample", "".join(step)), how)
 
 
 def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -290,7 +378,7 @@ def units_given(texts: Iterable[str]) -> dict[str, str]:
     found: dict[str, str] = {}
     for text in texts:
         name, _, unit = ("".join(quoted_name(part.strip())) for part in text.rpartition("="))
-        if not (name and unit in UNITS):
+        if not (name and (unit in UNITS or "%" in unit)):
             raise ValueError(f"--unit is {text!r}; write NAME=UNIT with one of {', '.join(UNITS)}")
         if name in found:
             raise ValueError(f"--unit names {name!r} twice")

@@ -8,10 +8,10 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from operator import attrgetter
 from shlex import quote
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,16 @@ _NO_LEADER = (
     " (a missing or failed measurement, or no leader? --no-leader end leaves such rows out; or "
     + _HELD
 )
+# So many texts of a column are shown.
+_MANY_TEXTS = 10
+#: What the values of a step may become.
+BECOME = ("mean", "last", "max", "min")
+# In steps of what is resampled, the longest hole within an episode.
+_HOLE = 10.0
+# A value in quotes; and what stands between conditions, outside of quotes.
+_IN_QUOTES = re.compile(r"""(["'])(.*)\1$""")
+_OUTSIDE = r"""(?=(?:[^"']|"[^"]*"|'[^']*')*$)"""
+_OR, _AND = (re.compile(rf"\s+{word}\s+{_OUTSIDE}") for word in ("or", "and"))
 _SIGNS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt}
 _SIGNS |= {"==": operator.eq, "!=": operator.ne}
 _TRUTHS = {"true": 1, "yes": 1, "1": 1, "1.0": 1, "false": 0, "no": 0, "0": 0, "0.0": 0}
@@ -118,10 +128,15 @@ class Noted:
     #: How many times a rate is what another column says, where they differ: of gap, and action.
     rates: dict[str, float] = field(default_factory=dict)
     leaderless: int = 0  #: rows without a leader, or in which a number is missing, left out
+    elsewhere: int = 0  #: rows left out for ``where``
+    resampled: int = 0  #: rows of which those that are learnt were made
+    crossed: int = 0  #: transitions that nobody knows, across holes within an episode
     after_failure: int = 0  #: rows left out because the failure before them still held
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
+    began: float = 0.0  #: time 0, where that is a date, since 1970 [s]
     failing: int = 0  #: rows that meet what tells of failures
-    compared: tuple[float, float] | None = None  #: range of the column compared for that, in SI
+    #: By column compared for that, what was there: the ends of its range in SI, or texts.
+    compared: dict[str, list[Any]] = field(default_factory=dict)
     fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
     longest_step: float = 0.0  #: the usual one, beyond belief [s]
     #: By variable, the number that it is below 0 (0 where there are several), and in how many rows.
@@ -191,44 +206,87 @@ def units_of(units: Mapping[str, str], used: Sequence[str]) -> dict[str, str]:
     return found
 
 
-class Condition(NamedTuple):
-    """What tells of failures: a column of truth values, or one that is compared with a number."""
+class Term(NamedTuple):
+    """A column of truth values, or one that is compared with a number or a text."""
 
     column: str
     sign: str  #: of the comparison; empty for truth values
-    number: float
+    value: float | str
 
     @classmethod
-    def parse(cls, text: str, option: str = "--failed") -> Condition:
-        """From ``collided`` or ``gap<=0``; a name with a sign in it stands in double quotes."""
+    def parse(cls, text: str) -> Term:
+        """From ``collided``, ``gap<=0`` or ``Status=='off'``; a ValueError if it is none."""
         name, rest = quoted_name(text)
-        column, sign, number, *_ = *re.split("([<>]=?|[=!]=)", rest, maxsplit=1), "", "0"
-        try:
-            condition = cls(name + column.strip(), sign, float(number))
-        except ValueError:
-            condition = cls("", "", np.nan)
-        if not (condition.column and np.isfinite(condition.number)):
-            raise ValueError(
-                f"{option} is {text!r}; write a column of truth values, such as collided, or "
-                "compare one with a number, such as 'gap<=0'"
-            )
-        return condition
+        column, sign, value, *_ = *re.split("([<>]=?|[=!]=|=)", rest, maxsplit=1), "", ""
+        column, value, text_given = name + column.strip(), value.strip(), _IN_QUOTES.match(value)
+        sign = "==" if sign == "=" else sign
+        if not column or bool(sign) != bool(value) or (not sign and _IN_QUOTES.match(column)):
+            raise ValueError(text)
+        if sign and not text_given and is_number(value) and np.isfinite(float(value)):
+            return cls(column, sign, float(value))
+        is_odd = not text_given and (is_number(value) or re.search("[<>=]", value))
+        if sign[:1] in ("<", ">") or is_odd:
+            raise ValueError(text)
+        return cls(column, sign, text_given[2] if text_given else value)
+
+    @property
+    def of_number(self) -> bool:
+        """Whether the column is compared with a number."""
+        return isinstance(self.value, float)
 
     def holds(self, piece: Piece) -> NDArray[np.bool_]:
-        """In which rows of a piece it holds; where a number is missing it never does."""
-        if self.sign:
+        """In which rows of a piece it holds; where nothing stands it never does."""
+        if self.of_number:
             values = piece.numbers[self.column]
-            return np.asarray(_SIGNS[self.sign](values, self.number) & ~np.isnan(values))
-        texts = piece.texts[self.column].str.strip_chars().str.to_lowercase()
-        values = texts.replace_strict(_TRUTHS, default=-1).to_numpy()
+            return np.asarray(_SIGNS[self.sign](values, self.value) & ~np.isnan(values))
+        texts = piece.texts[self.column].str.strip_chars()
+        if self.sign:
+            return ((texts != "") & ((texts == self.value) == (self.sign == "=="))).to_numpy()
+        values = texts.str.to_lowercase().replace_strict(_TRUTHS, default=-1).to_numpy()
         if (values < 0).any():
             piece.leave_out(
                 self.column,
                 values < 0,
                 "{!r} is no truth value; here a column of 0 and 1, true and false or yes and no is "
-                f"needed, or a comparison such as '{self.column}>0'",
+                f"needed, or a comparison such as '{self.column}>0' or \"{self.column}=='on'\"",
             )
         return np.asarray(values > 0)
+
+
+class Condition(NamedTuple):
+    """What holds of some rows: any of these, of each of which all terms hold."""
+
+    either: Sequence[Sequence[Term]]
+
+    @classmethod
+    def parse(cls, text: str, option: str = "--failed") -> Condition:
+        """Terms with ``and`` and ``or`` between; a name with a sign in it is in double quotes."""
+        try:
+            return cls([[*map(Term.parse, _AND.split(part))] for part in _OR.split(text)])
+        except ValueError:
+            raise ValueError(
+                f"{option} is {text!r}; write a column of truth values, such as collided, or "
+                "compare one with a number or a text, such as 'gap<=0' or \"Status=='off'\", "
+                "with 'and' or 'or' between several"
+            ) from None
+
+    @property
+    def terms(self) -> list[Term]:
+        """All of them."""
+        return [term for terms in self.either for term in terms]
+
+    def holds(self, piece: Piece) -> NDArray[np.bool_]:
+        """In which rows of a piece it holds."""
+        each = [np.logical_and.reduce([t.holds(piece) for t in terms]) for terms in self.either]
+        return np.asarray(np.logical_or.reduce(each))
+
+
+class Resample(NamedTuple):
+    """How rows become fewer: those of a step are one."""
+
+    step: float  #: [s]
+    #: Of columns: ``"last"``, ``"max"``, ``"min"``; the mean of others.
+    how: Mapping[str, str] = {}
 
 
 @dataclass(frozen=True)
@@ -263,6 +321,16 @@ class LogColumns:
         not older than this [s]; rows are those with an action. Where no row has all values, 0.5 s.
     skip_bad : int
         So many bad rows of a file are left out, and counted; with more it is refused.
+    where : str, optional
+        A condition, as ``failed`` takes one: rows in which it does not hold are left out, and end
+        the episode. A failure that begins with the first of them is that of the row before.
+    resample : Resample, optional
+        Rows of a step become one, with a clock as regular as that; the row that failed stays as it
+        is. A row in which a number is missing is left out, and ends no episode.
+    hole : float, optional
+        Longer than this [s] is a hole that begins an episode; what is shorter, but no usual step,
+        costs the transition across it alone. Without it each begins an episode; with ``resample``
+        it is ten of its steps.
     """
 
     observe: ObservationEncoder = field(default_factory=lambda: ObservationEncoder(*VARIABLES))
@@ -275,6 +343,14 @@ class LogColumns:
     no_leader: str | None = None
     hold: float | None = None
     skip_bad: int = SKIPPED
+    where: str | None = None
+    resample: Resample | None = None
+    hole: float | None = None
+
+    @property
+    def longest_hole(self) -> float | None:
+        """Up to which a hole costs no episode [s]."""
+        return self.hole or (self.resample and _HOLE * self.resample.step)
 
 
 # -- Reading --------------------------------------------------------------------------------------
@@ -335,20 +411,24 @@ def read_traces(
     columns = columns or LogColumns()
     lengths = lengths or VehicleLengths()
     noted = noted or Noted()
-    clock = _Clock(columns.dt)
+    clock = _Clock(columns)
     for path in paths:
         clock.open(path)
-        rows, left_out, skips = 0, noted.leaderless, Skips(columns.skip_bad, noted.skipped)
-        table = _open(path, columns, lengths, on_read, topics, skips, noted.told)
+        rows, left_out = 0, noted.leaderless + noted.elsewhere
+        skips = Skips(columns.skip_bad, noted.skipped)
+        table = open_table(path, columns, lengths, on_read, topics, skips, noted.told)
         these = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
-        for chunk in _Reader(table, these, clock, noted).chunks():
+        chunks = _Reader(table, these, clock, noted).chunks()
+        if these.longest_hole:
+            chunks = _on_one_clock(chunks, these, noted)
+        for chunk in chunks:
             rows += len(chunk.times)
             noted.see(chunk, columns.observe.names, first=rows == len(chunk.times))
             yield chunk
-        if rows == 0 and noted.leaderless > left_out:
-            raise ValueError(
-                f"{path}: no row is left; {', '.join(columns.observe.names)} must all be there"
-            )
+        if rows == 0 and noted.leaderless + noted.elsewhere > left_out:
+            meets = f", and --where {columns.where} must hold" if columns.where else ""
+            names = ", ".join(columns.observe.names)
+            raise ValueError(f"{path}: no row is left; {names} must all be there{meets}")
         if rows == 0:
             skips.refuse_nothing(f"{path} has a header but no rows")
     lengths.refuse_unknown()
@@ -429,19 +509,89 @@ def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterat
 
 
 def _joined(parts: Sequence[Chunk]) -> Chunk:
+    """Chunks as one; ``jumps`` are those of the last one."""
+    if len(parts) == 1:
+        return parts[0]
+    offsets = np.cumsum([0, *(len(part.times) for part in parts[:-1])])
+
+    def rows(name: str) -> NDArray[np.int64]:
+        found = [getattr(part, name) + at for part, at in zip(parts, offsets, strict=True)]
+        return np.concatenate(found)
+
     observations, actions, times = (
         np.concatenate([getattr(part, name) for part in parts])
         for name in ("observations", "actions", "times")
     )
-    failures = parts[-1].failures  # which end an episode
-    if failures is not None:
-        failures = failures + len(times) - len(parts[-1].times)
-    return parts[0]._replace(
-        observations=observations, actions=actions, times=times, dt=parts[-1].dt, failures=failures
-    )
+    fails = None if parts[0].failures is None else rows("failures")
+    names = [name for part in parts for name in part.names]
+    dt, jumps, source = parts[-1].dt, parts[-1].jumps, parts[0].source
+    return Chunk(source, observations, actions, times, rows("starts"), dt, jumps, fails, names)
 
 
-def _open(
+def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) -> Iterator[Chunk]:
+    """The rows of a step as one; before a hole within an episode the action is unknown.
+
+    Its last row may belong to a step that goes on, or have a hole behind it: a chunk leaves it to
+    the next one.
+    """
+    step = columns.resample and columns.resample.step
+    said = columns.resample.how if columns.resample else {}
+    variables, names = columns.observe.variables, columns.observe.names
+    hows = [said.get(name, "mean") if name in variables else "last" for name in names]
+    rest: Chunk | None = None
+    for chunk in chain(chunks, [None]):
+        parts = [one for one in (rest, chunk) if one is not None]
+        if not parts:
+            return
+        noted.resampled += 0 if chunk is None else len(chunk.times)
+        whole = _joined(parts)
+        times, fails = whole.times, np.zeros(len(whole.times), np.bool_)
+        fails[[] if whole.failures is None else whole.failures] = True
+        begins = fails | (not step)  # the row that failed stays as it is
+        begins[whole.starts] = begins[0] = True
+        if step:
+            ticks = np.floor(times / step + 1e-9)
+            begins[1:] |= ticks[1:] != ticks[:-1]
+            later = np.append(False, fails[1:] & (ticks[1:] == ticks[:-1]))
+            later[whole.starts] = False
+            times = step * (ticks + later)
+        first = np.flatnonzero(begins)
+        steps = np.diff(times[first])
+        lost = (steps > LONGEST_STEP * whole.dt) | (steps < whole.dt / LONGEST_STEP)
+        starts = np.searchsorted(first, whole.starts)
+        lost[starts[starts > 0] - 1] = False
+        actions = _become(whole.actions, first, said.get(columns.action, "mean"))
+        actions[:-1][lost] = np.nan
+        seen = [_become(z, first, how) for z, how in zip(whole.observations.T, hows, strict=True)]
+        made = whole._replace(
+            observations=np.column_stack(seen),
+            actions=actions,
+            times=times[first],
+            starts=starts,
+            failures=None if whole.failures is None else np.searchsorted(first, whole.failures),
+        )
+        keeps = len(first) - (chunk is not None and not fails[-1])
+        noted.crossed += int(lost[:keeps].sum())
+        rest = None
+        if keeps < len(first):
+            rest = whole.rows(int(first[-1]), len(fails))._replace(jumps=0)
+        if keeps:
+            yield made.rows(0, keeps)
+
+
+def _become(values: NDArray[np.float64], first: NDArray[np.int64], how: str) -> NDArray[np.float64]:
+    """What the values of each step become; those that are missing do not count."""
+    if how == "last":
+        return np.asarray(values[np.append(first[1:], len(values)) - 1])
+    if how != "mean":
+        return np.asarray((np.fmax if how == "max" else np.fmin).reduceat(values, first))
+    there = ~np.isnan(values)
+    counts = np.add.reduceat(there, first, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.add.reduceat(np.where(there, values, 0.0), first) / counts)
+
+
+def open_table(
     path: str,
     columns: LogColumns,
     lengths: VehicleLengths,
@@ -497,13 +647,15 @@ def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
     """What is read of a recording of many vehicles; what else was asked for is refused."""
     asked = [f"--observe {name}" for name in columns.observe.names if name not in VARIABLES]
     asked += [f"--action {columns.action}"] if columns.action != ACTION else []
-    given = {"--episode": columns.episode, "--dt": columns.dt, "--unit": columns.units or None}
-    given |= {"--hold": columns.hold}
+    given: dict[str, object] = {"--episode": columns.episode, "--dt": columns.dt}
+    given |= {"--unit": columns.units or None}
+    given |= {"--hold": columns.hold, "--where": columns.where, "--hole": columns.hole}
+    given |= {"--resample": columns.resample}
     asked += [option for option, value in given.items() if value is not None]
     if columns.no_leader not in (None, "end"):  # who has none is no pair
         asked += [f"--no-leader {columns.no_leader}"]
-    failed = None if columns.failed is None else Condition.parse(columns.failed)
-    if failed is not None and not (failed.sign and failed.column in (*VARIABLES, ACTION)):
+    terms = [] if columns.failed is None else Condition.parse(columns.failed).terms
+    if not all(term.of_number and term.column in (*VARIABLES, ACTION) for term in terms):
         asked += [f"--failed {columns.failed} (but with 'gap<=0')"]
     if asked:
         raise ValueError(
@@ -520,9 +672,11 @@ class _Clock:
     The usual step of a file is the median of the steps in the first rows read of it.
     """
 
-    def __init__(self, dt: float | None) -> None:
-        self.ticks = dt is None
-        self.dt = np.nan if dt is None else dt
+    def __init__(self, columns: LogColumns) -> None:
+        self.ticks = columns.dt is None
+        step = columns.resample.step if columns.resample else columns.dt
+        self.dt = np.nan if step is None else step
+        self._longest, self._resampled = columns.longest_hole or 0.0, columns.resample is not None
         self._first_path = ""
 
     def open(self, path: str) -> None:
@@ -535,9 +689,12 @@ class _Clock:
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Mark rows after a hole in time within an episode, and those that bring nothing later."""
         late = np.zeros(piece.rows, np.bool_)
+        if self._longest:  # a row without a time costs no more than itself
+            rows = np.where(np.isnan(times), 0, np.arange(1, len(times) + 1))
+            times = np.append(self._last, times)[np.maximum.accumulate(rows)]
         steps = np.diff(times, prepend=self._last)
         steps[starts] = np.nan
-        if (steps <= 0.0).any():
+        if ((steps < 0.0) | ((steps == 0.0) & ~piece.bad & (not self._resampled))).any():
             late = self._late(times, starts, piece)
             on = np.flatnonzero(~late)
             steps[late], steps[on] = np.nan, np.diff(times[on], prepend=self._last)
@@ -545,9 +702,11 @@ class _Clock:
             times = np.append(self._last, times[on])
         self._last = times[-1]
         first = steps[:_FIRST_ROWS]
-        if np.isnan(self._usual) and not np.isnan(first).all():
+        if np.isnan(self._usual) and not (np.isnan(first).all() or self._resampled):
             exact = -math.log10(np.spacing(np.nanmax(abs(times))))  # digits that times can have
             self._settle(round(float(np.nanmedian(first)), min(9, int(exact))))
+        if self._longest:
+            return np.asarray(steps > self._longest), late
         unusual = (steps > LONGEST_STEP * self._usual) | (steps < self._usual / LONGEST_STEP)
         return np.asarray(unusual), late
 
@@ -556,14 +715,15 @@ class _Clock:
     ) -> NDArray[np.bool_]:
         late, latest = np.zeros(piece.rows, np.bool_), self._last
         for row, (time, begins) in enumerate(zip(times.tolist(), starts.tolist(), strict=True)):
-            late[row] = not begins and time <= latest
+            is_late = time < latest or (time == latest and not self._resampled)
+            late[row] = not begins and is_late and not piece.bad[row]
             if late[row]:
                 piece.skips.leave_out(
                     "time",
                     f"{piece.at(row)}: time goes from {latest:g} to {time:g} within an episode; it "
                     "must run forward (a row twice, rows not sorted by time, a clock of too few "
-                    "digits, or several episodes mixed? --episode names the columns that tell them "
-                    "apart, and --dt stands in for a clock)",
+                    "digits, summer time that ends, or several episodes mixed? --episode names the "
+                    "columns that tell them apart, and --dt stands in for a clock)",
                 )
             latest = latest if late[row] else time
         return late
@@ -579,7 +739,8 @@ class _Clock:
         if not abs(usual / self.dt - 1.0) < _SAME_STEP:
             raise ValueError(
                 f"{self._path} has a row every {usual:g} s, but {self._first_path} has one every "
-                f"{self.dt:g} s; a machine knows only one step: resample, or learn them apart"
+                f"{self.dt:g} s; a machine knows only one step: --resample "
+                f"{2.0 * max(usual, self.dt):g}s, or learn them apart"
             )
         self._usual = usual
 
@@ -593,10 +754,10 @@ class _Reader:
         self._observed = [v for v in self._variables if isinstance(v, str)]
         usual = [name for name in USUAL_EPISODE if name in table.columns]
         self._episode = usual if columns.episode is None else list(columns.episode)
-        self._failed = None if columns.failed is None else Condition.parse(columns.failed)
-        self._nobody = None
-        if columns.no_leader not in (None, "end"):
-            self._nobody = Condition.parse(columns.no_leader, "--no-leader")
+        told = {"--failed": columns.failed, "--where": columns.where}
+        told |= {} if columns.no_leader == "end" else {"--no-leader": columns.no_leader}
+        self._conditions = {o: Condition.parse(t, o) for o, t in told.items() if t is not None}
+        self._failed = self._conditions.get("--failed")
         self._before = 0  # rows
         self._first_date = np.nan
         # How long values are held, 0 for not at all; and those held, with their times.
@@ -608,38 +769,46 @@ class _Reader:
         self._latest: tuple[str, ...] | None = None
         # Whether the condition held in the row before, and whether that ended its episode.
         self._held = self._ended = False
+        self._kept = self._failed_before = False  # that row; whether what failed turned out later
         self._unknown: Callable[[], str] | None = None  # says where that row has no action
 
     def chunks(self) -> Iterator[Chunk]:
         """The rows that are learnt, piece by piece."""
         action, clock = self._columns.action, self._clock
         wanted, factors = self._wanted()
+        waiting: Chunk | None = None  # until it is known whether its last row failed
         for piece in filter(attrgetter("rows"), self._table.pieces(wanted)):
             for name, factor in factors.items():
                 piece.numbers[name] = piece.numbers[name] * factor
-            if clock.ticks and wanted.date is None:
+            if clock.ticks and not wanted.dates:
                 piece.leave_out_unusable(self._columns.time)
-            times = self._times(piece, wanted.date)
+            times = self._times(piece, is_date=bool(wanted.dates))
             if clock.ticks and (filled := self._fill(piece, times)) is not None:
                 piece, times = piece.take(filled), times[filled]
             if not piece.rows:
                 continue
             starts = self._starts(piece)
             anew, late, holes = starts.copy(), *np.zeros((2, piece.rows), np.bool_)
-            starts[[row for row in piece.anew if row < piece.rows]] = True
+            if not self._columns.longest_hole:
+                starts[[row for row in piece.anew if row < piece.rows]] = True
             if clock.ticks:
                 holes, late = clock.holes(times, starts, piece)
             starts |= holes
             self._before += piece.rows
             observations = np.column_stack([_encoded(piece, v) for v in self._variables])
             kept, fails = self._sift(piece, anew, starts, late)
+            if self._failed_before and waiting is not None and waiting.failures is not None:
+                last = len(waiting.times) - 1
+                waiting = waiting._replace(failures=np.append(waiting.failures, last))
             if not kept.any():
                 continue
+            if waiting is not None:
+                yield waiting
             episodes = (
                 np.searchsorted(piece.starts or (), np.flatnonzero(starts & kept), "right") - 1
             )
             rows = slice(None) if kept.all() else kept  # a slice copies nothing
-            yield Chunk(
+            waiting = Chunk(
                 source=self._table.path,
                 observations=observations[rows],
                 actions=piece.numbers[action][rows],
@@ -650,6 +819,8 @@ class _Reader:
                 failures=None if self._failed is None else np.flatnonzero(fails[rows]),
                 names=[piece.names[k] for k in episodes] if piece.names else (),
             )
+        if waiting is not None:
+            yield waiting
 
     def _fill(self, piece: Piece, times: NDArray[np.float64]) -> NDArray[np.int64] | None:
         """Fill in the latest values of each signal, and say which rows count: those with an action.
@@ -686,16 +857,18 @@ class _Reader:
 
     def _wanted(self) -> tuple[Wanted, dict[str, float]]:
         """What is read, and what turns columns into units of the SI, for those that need it."""
-        table, columns, failed = self._table, self._columns, self._failed
+        table, columns = self._table, self._columns
         learnt = [*self._observed, columns.action]
-        clock = [columns.time] if self._clock.ticks else []
-        conditions = {"--no-leader": self._nobody, "--failed": failed}
-        there = [one for one in conditions.values() if one is not None]
-        compared = [one.column for one in there if one.sign]
-        told = [one.column for one in there if not one.sign]
+        clock = []
+        if self._clock.ticks:  # a date and a time of day may be two columns
+            is_one = columns.time in table.columns
+            clock = [columns.time] if is_one else columns.time.split(",")
+        terms = [term for one in self._conditions.values() for term in one.terms]
+        compared = [term.column for term in terms if term.of_number]
+        told = [term.column for term in terms if not term.of_number]
         categories = [v.name for v in self._variables if isinstance(v, Category)]
         options = {
-            **{one.column: option for option, one in conditions.items() if one is not None},
+            **{t.column: option for option, one in self._conditions.items() for t in one.terms},
             **dict.fromkeys([*self._observed, *categories], "--observe"),
             **dict.fromkeys(self._episode, "--episode"),
             **dict.fromkeys(clock, "--time"),
@@ -705,16 +878,21 @@ class _Reader:
             if name not in table.columns:
                 shown = ", ".join(name[:40] for name in table.columns[:20])
                 more = f" and {len(table.columns) - 20:,} more" if len(table.columns) > 20 else ""
-                stands_in = ", and --dt stands in for a clock" if option == "--time" else ""
+                how = ", and --dt stands in for a clock" if option == "--time" else ""
+                if commas := [one for one in table.columns if "," in one and name in one]:
+                    how = f"; a name with a comma stands in double quotes: '\"{commas[0]}\"'"
                 raise ValueError(
                     f"{table.path} has no column {name!r}; it has {shown}{more} ({option} names "
-                    f"the right one{stands_in})"
+                    f"the right one{how})"
                 )
-        date = columns.time if clock and is_date(table.first(columns.time)) else None
-        numbers = [*learnt, *compared, *(clock if date is None else [])]
+        form = columns.units.get(columns.time, "")
+        form = form if "%" in form else ""
+        is_dated = clock and (form or is_date(" ".join(map(table.first, clock))))
+        numbers = [*learnt, *compared, *([] if is_dated else clock)]
         try:
             given = {name: unit for name in numbers if (unit := table.units.get(name))}
-            given |= units_of(columns.units, numbers)
+            units = {name: unit for name, unit in columns.units.items() if unit != form}
+            given |= units_of(units, numbers)
             for name, unit in given.items():
                 if unit in UNITS and (unit in TIMES) != (name == columns.time):
                     raise ValueError(
@@ -727,20 +905,22 @@ class _Reader:
         self._noted.untold += [name for name in numbers if name not in given]
         if not clock and is_number(table.first(columns.time)):
             numbers.append(columns.time)  # to be compared with --dt
-        wanted = Wanted(numbers, [*self._episode, *categories, *told], date)
+        texts = [*self._episode, *categories, *told]
+        wanted = Wanted(numbers, texts, clock if is_dated else (), form)
         return wanted, {name: UNITS[unit] for name, unit in given.items() if unit in UNITS}
 
-    def _times(self, piece: Piece, date: str | None) -> NDArray[np.float64]:
+    def _times(self, piece: Piece, *, is_date: bool) -> NDArray[np.float64]:
         if not self._clock.ticks:
             if self._before == 0:
                 self._compare_dt(piece)
             rows = np.arange(self._before, self._before + piece.rows)
             return rows * np.float64(self._clock.dt)
         times = np.where(piece.bad, np.nan, piece.numbers[self._columns.time])
-        if date is None:
+        if not is_date:
             return times
         if np.isnan(self._first_date):
             self._first_date = times[np.argmin(np.isnan(times))]
+            self._noted.began = float(self._first_date) * _MICROSECOND
         return (times - self._first_date) * _MICROSECOND
 
     def _compare_dt(self, piece: Piece) -> None:
@@ -794,49 +974,74 @@ class _Reader:
         An episode begins ``anew`` where the log says so, and at ``starts``. A condition that still
         holds is no second failure, and a hole in time does not make it one.
         """
-        action, compared = self._columns.action, self._failed
-        lacking = np.zeros(piece.rows, np.bool_)
-        for name in self._observed if self._columns.no_leader or self._hold else ():
-            lacking |= ~np.isfinite(piece.numbers[name])
-        nobody = False if self._nobody is None else self._nobody.holds(piece)
+        columns, failed = self._columns, self._failed
+        action = columns.action
+        lacking, nobody, elsewhere, still = np.zeros((4, piece.rows), np.bool_)
+        if columns.no_leader or columns.resample or self._hold:
+            for name in self._observed:
+                lacking |= ~np.isfinite(piece.numbers[name])
+        if "--no-leader" in self._conditions:
+            nobody = self._conditions["--no-leader"].holds(piece)
+        if "--where" in self._conditions:
+            elsewhere = ~self._conditions["--where"].holds(piece)
         lacking |= nobody
+        gone = lacking | elsewhere
         cars = VARIABLES if self._observed == [*VARIABLES] else ()
         for name in self._observed:
-            piece.leave_out_unusable(name, ~lacking, _NO_LEADER)
+            piece.leave_out_unusable(name, ~gone, _NO_LEADER)
         for name, span in zip(cars, RANGES, strict=False):
             why = f"{_NO_CAR}it lies between {span[0]:g} and {span[1]:g}"
-            piece.leave_out_unusable(name, ~lacking, "", span, why)
+            piece.leave_out_unusable(name, ~gone, "", span, why)
         unknown = np.isnan(piece.numbers[action])
-        piece.leave_out_unusable(action, ~lacking & ~unknown)
-        if not self._table.derives:
-            self._count_unknown(piece, unknown & ~lacking, starts)
-        if compared is not None and compared.sign and compared.column not in self._observed:
-            piece.leave_out(compared.column, np.isnan(piece.numbers[compared.column]) & ~lacking)
+        piece.leave_out_unusable(action, ~gone & ~unknown)
+        if not (self._table.derives or columns.resample):
+            self._count_unknown(piece, unknown & ~gone, starts)
+        for term in failed.terms if failed else ():
+            if term.of_number and term.column not in self._observed:
+                piece.leave_out(term.column, np.isnan(piece.numbers[term.column]) & ~gone)
         fails = np.zeros(piece.rows, np.bool_)
-        holds = None if compared is None else compared.holds(piece) & ~np.asarray(nobody)
-        kept = ~(lacking | piece.bad | late)
-        if compared is not None and holds is not None:
+        holds = fails if failed is None else failed.holds(piece) & ~nobody
+        kept = ~(gone | piece.bad | late)
+        self._failed_before = False
+        if failed:
             for row in np.flatnonzero(late)[::-1]:  # whose time the row before has
                 holds[max(row - 1, 0)] |= holds[row]
             for row in np.flatnonzero(late):
                 holds[row] = holds[row - 1] if row else self._held
             self._noted.failing += int(holds.sum())
-            if compared.sign:
-                values = piece.numbers[compared.column]
-                seen = np.append(values[np.isfinite(values)], self._noted.compared or ())
-                self._noted.compared = (float(seen.min()), float(seen.max())) if len(seen) else None
-            before = np.concatenate([[self._held], holds[:-1]]) & ~anew
+            self._note_compared(piece, failed)
+            before = np.append(self._held, holds[:-1]) & ~anew
             self._held = bool(holds[-1])
             fails, still = holds & ~before, holds & before
-            self._noted.unplaced += int((fails & ~kept).sum())
+            # What fails as it is left out is the end of the episode before.
+            ended = fails & ~kept & ~starts & np.append(self._kept, kept[:-1])
+            still |= ended  # it is over
+            self._noted.unplaced += int((fails & ~kept & ~ended).sum())
             self._noted.after_failure += int((still & kept).sum())
-            fails &= kept
+            self._failed_before = bool(ended[0])
+            fails = (fails & kept) | np.append(ended[1:], False)
             kept &= ~still
+        self._noted.elsewhere += int((elsewhere & ~lacking).sum())
         self._noted.leaderless += int(lacking.sum())
-        ends = fails | ~(kept | late)
-        starts |= np.concatenate([[self._ended], ends[:-1]])
-        self._ended = bool(ends[-1])
+        if columns.no_leader or not columns.longest_hole:
+            elsewhere |= lacking
+        if not columns.longest_hole:
+            elsewhere |= piece.bad
+        ends = (fails | still | elsewhere) & ~late
+        starts |= np.append(self._ended, ends[:-1])
+        self._ended, self._kept = bool(ends[-1]), bool(kept[-1])
         return kept, fails
+
+    def _note_compared(self, piece: Piece, failed: Condition) -> None:
+        """What stands in the columns that tell of failures, should no row meet what is asked."""
+        for term in failed.terms:
+            seen: list[Any] = self._noted.compared.setdefault(term.column, [])
+            if term.of_number:
+                values = piece.numbers[term.column]
+                values = np.append(seen, values[np.isfinite(values)])
+                seen[:] = [values.min(), values.max()] if len(values) else []
+            elif term.sign:
+                seen[:] = sorted({*seen, *piece.texts[term.column].unique()})[:_MANY_TEXTS]
 
     def _count_unknown(
         self, piece: Piece, unknown: NDArray[np.bool_], starts: NDArray[np.bool_]

@@ -79,11 +79,16 @@ _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s":
 _MOST_ABOVE, _COMMENT = 100, re.compile(r"\s*(#|%|//)+\s*")
 # What stands in a field where there is no number.
 _NOTHING = ("", "na", "n/a", "null", "none")
+# By which a comma is known to be a decimal one; groups of three digits it may separate as well.
+_DECIMAL_COMMA = re.compile(r"\s*-?\d+,(\d\d?|\d{4,})\s*")
 # What no text holds.
 _CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
+# The day first, as only dots tell; whether its year has a century, and whether seconds follow.
+_DAY_FIRST = re.compile(r"\d\d?\.\d\d?\.(?:(\d{4})|\d\d),?[T ]+\d\d?:\d\d(:)?")
 _DATE_LIKE = re.compile(r"\s*\d{1,4}([.:/-])\d\d?\1\d")
-_ISO = "in ISO 8601, such as 2026-03-14T09:26:53.5+01:00"
+_ISO = "in ISO 8601, such as 2026-03-14T09:26:53.5+01:00, or as 14.03.2026 09:26:53"
+_SAYS_HOW = "; --unit 'COLUMN=%m/%d/%Y %I:%M:%S %p' says how others are written"
 
 
 def unit_of(text: str) -> str:
@@ -349,13 +354,13 @@ class Wanted(NamedTuple):
 
     numbers: Sequence[str]
     texts: Sequence[str] = ()
-    date: str | None = None  #: comes as a number, of microseconds
+    dates: Sequence[str] = ()  #: which together come as a number, of microseconds
+    form: str = ""  #: how dates are written, as `strftime` has it; else as they look
 
     @property
     def all(self) -> list[str]:
         """Columns that are read, each once."""
-        dates = [self.date] if self.date else []
-        return list(dict.fromkeys([*self.numbers, *self.texts, *dates]))
+        return list(dict.fromkeys([*self.numbers, *self.texts, *self.dates]))
 
     def piece(
         self, found: Mapping[str, polars.Series], find: Find, skips: Skips, anew: Sequence[int] = ()
@@ -376,8 +381,12 @@ class Wanted(NamedTuple):
         for name in self.texts:
             texts = found[name].cast(polars.String)
             piece.texts[name] = texts.fill_null("") if texts.null_count() else texts
-        if self.date is not None:
-            piece.numbers[self.date] = _microseconds(piece, self.date, found[self.date])
+        if self.dates:
+            dates = found[self.dates[0]]
+            for name in self.dates[1:]:  # the time of day, behind the date
+                dates = dates.cast(polars.String) + " " + found[name].cast(polars.String)
+            numbers = _microseconds(piece, self.dates[0], dates, self.form)
+            piece.numbers[",".join(self.dates)] = numbers
         return piece
 
 
@@ -400,6 +409,10 @@ class Table:
         """What stands first in a column; nothing of a table of numbers alone."""
         return ""
 
+    def holds(self, name: str) -> Literal["number", "text", ""]:
+        """What a column holds, as far as is known from its type or first row; else nothing."""
+        return ""
+
 
 class _Odd(NamedTuple):
     """What Python's own reader makes of some lines."""
@@ -414,9 +427,10 @@ class _Odd(NamedTuple):
 class CsvTable(Table):
     """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
 
-    Without any of these they end at a space. At a semicolon, a number may have a decimal comma. The
-    header is the line that has most of the names that are looked for; what stands above is passed
-    over, and one further down, as in files that were appended to another, names the columns anew.
+    Without any of these they end at a space. At a semicolon, a number may have a decimal comma; at
+    a tab where the first rows have one. The header is the line that has most of the names that are
+    looked for; what stands above is passed over, and one further down, as in files that were
+    appended to another, names the columns anew.
     polars reads blocks of plain lines; Python's own reader, which is slower, blocks with anything
     odd, such as a line break within quotes, and what a message is to name.
     """
@@ -451,6 +465,8 @@ class CsvTable(Table):
             self.units = dict(zip(self.columns, told, strict=False))
             self._above, rows = self._above + 1, rows[1:]
         self._first_row = rows[0] if rows else []
+        commas = map(_DECIMAL_COMMA.fullmatch, [one for row in rows for one in row])
+        self._has_commas = self._separator == ";" or (self._separator == "\t" and any(commas))
         if all(is_number(name) for name in self.columns):
             raise ValueError(
                 f"{path}, line {at + 1}: {header.strip()[:200]!r} is no header; a line above the "
@@ -467,7 +483,10 @@ class CsvTable(Table):
         if most:
             return best
         rows = [at for at, one in enumerate(lines) if one.strip() and not _COMMENT.match(one)]
-        first = next((at for at in rows if not lines[at].startswith("sep=")), 0)
+        rows = [at for at in rows if not lines[at].startswith("sep=")]
+        counts = [len(_fields(lines[at], _separator(lines[at]))) for at in rows]
+        usual = max(counts, key=counts.count, default=0)  # titles above have fewer fields
+        first = next((at for at, n in zip(rows, counts, strict=True) if n >= usual), 0)
         separator = _separator(lines[first])
         above, row = (_fields(lines[at], separator) for at in (max(first - 1, 0), first))
         return first - 1 if first and is_number(row[0]) and len(above) == len(row) else first
@@ -475,6 +494,13 @@ class CsvTable(Table):
     def first(self, name: str) -> str:
         """What the first row has in a column."""
         return dict(zip(self.columns, self._first_row, strict=False)).get(name, "")
+
+    def holds(self, name: str) -> Literal["number", "text", ""]:
+        """By its first row; nothing of a column without a name of its own."""
+        if not name or self.columns.count(name) > 1:
+            return ""
+        text = self.first(name)
+        return "number" if is_number(text.replace(",", ".", self._has_commas)) else "text"
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """Read columns, in the order of rows."""
@@ -511,7 +537,7 @@ class CsvTable(Table):
                         name: polars.Series(name, each, polars.String)
                         for name, each in zip(wanted.all, fields, strict=True)
                     }
-                if self._separator == ";":
+                if self._has_commas:
                     for name in wanted.numbers:
                         if found[name].dtype == polars.String:
                             found[name] = found[name].str.replace(",", ".", literal=True)
@@ -534,7 +560,7 @@ class CsvTable(Table):
         # As polars calls columns, for there may be two of one name.
         kinds: dict[str, Any] = {f"column_{k + 1}": polars.String for k in range(len(columns))}
         numbers = {f"column_{places[name] + 1}": polars.Float64 for name in wanted.numbers}
-        dialect: Any = {"separator": self._separator, "decimal_comma": self._separator == ";"}
+        dialect: Any = {"separator": self._separator, "decimal_comma": self._has_commas}
         for schema in (kinds | numbers, kinds):
             try:
                 frame = polars.read_csv(
@@ -652,6 +678,14 @@ class ParquetTable(Table):
             found = self._scan.select(name).drop_nulls().head(1).collect()
         return str(found.item()) if len(found) else ""
 
+    def holds(self, name: str) -> Literal["number", "text", ""]:
+        """By its type."""
+        import polars
+
+        kind = self._types[name]
+        is_text = kind in (polars.String, polars.Categorical, polars.Boolean) or kind.is_temporal()
+        return "number" if kind.is_numeric() else "text" if is_text else ""
+
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """Read columns, in the order of rows."""
         for name in wanted.numbers:
@@ -701,13 +735,13 @@ def explained(text: str, hint: str = "") -> str:
     if is_number(text.replace(",", ".")):
         return f"{text[:40]!r} is no number (a decimal comma? write 1.5)"
     if _DATE_LIKE.match(text):
-        return f"{text[:40]!r} is no number (a date? it has to be {_ISO})"
+        return f"{text[:40]!r} is no number (a date? it has to be {_ISO}{_SAYS_HOW})"
     return f"{text[:40]!r} is no number (a text, a date, or a unit behind the number?)"
 
 
 def is_date(text: str) -> bool:
-    """Whether it is, or is meant to be, a time of ISO 8601."""
-    return _DATE.match(text) is not None
+    """Whether it is, or is meant to be, a time of ISO 8601, or one that begins with the day."""
+    return (_DATE.match(text) or _DAY_FIRST.match(text.strip())) is not None
 
 
 def is_number(text: str) -> bool:
@@ -719,17 +753,24 @@ def is_number(text: str) -> bool:
     return True
 
 
-def _microseconds(piece: Piece, name: str, dates: polars.Series) -> NDArray[np.float64]:
+def _microseconds(
+    piece: Piece, name: str, dates: polars.Series, form: str = ""
+) -> NDArray[np.float64]:
     """Microseconds since 1970, exactly; without a zone a date is taken as UTC."""
     import polars
 
     why = f"{{!r}} is not read as a date; all must be {_ISO}, and all have a zone, or none"
     if dates.dtype == polars.String:
-        texts = dates.str.strip_chars().str.replace(",", ".", literal=True)
+        texts = dates.str.strip_chars()
+        if not form and (found := _DAY_FIRST.match(str(texts.first()))):
+            texts = texts.str.replace(", ", " ", literal=True)
+            form = f"%d.%m.%{'Y' if found[1] else 'y'} %H:%M{':%S%.f' if found[2] else ''}"
+        if "," not in form:
+            texts = texts.str.replace(",", ".", literal=True)
         try:
-            dates = texts.str.to_datetime(strict=False)
+            dates = texts.str.to_datetime(form or None, strict=False)
         except polars.exceptions.ComputeError:  # it knows no form from the first one
             dates = polars.Series(name, [None] * len(texts), polars.Datetime("us"))
     if dates.null_count():
-        piece.leave_out(name, dates.is_null().to_numpy(), why)
+        piece.leave_out(name, dates.is_null().to_numpy(), f"{why}{_SAYS_HOW}")
     return dates.dt.epoch("us").cast(polars.Float64).to_numpy()

@@ -18,14 +18,20 @@ from evofsm.cli.options import (
     ActionColumn,
     Failed,
     Hold,
+    Hole,
+    Horizon,
+    Json,
     Lengths,
     ModeName,
     NoLeader,
+    Persist,
+    Resampled,
     SkipBad,
     Step,
     TimeColumn,
     TopicsFile,
     Units,
+    Where,
     argument,
     option,
     reading_of,
@@ -41,6 +47,8 @@ if TYPE_CHECKING:
     from evofsm.guard import Guard
     from evofsm.io import Chunk
 
+# Share by which the step of a log may differ from that of the guard.
+_SAME_STEP = 0.05
 # What other files end with is read as JSON lines.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
 
@@ -112,6 +120,13 @@ def monitor(
     hold: Hold = None,
     skip_bad: SkipBad = SKIPPED,
     vehicle_length: Lengths = None,
+    where: Where = None,
+    resample: Resampled = None,
+    hole: Hole = None,
+    horizon: Horizon = None,
+    persist: Persist = 0.0,
+    plot: Annotated[Path | None, option("Of --summary, where nobody acts: a picture.")] = None,
+    as_json: Json = False,
 ) -> int | None:
     """Decide alongside a stack of your own: rows in, decisions out, a JSON line each.
 
@@ -124,7 +139,9 @@ def monitor(
     saved.
 
     With --summary it reads FILE, such lines or a log as evofsm learn reads it (by the options from
-    --observe to --vehicle-length), and prints how often it would have alarmed and how risky it was.
+    --observe to --hole), and prints how often it would have alarmed and how risky it was.
+    Where nobody acts (--action ''), alarms stand beside plain thresholds: failures foreseen, how
+    far ahead, false ones a day. Without --guard the first 60 % of the log are learnt from.
     """
     if sum(one is not None for one in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
@@ -139,7 +156,7 @@ def monitor(
     from evofsm.driving.assumed import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
     from evofsm.fsm.validation import positive
-    from evofsm.guard import Guard
+    from evofsm.guard import Foresight, Guard
 
     if guard is not None and brakes is not None:
         raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
@@ -158,16 +175,33 @@ def monitor(
     rows = EPISODE if episode is None or is_log else int(episode)
     with ExitStack() as stack:
         if summary and file is not None:
+            from evofsm.cli.foreseen import Asked, show_foreseen
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
+            from evofsm.fsm import Labels
 
             used = fresh() if guard else None
+            alone = action == "" or isinstance(used and used.judge, Foresight)
+            if (as_json or plot) and not (is_log and alone):
+                raise ValueError("--json and --plot are for logs where nobody acts: --action ''")
             if is_log:
                 own = used.variables if used else VARIABLES
                 if observe is None or set(split_names(observe)) == set(own):  # in its own order
                     observe = ",".join(f'"{name}"' for name in own)
-                asked = observe, action, time, episode, dt, failed, unit, topics, no_leader
-                reading = reading_of(*asked, hold, skip_bad, vehicle_length)
-                chunks, interval = _episodes(file, reading)
+                action = "" if alone else action
+                asked = observe, action, time, episode, dt, failed, unit, topics
+                more = no_leader, hold, skip_bad, vehicle_length, where, resample, hole
+                reading = reading_of(*asked, *more)
+                chunks, interval = _episodes(file, reading, dated=alone)
+                if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
+                    what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
+                    warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
+            if is_log and alone:
+                wanted = (
+                    Labels(names=reading.columns.observe.names),
+                    Asked(horizon, persist, tolerance),
+                )
+                show_foreseen(file, list(chunks), used, *wanted, plot, as_json=as_json)
+                return None
             used = used or fresh()
             _prepare(used, mode, tolerance, None, stack, learn=learn)
             warn(_of_saved(guard, used) if guard else assumptions(reckoned, tolerated))
@@ -214,13 +248,15 @@ def monitor(
     return None
 
 
-def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
-    """The episodes of a log, and the time between two rows [s]."""
+def _episodes(
+    file: Path, reading: Reading, *, dated: bool = False
+) -> tuple[Iterator[Chunk], float]:
+    """The episodes of a log, with dates where they are wanted, and the time of a step [s]."""
     from evofsm.cli.learning import warnings_of
     from evofsm.io import episodes_of, read_traces
     from evofsm.io.logs import Noted
 
-    columns, lengths, topics = reading
+    columns, lengths, topics, _ = reading
     noted = Noted()
     chunks = read_traces([str(file)], columns, lengths, noted=noted, topics=topics)
     episodes = (one for one in episodes_of(chunks) if len(one.times) > 1)
@@ -228,7 +264,8 @@ def _episodes(file: Path, reading: Reading) -> tuple[Iterator[Chunk], float]:
         raise ValueError(f"{file}: no episode has two rows")
 
     def all_of_them() -> Iterator[Chunk]:
-        yield from chain([first], episodes)
+        for one in chain([first], episodes):
+            yield one._replace(times=one.times + noted.began) if dated else one
         for warning in warnings_of(noted, columns):
             warn(f"warning: {warning}")
 

@@ -106,7 +106,9 @@ class Form:
         # By keys of our own: a column may be called "Tank 1 [mm]", which no attribute can be.
         self._keys = {f"v{k}": name for k, name in enumerate(self.variables or ["observation"])}
         seen = [(key, _Seen if self.variables else several) for key in self._keys]
-        action = ("proposal", _action(guard))
+        action: Any = ("proposal", _action(guard))
+        if isinstance(guard.actions, Choices) and guard.actions.n_actions == 1:  # nobody acts
+            action = (*action, 0)
         version = ("schema", Literal[1], SCHEMA)
         self._row = self._struct("Row", ("time", _Number), action, *seen, version)
         placed = ("ego", _Vehicle), ("objects", list[_Vehicle])

@@ -77,7 +77,7 @@ def watch(
     actions are random), failed(step) (else an episode that is terminated has failed), and
     variables, their names. The guard of an environment is given nothing but which episodes failed.
 
-    A log is read with the options of evofsm learn, from --observe to --vehicle-length; its gap,
+    A log is read with the options of evofsm learn, from --observe to --hole; its gap,
     own speed and leader's speed are named in this order.
 
     The page shows what happens, what is known of failure, how risky each action is, and what was
@@ -88,7 +88,7 @@ def watch(
     from evofsm.io import VehicleLengths
 
     is_log = _is_log(what)
-    columns, lengths, topics = reading
+    columns, lengths, topics, _ = reading
     given = columns.episode, columns.dt, columns.failed, columns.units, columns.no_leader
     if not is_log and (any(given) or topics or lengths != VehicleLengths()):
         raise ValueError(f"options of columns are for a log, and {what} is none")
@@ -177,7 +177,7 @@ def _recorded(
                 )
                 if is_cut:
                     warn(f"watched are the first {written:,.0f} s of the simulation")
-            stretches, more = record_log(log, run, *reading, **settings, show=move)
+            stretches, more = record_log(log, run, *reading[:3], **settings, show=move)
             if more:
                 warn(f"watched are the first {MOST_ROWS:,} rows; there are more")
             recording = Recording(run, stretches)

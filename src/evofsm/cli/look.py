@@ -1,0 +1,210 @@
+"""A first look at a log, before anybody said what its columns mean: what is in it, what to ask."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import polars
+from numpy.typing import NDArray
+
+from evofsm.cli.options import seconds
+from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
+from evofsm.io.tables import TIMES, Skips, Table, Wanted, is_date
+
+# So many fields and rows are looked at; columns of more texts are no list of states.
+_MOST_FIELDS, _MOST_ROWS, _FEW = 20_000_000, 1_000_000, 12
+_EPOCHS = {"ns": 1e17, "us": 1e14, "ms": 1e11}  # times since 1970 are larger
+_SHOWN = 40  # columns
+_SIGNS = "<>=! "  # what in a name of a condition is ambiguous
+# A larger share of steps, and so many, that are no usual one make no clock.
+_ODD, _MANY = 0.001, 10
+_TIME = re.compile("(t|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
+_SET = re.compile("acc|action|valve|ventil|soll|set|^u$|cmd|throttle", re.IGNORECASE)
+_FAILURE = re.compile(
+    "st(ö|oe)r|fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|not-?aus|emergency",
+    re.IGNORECASE,
+)
+_CODE = re.compile(f"{_FAILURE.pattern}|stat|zustand|code", re.IGNORECASE)
+_LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 30min 1h 5h 10h 1d"
+_NICE = [(seconds("", text), text) for text in _LONG.split()]
+
+
+class Look(NamedTuple):
+    """What was found."""
+
+    facts: list[tuple[str, str]]  #: by column, and of all rows
+    options: list[tuple[str, str]]  #: what could be asked of it
+
+
+def look_at(table: Table) -> Look:
+    """Look at the first million rows, or fewer of many columns."""
+    frame, clock, form = _first_rows(table)
+    if not len(frame):
+        return Look([], [])
+    numbers = [name for name, kind in frame.schema.items() if kind.is_numeric() and name != clock]
+    values = {name: frame[name].to_numpy() for name in numbers}
+    values = {name: z for name, z in values.items() if np.isfinite(z).any()}
+    texts = [name for name in frame.columns if frame[name].dtype == polars.String]
+    shown = {name: f"{np.nanmin(z):.5g} to {np.nanmax(z):.5g}" for name, z in values.items()}
+    shown |= {name: _told(frame[name]) for name in texts}
+    facts = [*shown.items()][:_SHOWN]
+    if more := len(shown) - len(facts):
+        facts.append(("...", f"and {more:,} more columns"))
+    facts.append(("the clock", clock or "no column (--dt)"))
+    facts.append(("rows looked at", f"{len(frame):,}"))
+    options = [("--time", clock) if clock else ("--dt", "1"), *([("--unit", form)] if form else [])]
+    options += _of_steps(frame[clock].to_numpy(), facts) if clock else []
+    runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
+    if still:
+        limit = _round(0.1 * float(np.nanquantile(np.abs(values[still]), 0.95)))
+        runs = values[still] > limit
+        options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
+        facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
+    rare = [*_rare(frame, texts, values)]
+    likely = [one for one in rare if _FAILURE.search(one[1])]
+    rare = likely or [one for one in rare if one[0] in values]
+    facts += [("a failure?", f"{text} {told}") for _, text, told in rare]
+    options += [("--failed", text) for _, text, _ in rare[:1]]
+    groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
+    if group := next((name for name in groups if _is_in_blocks(frame[name])), ""):
+        facts.append(("an episode?", f"each {group}"))
+        options.append(("--episode", _named(group, ",")))
+    told_by = {group, *(name for name, *_ in rare)}
+    ends = {n: np.nanquantile(z[runs], (0.02, 0.98)) for n, z in values.items() if n not in told_by}
+    if still in ends and ends[still][1] < 1.1 * ends[still][0]:  # as it runs it is always the same
+        del ends[still]
+    # What goes on by the same from row to row is a count of them.
+    moved = {n: e.tolist() for n, e in ends.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
+    return Look(facts, _of_numbers(moved, options))
+
+
+def _first_rows(table: Table) -> tuple[polars.DataFrame, str, str]:
+    """Their columns, the clock in seconds, which one that is, and how it is written if oddly."""
+    firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
+    pairs = zip(firsts, [*firsts][1:], strict=False)
+    together = (f"{a},{b}" for a, b in pairs if is_date(f"{firsts[a]} {firsts[b]}"))
+    dated = [name for name, text in firsts.items() if is_date(text)]
+    clock, form = next(iter(dated), "") or next(together, ""), ""
+    dates = clock.split(",") if clock else []
+    numbers = [name for name in firsts if table.holds(name) == "number"]
+    texts = [name for name in firsts if name not in {*numbers, *dated, *dates}]
+    table.skips, frame = Skips(1 << 60), polars.DataFrame()
+    for piece in table.pieces(Wanted(numbers, texts, dates)):
+        frame.vstack(polars.DataFrame({**piece.numbers, **piece.texts}), in_place=True)
+        if len(frame) >= min(_MOST_ROWS, _MOST_FIELDS // len(firsts)):
+            break
+    if not clock and (form := next(filter(None, map(_form, map(frame.get_column, texts))), "")):
+        clock, _, written = form.partition("=")
+        at = frame[clock].str.to_datetime(written, strict=False)
+        frame = frame.with_columns(at.dt.epoch("us").alias(clock))
+    scale = 1e-6
+    if not clock and (clock := next(filter(_TIME.match, numbers), "")) and len(frame):
+        since = frame[clock].abs().max()  # 1970, if it is large
+        unit = next((one for one, least in _EPOCHS.items() if float(str(since)) > least), "s")
+        form, scale = "" if unit == "s" else f"{_named(clock, '=')}={unit}", TIMES[unit]
+    if clock and len(frame):
+        frame = frame.with_columns(frame[clock] * scale)
+    return frame, clock, form
+
+
+def _of_steps(times: NDArray[np.float64], facts: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """What makes one clock of such steps."""
+    steps = np.diff(times)
+    later = steps[steps > 0.0]
+    usual = float(np.median(later)) if len(later) else math.nan
+    odd = (steps == 0.0) | (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
+    facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {usual:.2g} s"
+    if odd.sum() < max(_MANY, _ODD * len(steps)):
+        return []
+    facts.append(("other steps", f"{odd.sum():,}, the longest {later.max():,.0f} s"))
+    least = max(usual, 3.5 * float(np.median(steps)))  # of few digits many times are the same
+    step = next((one for one in _NICE if one[0] >= least), _NICE[-1])
+    hole = next((one for one in _NICE if one[0] >= 10.0 * step[0]), _NICE[-1])
+    return [("--resample", step[1]), ("--hole", hole[1])]
+
+
+def _of_numbers(
+    ends: dict[str, list[float]], options: list[tuple[str, str]]
+) -> list[tuple[str, str]]:
+    """With what to observe of numbers that go from here to there, and what somebody sets."""
+    if not ends:
+        return []
+    action = next(filter(_SET.search, ends), "")  # else nobody acts
+    seen = [name for name in ends if name != action] or [action]
+    apart = {name: _round((high - low) / 4.0) for name, (low, high) in ends.items()}
+    acts = [("--action", _named(action, ""))]
+    if action:
+        width, (low, high) = apart[action], ends[action]
+        low, high = math.floor(low / width) * width, math.ceil(high / width) * width
+        acts.append(("--action-range", f"{low:.6g}:{high:.6g}:{width:g}"))
+    scales = [("--scale", f"{_named(name, '=')}={apart[name]:g}") for name in seen]
+    observed = ",".join(_named(name, ",=") for name in seen)
+    return [("--observe", observed), *acts, *options, ("--rule", "novelty"), *scales]
+
+
+def _form(texts: polars.Series) -> str:
+    """How dates with slashes are written, as --unit takes it; of others nothing."""
+    found = re.match(r"\d\d?/\d\d?/\d{4} \d\d?:\d\d(:\d\d)?( [AP]M)?$", texts[0] or "")
+    if not found:
+        return ""
+    is_usual = found[2] or int(str(texts.str.extract(r"/(\d\d?)/").cast(polars.Int8).max())) > 12
+    day, hour = "%m/%d" if is_usual else "%d/%m", "%I:%M" if found[2] else "%H:%M"
+    return f"{texts.name}={day}/%Y {hour}{':%S' if found[1] else ''}{' %p' if found[2] else ''}"
+
+
+def _round(number: float) -> float:
+    return float(f"{number:.0e}")
+
+
+def _named(name: str, signs: str) -> str:
+    """A column's name as options take it, in double quotes where one of these is in it."""
+    quoted = '"' + name.replace('"', '""') + '"'
+    return quoted if set(name) & {*signs, '"'} else name
+
+
+def _stands(z: NDArray[np.float64]) -> bool:
+    """Whether numbers are near 0 for a while, and else far from it."""
+    size = np.abs(z[np.isfinite(z)])
+    low, mid = (float(np.mean(size < x * np.quantile(size, 0.95))) for x in (0.05, 0.5))
+    return 0.01 < low < 0.9 and mid - low < 0.02 and len(np.unique(size)) > 2
+
+
+def _rare(
+    frame: polars.DataFrame, texts: list[str], numbers: dict[str, NDArray[np.float64]]
+) -> Iterator[tuple[str, str, str]]:
+    """Columns, conditions that hold of few of their rows, and how often: by a text, or a code."""
+    is_so = [
+        (name, text, (frame[name] == text).to_numpy())
+        for name in texts
+        if frame[name].n_unique() <= _FEW
+        for text in filter(None, frame[name].unique(maintain_order=True))
+    ]
+    for name, z in numbers.items():
+        codes = np.unique(z[np.isfinite(z)]) if _CODE.search(name) else np.arange(2)
+        if len(codes) <= _FEW and not (z % 1.0).any() and np.isin(z, codes).all():
+            is_so += [(name, f"{code:g}", z == code) for code in codes.tolist() if code]
+    for name, text, here in is_so:
+        if 0.0 < here.mean() < 0.25:
+            times = int(here[0]) + int((here[1:] & ~here[:-1]).sum())
+            is_plain = re.fullmatch(r"[^\W\d]\w*", text) or name in numbers
+            value = text if is_plain else f"'{text}'"
+            told = f"({'once' if times == 1 else f'{times:,} times'}, {here.mean():.2%} of rows)"
+            yield name, f"{_named(name, _SIGNS)}=={value}", told
+
+
+def _is_in_blocks(values: polars.Series) -> bool:
+    """Whether the rows of each of several values stand together, some of them at least."""
+    blocks = int(str(values.rle_id().max())) + 1
+    return 1 < values.n_unique() == blocks <= len(values) / 10
+
+
+def _told(texts: polars.Series) -> str:
+    """The texts of a column, in words."""
+    if (n := texts.n_unique()) > _FEW:
+        return f"{n:,} different texts, such as {texts[0]!r}"
+    counts = texts.value_counts(sort=True, name="rows").rows()
+    return ", ".join(f"{text or 'nothing'} {n / len(texts):.2%}" for text, n in counts)

@@ -1,0 +1,542 @@
+"""Alarms where nobody acts: thresholds on what is seen, on what is to come, and on where it failed.
+
+A *limit* is a threshold of a variable, or of the nearness to a form of failure as `failure.explain`
+learns them: now, or as it will be at the present rate in half the horizon, or in all of it. An
+alarm is on while one of its limits is passed; it comes after a hold time, and stays on for an
+eighth of the horizon after the last of them. It is true if a failure comes within the horizon, and
+false once for each horizon that passes without one.
+
+For each rate of false alarms that may be stated there is an alarm, of at most so many limits, and
+beside it one of plain thresholds. Both are searched for in the same way, for the longest warning on
+average (none counts as 0). Which of them it is, and how often it was right, is told by episodes
+that were held out of it, a third of the log at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm import store
+from evofsm.fsm.kernels import kernel
+from evofsm.fsm.naming import Labels
+from evofsm.fsm.proportions import wilson_bounds
+from evofsm.fsm.validation import positive
+from evofsm.guard.actions import Action
+from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, Situation
+from evofsm.guard.learnt import failure
+from evofsm.guard.learnt.rollout import FAILS, Flags, Floats, Ints
+from evofsm.guard.learnt.words import region
+from evofsm.store import COUNT, FROM_1, SIZE, Kind, Numbers, Place
+
+#: False alarms a day that an alarm may be asked for, the fewest first.
+RATES = (0.1, 0.3, 1.0, 3.0)
+# In horizons: how far ahead limits look, over what the rate is taken, how long an alarm stays on.
+_AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.125
+# Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts held out.
+_MOST, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 4.0, 12), 3
+# Blocks of rows in a horizon, as limits are searched for.
+_BLOCKS = 15
+# Kinds of alarms; thresholds are plain unless others warn for longer by so much.
+_LEARNT, _PLAIN, _NONE = range(3)
+_BETTER = 0.95
+# What a further limit has to add to the share of the horizon that is warned before; survived rows
+# that forms of failure are learnt from.
+_WORTH, _ROWS = 2e-3, 4000
+#: Columns of a limit: which rate it is for, the kind of alarm, the variable or form,
+#: which of `_AHEAD`, whether above (1) or below (-1), and the threshold.
+_RATE, _KIND, _OF, _WHEN, _SIGN, _AT = range(6)
+_DAY = 86400.0
+#: The file of such a judge.
+KIND = Kind(
+    "foresight",
+    {
+        "forms": Numbers(("forms", failure.SIZE)),
+        "limits": Numbers(("limits", 6)),
+        "held_out": COUNT.of("rates", 3),
+    },
+    {"dt": SIZE, "horizon": FROM_1, "hold": FROM_1, "names": list[str], "units": list[str]},
+)
+
+
+class Runs(NamedTuple):
+    """Episodes, one after the other."""
+
+    rows: Floats  #: (T, m)
+    starts: Ints  #: (E,) at which row each begins
+    failed: Flags  #: (E,) which of them ended in failure
+
+    @property
+    def lengths(self) -> Ints:
+        """(E,) rows of each."""
+        return np.diff(self.starts, append=len(self.rows))
+
+    def part(self, which: Flags) -> Runs:
+        """Some of the episodes."""
+        rows, lengths = self.rows[np.repeat(which, self.lengths)], self.lengths[which]
+        return Runs(rows, np.cumsum(lengths) - lengths, self.failed[which])
+
+
+class Tally(NamedTuple):
+    """What came of an alarm."""
+
+    failures: int
+    foreseen: int  #: in alarm as the failure came
+    lead: float  #: mean time that the alarm was on by then, at most the horizon, 0 if not [s]
+    false: int
+    days: float
+
+    @property
+    def rate(self) -> float:
+        """False alarms a day."""
+        return self.false / self.days
+
+
+class Foresight(LearningJudge):
+    """Says that a failure is near, where nobody acts; it learns from whole logs (`learn_log`).
+
+    The risk is the share of such alarms that a failure followed, on episodes held out; 0 while none
+    is on. Which alarm it is, of those for several rates of false ones, says the tolerance: the one
+    with most alarms of which more than that were right.
+
+    Examples
+    --------
+    >>> from evofsm.guard import Choices, ActionReviser, Guard
+    >>> rng = np.random.default_rng(0)
+    >>> heats = [np.cumsum(rng.random(100)) for _ in range(12)]  # it fails above 50, some stop
+    >>> runs = [heat[: (np.append(heat > 50, True).argmax() + 1)] for heat in heats]
+    >>> judge = Foresight.learn_log(runs, [run[-1] > 50 for run in runs], dt=60.0, horizon=600.0)
+    >>> guard = Guard.of(ActionReviser(judge, Choices(1)), interval=60.0, learn=False)
+    >>> [guard.decide([heat], 0).risk_proposed > 0.5 for heat in (10.0, 10.5, 49.0)]
+    [False, False, True]
+    """
+
+    fallback = Fallback(0.0, "nobody acts")
+
+    def __init__(
+        self,
+        dt: float,
+        horizon: int,
+        hold: int,
+        forms: Floats,
+        limits: Floats,
+        held_out: Floats,
+        names: Sequence[str] = (),
+        units: Sequence[str] = (),
+    ) -> None:
+        self.dt = positive("dt", dt)
+        self.horizon, self.hold = horizon, hold  #: [rows]
+        self.forms, self.limits = forms, limits
+        #: (rates, 3) of each of `RATES` alarms, those that were right, and whether it is plain.
+        self.held_out = held_out
+        self.labels = Labels(names=tuple(names), units=tuple(units), dt=dt)
+        self.start_episode()
+
+    # -- Learning -------------------------------------------------------------------------------
+
+    @classmethod
+    def learn_log(
+        cls,
+        episodes: Sequence[ArrayLike],
+        failed: ArrayLike,
+        *,
+        dt: float,
+        horizon: float,
+        hold: float = 0.0,
+        names: Sequence[str] = (),
+        units: Sequence[str] = (),
+    ) -> Self:
+        """Learn from episodes, (T,) or (T, m) each; failed are those that ended with a failure.
+
+        ``horizon`` and ``hold`` are in seconds: how long before a failure an alarm is true, and how
+        long a limit has to be passed.
+        """
+        ahead, held = max(round(positive("horizon", horizon) / dt), 1), 1 + round(hold / dt)
+        log = runs_of(episodes, failed)
+        names = names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
+        if not log.failed.any():
+            raise ValueError("no episode failed, so there is nothing to foresee")
+        nothing = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 3))
+        fresh = cls(dt, ahead, held, *nothing)
+        number = np.arange(len(log.failed)) * _PARTS // len(log.failed)
+        tallies = np.zeros((2, len(RATES), 3))  # of both kinds: warned, foreseen, false
+        for k in range(_PARTS):
+            if (number == k).all() or not log.failed[number != k].any():
+                continue
+            judge, rest = fresh._fitted(log.part(number != k)), log.part(number == k)
+            for plain, rate in np.ndindex(2, len(RATES)):
+                found, _ = judge.tally(rest, rate, plain=bool(plain))
+                tallies[plain, rate] += found.lead * found.failures, found.foreseen, found.false
+        judge = fresh._fitted(log)
+        kind = (tallies[1, :, 0] >= _BETTER * tallies[0, :, 0]).astype(int)
+        _, right, false = tallies[kind, np.arange(len(RATES))].T
+        alarms, chance = right + false, log.failed.sum() * ahead / len(log.rows)
+        for k in range(len(RATES)):  # whether it is better than an alarm at any time
+            if not (right[k] and wilson_bounds(right[k] / alarms[k], alarms[k])[0] > chance):
+                kind[k] = _NONE
+        told = np.column_stack([alarms, right, kind])
+        return cls(dt, ahead, held, judge.forms, judge.limits, told, names, units)
+
+    def _fitted(self, log: Runs) -> Self:
+        """With forms and limits of both kinds, for all rates."""
+        last = np.append(log.starts[1:], len(log.rows)) - 1
+        rows, failed = np.delete(log.rows, last[log.failed], 0), log.rows[last[log.failed]]
+        unit = np.median(np.abs(np.diff(log.rows, axis=0)), axis=0) + 1e-12
+        box, some = np.sort(rows, axis=0), rows[:: max(len(rows) // _ROWS, 1)]
+        survived = failure.Survived(some, box[:2], box[:-3:-1], unit, rows.std(0))
+        forms = failure.explain(FAILS, failed, survived)
+        judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
+        columns = judge._columns(log.rows, log.starts)
+        limits = [judge._searched(columns, log, plain=plain) for plain in (False, True)]
+        judge.limits = np.concatenate(limits)
+        return judge
+
+    def _searched(self, columns: Floats, log: Runs, *, plain: bool) -> Floats:
+        """The limits that warn longest, of each rate."""
+        m, of = log.rows.shape[1], len(columns) // len(_AHEAD)
+        above = product(range(1 if plain else len(_AHEAD)), range(m if plain else of), (1, -1))
+        asked = [(v, when, sign) for when, v, sign in above if v < m or sign > 0]
+        # Rows are looked at by blocks, in which it is enough that one of them is beyond.
+        size = max(self.horizon // _BLOCKS, 1)
+        since = np.arange(len(log.rows)) - np.repeat(log.starts, log.lengths)
+        blocks = np.flatnonzero(since % size == 0)
+        shares = 1.0 - np.geomspace(0.3, max(3.0 / len(log.rows), 1e-5), _TRIED)
+        signed = [sign * columns[v + of * when] for v, when, sign in asked]
+        tried = [np.quantile(x, shares) for x in signed]
+        x = [np.maximum.reduceat(x, blocks) for x in signed]
+        spans = np.maximum(self._spans // size, 1)
+        starts, leads = np.searchsorted(blocks, log.starts), np.zeros(len(log.starts))
+        most = spans[0] * log.failed.sum(), len(log.rows) * self.dt / _DAY
+        known: dict[tuple[tuple[int, int], ...], Floats] = {}
+
+        def more(rule: tuple[tuple[int, int], ...]) -> Floats:
+            """(limits, thresholds, 2) share that is warned, and false alarms a day, of one more."""
+            if rule not in known:
+                on, found = np.zeros(len(blocks), np.bool_), np.zeros((len(asked), _TRIED, 2))
+                for k, j in rule:
+                    on |= x[k] > tried[k][j]
+                for k in range(len(asked)):
+                    _try(on, x[k], tried[k], starts, log.failed, spans, leads, found[k])
+                known[rule] = found / most
+            return known[rule]
+
+        rules: dict[tuple[tuple[int, int], ...], Floats] = {(): np.zeros(2)}
+        for price in _PRICES:
+            rule, worth = tuple[tuple[int, int], ...](), 0.0
+            while len(rule) < _MOST:
+                gain = more(rule) @ (1.0, -price)
+                best = divmod(int(gain.argmax()), _TRIED)
+                if gain[best] <= worth + _WORTH:
+                    break
+                worth, told, rule = gain[best], more(rule)[best], (*rule, best)
+                rules[rule] = told
+        rows, alone = [], more(())
+        for rate, false in enumerate(RATES):
+            fitting = np.where(alone[..., 1] <= false, alone[..., 0], -1.0)
+            best = divmod(int(fitting.argmax()), _TRIED)
+            rules[(best,)] = alone[best]
+            fit = [one for one in rules if rules[one][1] <= false]
+            best_rule = max(fit, key=lambda one: float(rules[one][0]))
+            rows += [(rate, plain, *asked[k], asked[k][2] * tried[k][j]) for k, j in best_rule]
+        return np.array(rows, np.float64).reshape(-1, 6)
+
+    # -- Telling --------------------------------------------------------------------------------
+
+    @property
+    def _spans(self) -> Ints:
+        """The horizon, how long a limit has to be passed, and how long an alarm stays on [rows]."""
+        return np.array([self.horizon, self.hold, max(round(_STAYS * self.horizon), 1)])
+
+    def _columns(self, rows: Floats, starts: Ints, memory: Floats | None = None) -> Floats:
+        """(3 v, T) variables and nearness to forms: now, and as far ahead as `_AHEAD` says."""
+        x = np.vstack([rows.T, -failure.distances(self.forms, rows)])
+        memory = np.full((2, len(x)), np.nan) if memory is None else memory
+        keeps, found = np.exp(-1.0 / (_SMOOTHED * self.horizon)), np.empty((len(_AHEAD), *x.shape))
+        _look_ahead(x, starts, keeps, np.array(_AHEAD) * self.horizon, memory, found)
+        columns: Floats = found.reshape(-1, len(rows))
+        return columns
+
+    def _passed(self, columns: Floats, limits: Floats) -> Flags:
+        """(n, T) which limits are passed."""
+        of, when, sign = limits[:, [_OF, _WHEN, _SIGN]].T.astype(int)
+        x = columns[of + when * (len(columns) // len(_AHEAD))]
+        return np.asarray(sign[:, None] * x > (sign * limits[:, _AT])[:, None])
+
+    def of_rate(self, rate: int, *, plain: bool | None = None) -> Floats:
+        """The limits of an alarm, by default of the kind that did better on what was held out."""
+        kind = self.held_out[rate, 2] if plain is None else _PLAIN if plain else _LEARNT
+        which = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
+        return np.asarray(self.limits[which])
+
+    def tally(
+        self, log: Runs, rate: int, *, plain: bool | None = None, hold: float | None = None
+    ) -> tuple[Tally, Flags]:
+        """What came of the alarm for one of `RATES`, and when it was on (T,)."""
+        limits = self.of_rate(rate, plain=plain)
+        on = np.asarray(self._passed(self._columns(log.rows, log.starts), limits).any(axis=0))
+        spans, leads = self._spans, np.zeros(len(log.starts))
+        spans[1] = self.hold if hold is None else 1 + round(hold / self.dt)
+        false = _tally(on, np.zeros(len(on)), 1.0, log.starts, log.failed, spans, leads, on)
+        n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
+        lead = float(leads.sum()) / max(n, 1) * self.dt
+        return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
+
+    def told(self, limit: Floats) -> str:
+        """Where a limit is passed, in words."""
+        return " ".join(self._words(limit))
+
+    def _words(self, limit: Floats) -> tuple[str, str]:
+        v, when, sign, at = int(limit[_OF]), int(limit[_WHEN]), limit[_SIGN], limit[_AT]
+        soon = f" in {span(_AHEAD[when] * self.horizon * self.dt)} at its rate" * (when > 0)
+        names, m = self.labels.names, len(self.labels.names)
+        if v < m:
+            return names[v], f"{'above' if sign > 0.0 else 'below'} {at:.4g}{soon}"
+        row = self.forms[v - m].copy()
+        is_flat = not row[failure.P : failure.HELD].any()
+        if is_flat:  # then a limit of nearness is one of the form
+            row[failure.C] -= at * np.hypot(row[failure.B], row[failure.D])
+        there = region(names, row[failure.I : failure.HELD].tolist(), 0).rpartition(" (")[0]
+        if is_flat:
+            what, _, beyond = there.removeprefix("where ").partition(" is ")
+            return what, f"{beyond}{soon}"
+        how = "beyond" if at > 0.0 else "within"
+        return "it", f"{how} {abs(at):.2g} typical steps of where it fails{soon}: {there}"
+
+    def passed(self, rows: Floats) -> Floats:
+        """(n, 6) the limits that the last row of an episode so far, (T, m), passes."""
+        columns = self._columns(rows, np.zeros(1, np.int64))
+        return self._limits[self._passed(columns[:, -1:], self._limits)[:, 0]]
+
+    def reason(self, rate: int, z: Floats, passed: Floats) -> str:
+        """Why an alarm is on at an observation (m,), with the limits (n, 6) that are passed."""
+        alarms, right, _ = self.held_out[rate].tolist()
+        mine, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
+        if len(mine):
+            v, (name, there) = int(mine[0, _OF]), self._words(mine[0])
+            why = f"{name} {z[v]:.4g}: {there}" if v < len(z) else f"{name} {there}"
+        within = span(self.horizon * self.dt)
+        return f"{why}; after {right:.0f} of {alarms:.0f} such alarms it failed within {within}"
+
+    @property
+    def shares(self) -> Floats:
+        """(rates,) of the alarms those that were right; 0 where nothing foresees a failure."""
+        share = self.held_out[:, 1] / np.maximum(self.held_out[:, 0], 1.0)
+        return np.where(self.held_out[:, 2] == _NONE, 0.0, share)
+
+    def rate_of(self, tolerance: float) -> int | None:
+        """Which of `RATES` the alarm is for, more of which are right; None if there is none."""
+        fit = np.flatnonzero(self.shares > tolerance)
+        return int(fit[-1]) if len(fit) else None
+
+    def tolerance_of(self, rate: float) -> float:
+        """The tolerance with which there are at most so many false alarms a day, if it can be."""
+        k = max(int(np.searchsorted(RATES, rate, "right")) - 1, 0)
+        more = float(self.shares[k + 1 :].max(initial=0.0))
+        return float(np.clip(0.5 * (self.shares[k] + more), 0.01, 0.99))
+
+    @property
+    def told_by_experience(self) -> str:
+        """What each alarm is, and how often it was right."""
+        said = []
+        for rate, (alarms, right, kind) in enumerate(self.held_out.tolist()):
+            limits = " or ".join(map(self.told, self.of_rate(rate))) or "nothing foresees it"
+            plain = "plain thresholds do as well: " if kind == _PLAIN else ""
+            said.append(
+                f"for {RATES[rate]:g} false alarms a day {plain}{limits} ({right:.0f} of "
+                f"{alarms:.0f} were right)"
+            )
+        return "; ".join(said)
+
+    # -- Beside a machine -----------------------------------------------------------------------
+
+    def start_episode(self, *, learn: bool = True) -> None:
+        """Nothing was seen yet."""
+        kept = [self.of_rate(rate) for rate in range(len(self.held_out))]
+        self._limits = np.concatenate([np.empty((0, 6)), *kept])
+        # Variables smoothed once and twice; rows since limits were passed, and not; what is on.
+        self._now: tuple[Any, ...] = None, *np.zeros((3, len(kept)), int)
+
+    def _next(self, z: Floats) -> tuple[Flags, tuple[Any, ...]]:
+        """Which limits are passed, and the state after an observation (m,)."""
+        memory, up, down, on = self._now
+        memory = np.full((2, len(z) + len(self.forms)), np.nan) if memory is None else memory.copy()
+        columns = self._columns(z[None], np.empty(0, np.int64), memory)
+        passed = self._passed(columns, self._limits)[:, 0]
+        above = np.bincount(self._limits[passed, _RATE].astype(int), minlength=len(up)) > 0
+        up, down = np.where(above, up + 1, 0), np.where(above, 0, down + 1)
+        on = (up >= self.hold) | ((on > 0) & (down < self._spans[2]))
+        return passed, (memory, up, down, on)
+
+    def search(
+        self,
+        situation: Situation,
+        wanted: Action,
+        /,
+        *,
+        tolerance: float,
+        revising: bool,
+        mask: Any = None,
+    ) -> Search:
+        """Keep what is proposed, as nobody acts; the risk is that of the alarm that is on."""
+        passed, (*_, on) = self._next(situation.observation)
+        rate, risk, reason = self.rate_of(tolerance), 0.0, "no alarm is on"
+        evidence = 0.0 if rate is None else float(self.held_out[rate, 0])
+        if rate is not None and on[rate]:
+            risk = float(self.shares[rate])
+            reason = self.reason(rate, situation.observation, self._limits[passed])
+        low, high = wilson_bounds(risk, evidence) if risk else (0.0, 1.0)
+        risks, lows, highs, none = np.array([[risk], [low], [high], [np.nan]])
+        judged = Judgement(risks, lows, highs, none, evidence)
+        return Search(np.array([float(wanted)]), judged, 0, reason)
+
+    def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
+        """The risk, whatever would be done."""
+        found = self.search(situation, 0.0, tolerance=0.0, revising=False).judged
+        every = [np.repeat(one, np.size(actions)) for one in found[:4]]
+        return Judgement(every[0], every[1], every[2], every[3], found.evidence)
+
+    def why(self, judged: Judgement, /) -> str:
+        """Why it is dangerous."""
+        return "an alarm is on"
+
+    def follow(self, observation: ArrayLike, action: Action, /) -> None:
+        """Keep up with what happens."""
+        self._now = self._next(np.asarray(observation, np.float64))[1]
+
+    def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike, /) -> None:
+        """The same: it learns from whole logs alone."""
+        self.follow(observation, action)
+
+    watch = learn
+
+    def end(self, observation: Floats | None, *, failed: bool) -> None:
+        """The episode is over."""
+        self.start_episode()
+
+    def sums(self, n_states: int, /) -> dict[str, float]:
+        """What it has learnt, in a few sums."""
+        return {"limits": float(self.limits.sum()), "forms": float(self.forms.sum())}
+
+    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
+        arrays = {name: getattr(self, name) for name in KIND.arrays}
+        settings = {name: getattr(self, name) for name in ("dt", "horizon", "hold")}
+        settings |= {name: list(getattr(self.labels, name)) for name in ("names", "units")}
+        store.write(path, KIND, settings, arrays, provenance)
+
+    @classmethod
+    def load(cls, path: Place) -> Self:
+        """Read what was learnt; a ValueError if the file is damaged."""
+        settings, arrays = store.read(path, KIND)
+        with store.explained(path):
+            count = len(settings["names"]) + len(arrays["forms"])
+            which, most = arrays["limits"][:, :_SIGN], (len(RATES), _NONE, count, len(_AHEAD))
+            if not ((which >= 0) & (which < most) & (which % 1.0 == 0.0)).all():
+                raise ValueError("a limit is of no variable, or of no rate")
+            if not (np.isin(arrays["forms"][:, [failure.I, failure.J]], range(count))).all():
+                raise ValueError("a form is of no variable")
+            known: dict[str, Any] = {**settings, **arrays}
+            return cls(**known)
+
+
+def runs_of(episodes: Sequence[ArrayLike], failed: ArrayLike) -> Runs:
+    """Episodes one after the other, (T,) or (T, m) each."""
+    rows = [np.asarray(one, np.float64).reshape(len(np.asarray(one)), -1) for one in episodes]
+    lengths = np.array([len(one) for one in rows])
+    return Runs(np.concatenate(rows), np.cumsum(lengths) - lengths, np.array(failed, np.bool_))
+
+
+def span(seconds: float) -> str:
+    """A time in words.
+
+    >>> span(90.0), span(1800.0), span(9000.0)
+    ('90 s', '30 min', '2.5 h')
+    """
+    for unit, size, most in (("s", 1.0, 120.0), ("min", 60.0, 7200.0)):
+        if seconds < most:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds / 3600.0:.3g} h"
+
+
+# -- Kernels --------------------------------------------------------------------------------------
+
+
+@kernel
+def _look_ahead(
+    x: Floats, starts: Ints, keeps: float, ahead: Floats, memory: Floats, found: NDArray[Any]
+) -> None:
+    """(h, v, T) what x (v, T) is in so many rows at its rate; memory (2, v) is smoothed x."""
+    for v in range(x.shape[0]):
+        once, twice = memory[0, v], memory[1, v]
+        place = 0
+        for t in range(x.shape[1]):
+            if place < len(starts) and starts[place] == t:
+                once, twice = np.nan, np.nan
+                place += 1
+            now = x[v, t]
+            if not np.isnan(now):
+                once = now if np.isnan(once) else keeps * once + (1.0 - keeps) * now
+                twice = once if np.isnan(twice) else keeps * twice + (1.0 - keeps) * once
+            rate = (once - twice) * (1.0 - keeps) / keeps
+            found[0, v, t] = now
+            for h in range(1, len(ahead)):
+                found[h, v, t] = 2.0 * once - twice + ahead[h] * rate + 0.0 * now
+        memory[0, v], memory[1, v] = once, twice
+
+
+@kernel
+def _tally(
+    above: Flags,
+    x: Floats,
+    at: float,
+    starts: Ints,
+    failed: Flags,
+    spans: Ints,
+    leads: Floats,
+    on: Flags,
+) -> int:
+    """False alarms, while ``above`` or x is beyond a threshold; leads (E,) and on (T,) are set."""
+    false, horizon, hold, stays = 0, spans[0], spans[1], spans[2]
+    for e in range(len(starts)):
+        end = starts[e + 1] if e + 1 < len(starts) else len(x)
+        up, down, begun = 0, 0, -1
+        for t in range(starts[e], end):
+            if above[t] or x[t] > at:
+                up, down = up + 1, 0
+                if begun < 0 and up >= hold:
+                    begun = t
+            else:
+                up, down = 0, down + 1
+                if begun >= 0 and down >= stays:
+                    false += (t - begun + horizon - 1) // horizon
+                    begun = -1
+            if len(on):
+                on[t] = begun >= 0
+        lasted = end - 1 - begun if begun >= 0 else 0
+        leads[e] = min(lasted, horizon) if failed[e] else 0.0
+        if failed[e]:
+            false += (max(lasted - horizon, 0) + horizon - 1) // horizon
+        elif begun >= 0:
+            false += lasted // horizon + 1
+    return false
+
+
+@kernel
+def _try(
+    above: Flags,
+    x: Floats,
+    tried: Floats,
+    starts: Ints,
+    failed: Flags,
+    spans: Ints,
+    leads: Floats,
+    found: Floats,
+) -> None:
+    """(n, 2) rows warned, and false alarms, with each threshold."""
+    for k in range(len(tried)):
+        found[k, 1] = _tally(above, x, tried[k], starts, failed, spans, leads, above[:0])
+        found[k, 0] = leads.sum()

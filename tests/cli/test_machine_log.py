@@ -1,0 +1,151 @@
+"""A machine's log, as plants export them: from what is in it to what a guard of it says."""
+
+import math
+import random
+import re
+import shlex
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+polars = pytest.importorskip("polars")
+pytest.importorskip("typer")
+
+VIBRATION, BEARING = "Schwingung, mm/s", "Lagertemperatur °C"
+FORMS = "german", "two columns", "english", "american", "parquet", "codes"
+FIRST = datetime(2025, 3, 10, 6, 0, 11)
+
+
+def pump(runs=14, seed=1):
+    """A row every 5 s or so: a pump whose vibration now and then grows until it trips at 7.1."""
+    chance, rows, at = random.Random(seed), [], 0.0
+    for run in range(runs):
+        trips, slow = run % 2 == 0, chance.uniform(150, 250)
+        for k in range(400):
+            grown = max(0.0, k - 150) / slow * (5.5 if trips else 1.0)
+            vibration = 2.8 + math.sin(k / 40) / 3 + grown + chance.gauss(0.0, 0.08)
+            stops = vibration > 7.1 or k == 399
+            status = "Störung" if vibration > 7.1 else "Betrieb"
+            bearing = 60 + 4 * math.sin(k / 90) + chance.gauss(0.0, 0.2)
+            rows.append((at, vibration, bearing, 1480 + chance.gauss(0.0, 9.0), status))
+            at += 5 + chance.uniform(-1, 1) + 40 * (chance.random() < 0.01)
+            if stops:
+                break
+        for _ in range(60):
+            rows.append((at, 0.1, 40.0, 0.0, status if status == "Störung" else "Stillstand"))
+            at += 5 + chance.uniform(-1, 1)
+    return polars.DataFrame(rows, ["Zeit", VIBRATION, BEARING, "Drehzahl", "Status"], orient="row")
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+
+
+def written(form="german"):
+    """An export of it, in one of several forms."""
+    path = Path("pump.parquet" if form == "parquet" else "pump.csv")
+    frame = pump()
+    dates = [FIRST + timedelta(seconds=round(at, 3)) for at in frame["Zeit"]]
+    if form == "parquet":
+        frame.with_columns(Zeit=polars.Series(dates)).with_row_index().write_parquet(path)
+        return str(path)
+    if form == "codes":  # a clock in ms, codes, and a comma within the names
+        of = polars.col("Status").replace_strict({"Betrieb": 1, "Störung": 4}, default=0)
+        epoch = (polars.col("Zeit") * 1e3 + 1.74e12).cast(polars.Int64)
+        frame.select("Drehzahl", VIBRATION, BEARING, t=epoch, code=of).write_csv(path)
+        return str(path)
+    comma = form in ("german", "two columns")
+    header = [*frame.columns]
+    if form == "two columns":
+        header = ["Datum", "Uhrzeit", *header[1:]]
+    lines = []
+    for date, (_, *numbers, status) in zip(dates, frame.rows(), strict=True):
+        when = date.strftime("%d.%m.%Y %H:%M:%S" if comma else "%m/%d/%Y %I:%M:%S %p")
+        when = date.isoformat(" ", "milliseconds") if form == "english" else when
+        when = when.replace(" ", ";") if form == "two columns" else when
+        shown = [f"{x:.3f}".replace(".", "," if comma else ".") for x in numbers]
+        lines.append((";" if comma else ",").join([when, *shown, status]))
+    names = [f'"{name}"' if not comma and "," in name else name for name in header]
+    text = "\n".join([(";" if comma else ",").join(names), *lines, ""])
+    path.write_bytes(text.encode("cp1252" if comma else "utf-8"))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    "form", ["german", "two columns", "english", "american", "parquet", "codes"]
+)
+def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, form):
+    path = written(form)
+    first = evofsm("learn", path)
+    assert first.exit_code == 2
+    assert "a way to read it stands above" in first.stderr
+    found = " ".join(first.stdout.split())
+    failed = "code==4" if form == "codes" else "Status==Störung"
+    for part in (f"What {path} holds", "one every 5 s", "by Drehzahl", f"{failed} (7 times"):
+        assert part in found
+    (command,) = re.findall(r"^  evofsm (learn .*)", first.stdout.replace("\\\n", ""), re.M | re.S)
+    learnt = evofsm(*shlex.split(command))
+    assert learnt.exit_code == 0, learnt.stderr
+    text = " ".join(learnt.stdout.split())
+    for part in (
+        "one every 20 s",
+        "episodes 14,",
+        f"7 episodes ended with {failed}",
+        "became means of 20 s (--resample 20s,NAME=max",
+        "of at most 300 s (--hole) cost a transition each",
+        "840 rows: --where Drehzahl>100 does not hold; there an episode ends",
+    ):
+        assert part in text
+    asked = dict(zip(*[iter(shlex.split(command)[2:])] * 2, strict=False))
+    asked = [word for name in READ if name in asked for word in (name, asked[name])]
+    summed = evofsm("monitor", path, "--summary", "--guard", "guard.evofsm", *asked)
+    assert " 7 of 7 " in summed.stdout
+    limit = re.search(f"{VIBRATION} above ([0-9.]+)", summed.stdout)
+    assert 5.0 < float(limit[1]) < 7.1
+    assert "warning" not in summed.stderr
+    at = asked.index("--resample")
+    del asked[at : at + 2]
+    other = evofsm("monitor", path, "--summary", "--guard", "guard.evofsm", *asked)
+    assert "has a row every 5 s, and guard.evofsm decides each 20 s: --resample 20s" in other.stderr
+
+
+READ = "--action", "--time", "--unit", "--where", "--failed", "--resample", "--hole"
+
+
+def test_what_a_log_seems_to_need_is_said_before_the_work(evofsm, refused):
+    path = written()
+    asked = "learn", path, "--observe", f'"{VIBRATION}"', "--action", BEARING, "--time", "Zeit"
+    told = evofsm(*asked, "--action-range", "50:70:5")
+    for part in (
+        "begin an episode each: --resample 20s",
+        "the machine seems to stand still in some rows: --where 'Drehzahl>100'",
+        "nothing says what failed; perhaps: --failed 'Status==Störung'",
+    ):
+        assert part in told.stderr
+    assert "is the time in" not in told.stderr  # which is a date
+    assert "(a longer --hole bridges them)" in " ".join(told.stdout.split())
+    needs = "--where", "Drehzahl>100", "--failed", "Status==Störung", "--resample", "30s"
+    told = evofsm(*asked, *needs)
+    assert told.stderr == ""
+    hint = refused(*asked[:3], VIBRATION, *asked[4:])
+    assert f"""stands in double quotes: '"{VIBRATION}"'""" in hint
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--resample", "often"], "--resample is 'often'; write how long, such as 30s"),
+        (["--resample", "30s,Drehzahl=most"], "NAME=HOW with one of mean, last, max, min"),
+        (["--hole", "5 weeks"], "--hole is '5 weeks'; write how long"),
+        (["--hole", "1min", "--dt", "1"], "--hole goes by a clock, and --dt stands in for one"),
+        (["--where", "Drehzahl>"], "--where is 'Drehzahl>'; write a column of truth values"),
+        (["--where", "Drehzahl>9999", "--resample", "30s"], "and --where Drehzahl>9999 must hold"),
+    ],
+)
+def test_what_cannot_be_done_with_rows_is_refused(refused, options, message):
+    path = written()
+    asked = "--observe", BEARING, "--action", "Drehzahl", "--time", "Zeit"
+    assert message in refused("learn", path, *asked, "--failed", "Status==Störung", *options)

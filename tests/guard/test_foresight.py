@@ -1,0 +1,133 @@
+"""Where nobody acts, alarms are no worse than plain thresholds, and say what they rest on."""
+
+import re
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+from evofsm.guard import ActionReviser, Choices, Foresight, Guard
+from evofsm.guard.foresight import RATES, runs_of
+
+DT, HORIZON = 60.0, 1200.0
+NAMES = ("pressure", "flow")
+
+
+def surging(rng):
+    """At a high pressure it needs more flow; a fault brings it nearer, or heals."""
+    n = rng.integers(200, 600)
+    load = np.clip(0.6 + 0.2 * np.cumsum(rng.normal(0.0, 0.1, n)), 0.2, 1.0)
+    fault = np.zeros(n)
+    at, peak = rng.integers(100, n), rng.choice([0.6, 1.5])
+    grown = np.arange(n - at) / rng.uniform(20.0, 60.0)
+    fault[at:] = np.where(grown < peak, grown, np.maximum(2.0 * peak - grown, 0.0))
+    z = np.column_stack([load - 0.1 * fault, load + 0.1 * fault]) + rng.normal(0.0, 0.005, (n, 2))
+    return cut(z, z[:, 1] - z[:, 0] > 0.2)
+
+
+def plain(rng):
+    """It fails where the flow is high."""
+    n = rng.integers(200, 600)
+    z = rng.normal(0.5, 0.1, (n, 2))
+    if rng.random() < 0.5:
+        z[-40:, 1] += np.linspace(0.0, 2.0, 40)
+    return cut(z, z[:, 1] > 2.0)
+
+
+def random(rng):
+    """Nothing foresees it."""
+    z = rng.normal(0.5, 0.1, (rng.integers(200, 600), 2))
+    return z, rng.random() < 0.5
+
+
+def cut(z, fails):
+    return (z[: fails.argmax() + 1], True) if fails.any() else (z, False)
+
+
+def log_of(machine, seed, count=60):
+    rng = np.random.default_rng(seed)
+    return tuple(zip(*(machine(rng) for _ in range(count)), strict=True))
+
+
+def learnt(machine, **settings):
+    return Foresight.learn_log(*log_of(machine, 0), dt=DT, horizon=HORIZON, names=NAMES, **settings)
+
+
+@pytest.fixture(scope="module")
+def surge():
+    return learnt(surging)
+
+
+def test_where_one_limit_depends_on_another_it_foresees_more_than_thresholds(surge):
+    then = runs_of(*log_of(surging, 1))
+    rate = RATES.index(1.0)
+    ours, thresholds = (surge.tally(then, rate, plain=plain)[0] for plain in (None, True))
+    assert ours.foreseen == ours.failures > 10
+    assert ours.lead > thresholds.lead + DT
+    assert ours.rate < 2.0
+    assert re.search(r"0\.\d+ flow above 0\.\d+", surge.told_by_experience)
+
+
+def test_where_thresholds_do_as_well_it_says_so_and_takes_them():
+    judge = learnt(plain)
+    rate = RATES.index(0.3)
+    assert "plain thresholds do as well: flow above" in judge.told_by_experience
+    assert np.array_equal(judge.of_rate(rate), judge.of_rate(rate, plain=True))
+
+
+def test_where_nothing_foresees_a_failure_there_is_no_alarm():
+    judge = learnt(random)
+    assert judge.rate_of(0.01) is None
+    assert judge.told_by_experience.count("nothing foresees it") == len(RATES)
+
+
+def test_a_guard_alarms_row_by_row_as_the_log_was_judged_also_from_its_file(surge):
+    reviser = ActionReviser(surge, Choices(1), tolerance=surge.tolerance_of(1.0))
+    file = BytesIO()
+    Guard.of(reviser, interval=DT, learn=False).save(file)
+    guard = Guard.load(BytesIO(file.getvalue()))
+    episodes, failed = log_of(surging, 2, 8)
+    tally, on = surge.tally(runs_of(episodes, failed), surge.rate_of(reviser.tolerance))
+    said = []
+    for episode, is_failed in zip(episodes, failed, strict=True):
+        said += [guard.decide(z, 0) for z in episode]
+        guard.end(is_failed)
+    assert [one.risk_proposed > reviser.tolerance for one in said] == on.tolist()
+    assert tally.foreseen > 0
+    first = said[int(on.argmax())]
+    assert first.interval[0] < first.risk_proposed < first.interval[1]
+    assert "such alarms it failed within 20 min" in first.reason
+    assert first.executed == 0
+
+
+def test_what_is_repeated_or_missing_changes_no_alarm(surge):
+    guard = Guard.of(ActionReviser(surge, Choices(1), tolerance=0.3), interval=DT, learn=False)
+    near = [0.4, 0.62]
+    assert guard.decide(near, 0, 0.0).risk_proposed > 0.3
+    assert guard.decide([0.6, 0.6], 0, 0.0).risk_proposed > 0.3  # as old as before: nothing new
+    assert guard.decide([np.nan, np.nan], 0, DT).reason.startswith("not seen: pressure, flow")
+
+
+@pytest.mark.parametrize(
+    ("heat", "failed", "hold", "told"),
+    [
+        ([0, 0, 9, 9, 9], True, 0.0, (1, 2.0, 0)),
+        ([0, 0, 9, 9, 9], True, 120.0, (0, 0.0, 0)),  # it would have come with the failure
+        ([0, 0, 9, 9, 0, 0, 0, 0, 0, 0], False, 0.0, (0, 0.0, 1)),
+        ([9] * 41, False, 0.0, (0, 0.0, 3)),  # once for each horizon
+        ([9] * 41, True, 0.0, (1, 20.0, 1)),  # the horizon before the failure is right
+        ([9, 0, 9, 0, 9], True, 0.0, (1, 4.0, 0)),  # it stays on for a while
+        ([0, 0, 0, 0, 9], True, 0.0, (0, 0.0, 0)),  # no warning
+    ],
+)
+def test_what_counts_as_foreseen_and_as_false(heat, failed, hold, told):
+    limits = np.array([[0, 1, 0, 0, 1, 5.0]])
+    judge = Foresight(DT, 20, 1, np.empty((0, 14)), limits, np.zeros((1, 3)), ("heat",))
+    found, _ = judge.tally(runs_of([heat], [failed]), 0, plain=True, hold=hold)
+    foreseen, minutes, false = told
+    assert (found.foreseen, found.lead, found.false) == (foreseen, minutes * DT, false)
+
+
+def test_a_log_without_failures_is_refused():
+    with pytest.raises(ValueError, match="no episode failed"):
+        Foresight.learn_log([[1.0, 2.0]], [False], dt=DT, horizon=HORIZON)
