@@ -19,7 +19,6 @@ from typer import Option
 
 from evofsm.fsm import EvolvingFSM, Novelty
 from evofsm.guard import Foresight
-from evofsm.guard.foresight import RATES, runs_of
 from evofsm.paper import Page, Table
 from studies import lib
 
@@ -256,20 +255,22 @@ def judged(name: str, days: float, seed: int) -> list[dict[str, Any]]:
     values, failed = [run.values for run in runs], [run.tripped for run in runs]
     given: dict[str, Any] = {"dt": STEP, "horizon": HORIZON}
     known = Foresight.learn_log(values[:first], failed[:first], **given)
-    then = runs_of(values[first:], failed[first:])
+    then = Foresight.runs(values[first:], failed[first:])
     risks = risks_of(values, failed, first)
     counted = Foresight.learn_log(risks[:first], failed[:first], **given)
     alarms = {
         OURS: (known, then, None),
         THRESHOLDS: (known, then, True),
-        STATES: (counted, runs_of(risks[first:], failed[first:]), True),
+        STATES: (counted, Foresight.runs(risks[first:], failed[first:]), True),
     }
 
     def told() -> Iterator[dict[str, Any]]:
-        for (alarm, (judge, log, plain)), rate in product(alarms.items(), range(len(RATES))):
+        for (alarm, (judge, log, plain)), rate in product(
+            alarms.items(), range(len(Foresight.rates))
+        ):
             found, _ = judge.tally(log, rate, plain=plain)
             limits = " or ".join(map(judge.told, judge.of_rate(rate, plain=plain)))
-            who = {"machine": name, "seed": seed, "alarm": alarm, "stated": RATES[rate]}
+            who = {"machine": name, "seed": seed, "alarm": alarm, "stated": Foresight.rates[rate]}
             came = {"failures": found.failures, "seen": found.foreseen, "false": found.false}
             warned = {"warned": found.lead * found.failures, "days": found.days}
             yield {**who, **came, **warned, "limits": limits}
@@ -279,7 +280,7 @@ def judged(name: str, days: float, seed: int) -> list[dict[str, Any]]:
 
 def risks_of(values: list[Floats], failed: list[bool], first: int) -> list[Floats]:
     """Of each row the share of episodes that failed soon after they came to its state."""
-    log = runs_of(values[:first], failed[:first])
+    log = Foresight.runs(values[:first], failed[:first])
     scales = _APART * log.rows.std(0)
     machine = EvolvingFSM(
         1,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard
-from evofsm.guard.foresight import RATES, runs_of
+from evofsm.guard.foresight import RATES, Runs
 
 DT, HORIZON = 60.0, 1200.0
 NAMES = ("pressure", "flow")
@@ -59,7 +59,7 @@ def surge():
 
 
 def test_where_one_limit_depends_on_another_it_foresees_more_than_thresholds(surge):
-    then = runs_of(*log_of(surging, 1))
+    then = Runs.of(*log_of(surging, 1))
     rate = RATES.index(1.0)
     ours, thresholds = (surge.tally(then, rate, plain=plain)[0] for plain in (None, True))
     assert ours.foreseen == ours.failures > 10
@@ -87,7 +87,7 @@ def test_a_guard_alarms_row_by_row_as_the_log_was_judged_also_from_its_file(surg
     Guard.of(reviser, interval=DT, learn=False).save(file)
     guard = Guard.load(BytesIO(file.getvalue()))
     episodes, failed = log_of(surging, 2, 8)
-    tally, on = surge.tally(runs_of(episodes, failed), surge.rate_of(reviser.tolerance))
+    tally, on = surge.tally(Runs.of(episodes, failed), surge.rate_of(reviser.tolerance))
     said = []
     for episode, is_failed in zip(episodes, failed, strict=True):
         said += [guard.decide(z, 0) for z in episode]
@@ -123,7 +123,7 @@ def test_what_is_repeated_or_missing_changes_no_alarm(surge):
 def test_what_counts_as_foreseen_and_as_false(heat, failed, hold, told):
     limits = np.array([[0, 1, 0, 0, 1, 5.0]])
     judge = Foresight(DT, 20, 1, np.empty((0, 14)), limits, np.zeros((1, 3)), ("heat",))
-    found, _ = judge.tally(runs_of([heat], [failed]), 0, plain=True, hold=hold)
+    found, _ = judge.tally(Runs.of([heat], [failed]), 0, plain=True, hold=hold)
     foreseen, minutes, false = told
     assert (found.foreseen, found.lead, found.false) == (foreseen, minutes * DT, false)
 

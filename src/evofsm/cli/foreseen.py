@@ -14,7 +14,7 @@ from evofsm.cli.options import require
 from evofsm.cli.show import facts, print_json, show, table
 from evofsm.fsm import EvolvingFSM, Labels
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
-from evofsm.guard.foresight import RATES, Runs, runs_of, span
+from evofsm.guard.foresight import RATES, Runs, span
 from evofsm.io import Chunk
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class Told(NamedTuple):
     def of(cls, chunks: Sequence[Chunk]) -> Told:
         """The episodes that are chunks."""
         failed = [one.failures is not None and len(one.failures) > 0 for one in chunks]
-        runs = runs_of([one.observations for one in chunks], failed)
+        runs = Runs.of([one.observations for one in chunks], failed)
         return cls(runs, np.concatenate([one.times for one in chunks]))
 
 

@@ -25,7 +25,7 @@ from evofsm import store
 from evofsm.fsm.kernels import kernel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import wilson_bounds
-from evofsm.fsm.validation import positive
+from evofsm.fsm.validation import positive, refuse_unusable
 from evofsm.guard.actions import Action
 from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, Situation
 from evofsm.guard.learnt import failure
@@ -75,6 +75,13 @@ class Runs(NamedTuple):
         """(E,) rows of each."""
         return np.diff(self.starts, append=len(self.rows))
 
+    @classmethod
+    def of(cls, episodes: Sequence[ArrayLike], failed: ArrayLike) -> Runs:
+        """Those, (T,) or (T, m) each."""
+        rows = [np.asarray(one, np.float64).reshape(np.shape(one)[0], -1) for one in episodes]
+        lengths = np.array([*map(len, rows)])
+        return cls(np.concatenate(rows), np.cumsum(lengths) - lengths, np.array(failed, np.bool_))
+
     def part(self, which: Flags) -> Runs:
         """Some of the episodes."""
         rows, lengths = self.rows[np.repeat(which, self.lengths)], self.lengths[which]
@@ -116,6 +123,8 @@ class Foresight(LearningJudge):
     """
 
     fallback = Fallback(0.0, "nobody acts")
+    rates = RATES  #: for each there is an alarm
+    runs = Runs.of
 
     def __init__(
         self,
@@ -156,10 +165,11 @@ class Foresight(LearningJudge):
         long a limit has to be passed.
         """
         ahead, held = max(round(positive("horizon", horizon) / dt), 1), 1 + round(hold / dt)
-        log = runs_of(episodes, failed)
-        names = names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
-        if not log.failed.any():
+        if not np.any(failed):
             raise ValueError("no episode failed, so there is nothing to foresee")
+        log = Runs.of(episodes, failed)
+        refuse_unusable("observations", log.rows)
+        names = names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
         nothing = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 3))
         fresh = cls(dt, ahead, held, *nothing)
         number = np.arange(len(log.failed)) * _PARTS // len(log.failed)
@@ -441,13 +451,6 @@ class Foresight(LearningJudge):
                 raise ValueError("a form is of no variable")
             known: dict[str, Any] = {**settings, **arrays}
             return cls(**known)
-
-
-def runs_of(episodes: Sequence[ArrayLike], failed: ArrayLike) -> Runs:
-    """Episodes one after the other, (T,) or (T, m) each."""
-    rows = [np.asarray(one, np.float64).reshape(len(np.asarray(one)), -1) for one in episodes]
-    lengths = np.array([len(one) for one in rows])
-    return Runs(np.concatenate(rows), np.cumsum(lengths) - lengths, np.array(failed, np.bool_))
 
 
 def span(seconds: float) -> str:
