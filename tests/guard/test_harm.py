@@ -51,7 +51,7 @@ def test_a_guard_under_which_it_fails_sooner_hardly_drives_and_says_so(wrong):
     guard = make()
     rows = drive(guard, 40)
     assert {why for _, why in rows} == {"", "shadow"}
-    assert sum(steps == 1 for steps, _ in rows) <= 8
+    assert sum(steps == 1 for steps, _ in rows) <= 10
     said = "it was not shown to help: guarded episodes failed after 1 steps in the median"
     assert said in str(guard)
     assert "the controller alone failed after 20 steps" in guard.judge.told_by_experience
@@ -184,7 +184,7 @@ def test_frozen_it_acts_where_episodes_ended_better(guarded, alone, helps):
 
 def test_the_arm_that_is_better_is_drawn_ever_more_often():
     """By simulation: failure after times that differ by a factor, cut off at 300 steps."""
-    for better_by, least, most in ((3.0, 0.7, 1.0), (1.0, 0.2, 0.8), (1 / 3, 0.0, 0.25)):
+    for better_by, least, most in ((3.0, 0.7, 1.0), (1.0, 0.2, 0.8), (1 / 3, 0.0, 0.3)):
         chance, guarded = np.random.default_rng(0), 0
         for _ in range(20):
             harm = Harm().after((30, 0, 29), failed=True)

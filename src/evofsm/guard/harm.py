@@ -4,8 +4,9 @@ A guard that learns may be wrong, and what it refuses keeps away the only eviden
 there are two arms, *guarded* and *alone*, each with a record of its latest episodes. Of two
 episodes the better one is found by rank, which assumes nothing about how failures are distributed:
 
-1. One that failed while the other went on is worse (Gehan, Biometrika 52, 1965). What was cut off
-   before the other failed says nothing; what ended by itself without failure never fails.
+1. One that failed while the other went on is worse (Gehan, Biometrika 52, 1965), less so if the
+   other failed, too, only later. What was cut off before the other failed says nothing; what ended
+   by itself without failure never fails.
 2. Where neither failed, the higher score is better, if both are told and differ by more than 5 %;
    else what ended by itself, as at a goal, is better than what was cut off.
 
@@ -35,9 +36,11 @@ from evofsm.store import COUNT, Numbers
 # Episodes of each arm that are kept, the latest; what is left of the weight of one an episode
 # later; and the weights of those that ended well, with which guarded and alone begin: who drives
 # alone until the first refusal is known already.
-_KEPT, _FADES, _HOPES = 20, 0.98, (0.25, 0.05)
+_KEPT, _FADES, _HOPES = 20, 0.98, (0.5, 0.05)
 # So many episodes after the latest of the controller alone one is drawn, and then as often.
 _RARELY = 10
+# What it counts that of two episodes that failed one did so later.
+_SOONER = 0.3
 # Scores that differ by less than this share are equal.
 _ALIKE = 0.05
 # The latest guarded episodes, if all failed, are reason enough for one draw to decide; else it
@@ -212,6 +215,8 @@ class Harm(NamedTuple):
 def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.float64]:
     """(s, o) 1 where one of ``some`` ended better than one of ``others``, -1 where worse; else 0.
 
+    Where both failed it counts less.
+
     Examples
     --------
     >>> failed, later = Outcome(1, 30, True, False), Outcome(2, 90, True, False)
@@ -219,6 +224,8 @@ def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.flo
     >>> better([cut_off, landed], [failed, later, landed])
     array([[ 1.,  0., -1.],
            [ 1.,  1.,  0.]])
+    >>> better([later], [failed])
+    array([[0.3]])
     """
     (s_steps, s_fails, s_well, s_score), (o_steps, o_fails, o_well, o_score) = (
         np.array([(one.steps, one.failed, one.ended, one.score) for one in arm]).reshape(-1, 4).T
@@ -231,7 +238,8 @@ def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.flo
     scored = np.where(np.abs(more) > _ALIKE * size, np.sign(more), 0.0)
     neither = np.where(scored != 0.0, scored, s_well[:, None] - o_well)
     fails = (s_fails[:, None] > 0) | (o_fails > 0)
-    return np.where(fails, best.astype(float) - worse, neither)
+    both = (s_fails[:, None] > 0) & (o_fails > 0)
+    return np.where(fails, np.where(both, _SOONER, 1.0) * (best.astype(float) - worse), neither)
 
 
 def _ended(outcomes: Sequence[Outcome]) -> str:
