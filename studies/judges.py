@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
@@ -71,6 +71,13 @@ _GONE: dict[str, dict[str, Any]] = {
     "horizon": {"horizon_min": 64, "horizon_max": 64},
     "exploration": {"tries": 0},
 }
+_SETTINGS = asdict(LearntSettings())
+#: Each number of its settings, halved and doubled; of what is near 1 how much it lacks.
+SWEEP = tuple(
+    f"{name}={1.0 - times * (1.0 - value) if 0.5 < value < 1.0 else type(value)(times * value):g}"
+    for name, value in _SETTINGS.items()
+    for times in (0.5, 2.0)
+)
 #: Our judges: of variables, and of scenes.
 OURS = ("learnt", "scene")
 #: Tasks of which more was asked: learning seeds, and training episodes.
@@ -165,7 +172,7 @@ def learnt_guard(
     Without ``harm`` no episode is driven in shadow.
     """
     parts = [part for part in without if part in LearntRisk.PARTS]
-    gone = [_GONE[part] for part in without if part in _GONE]
+    gone = [_GONE.get(part) or setting(part) for part in without if part not in LearntRisk.PARTS]
     settings = LearntSettings(**{name: value for one in gone for name, value in one.items()})
     told |= {"horizon": horizon, "seed": seed}
     judge = LearntRisk(interval, **told, without=parts, settings=settings)
@@ -174,6 +181,27 @@ def learnt_guard(
     if "states" in without:
         guard.machine = EvolvingFSM(guard.actions.n_actions, max_states=1)
     return guard
+
+
+def setting(part: str) -> dict[str, Any]:
+    """A number of `LearntSettings` by NAME=VALUE; nothing of another part.
+
+    Raises
+    ------
+    ValueError
+        If there is no such number.
+
+    Examples
+    --------
+    >>> setting("horizon=32"), setting("harm")
+    ({'horizon': 32}, {})
+    """
+    name, is_set, value = part.partition("=")
+    if not is_set:
+        return {}
+    if (default := _SETTINGS.get(name)) is None:
+        raise ValueError(f"there is no setting {name!r}; there are {', '.join(_SETTINGS)}")
+    return {name: type(default)(float(value))}
 
 
 def told_to(judge: Any) -> str:
@@ -456,7 +484,11 @@ class Judges(Study):
         str, Option(help="Judges beside the controller alone: learnt, told, counted.")
     ] = "learnt"
     without: Annotated[
-        str, Option(help="Parts to take away, each by itself, with commas; all, or none.")
+        str,
+        Option(
+            help="Parts to take away, each by itself, with commas; all, or none. NAME=VALUE is "
+            "another setting of the learnt judge, sweep each of them halved and doubled."
+        ),
     ] = ALL
     controllers: Annotated[
         str, Option(help="Controllers with commas; all, or first: the first one of each system.")
@@ -489,7 +521,9 @@ class Judges(Study):
         if self.without in (ALL, "none"):
             return tuple(PARTS) if self.without == ALL else ()
         named = tuple(dict.fromkeys(lib.names_in(self.without)))
-        if wrong := [part for part in named if part not in PARTS]:
+        if "sweep" in named:
+            return (*(part for part in named if part != "sweep"), *SWEEP)
+        if wrong := [part for part in named if part not in PARTS and not setting(part)]:
             raise ValueError(f"there is no part {wrong[0]!r}; there are {', '.join(PARTS)}")
         return named
 

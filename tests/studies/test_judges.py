@@ -1,6 +1,7 @@
 """A trial learns, is frozen, and counts what it does held out; the studies run what they name."""
 
 import re
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from studies import benchmark, judges
 from studies.judges import PARTS, Judges, Tasks, make_judge, run, summary, trial
 from studies.rivals import Rival
 from studies.systems import Start, make_system
+
+from evofsm.guard import LearntSettings
 
 PAGE = Path(__file__).parents[2] / "docs" / "judges.md"
 
@@ -150,6 +153,17 @@ def test_parts_are_named_or_refused():
     assert Judges(without="lags, shy, lags").parts == ("lags", "shy")
     with pytest.raises(ValueError, match="no part 'wheels'; there are stretches"):
         _ = Judges(without="wheels").parts
+
+
+def test_every_setting_of_the_learnt_judge_is_swept():
+    swept = Judges(without="harm,sweep").parts
+    names = [field.name for field in fields(LearntSettings)]
+    assert [one.partition("=")[0] for one in swept[1:]] == [each for each in names for _ in "ab"]
+    assert {"horizon=32", "margin_fade=0.95"} < {*swept}
+    judge = make_judge("learnt", make_system("acc"), ["horizon=32", "shy"]).judge
+    assert (judge.settings.horizon, judge.settings.shy) == (32, judge.settings.prior)
+    with pytest.raises(ValueError, match="no setting 'wheels'; there are n_disturbances"):
+        _ = Judges(without="wheels=4").parts
 
 
 def rows(judge, **columns):
