@@ -276,7 +276,7 @@ def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]
     if lacking := [column for column in single if column not in given]:
         raise ValueError(
             f"--rule novelty has to know the difference that counts as 1 in {lacking[0]!r}: "
-            f"--scale {lacking[0]}=2 (4 m of a gap and 2 m/s of a speed are usual)"
+            f"--scale {quote(lacking[0])}=2 (4 m of a gap and 2 m/s of a speed are usual)"
         )
     return [given.get(name, 1.0) for name in encoder.names]
 
@@ -348,8 +348,7 @@ def _look_first(file: str, reading: Reading) -> list[str]:
         command = [f"evofsm learn {quote(file)}", *(f"{a} {quote(b)}" for a, b in options)]
         show(facts(f"What {file} holds", found), "\nA way to learn from it:")
         print("  " + " \\\n      ".join(command), flush=True)
-        what = f"{file} has no column {VARIABLES[0]!r}; a way to read it stands above"
-        raise ValueError(f"{what} (--observe names the right ones)")
+        raise ValueError(f"say what to --observe of {file}: a way to read it stands above")
     said = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
     asked = zip(_UNASKED.items(), said, strict=True)
     return [f"{why}: {a} {quote(could[a])}" for (a, why), b in asked if b is None and a in could]
