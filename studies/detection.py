@@ -1,4 +1,4 @@
-"""Who sees danger, how early, and whether alarms keep the rate of errors that they state.
+"""Who sees danger, and how early.
 
 Nobody acts: every decision of unrevised held-out episodes is a case, which measures score from what
 was seen until then. Ours has watched other episodes; thresholds are chosen on yet others.
@@ -8,8 +8,6 @@ that stays on to the collision at one false alarm per hour, ``false_time`` the s
 without the danger in alarm then; null where hours do not suffice. Frame ``seeds``: areas of the
 other learning seeds, on fewer episodes. Frame ``grid``: brakes that nobody was told of; ``missed``
 and ``called`` are shares of dead ends, and of other decisions, at the measure's own threshold.
-Frame ``alarms``: one alarm on one score in one world, of all learning seeds: ``most`` is the rate
-that is guaranteed, ``other`` that of the other kind of errors.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from itertools import chain, count, islice, product
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import polars as pl
@@ -50,28 +48,20 @@ from evofsm.driving import (
     training,
 )
 from evofsm.fsm import EvolvingFSM
-from evofsm.guard import ConformalAlarm, Guard, RiskMeasure
+from evofsm.guard import Guard, RiskMeasure
 from evofsm.paper import Page, Table
 from studies import lib
 from studies.lib import ALL, Frames, Study, Target, at_least, frame_of
 from studies.policies import TUNED_MEASURES
 
 Floats = NDArray[np.float64]
-Errors = Literal["false alarms", "misses"]
 
 #: What is judged if nothing else is asked for; see `world`.
 WORLDS = (
     *("paper", "emergency", "stop_and_go", "cut_in", "ncap", "r157"),
     *("weak_brakes", "rare", "shift", "shift-at-once", "emergency+noise"),
 )
-#: Families in which alarms state their rates; the last one changes on the way.
-ALARMED = ("emergency", "cut_in", "stop_and_go", "shift")
-#: Kinds of alarms: a threshold that adapts, and one that is chosen once.
-ADAPTIVE, FIXED = "adaptive", "fixed"
-#: What is stated: of safe windows the share in alarm, of dangerous ones the share that is not.
-STATED: dict[Errors, float] = {"false alarms": 0.05, "misses": 0.1}
-
-#: A collision within so long counts as coming, and windows are so long [s].
+#: A collision within so long counts as coming [s].
 HORIZON = 5.0
 #: False alarms per hour at which lead times are told [1/h].
 RATE = 1.0
@@ -547,109 +537,12 @@ def _follow_each(
 _follow: Any = njit(cache=True)(_follow_each)
 
 
-# -- Rates that are held --------------------------------------------------------------------------
-
-
-class Windows(NamedTuple):
-    """n windows of some episodes, in the order of time."""
-
-    score: Floats  #: (n,) the highest of each window
-    happened: NDArray[np.bool_]  #: (n,) whether a collision came in it or within `HORIZON` of it
-    episode: NDArray[np.intp]  #: (n,) which they are of, from 0
-
-
-def windows(exposure: Exposure, scores: Floats) -> Windows:
-    """Cut episodes into windows; those of which it is not known what came are left out."""
-    interval, found = exposure.family.interval, []
-    length = round(HORIZON / interval)
-    for episode, (first, one) in enumerate(zip(exposure.first, exposure.watched, strict=False)):
-        n = len(one.commands)
-        for begin in range(0, n, length):
-            end = min(begin + length, n)
-            left = one.end - interval * end
-            if one.collided or left >= HORIZON:
-                highest = scores[first + begin : first + end].max()
-                found.append((highest, one.collided and left <= HORIZON, episode))
-    score, happened, episodes = zip(*found, strict=True) if found else ((), (), ())
-    return Windows(np.array(score, float), np.array(happened, bool), np.array(episodes, np.intp))
-
-
-def said_by(alarm: ConformalAlarm, windows: Windows) -> Iterator[bool]:
-    """What an adaptive alarm says of each window, told one window later what came of it."""
-    before: tuple[float, bool, bool] | None = None
-    for score, happened in zip(windows.score.tolist(), windows.happened.tolist(), strict=True):
-        alarmed = alarm.alarms(score)
-        if before:
-            alarm.update(*before[:2], alarmed=before[2])
-        before = score, happened, alarmed
-        yield alarmed
-    if before:
-        alarm.update(*before[:2], alarmed=before[2])
-
-
-def fixed_threshold(windows: Windows, rate: float, of: Errors) -> float:
-    """Chosen once, so that the rate is held as long as nothing changes (split conformal).
-
-    Infinite, or minus infinite, where there are too few windows for that.
-    """
-    safe, danger = windows.score[~windows.happened], windows.score[windows.happened]
-    values = np.sort(safe if of == "false alarms" else -danger)
-    rank = math.ceil(round((1.0 - rate) * (len(values) + 1), 9))
-    quantile = float(values[rank - 1]) if rank <= len(values) else math.inf
-    return quantile if of == "false alarms" else -quantile
-
-
-def errors_of(alarmed: NDArray[np.bool_], seen: Windows, of: Errors) -> dict[str, Any]:
-    """Errors of an alarm, and windows in which it could make one, by episode; then the others."""
-    misses = of == "misses"
-    wrong, counts = alarmed != misses, seen.happened == misses
-    episodes = int(seen.episode.max(initial=-1)) + 1
-    return {
-        "errors": np.bincount(seen.episode, wrong & counts, episodes).astype(int).tolist(),
-        "windows": np.bincount(seen.episode, counts, episodes).astype(int).tolist(),
-        "other": int(np.sum(~wrong & ~counts)),
-        "could": int(np.sum(~counts)),
-    }
-
-
-def rates(said: pl.DataFrame, rounds: int, seed: int) -> pl.DataFrame:
-    """All learning seeds of each alarm in one row, with intervals over episodes."""
-    by = ["world", "changed", "score", "alarm", "of", "stated"]
-    frame = said.group_by(by, maintain_order=True).agg(
-        pl.col("errors", "windows").explode(),
-        pl.col("other", "could").sum(),
-        pl.when(pl.col("most").null_count() == 0).then(pl.col("most").sum()),
-    )
-    ends = []
-    for errors, windows in frame.select(pl.col("errors", "windows")).iter_rows():
-        made, counted = np.array(errors), np.array(windows)
-        if 0 < made.sum() < counted.sum():
-
-            def rate(one: NDArray[np.intp], made: Any = made, counted: Any = counted) -> float:
-                return float(made[one].sum() / (counted[one].sum() or math.nan))
-
-            ends.append(lib.bootstrap(rate, len(made), rounds, seed))
-        else:  # all are alike
-            low, high = lib.exact_interval(made.sum(), counted.sum())
-            ends.append(lib.Interval(float(low), float(high)))
-    total = pl.col("windows").list.sum()
-    return frame.with_columns(
-        pl.Series("low", [one.low for one in ends]),
-        pl.Series("high", [one.high for one in ends]),
-        errors=pl.col("errors").list.sum(),
-        windows=total,
-        realised=pl.col("errors").list.sum() / total,
-        most=pl.col("stated") + pl.col("most") / total,
-        other=pl.col("other") / pl.col("could"),
-    ).with_columns(holds=pl.col("stated").is_between("low", "high"))
-
-
 # -- The study ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
 class Detection(Study):
-    """Who sees dead ends and collisions coming, and which alarms keep their rate of errors.
+    """Who sees dead ends and collisions coming, and how early.
 
     Nobody acts. Ours has watched other episodes; thresholds are chosen on yet others.
     """
@@ -676,13 +569,6 @@ class Detection(Study):
     grid_leader: tuple[float, ...] = (3.0, 4.5, 6.0, 7.5, 9.0)  # leaders' hardest [m/s²]
     grid_train: int = 20  # episodes that are watched in each world of the grid
     grid_hours: float = 0.5  # of held-out driving in each
-    alarm_seeds: int = 3  # learning seeds, each with draws of its own
-    alarm_step: float = 0.02  # of the adaptive alarm
-    alarm_memory: int = 500  # scores, of the adaptive alarm
-    alarm_train: int = 60  # episodes that are watched
-    alarm_calibration: int = 200  # episodes that thresholds are chosen on
-    alarm_test: int = 400  # held-out episodes; after a change as many again
-    alarm_rounds: int = 1000  # of the bootstrap
 
     def shortened(self) -> Self:
         """Just enough for one false alarm per hour to be measurable."""
@@ -697,11 +583,6 @@ class Detection(Study):
             grid=(2.0, 4.0, 6.0),
             grid_leader=(3.0, 6.0, 9.0),
             grid_hours=0.2,
-            alarm_seeds=1,
-            alarm_train=20,
-            alarm_calibration=60,
-            alarm_test=100,
-            alarm_rounds=200,
         )
 
     @property
@@ -710,28 +591,23 @@ class Detection(Study):
         return WORLDS if self.family == ALL else tuple(dict.fromkeys(lib.names_in(self.family)))
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
-        """Judge every measure in every world, then every alarm."""
+        """Judge every measure in every world."""
         for name in self.worlds:
             world(name)  # so that a wrong name shows at once
         others = product(self.worlds, range(1, self.seeds))
         cells = product(self.grid, self.grid_leader)
-        streams = product([one for one in ALARMED if one in self.worlds], range(self.alarm_seeds))
         tasks: dict[str, list[partial[list[Any]]]] = {
             "rows": [partial(_judge_world, self, name) for name in self.worlds],
             "seeds": [partial(_other_seed, self, *one) for one in others],
             "grid": [partial(_judge_cell, self, *one) for one in cells],
-            "alarms": [partial(_stream, self, *one) for one in streams],
         }
         every = [task for some in tasks.values() for task in some]
         done = iter(lib.parallel(every, workers, "Watching and judging"))
         found = {name: [*chain(*islice(done, len(some)))] for name, some in tasks.items()}
-        frames = {name: frame_of(rows) for name, rows in found.items() if rows}
-        if "alarms" in frames:
-            frames["alarms"] = rates(frames["alarms"], self.alarm_rounds, self.seed)
-        return frames
+        return {name: frame_of(rows) for name, rows in found.items() if rows}
 
     def page(self, found: Frames) -> Page:
-        """Who sees danger, how early, what alarms hold, and where ours loses."""
+        """Who sees danger, how early, and where ours loses."""
         return Page(
             name=self.name,
             about=_ABOUT,
@@ -741,10 +617,6 @@ class Detection(Study):
             lost=list(_lost(found)),
             facts=self.facts,
             packages=("scipy",),
-            sources={
-                "I. Gibbs, E. Candès, Adaptive conformal inference under distribution shift, "
-                "2021, arXiv:2106.00170": "https://arxiv.org/abs/2106.00170"
-            },
         )
 
 
@@ -848,49 +720,9 @@ def _judge_cell(study: Detection, decel: float, leader_decel: float) -> list[dic
     return rows
 
 
-def _stream(study: Detection, name: str, learning_seed: int) -> list[dict[str, Any]]:
-    """One family with one learning seed, and what comes after its change if there is one.
-
-    Thresholds are chosen on calibration draws, which the adaptive alarm takes as its first updates.
-    """
-    family, seed = load_family(name), study.seed + learning_seed
-    watcher = Watcher(family)
-    watcher.watch((family, draw) for draw in training(family, seed, 0, study.alarm_train))
-    scores = watcher.scores() | classics(family)
-
-    def seen(of: Family, draws: Iterable[Draw], episodes: int) -> dict[str, Windows]:
-        exposure = Exposure(of, tuple(watch(of, draw) for draw in islice(draws, episodes)))
-        return {one: windows(exposure, scores[one](exposure)) for one in (OURS, COUNTS, "ttc")}
-
-    n = study.alarm_test
-    chosen_on = seen(family, calibration_draws(family, seed), study.alarm_calibration)
-    stages = [(name, seen(family, held_out_draws(family, seed), n))]
-    if (after := family.shifted) is not None:
-        draws = islice(held_out_draws(after, seed), n, None)
-        stages.append((f"{name}, after", seen(after, draws, n)))
-    found = []
-    for (score, before), (of, rate) in product(chosen_on.items(), STATED.items()):
-        alarm = ConformalAlarm(rate, of=of, step=study.alarm_step, memory=study.alarm_memory)
-        list(said_by(alarm, before))
-        once = fixed_threshold(before, rate, of)
-        for stage, by_score in stages:
-            then = by_score[score]
-            # As the level is now, with a delay of one; see the proof in `evofsm.guard.conformal`.
-            most = alarm.level / study.alarm_step + 2.0 - rate
-            adaptive = np.array(list(said_by(alarm, then)), np.bool_)
-            fixed = then.score > once if of == "false alarms" else then.score >= once
-            row = {"world": stage, "changed": stage != name, "score": score}
-            row |= {"of": of, "stated": rate}
-            found += [
-                row | {"alarm": ADAPTIVE, "most": most} | errors_of(adaptive, then, of),
-                row | {"alarm": FIXED, "most": None} | errors_of(fixed, then, of),
-            ]
-    return found
-
-
 # -- The page -------------------------------------------------------------------------------------
 
-_ABOUT = """Who sees danger, how early, and which alarms keep the rate that they state?
+_ABOUT = """Who sees danger, and how early?
 
 Nobody acts. Each decision of unrevised episodes is a case, and every measure scores it from what
 was seen until then. Two things may come: a dead end (by an oracle: if both cars braked as hard as
@@ -899,10 +731,7 @@ Ours has watched other episodes without acting and was told nothing; on dead end
 perfect because the oracle is kinematics with the true brakes, and ours the same kinematics with
 brakes that it learnt: what is shown is that they can be learnt by watching.
 
-An alarm holds for 1 s after it was raised, and is false if the danger does not come within 5 s.
-Rates that are stated are of windows of 5 s: which share of the safe ones an alarm disturbs, or of
-the dangerous ones it misses. Fixed: a threshold that is chosen once, by split conformal prediction.
-Adaptive: ConformalAlarm, which goes on learning from what came of each window, one window later."""
+An alarm holds for 1 s after it was raised, and is false if the danger does not come within 5 s."""
 
 # Measures that stand in the columns of tables over worlds.
 _AREAS = (OURS, STATES, PAPER, "rss-r157", "rss-tuned", "rss-matched", "ttc")
@@ -975,37 +804,6 @@ def _parts(found: Frames) -> Iterator[Table]:
             "At the measure's own threshold: share of dead ends missed, of others called one.",
             pl.when(_IS_OURS).then(pl.lit("ours")),
         )
-    if "alarms" in found:
-        yield Table(
-            "Rates of errors that are stated, and realised",
-            _against_fixed(found["alarms"]),
-            _ALARMS,
-            "at most: what is guaranteed of the adaptive one, whatever comes. other errors: share "
-            "of errors of the other kind, the price. windows: those that the rate is of.",
-            pl.when(~pl.col("holds_ours")).then(pl.lit("fails")),
-        )
-
-
-_IS_ADAPTIVE = pl.col("alarm") == ADAPTIVE
-# Theirs is the fixed threshold.
-_ALARMS = {
-    "of": "{of}",
-    "stated": "{stated:%}",
-    "world": "{world}",
-    "score": "{score}",
-    "adaptive": "{realised_ours:%}",
-    "95 %": "{low_ours:p}–{high_ours:p}",
-    "at most": "{most_ours:%}",
-    "other errors": "{other_ours:%}",
-    "fixed": "{realised:%}",
-    "fixed 95 %": "{low:p}–{high:p}",
-    "fixed, other": "{other:%}",
-    "windows": "{windows}",
-}
-
-
-def _against_fixed(alarms: pl.DataFrame) -> pl.DataFrame:
-    return lib.compared(alarms, _IS_ADAPTIVE, ["world", "score", "of"])
 
 
 def _targets(found: Frames) -> Iterator[Target]:
@@ -1035,12 +833,6 @@ def _targets(found: Frames) -> Iterator[Target]:
         if not math.isnan(area("rare", measure)):
             what = f"AUROC on rare, {measure}: {PAPER}'s + 0.2"
             yield at_least(what, area("rare", measure), area("rare", PAPER) + 0.2, "{:.4f}")
-    if "alarms" in found:
-        adaptive = found["alarms"].filter(_IS_ADAPTIVE)
-        for (of, changed), some in adaptive.group_by("of", "changed", maintain_order=True):
-            what = f"Adaptive, {of}, {'after the change' if changed else 'as calibrated'}"
-            held = some["holds"].to_numpy().mean()
-            yield at_least(f"{what}: share of rates that are held", held, 1.0, "{:.0%}")
 
 
 def _lost(found: Frames) -> Iterator[Table]:
@@ -1086,14 +878,4 @@ def _lost(found: Frames) -> Iterator[Table]:
                 "called": "{called:%}",
                 "called by ours": "{called_ours:%}",
             },
-        )
-    if "alarms" in found:
-        both = _against_fixed(found["alarms"])
-        loose = pl.col("most_ours") > 2.0 * pl.col("stated")
-        cheaper = pl.col("holds") & (pl.col("other") < pl.col("other_ours"))
-        yield Table(
-            "Adaptive alarms that do not hold their rate, hold it at the price of half of all "
-            "others, are bounded only by twice the rate, or where the fixed one is cheaper",
-            both.filter(~pl.col("holds_ours") | (pl.col("other_ours") >= 0.5) | loose | cheaper),
-            _ALARMS,
         )

@@ -10,7 +10,7 @@ from evofsm.cli.options import Json, argument, imported, option
 from evofsm.cli.show import facts, print_json, show
 
 if TYPE_CHECKING:
-    from evofsm.guard.replay import Audit, Contents
+    from evofsm.guard.replay import Audit
 
 _KEEP = (
     "Keep the head where the log is not. Without it (--head) neither an end that is cut off nor a "
@@ -59,15 +59,22 @@ def audit(
 
 def _facts(found: Audit) -> Iterator[tuple[str, str]]:
     """What was found, line by line."""
+    from evofsm.fsm.validation import counted
+
     finding, contents = found.finding, found.contents
     if finding is None:
-        yield "chain", f"unbroken: {_count(found.head.number, 'record')}"
+        yield "chain", f"unbroken: {counted(found.head.number, 'record')}"
     else:
         yield "chain", f"TAMPERED WITH at record {finding.record}: {finding.explanation}"
     if found.half_written:
         cause = "as by a crash, or it is being written now"
         yield "", f"its last line is half written ({found.half_written} bytes): {cause}"
-    yield "holds", _of_contents(contents) + ("" if finding is None else ", so far")
+    held = f"{counted(contents.sessions, 'session')}, {counted(contents.episodes, 'episode')}, "
+    held += counted(contents.decisions, "decision")
+    held += f" ({contents.spoke:,} changed something or warned)"
+    if contents.settings:
+        held += f", {counted(contents.settings, 'setting change')}"
+    yield "holds", held + ("" if finding is None else ", so far")
     if found.replayed is None:
         yield "replay", "not done"
     else:
@@ -76,21 +83,11 @@ def _facts(found: Audit) -> Iterator[tuple[str, str]]:
         yield "head", str(found.head)
 
 
-def _of_contents(contents: Contents) -> str:
-    decisions = _count(contents.decisions, "decision")
-    parts = [
-        _count(contents.sessions, "session"),
-        _count(contents.episodes, "episode"),
-        f"{decisions} ({contents.spoke:,} changed something or warned)",
-    ]
-    if contents.settings:
-        parts.append(_count(contents.settings, "change of settings", "changes of settings"))
-    return ", ".join(parts)
-
-
 def _of_replay(found: Audit, replayed: int) -> Iterator[tuple[str, str]]:
+    from evofsm.fsm.validation import counted
+
     difference, decisions = found.difference, found.contents.decisions
-    good = f"{_count(replayed, 'decision')} as recorded, to the last bit"
+    good = f"{counted(replayed, 'decision')} as recorded, to the last bit"
     if difference is None:
         yield "replay", good
     else:
@@ -99,9 +96,9 @@ def _of_replay(found: Audit, replayed: int) -> Iterator[tuple[str, str]]:
             yield "", f"{name}: recorded {_short(recorded)}, replayed {_short(again)}"
         yield "", f"before it {good}"
     for why in dict.fromkeys(found.not_replayed):
-        yield "", f"{_count(found.not_replayed.count(why), 'session')} not replayed: {why}"
+        yield "", f"{counted(found.not_replayed.count(why), 'session')} not replayed: {why}"
     if difference is None and replayed < decisions:
-        yield "", f"{_count(decisions - replayed, 'decision')} compared with nothing"
+        yield "", f"{counted(decisions - replayed, 'decision')} compared with nothing"
     if difference is not None and found.other_makers:
         then = ", ".join(f"{one.name} {one.recorded}" for one in found.other_makers)
         yield "", f"it was recorded with {then}: floats may differ there"
@@ -109,7 +106,3 @@ def _of_replay(found: Audit, replayed: int) -> Iterator[tuple[str, str]]:
 
 def _short(text: str) -> str:
     return text if len(text) <= _LETTERS else f"{text[: _LETTERS - 3]}..."
-
-
-def _count(count: int, one: str, many: str = "") -> str:
-    return f"{count:,} {one if count == 1 else many or one + 's'}"

@@ -17,7 +17,6 @@ from .api import Situation as Situation
 from .audit_log import AuditLog as AuditLog
 from .audit_log import Head as Head
 from .check import check_contract as check_contract
-from .conformal import ConformalAlarm as ConformalAlarm
 from .foresight import Foresight as Foresight
 from .guard import DecisionLogger as DecisionLogger
 from .guard import Guard as Guard

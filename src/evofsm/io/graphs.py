@@ -12,6 +12,7 @@ import numpy as np
 
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import in_a_line
+from evofsm.fsm.validation import counted
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.
 _DOT_MARK = ',\n      shape=hexagon, style=filled, fillcolor="#D55E00", fontcolor=white, penwidth=2'
@@ -81,10 +82,11 @@ def to_dot(
     lines = [_DOT_HEAD]
     most = model.visits.max(initial=0.0) or 1.0
     for state in range(model.n_states):
-        texts = [f"#{state + 1}", *_where(model, state), _counted(model.visits[state], "visit")]
+        visits = counted(round(model.visits[state]), "visit")
+        texts = [f"#{state + 1}", *_where(model, state), visits]
         if ends := model.endings[state]:
             share = ends / model.endings.sum()
-            texts.append(f"{_counted(ends, 'failure')}, {share:.0%} of all")
+            texts.append(f"{counted(round(ends), 'failure')}, {share:.0%} of all")
         if dead_ends is not None and state in marked:
             texts.append("dead end")
         label = r"\n".join(text.replace("\\", r"\\").replace('"', r"\"") for text in texts)
@@ -114,10 +116,6 @@ def _where(model: FSMModel, state: int) -> list[str]:
         " ".join(part for part in (in_a_line(name), f"{value:.4g}", in_a_line(unit)) if part)
         for (name, unit), value in zip(variables, model.centers[state], strict=True)
     ]
-
-
-def _counted(number: float, what: str) -> str:
-    return f"{number:,.0f} {what}{'' if round(number) == 1 else 's'}"
 
 
 # -- PRISM ----------------------------------------------------------------------------------------
@@ -179,7 +177,7 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     body, unknown = list[str](), list[int]()
     for state in range(n):
         about = [f"#{state + 1}", *(_where(model, state) if model.names else [])]
-        body += ["", f"  // {', '.join([*about, _counted(model.visits[state], 'visit')])}"]
+        body += ["", f"  // {', '.join([*about, counted(round(model.visits[state]), 'visit')])}"]
         actions = np.flatnonzero(model.decisions[:, state] >= evidence).tolist()
         for action in actions:
             body += _command(model, state, action, least)
