@@ -296,9 +296,9 @@ class Foresight(LearningJudge):
         lead = float(leads.sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
 
-    def told(self, limit: Floats) -> str:
-        """Where a limit is passed, in words."""
-        return " ".join(self._words(limit))
+    def words(self, rate: int, *, plain: bool | None = None) -> str:
+        """Where an alarm is on, as `of_rate` has its limits."""
+        return " or ".join(" ".join(self._words(one)) for one in self.of_rate(rate, plain=plain))
 
     def _words(self, limit: Floats) -> tuple[str, str]:
         v, when, sign, at = int(limit[_OF]), int(limit[_WHEN]), limit[_SIGN], limit[_AT]
@@ -352,15 +352,16 @@ class Foresight(LearningJudge):
     @property
     def told_by_experience(self) -> str:
         """What each alarm is, and how often it was right."""
-        said = []
-        for rate, (alarms, right, kind) in enumerate(self.held_out.tolist()):
-            limits = " or ".join(map(self.told, self.of_rate(rate))) or "nothing foresees it"
-            plain = "plain thresholds do as well: " if kind == _PLAIN else ""
-            said.append(
-                f"for {RATES[rate]:g} false alarms a day {plain}{limits} ({right:.0f} of "
-                f"{alarms:.0f} were right)"
-            )
-        return "; ".join(said)
+        rates = enumerate(RATES[: len(self.held_out)])
+        return "; ".join(f"for {rate:g} false alarms a day {self.of(k)}" for k, rate in rates)
+
+    def of(self, rate: int) -> str:
+        """What the alarm for one of `RATES` is, and how often it was right, in words."""
+        alarms, right, kind = self.held_out[rate].tolist()
+        if kind == _NONE:
+            return "nothing was better than chance"
+        plain = "plain thresholds do as well: " if kind == _PLAIN else ""
+        return f"{plain}{self.words(rate)} ({right:.0f} of {alarms:.0f} were right, held out)"
 
     # -- Beside a machine -----------------------------------------------------------------------
 
