@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from evofsm.cli.options import seconds
 from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
-from evofsm.io.tables import TIMES, Skips, Table, Wanted, is_date
+from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
 
 # So many fields and rows are looked at; columns of more texts are no list of states.
 _MOST_FIELDS, _MOST_ROWS, _FEW = 20_000_000, 1_000_000, 12
@@ -40,7 +40,7 @@ class Look(NamedTuple):
     options: list[tuple[str, str]]  #: what could be asked of it
 
 
-def look_at(table: Table) -> Look:
+def look_at(table: CsvTable | ParquetTable) -> Look:
     """Look at the first million rows, or fewer of many columns."""
     frame, clock, form = _first_rows(table)
     if not len(frame):
@@ -64,7 +64,7 @@ def look_at(table: Table) -> Look:
         runs = values[still] > limit
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
-    rare = [*_rare(frame, texts, values)]
+    rare = [*_rare(frame, [*texts, *values])]
     likely = [one for one in rare if _FAILURE.search(one[1])]
     rare = likely or [one for one in rare if one[0] in values]
     facts += [("a failure?", f"{text} {told}") for _, text, told in rare]
@@ -82,7 +82,7 @@ def look_at(table: Table) -> Look:
     return Look(facts, _of_numbers(moved, options))
 
 
-def _first_rows(table: Table) -> tuple[polars.DataFrame, str, str]:
+def _first_rows(table: CsvTable | ParquetTable) -> tuple[polars.DataFrame, str, str]:
     """Their columns, the clock in seconds, which one that is, and how it is written if oddly."""
     firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
     pairs = zip(firsts, [*firsts][1:], strict=False)
@@ -173,27 +173,25 @@ def _stands(z: NDArray[np.float64]) -> bool:
     return 0.01 < low < 0.9 and mid - low < 0.02 and len(np.unique(size)) > 2
 
 
-def _rare(
-    frame: polars.DataFrame, texts: list[str], numbers: dict[str, NDArray[np.float64]]
-) -> Iterator[tuple[str, str, str]]:
+def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str, str, str]]:
     """Columns, conditions that hold of few of their rows, and how often: by a text, or a code."""
-    is_so = [
-        (name, text, (frame[name] == text).to_numpy())
-        for name in texts
-        if frame[name].n_unique() <= _FEW
-        for text in filter(None, frame[name].unique(maintain_order=True))
-    ]
-    for name, z in numbers.items():
-        codes = np.unique(z[np.isfinite(z)]) if _CODE.search(name) else np.arange(2)
-        if len(codes) <= _FEW and not (z % 1.0).any() and np.isin(z, codes).all():
-            is_so += [(name, f"{code:g}", z == code) for code in codes.tolist() if code]
-    for name, text, here in is_so:
-        if 0.0 < here.mean() < 0.25:
-            times = int(here[0]) + int((here[1:] & ~here[:-1]).sum())
-            is_plain = re.fullmatch(r"[^\W\d]\w*", text) or name in numbers
-            value = text if is_plain else f"'{text}'"
-            told = f"({'once' if times == 1 else f'{times:,} times'}, {here.mean():.2%} of rows)"
-            yield name, f"{_named(name, _SIGNS)}=={value}", told
+    for name in columns:
+        kinds = frame[name].unique(maintain_order=True)
+        is_number = kinds.dtype.is_numeric()
+        is_code = not is_number or (
+            (kinds % 1.0 == 0.0).all()
+            and (kinds.is_in([0.0, 1.0]).all() or _CODE.search(name) is not None)
+        )
+        for kind in kinds if is_code and len(kinds) <= _FEW else ():
+            here = (frame[name] == kind).to_numpy()
+            if kind and here.mean() < 0.25:
+                times = int((here > np.append(False, here[:-1])).sum())
+                text = f"{kind:g}" if is_number else kind
+                value = text if is_number or re.fullmatch(r"[^\W\d]\w*", text) else f"'{text}'"
+                told = (
+                    f"({'once' if times == 1 else f'{times:,} times'}, {here.mean():.2%} of rows)"
+                )
+                yield name, f"{_named(name, _SIGNS)}=={value}", told
 
 
 def _is_in_blocks(values: polars.Series) -> bool:
