@@ -22,17 +22,14 @@ def surging(rng):
     grown = np.arange(n - at) / rng.uniform(20.0, 60.0)
     fault[at:] = np.where(grown < peak, grown, np.maximum(2.0 * peak - grown, 0.0))
     z = np.column_stack([load - 0.1 * fault, load + 0.1 * fault]) + rng.normal(0.0, 0.005, (n, 2))
-    return cut(z, z[:, 1] - z[:, 0] > 0.2)
+    fails = np.append(z[:, 1] - z[:, 0] > 0.2, True)
+    return z[: fails.argmax() + 1], fails.argmax() < n
 
 
 def random(rng):
     """Nothing foresees it."""
     z = rng.normal(0.5, 0.1, (rng.integers(200, 600), 2))
     return z, rng.random() < 0.5
-
-
-def cut(z, fails):
-    return (z[: fails.argmax() + 1], True) if fails.any() else (z, False)
 
 
 def log_of(machine, seed, count):

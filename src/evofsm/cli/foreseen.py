@@ -211,7 +211,7 @@ def _draw(
     risk = np.max(on * judge.shares[:, None], axis=0)
     failed, ends = np.zeros(len(risk), np.bool_), runs.starts + runs.lengths - 1
     failed[ends[runs.failed]] = True
-    last = int(np.flatnonzero(failed)[-1]) if failed.any() else len(risk) - 1
+    last = int(ends[runs.failed][-1] if runs.failed.any() else ends[-1])
     near = max(int(runs.starts[runs.starts <= last][-1]), last - 4 * judge.horizon)
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
     model = None if machine is None or not machine.n_states else machine.model()

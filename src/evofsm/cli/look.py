@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import polars
@@ -14,6 +13,8 @@ from numpy.typing import NDArray
 from evofsm.cli.options import seconds
 from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
+
+Pairs = list[tuple[str, str]]
 
 # So many fields and rows are looked at; columns of more texts are no list of states.
 _MOST_FIELDS, _MOST_ROWS, _FEW = 20_000_000, 1_000_000, 12
@@ -33,18 +34,11 @@ _LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 3
 _NICE = [(seconds("", text), text) for text in _LONG.split()]
 
 
-class Look(NamedTuple):
-    """What was found."""
-
-    facts: list[tuple[str, str]]  #: by column, and of all rows
-    options: list[tuple[str, str]]  #: what could be asked of it
-
-
-def look_at(table: CsvTable | ParquetTable) -> Look:
-    """Look at the first million rows, or fewer of many columns."""
+def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
+    """What the first rows hold, by column and in all, and options that could be asked for."""
     frame, clock, form = _first_rows(table)
     if not len(frame):
-        return Look([], [])
+        return [], []
     numbers = [name for name, kind in frame.schema.items() if kind.is_numeric() and name != clock]
     values = {name: frame[name].to_numpy() for name in numbers}
     values = {name: z for name, z in values.items() if np.isfinite(z).any()}
@@ -79,7 +73,7 @@ def look_at(table: CsvTable | ParquetTable) -> Look:
         del ends[still]
     # What goes on by the same from row to row is a count of them.
     moved = {n: e.tolist() for n, e in ends.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
-    return Look(facts, _of_numbers(moved, options))
+    return facts, _of_numbers(moved, options)
 
 
 def _first_rows(table: CsvTable | ParquetTable) -> tuple[polars.DataFrame, str, str]:
@@ -111,7 +105,7 @@ def _first_rows(table: CsvTable | ParquetTable) -> tuple[polars.DataFrame, str, 
     return frame, clock, form
 
 
-def _of_steps(times: NDArray[np.float64], facts: list[tuple[str, str]]) -> list[tuple[str, str]]:
+def _of_steps(times: NDArray[np.float64], facts: Pairs) -> Pairs:
     """What makes one clock of such steps."""
     steps = np.diff(times)
     later = steps[steps > 0.0]
@@ -127,9 +121,7 @@ def _of_steps(times: NDArray[np.float64], facts: list[tuple[str, str]]) -> list[
     return [("--resample", step[1]), ("--hole", hole[1])]
 
 
-def _of_numbers(
-    ends: dict[str, list[float]], options: list[tuple[str, str]]
-) -> list[tuple[str, str]]:
+def _of_numbers(ends: dict[str, list[float]], options: Pairs) -> Pairs:
     """With what to observe of numbers that go from here to there, and what somebody sets."""
     if not ends:
         return []
