@@ -46,15 +46,9 @@ def guard_where_nobody_acts(
     """
     runs, dt = _runs(episodes), float(episodes[0].dt)
     horizon = horizon or max(float(np.median(runs.lengths)) / 20.0, 10.0) * dt
-    judge = Foresight.learn_log(
-        [one.observations for one in episodes],
-        runs.failed,
-        dt=dt,
-        horizon=horizon,
-        hold=hold,
-        names=labels.names,
-        units=labels.units,
-    )
+    rows, names, units = [one.observations for one in episodes], labels.names, labels.units
+    given = {"dt": dt, "horizon": horizon, "hold": hold}
+    judge = Foresight.learn_log(rows, runs.failed, **given, names=names, units=units)
     tolerance = judge.tolerance_of(RATE) if tolerance is None else tolerance
     reviser = ActionReviser(judge, Choices(1), tolerance=tolerance, mode=Mode.SHADOW)
     return Guard.of(reviser, interval=dt, machine=machine, learn=False)
@@ -169,11 +163,10 @@ def _tables(found: dict[str, Any], judge: Foresight, title: str) -> Iterator[Ren
     yield facts(title, pairs)
     title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
     yield table(title, _HEADER, rows, bold=bold)
-    beside = (
-        "" if one["kind"] == "plain" else f"; plain thresholds would be {one['plain']}"
-        for one in found["limits"]
-    )
-    said = [(f"{RATES[k]:g}", f"{judge.of(k)}{more}") for k, more in enumerate(beside)]
+    said = []
+    for k, one in enumerate(found["limits"]):
+        beside = "" if one["kind"] == "plain" else f"; plain thresholds would be {one['plain']}"
+        said.append((f"{one['stated']:g}", f"{judge.of(k)}{beside}"))
     yield facts("\nWhere they alarm, by false alarms a day", said)
     rows = []
     for one in found["listed"][-_LISTED:]:
