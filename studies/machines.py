@@ -269,7 +269,7 @@ def judged(name: str, days: float, seed: int) -> list[dict[str, Any]]:
             alarms.items(), range(len(Foresight.rates))
         ):
             found, _ = judge.tally(log, rate, plain=plain)
-            limits = " or ".join(map(judge.told, judge.of_rate(rate, plain=plain)))
+            limits = judge.words(rate, plain=plain)
             who = {"machine": name, "seed": seed, "alarm": alarm, "stated": Foresight.rates[rate]}
             came = {"failures": found.failures, "seen": found.foreseen, "false": found.false}
             warned = {"warned": found.lead * found.failures, "days": found.days}

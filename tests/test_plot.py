@@ -212,9 +212,9 @@ def test_a_history_marks_alarms_and_failures_and_leaves_holes_blank():
     plot.history(axes, when, when[:, None], ["heat"], risk, failed, 0.5)
     heat, said = axes
     assert np.isnan(heat.lines[-1].get_ydata()).tolist() == [False] * 3 + [True] + [False] * 2
-    (band,) = heat.patches
-    assert band.get_x() == pytest.approx(9060.0 / 3600.0)
-    assert band.get_x() + band.get_width() == pytest.approx(9120.0 / 3600.0)
+    (band,) = heat.collections
+    (path,) = band.get_paths()
+    assert path.get_extents().intervalx == pytest.approx([9060.0 / 3600.0, 9120.0 / 3600.0])
     assert said.get_xlabel() == "time [hours]"
     labels = [text.get_text() for text in said.get_legend().get_texts()]
-    assert labels == ["tolerance", "failure", "alarm"]
+    assert labels == ["alarm", "tolerance", "failure"]

@@ -376,21 +376,20 @@ def history(
     ['heat', 'risk']
     """
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
-    said, crosses = np.asarray(risk, np.float64), when[np.asarray(failed, np.bool_)]
-    steps = np.diff(when, prepend=when[:1])
-    blank = steps > 3.0 * np.median(steps)
-    unit, size = ("days", 86400.0) if np.ptp(when) > 2e5 else ("hours", 3600.0)
-    unit, size = (unit, size) if np.ptp(when) > 7200.0 else ("minutes", 60.0)
-    x, crosses = (when - when[0]) / size, (crosses - when[0]) / size
-    edges = np.flatnonzero(np.diff(said > tolerance, prepend=False, append=False))
+    said, fails = np.asarray(risk, np.float64), np.asarray(failed, np.bool_)
+    steps, lasts = np.diff(when, prepend=when[:1]), np.ptp(when)
+    blank = np.where(steps > 3.0 * np.median(steps), np.nan, 0.0)
+    unit, size = ("hours", 3600.0) if lasts > 7200.0 else ("minutes", 60.0)
+    unit, size = ("days", 86400.0) if lasts > 2e5 else (unit, size)
+    x, red, orange = (when - when[0]) / size, COLORS["dead end"], COLORS["follower"]
     for ax in axes:
-        for first, end in edges.reshape(-1, 2):
-            look: Look = {"color": COLORS["follower"], "alpha": 0.25, "linewidth": 1.0}
-            ax.axvspan(x[first], x[end - 1], **look)
-        for cross in crosses:
-            ax.axvline(cross, color=COLORS["dead end"], linewidth=0.8, linestyle="--")
+        look: Look = {"color": orange, "alpha": 0.25, "linewidth": 1.0, "label": "alarm"}
+        look["transform"] = ax.get_xaxis_transform()
+        ax.fill_between(x, 0.0, 1.0, said > tolerance, **look)
+        for cross in x[fails]:
+            ax.axvline(cross, color=red, linewidth=0.8, linestyle="--")
     for ax, name, values in zip(axes, names, z.T, strict=False):
-        ax.plot(x, np.where(blank, np.nan, values), color=ink(), linewidth=0.6)
+        ax.plot(x, values + blank, color=ink(), linewidth=0.6)
         ax.set_ylabel(name)
     if model is not None:
         some = np.arange(0, len(z), max(len(z) // 2000, 1))
@@ -398,13 +397,10 @@ def history(
         axes[-2].plot(x[some], seen, ".", markersize=1.5, color=COLORS["leader"])
         label_states(axes[-2].yaxis, model.n_states)
         axes[-2].set_ylabel("state")
-    axes[-1].step(x, np.where(blank, np.nan, said), where="post", color=COLORS["follower"])
-    look = {"color": ink(), "linewidth": 0.8, "linestyle": ":", "label": "tolerance"}
-    axes[-1].axhline(tolerance, **look)
-    look = {"linestyle": "none", "marker": "X", "color": COLORS["dead end"], "clip_on": False}
-    axes[-1].plot(crosses, np.ones(len(crosses)), markersize=4.5, label="failure", **look)
-    alarm: Look = {"marker": "s", "linestyle": "none", "alpha": 0.25, "color": COLORS["follower"]}
-    axes[-1].plot([], [], label="alarm", **alarm)
+    axes[-1].step(x, said + blank, where="post", color=orange)
+    axes[-1].axhline(tolerance, color=ink(), linewidth=0.8, linestyle=":", label="tolerance")
+    look = {"linestyle": "none", "marker": "X", "markersize": 4.5, "clip_on": False}
+    axes[-1].plot(x[fails], np.ones(fails.sum()), color=red, label="failure", **look)
     _explain(axes[-1])
     axes[-1].set(ylim=(-0.03, 1.03), ylabel="risk", xlabel=f"time [{unit}]")
 

@@ -129,7 +129,7 @@ def learn(
 
     Of a log whose columns nobody named, evofsm learn LOG prints what is in it, and what to ask.
     """
-    from evofsm.cli.foreseen import Asked, guard_where_nobody_acts
+    from evofsm.cli.foreseen import guard_where_nobody_acts
     from evofsm.cli.learning import guard_of_log, learn_traces, refusing, teach, warnings_of
     from evofsm.driving.naming import UNITS, VARIABLES
     from evofsm.fsm import Labels
@@ -185,10 +185,10 @@ def learn(
             if refused := refusing(share):
                 warn(f"warning: in the later half of the log the guard {refused}")
         else:
-            asked = Asked(horizon, persist, None if tolerance == TOLERANCE else tolerance)
+            asked = horizon, persist, None if tolerance == TOLERANCE else tolerance
             episodes = [one for one in episodes_of(rows) if len(one.times) > 1]
             labels = Labels(names=encoder.names, units=learning.model.units)
-            taught = guard_where_nobody_acts(episodes, labels, asked, learning.machine)
+            taught = guard_where_nobody_acts(episodes, labels, *asked, learning.machine)
         taught.save(guard, provenance)
     if as_json:
         told = {"files": files, "saved": out, "guard": guard, **_document(learning, provenance)}

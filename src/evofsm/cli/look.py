@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import polars
@@ -13,7 +12,9 @@ from numpy.typing import NDArray
 
 from evofsm.cli.options import seconds
 from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
-from evofsm.io.tables import TIMES, Skips, Table, Wanted, is_date
+from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
+
+Pairs = list[tuple[str, str]]
 
 # So many fields and rows are looked at; columns of more texts are no list of states.
 _MOST_FIELDS, _MOST_ROWS, _FEW = 20_000_000, 1_000_000, 12
@@ -33,18 +34,11 @@ _LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 3
 _NICE = [(seconds("", text), text) for text in _LONG.split()]
 
 
-class Look(NamedTuple):
-    """What was found."""
-
-    facts: list[tuple[str, str]]  #: by column, and of all rows
-    options: list[tuple[str, str]]  #: what could be asked of it
-
-
-def look_at(table: Table) -> Look:
-    """Look at the first million rows, or fewer of many columns."""
+def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
+    """What the first rows hold, by column and in all, and options that could be asked for."""
     frame, clock, form = _first_rows(table)
     if not len(frame):
-        return Look([], [])
+        return [], []
     numbers = [name for name, kind in frame.schema.items() if kind.is_numeric() and name != clock]
     values = {name: frame[name].to_numpy() for name in numbers}
     values = {name: z for name, z in values.items() if np.isfinite(z).any()}
@@ -64,7 +58,7 @@ def look_at(table: Table) -> Look:
         runs = values[still] > limit
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
-    rare = [*_rare(frame, texts, values)]
+    rare = [*_rare(frame, [*texts, *values])]
     likely = [one for one in rare if _FAILURE.search(one[1])]
     rare = likely or [one for one in rare if one[0] in values]
     facts += [("a failure?", f"{text} {told}") for _, text, told in rare]
@@ -79,10 +73,10 @@ def look_at(table: Table) -> Look:
         del ends[still]
     # What goes on by the same from row to row is a count of them.
     moved = {n: e.tolist() for n, e in ends.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
-    return Look(facts, _of_numbers(moved, options))
+    return facts, _of_numbers(moved, options)
 
 
-def _first_rows(table: Table) -> tuple[polars.DataFrame, str, str]:
+def _first_rows(table: CsvTable | ParquetTable) -> tuple[polars.DataFrame, str, str]:
     """Their columns, the clock in seconds, which one that is, and how it is written if oddly."""
     firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
     pairs = zip(firsts, [*firsts][1:], strict=False)
@@ -111,7 +105,7 @@ def _first_rows(table: Table) -> tuple[polars.DataFrame, str, str]:
     return frame, clock, form
 
 
-def _of_steps(times: NDArray[np.float64], facts: list[tuple[str, str]]) -> list[tuple[str, str]]:
+def _of_steps(times: NDArray[np.float64], facts: Pairs) -> Pairs:
     """What makes one clock of such steps."""
     steps = np.diff(times)
     later = steps[steps > 0.0]
@@ -127,9 +121,7 @@ def _of_steps(times: NDArray[np.float64], facts: list[tuple[str, str]]) -> list[
     return [("--resample", step[1]), ("--hole", hole[1])]
 
 
-def _of_numbers(
-    ends: dict[str, list[float]], options: list[tuple[str, str]]
-) -> list[tuple[str, str]]:
+def _of_numbers(ends: dict[str, list[float]], options: Pairs) -> Pairs:
     """With what to observe of numbers that go from here to there, and what somebody sets."""
     if not ends:
         return []
@@ -173,27 +165,25 @@ def _stands(z: NDArray[np.float64]) -> bool:
     return 0.01 < low < 0.9 and mid - low < 0.02 and len(np.unique(size)) > 2
 
 
-def _rare(
-    frame: polars.DataFrame, texts: list[str], numbers: dict[str, NDArray[np.float64]]
-) -> Iterator[tuple[str, str, str]]:
+def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str, str, str]]:
     """Columns, conditions that hold of few of their rows, and how often: by a text, or a code."""
-    is_so = [
-        (name, text, (frame[name] == text).to_numpy())
-        for name in texts
-        if frame[name].n_unique() <= _FEW
-        for text in filter(None, frame[name].unique(maintain_order=True))
-    ]
-    for name, z in numbers.items():
-        codes = np.unique(z[np.isfinite(z)]) if _CODE.search(name) else np.arange(2)
-        if len(codes) <= _FEW and not (z % 1.0).any() and np.isin(z, codes).all():
-            is_so += [(name, f"{code:g}", z == code) for code in codes.tolist() if code]
-    for name, text, here in is_so:
-        if 0.0 < here.mean() < 0.25:
-            times = int(here[0]) + int((here[1:] & ~here[:-1]).sum())
-            is_plain = re.fullmatch(r"[^\W\d]\w*", text) or name in numbers
-            value = text if is_plain else f"'{text}'"
-            told = f"({'once' if times == 1 else f'{times:,} times'}, {here.mean():.2%} of rows)"
-            yield name, f"{_named(name, _SIGNS)}=={value}", told
+    for name in columns:
+        kinds = frame[name].unique(maintain_order=True)
+        is_number = kinds.dtype.is_numeric()
+        is_code = not is_number or (
+            (kinds % 1.0 == 0.0).all()
+            and (kinds.is_in([0.0, 1.0]).all() or _CODE.search(name) is not None)
+        )
+        for kind in kinds if is_code and len(kinds) <= _FEW else ():
+            here = (frame[name] == kind).to_numpy()
+            if kind and here.mean() < 0.25:
+                times = int((here > np.append(False, here[:-1])).sum())
+                text = f"{kind:g}" if is_number else kind
+                value = text if is_number or re.fullmatch(r"[^\W\d]\w*", text) else f"'{text}'"
+                told = (
+                    f"({'once' if times == 1 else f'{times:,} times'}, {here.mean():.2%} of rows)"
+                )
+                yield name, f"{_named(name, _SIGNS)}=={value}", told
 
 
 def _is_in_blocks(values: polars.Series) -> bool:

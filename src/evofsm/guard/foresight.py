@@ -15,6 +15,7 @@ that were held out of it, a third of the log at a time.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from itertools import product
 from typing import Any, NamedTuple, Self
 
@@ -221,18 +222,18 @@ class Foresight(LearningJudge):
         spans = np.maximum(self._spans // size, 1)
         starts, leads = np.searchsorted(blocks, log.starts), np.zeros(len(log.starts))
         most = spans[0] * log.failed.sum(), len(log.rows) * self.dt / _DAY
-        known: dict[tuple[tuple[int, int], ...], Floats] = {}
 
+        @cache
         def more(rule: tuple[tuple[int, int], ...]) -> Floats:
             """(limits, thresholds, 2) share that is warned, and false alarms a day, of one more."""
-            if rule not in known:
-                on, found = np.zeros(len(blocks), np.bool_), np.zeros((len(asked), _TRIED, 2))
-                for k, j in rule:
-                    on |= x[k] > tried[k][j]
-                for k in range(len(asked)):
-                    _try(on, x[k], tried[k], starts, log.failed, spans, leads, found[k])
-                known[rule] = found / most
-            return known[rule]
+            above, found = np.zeros(len(blocks), np.bool_), np.zeros((len(asked), _TRIED, 2))
+            for k, j in rule:
+                above |= x[k] > tried[k][j]
+            for k, j in np.ndindex(len(asked), _TRIED):
+                beyond = above | (x[k] > tried[k][j])
+                false = _tally(beyond, starts, log.failed, spans, leads, beyond)
+                found[k, j] = leads.sum(), false
+            return np.asarray(found / most)
 
         rules: dict[tuple[tuple[int, int], ...], Floats] = {(): np.zeros(2)}
         for price in _PRICES:
@@ -290,14 +291,14 @@ class Foresight(LearningJudge):
         on = np.asarray(self._passed(self._columns(log.rows, log.starts), limits).any(axis=0))
         spans, leads = self._spans, np.zeros(len(log.starts))
         spans[1] = self.hold if hold is None else 1 + round(hold / self.dt)
-        false = _tally(on, np.zeros(len(on)), 1.0, log.starts, log.failed, spans, leads, on)
+        false = _tally(on, log.starts, log.failed, spans, leads, on)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
         lead = float(leads.sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
 
-    def told(self, limit: Floats) -> str:
-        """Where a limit is passed, in words."""
-        return " ".join(self._words(limit))
+    def words(self, rate: int, *, plain: bool | None = None) -> str:
+        """Where an alarm is on, as `of_rate` has its limits."""
+        return " or ".join(" ".join(self._words(one)) for one in self.of_rate(rate, plain=plain))
 
     def _words(self, limit: Floats) -> tuple[str, str]:
         v, when, sign, at = int(limit[_OF]), int(limit[_WHEN]), limit[_SIGN], limit[_AT]
@@ -351,15 +352,16 @@ class Foresight(LearningJudge):
     @property
     def told_by_experience(self) -> str:
         """What each alarm is, and how often it was right."""
-        said = []
-        for rate, (alarms, right, kind) in enumerate(self.held_out.tolist()):
-            limits = " or ".join(map(self.told, self.of_rate(rate))) or "nothing foresees it"
-            plain = "plain thresholds do as well: " if kind == _PLAIN else ""
-            said.append(
-                f"for {RATES[rate]:g} false alarms a day {plain}{limits} ({right:.0f} of "
-                f"{alarms:.0f} were right)"
-            )
-        return "; ".join(said)
+        rates = enumerate(RATES[: len(self.held_out)])
+        return "; ".join(f"for {rate:g} false alarms a day {self.of(k)}" for k, rate in rates)
+
+    def of(self, rate: int) -> str:
+        """What the alarm for one of `RATES` is, and how often it was right, in words."""
+        alarms, right, kind = self.held_out[rate].tolist()
+        if kind == _NONE:
+            return "nothing was better than chance"
+        plain = "plain thresholds do as well: " if kind == _PLAIN else ""
+        return f"{plain}{self.words(rate)} ({right:.0f} of {alarms:.0f} were right, held out)"
 
     # -- Beside a machine -----------------------------------------------------------------------
 
@@ -413,15 +415,11 @@ class Foresight(LearningJudge):
         """Why it is dangerous."""
         return "an alarm is on"
 
-    def follow(self, observation: ArrayLike, action: Action, /) -> None:
-        """Keep up with what happens."""
+    def follow(self, observation: ArrayLike, action: Action, belief: ArrayLike = (), /) -> None:
+        """Keep up with what happens; it learns from whole logs alone."""
         self._now = self._next(np.asarray(observation, np.float64))[1]
 
-    def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike, /) -> None:
-        """The same: it learns from whole logs alone."""
-        self.follow(observation, action)
-
-    watch = learn
+    learn = watch = follow
 
     def end(self, observation: Floats | None, *, failed: bool) -> None:
         """The episode is over."""
@@ -492,23 +490,17 @@ def _look_ahead(
 
 
 @kernel
-def _tally(
-    above: Flags,
-    x: Floats,
-    at: float,
-    starts: Ints,
-    failed: Flags,
-    spans: Ints,
-    leads: Floats,
-    on: Flags,
-) -> int:
-    """False alarms, while ``above`` or x is beyond a threshold; leads (E,) and on (T,) are set."""
+def _tally(above: Flags, starts: Ints, failed: Flags, spans: Ints, leads: Floats, on: Flags) -> int:
+    """False alarms where ``above`` marks (T,) the rows beyond a limit; leads (E,), on (T,) are set.
+
+    ``on`` may be the same as ``above``.
+    """
     false, horizon, hold, stays = 0, spans[0], spans[1], spans[2]
     for e in range(len(starts)):
-        end = starts[e + 1] if e + 1 < len(starts) else len(x)
+        end = starts[e + 1] if e + 1 < len(starts) else len(above)
         up, down, begun = 0, 0, -1
         for t in range(starts[e], end):
-            if above[t] or x[t] > at:
+            if above[t]:
                 up, down = up + 1, 0
                 if begun < 0 and up >= hold:
                     begun = t
@@ -517,8 +509,7 @@ def _tally(
                 if begun >= 0 and down >= stays:
                     false += (t - begun + horizon - 1) // horizon
                     begun = -1
-            if len(on):
-                on[t] = begun >= 0
+            on[t] = begun >= 0
         lasted = end - 1 - begun if begun >= 0 else 0
         leads[e] = min(lasted, horizon) if failed[e] else 0.0
         if failed[e]:
@@ -526,20 +517,3 @@ def _tally(
         elif begun >= 0:
             false += lasted // horizon + 1
     return false
-
-
-@kernel
-def _try(
-    above: Flags,
-    x: Floats,
-    tried: Floats,
-    starts: Ints,
-    failed: Flags,
-    spans: Ints,
-    leads: Floats,
-    found: Floats,
-) -> None:
-    """(n, 2) rows warned, and false alarms, with each threshold."""
-    for k in range(len(tried)):
-        found[k, 1] = _tally(above, x, tried[k], starts, failed, spans, leads, above[:0])
-        found[k, 0] = leads.sum()

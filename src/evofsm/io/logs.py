@@ -534,10 +534,13 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
     Its last row may belong to a step that goes on, or have a hole behind it: a chunk leaves it to
     the next one.
     """
+    import polars
+
     step = columns.resample and columns.resample.step
     said = columns.resample.how if columns.resample else {}
     variables, names = columns.observe.variables, columns.observe.names
     hows = [said.get(name, "mean") if name in variables else "last" for name in names]
+    hows.append(said.get(columns.action, "mean"))
     rest: Chunk | None = None
     for chunk in chain(chunks, [None]):
         parts = [one for one in (rest, chunk) if one is not None]
@@ -560,9 +563,12 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
         lost = (steps > LONGEST_STEP * whole.dt) | (steps < whole.dt / LONGEST_STEP)
         starts = np.searchsorted(first, whole.starts)
         lost[starts[starts > 0] - 1] = False
-        actions = _become(whole.actions, first, said.get(columns.action, "mean"))
+        rows = polars.DataFrame(np.column_stack([whole.observations, whole.actions]))
+        rows = rows.fill_nan(None).with_columns(step=np.cumsum(begins))  # what lacks does not count
+        become = (getattr(polars.nth(k), how)() for k, how in enumerate(hows))
+        rows = rows.group_by("step", maintain_order=True).agg(become).drop("step")
+        *seen, actions = rows.to_numpy().T.copy()
         actions[:-1][lost] = np.nan
-        seen = [_become(z, first, how) for z, how in zip(whole.observations.T, hows, strict=True)]
         made = whole._replace(
             observations=np.column_stack(seen),
             actions=actions,
@@ -577,18 +583,6 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
             rest = whole.rows(int(first[-1]), len(fails))._replace(jumps=0)
         if keeps:
             yield made.rows(0, keeps)
-
-
-def _become(values: NDArray[np.float64], first: NDArray[np.int64], how: str) -> NDArray[np.float64]:
-    """What the values of each step become; those that are missing do not count."""
-    if how == "last":
-        return np.asarray(values[np.append(first[1:], len(values)) - 1])
-    if how != "mean":
-        return np.asarray((np.fmax if how == "max" else np.fmin).reduceat(values, first))
-    there = ~np.isnan(values)
-    counts = np.add.reduceat(there, first, dtype=np.float64)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.add.reduceat(np.where(there, values, 0.0), first) / counts)
 
 
 def open_table(

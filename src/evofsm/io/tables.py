@@ -409,10 +409,6 @@ class Table:
         """What stands first in a column; nothing of a table of numbers alone."""
         return ""
 
-    def holds(self, name: str) -> Literal["number", "text", ""]:
-        """What a column holds, as far as is known from its type or first row; else nothing."""
-        return ""
-
 
 class _Odd(NamedTuple):
     """What Python's own reader makes of some lines."""
@@ -496,7 +492,7 @@ class CsvTable(Table):
         return dict(zip(self.columns, self._first_row, strict=False)).get(name, "")
 
     def holds(self, name: str) -> Literal["number", "text", ""]:
-        """By its first row; nothing of a column without a name of its own."""
+        """What a column holds, by its first row; nothing of one without a name of its own."""
         if not name or self.columns.count(name) > 1:
             return ""
         text = self.first(name)
@@ -679,7 +675,7 @@ class ParquetTable(Table):
         return str(found.item()) if len(found) else ""
 
     def holds(self, name: str) -> Literal["number", "text", ""]:
-        """By its type."""
+        """What a column holds, by its type, as far as that is known."""
         import polars
 
         kind = self._types[name]

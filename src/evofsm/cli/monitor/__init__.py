@@ -175,7 +175,7 @@ def monitor(
     rows = EPISODE if episode is None or is_log else int(episode)
     with ExitStack() as stack:
         if summary and file is not None:
-            from evofsm.cli.foreseen import Asked, show_foreseen
+            from evofsm.cli.foreseen import show_foreseen
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
             from evofsm.fsm import Labels
 
@@ -196,11 +196,9 @@ def monitor(
                     what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
                     warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
             if is_log and alone:
-                wanted = (
-                    Labels(names=reading.columns.observe.names),
-                    Asked(horizon, persist, tolerance),
-                )
-                show_foreseen(file, list(chunks), used, *wanted, plot, as_json=as_json)
+                labels = Labels(names=reading.columns.observe.names)
+                wanted = horizon, persist, tolerance
+                show_foreseen(file, list(chunks), used, labels, wanted, plot, as_json=as_json)
                 return None
             used = used or fresh()
             _prepare(used, mode, tolerance, None, stack, learn=learn)
