@@ -406,7 +406,9 @@ def _said(
     reviser: Any = guard.reviser
     wanted = row[len(row) - len(np.atleast_1d(no_action(guard.actions))) :]
     proposal: Any = wanted if isinstance(guard.actions, BoxActions) else float(wanted[0])
-    remark = make_usable(Proposal(proposal), guard.actions, reviser.risk.fallback).remark
+    usable = make_usable(Proposal(proposal), guard.actions, reviser.risk.fallback)
+    code = code | {"passes": bool((done[len(done) // 2 :] == usable.action).all())}
+    remark = usable.remark
     is_told = code["remark"] == bool(remark) + remark.startswith("no ")
     is_kinematic = isinstance(reviser.risk, LatentRisk)
     tell = _kinematic if is_kinematic else _learnt
@@ -432,6 +434,8 @@ def _learnt(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str
         why = words.comes_near(judge.backup_text(code["backup_near"]))
     if kind == 1:
         return f"{why}; {words.changed(backup, remembered, judge.margin, allowed)}"
+    if kind == 3 and code["passes"]:
+        return f"{why}; {words.NO_LONGER}"
     return f"{why}; {words.lasting(backup, cut=kind == 2)}"
 
 

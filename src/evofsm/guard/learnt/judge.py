@@ -357,9 +357,13 @@ class LearntRisk(ActionJudge):
                     break
         if passes:
             instead = words.changed(backup, remembered, margin, allowed)
+        elif tried is not None:
+            instead = words.TRIED
         else:
-            instead = words.TRIED if tried is not None else words.lasting(backup, cut=cut)
-        executed = np.reshape(self.decode(action), np.shape(wanted))
+            instead = words.NO_LONGER if action is proposal else words.lasting(backup, cut=cut)
+        executed = wanted
+        if action is not proposal:
+            executed = np.reshape(self.decode(action), np.shape(wanted))
         return Search(np.array((one[0], executed)), judged, 1, f"{why}; {instead}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:

@@ -369,10 +369,11 @@ static double mean_worth(const evofsm_state *s) {
   return total / (double)K;
 }
 
-/* From the proposal (inner) to the action: at most 2 ASKED + HALVINGS rollouts, or 3 ASKED. */
+/* From the proposal (inner) to the action: at most 2 ASKED + HALVINGS rollouts, or 4 ASKED. */
 static int search(evofsm_state *s, const double proposal[A], double action[A], int *backup,
                   double *left) {
-  double own[A], closer[A], refused = 0.0, share = 1.0, longest = -INFINITY, distance;
+  double own[A], closer[A], refused = 0.0, share = 1.0, distance;
+  double longest = -INFINITY, wanted = -INFINITY;
   int i, r, step_of;
   s->done = 0;
   copy(action, proposal, A);
@@ -418,8 +419,12 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
       *backup = s->ranks[r];
       longest = distance;
     }
+    rollout(s, proposal, policies[s->ranks[r]], SCALE, 0.0, K, &distance);
+    wanted = greater(wanted, mean_worth(s));
   }
-  action_of(s, *backup, action);
+  if (wanted < longest - NO_LONGER) {
+    action_of(s, *backup, action);
+  }
   *left = INFINITY;
   return EVOFSM_NOTHING_PASSES;
 }
@@ -515,7 +520,9 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
     if (out->reason > EVOFSM_CHANGED || ALLOWED > 0) {
       unsurvived = foresee(s, action);
     }
-    decode(action, s->best);
+    if (!are_same(action, proposal)) {
+      decode(action, s->best);
+    }
   } else if (ALLOWED > 0) {
     out->unsurvived = unsurvived = foresee(s, proposal);
   }

@@ -46,8 +46,9 @@ _RESERVE = 0.01
 _DISTANCE, _FAR = 0.05, 0.05
 # Halvings between a proposal and an action that passes.
 _HALVINGS = 4
-# Of two backups that last as long up to so much the first is taken.
-_EQUAL = 1e-9
+# Of two backups that last as long up to so much the first is taken; and who takes over has to last
+# longer than the proposal by more than that.
+_EQUAL, _NO_LONGER = 1e-9, 0.002
 
 
 class Model(NamedTuple):
@@ -493,9 +494,9 @@ def search(
     The proposal itself if one does; else what the first of ``ranks`` does that survives, and from
     there as near to the proposal as halvings come. All disturbances have to be survived but
     ``allowed``, and that none begins. Where no action passes it is that of the backup that lasts
-    longest, if that is asked (``lasting``). ``situation`` is (2m + a,), proposal and action are
-    (a,). After ``most`` steps of rollouts it is cut short, with the action of the first of
-    ``ranks``.
+    longest, if that is asked (``lasting``), or the proposal if none lasts longer than after it.
+    ``situation`` is (2m + a,), proposal and action are (a,). After ``most`` steps of rollouts it is
+    cut short, with the action of the first of ``ranks``.
 
     Returns what was found, the action, after which backup it passes, and the least distance to
     failure that is then left; where nothing passes, how far apart backups are, near 0 if all last
@@ -539,13 +540,17 @@ def search(
         return CHANGED, action, q, left
     if not lasting:
         return NOTHING_PASSES, proposal, ranks[0], math.inf
-    which, longest, shortest = ranks[0], -np.inf, np.inf
+    which, longest, shortest, wanted = ranks[0], -np.inf, np.inf, -np.inf
     for q in ranks:
-        lasts = float(rollout(model, situation[None], policies[q], residuals, scale).worth.mean())
+        asked = model, situation[None], policies[q], residuals, scale
+        lasts = float(rollout(*asked).worth.mean())
         shortest = min(shortest, lasts)
         if lasts > longest + _EQUAL:
             which, longest = q, lasts
+        wanted = max(wanted, float(rollout(*asked, proposal[None]).worth.mean()))
     apart = (longest - shortest) / (abs(longest) + 1e-12)
+    if wanted >= longest - _NO_LONGER:
+        return NOTHING_PASSES, proposal, which, apart
     return NOTHING_PASSES, action_of(model, policies[which], situation[:m]), which, apart
 
 

@@ -43,6 +43,8 @@ NOTHING_SEEN = "nothing of this episode was observed yet"
 NO_FAILURE = "no failure is known yet, so nothing is refused"
 #: What is done where all backups look alike and another action was hardly used.
 TRIED = "no action passes; what this one does is hardly known, so it is tried"
+#: What is done where no backup lasts longer than the proposal.
+NO_LONGER = "no action passes, and no backup lasts longer than the proposal, which passes"
 
 # Disturbances that are taken to be harder by a smaller factor are taken as they were.
 _HARDER = 1.05
