@@ -37,8 +37,7 @@ def taught(**given):
 
 def test_a_given_model_knows_of_brakes_that_were_never_tried():
     without, told = (
-        sum(drive(guard, 100 + k) for k in range(8))
-        for guard in (taught(), taught(model=move))
+        sum(drive(guard, 100 + k) for k in range(8)) for guard in (taught(), taught(model=move))
     )
     assert without >= 6
     assert told <= 2  # it is fitted, not copied

@@ -26,8 +26,8 @@ _STOPS = 4.0
 # Episodes before it may move otherwise, and after it did, in which it is learnt how; transitions
 # that a correction needs, and how it is held to 0.
 _LEARNT, _FEW, _HELD = 20, 15.0, 0.3
-# Steps from which it is tried how much lags foresee.
-_STARTS = 12
+# Steps from which it is tried how much lags foresee, and what is missed counts at most [steps].
+_STARTS, _FAR_OFF = 12, 1e9
 
 
 def steps(state: State, z: Floats) -> State:
@@ -147,7 +147,8 @@ def misled(
             phi = features(known, at, at - before, u[now - 1], u[now])
             move = np.clip(phi @ known.weights, known.least, known.most)
             at, before = np.clip(at + move, known.lowest, known.highest), at
-            total += np.log1p(((at - z[now + 1]) / state.unit) ** 2).sum(1).mean()
+            off = np.abs(at - z[now + 1]) / np.maximum(state.unit, 1e-300)
+            total += np.log1p(np.minimum(off, _FAR_OFF) ** 2).sum(1).mean()
         missed.append(total / state.horizon)
     worse = np.clip(missed[0] - missed[1], 0.0 if failed else -1.0, 1.0)
     return state._replace(misled=max(0.0, state.misled + float(worse)))
