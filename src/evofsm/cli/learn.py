@@ -348,7 +348,7 @@ def _look_first(file: str, reading: Reading) -> list[str]:
         command = [f"evofsm learn {quote(file)}", *(f"{a} {quote(b)}" for a, b in options)]
         show(facts(f"What {file} holds", found), "\nA way to learn from it:")
         print("  " + " \\\n      ".join(command), flush=True)
-        raise ValueError(f"say what to --observe of {file}: a way to read it stands above")
+        raise ValueError(f"say what is observed in {file} (--observe names it); a way stands above")
     said = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
     asked = zip(_UNASKED.items(), said, strict=True)
     return [f"{why}: {a} {quote(could[a])}" for (a, why), b in asked if b is None and a in could]
