@@ -104,7 +104,7 @@ def run_episode(
         over, failed = bool(terminated or truncated), bool(info.get("failed", terminated))
         if over:
             if feeding:
-                feeding["score"] = score
+                feeding["score"] = score if math.isfinite(score) else None
             guard.end(failed, np.ravel(observation), terminated=bool(terminated), **feeding)
         realised = float(info.get("realised", math.nan))
         yield Decision(situation, revision, realised, float(reward), failed, seconds)
