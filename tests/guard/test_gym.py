@@ -203,14 +203,6 @@ def test_gymnasium_finds_nothing_to_complain_of(own):
     check_env(env, skip_render_check=True)
 
 
-def test_a_failure_ends_the_episode_where_the_environment_goes_on():
-    env = of_cars(Script(FAR, HIT, failed=True, terminates=False))
-    env.reset()
-    env.step(np.array([0.0]))
-    assert env.guard.machine.endings.sum() == 1
-    assert env.guard.machine.state is None  # the next observation is no consequence
-
-
 def test_a_reset_in_mid_episode_ends_it_without_failure():
     env = of_cars(Script(FAR, NEAR, NEAR))
     for seed, options in ((1, None), (2, {"a": "b"})):
@@ -231,15 +223,6 @@ def test_where_nothing_is_ahead_a_usable_proposal_is_kept_and_nothing_is_learnt(
     env = of_cars(Script(None, None))
     env.reset()
     assert env.step(np.array([np.nan]))[-1]["reviser/executed_action"] == [-1.0]
-
-
-def test_what_is_executed_stays_in_the_environments_space():
-    env = Script(NEAR, NEAR, action_space=Box(-2.0, 2.0, (), np.float32))
-    env = RevisedActions(env, guard_for_cars(-2.0, 1.0))
-    env.reset()
-    info = env.step(np.float32(1.0))[-1]
-    assert info["reviser/executed_action"] in env.action_space
-    assert info["reviser/executed_action"] == -2.0
 
 
 @pytest.mark.parametrize("missing", Missing)
@@ -305,6 +288,7 @@ def test_actions_that_are_not_the_guards_are_refused(space, guarded):
         (Box(-2.0, 2.0, (2, 1), np.float32), [[1.0], [2.0]], [[0.5], [0.5]], 10.0**0.5 / 4.0),
         (Box(-2.0, 2.0, (1,), np.float32), [9.0], [0.5], 0.75),
         (Box(-2.0, 2.0, (1,), np.float32), [math.nan], [0.0], 1.0),
+        (Box(-2.0, 2.0, (), np.float32), 1.0, 0.5, 0.25),
     ],
 )
 @pytest.mark.parametrize("penalty", [0.0, 3.0])
@@ -808,24 +792,6 @@ def test_a_step_that_only_resets_is_no_decision_and_costs_nothing():
         assert not resets or rewards == [0.0]
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_a_failure_is_told_by_the_environments_own_info(mode):
-    envs, ended = recorded("CartPole-v1", 3, mode, 12)
-    guard = guard_for(envs.single_action_space)
-    asked = []
-
-    def failed(step):
-        asked.append(step)
-        return step.info["length"] == 12
-
-    drive_all(RevisedVectorActions(envs, guard, failed=failed), 60)
-    learnt = [failed for *_, failed in guard.judge.episodes]
-    assert learnt == [len(rows) == 12 for rows, *_ in ended]
-    assert all("_length" not in step.info and step.reward == 1.0 for step in asked)
-    last = [tuple(map(float, step.observation)) for step in asked if step.terminated]
-    assert last == [seen for _, seen, terminated in ended if terminated]
-
-
 class Bare(VectorWrapper):
     """Leaves out what the documents of a vector call optional."""
 
@@ -914,15 +880,6 @@ def test_with_one_environment_it_comes_to_the_same_bit_for_bit(mode, snapshot):
         many_said = [np.asarray(infos[name][0]).tolist() for infos in told]
         assert repr(many_said) == repr([np.asarray(info[name]).tolist() for info in alone]), name
     assert snapshot(many.guard.machine) == snapshot(one.guard.machine)
-
-
-def test_a_frozen_guard_learns_from_none_of_them():
-    guard = guard_for(ONE)
-    guard.freeze()
-    revised = RevisedVectorActions(SyncVectorEnv([lambda: Script(FAR, NEAR, FAR)] * 2), guard)
-    drive_all(revised, 7)
-    assert guard.judge.episodes == []
-    assert guard.machine.n_states == 0
 
 
 def test_a_guard_with_an_audit_log_is_not_shared():
