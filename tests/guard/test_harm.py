@@ -9,7 +9,7 @@ import pytest
 from evofsm.guard import AuditLog, Guard, LearntRisk, Mode, audit, merge_judges
 from evofsm.guard.api import Search
 from evofsm.guard.export import write_c99
-from evofsm.guard.harm import Harm, Outcome, better
+from evofsm.guard.harm import Harm
 from evofsm.guard.learnt.judge import _unjudged
 
 _ALONE = 0.05  # what the controller wants: so it fails after 20 steps
@@ -206,8 +206,3 @@ def test_a_controller_that_became_good_is_found_out():
         harm = harm.after((60, 0, 0) if drives else (0, 40, 0), failed=False, ended=not drives)
         alone += not drives
     assert alone > 150
-
-
-def test_of_two_which_failed_at_once_none_is_better():
-    some = [Outcome(1, 30, True, True)]
-    assert not better(some, some).any()

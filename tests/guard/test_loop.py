@@ -123,8 +123,3 @@ def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
     assert LatentRisk.load(tmp_path / "risk.evofsm").brakes.decel == pytest.approx(6.0)
     reviser.mode = Mode.ACT
     assert braked(7.0) == pytest.approx(6.0)  # its own braking is told from what it commands
-
-
-def test_an_interval_that_is_no_multiple_of_the_steps_is_refused():
-    with pytest.raises(ValueError, match="no multiple"):
-        driven(interval=0.255)

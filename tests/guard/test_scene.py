@@ -8,7 +8,7 @@ import pytest
 from evofsm import store
 from evofsm.guard import Guard, Mode, Proposal, SceneRisk
 from evofsm.guard.actions import same_action
-from evofsm.guard.scene import _KIND, Contact, Foreseen, Memory
+from evofsm.guard.scene import _KIND, Contact, Foreseen
 
 LEFT, STAY, RIGHT = range(3)
 THINGS = 3
@@ -147,19 +147,6 @@ def test_what_oneself_never_did_at_first_is_learnt_too():
     assert guard.decide(abreast_soon, STAY).risk_proposed < 0.2
 
 
-def test_an_object_that_was_taken_for_another_one_is_no_forecast(taught):
-    memory = taught.judge.memory
-    past, links = memory.past, memory.past.links.copy()
-    now = links[:2].copy()
-    assert (now >= 0).all()
-    assert abs(np.diff(past.away[now, 0])) > 10.0
-    links[:2] = now[::-1]
-    again = Memory(memory.n_actions, 1)
-    again.restore(past._replace(links=links), memory.failures, memory.fitted)
-    assert len(again._paths) == len(memory._paths) - 2
-    assert np.abs(again._paths[:, 0, 0]).max() < 8.5
-
-
 def test_what_fails_only_in_one_and_the_same_place_is_learnt():
     """As in a world of cells: how close is too close is then 0."""
     guard, random = Rain().guard(), np.random.default_rng(0)
@@ -291,13 +278,6 @@ def test_the_shape_of_what_is_too_close_is_learnt():
     assert (np.diff(contact.risk) <= 0.0).all()
     coming = contact.of(np.array([[9.0, 0.0], [6.0, 0.0], [2.0, 0.0], [9.0, 0.0]]))
     assert coming[0] < 0.05 < 0.3 < coming[1] == coming[2]
-
-
-def test_risk_is_of_those_who_failed_there_or_farther_and_survived_there_or_closer():
-    survived, failed = np.array([[0.5, 0.5], [2.0, 2.0]]), np.array([[1.0, 1.0]])
-    contact = Contact.learn((survived, survived), [(failed, failed)], np.ones(2))
-    assert contact.closeness / contact.closeness[-1] == pytest.approx([0.0, 0.25, 0.5, 1.0])
-    assert contact.risk == pytest.approx([1.0, 2 / 3, 2 / 3, 1 / 3])  # with one that might fail
 
 
 @pytest.mark.parametrize(
