@@ -6,6 +6,7 @@ import shutil
 from contextlib import contextmanager
 from html import unescape
 from html.parser import HTMLParser
+from io import BytesIO
 
 import hypothesis
 import numpy as np
@@ -83,6 +84,17 @@ def compiled():
 def snapshot():
     """Everything a machine holds, byte for byte: what it would write to a file."""
     return one_machine.saved
+
+
+@pytest.fixture(scope="session")
+def reloaded():
+    """The same guard, machine or judge, as its file brings it back."""
+
+    def load(one, **how):
+        one.save(file := BytesIO())
+        return type(one).load(BytesIO(file.getvalue()), **how)
+
+    return load
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """Where nobody acts, alarms are no worse than plain thresholds, and say what they rest on."""
 
 import re
-from io import BytesIO
 
 import numpy as np
 import pytest
@@ -62,11 +61,9 @@ def test_where_nothing_foresees_a_failure_there_is_no_alarm():
     assert judge.told_by_experience.count("nothing was better than chance") == len(RATES)
 
 
-def test_a_guard_alarms_row_by_row_as_the_log_was_judged_also_from_its_file(surge):
+def test_a_guard_alarms_row_by_row_as_the_log_was_judged_also_from_its_file(surge, reloaded):
     reviser = ActionReviser(surge, Choices(1), tolerance=surge.tolerance_of(1.0))
-    file = BytesIO()
-    Guard.of(reviser, interval=DT, learn=False).save(file)
-    guard = Guard.load(BytesIO(file.getvalue()))
+    guard = reloaded(Guard.of(reviser, interval=DT, learn=False))
     episodes, failed = log_of(surging, 2, 8)
     tally, on = surge.tally(Runs.of(episodes, failed), surge.rate_of(reviser.tolerance))
     said = []

@@ -650,13 +650,12 @@ def test_two_that_feed_one_guard_by_turns_are_told_and_one_after_the_other_may()
         (continuous(), [0.1, 0.2], "judge: Balance (ActionReviser, tolerance 0.02, mode act)"),
     ],
 )
-def test_a_guard_in_print_says_what_it_learnt_from(guard, row, says):
+def test_a_guard_in_print_says_what_it_learnt_from(reloaded, guard, row, says):
     guard = guard.copy()
     for failed in (False, True, True):
         guard.decide(row, 0)
         guard.end(failed=failed)
-    guard.save(file := io.BytesIO())
-    again = Guard.load(io.BytesIO(file.getvalue()), judge=type(guard.judge))
+    again = reloaded(guard, judge=type(guard.judge))
     assert str(guard) == str(again) == str(guard.copy())
     assert says in str(guard)
     assert "episodes: 3, failures: 2, states: 1, frozen: no" in str(guard)

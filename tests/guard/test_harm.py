@@ -1,7 +1,6 @@
 """A guard drives where guarded episodes end better than those alone, and says so."""
 
 import math
-from io import BytesIO
 
 import numpy as np
 import pytest
@@ -59,16 +58,13 @@ def test_a_guard_under_which_it_fails_sooner_hardly_drives_and_says_so(wrong):
 
 
 @pytest.mark.parametrize("n", [3, 15])
-def test_frozen_so_it_does_not_act_and_warns(wrong, tmp_path, n):
+def test_frozen_so_it_does_not_act_and_warns(wrong, reloaded, tmp_path, n):
     guard = make()
     drive(guard, n)
     with pytest.warns(UserWarning, match="was not shown to help: frozen so, proposals pass"):
         guard.freeze()
     assert {why for _, why in drive(guard, 12)} == {"was not shown to help"}
-    file = BytesIO()
-    guard.save(file)
-    again = Guard.load(BytesIO(file.getvalue()))
-    assert drive(again, 3) == drive(guard, 3)
+    assert drive(reloaded(guard), 3) == drive(guard, 3)
     with (
         pytest.warns(UserWarning, match="was not shown to help"),
         pytest.raises(ValueError, match="would let all proposals pass"),
@@ -103,13 +99,11 @@ def test_a_guard_that_saves_drives_nearly_always(wrong):
     assert "it replaces the controller: 0% of proposals are kept; that is no filter" in str(guard)
 
 
-def test_saved_copied_and_replayed_from_a_log_it_goes_on_the_same(wrong, tmp_path):
+def test_saved_copied_and_replayed_from_a_log_it_goes_on_the_same(wrong, reloaded, tmp_path):
     with AuditLog(tmp_path / "log") as log:
         guard = make(audit=log)
         drive(guard, 7)
-        file = BytesIO()
-        guard.save(file)
-        twins = guard.copy(), Guard.load(BytesIO(file.getvalue()))
+        twins = guard.copy(), reloaded(guard)
         rows = drive(guard, 8)
         guard.shadow = False
         drive(guard, 2)

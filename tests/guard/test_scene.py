@@ -209,14 +209,13 @@ def test_the_oldest_episodes_are_forgotten(monkeypatch):
 
 
 @pytest.mark.parametrize("more", [0, 1])
-def test_in_a_file_it_is_kept_as_it_is_also_between_two_fits(more):
-    world, file = Rain(), BytesIO()
+def test_in_a_file_it_is_kept_as_it_is_also_between_two_fits(more, reloaded):
+    world = Rain()
     guard = world.guard()
     failures(world, guard, range(12))
     world.steps = 4
     failures(world, guard, range(100, 100 + more))
-    guard.save(file)
-    again = Guard.load(BytesIO(file.getvalue()))
+    again = reloaded(guard)
     assert again.judge.sums(0) == guard.judge.sums(0)
     world.steps = 40
     for seed in (901, 902):  # and it goes on learning

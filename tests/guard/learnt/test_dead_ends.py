@@ -1,13 +1,10 @@
 """Where an episode failed that had been certified not to, one may be in a dead end."""
 
-from io import BytesIO
-
 import numpy as np
 import pytest
 
 from evofsm import Guard
 from evofsm.guard import LearntRisk, merge_judges
-from evofsm.guard.learnt.rollout import NOTHING_PASSES, rollout, search
 
 WALL, TRAP = 1.0, 0.6
 ICE = 0.5  #: of the kinds of road that are seen, the one on which it fails at the trap
@@ -42,28 +39,19 @@ def wary():
     return taught()
 
 
-def file_of(one):
-    one.save(file := BytesIO())
-    return BytesIO(file.getvalue())
-
-
-def test_where_a_certificate_was_refuted_is_a_dead_end_that_is_named_and_kept_away_from(wary):
+def test_where_a_certificate_was_refuted_is_a_dead_end_that_is_named_and_kept_away_from(
+    wary, reloaded
+):
     ends, told = wary.judge.state.centres, str(wary)
     assert (ends[:, 2] == ICE).all()
     assert (np.abs(ends[:, 0] - TRAP) < 0.1).all()
     assert f"; {len(ends)} dead end" in told
     assert "that had been certified failed from there" in told
-    guard = Guard.load(file_of(wary))
+    guard = reloaded(wary)
     said = [one for episode in range(30, 33) for one in play(guard, ICE, episode)[0]]
     assert any("would come near a dead end, from where" in one.reason for one in said)
     explained = [one.explanation for one in said if "from a dead end" in one.explanation]
     assert "that had been certified failed. Its centre is in #" in explained[-1]
-
-
-def test_without_them_nothing_is_learnt_from_it():
-    guard = taught(without=["regions", "dead-ends"])
-    assert "dead end" not in str(guard)
-    assert play(guard, ICE, 30)[1]
 
 
 def test_what_is_survived_there_takes_it_back(wary):
@@ -83,29 +71,16 @@ def test_merged_they_are_all_there_are(wary):
     assert merged.counts.sum() == wary.judge.state.counts.sum() + other.state.counts.sum()
 
 
-def test_however_variables_are_written_it_decides_the_same(wary):
+def test_however_variables_are_written_it_decides_the_same(wary, reloaded):
     def see(z):
         return (z * [-4.0, 1e-3, 60.0] + [3.0, 0.1, -7.0])[[2, 0, 1]]
 
     other = taught(see=see)
     assert len(other.judge.state.counts) == len(wary.judge.state.counts)
-    pair, reasons = [Guard.load(file_of(guard)) for guard in (wary, other)], []
+    pair, reasons = [reloaded(guard) for guard in (wary, other)], []
     for episode in range(30, 33):
         rows = [play(pair[0], ICE, episode)[0], play(pair[1], ICE, episode, see)[0]]
         executed = [[one.executed for one in row] for row in rows]
         np.testing.assert_allclose(*executed, atol=1e-5)
         reasons += [one.reason for one in rows[1]]
     assert any("dead end" in reason for reason in reasons)
-
-
-def test_nothing_is_certified_in_one_but_how_soon_who_is_in_one_leaves_does_not_count(wary):
-    state, parts = wary.judge.state, wary.judge.parts
-    model, here = parts.model, np.append(state.centres[0], np.zeros(4))
-    wide = np.where(np.arange(5) == 3, 0.6, model.dead_ends)  # so that no step leads out of it
-    model = model._replace(dead_ends=wide)
-    free, b = model._replace(dead_ends=model.dead_ends[:0]), len(state.policies)
-    given = state.policies, np.arange(b), parts.residuals, 1.0, np.ones(1), 1.0, 0
-    assert search(model, here, *given)[0] == NOTHING_PASSES
-    assert search(free, here, *given)[0] != NOTHING_PASSES
-    asked = here[None], state.policies[0], parts.residuals
-    np.testing.assert_array_equal(rollout(model, *asked).worth, rollout(free, *asked).worth)

@@ -1,7 +1,5 @@
 """Endings that are no failure end a replay: who may land, lands."""
 
-from io import BytesIO
-
 import numpy as np
 import pytest
 
@@ -99,9 +97,8 @@ def test_who_lands_is_let_land_and_what_lands_too_fast_is_not(lander):
     assert failed == 0 < 4 < alone[0] < 16 <= landed
 
 
-def test_a_file_holds_them_and_a_merged_judge_knows_those_of_both(lander):
-    lander.judge.save(file := BytesIO())
-    again = LearntRisk.load(BytesIO(file.getvalue()))
+def test_a_file_holds_them_and_a_merged_judge_knows_those_of_both(lander, reloaded):
+    again = reloaded(lander.judge)
     assert again.told_by_experience == lander.judge.told_by_experience
     merged = merge_judges([lander.judge, again])
     assert len(merged.state.ended) == 2 * len(again.state.ended)

@@ -11,8 +11,14 @@ from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.state import KIND
 
 
-def assert_goes_on_alike(point, guard, exactly, content):
-    again = Guard.load(BytesIO(content(guard)))
+@pytest.mark.parametrize(
+    "episodes", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 3))]
+)
+def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(
+    point, exactly, content, reloaded, episodes
+):
+    guard = point.taught(episodes)
+    again = reloaded(guard)
     assert content(again) == content(guard)
     for episode in range(40, 43):
         assert exactly(point.play(again, episode)[0]) == exactly(point.play(guard, episode)[0])
@@ -20,13 +26,6 @@ def assert_goes_on_alike(point, guard, exactly, content):
     again.freeze()
     guard.freeze()
     assert exactly(point.play(again, 50)[0]) == exactly(point.play(guard, 50)[0])
-
-
-@pytest.mark.parametrize(
-    "episodes", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 3))]
-)
-def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(point, exactly, content, episodes):
-    assert_goes_on_alike(point, point.taught(episodes), exactly, content)
 
 
 @pytest.fixture

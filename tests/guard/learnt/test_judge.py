@@ -5,7 +5,6 @@ import math
 import pickle
 import re
 from dataclasses import replace
-from io import BytesIO
 
 import numpy as np
 import pytest
@@ -101,11 +100,11 @@ def test_features_grow_with_the_number_of_variables_or_it_is_refused(m, a, box):
 
 
 @pytest.mark.parametrize("places", [7, 20, 32])
-def test_many_variables_are_learnt_of_in_a_few_episodes_too(points, places, content):
+def test_many_variables_are_learnt_of_in_a_few_episodes_too(points, places, reloaded):
     many = replace(points["box"], places=places)
     guard = many.guard(shadow=False)
     assert sum(many.play(guard, k)[1] for k in range(6)) <= 2
-    assert Guard.load(BytesIO(content(guard))).judge.n_variables == 2 * places
+    assert reloaded(guard).judge.n_variables == 2 * places
 
 
 @pytest.mark.parametrize("m", [65, 500, 21_168])
@@ -117,53 +116,6 @@ def test_too_many_variables_are_refused_before_anything_is_allocated(point, cont
             act(np.zeros(m))
         assert content(guard) == before
     point.play(guard, 0)
-
-
-def test_where_all_that_it_may_remember_are_lost_its_interval_has_no_end(points):
-    judge = points["box"].taught(10).judge
-    most = judge.settings.n_disturbances
-    assert judge.remembered.number == most
-    counts = set()
-    for speed in np.linspace(0.0, 0.2, 400):
-        there = Situation(np.array([0.5, speed]), np.ones(1), None, math.nan, 0.0)
-        judged = judge.judge(there, [1.0])
-        count = judge._unsurvived  # -1 in a dead end
-        counts.add(count)
-        assert (judged.high[0] == 1.0) == (count in (-1, most))
-        assert judged.risk[0] == 1.0 if count < 0 else judged.risk[0] < judged.high[0]
-    assert {0 < count < most for count in counts} == {False, True}
-
-
-def long_episode(guard, steps, seen=lambda t, z: z):
-    """Observations of an episode without a failure that may go on and on, and what was decided."""
-    rng, z, course, said = np.random.default_rng(3), np.zeros(2), [], []
-    for t in range(steps):
-        course.append(z)
-        said.append(guard.decide(seen(t, z), float(rng.uniform(-0.2, 1.0))))
-        speed = 0.9 * z[1] + 0.02 * said[-1].executed + 0.002 * rng.normal()
-        z = np.array([z[0] + speed, speed])
-    return [*course, z], said
-
-
-@pytest.mark.parametrize("steps", [30, 1100])
-def test_what_is_noted_of_a_decision_belongs_to_its_observation(points, monkeypatch, steps):
-    """Although the first observations lack something, and a long episode is learnt in parts."""
-    guard, noted, learn = points["box"].taught(4), [], judging.learn
-
-    def listen(state, episode, *others, **named):
-        noted.append(episode)
-        return learn(state, episode, *others, **named)
-
-    monkeypatch.setattr(judging, "learn", listen)
-    course, said = long_episode(guard, steps, lambda t, z: z if t > 3 else [z[0], np.nan])
-    guard.end(False, course[-1])
-    assert len(noted) == 1 + steps // 1024
-    refused = {tuple(z): not kept_it for z, kept_it in zip(course[:-1], kept(said), strict=True)}
-    rows = [zip(one.observations[:-1].tolist(), one.refused, strict=True) for one in noted]
-    pairs = [(tuple(z), bool(was)) for each in rows for z, was in each if tuple(z) in refused]
-    assert len(pairs) >= steps - 6
-    assert any(was for _, was in pairs)
-    assert sum(was != refused[z] for z, was in pairs) <= 3 * (steps // 1024)  # those of both parts
 
 
 @pytest.mark.parametrize("how", [lambda guard: guard.copy(), copy.deepcopy, pickle.dumps])
@@ -349,10 +301,9 @@ def test_it_says_which_backup_survives_why_a_proposal_is_refused_and_what_fails(
         assert bool(instead) == (not as_proposed)
 
 
-def test_names_are_for_words_alone_and_are_kept():
+def test_names_are_for_words_alone_and_are_kept(reloaded):
     named = LearntRisk(0.1, n_actions=2, names=("place", "speed"), units=("m", "m/s"))
-    named.save(file := BytesIO())
-    labels = LearntRisk.load(BytesIO(file.getvalue())).labels
+    labels = reloaded(named).labels
     assert (labels.names, labels.units) == (("place", "speed"), ("m", "m/s"))
 
 
