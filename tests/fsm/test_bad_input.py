@@ -162,17 +162,6 @@ HIDDEN = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("z", HIDDEN.values(), ids=HIDDEN)
-def test_a_masked_entry_is_missing(machine, refuses, z):
-    words = "observation, variable 1: nan .*missing"
-    refuses(machine, lambda m: m.observe(z), ValueError, words)
-    refuses(machine, lambda m: m.learn_one(z, 1), ValueError, words)
-    for Z in (np.ma.array([z, z]), [z, z]):
-        words = "observations, row 0, variable 1: nan"
-        refuses(machine, lambda m, Z=Z: m.learn_many(Z, [0, 0]), ValueError, words)
-
-
 @pytest.mark.parametrize("missing", [Missing.HOLD, Missing.PARTIAL])
 @pytest.mark.parametrize("z", HIDDEN.values(), ids=HIDDEN)
 def test_a_masked_entry_is_treated_as_nan_is(grown, z, missing):

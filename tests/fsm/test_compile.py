@@ -100,11 +100,3 @@ def test_without_a_compiler_all_runs_in_python():
     """As projects set it for their tests, to debug or to measure coverage."""
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     subprocess.run([sys.executable, "-W", "error", "-c", WARMED], env=environment, check=True)
-
-
-def test_compiling_is_announced_once(caplog):
-    told = kernels._Announcement()
-    for _ in range(2):
-        told.on_start(None)
-        told.on_end(None)
-    assert [record.getMessage()[:23] for record in caplog.records] == ["compiling kernels, once"]

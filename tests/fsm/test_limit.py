@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.rules import Novelty, Paper
@@ -19,28 +17,6 @@ def sharp(**settings):
 def learn(machine, points, actions=None):
     Z = np.array(points, dtype=float)[:, None]
     return machine.learn_many(Z, np.zeros(len(Z), int) if actions is None else actions)
-
-
-@pytest.mark.slow
-@given(seed=st.integers(0, 1000), most=st.integers(1, 12))
-def test_there_are_never_more_states_and_every_array_stays_sound(seed, most):
-    rng = np.random.default_rng(seed)
-    Z, I = np.cumsum(rng.normal(size=(200, 2)), axis=0), rng.integers(-1, 3, 200)
-    failures = np.flatnonzero(rng.random(200) < 0.05)
-    machine = EvolvingFSM(3, rule=Novelty(radius=0.7), max_states=most)
-    trace = machine.learn_many(Z, I, [50], failures, belief=True)
-    assert trace.n_states.max() <= most
-    assert (trace.state < trace.n_states).all()
-    np.testing.assert_allclose(trace.belief.sum(axis=1), 1.0)
-    np.testing.assert_allclose(machine.transition_matrices.sum(axis=2), 1.0)
-    assert (machine.transition_matrices >= 0.0).all()
-    assert (machine.failures <= machine.decisions + 1e-12).all()
-    model = machine.model()
-    assert len(set(machine.state_ids)) == machine.n_states
-    assert (model.visits >= 0).all()
-    assert (model.changes >= 0).all()
-    assert model.visits.sum() == 200  # no evidence is lost
-    assert machine.endings.sum() == len(failures)
 
 
 def test_merged_states_have_the_evidence_of_both():

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm.fsm.arrays import by_name
-from evofsm.fsm.machine import EvolvingFSM, opened
+from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.merging import merge
 from evofsm.fsm.rules import Edges, Novelty, Paper
 
@@ -100,7 +99,7 @@ def test_what_has_observed_nothing_contributes_nothing(snapshot, rule, seed):
     assert merge([nothing, nothing]).n_states == 0
 
 
-def test_mean_scatter_and_potentials_are_those_of_all_the_data():
+def test_potentials_are_those_of_all_the_data():
     random = np.random.default_rng(1)
     shards = [random.normal(size=(rows, 2)) * 3.0 + 1e4 for rows in (1, 2, 40, 100)]
     # With distance_weight 1 the paper's recursion is exact: density over the whole past.
@@ -110,13 +109,7 @@ def test_mean_scatter_and_potentials_are_those_of_all_the_data():
         part.learn_many(Z, np.zeros(len(Z), int))
     merged = merge(parts)
     Z = np.concatenate(shards)
-    now = by_name(opened(merged)[0])
-    assert now["n_observations"] == len(Z)
-    np.testing.assert_allclose(now["first"] + now["mean"], Z.mean(axis=0), rtol=1e-14)
     scaled = Z / rule.scales
-    np.testing.assert_allclose(
-        now["scatter"], ((scaled - scaled.mean(axis=0)) ** 2).sum(), rtol=1e-9
-    )
     merged.observe([1e4, 1e4])  # takes the latest into the potentials
     n = len(merged.centers)
     offsets = ((merged.centers[:, None] / rule.scales - scaled) ** 2).sum(axis=-1)

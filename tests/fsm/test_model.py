@@ -46,15 +46,6 @@ def test_it_counts_founding_visits_and_uses(spiral):
     assert model.uses.tolist() == [79, 30]
 
 
-def test_later_learning_does_not_change_a_snapshot(grown):
-    model = grown.model()
-    fields = [field.name for field in dataclasses.fields(model)]
-    before = {name: np.array(getattr(model, name)) for name in fields[:8]}
-    grown.learn_many(np.random.default_rng(0).normal(size=(50, 2)), [0, 1] * 25)
-    for name, value in before.items():
-        np.testing.assert_array_equal(getattr(model, name), value)
-
-
 def test_nothing_in_a_snapshot_can_be_changed(grown):
     model = grown.model()
     for field in dataclasses.fields(model):

@@ -53,11 +53,13 @@ def test_an_interrupt_at_any_line_leaves_a_whole_machine(deed, every):
 @pytest.mark.parametrize(
     "twin", [copy.copy, copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))]
 )
-def test_a_copy_has_a_lock_of_its_own(grown, twin):
+def test_a_copy_goes_its_own_way_and_has_a_lock_of_its_own(grown, snapshot, twin):
+    before = snapshot(grown)
     with grown._lock:
         another = twin(grown)
+        assert snapshot(another) == before
         assert elsewhere(lambda: another.learn_one([0.1, 0.2], 0))
-    assert another.n_states >= grown.n_states
+    assert snapshot(another) != before == snapshot(grown)
 
 
 @needs_fork

@@ -31,16 +31,11 @@ def test_matrices_are_those_worked_out_by_hand(machine):
     np.testing.assert_allclose(machine.marginal_matrix, marginal, rtol=1e-15)
 
 
-@pytest.mark.parametrize("policy", ["marginal", "hold", "observed"])
-@pytest.mark.parametrize(("action", "expected"), [(0, [5 / 6, 1 / 6]), (1, [1 / 2, 1 / 2])])
-def test_one_step_ahead_the_action_alone_decides(machine, action, policy, expected):
-    assert machine.belief.tolist() == [0.0, 1.0]
-    np.testing.assert_allclose(machine.predict(action, policy=policy), expected, rtol=1e-15)
-
-
 @pytest.mark.parametrize(
     ("policy", "action", "horizon", "expected"),
     [
+        *((policy, 0, 1, [5 / 6, 1 / 6]) for policy in ("marginal", "hold", "observed")),
+        ("marginal", 1, 1, [1 / 2, 1 / 2]),
         ("marginal", 0, 2, [59 / 126, 67 / 126]),
         ("marginal", 0, 3, [1469 / 2646, 1177 / 2646]),
         ("marginal", 1, 2, [23 / 42, 19 / 42]),
@@ -51,13 +46,11 @@ def test_one_step_ahead_the_action_alone_decides(machine, action, policy, expect
         ("observed", 0, 3, [12395 / 23814, 11419 / 23814]),
     ],
 )
-def test_further_steps_follow_the_policy(machine, policy, action, horizon, expected):
+def test_the_action_decides_the_first_step_and_the_policy_further_ones(
+    machine, policy, action, horizon, expected
+):
+    assert machine.belief.tolist() == [0.0, 1.0]
     np.testing.assert_allclose(machine.predict(action, horizon, policy), expected, rtol=1e-14)
-
-
-def test_before_any_observation_the_forecast_is_empty():
-    assert EvolvingFSM(2).predict(0).shape == (0,)
-    assert EvolvingFSM(2).predict(1, 3).shape == (0,)
 
 
 def test_at_the_start_of_an_episode_the_forecast_comes_from_the_uniform_belief(machine):
