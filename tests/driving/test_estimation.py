@@ -1,7 +1,5 @@
 """What is learnt of brakes, of leaders and of the noise of sensors."""
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -36,15 +34,6 @@ def drive(brakes, true_decel, *, rounds=1, speed=25.0, noise=0.0, seed=0, late=0
             counted_on.append(brakes.decel)
             v = max(0.0, v + DT * max(given[-1 - late], -true_decel))
     return np.array(counted_on)
-
-
-def test_full_braking_is_learnt_as_it_is_and_not_as_commanded():
-    brakes = OwnBrakes(lowest=-4.5, assumed=0.6, dt=DT)
-    assert brakes.decel == pytest.approx(2.7)
-    assert not brakes.known
-    drive(brakes, 2.5)
-    assert brakes.known
-    assert brakes.decel == pytest.approx(2.5)
 
 
 @pytest.mark.parametrize(("command", "brings", "decisions"), [(-4.5, 2.5, 12), (-3.0, 2.0, 20)])
@@ -116,14 +105,6 @@ def test_gentle_braking_does_not_water_down_what_hard_braking_may_be():
     assert manoeuvres.gentle == 400
 
 
-@pytest.mark.parametrize("decel", [math.nan, math.inf, -1.0])
-def test_what_is_no_manoeuvre_is_refused(decel):
-    manoeuvres = Manoeuvres(assumed=10.0)
-    with pytest.raises(ValueError, match="decel"):
-        manoeuvres.remember(3.0, decel)
-    assert len(manoeuvres) == 0
-
-
 def watch_it(watch, speeds, gap=60.0, own=10.0):
     """Manoeuvres of a leader with these speeds; the gap follows from them."""
     told, last = [], speeds[0]
@@ -164,14 +145,6 @@ def test_noise_is_no_manoeuvre(dt, speed, deviation, known):
         seen = watch.see(30.0, max(0.0, speed + own), max(0.0, speed + noise), known)
         told += seen is not None
     assert told <= 1  # in an hour
-
-
-@pytest.mark.parametrize(("decel", "told"), [(2.0, []), (3.0, [3.0])])
-def test_a_manoeuvre_begins_harder_than_noise_could_make_it(decel, told):
-    watch = BrakeWatch(DT)
-    speeds = [*[30.0] * 8, *(30.0 - decel * DT * np.arange(13)), *[30.0 - 3.0 * decel] * 8]
-    found = [watch.see(50.0, speed, speed, 0.25) for speed in speeds]
-    assert [one for one in found if one is not None] == told
 
 
 @pytest.mark.parametrize("cut_in", [(12.0, 12.0), (30.0, 8.0), (12.0, 20.0), (29.0, 5.0)])

@@ -98,14 +98,10 @@ def test_limits_are_true_and_reached_and_no_run_starts_in_a_dead_end(family):
 
 
 @pytest.mark.parametrize("name", [name for name in FAMILIES if name not in FIXED])
-def test_a_draw_is_always_the_same_and_training_and_test_never_meet(name):
-    def draws():
-        family = load_family(f"{name}+noise")
-        keys = [(s, i, of) for s in (0, 1) for i in range(60) for of in ("train", "test")]
-        return [repr(family.draw(*key)) for key in keys]
-
-    assert draws() == draws()
-    assert len(set(draws())) == 240
+def test_training_and_test_never_meet(name):
+    family = load_family(f"{name}+noise")
+    keys = [(s, i, of) for s in (0, 1) for i in range(60) for of in ("train", "test")]
+    assert len({repr(family.draw(*key)) for key in keys}) == 240
 
 
 @pytest.mark.parametrize(("name", "digest"), DRAWN.items())
@@ -132,14 +128,6 @@ def test_a_draw_that_is_none_is_refused(which, message):
 
 
 # -- Variants, shifts, switches -------------------------------------------------------------------
-
-
-def test_variants_come_in_turn_or_at_random():
-    paper, ncap = LOADED["paper"], LOADED["ncap"]
-    assert (paper.cases, LOADED["r157"].cases, ncap.cases) == (4, 7, 1)
-    assert [paper.draw(0, i).variant for i in range(5)] == [*paper.variants, "case 1"]
-    drawn = [ncap.draw(0, i).variant for i in range(300)]
-    assert min(map(drawn.count, ("CCRs", "CCRm", "CCRb"))) > 70
 
 
 def test_switches_are_on_before_and_after_a_shift():

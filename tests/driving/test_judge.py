@@ -189,25 +189,6 @@ def test_frozen_it_still_knows_what_was_commanded_last():
     assert chances[1] < chances[0]
 
 
-def test_neither_following_nor_a_question_teaches(taught, snapshot):
-    before = snapshot(taught)
-    for k in range(60):
-        taught.follow([60.0, 20.0, max(0.0, 20.0 - k)], -4.0)
-    taught.start_episode(learn=False)
-    taught.judge(situation(20.0, 20.0, 10.0), [1.0, 0.0])
-    taught.score(np.array([[20.0, 20.0, 20.0]]), DT)
-    assert snapshot(taught) == before
-
-
-def test_saved_and_loaded_it_judges_identically(taught, tmp_path):
-    taught.save(tmp_path / "risk")
-    loaded = LatentRisk.load(tmp_path / "risk")
-    for gap, speed, leader_speed in np.random.default_rng(0).uniform(0.0, 40.0, (50, 3)):
-        asked = situation(gap, speed, leader_speed), [-4.0, 0.0, 2.0]
-        for one, other in zip(taught.judge(*asked), loaded.judge(*asked), strict=True):
-            np.testing.assert_array_equal(one, other)
-
-
 @pytest.mark.parametrize(
     ("observation", "acceleration", "named"),
     [
