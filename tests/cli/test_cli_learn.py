@@ -60,20 +60,6 @@ def test_learn_prints_what_was_read_and_learnt(evofsm, log):
     assert result.stderr == ""
 
 
-def test_learn_saves_a_model_that_inspect_prints(evofsm, log, tmp_path):
-    path = tmp_path / "model.evofsm"
-    learnt = evofsm("learn", log, "--out", path)
-    assert learnt.stdout.splitlines()[-1].startswith(f"Saved to {path}.")
-    model = FSMModel.load(path)
-    assert (model.names, model.units, model.dt) == (
-        *(("gap", "v_follower", "v_leader"), ("m", "m/s", "m/s"), 0.1),
-    )
-    text = " ".join(evofsm("inspect", path).stdout.split())
-    assert "observations 700, one every 0.1 s" in text
-    assert f"states {model.n_states}, of 3 variables" in text
-    assert "a(17) ≥ 2.3" in text
-
-
 def test_options_reach_the_machine_and_the_log(evofsm, tmp_path):
     path, model = tmp_path / "log.csv", tmp_path / "model.evofsm"
     rows = [f"{k % 7},{'red' if k % 20 < 10 else 'green'},{k % 3}" for k in range(100)]
@@ -357,18 +343,6 @@ def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, refused, tmp_
     assert "rows 29, one every 0.1 s" in text
     assert told.stderr == ""
     assert FSMModel.load(tmp_path / "model").centers[0].tolist() == pytest.approx([20, 15, 15])
-    own = tmp_path / "own.csv"
-    own.write_text(
-        "\n".join(["time,ego_kmh,jerk,u", "s,,m/s^3,", *(f"{k},79.2,1,0" for k in range(9)), ""])
-    )
-    named = ("learn", own, "--observe", "ego_kmh,jerk", "--action", "u", "--out", tmp_path / "own")
-    assert "ego_kmh is called as if it were in km/h" in evofsm(*named).stderr
-    text = " ".join(evofsm(*named, "--unit", "ego_kmh=km/h").stdout.split())
-    assert "ego_kmh [m/s] jerk [m/s3]" in text
-    assert "#1 22.00" in text
-    assert "ego_kmh [m/s]" in evofsm("inspect", tmp_path / "own").stdout
-    warned = evofsm("learn", path, "--no-leader", "end")
-    assert "a row every 100 s: is the time in ms? --unit time=ms converts it" in warned.stderr
 
 
 @pytest.mark.parametrize(

@@ -95,17 +95,6 @@ def test_skill_is_what_its_definition_says(trace, monkeypatch, dt, steps):
         assert (skill.persistence, skill.divergence) == pytest.approx(tuple(np.mean(ahead, axis=0)))
 
 
-def test_where_the_action_tells_what_comes_forecasts_beat_persistence():
-    # A switch: the action says where to go, so the belief never stays and is always foreseen.
-    places = np.random.default_rng(3).integers(0, 2, 4000)
-    Z = 10.0 * places[:-1, None].astype(float)
-    learnt = learn_traces(
-        chunks(Z, np.where(places[1:], 0.9, -0.9), [0]), machine(spread=0.01), ACTIONS
-    )
-    assert learnt.model.n_states == 2
-    assert learnt.skills[0].skill > 0.9
-
-
 def test_a_transition_goes_from_where_one_was_to_where_one_came():
     Z = np.tile([[0.0], [10.0], [30.0]], (40, 1))
     fsm = EvolvingFSM(ACTIONS.n_actions, rule=Novelty(1.0, [2.0]))

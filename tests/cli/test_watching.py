@@ -2,7 +2,6 @@
 
 import asyncio
 import math
-from types import SimpleNamespace
 
 import pytest
 
@@ -13,19 +12,15 @@ from evofsm.cli.watch.recorded import Recording, record_log
 from evofsm.cli.watch.session import (
     OnRoads,
     Session,
-    _names_of,
     learn_first,
     read_simulated,
     watched_guard,
 )
-from evofsm.cli.watch.shown import Chronicle, Judged, known_of
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.fsm.observations import ObservationEncoder
 from evofsm.guard import Mode
-from evofsm.guard.harm import Harm, Outcome
-from evofsm.guard.learnt.state import State
 from evofsm.io import LogColumns, read_run, recording
 from monitor_rows import line, traffic
 
@@ -83,30 +78,6 @@ def test_the_same_run_is_shown_the_same_and_restarting_begins_anew():
         session.restart(4)
 
 
-def test_danger_is_over_two_seconds_after_the_last_wish_that_was_not_tolerable():
-    calm, chronicle = opened().step(), Chronicle(0.02)
-    risks = {0.0: 0.5, 1.0: 0.01, 1.9: 0.01, 2.0: 0.01, 3.0: 0.03, 4.0: math.nan}
-    told = []
-    for time, risk in risks.items():
-        frame = calm._replace(time=time, proposed_risk=Judged(risk), revised=True, advises=True)
-        told.append(chronicle.tell(frame))
-    assert [story.in_danger for story in told] == [True, True, True, False, True, True]
-    assert (told[-1].first, told[-1].danger.began.time, told[-1].danger.last) == (0.0, 3.0, 3.0)
-    assert (told[-1].revised, told[-1].danger.revised, told[-1].danger.wishes) == (6, 1, 1)
-
-
-def test_states_grow_from_empty_and_keep_their_numbers():
-    session = opened(guard=watched_guard(PAPER))
-    assert session.graph().states == ()
-    drive(session)
-    graph = session.graph()
-    assert len(graph.states) > 4
-    assert [state.state for state in graph.states] == list(range(len(graph.states)))
-    origins = {origin for origin, _, _ in graph.transitions}
-    assert all(origin != target for origin, target, _ in graph.transitions)
-    assert origins <= set(range(len(graph.states)))
-
-
 def test_any_environment_is_watched_by_a_guard_that_is_given_nothing_but_which_episodes_failed():
     system = read_simulated("CartPole-v1")
     learn_first(system.guard, system, 24)
@@ -144,27 +115,6 @@ def test_the_first_failure_of_a_kind_is_called_so_and_no_other_one(on):
                 assert first == ("A guard cannot prevent the first failure" in told.done)
                 said += sides
     assert len(set(said)) >= 2 - on
-
-
-def test_variables_of_known_environments_have_names():
-    told = "CartPole-v1 4 MountainCar-v0 2 Pendulum-v1 3 Acrobot-v1 6 LunarLander-v3 8"
-    words = f"{told} BipedalWalker-v3 24 Other-v0 4 CartPole-v1 5".split()
-    for name, size in zip(words[::2], map(int, words[1::2]), strict=True):
-        env = SimpleNamespace(spec=SimpleNamespace(id=name))
-        env.observation_space = SimpleNamespace(shape=(size,))
-        is_known = (name, size) not in (("Other-v0", 4), ("CartPole-v1", 5))  # that is wrapped
-        assert len({*_names_of(env)}) == size * is_known
-
-
-def test_a_guard_that_was_not_shown_to_help_says_so():
-    judge = read_simulated("CartPole-v1").guard.judge
-    judge.state = State.none(4, judge.size, judge.choices, judge.settings, None)
-    for steps, said in ((30, ""), (10, "it was not shown to help: guarded episodes failed")):
-        ends = [(20, False)] * 5 + [(steps, True)] * 5
-        outcomes = [Outcome(k + 1, n, True, guarded) for k, (n, guarded) in enumerate(ends)]
-        judge.harm = Harm(tuple(outcomes), len(ends))
-        assert known_of(judge).harm.startswith(said)
-        assert bool(known_of(judge).harm) == bool(said)
 
 
 def test_a_file_holds_an_environment_of_ones_own(tmp_path):
@@ -414,18 +364,6 @@ def test_it_waits_steps_and_goes_on():
 
     told = asyncio.run(asyncio.wait_for(play(), 60.0))
     assert [what.over for kind, what in told if kind == "frame"][-1]
-
-
-def test_speed_is_kept():
-    async def play():
-        told = []
-        player = Player(opened(), lambda kind, what: told.append(kind), speed=8.0)
-        playing = asyncio.create_task(player.play())
-        await asyncio.sleep(1.0)
-        playing.cancel()
-        return told.count("frame")
-
-    assert 10 < asyncio.run(play()) <= 34
 
 
 def test_a_run_that_breaks_off_says_why():

@@ -58,15 +58,6 @@ def test_an_alarm_begins_where_something_would_be_changed_and_lasts_until_the_ri
     assert not opens()
 
 
-@pytest.mark.parametrize(
-    ("gap", "own", "leader", "alarms"),
-    [(6, 24, 24, True), (6, 22, 24, True), (25, 28, 28, True), (60, 24, 24, False)],
-)
-def test_where_a_full_brake_of_the_leader_cannot_be_survived_it_alarms(gap, own, leader, alarms):
-    row = {"time": 0.0, "gap": gap, "v_follower": own, "v_leader": leader, "proposal": 0.0}
-    assert Decider(made()).answer(line(row))["alarm"] is alarms  # as in the picture of README.md
-
-
 def test_in_act_what_is_executed_is_the_guards():
     guard = made()
     guard.reviser.mode = Mode.ACT
@@ -98,13 +89,6 @@ def test_gaps_in_time_and_rows_that_come_too_often_are_noted():
     assert notes[4] is None
 
 
-def test_speeds_that_must_be_of_another_unit_are_noted_once():
-    decider = Decider(made())
-    row = next(iter(rows(1))) | {"v_follower": 79.0}
-    notes = [decider.answer(line(row | {"time": 0.1 * k})).get("note") for k in range(3)]
-    assert notes == ["v_follower is above 60 m/s: is that km/h?", None, None]
-
-
 @pytest.mark.parametrize(
     ("row", "about", "why"),
     [
@@ -123,17 +107,6 @@ def test_a_row_that_no_car_can_drive_is_refused_by_name_and_changes_nothing(row,
     assert (refused["kind"], refused["about"]) == ("error", about)
     assert why in refused["error"]
     assert decider.answer(line(second)) == plain.answer(line(second))
-
-
-def test_an_episode_ends_where_it_is_told_to_and_learns_of_it():
-    guard = made(learn=True)
-    decider = Decider(guard)
-    for row in rows(20):
-        decider.answer(line(row))
-    answer = decider.answer(b'{"end": true, "failed": true}')
-    assert (answer["kind"], answer["failed"], answer["n"]) == ("end", True, 20)
-    assert guard.machine.endings.sum() == 1.0
-    assert decider.answer(b'{"end": true}')["kind"] == "end"  # nothing is under way: nothing to do
 
 
 def in_flight():
@@ -186,17 +159,6 @@ def test_episodes_of_one_length_end_at_the_same_time_and_each_end_counts(length)
         assert guard.n_failed == 3
 
 
-def test_an_end_that_is_sent_again_counts_once():
-    guard = made(learn=True)
-    decider = Decider(guard)
-    for row in rows(20):
-        decider.answer(line(row))
-    last = {"gap": -0.1, "v_follower": 20.0, "v_leader": 15.0}
-    end = line({"end": True, "failed": True, **last})
-    assert decider.answer(end) == decider.answer(end)
-    assert guard.machine.endings.sum() == 1.0
-
-
 @pytest.mark.parametrize(
     "end", [b'{"end": true, "observation": [1e100]}', b'{"end": true, "observation": [1, 2, 3]}']
 )
@@ -207,16 +169,6 @@ def test_an_end_that_the_guard_cannot_take_is_answered_and_changes_nothing(end):
         assert decider.answer(message % k) == plain.answer(message % k)
         assert decider.answer(end)["kind"] == "error"
     assert (decider.n, decider.rows) == (3, 3)
-
-
-def test_after_an_end_time_may_begin_anew():
-    decider = Decider(made())
-    row = next(iter(rows(1)))
-    assert [decider.answer(line(row | {"time": t}))["n"] for t in (0.1, 0.2)] == [1, 2]
-    decider.answer(b'{"end": true}')
-    again = decider.answer(line(row | {"time": 0.1}))
-    assert (again["kind"], again["n"]) == ("decision", 3)
-    assert "note" not in again
 
 
 def test_an_episode_ends_by_itself_while_there_is_no_alarm():

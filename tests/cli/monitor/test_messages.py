@@ -1,6 +1,7 @@
 """What a line may hold; anything else is refused by a sentence that names the key."""
 
 import json
+import math
 
 import hypothesis.strategies as st
 import pytest
@@ -48,6 +49,7 @@ def test_a_row_is_read_to_the_last_bit():
         ({"gap": "near"}, "gap", 'is "near"; it must be float or null'),
         ({"gap": 1e101}, "gap", "is 1e+101; it must be float <= 1e+100"),
         ({"gap": 10**400}, "gap", "is too large"),
+        ({"gap": math.nan}, "line", "holds NaN, which is no JSON; a number that was not seen is null"),
         ({"proposal": ...}, "proposal", "is missing: what the controller wants to do"),
         ({"proposal": "brake"}, "proposal", "it must be float or null"),
         ({"speed": 3.0}, "speed", "is not known; known are gap, proposal, schema, time, v_foll"),
@@ -68,14 +70,6 @@ def test_what_is_no_row_is_named(changed, about, what):
 )
 def test_junk_is_refused_as_a_line(junk):
     assert refused(FORM, junk)[0] == "line"
-
-
-def test_what_python_writes_for_nan_is_named():
-    about, text = refused(FORM, line(gap=float("nan")))
-    assert (about, text) == (
-        "line",
-        "holds NaN, which is no JSON; a number that was not seen is null",
-    )
 
 
 def test_the_time_of_what_is_refused_is_told_where_it_can_be_read():
