@@ -185,15 +185,6 @@ def test_chunks_go_on_where_the_one_before_ended(tmp_path, monkeypatch):
     assert lengths == [900, 800, 700]
 
 
-def test_episodes_know_their_failures_wherever_chunks_end(tmp_path, monkeypatch):
-    path = write(tmp_path / "a.csv", [*short([2, 1, 0]), *short([4, 5], "q")], SHORT)
-    monkeypatch.setattr(tables, "_CSV_BYTES", 1)
-    first, second = episodes_of(read(path, failed="crash"))
-    assert (first.failures.tolist(), second.failures.tolist()) == ([2], [])
-    assert second.observations[:, 0].tolist() == [4, 5]
-    assert (first.starts.tolist(), second.starts.tolist()) == ([0], [0])
-
-
 def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "_CSV_BYTES", 1 << 18)
 
@@ -364,20 +355,6 @@ def test_without_a_clock_a_row_that_is_left_out_ends_an_episode(tmp_path):
     assert together(write(tmp_path / "a.csv", lines, SHORT), dt=0.1)[:2] == ([1, 2, 4, 5], [0, 2])
 
 
-def test_a_row_that_is_cut_off_anywhere_costs_no_other(tmp_path):
-    lines = (f'{k},9,8,7,"-0.5"' for k in range(3))
-    whole = "\n".join(['time,gap,v_follower,v_leader,"a, own"', *lines])
-    path, noted = tmp_path / "a.csv", Noted()
-    for left in range(len(whole) - 13, len(whole)):
-        path.write_text(whole[:left])
-        (chunk,) = read(str(path), action="a, own", noted=noted)
-        assert len(chunk.times) in (2, 3)
-        assert (chunk.actions[:2] == -0.5).all()
-    path.write_text(whole.replace("2,9", '2,"9'))
-    with pytest.raises(ValueError, match="an unclosed quote"):
-        read(str(path), action="a, own", skip_bad=0)
-
-
 def test_a_failure_at_a_time_that_is_there_twice_is_one(tmp_path):
     rows = [*short([3, 2, 1]), "p,0.2,0,10,11,-0.5,1"]
     path = write(tmp_path / "a.csv", rows, SHORT)
@@ -494,15 +471,6 @@ def test_what_columns_say_of_each_other_is_compared(tmp_path, change, said):
     assert "are the speeds mixed up?" in " ".join(warnings_of(noted))
 
 
-@pytest.mark.parametrize(("dt", "warns"), [(0.1, False), (0.2, True), (0.05, True)])
-@pytest.mark.parametrize("unit", [1.0, 1e3])
-def test_a_step_that_is_told_is_compared_with_the_clock(tmp_path, dt, warns, unit):
-    lines = [f"p,{unit * k / 10},9,10,11,0,0" for k in range(9)]
-    noted = Noted()
-    read(write(tmp_path / "a.csv", lines, SHORT), dt=dt, noted=noted)
-    assert [f"--dt says {dt:g} s" in one for one in warnings_of(noted)] == [True] * warns
-
-
 # -- Signals of several clocks ---------------------------------------------------------------------
 
 
@@ -588,15 +556,6 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, pieces, nothing):
     path = write(tmp_path / "d.csv", lines, SHORT)  # what leads on from a last row is not needed
     read(path, noted=noted, no_leader="end", failed="crash")
     assert "1 failures lie in rows that are left out" in " ".join(warnings_of(noted))
-
-
-def test_a_number_may_stand_for_no_leader(tmp_path):
-    lines = short([0, 5, 4, 0, 0, 3, 2], crash=[0, 7, 7, 0, 0, 7, 7])  # the column of its id
-    path, noted = write(tmp_path / "a.csv", lines, SHORT), Noted()
-    found = together(path, noted=noted, no_leader="crash==0", failed="gap<=0")
-    assert found[:2] == ([5, 4, 3, 2], [0, 2])
-    assert (noted.leaderless, noted.failed, warnings_of(noted)) == (3, 0, [])
-    assert "(--no-leader names the right one" in refusal(path, no_leader="lead==0")
 
 
 @pytest.mark.parametrize(("nobody", "warns"), [((-1, -1), True), ((-1, -2), False)])

@@ -194,19 +194,6 @@ def test_units_offsets_and_places_in_arrays(tmp_path):
         read(path, {"variables": variables, "stamp": "header"})
 
 
-def test_messages_may_be_placed_by_their_headers(tmp_path):
-    # The follower is recorded 0.3 s late; its header says when it was.
-    messages = []
-    for k in range(30):
-        at = round((100.0 + 0.1 * k) * SECOND)
-        messages.append((0.1 * k, OTHER, odometry(50.0 + 1.8 * k, 18.0, at)))
-        messages.append((0.1 * k + 0.3, EGO, odometry(2.0 * k, 20.0, at)))
-    path = write(tmp_path / "bag", messages)
-    (received,), (stamped,) = read(path), read(path, TOLD | {"stamp": "header"})
-    assert received.observations[0, 0] == pytest.approx(45.0 + 1.8 * 3)
-    assert stamped.observations[0, 0] == pytest.approx(45.0)
-
-
 @pytest.mark.parametrize("plugin", [SQLITE, MCAP])
 @pytest.mark.parametrize(("rate", "warns"), [(1.0, False), (0.5, True), (2.0, True)])
 def test_two_clocks_of_different_rates_are_told(tmp_path, plugin, rate, warns):

@@ -424,19 +424,6 @@ def test_ground_truth_and_sensor_views_are_read_gzipped_or_not(tmp_path, osi):
         assert_pair(tmp_path / name)
 
 
-def test_a_traffic_light_is_not_taken_for_ground_truth_in_a_view(tmp_path, osi):
-    import betterosi
-
-    messages = []
-    for k in range(5):
-        truth = betterosi.GroundTruth.from_binary(osi.osi_messages(k)[0])
-        truth.traffic_light.append(betterosi.TrafficLight(id=betterosi.Identifier(value=3)))
-        messages.append(truth.to_binary())
-    content = b"".join(len(one).to_bytes(4, "little") + one for one in messages)
-    (tmp_path / "trace.osi").write_bytes(content)
-    assert_pair(tmp_path / "trace.osi")
-
-
 def test_mcap_is_read_by_its_schema_and_named_where_it_holds_something_else(tmp_path, osi):
     pytest.importorskip("mcap")
     path = tmp_path / "trace.mcap"

@@ -49,7 +49,7 @@ def test_a_row_is_read_to_the_last_bit():
         ({"gap": "near"}, "gap", 'is "near"; it must be float or null'),
         ({"gap": 1e101}, "gap", "is 1e+101; it must be float <= 1e+100"),
         ({"gap": 10**400}, "gap", "is too large"),
-        ({"gap": math.nan}, "line", "holds NaN, which is no JSON; a number that was not seen is null"),
+        ({"gap": math.nan}, "line", "holds NaN, which is no JSON; a number that was not"),
         ({"proposal": ...}, "proposal", "is missing: what the controller wants to do"),
         ({"proposal": "brake"}, "proposal", "it must be float or null"),
         ({"speed": 3.0}, "speed", "is not known; known are gap, proposal, schema, time, v_foll"),
