@@ -8,8 +8,8 @@ import pytest
 import fsm_rows
 import speed
 from evofsm import EvolvingFSM
-from fsm_rows import LATTICE_RULE, LATTICES, PAPER_ROUND, lattice_stream, paper_stream
-from timing import Row, compare, judged, worsened
+from fsm_rows import LATTICE_RULE, LATTICES, lattice_stream
+from timing import Row, judged, worsened
 
 pytestmark = pytest.mark.slow
 
@@ -20,31 +20,6 @@ def test_a_lattice_has_as_many_states_as_it_says_and_its_walk_founds_no_other(n_
     machine = EvolvingFSM(1, rule=LATTICE_RULE)
     states = machine.learn_many(stream.observations, np.zeros_like(stream.actions)).n_states
     assert (states[n_states - 1 :] == n_states).all()
-
-
-def test_beliefs_on_the_lattice_are_as_sure_as_they_should_be():
-    machine = fsm_rows.walked(256, 17)
-    spread = fsm_rows.perplexity(machine, fsm_rows.walk(256, 17, 500))
-    assert 4.0 < np.median(spread) < spread.max() <= 16.0
-
-
-def test_a_round_of_the_paper_ends_where_another_begins():
-    at_rest = paper_stream(PAPER_ROUND + 1).observations[[0, PAPER_ROUND]]
-    np.testing.assert_array_equal(at_rest[0], at_rest[1])
-
-
-def test_ours_and_the_reference_take_turns():
-    turns = []
-
-    def work(name, seconds):
-        numbers = iter([100.0, *seconds])  # the first, which compiles, does not count
-        return lambda: turns.append(name) or next(numbers)
-
-    result = compare(
-        "work", work("a", [3, 1, 2]), "b", work("b", [6, 8, 7]), 3, {"c": work("c", [1, 1, 9])}
-    )
-    assert turns == ["a", "b", "c"] * 4
-    assert (result["ours_s"], result["reference_s"], result["beside"]) == (2, 7, {"c": 1})
 
 
 def measured(ours, reference):

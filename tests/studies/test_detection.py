@@ -1,6 +1,5 @@
 """Who sees danger: what is watched, alarms as events, and the study."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -62,18 +61,6 @@ def test_alarms_hold_for_a_second_and_come_true_if_the_danger_follows_soon():
     assert detection.count_alarms(raised(40, 5), safe, 0.5, 0.25) == (1, 4)
 
 
-def test_the_threshold_keeps_the_rate_on_what_it_was_chosen_on():
-    rng = np.random.default_rng(3)
-    n = 4 * 3600 * 4
-    some = cases((rng.random(n) < 0.02).tolist())
-    score = rng.normal(size=n) + some.truth
-    for rate in (2.0, 10.0, 50.0):
-        threshold = detection.choose_threshold(score, some, rate, 0.25)
-        assert 0.9 * rate < detection.count_alarms(score, some, threshold, 0.25)[0] / some.hours
-        assert detection.count_alarms(score, some, threshold, 0.25)[0] <= rate * some.hours
-    assert detection.choose_threshold(score, cases([True] * n), 1.0, 0.25) == -math.inf
-
-
 def test_lead_time_is_that_of_the_alarm_that_stays_on():
     three = exposure(True, False, True)
     score = np.concatenate([raised(40, 3, *range(30, 40)), np.ones(40), raised(40, 10)])
@@ -98,18 +85,6 @@ def test_what_would_have_come_after_the_end_is_left_out():
     assert truth.tolist() == [False] * 20 + [True] * 20
 
 
-def test_worlds_by_name():
-    shift, at_once = detection.world("shift", since=3), detection.world("shift-at-once")
-    assert (shift.watched.decel, shift.family.decel, shift.settled.decel) == (4.5, 2.5, 2.5)
-    assert (at_once.since, at_once.settled.decel) == (0, 4.5)
-    assert [family.decel for family, _ in shift.training(0, 0, 6)] == [4.5] * 6 + [2.5] * 3
-    assert detection.world("emergency+noise").family.draw(0, 0).scenario.sensors.gap_noise > 0.0
-    paper = detection.world("paper").family
-    assert paper.draw(0, 0).scenario.initial_gap != paper.draw(0, 4).scenario.initial_gap
-    with pytest.raises(ValueError, match="no shift"):
-        detection.world("rare-at-once")
-
-
 @pytest.mark.parametrize("name", ["emergency", "emergency+noise"])
 def test_scores_know_nothing_of_what_comes_later_and_ours_tells_dead_ends(name, monkeypatch):
     here = detection.world(name)
@@ -131,16 +106,6 @@ def test_scores_know_nothing_of_what_comes_later_and_ours_tells_dead_ends(name, 
     monkeypatch.setattr(detection, "_estimates", lambda _, one: (one.seen, 0.0 * one.commands))
     surely = detection._scores(watcher.risk, some)  # without doubt nothing is averaged
     assert scores[OURS](some) == pytest.approx(np.tanh(surely) if "noise" in name else surely)
-
-
-def test_failures_are_counted_in_states_within_the_horizon():
-    here = detection.world("emergency")
-    watcher = detection.Watcher(here.watched).watch(here.training(0, 0, 1))
-    (cases_, failures) = watcher.default._counts.sum(axis=1)
-    one = detection.watch(*next(here.training(0, 0, 1)))
-    assert one.collided
-    assert (cases_, failures) == pytest.approx((len(one.commands), 20))
-    assert np.all((watcher.default.probability > 0.0) & (watcher.default.probability < 1.0))
 
 
 @pytest.fixture(scope="module")

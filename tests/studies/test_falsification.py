@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -43,17 +42,6 @@ def test_splitting_and_plain_sampling_say_the_same_where_both_see():
     error = math.hypot(np.std(values, ddof=1) / math.sqrt(8), math.sqrt(share * (1 - share) / n))
     assert 0.005 < share < 0.015
     assert abs(np.mean(values) - share) < 3.5 * error
-
-
-def test_what_is_found_failed_can_be_played_again_and_hangs_on_the_seed():
-    score = above(0.9999)
-    found, again, other = (split(score, [seed], cases=40, moves=5) for seed in (4, 4, 5))
-    assert found == again
-    assert found.probability != other.probability
-    assert len({case.latent["x"] for case in found.failed}) == len(found.failed) > 1
-    assert all(score(case.chance) == math.inf for case in found.failed)
-    assert list(found.levels) == sorted(set(found.levels))
-    assert found.best < 0.9999
 
 
 def test_places_that_depend_on_others_are_drawn_as_ever():
@@ -162,16 +150,6 @@ def test_who_drives_alone_drives_as_in_the_framework(name):
     assert alone.observations.tolist() == whole.observations.tolist()
     assert needed_braking(alone) == needed_braking(whole) > 0.0
     assert (needed_braking(alone) == math.inf) is whole.collided
-
-
-def test_needed_braking_is_that_of_the_worst_moment():
-    accelerations = np.zeros(2)
-    seen = np.array([[10.0, 20.0, 10.0]] * 2)
-    episode = SimpleNamespace(collided=False, observations=seen, leader_accelerations=accelerations)
-    assert needed_braking(episode) == 5.0  # 10 m/s slower within 10 m
-    accelerations[1] = -5.0  # it stands after 10 m more
-    assert needed_braking(episode) == 10.0
-    assert needed_braking(SimpleNamespace(collided=True)) == math.inf
 
 
 def test_cases_that_were_found_stay_broken_alone_and_whole_under_the_guard():

@@ -13,12 +13,8 @@ from studies.forecasts import (
     PAPER,
     REFERENCES,
     STAYS,
-    Cases,
     ForecastStudy,
-    Run,
-    Taylor,
     add_up,
-    cases,
     compare,
     drive,
     logs_in,
@@ -113,32 +109,6 @@ def test_what_an_episode_got_in_several_rounds_is_added_up():
 
 
 # -- Failures of tasks ----------------------------------------------------------------------------
-
-
-def run(steps, *, failed):
-    """A point that moves by 1 in each step."""
-    actions = np.zeros((steps, 1))
-    return Run(np.arange(float(steps + 1))[:, None], actions, tuple(actions[:, 0]), failed)
-
-
-def test_steps_are_counted_back_from_the_end():
-    some = cases([run(12, failed=True), run(9, failed=False)], every=5)
-    np.testing.assert_array_equal(some.z[:, 0], [6.0, 11.0, 3.0, 8.0])
-    np.testing.assert_array_equal(some.left, [6.0, 1.0, math.inf, math.inf])
-    np.testing.assert_array_equal(some.known(5), [True, True, True, False])
-    np.testing.assert_array_equal(some.episode, [0, 0, 1, 1])
-    np.testing.assert_array_equal(some.change, 1.0)
-
-
-def test_extrapolation_is_exact_where_motion_is_uniform_or_its_pace_grows():
-    z = np.array([[0.0], [0.0]])
-    change, earlier = np.array([[1.0], [2.0]]), np.array([[1.0], [1.0]])
-    zeros, left = np.zeros((2, 1)), np.full(2, math.inf)
-    some = Cases(z, change, earlier, zeros, zeros, left, left, np.zeros(2, np.intp))
-    sides = np.array([[0.0, 1.0, 10.9, 1.0]])
-    np.testing.assert_array_equal(Taylor(sides, 1)(some), [-11.0, -6.0])
-    np.testing.assert_array_equal(Taylor(sides, 2)(some), [-11.0, -3.0])  # 3, 7, 12
-    assert np.isinf(Taylor(-sides, 1)(some)).all()
 
 
 @pytest.mark.slow

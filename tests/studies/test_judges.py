@@ -8,9 +8,9 @@ import numpy as np
 import polars as pl
 import pytest
 from studies import benchmark, judges
-from studies.judges import PARTS, Judges, Tasks, make_judge, run, summary, trial
+from studies.judges import Judges, Tasks, make_judge, trial
 from studies.rivals import Rival
-from studies.systems import Start, make_system
+from studies.systems import make_system
 
 from evofsm.guard import LearntSettings
 
@@ -76,18 +76,6 @@ def test_proposals_that_are_kept_change_nothing_and_cars_score_mobility():
     assert row["score"] == pytest.approx(1.0)
 
 
-def test_the_kinematic_judge_drives_as_it_does_elsewhere():
-    from evofsm.driving import drive, guard_for_family
-
-    system = make_system("emergency")
-    start = Start.training(0, 0, 4)
-    guard, other = guard_for_family(system.family), guard_for_family(system.family)
-    ended = run(system, guard, start)
-    driven = drive(other, system.family.draw(start.seed, start.episode, split="train"))
-    assert ended.kept == len(driven.decisions) - int(driven.changed.sum())
-    np.testing.assert_array_equal(system.road.episode().record, driven.record)
-
-
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_an_episode_of_ten_decisions_is_enough_to_learn_from(seed):
     """It fails once, as it must, perhaps again as brakes come late, and then no more."""
@@ -121,17 +109,6 @@ def test_every_judge_part_and_seed_has_a_row(made):
     assert parts.cells[1][:4] == ("acc", "margin", "no margin", "0 of 4")
 
 
-def test_goals_and_steps_stand_beside_the_controller_alone_and_harm_is_where_it_loses(made):
-    study = Judges(systems="disc", controllers="first", seeds=1, train=12, test=4, without="none")
-    alone, ours = study.run(workers=1)["rows"].to_dicts()
-    assert alone["steps"] == alone["steps_alone"] == ours["steps_alone"]
-    assert alone["goals"] + alone["failed"] == alone["episodes"] == 4
-    assert (ours["goals"], ours["failed"], ours["steps"]) == (0, 0, 120.0)  # away from all
-    assert ours["steps_learning"] == 120.0 > ours["steps_learning_alone"]
-    harm = study.page({"rows": rows("learnt", steps=[95.0, 89.0])}).losses[0]
-    assert harm.frame["least"].to_list() == [0.89]
-
-
 def test_the_failure_function_is_told_where_an_observation_shows_it(made):
     make_judge("told", make_system("disc"))
     assert made[-1].given["failed"](np.array([0.5, 0.5, 0.0, 0.0]))
@@ -146,14 +123,6 @@ def test_the_benchmark_names_what_is_less_than_was_accepted():
     missed = benchmark.compared(rows.with_columns(failed=worse)).filter(pl.col("missed") != "")
     assert set(missed["system"]) == {"disc"}
     assert set(missed["missed"]) == {"failed"}
-
-
-def test_parts_are_named_or_refused():
-    assert Judges().parts == tuple(PARTS)
-    assert Judges(without="none").parts == Judges().shortened().parts == ()
-    assert Judges(without="lags, shy, lags").parts == ("lags", "shy")
-    with pytest.raises(ValueError, match="no part 'wheels'; there are stretches"):
-        _ = Judges(without="wheels").parts
 
 
 def test_every_setting_of_the_learnt_judge_is_swept():
@@ -179,13 +148,6 @@ def rows(judge, **columns):
     given |= {"steps_alone": 100.0, "steps_learning_alone": 100.0, "score_alone": 1.0}
     missing = [pl.lit(value).alias(name) for name, value in given.items() if name not in columns]
     return frame.with_columns(missing).select(*given)
-
-
-def test_learning_seeds_are_one_line_of_counts_the_worst_and_the_one_in_the_middle():
-    line = summary(rows("learnt", failed=[0, 3, 0], score=[5.0, 1.0, 3.0], kept=[0.1, 0.9, 0.2]))
-    (one,) = line.to_dicts()
-    assert (one["failed"], one["episodes"], one["worst"]) == (3, 300, 0.03)
-    assert (one["score"], one["score_worst"], one["kept"]) == (3.0, 1.0, 0.2)
 
 
 def test_whoever_fails_less_or_returns_more_is_where_it_loses_and_targets_follow():

@@ -150,15 +150,6 @@ def test_areas_are_those_of_their_definitions_with_any_weights(cases):
     assert found.auprc == pytest.approx(auprc if true.sum() else np.nan, nan_ok=True)
 
 
-def test_infinite_scores_have_a_rank_and_nan_has_none():
-    assert lib.Ranked([np.inf, 1.0, -np.inf], [True, True, False]).areas().auroc == 1.0
-    assert lib.Ranked([np.inf, np.inf], [True, False]).areas().auroc == 0.5
-    with pytest.raises(ValueError, match="NaN"):
-        lib.Ranked([np.nan], [True])
-    with pytest.raises(ValueError, match="equally long"):
-        lib.Ranked([1.0, 2.0], [True])
-
-
 def test_episodes_are_resampled_as_a_whole():
     rng = np.random.default_rng(0)
     episode = np.repeat(np.arange(20), 50)

@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import polars as pl
 import pytest
-from studies.drives import Episode, checksums_in, read_runs, runs_in
+from studies.drives import checksums_in, read_runs, runs_in
 from studies.real import (
     HORIZONS,
     TARGETS,
@@ -15,7 +15,6 @@ from studies.real import (
     Real,
     case_of,
     coming,
-    foretellable,
 )
 
 TTC_3, BRAKING = Question("ttc-3", 2.0), Question("braking-3", 2.0)
@@ -129,20 +128,6 @@ def test_what_is_under_way_or_not_known_is_no_case():
     assert known.tolist() == [True, True, True, False, False, False, False]
     came, known = coming(np.array([False, False, True]), 5)  # known, though the end is near
     assert (came & known).tolist() == [True, True, False]
-
-
-def test_events_between_two_decisions_are_not_overlooked():
-    accelerations = np.zeros(40)
-    accelerations[31] = -4.0  # an odd row, and decisions are made in even ones
-    times, seen = 0.1 * np.arange(40), np.full((40, 3), [20.0, 10.0, 10.0])
-    episode = Episode("run", "v1-v2", times, seen, accelerations, 0.1)
-    case = case_of(episode)
-    came, known = case.answers[BRAKING]
-    assert case.times[came & known] == pytest.approx(np.arange(12, 31, 2) / 10.0)
-    assert case.begins["braking-3"] == pytest.approx([3.1])
-    assert foretellable([case], BRAKING) == (1, 1)
-    with pytest.raises(ValueError, match=r"run, v1-v2: a row every 0\.15 s"):
-        case_of(episode._replace(dt=0.15))
 
 
 # -- What is learnt, and how it is judged ---------------------------------------------------------

@@ -6,9 +6,6 @@ import pytest
 from studies.sensitivity import (
     NEAR,
     PARAMETERS,
-    SCALES,
-    SPEED_NOISE,
-    STANDARDISED,
     Remembering,
     Sensitivity,
     Trial,
@@ -39,31 +36,6 @@ def test_the_fast_way_has_the_verdicts_of_the_papers_study(changes):
     verdicts = {claim.id: claim.holds for claim in check_claims(slow)}
     assert verdicts == {claim: row[claim] for claim in verdicts}
     assert row["n_states"] == slow.model.n_states
-
-
-def test_noise_is_seen_by_the_machine_alone_and_differs_from_run_to_run():
-    setting = replace(recovered(), noise=0.2, noise_seed=3)
-    settings = setting.paper_settings()
-    episode = KinematicWorld().run(settings.scenario, settings.drivers[1])
-    before = episode.observations.copy()
-    first, again, other = (setting.observe(number, episode) for number in (0, 0, 1))
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
-    assert np.array_equal(episode.observations, before)
-    added = (first - before)[episode.observations[:, 1:].min(axis=1) > 3.0]
-    assert added.std(axis=0) == pytest.approx([0.2, 0.2 * SPEED_NOISE, 0.2 * SPEED_NOISE], rel=0.1)
-    scaled = replace(recovered(), scaling=STANDARDISED).observe(0, episode)
-    assert scaled * SCALES == pytest.approx(before)
-
-
-@pytest.mark.parametrize("one", PARAMETERS.values(), ids=lambda one: one.name)
-def test_every_range_holds_the_recovered_value_and_its_levels_stay_within(one):
-    levels = one.levels(9)
-    assert levels.count(one.recovered) == 1
-    if not one.choices:
-        assert (levels[0], levels[-1], len(levels)) == (one.low, one.high, 9)
-        assert levels == sorted(set(levels))
-        assert one.place_of(one.value_at(0.3)) == pytest.approx(0.3)
 
 
 def test_a_hypercube_fills_each_range_evenly_and_varies_what_its_name_says():

@@ -61,19 +61,6 @@ def test_what_is_missing_is_named_with_the_command_that_installs_it(monkeypatch)
     assert lacking("disc") == ""
 
 
-def test_training_and_held_out_episodes_are_others():
-    starts = {Start.training(0, seed, one) for seed in range(3) for one in range(5)}
-    starts |= {Start.held_out(0, one) for one in range(5)}
-    assert len({start.rng(0).random() for start in starts}) == len(starts) == 20
-    assert STARTS[0].rng(0).random() != STARTS[0].rng(1).random()
-
-
-def test_a_change_is_told_in_halves_of_the_range():
-    assert Box((-2.0,), (2.0,)).change(1.0, 2.0) == 0.5
-    assert Box((0.0, 0.0), (1.0, 4.0)).change(np.array([0.5, 4.0]), np.array([1.0, 4.0])) == 0.5
-    assert [Discrete(3).change(*pair) for pair in ((1, 1), (1, 2))] == [0.0, 1.0]
-
-
 def test_acc_is_the_published_one():
     seen, done, paid, failed = play(make_system("acc"), STARTS[1])
     assert failed
@@ -87,15 +74,6 @@ def test_acc_is_the_published_one():
     held = make_system("acc-5")
     assert len(play(held, STARTS[0], lambda z: -2.0)[1]) == held.steps == 60
     assert held.interval == pytest.approx(0.1)
-
-
-def test_tanks_fail_where_one_overflows_or_runs_dry_and_not_before():
-    tanks = make_system("tanks", "full")
-    seen, _, _, failed = play(tanks, STARTS[0])
-    assert failed
-    assert seen[-2, :2].max() < 2.0 <= seen[-1, :2].max() < 2.3
-    dry = play(tanks, STARTS[0], lambda z: np.zeros(2))[0]
-    assert dry[-2, :2].min() > 0.1 >= dry[-1, :2].min()
 
 
 # -- Rivals ---------------------------------------------------------------------------------------
