@@ -46,18 +46,6 @@ def test_learning_needs_numpy_and_numba_and_nothing_else_that_is_heavy():
     assert modules_after(learning) & HEAVY <= {"numba", "scipy"}
 
 
-def test_importing_the_package_costs_little_more_than_importing_numpy():
-    seconds = {"numpy": [], "evofsm": []}
-    for _ in range(7):
-        for module, measured in seconds.items():
-            program = (
-                "from time import perf_counter as now\n"
-                f"start = now(); import {module}; print(now() - start)"
-            )
-            measured.append(float(run(sys.executable, "-c", program)))
-    assert min(seconds["evofsm"]) <= 1.5 * min(seconds["numpy"])
-
-
 # -- What is told of it ------------------------------------------------------------------------
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
