@@ -58,18 +58,6 @@ def test_rows_of_matrices_are_distributions(taught, action):
         np.testing.assert_allclose(P.sum(axis=1), 1.0, atol=1e-9)
 
 
-def test_asking_changes_nothing_and_many_rows_are_answered_as_one_by_one(taught, machine, walk):
-    Z, actions = walk
-    before = matrix(taught, 1, 5)
-    beliefs = machine.model().recognise(Z[:20])
-    given = beliefs.copy()
-    many = taught.predict(beliefs, actions[:20], 5)
-    single = [taught.predict(b, i, 5) for b, i in zip(beliefs, actions[:20], strict=True)]
-    np.testing.assert_allclose(many, single, rtol=1e-12)
-    np.testing.assert_array_equal(beliefs, given)
-    np.testing.assert_array_equal(before, matrix(taught, 1, 5))
-
-
 def test_states_created_later_are_taken_in(walk):
     Z, actions = walk
     machine = EvolvingFSM(n_actions=2, rule=RULE)

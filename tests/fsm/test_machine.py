@@ -67,16 +67,6 @@ def test_after_a_failure_an_episode_begins(grown, end):
     assert grown.model().changes.sum() == changes
 
 
-def test_counts_never_forget_where_frequencies_do():
-    machine = EvolvingFSM(n_actions=1, radius=0.5, learning_rate=0.5, spread=1e-6)
-    machine.learn_many([[0.0], [0.0], [2.0], [1.0]], [-1, -1, -1, 0], failures=[])
-    machine.observe([0.0], failed=True)
-    machine.learn_many(np.zeros((5000, 1)), [0] * 5000)
-    assert machine.origin_frequency[0, 1] == 0.0
-    assert machine.decisions[0].tolist() == [4999.0, 1.0]
-    assert machine.failures[0].tolist() == [0.0, 1.0]
-
-
 GIVEN = {
     "a list": lambda z: z.tolist(),
     "single precision": lambda z: z.astype(np.float32),

@@ -145,21 +145,6 @@ def test_the_strongest_centre_leads_and_centres_stay_apart():
     assert merge(parts, radius=4.0).n_states < merged.n_states < merge(parts, radius=0.2).n_states
 
 
-@pytest.mark.parametrize("rule", RULES)
-def test_it_is_saved_and_loaded_and_goes_on_learning(snapshot, rule, tmp_path):
-    merged = merge([taught(rule, seed) for seed in range(3)])
-    merged.save(tmp_path / "merged.evofsm")
-    again = EvolvingFSM.load(tmp_path / "merged.evofsm")
-    random = np.random.default_rng(8)
-    Z, I = random.normal(size=(200, 2)) * 6.0, random.integers(0, 3, 200)
-    for machine in (merged, again):
-        trace = machine.learn_many(Z, I)
-        np.testing.assert_allclose(machine.transition_matrices.sum(axis=-1), 1.0, atol=1e-9)
-        assert np.isnan(trace.surprise[0])  # a new episode
-        assert not np.isnan(trace.surprise[1:]).any()
-    assert snapshot(merged) == snapshot(again)
-
-
 @pytest.mark.parametrize(
     ("machines", "error", "message"),
     [

@@ -119,14 +119,6 @@ def test_no_observation_is_farther_than_the_radius_from_every_centre(seed, radiu
         )
 
 
-def test_centres_never_move_and_are_observations_to_the_last_bit():
-    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(0.3, 7.0)))
-    Z = np.random.default_rng(0).normal(size=(500, 2)) * [1.0, 20.0]
-    trace = machine.learn_many(Z, [0] * 500)
-    assert set(trace.event.tolist()) == {Event.NONE, Event.CREATED}
-    assert machine.centers.tobytes() == Z[trace.event == Event.CREATED].tobytes()
-
-
 def test_belief_falls_with_scaled_distance_however_much_was_seen():
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=2.0, scales=(10.0, 1.0), spread=0.5))
     for wide in (10.0, 1000.0):

@@ -95,19 +95,6 @@ def test_a_revised_action_is_the_nearest_value_of_its_interval(actions, share):
         assert abs(value - wanted) <= np.abs(inside - wanted).min() + 1e-12
 
 
-def test_what_is_revised_is_said_with_numbers():
-    revision = ActionReviser(Told(above(-0.75)), ACTIONS).revise(HERE, Proposal(2.0))
-    assert revision.executed < -0.75
-    assert revision.proposed == 2.0
-    assert (revision.risk_proposed, revision.risk_executed) == (1.0, 0.0)
-    assert revision.interval == (0.0, 0.0)
-    assert revision.evidence == 7.0
-    assert "risk 100.0%" in revision.reason
-    hopeless = ActionReviser(Told(lambda a: 1.0), ACTIONS).revise(HERE, Proposal(2.0))
-    assert hopeless.executed == LOW
-    assert "nothing can" in hopeless.reason
-
-
 def not_acting(judge):
     """Revisers whose decisions are not executed."""
     for mode in (Mode.SHADOW, Mode.ADVISE):

@@ -126,21 +126,6 @@ def test_blind_from_the_start_it_brakes():
     assert "gap" in revision.reason
 
 
-@pytest.mark.parametrize("learn", [True, False])
-@pytest.mark.parametrize("policy", [Missing.PARTIAL, Missing.HOLD])
-def test_it_drives_on_when_sensors_fail_now_and_then(learn, policy):
-    watch, rng = guard(learn=learn, missing=policy), np.random.default_rng(1)
-    for k in range(200):
-        observation = np.array([40.0, 12.0, 12.0 + np.sin(0.1 * k)])
-        observation[rng.random(3) < 0.3] = NAN
-        revision = watch.decide(observation, 0.1)
-        assert ACTIONS.low <= revision.executed <= ACTIONS.high
-        assert watch.situation.belief.sum() == pytest.approx(1.0)
-    before = watch.machine.endings.sum()
-    watch.end(failed=True, observation=[NAN, 10.0, 0.0])  # unseen
-    assert watch.machine.endings.sum() == before + learn
-
-
 LARGE = (5e-324, 1e-300, 1e-160, 150.0, 1e3, 1e6, 1e15, 1e18, 1e29, 1e30)
 ODD = st.sampled_from([*LARGE, *np.negative(LARGE), -0.0]) | st.floats(-200.0, 200.0) | st.floats()
 

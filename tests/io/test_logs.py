@@ -173,18 +173,6 @@ def test_a_hole_in_time_begins_an_episode_and_is_counted(tmp_path):
     assert (chunk.starts.tolist(), chunk.jumps) == ([0, 10, 15], 2)
 
 
-def test_chunks_go_on_where_the_one_before_ended(tmp_path, monkeypatch):
-    path = write(tmp_path / "a.csv", [*log(900), *log(800, "v2-v3"), *log(700, "v3-v4")])
-    (whole,) = read(path)
-    assert whole.rows(0, 900).starts.tolist() == [0]
-    monkeypatch.setattr(tables, "_CSV_BYTES", 1 << 14)
-    monkeypatch.setattr(CsvTable, "_odd", lambda *_: 1 / 0)  # slower: plain files do without it
-    assert len(read(path)) > 2
-    assert together(path) == (whole.observations[:, 0].tolist(), [0, 900, 1700], [])
-    lengths = [len(episode.times) for episode in episodes_of(read(path))]
-    assert lengths == [900, 800, 700]
-
-
 def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "_CSV_BYTES", 1 << 18)
 
@@ -726,28 +714,6 @@ def test_times_may_be_dates(tmp_path, texts, point):
         (chunk,) = read(one)
         assert chunk.times == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-12)
         assert (chunk.dt, chunk.starts.tolist()) == (0.1, [0])
-
-
-@pytest.mark.parametrize(
-    ("text", "time", "form"),
-    [
-        ("31.03.2025 23:59:5{}", "time", ""),
-        ("1.4.25 6:00:0{}", "time", ""),
-        ("31.03.2025, 06:00:0{},000", "time", ""),
-        ("31.03.2025;06:00:0{}", "day,time", ""),
-        ("2025-03-31;06:00:0{}", "day,time", ""),
-        ("12/31/2025 6:00:0{} PM", "time", "%m/%d/%Y %I:%M:%S %p"),
-        ("20251231_06000{}", "time", "%Y%m%d_%H%M%S"),
-    ],
-)
-def test_dates_may_begin_with_the_day_stand_in_two_columns_or_be_described(
-    tmp_path, text, time, form
-):
-    rows = [f"{text.format(k)};{k},5;10;11;0" for k in range(4)]
-    header = f"{time.replace(',', ';')};gap;v_follower;v_leader;a_follower"
-    units = units_given([f"time={form}"] if form else [])
-    (chunk,) = read(write(tmp_path / "a.csv", rows, header), time=time, units=units)
-    assert chunk.times.tolist() == [0.0, 1.0, 2.0, 3.0]
 
 
 @pytest.mark.parametrize(

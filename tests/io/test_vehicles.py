@@ -76,14 +76,6 @@ def test_gap_is_between_bumpers_and_the_action_is_what_came_next(tmp_path):
     assert times.tolist() == [0.0, 0.5, 1.0]
 
 
-def test_pairs_are_neighbours_on_the_same_lane_only(tmp_path):
-    here = [("a", "e_0", 90.0, 1.0), ("b", "e_1", 60.0, 2.0), ("c", "e_0", 50.0, 3.0)]
-    here += [("d", "e_0", 46.0, 4.0), ("e", "f_0", 20.0, 5.0)]
-    found = episodes(write(tmp_path / "a.xml", xml({0.0: here, 0.1: here})))
-    first = [observations[0].tolist() for observations, _, _ in found]
-    assert first == [[-1.0, 4.0, 3.0], [35.0, 3.0, 1.0]]  # a collision is kept as it is
-
-
 def test_an_episode_ends_when_somebody_cuts_in_or_a_pair_is_away(tmp_path):
     a, b, c = ("a", "e_0", 90.0, 1.0), ("b", "e_0", 10.0, 1.0), ("c", "e_0", 50.0, 1.0)
     road = {0.0: [a, b], 0.1: [a, b], 0.2: [a, b, c], 0.3: [a, b], 0.4: [a], 0.5: [a, b], 0.6: []}

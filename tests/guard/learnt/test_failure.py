@@ -73,14 +73,6 @@ def test_order_unit_direction_and_origin_of_variables_make_no_difference(shape):
     np.testing.assert_allclose(far.min(0), otherwise.min(0), rtol=1e-4, atol=1e-4)
 
 
-def test_sides_that_explain_few_failures_go_where_a_bent_form_explains_all():
-    failures, survived = seen("oblique")
-    survived = survived[survived[:, 2] < np.sort(failures[:, 2])[-2]]
-    forms = explain(FAILS, failures, survived_as(survived, UNIT))
-    assert len(forms) == 1
-    assert not are_sides(forms).any()
-
-
 EXACT = np.zeros((2, 2))
 AMID = [[-0.1, 13.0], [0.1, 4.0], [0.2, 5.0], [0.3, 6.0]]
 ABOVE_ALONE = np.array([[0.0, 0.2], [0.2, 0.2]])  # who stands, does not fail for it

@@ -103,15 +103,3 @@ def test_a_side_on_which_episodes_fail_is_never_a_saturation():
     assert judge.state.reached[0, 0] >= 2
     assert judge.told_by_experience.startswith("fails where variable 1 is below 0")
     assert judge.parts.model.lowest[0] == -np.inf
-
-
-def test_a_leader_who_brakes_is_remembered_number_0_is_none_and_nothing_disturbs_who_rests():
-    judge = taught(6)
-    found = judge.parts.residuals
-    assert found.shape == (judge.horizon, 3, 1 + judge.remembered.number)
-    assert not found[:, :, 0].any()
-    assert found[:, 2].min() == pytest.approx(-0.75, abs=0.2)  # 3 m/s² for 0.25 s
-    resting = LearntRisk(0.25, -2.5, 2.5)
-    for _ in range(3):
-        follow(resting, np.tile([300.0, 0.0, 0.0], (60, 1)), np.full(59, -1.0))
-    assert not resting.parts.residuals.any()

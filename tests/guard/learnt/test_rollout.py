@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from evofsm.guard import LearntSettings
-from evofsm.guard.learnt.backups import evolved, first_backups
 from evofsm.guard.learnt.rollout import (
     CHANGED,
     CRASHES,
@@ -20,7 +18,6 @@ from evofsm.guard.learnt.rollout import (
     n_features,
     rollout,
     search,
-    value_of,
 )
 
 STEPS, WALL = 20, 100.0
@@ -216,21 +213,3 @@ def test_so_many_disturbances_need_not_be_survived_but_that_none_begins():
         found = search_for(model, [0.0], [[[0.0, 0.0]]], allowed=allowed, **asked)
         assert found[0] == how
         assert how != KEPT or found[-1] == pytest.approx(3.0)  # of those that are survived
-
-
-# -- Backups ------------------------------------------------------------------------------------
-
-
-def test_feedback_evolves_where_no_constant_action_survives():
-    """Between two walls: each constant one runs into one of them."""
-    model = mover(forms=np.vstack([side(0, 1.0, 3.0), side(0, -1.0, -3.0)]))
-    policies, linear = first_backups(np.ones((1, 1)), 1, 0, 3)
-    pushed, random = np.zeros((STEPS, 1, 3)), np.random.default_rng(1)
-    pushed[:, 0, 1], pushed[:, 0, 2] = 0.5, -0.5
-    situations = np.array([[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    given = model, situations, pushed, 1.0, LearntSettings(), random
-    for _ in range(10):
-        policies, linear = evolved(policies, linear, *given)
-    assert linear[0]
-    assert policies[0, 0, 1] < 0.0  # back to the middle
-    assert (value_of(model, situations, policies[:1], pushed) >= 0.0).all()
