@@ -2,24 +2,12 @@
 
 import json
 
-import numpy as np
 import pytest
 
-import fsm_rows
 import speed
-from evofsm import EvolvingFSM
-from fsm_rows import LATTICE_RULE, LATTICES, lattice_stream
 from timing import Row, judged, worsened
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.mark.parametrize("n_states", LATTICES)
-def test_a_lattice_has_as_many_states_as_it_says_and_its_walk_founds_no_other(n_states):
-    stream = lattice_stream(n_states, n_states + 200)
-    machine = EvolvingFSM(1, rule=LATTICE_RULE)
-    states = machine.learn_many(stream.observations, np.zeros_like(stream.actions)).n_states
-    assert (states[n_states - 1 :] == n_states).all()
 
 
 def measured(ours, reference):
@@ -102,13 +90,3 @@ def test_real_rows_run_and_the_table_is_no_wider_than_100_columns(tmp_path, caps
     assert [result["id"] for result in json.loads(file.read_text())] == QUICK.split(",")
     for result in json.loads(file.read_text()):
         assert result["ours_s"] > 0.0 < result["reference_s"]
-
-
-@pytest.mark.filterwarnings("ignore")  # whatever others warn of
-@pytest.mark.parametrize("row", [fsm_rows.stream_k_means, fsm_rows.db_stream])
-def test_others_cluster_the_same_stream(row):
-    pytest.importorskip("river")
-    pytest.importorskip("deeptime")
-    result = row(1, True)
-    assert result["reference"].startswith("river ")
-    assert any("deeptime" in what for what in result["beside"])

@@ -8,7 +8,7 @@ import pytest
 from studies import detection, lib
 from studies.detection import COUNTS, OURS, PAPER, STATES, Danger, Detection, Exposure, Watched
 
-from evofsm.driving import drive, load_family, unrevised_guard
+from evofsm.driving import load_family
 from evofsm.paper import write_page
 
 TINY = Detection(
@@ -65,17 +65,6 @@ def test_lead_time_is_that_of_the_alarm_that_stays_on():
     three = exposure(True, False, True)
     score = np.concatenate([raised(40, 3, *range(30, 40)), np.ones(40), raised(40, 10)])
     assert detection.lead_times(score, three, 0.5).tolist() == [2.5, 0.0]
-
-
-def test_watching_is_driving_unrevised():
-    family = load_family("rare+noise")
-    draw = family.draw(1, 2, split="test")
-    one, driven = detection.watch(family, draw), drive(unrevised_guard(family), draw)
-    seen = [decision.situation.observation for decision in driven.decisions]
-    assert np.array_equal(one.seen, seen)
-    assert np.array_equal(one.commands, driven.executed)
-    assert np.array_equal(one.true, driven.observations[::25][: len(seen)])
-    assert (one.end, one.collided) == (driven.time[-1], driven.collided)
 
 
 def test_what_would_have_come_after_the_end_is_left_out():

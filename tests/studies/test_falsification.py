@@ -8,13 +8,11 @@ import numpy as np
 import polars as pl
 import pytest
 from studies.falsification import (
-    Cars,
     Chosen,
     Falsification,
     Toy,
     kept,
     load,
-    needed_braking,
     plain,
     row_of,
     split,
@@ -42,28 +40,6 @@ def test_splitting_and_plain_sampling_say_the_same_where_both_see():
     error = math.hypot(np.std(values, ddof=1) / math.sqrt(8), math.sqrt(share * (1 - share) / n))
     assert 0.005 < share < 0.015
     assert abs(np.mean(values) - share) < 3.5 * error
-
-
-def test_places_that_depend_on_others_are_drawn_as_ever():
-    """A second number is asked for by some cases alone; the answer is that of the mixture."""
-
-    def score(chance):
-        if (x := chance("x")) < 0.5:
-            return x
-        return math.inf if chance("y") >= 0.98 else 0.5 + chance("y")
-
-    values = [split(score, (6, k), cases=80, moves=5).probability for k in range(10)]
-    error = np.std(values, ddof=1) / math.sqrt(len(values))
-    assert abs(np.mean(values) - 0.01) < 3.7 * error
-
-
-def test_where_nothing_fails_it_says_how_far_it_came():
-    flat = split(lambda chance: 1.0, [0], cases=20, moves=5)
-    assert (flat.probability, flat.reached, flat.best, flat.tried) == (0.0, 1.0, 1.0, 20)
-    never = split(lambda chance: chance("x"), [0], cases=20, moves=2, least=1e-3)
-    assert (never.probability, never.failed) == (0.0, ())
-    assert 1e-3 <= never.reached < 2e-3
-    assert 0.99 < never.best < 1.0
 
 
 STUDY = Falsification(
@@ -141,15 +117,6 @@ def test_failures_under_a_guard_and_runs_that_disagree_are_among_the_losses(
     assert "scenario.initial_gap [m]" in table.header
     assert not any("sensors.seed" in name for name in table.header)
     read_page(write_page(tmp_path / "index.html", [page])).is_sound()
-
-
-@pytest.mark.parametrize("name", FAMILIES)
-def test_who_drives_alone_drives_as_in_the_framework(name):
-    draw = load(name).draw(seed=2, index=0)
-    alone, whole = Cars(name).play(draw), drive(unrevised_guard(load(name)), draw)
-    assert alone.observations.tolist() == whole.observations.tolist()
-    assert needed_braking(alone) == needed_braking(whole) > 0.0
-    assert (needed_braking(alone) == math.inf) is whole.collided
 
 
 def test_cases_that_were_found_stay_broken_alone_and_whole_under_the_guard():

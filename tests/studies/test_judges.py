@@ -1,18 +1,13 @@
 """A trial learns, is frozen, and counts what it does held out; the studies run what they name."""
 
 import re
-from dataclasses import fields
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 import pytest
 from studies import benchmark, judges
-from studies.judges import Judges, Tasks, make_judge, trial
+from studies.judges import Judges, Tasks, trial
 from studies.rivals import Rival
-from studies.systems import make_system
-
-from evofsm.guard import LearntSettings
 
 PAGE = Path(__file__).parents[2] / "docs" / "judges.md"
 
@@ -109,13 +104,6 @@ def test_every_judge_part_and_seed_has_a_row(made):
     assert parts.cells[1][:4] == ("acc", "margin", "no margin", "0 of 4")
 
 
-def test_the_failure_function_is_told_where_an_observation_shows_it(made):
-    make_judge("told", make_system("disc"))
-    assert made[-1].given["failed"](np.array([0.5, 0.5, 0.0, 0.0]))
-    with pytest.raises(ValueError, match="reactor does not show"):
-        make_judge("told", make_system("reactor"))
-
-
 def test_the_benchmark_names_what_is_less_than_was_accepted():
     rows = benchmark.accepted().with_columns(without=pl.lit(""))
     assert (benchmark.compared(rows)["missed"] == "").all()
@@ -123,17 +111,6 @@ def test_the_benchmark_names_what_is_less_than_was_accepted():
     missed = benchmark.compared(rows.with_columns(failed=worse)).filter(pl.col("missed") != "")
     assert set(missed["system"]) == {"disc"}
     assert set(missed["missed"]) == {"failed"}
-
-
-def test_every_setting_of_the_learnt_judge_is_swept():
-    swept = Judges(without="harm,sweep").parts
-    names = [field.name for field in fields(LearntSettings)]
-    assert [one.partition("=")[0] for one in swept[1:]] == [each for each in names for _ in "ab"]
-    assert {"horizon=32", "margin_fade=0.95"} < {*swept}
-    judge = make_judge("learnt", make_system("acc"), ["horizon=32", "shy"]).judge
-    assert (judge.settings.horizon, judge.settings.shy) == (32, judge.settings.prior)
-    with pytest.raises(ValueError, match="no setting 'wheels'; there are n_disturbances"):
-        _ = Judges(without="wheels=4").parts
 
 
 def rows(judge, **columns):

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from studies.judges import make_judge, run, trial
-from studies.rivals import BackupShield, Counted, obstacle_shield, rivals_of
+from studies.judges import trial
 from studies.shapes import PEERS, SHAPES
-from studies.systems import HIGHWAY, SYSTEMS, Box, Discrete, Start, System, lacking, make_system
+from studies.systems import HIGHWAY, SYSTEMS, Box, Start, lacking, make_system
 
 NAMES = [name for name in (*SYSTEMS, *SHAPES, *PEERS) if not lacking(name)]
 EVERY = [(name, controller) for name in NAMES for controller in make_system(name).controllers]
@@ -97,59 +96,6 @@ def test_judges_that_are_told_the_equations_save_and_come_close(task, controller
     assert row["told"] in ("dynamics and noise", "linear model and limits")
 
 
-def test_a_backup_shield_takes_the_closest_action_that_can_still_be_saved():
-    """A point that moves by its speed; braking takes 1 off it, the wall is at 10."""
-    shield = BackupShield(
-        Box((-1.0,), (1.0,)),
-        move=lambda states, taken: np.column_stack(
-            [states[:, 0] + states[:, 1], states[:, 1] + taken.reshape(-1)]
-        ),
-        fails=lambda states: states[:, 0] >= 10.0,
-        backup=lambda states: np.where(states[:, 1] > 0.0, -1.0, 0.0),
-        steps=20,
-    )
-    assert shield.action(np.array([0.0, 0.0]), 1.0) == 1.0
-    assert shield.action(np.array([5.0, 2.5]), 1.0) == pytest.approx(-0.75, abs=0.3)
-    assert shield.action(np.array([9.0, 5.0]), 1.0) == 1.0  # lost, whatever is done
-    obstacle = obstacle_shield(Box((-2.0, -2.0), (2.0, 2.0)))
-    far, near = np.array([0.5, 0.5, 0.0, 0.05]), np.array([0.5, 1.85, 0.0, 0.05])
-    assert np.array_equal(obstacle.action(far, np.ones(2)), np.ones(2))
-    assert not np.array_equal(obstacle.action(near, np.ones(2)), np.ones(2))
-
-
-class Ladder(System):
-    """Up or down a ladder of ten rungs, from the middle; the top one breaks."""
-
-    name, variables = "ladder", ("rung",)
-    actions, interval, steps = Discrete(2), 1.0, 30
-
-    @property
-    def controllers(self):
-        return {"random": lambda z: int(self.whim.integers(2))}
-
-    def _begin(self, start):
-        self._rung = 5
-
-    def _observation(self):
-        return np.array([float(self._rung)])
-
-    def _advance(self, action):
-        self._rung = max(self._rung + (1 if action else -1), 0)
-        return 1.0, self._rung >= 9
-
-
-@pytest.mark.slow
-def test_a_shield_by_counts_learns_which_rung_breaks():
-    ladder, judge = Ladder(), Counted(Ladder())
-    assert any(run(ladder, judge, Start.training(0, 0, k)).failed for k in range(40))
-    judge.freeze()
-    tested = [run(ladder, judge, Start.held_out(0, k)) for k in range(30)]
-    assert sum(one.failed for one in tested) <= 2
-    assert judge.decide(np.array([8.0]), 1).executed == 0
-    assert judge.decide(np.array([5.0]), 0).executed == 0
-    assert sum(one.kept for one in tested) > 0.4 * sum(len(one.times) for one in tested)
-
-
 # -- highway-env ----------------------------------------------------------------------------------
 
 
@@ -165,14 +111,3 @@ def test_a_task_of_highway_env_is_drawn_by_its_start_alone_and_seen_as_rows(task
     assert len(seen[0]) % system.columns == 0
     assert len({system.propose(one) for one in seen}) > 1  # the network looks
     assert task not in SYSTEMS
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("task", HIGHWAY)
-def test_it_drives_to_the_end_under_each_rival(task):
-    pytest.importorskip("highway_env")
-    system = make_system(task)
-    for judge in ("unrevised", *rivals_of(system)):
-        ended = run(system, make_judge(judge, system), Start.held_out(3, 1))
-        assert 0 < len(ended.times) <= system.steps
-        assert 0.0 <= ended.speed <= 40.0
