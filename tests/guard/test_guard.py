@@ -413,44 +413,24 @@ def test_a_judge_that_wants_to_know_is_told_whether_it_may_learn(tmp_path):
     assert not hasattr(continuous().judge, "learning")
 
 
-def test_a_judge_is_told_all_that_happens_and_the_machine_counts_what_began():
-    class Observing(LearntRisk):
-        told = ()
+def test_what_a_judge_did_not_expect_is_counted_where_it_began_unless_it_failed_or_is_frozen():
+    class Surprised(LearntRisk):
+        seen = 0
 
         def observe(self, observation):
-            self.told += (("seen", observation.tolist()),)
-            return len(self.told) in (6, 9, 11)  # something unexpected began then
+            self.seen += 1
+            return self.seen % 2 == 0
 
-        def act(self, action):
-            self.told += (("did", action),)
-
-        def learn(self, observation, action, belief):
-            self.told += ("learnt",)
-
-        def end(self, observation, *, failed, terminated):
-            self.told += (("failed" if failed else "ended", observation is not None),)
-
-    guard = continuous(judge=Observing(DT, -4.0, 4.0), failed=lambda z: abs(z[0]) > 0.8)
-    step = (("seen", [0.1, 0.0]), ("did", 0.0), "learnt")
-    for _ in range(3):
-        guard.decide([0.1, 0.0], 0.0)
-    guard.decide([0.1, 0.0], 0.0, time=2 * DT)  # the same observation once more
-    guard.end(observation=[0.9, 0.0])
-    once_more, last = ("did", 0.0), ("seen", [0.9, 0.0])
-    assert guard.judge.told == (*step, *step, *step, once_more, last, ("failed", True))
-    assert guard.machine.onsets.sum() == 0.0  # of what failed nothing is counted
-    guard.judge.told = (None,) * 2
-    guard.decide([0.1, 0.0], 0.0)
-    guard.decide([0.1, 0.0], 0.0)
-    guard.end(observation=[0.2, 0.0])
-    ended = ("seen", [0.2, 0.0]), ("ended", True)
-    assert guard.judge.told == (None, None, *step, *step, *ended)
-    assert guard.machine.onsets.tolist() == [2.0]
-    before = guard.judge.told
+    guard = continuous(judge=Surprised(DT, -4.0, 4.0))
+    for failed, counted in ((True, 1.0), (False, 3.0)):  # the last of 4 observations failed
+        for k in range(3):
+            guard.decide([0.1 * k, 0.0], 0.0)
+        guard.end(failed, [0.9, 0.0])
+        assert guard.machine.onsets.sum() == counted
     guard.freeze()
     guard.decide([0.0, 0.0], 1.0)
     guard.end(failed=True)
-    assert guard.judge.told == before
+    assert guard.judge.seen == 8
 
 
 # -- What is refused ----------------------------------------------------------------------------

@@ -835,21 +835,6 @@ def test_what_the_documents_call_optional_may_be_absent(mode, without):
     assert guard.judge.episodes == ended
 
 
-@pytest.mark.parametrize("width", [1, 2])
-def test_a_change_costs_reward_of_any_shape(width):
-    class Wide(VectorWrapper):
-        def step(self, actions):
-            seen, rewards, *others = self.env.step(actions)
-            return seen, np.tile(rewards[:, None], width), *others
-
-    envs = Wide(SyncVectorEnv([lambda: Script(FAR, NEAR, FAR)] * 3))
-    revised = RevisedVectorActions(envs, guard_for(ONE, Spy(above_half)), penalty=1.0)
-    revised.reset()
-    _, rewards, *_, infos = revised.step(np.full((3, 1), 2.5))
-    assert rewards.shape == (3, width)
-    assert (rewards == 1.5 - infos["reviser/penalty"][:, None]).all()
-
-
 def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
     class Once(Spy):
         def judge(self, situation, actions):
@@ -1001,52 +986,6 @@ def test_what_an_agent_meets_after_a_step_without_an_action_is_no_consequence(cr
         (5, True),
         (3, True),
     ]
-
-
-@pytest.mark.parametrize("name", [None, "final_obs"])
-def test_agents_whose_environment_begins_again_by_itself_are_learnt(crowd, name):
-    class Once(crowd):
-        def step(self, actions):
-            if not self.agents:
-                return self.reset()[0], *[
-                    dict.fromkeys(self.scripts, x) for x in (0.0, False, False, {})
-                ]
-            seen, *said, infos = super().step(actions)
-            if not self.agents and name:
-                infos = {one: info | {name: seen[one]} for one, info in infos.items()}
-                seen = self.reset()[0]
-            return seen, *said, infos
-
-    guard = guard_for(ONE)
-    env = evofsm.guard.RevisedAgents(Once(4, 4), guard)
-    env.reset()
-    for _ in range(12):
-        env.step({agent: np.array([0.0]) for agent in ("a0", "a1")})
-    ends = [(len(rows), last, failed) for rows, last, failed in guard.judge.episodes]
-    assert ends == [(3, tuple(NEAR), True)] * (8 if name else 6)
-
-
-def test_of_a_masked_agent_only_what_is_allowed_is_executed(crowd):
-    class Masked(crowd):
-        one, possible_agents = Barred("observation"), ("a",)
-
-        def __init__(self):
-            self.observation_space = lambda agent: self.one.observation_space
-            self.action_space = lambda agent: self.one.action_space
-
-        def reset(self, seed=None, options=None):
-            self.agents = ["a"]
-            return tuple({"a": it} for it in self.one.reset())
-
-        def step(self, actions):
-            return tuple({"a": it} for it in self.one.step(actions["a"]))
-
-    env = evofsm.guard.RevisedAgents(
-        Masked(), guard_for(Discrete(3), Spy(lambda action: action < 2))
-    )
-    env.reset()
-    executed = [env.step({"a": 0})[4]["a"]["reviser/executed_action"] for _ in range(20)]
-    assert {0, 2} <= set(executed)
 
 
 def test_agents_that_take_turns_are_told_of_the_parallel_interface(crowd):

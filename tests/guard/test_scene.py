@@ -8,7 +8,7 @@ import pytest
 from evofsm import store
 from evofsm.guard import Guard, Mode, Proposal, SceneRisk
 from evofsm.guard.actions import same_action
-from evofsm.guard.scene import _KIND, Contact, Foreseen
+from evofsm.guard.scene import _KIND, Foreseen
 
 LEFT, STAY, RIGHT = range(3)
 THINGS = 3
@@ -256,27 +256,6 @@ def test_a_forged_file_is_refused(taught, forge, tmp_path, change, why):
     forge(tmp_path / "judge", change)
     with pytest.raises(ValueError, match=why):
         SceneRisk.load(tmp_path / "judge")
-
-
-# -- How close is too close --------------------------------------------------------------------
-
-
-def test_the_shape_of_what_is_too_close_is_learnt():
-    random = np.random.default_rng(0)
-    start = random.uniform(-10.0, 10.0, (4000, 2))
-    end = start + random.normal(0.0, 0.3, (4000, 2))
-    way = np.linspace(0.0, 1.0, 50)[:, None, None]
-    met = (np.abs(start + way * (end - start)) < [4.0, 1.0]).all(-1).any(0)
-    failed = [(start[[k]], end[[k]]) for k in np.flatnonzero(met)[:40]]
-    contact = Contact.learn((start[~met], end[~met]), failed, np.array([5.0, 5.0]))
-    assert contact.sides[0] / contact.sides[1] == pytest.approx(4.0, rel=0.4)
-    at = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 0.7], [6.0, 0.0], [0.0, 1.6]])
-    risk = contact.of(np.repeat(at[:, None], 3, axis=1))[:, -1]
-    assert (risk[:3] > 0.3).all()
-    assert (risk[3:] < 0.05).all()
-    assert (np.diff(contact.risk) <= 0.0).all()
-    coming = contact.of(np.array([[9.0, 0.0], [6.0, 0.0], [2.0, 0.0], [9.0, 0.0]]))
-    assert coming[0] < 0.05 < 0.3 < coming[1] == coming[2]
 
 
 @pytest.mark.parametrize(

@@ -176,31 +176,3 @@ def test_what_refused_for_long_without_a_failure_is_tried_by_its_smallest_rival(
     assert (guard.judge.state.forms[:, SAYS] == ENDS).any()  # it is known now
     guard.freeze()
     assert sum(fly(softly) for _ in range(9)) == 9
-
-
-def test_a_rival_that_was_wrong_is_tried_later_the_next_time():
-    guard = Guard(-np.ones(1), np.ones(1), interval=0.1, horizon=2.0)
-    rng = np.random.default_rng(0)
-
-    def play(to, failed):
-        z = np.zeros(2)
-        while z[0] < to:
-            guard.decide(z, np.ones(1))
-            z = z + 0.02 + 0.002 * rng.normal(size=2)
-        guard.end(failed, z)
-
-    def wait():
-        for _ in range(60):
-            guard.decide(0.95 + 0.02 * rng.normal(size=2), np.ones(1))
-        guard.end(False)
-
-    for k in range(4):
-        play(1.0 if k == 3 else 0.5, k == 3)
-    for _ in range(8):
-        wait()
-    assert guard.judge.state.held < 0
-    play(0.98, failed=True)  # not as it did
-    assert (guard.judge.state.held, guard.judge.state.wrong) == (0, 1)
-    for _ in range(8):
-        wait()
-    assert guard.judge.state.held == 8

@@ -68,18 +68,6 @@ def test_it_learns_what_a_car_does_but_nothing_of_the_failing_transition():
     assert not (other.state.windows[:, :, :3] == crash).all(2).any()
 
 
-def test_a_long_rest_at_an_end_teaches_nothing_of_what_an_action_does():
-    judge = taught()
-    effect = judge.parts.model.weights[[7, 8], 1].copy()  # of this action and the one before
-    U = np.full(120, -2.0)
-    own = np.maximum(0.0, 2.0 + 0.25 * np.cumsum(np.append(0.0, U)))
-    Z = np.column_stack([30.0 - 0.25 * np.append(0.0, np.cumsum(own[:-1])), own, np.zeros(121)])
-    for _ in range(2):
-        follow(judge, Z, U)
-        np.testing.assert_allclose(judge.parts.model.weights[[7, 8], 1], effect, atol=0.02)
-    assert judge.parts.model.lowest[1] == 0.0
-
-
 @pytest.mark.parametrize("back", [1, 120])
 def test_a_jump_changes_model_and_units_by_less_than_1_percent(back):
     one, other = taught(6), taught(6)

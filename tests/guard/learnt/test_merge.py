@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from evofsm.guard import LearntRisk, Mode, merge_judges
-from evofsm.guard.learnt.rollout import features
 
 
 def test_what_two_learnt_apart_is_what_one_would_have_of_both(points, content):
-    """Counted from another origin: what is expected of an action, and where it fails."""
+    """Counted from another origin: what was seen, and where it fails."""
     point, whole = points["box"], points["box"].guard(mode=Mode.OFF)
     guards = [point.guard(mode=Mode.OFF), point.guard(mode=Mode.OFF)]
     for episode in range(8):
@@ -20,16 +19,6 @@ def test_what_two_learnt_apart_is_what_one_would_have_of_both(points, content):
     one, other = merged.state, whole.judge.state
     for name in ("n_episodes", "n_failed", "n_seen", "least", "most", "lowest", "highest", "used"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), 1e-9, err_msg=name)
-    paths = []
-    for judge in (merged, whole.judge):
-        model, u = judge.parts.model, np.ones((1, 1))
-        z, change, path = np.zeros((1, 2)), np.zeros((1, 2)), []
-        for _ in range(10):
-            change = features(model, z, change, u, u) @ model.weights
-            z = z + change
-            path.append(z[0, 0])
-        paths.append(path)
-    np.testing.assert_allclose(paths[0], paths[1], rtol=0.05)
     assert (
         merged.told_by_experience.partition(";")[0]
         == whole.judge.told_by_experience.partition(";")[0]
