@@ -59,12 +59,6 @@ def test_they_answer_with_the_axes_they_were_given_and_leave_the_style(machine, 
     assert dict(matplotlib.rcParams) == before
 
 
-def test_type_has_the_size_and_colour_of_the_users_style(model):
-    with matplotlib.rc_context({"font.size": 16.0, "text.color": "#eeeeee"}):
-        large = plot.graph(model, new()).texts[-1]
-    assert (large.get_fontsize(), large.get_color()) == (14.0, "#eeeeee")
-
-
 def test_states_stand_where_their_centres_are_and_what_is_on_the_axes_stays_in_view(model):
     ax = new()
     ax.plot([-50.0, 50.0], [-50.0, 50.0])

@@ -218,13 +218,3 @@ def test_words_never_touch_and_nothing_is_larger_than_the_screen(seen, session, 
     page.wait_for_timeout(300)  # drawings keep their scale where folds take their room
     scales = "[...document.querySelectorAll('canvas')].map((one) => one.height - one.clientHeight)"
     assert {*page.evaluate(scales)} <= {0, 150}  # which is that of a canvas that is not drawn
-
-
-@pytest.mark.slow
-def test_another_plane_can_be_chosen(seen):
-    page = seen(session=environment(DISC), speed=math.inf)
-    shows(page, "headline", "ailure")
-    shown = page.locator("#map-canvas")
-    assert shown.get_attribute("aria-label").startswith("x and y")
-    page.locator("#up").select_option("speed x")
-    playwright.expect(shown).to_have_attribute("aria-label", re.compile("^x and speed x"))

@@ -222,23 +222,6 @@ def situation(row):
     return Situation(np.asarray(row), np.ones(1), 0, np.nan, 0.0)
 
 
-def test_without_noise_the_estimate_is_the_observation():
-    rows, done = traffic(600)
-    perception = Perception(DT)
-    for row, estimate in zip(rows, estimates(perception, rows, done), strict=True):
-        assert estimate.mean == tuple(row)
-        assert not np.any(estimate.covariance)
-    assert perception.noise == (0.0, 0.0, 0.0)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_noise_is_learnt_as_it_is(seed):
-    rows, done = traffic(500, seed)
-    perception = Perception(DT)
-    estimates(perception, noisy(rows, seed + 100), done)
-    assert np.array(perception.noise) == pytest.approx(NOISE, rel=0.2)
-
-
 def test_estimates_are_better_than_observations_and_know_how_good_they_are():
     rows, done = traffic(2000)
     seen = noisy(rows)

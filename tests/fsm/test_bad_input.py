@@ -105,11 +105,6 @@ def test_an_action_that_cannot_be_right(machine, refuses, i, error, words):
     refuses(machine, lambda m: m.predict(i), error, words)
 
 
-def test_an_action_before_the_first_observation_of_an_episode(grown, refuses):
-    grown.start_episode()
-    refuses(grown, lambda m: m.act(0), ValueError, "act before observe: this episode")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("Z", "I", "starts", "error", "words"), cases(BATCHES))
 def test_a_batch_that_cannot_be_right(machine, refuses, Z, I, starts, error, words):

@@ -211,16 +211,6 @@ def test_what_lies_far_from_every_state_was_never_seen_whatever_the_belief(rule,
     assert far.state == model.recognise([never]).argmax()
 
 
-def test_the_machine_says_so_of_what_founds_no_state():
-    machine = EvolvingFSM(1, radius=0.5)
-    machine.learn_many([[0.0], [0.1], [-0.1]] * 20, [0] * 60)
-    step = machine.observe([3.0])
-    assert step.belief[step.state] > 0.9
-    assert machine.explain().never_seen
-    machine.observe([np.nan], missing=Missing.PARTIAL)
-    assert not machine.explain().never_seen  # nothing is known of it
-
-
 def test_either_a_situation_or_an_observation_is_explained():
     model = untold().model()
     for wrong in ({}, {"situation": 0, "observation": [0.0]}):

@@ -78,15 +78,6 @@ def test_parts_that_do_not_fit_each_other_are_refused(change, words):
 # -- Recognition -------------------------------------------------------------------------------
 
 
-def test_many_rows_are_recognised_each_as_alone(grown):
-    model = grown.model()
-    Z = np.random.default_rng(0).normal(size=(20, 2)) * 4.0
-    many = model.recognise(Z)
-    assert many.shape == (20, model.n_states)
-    for z, belief in zip(Z, many, strict=True):
-        assert model.recognise(z).tobytes() == belief.tobytes()
-
-
 @pytest.mark.parametrize(
     ("z", "words"),
     [

@@ -100,12 +100,6 @@ def test_that_holds_in_every_unit(learn, scale):
     learn(EvolvingFSM(n_actions=2, radius=0.3 * scale), Z, np.arange(200) % 2)
 
 
-def test_that_holds_while_many_states_are_created(learn, spiral):
-    machine = EvolvingFSM(n_actions=3, radius=0.01)
-    learn(machine, spiral(120), np.arange(120) % 4 - 1, [0, 41, 90])
-    assert machine.n_states > 32
-
-
 @given(streams(), st.sampled_from([1.0, -64.0, 2.0**20, -(2.0**40)]))
 def test_shifting_all_observations_changes_no_belief(stream, offset):
     machine, Z, I, starts, _ = stream

@@ -8,7 +8,6 @@ from evofsm.cli.monitor.state import State
 from evofsm.cli.monitor.transports import Server
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.guard import Guard, Mode
-from evofsm.store import read_header
 from monitor_rows import JUNK, line, scenes, traffic
 
 SETTINGS = {"learn": True, "guard": None}
@@ -65,17 +64,6 @@ def test_it_goes_on_bit_for_bit_wherever_it_is_killed(opened, learn, mode):
         if k % 50 == 0:
             assert decider.answer(JUNK[k // 50 % len(JUNK)])["kind"] == "error"
         assert decider.answer(line(row)) == plain.answer(line(row)), k
-
-
-def test_a_saved_guard_is_gone_on_from_and_keeps_where_it_came_from(tmp_path, opened):
-    path = tmp_path / "guard.evofsm"
-    made().save(path, {"drive": "Monday"})
-    decider, state = opened(path)
-    decider.answer(line(next(traffic(1))))
-    state.close()
-    assert read_header(path).provenance["drive"] == "Monday"
-    decider, state = opened(path)
-    assert decider.n == 1
 
 
 def test_a_last_record_that_was_half_written_is_left_out(opened):

@@ -9,7 +9,6 @@ import socket
 import sys
 import threading
 import time
-import tracemalloc
 import unittest.mock
 from contextlib import contextmanager
 
@@ -87,14 +86,6 @@ def test_lines_are_the_same_however_they_are_cut(plain, size):
     assert [first, last] == plain[:2]
     assert empty["error"] == "is empty"
     assert long["error"] == f"is longer than {LONGEST} bytes"
-
-
-def test_a_line_without_an_end_takes_no_more_memory_than_the_longest():
-    pieces = iter([b"x" * LONGEST] * 200)
-    tracemalloc.start()
-    Server(Decider(guard_of_monitor(0.1, 6.0))).converse(lambda _: next(pieces, b""), id)
-    assert tracemalloc.get_traced_memory()[1] < 20 * LONGEST
-    tracemalloc.stop()
 
 
 def test_it_ends_after_the_message_under_way_however_many_came_at_once(monkeypatch):
