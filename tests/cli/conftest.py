@@ -1,9 +1,12 @@
 """What tests of commands share."""
 
 import asyncio
+import math
 import queue
+import random
 import threading
 from contextlib import contextmanager
+from datetime import datetime, timedelta
 
 import pytest
 
@@ -32,6 +35,34 @@ def refused(evofsm):
         return line
 
     return refuse
+
+
+@pytest.fixture(scope="session")
+def pump():
+    """A log of a row every 5 s or so: now and then vibration grows until the pump trips at 7.1."""
+    polars = pytest.importorskip("polars")
+
+    def make(runs=14):
+        chance, rows, at = random.Random(1), [], datetime(2025, 3, 10, 6, 0, 11)
+        for run in range(runs):
+            slow, grows = chance.uniform(150, 250), 1.0 if run % 2 else 5.5
+            for k in range(400):
+                vibration = 2.8 + math.sin(k / 40) / 3 + max(0.0, k - 150) / slow * grows
+                vibration += chance.gauss(0.0, 0.08)
+                bearing = 60 + 4 * math.sin(k / 90) + chance.gauss(0.0, 0.2)
+                status = "Störung" if vibration > 7.1 else "Betrieb"
+                rows.append((at, vibration, bearing, 1480 + chance.gauss(0.0, 9.0), status))
+                at += timedelta(seconds=5 + chance.uniform(-1, 1) + 40 * (chance.random() < 0.01))
+                if vibration > 7.1:
+                    break
+            for _ in range(60):
+                stands = status if status == "Störung" else "Stillstand"
+                rows.append((at, 0.1, 40.0, 0.0, stands))
+                at += timedelta(seconds=5 + chance.uniform(-1, 1))
+        columns = "Zeit", "Schwingung, mm/s", "Lagertemperatur °C", "Drehzahl", "Status"
+        return polars.DataFrame(rows, columns, orient="row")
+
+    return make
 
 
 @pytest.fixture

@@ -1,10 +1,7 @@
 """A machine's log, as plants export them: from what is in it to what a guard of it says."""
 
-import math
-import random
 import re
 import shlex
-from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -13,28 +10,6 @@ polars = pytest.importorskip("polars")
 pytest.importorskip("typer")
 
 VIBRATION, BEARING = "Schwingung, mm/s", "Lagertemperatur °C"
-FIRST = datetime(2025, 3, 10, 6, 0, 11)
-
-
-def pump(runs=14, seed=1):
-    """A row every 5 s or so: a pump whose vibration now and then grows until it trips at 7.1."""
-    chance, rows, at = random.Random(seed), [], 0.0
-    for run in range(runs):
-        trips, slow = run % 2 == 0, chance.uniform(150, 250)
-        for k in range(400):
-            grown = max(0.0, k - 150) / slow * (5.5 if trips else 1.0)
-            vibration = 2.8 + math.sin(k / 40) / 3 + grown + chance.gauss(0.0, 0.08)
-            stops = vibration > 7.1 or k == 399
-            status = "Störung" if vibration > 7.1 else "Betrieb"
-            bearing = 60 + 4 * math.sin(k / 90) + chance.gauss(0.0, 0.2)
-            rows.append((at, vibration, bearing, 1480 + chance.gauss(0.0, 9.0), status))
-            at += 5 + chance.uniform(-1, 1) + 40 * (chance.random() < 0.01)
-            if stops:
-                break
-        for _ in range(60):
-            rows.append((at, 0.1, 40.0, 0.0, status if status == "Störung" else "Stillstand"))
-            at += 5 + chance.uniform(-1, 1)
-    return polars.DataFrame(rows, ["Zeit", VIBRATION, BEARING, "Drehzahl", "Status"], orient="row")
 
 
 @pytest.fixture(autouse=True)
@@ -43,34 +18,38 @@ def _in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
 
 
-def written(form="german"):
-    """An export of it, in one of several forms."""
-    path, frame, when = "pump.csv", pump(), polars.col("Zeit")
-    date = polars.lit(FIRST) + polars.duration(microseconds=when * 1e6)
-    if form == "parquet":
-        path = "pump.parquet"
-        frame.with_columns(Zeit=date).with_row_index().write_parquet(path)
-    elif form == "codes":  # a clock in ms, and codes
-        of = polars.col("Status").replace_strict({"Betrieb": 1, "Störung": 4}, default=0)
-        epoch = (when * 1e3 + 1.74e12).cast(polars.Int64)
-        frame.select("Drehzahl", VIBRATION, BEARING, t=epoch, code=of).write_csv(path)
-    elif form in ("english", "american"):
-        how = "%Y-%m-%d %H:%M:%S%.3f" if form == "english" else "%m/%d/%Y %I:%M:%S %p"
-        frame.with_columns(date.dt.strftime(how).alias("Zeit")).write_csv(path, float_precision=3)
-    else:
-        how = "%d.%m.%Y;%H:%M:%S" if form == "two columns" else "%d.%m.%Y %H:%M:%S"
-        frame = frame.with_columns(date.dt.strftime(how).alias("Zeit"))
-        dialect = {"separator": ";", "decimal_comma": True, "quote_style": "never"}
-        text = frame.write_csv(None, float_precision=3, **dialect)
-        text = text.replace("Zeit", "Datum;Uhrzeit") if form == "two columns" else text
-        Path(path).write_bytes(text.encode("cp1252"))
-    return path
+@pytest.fixture
+def written(pump):
+    """Exports it, in one of several forms."""
+
+    def write(form="german"):
+        path, frame, when = "pump.csv", pump(), polars.col("Zeit")
+        if form == "parquet":
+            path = "pump.parquet"
+            frame.with_row_index().write_parquet(path)
+        elif form == "codes":  # a clock in ms, and codes
+            of = polars.col("Status").replace_strict({"Betrieb": 1, "Störung": 4}, default=0)
+            epoch = when.dt.epoch("ms")
+            frame.select("Drehzahl", VIBRATION, BEARING, t=epoch, code=of).write_csv(path)
+        elif form in ("english", "american"):
+            how = "%Y-%m-%d %H:%M:%S%.3f" if form == "english" else "%m/%d/%Y %I:%M:%S %p"
+            frame.with_columns(when.dt.strftime(how)).write_csv(path, float_precision=3)
+        else:
+            how = "%d.%m.%Y;%H:%M:%S" if form == "two columns" else "%d.%m.%Y %H:%M:%S"
+            dialect = {"separator": ";", "decimal_comma": True, "quote_style": "never"}
+            text = frame.with_columns(when.dt.strftime(how))
+            text = text.write_csv(None, float_precision=3, **dialect)
+            text = text.replace("Zeit", "Datum;Uhrzeit") if form == "two columns" else text
+            Path(path).write_bytes(text.encode("cp1252"))
+        return path
+
+    return write
 
 
 @pytest.mark.parametrize(
     "form", ["german", "two columns", "english", "american", "parquet", "codes"]
 )
-def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, form):
+def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, written, form):
     path = written(form)
     first = evofsm("learn", path)
     assert first.exit_code == 2
@@ -104,7 +83,7 @@ def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, for
 READ = "--action", "--time", "--unit", "--where", "--failed", "--resample", "--hole"
 
 
-def test_what_a_log_seems_to_need_is_said_before_the_work(evofsm, refused):
+def test_what_a_log_seems_to_need_is_said_before_the_work(evofsm, refused, written):
     path = written()
     asked = "learn", path, "--observe", f'"{VIBRATION}"', "--action", "", "--time", "Zeit"
     told = evofsm(*asked)
@@ -136,7 +115,7 @@ def test_what_a_log_seems_to_need_is_said_before_the_work(evofsm, refused):
         (["--where", "Drehzahl>9999", "--resample", "30s"], "and --where Drehzahl>9999 must hold"),
     ],
 )
-def test_what_cannot_be_done_with_rows_is_refused(refused, options, message):
+def test_what_cannot_be_done_with_rows_is_refused(refused, written, options, message):
     path = written()
     asked = "--observe", BEARING, "--action", "Drehzahl", "--time", "Zeit"
     assert message in refused("learn", path, *asked, "--failed", "Status==Störung", *options)
