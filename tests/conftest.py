@@ -1,8 +1,10 @@
 import faulthandler
 import hashlib
 import json
+import os
 import re
 import shutil
+import warnings
 from contextlib import contextmanager
 from html import unescape
 from html.parser import HTMLParser
@@ -64,6 +66,28 @@ def ends_in_time():
             faulthandler.cancel_dump_traceback_later()
 
     return within
+
+
+@pytest.fixture(scope="session")
+def in_a_child():
+    """Does it in a process that inherits everything: whether it raised nothing."""
+    if not hasattr(os, "fork"):
+        pytest.skip("nothing can fork here")
+
+    def run(do):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # threads are what is asked for
+            child = os.fork()
+        if child == 0:
+            code = 1
+            try:
+                do()
+                code = 0
+            finally:
+                os._exit(code)
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -300,20 +300,6 @@ def test_failures_are_learnt_from_a_column_or_a_comparison(evofsm, crashes, tmp_
     assert "2 of 4" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
 
 
-def test_a_log_that_tells_nothing_of_failures_is_said_to(evofsm, crashes, tmp_path):
-    path = tmp_path / "model"
-    learnt = evofsm("learn", crashes, "--out", path)
-    assert "failures not known; --failed" in " ".join(learnt.stdout.split())
-    text = " ".join(evofsm("explain", path, "--state", "all").stdout.split())
-    assert "Which episodes failed is not known" in text
-    assert "0 of" not in text
-    safe = tmp_path / "safe"
-    assert evofsm("learn", crashes, "--failed", "gap<-9", "--out", safe).exit_code == 0
-    text = " ".join(evofsm("explain", safe, "--state", "all").stdout.split())
-    assert "Which episodes failed is not known" not in text
-    assert "0 of 3 (at most 48 %) failed later on" in text
-
-
 def test_a_failure_that_no_row_meets_is_said_with_the_range_of_its_column(evofsm, tmp_path):
     path, level = tmp_path / "tank.csv", "level [mm]"
     rows = [f"{k},{500 + 50 * k},0.1,{k == 20}" for k in range(9)]

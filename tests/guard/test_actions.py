@@ -55,8 +55,9 @@ def test_every_cell_is_encoded_by_its_middle_and_beyond_lies_the_edge():
     assert [BOX.encode(middle) for middle in middles] == list(range(81))
     assert BOX.encode([-9.0, -9.0]) == 0
     assert BOX.encode([9.0, math.inf]) == 80
-    with pytest.raises(ValueError, match="NaN"):
-        BOX.encode([0.0, math.nan])
+    for action, why in (([0.0, math.nan], "NaN"), ([0.0], "it must have 2")):
+        with pytest.raises(ValueError, match=why):
+            BOX.encode(action)
 
 
 @pytest.mark.parametrize(
@@ -68,18 +69,12 @@ def test_every_cell_is_encoded_by_its_middle_and_beyond_lies_the_edge():
         ({"low": (-1.7e308,), "high": (1.7e308,)}, "too large"),
         ({"low": (), "high": ()}, "not empty"),
         ({"low": 0.0, "high": 1.0}, "low has shape"),
+        ({"low": ("a",), "high": (1.0,)}, "low"),
     ],
 )
 def test_what_is_no_box_is_refused(settings, message):
-    with np.errstate(over="ignore"), pytest.raises(ValueError, match=message):
+    with np.errstate(over="ignore"), pytest.raises((TypeError, ValueError), match=message):
         BoxActions(**settings)
-
-
-def test_numbers_in_words_are_refused():
-    with pytest.raises(TypeError, match="low"):
-        BoxActions(("a",), (1.0,))
-    with pytest.raises(ValueError, match="it must have 2"):
-        BOX.encode([0.0])
 
 
 def test_options_are_the_nearest_of_each_cell_and_the_corners():

@@ -600,25 +600,7 @@ def test_what_an_interrupt_breaks_off_is_done_again_and_written_once(tmp_path, m
     assert times > 100
 
 
-forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing can fork here")
-
-
-def in_a_child(do):
-    """Do it in a process that inherits everything: whether it raised nothing."""
-    child = os.fork()
-    if child == 0:
-        code = 1
-        try:
-            do()
-            code = 0
-        finally:
-            os._exit(code)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-
-
-@forks
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_child_that_inherits_a_log_leaves_it_to_its_parent(tmp_path):
+def test_a_child_that_inherits_a_log_leaves_it_to_its_parent(in_a_child, tmp_path):
     path = tmp_path / "log"
     log = AuditLog(path)
     guard = Guard.of(Unrevised(ACTIONS), interval=0.25, audit=log)
@@ -640,7 +622,7 @@ def test_a_child_that_inherits_a_log_leaves_it_to_its_parent(tmp_path):
     assert audit(path).replayed == 2
 
 
-@forks
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing can fork here")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_child_that_lives_on_does_not_keep_a_log_that_its_parent_closed(tmp_path):
     reading, writing = os.pipe()

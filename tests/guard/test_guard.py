@@ -2,7 +2,6 @@
 
 import io
 import math
-import os
 import sys
 import threading
 from collections import Counter
@@ -550,9 +549,9 @@ def test_what_raises_in_a_part_of_it_is_done_again_by_the_same_call(broken, snap
     assert times
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing can fork here")
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_child_forked_amid_an_end_in_another_thread_has_the_guard_of_before(monkeypatch):
+def test_a_child_forked_amid_an_end_in_another_thread_has_the_guard_of_before(
+    in_a_child, monkeypatch
+):
     guard, twin = one_guard.learnt(), one_guard.learnt()
     amid, over, learn = threading.Event(), threading.Event(), judging.learn
 
@@ -567,18 +566,17 @@ def test_a_child_forked_amid_an_end_in_another_thread_has_the_guard_of_before(mo
     thread = threading.Thread(target=guard.end, args=(True, [1.2, 0.1]))
     thread.start()
     amid.wait()
-    if (child := os.fork()) == 0:
-        code = 1
-        try:
-            before = one_guard.held(guard) == one_guard.held(twin)
-            guard.end(True, [1.2, 0.1])
-            twin.end(True, [1.2, 0.1])
-            code = int(not before or one_guard.gone_on(guard) != one_guard.gone_on(twin))
-        finally:
-            os._exit(code)
+
+    def end():
+        assert one_guard.held(guard) == one_guard.held(twin)
+        for one in (guard, twin):
+            one.end(True, [1.2, 0.1])
+        assert one_guard.gone_on(guard) == one_guard.gone_on(twin)
+
+    is_as_before = in_a_child(end)
     over.set()
     thread.join()
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert is_as_before
 
 
 # -- Who feeds it -------------------------------------------------------------------------------

@@ -193,18 +193,6 @@ def test_neither_the_order_of_objects_nor_rows_that_are_not_seen_make_a_differen
     assert first.executed == other.executed != STAY
 
 
-def test_the_oldest_episodes_are_forgotten(monkeypatch):
-    monkeypatch.setattr("evofsm.guard.scene._MOST", 60)
-    world = Rain(steps=6)
-    guard = world.guard(mode=Mode.OFF)
-    for seed in range(8):
-        world.play(guard, seed)
-    past = guard.judge.memory.past
-    assert 30 < len(past.away) <= 60
-    assert guard.judge.memory.fitted <= len(past.ends) - 1 < 8
-    assert ((past.moment[past.links] == past.moment + 1) | (past.links < 0)).all()
-
-
 # -- Files -------------------------------------------------------------------------------------
 
 

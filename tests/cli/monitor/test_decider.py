@@ -120,7 +120,7 @@ def in_flight():
     return messages
 
 
-@pytest.mark.parametrize("answered", [*range(1, 20), 22, 23, 24, 27, 28])
+@pytest.mark.parametrize("answered", [1, 2, 10, 19, 22, 23, 24, 27, 28])
 @pytest.mark.parametrize("decided", [24, 26, 28, 29])
 def test_what_was_in_flight_and_is_sent_again_is_decided_once(answered, decided):
     messages = in_flight()
