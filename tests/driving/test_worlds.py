@@ -75,15 +75,6 @@ def test_a_second_simulation_in_the_process_is_refused():
         assert len(after.run(replace(SETTINGS.scenario, duration=0.1), SETTINGS.drivers[2]).time)
 
 
-def test_a_world_changes_its_step_between_runs():
-    with SumoWorld() as world:
-        for dt in (0.01, 0.1):
-            scenario = replace(SETTINGS.scenario, dt=dt, duration=2.0)
-            episode = world.run(scenario, SETTINGS.drivers[1])
-            closed_form = KinematicWorld().run(scenario, SETTINGS.drivers[1])
-            assert np.abs(episode.observations - closed_form.observations).max() < 1e-9
-
-
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
 def test_a_controller_that_proposes_no_number_is_named(wrong):
     with pytest.raises(ValueError, match="controller proposed"):

@@ -7,7 +7,6 @@ import re
 import sys
 import tracemalloc
 from dataclasses import replace
-from shlex import quote
 
 import numpy as np
 import pytest
@@ -546,23 +545,6 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, pieces, nothing):
     assert "1 failures lie in rows that are left out" in " ".join(warnings_of(noted))
 
 
-@pytest.mark.parametrize(("nobody", "warns"), [((-1, -1), True), ((-1, -2), False)])
-def test_one_number_below_zero_that_comes_again_and_again_is_asked_about(tmp_path, nobody, warns):
-    rows = [(20, 72), *((one, one) for one in nobody * 2), (-0.4, 72)]  # which is a collision
-    lines = [f"{k / 10};{gap};72;{lead};0" for k, (gap, lead) in enumerate(rows)]
-    path, noted = (
-        write(tmp_path / "a.csv", lines, "time;gap;v_follower;v_leader;a_follower"),
-        Noted(),
-    )
-    read(path, noted=noted, units={"v": "km/h"})
-    asked = [one for one in warnings_of(noted) if "in 4 rows, and else never below 0" in one]
-    assert len(asked) == warns
-    if asked:
-        option = re.search("--no-leader (v_leader==[-0-9.]+) leaves such rows out", asked[0])[1]
-        left = together(path, no_leader=option, units={"v": "km/h"})
-        assert left[0] == [20, -0.4]
-
-
 @pytest.mark.parametrize("odd", ["", ";;;;"])
 def test_where_fields_end_at_a_semicolon_numbers_may_have_a_decimal_comma(tmp_path, odd):
     lines = [f"{k / 10}; {20 - k / 3}; 10,5; 11; -0,5".replace(".", ",") for k in range(4)]
@@ -756,24 +738,6 @@ def test_a_row_of_units_below_the_names_is_none_of_the_log(tmp_path, row):
     assert chunk.observations[0, 1] == pytest.approx(36 * 0.44704)
     bad = write(tmp_path / "b.csv", [*lines, "p,9,9,36,fast,1,0"], SHORT)
     assert "line 6, column 'v_leader'" in refusal(bad)
-
-
-@pytest.mark.parametrize(
-    ("name", "unit"),
-    [("ego_kmh", "km/h"), ("speed [km/h]", "km/h"), ("egoMph", "mph"), ("dist_cm", "cm")],
-)
-def test_a_unit_in_a_column_s_name_is_asked_about_unless_it_was_told(tmp_path, name, unit):
-    header, lines = f"time,{name},u", [f"{k / 10},79,0" for k in range(3)]
-    path = write(tmp_path / "a.csv", lines, header)
-    columns = {"observe": ObservationEncoder(name), "action": "u"}
-    noted = Noted()
-    read(path, noted=noted, **columns)
-    (warning,) = warnings_of(noted)
-    assert f"{name} is called as if it were in {unit}" in warning
-    assert f"--unit {quote(f'{name}={unit}')} converts it" in warning
-    told = Noted()
-    read(path, noted=told, units={name: unit}, **columns)
-    assert warnings_of(told) == []
 
 
 @pytest.mark.parametrize(

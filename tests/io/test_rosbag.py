@@ -146,17 +146,6 @@ def mcap_of_a_drive(path, **how):
         writer.finish()
 
 
-def test_mcap_that_was_merged_with_others_is_read_by_its_topics(tmp_path):
-    path = tmp_path / "merged.mcap"
-    with mcap_of_a_drive(path) as writer:
-        for name, language in (("foxglove.Log", "protobuf"), ("x", "jsonschema"), ("y", "flat")):
-            schema = writer.register_schema(name, language, b"\xff\xfe")
-            writer.add_message(writer.register_channel(name, language, schema), 0, b"\xff", 0)
-        writer.add_message(writer.register_channel("/none", "json", 0), 0, b"{}", 0)
-    (plain,) = read(write(tmp_path / "plain", drive(), MCAP))
-    assert (read(str(path))[0].observations == plain.observations).all()
-
-
 def test_what_is_too_old_is_a_hole_in_time(tmp_path):
     silent = [one for one in drive(4.0) if one[1] == EGO or not 1.05 < one[0] < 2.95]
     (chunk,) = read(write(tmp_path / "bag", silent))

@@ -1,13 +1,8 @@
 """The closed loop on fewer draws, and how its tables are made."""
 
-from dataclasses import replace
-
-import numpy as np
-import polars as pl
 import pytest
 from studies import closed_loop
-from studies.closed_loop import MACHINE, OURS, ClosedLoop, final, lines_of
-from studies.policies import Group
+from studies.closed_loop import MACHINE, OURS, ClosedLoop
 
 TINY = ClosedLoop(
     train=10,
@@ -81,54 +76,3 @@ def test_the_papers_cases_are_driven_without_a_collision_and_left_alone_where_sa
     assert all(row["end"] > 59.9 for row in found)
     assert {"brake at 11 s", "brake at 15 s"} <= set(case)
     assert max(case["case 2"]["changed"], case["case 3"]["changed_late"]) <= 0.05
-
-
-# -- The tables, of rows that are made up ---------------------------------------------------------
-
-
-def row(policy, group, rate, mobility, seed=None, trained=0, **others):
-    values = {"collision_low": 0.0, "collision_high": 1.0, "mobility_low": 0.0}
-    values |= {"mobility_high": 1.0, "intervention_rate": 0.5, "mean_change": 1.0, "jerk": 1.0}
-    values |= {"rear_ends": 0, "episodes_until_safe": None, "train_collisions": 0, "episodes": 100}
-    values |= {"policy": policy, "group": group, "told": group, "learning_seed": seed}
-    values |= {"collisions": int(100 * rate), "collision_rate": rate, "mobility": mobility}
-    return values | {"train_episodes": trained} | others
-
-
-ROWS = pl.DataFrame(
-    [
-        row("unrevised", Group.BOUND, 0.9, 1.0),
-        row("ttc", Group.FIXED, 0.0, 0.95),
-        row("rss", Group.MATCHED, 0.1, 0.99),
-        row("rss-tuned", Group.TUNED, 0.01, 0.8, intervention_rate=0.1),
-        *(
-            row(OURS, Group.LEARNT, rate, mobility, seed, 100, episodes_until_safe=until)
-            for seed, (rate, mobility, until) in enumerate(
-                [(0.01, 0.9, 3), (0.02, 0.94, None), (0.02, 0.92, None), (0.0, 0.91, 1)]
-            )
-        ),
-    ]
-)
-
-
-def test_ours_is_told_as_the_median_of_each_column_and_as_the_worst_seed():
-    lines = lines_of(ROWS)
-    assert lines["policy"].to_list() == ["unrevised", "ttc", "rss-tuned", "rss", OURS, OURS]
-    median, worst = final(lines), final(lines, which="worst")
-    assert (median["collision_rate"], median["mobility"]) == (0.015, 0.915)
-    assert median["episodes_until_safe"] == np.inf  # two of four seeds were never safe
-    assert (worst["collision_rate"], worst["mobility"]) == (0.02, 0.92)
-    assert median["which"] == "median of 4"
-
-
-def test_whoever_is_better_on_an_axis_at_no_more_collisions_is_where_it_loses():
-    lines = lines_of(ROWS)
-    found = {"separation": pl.DataFrame(schema={"group": pl.String, "auroc": pl.Float64})}
-    table, *_ = closed_loop._lost(found, lines)
-    assert table.frame["policy"].to_list() == ["ttc", "rss-tuned"]  # not rss, which collides more
-    assert table.marks == ["fails", None]
-    targets = closed_loop._targets(replace(TINY, family="rare"), {}, lines)
-    assert {one.target: one.met for one in targets} == {
-        "collisions, worst seed": True,
-        "fixed constants that are better on both axes": False,
-    }

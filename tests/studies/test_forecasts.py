@@ -1,6 +1,5 @@
 """Fair references, honest splits, and scores by hand."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +19,6 @@ from studies.forecasts import (
     logs_in,
     read_part,
     score,
-    skill,
     stays,
 )
 
@@ -83,21 +81,6 @@ def test_scores_by_hand():
     # Half of what came had a forecast of 0, which counts as 1e-6 / 2; then half a bit more.
     assert still["excess"] == pytest.approx(-0.5 * np.log2(5e-7), abs=1e-4)
     assert (still["forecasts"], still["episode"]) == (2, 1)
-
-
-def test_what_an_episode_got_in_several_rounds_is_added_up():
-    of_round = {0: {STAYS: 4.0, OURS: 1.0}, 1: {STAYS: 4.0, OURS: 3.0}}
-    rows = [
-        {"source": "s", "horizon": 1.0, "round": k, "part": 0, "method": name, "episode": 0}
-        | dict.fromkeys(("divergence", "excess", "log_score"), value)
-        | {"forecasts": 2}
-        for k, values in of_round.items()
-        for name, value in {**values, "batch": 8.0}.items()
-    ]
-    ours = next(one for one in add_up(pl.DataFrame(rows), 3, 0) if one["method"] == OURS)
-    assert (ours["skill"], ours["worst"], ours["over_batch"]) == (0.5, 0.25, 0.75)
-    assert (ours["episodes"], ours["forecasts"], ours["jsd"]) == (1, 4, 1.0)
-    assert math.isnan(skill(np.array([1.0]), np.array([0.0])))
 
 
 # -- Failures of tasks ----------------------------------------------------------------------------
