@@ -158,11 +158,6 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
     assert "refused   1 messages, the first because line: is no JSON" in by_lines.stdout
     assert "failures  2; 1 in alarm by then, for " in by_lines.stdout
     assert [one[1] for one in numbers_of(by_lines.stdout)[:6]] == [one[1] for one in by_risk]
-    guard = tmp_path / "guard.evofsm"
-    decider.guard.save(guard)
-    by_guard = evofsm(log, "--summary", "--guard", guard, *columns)
-    assert numbers_of(by_guard.stdout)[:6] == by_risk
-    assert f"what {guard} was given and has learnt; a risk of 0.05 is accepted" in by_guard.stderr
 
 
 @pytest.mark.parametrize(

@@ -228,19 +228,6 @@ def test_stops_and_limits_stay_the_drivers(road):
     assert stood
 
 
-def test_cars_come_and_go(road):
-    later = '<vehicle id="late" type="hasty" route="along" depart="5" departPos="0"/>'
-    sumo = road(*NO_GAP, others=later)
-    guards = attach(sumo, "type:hasty")
-    drive(sumo, 0.2)
-    assert guards.cars == ["ego"]
-    drive(sumo, 6.0)
-    assert guards.cars == ["ego", "late"]
-    sumo.vehicle.remove("ego")
-    drive(sumo, 0.2)
-    assert guards.cars == ["late"]
-
-
 REACTS = measures.ResponsibilitySensitiveSafety(0.1, 3.5, 4.5, 9.0)
 ACTIONS = IntervalActions(-9.0, 3.5, 0.3, outside="clip")
 OWN = {

@@ -179,16 +179,6 @@ def test_a_dead_end_is_a_collision_however_small_the_gap_that_is_left():
     assert score[0] < 0.0 < score[1]
 
 
-def test_frozen_it_still_knows_what_was_commanded_last():
-    risk = LatentRisk.given(-4.0, 4.0, 8.0)
-    risk.brakes.set_lagged(0.8, 1.0)
-    here, chances = situation(30.0, 20.0, 20.0), []
-    for command in (-4.0, 2.0):
-        risk.follow([30.0, 20.0, 20.0], command)
-        chances.append(risk.judge(here, [0.0]).critical[0])
-    assert chances[1] < chances[0]
-
-
 @pytest.mark.parametrize(
     ("observation", "acceleration", "named"),
     [

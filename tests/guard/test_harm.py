@@ -190,13 +190,3 @@ def test_the_arm_that_is_better_is_drawn_ever_more_often():
                 harm = harm.after(driven, failed=after < 299.0)
                 guarded += drives
         assert least <= guarded / 800 <= most
-
-
-def test_a_controller_that_became_good_is_found_out():
-    harm = arms([(60, "", None)] * 20, [(20, "f", None)] * 20)
-    alone = 0
-    for _ in range(300):
-        drives = not harm.passing(learning=True)
-        harm = harm.after((60, 0, 0) if drives else (0, 40, 0), failed=False, ended=not drives)
-        alone += not drives
-    assert alone > 150

@@ -7,7 +7,7 @@ import polars
 import pytest
 
 from evofsm.driving import KinematicWorld
-from evofsm.fsm import EvolvingFSM, FSMModel
+from evofsm.fsm import FSMModel
 from evofsm.paper.claims import check_claims
 from evofsm.paper.reproduction import Reproduction, divergences, reproduce
 from evofsm.paper.runs import Settings, run_paper
@@ -99,13 +99,6 @@ def test_one_round_is_a_study_too_and_says_how_far_it_is():
     assert [0.0 < run.first_surprise < 1.0 for run in study.runs] == [False, True, True, True]
     with pytest.raises(ValueError, match="at least once"):
         drive(rounds=0)
-
-
-def test_settings_are_those_of_the_papers_machine():
-    settings = Settings.load()
-    machine = EvolvingFSM(settings.actions.n_actions, **settings.machine)
-    assert repr(machine) == repr(EvolvingFSM.paper())
-    assert settings.actions.n_actions == 17
 
 
 @pytest.mark.parametrize(

@@ -282,15 +282,3 @@ def test_names_are_for_words_alone_and_are_kept(reloaded):
     named = LearntRisk(0.1, n_actions=2, names=("place", "speed"), units=("m", "m/s"))
     labels = reloaded(named).labels
     assert (labels.names, labels.units) == (("place", "speed"), ("m", "m/s"))
-
-
-@pytest.mark.parametrize("steps", [3, 4, 6])
-def test_episodes_that_fail_at_once_teach_without_a_warning(steps):
-    guard, random = Guard(low=-1.0, high=1.0, interval=0.1), np.random.default_rng(steps)
-    for _ in range(12):
-        z = 0.1 * random.normal(size=2)
-        for _ in range(steps):
-            executed = guard.decide(z, random.uniform(-1.0, 1.0)).executed
-            z = z + 0.1 * np.append(executed, random.normal())
-        guard.end(failed=True, observation=z + 1.0)
-    assert guard.judge.state.n_episodes == 12
