@@ -162,12 +162,6 @@ def test_an_end_that_is_cut_off_and_a_log_written_anew_show_with_the_head_only(f
     assert found(folder, forged, kept) == RECORDS
 
 
-@pytest.mark.parametrize("text", ["12", "x:" + "0" * 64, "3:" + "0" * 63])
-def test_a_head_that_is_none_is_refused(text):
-    with pytest.raises(ValueError, match="head is"):
-        Head.parse(text)
-
-
 @pytest.mark.parametrize("text", [b"", b"# Notes\n", b"{}\n", b"[" * 100_000 + b"\n"])
 def test_another_file_is_no_audit_log(tmp_path, text):
     path = tmp_path / "other"

@@ -9,7 +9,7 @@ import pytest
 from evofsm.driving.drivers import IDM
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.revisers import Unrevised
-from evofsm.driving.scenarios import Body, Leader, Scenario, Sensors
+from evofsm.driving.scenarios import Leader, Scenario
 from evofsm.driving.trials import drive
 from evofsm.driving.world import COMMANDED, SPEED
 from evofsm.fsm.actions import IntervalActions
@@ -61,14 +61,6 @@ def test_decisions_are_those_of_the_record():
         assert set(record[row:end, COMMANDED]) == {decision.revision.executed}
         did = (record[end, SPEED] - record[row, SPEED]) / (time[end] - time[row])
         assert decision.realised == pytest.approx(did)
-
-
-def test_realised_is_what_the_body_did_whatever_the_sensors_show():
-    weak = Body(lowest=-1.0, highest=1.0)
-    blind = Sensors(gap_noise=1.0, speed_noise=0.5, delay=0.3)
-    told = driven(script(2.0), on=scenario(2.0, body=weak, sensors=blind))
-    assert [d.realised for d in told.decisions] == [pytest.approx(1.0)] * 8
-    assert (told.executed == 2.0).all()
 
 
 def test_a_collision_ends_the_last_decision_early_and_is_learnt_as_a_failure():

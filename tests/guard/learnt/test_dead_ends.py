@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from evofsm import Guard
-from evofsm.guard import LearntRisk, merge_judges
+from evofsm.guard import LearntRisk
 
 WALL, TRAP = 1.0, 0.6
 ICE = 0.5  #: of the kinds of road that are seen, the one on which it fails at the trap
@@ -23,13 +23,13 @@ def play(guard, road, episode, see=lambda z: z):
     return said, place >= fails
 
 
-def taught(on_ice=2, see=lambda z: z, without=("regions",)):
-    """A guard that knows the wall, and met the trap so often."""
-    judge = LearntRisk(0.1, -1.0, 1.0, without=without)
+def taught(see=lambda z: z):
+    """A guard that knows the wall, and met the trap twice."""
+    judge = LearntRisk(0.1, -1.0, 1.0, without=["regions"])
     guard = Guard(low=-1.0, high=1.0, interval=0.1, judge=judge, explaining=True)
     for episode in range(4):
         play(guard, episode % 2, episode, see)
-    for episode in range(10, 10 + on_ice):
+    for episode in range(10, 12):
         play(guard, ICE, episode, see)
     return guard
 
@@ -63,12 +63,6 @@ def test_what_is_survived_there_takes_it_back(wary):
             guard.judge.act(0.0)
         guard.judge.end(None, failed=False)
     assert guard.judge.state.radii.sum() < few.radii.sum()
-
-
-def test_merged_they_are_all_there_are(wary):
-    other = taught(1).judge
-    merged = merge_judges([wary.judge, other]).state
-    assert merged.counts.sum() == wary.judge.state.counts.sum() + other.state.counts.sum()
 
 
 def test_however_variables_are_written_it_decides_the_same(wary, reloaded):

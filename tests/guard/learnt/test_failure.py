@@ -38,10 +38,10 @@ def seen(shape, seed=0):
     return z[fails][:40], z[~fails]
 
 
-def survived_as(rows, unit, spread=None):
+def survived_as(rows, unit):
     """What was survived, as it is asked of."""
     lowest, highest = np.array([rows.min(0)] * 2), np.array([rows.max(0)] * 2)
-    return Survived(rows, lowest, highest, unit, rows.std(0) if spread is None else spread)
+    return Survived(rows, lowest, highest, unit, rows.std(0))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -108,7 +108,7 @@ def test_failures_are_explained_by_ends_of_what_was_survived(failures, blur, end
 # -- As guards learn them -----------------------------------------------------------------------
 
 
-def play(guard, episode, wanted=None):
+def play(guard, episode):
     """Walk in the plane towards random places, amid a disc; whether it failed."""
     rng = np.random.default_rng(episode)
     place, speed, said = rng.uniform([-2.0, -1.5], [-1.4, 1.5]), np.zeros(2), []

@@ -16,15 +16,15 @@ def follow(judge, Z, U, *, failed=False):
     judge.end(None, failed=failed)
 
 
-def drive(draw, steps=120, *, braking=None, start=(40.0, 15.0, 15.0), noise=0.01):
+def drive(draw, steps=120, *, braking=None):
     """A gap [m] and two speeds [m/s] at 4 Hz; the leader brakes from a step on, and stands at 0."""
-    gap, own, leader = start
+    gap, own, leader = 40.0, 15.0, 15.0
     Z, U = [[gap, own, leader]], []
     for t in range(steps):
         a = float(np.clip(draw.normal(0.05 * (leader - own), 0.8), -2.5, 2.5))
         push = -3.0 if braking is not None and braking <= t < braking + 16 else 0.0
         own_next = max(0.0, own + 0.25 * a)
-        leader_next = max(0.0, leader + 0.25 * push + noise * draw.normal())
+        leader_next = max(0.0, leader + 0.25 * push + 0.01 * draw.normal())
         gap += 0.25 * (leader - own)
         own, leader = own_next, leader_next
         Z.append([gap, own, leader])
