@@ -173,12 +173,6 @@ def test_risk_lies_in_its_interval_and_grows_with_the_acceleration(gap, speed, l
     assert judged.evidence == 4
 
 
-def test_a_dead_end_is_a_collision_however_small_the_gap_that_is_left():
-    risk = LatentRisk.given(-4.0, 4.0, 8.0)  # at 20 m/s full braking of both needs 25 m
-    score = risk.score(np.array([[25.2, 20.0, 20.0], [24.8, 20.0, 20.0]]))
-    assert score[0] < 0.0 < score[1]
-
-
 @pytest.mark.parametrize(
     ("observation", "acceleration", "named"),
     [

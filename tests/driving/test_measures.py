@@ -155,11 +155,6 @@ def test_the_safe_distance_of_rss_by_hand():
     assert safe == pytest.approx([29.35, 0.0])
 
 
-def test_performance_models_score_in_metres_and_see_no_danger_in_opening_gaps():
-    rows = np.array([[17.0, 30.0, 18.0], [17.0, 18.0, 30.0]])
-    assert PerformanceModel(0.5, 6.0).score(rows, DT).tolist() == [1.0, -17.0]
-
-
 def test_pfs_falls_from_the_unsafe_to_the_safe_distance():
     # Unsafe below 20 m and safe from 32 m on, behind a margin of 2 m.
     gaps = np.array([21.0, 22.0, 28.0, 33.9, 34.0, 40.0, 0.0, -1.0])

@@ -14,7 +14,6 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.merging import merge
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import Novelty
 
 COUNTS = ("episodes", "failed_soon", "tried", "failed_after")
@@ -63,16 +62,6 @@ def test_an_episode_counts_once_for_each_state_and_action(seed, horizon):
     for name in COUNTS:
         np.testing.assert_array_equal(getattr(machine, name), told[name], err_msg=name)
         np.testing.assert_array_equal(getattr(machine.model(), name), told[name], err_msg=name)
-
-
-def test_an_episode_that_begins_unseen_is_no_part_of_the_one_before():
-    machine = EvolvingFSM(1, rule=Novelty(radius=1.0))
-    machine.learn_many([[0.0, 0.0], [9.0, 9.0]], [0, 0])
-    machine.start_episode()
-    machine.observe([9.0, np.nan], missing=Missing.PARTIAL)
-    machine.fail()
-    assert machine.episodes.tolist() == [1.0, 1.0]
-    assert machine.failed_soon.tolist() == [0.0, 0.0]
 
 
 def test_where_states_were_joined_there_is_no_interval():

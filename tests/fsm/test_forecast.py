@@ -50,14 +50,6 @@ def test_held_out_rows_are_foreseen_better_than_by_persistence(taught, machine, 
     assert jensen_shannon(predicted, then).mean() < 0.8 * jensen_shannon(now, then).mean()
 
 
-@pytest.mark.parametrize("action", [None, 0, 1])
-def test_rows_of_matrices_are_distributions(taught, action):
-    for steps in taught.steps:
-        P = matrix(taught, action, steps)
-        assert (P > 0.0).all()
-        np.testing.assert_allclose(P.sum(axis=1), 1.0, atol=1e-9)
-
-
 def test_states_created_later_are_taken_in(walk):
     Z, actions = walk
     machine = EvolvingFSM(n_actions=2, rule=RULE)

@@ -1,7 +1,5 @@
 """Machines that learnt apart become one: states matched, evidence added up, order of no matter."""
 
-import functools
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,7 +14,6 @@ RULES = [
     Paper(),
     Edges(),
 ]
-CENTRES = np.array([[0.0, 0.0], [8.0, 0.0], [0.0, 4.0], [8.0, 4.0], [16.0, 0.0], [16.0, 4.0]])
 
 
 def taught(rule, seed, rows=150, q=3, **settings):
@@ -26,33 +23,6 @@ def taught(rule, seed, rows=150, q=3, **settings):
     machine = EvolvingFSM(q, rule=rule, **settings)
     machine.learn_many(Z, random.integers(-1, q, rows), [0, rows // 3], [rows // 2])
     return machine
-
-
-def among(centres, seed, rows):
-    """A machine of states that are the same for all: observations are these points."""
-    random = np.random.default_rng(seed)
-    I, n = random.integers(0, 2, rows), len(centres)
-    anywhere = random.choice(n, rows - n, p=np.full(n, 1.0 / n))
-    machine = EvolvingFSM(2, rule=Novelty(1.0, spread=0.1))  # all are found, then it goes anywhere
-    machine.learn_many(centres[[*range(n), *anywhere]], I)
-    machine.start_episode()
-    return machine
-
-
-def assert_alike(one, other, atol):
-    """Equal but for rounding, and for the order of states."""
-    model, expected = one.model(), other.model()
-    assert model.centers.shape == expected.centers.shape
-    a, b = np.lexsort(model.centers.T), np.lexsort(expected.centers.T)
-    names = ("centers", "potentials", "visits", "created", "endings")
-    pairs = [(getattr(model, name)[a], getattr(expected, name)[b]) for name in names]
-    for name in ("origin_frequency", "decisions", "failures"):
-        pairs.append((getattr(model, name)[:, a], getattr(expected, name)[:, b]))
-    matrices = model.transition_matrices[:, a][:, :, a]
-    pairs.append((matrices, expected.transition_matrices[:, b][:, :, b]))
-    for left, right in pairs:
-        np.testing.assert_allclose(left, right, atol=atol)
-    assert (model.uses == expected.uses).all()
 
 
 seeds = st.lists(st.integers(0, 10_000), min_size=2, max_size=4, unique=True)
@@ -115,22 +85,6 @@ def test_potentials_are_those_of_all_the_data():
     offsets = ((merged.centers[:, None] / rule.scales - scaled) ** 2).sum(axis=-1)
     expected = 1.0 / (1.0 + offsets.mean(axis=1))
     np.testing.assert_allclose(merged.potentials[:n], expected, rtol=1e-9)
-
-
-@pytest.mark.parametrize("order", ["one after another", "the last first", "in pairs"])
-def test_merging_merged_machines_is_merging_all_where_the_states_are_the_same(order):
-    parts = [among(CENTRES, seed, rows=50 + 100 * seed) for seed in range(4)]
-    match order:
-        case "one after another":
-            folded = functools.reduce(lambda a, b: merge([a, b]), parts)
-        case "the last first":
-            folded = functools.reduce(lambda a, b: merge([a, b]), parts[::-1])
-        case "in pairs":
-            folded = merge([merge(parts[:2]), merge(parts[2:])])
-    merged = merge(parts)
-    for machine in (folded, merged):  # which takes the latest, any part's, into the potentials
-        machine.observe(CENTRES[0])
-    assert_alike(folded, merged, atol=1e-9)
 
 
 def test_the_strongest_centre_leads_and_centres_stay_apart():
