@@ -28,14 +28,14 @@ def machine(**settings):
     return EvolvingFSM(ACTIONS.n_actions, **{"radius": 0.2, "spread": 0.2, **settings})
 
 
-def chunks(Z, actions, starts=STARTS, dt=0.1, size=1000):
+def chunks(Z, actions, starts=STARTS, size=1000):
     """The trace in chunks of a size."""
     starts = np.array(starts)
     for first in range(0, len(Z), size):
         inside = starts[(starts >= first) & (starts < first + size)] - first
         rows = slice(first, first + size)
-        times = dt * np.arange(len(Z))[rows]
-        yield Chunk("made up", Z[rows], actions[rows], times, inside, dt)
+        times = 0.1 * np.arange(len(Z))[rows]
+        yield Chunk("made up", Z[rows], actions[rows], times, inside, 0.1)
 
 
 @pytest.mark.parametrize("size", [1, 7, 64])

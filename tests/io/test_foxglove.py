@@ -25,7 +25,7 @@ from evofsm.guard.api import Intake
 from evofsm.guard.loop import Decision
 from evofsm.guard.reviser import Mode
 from evofsm.io.foxglove import FOXGLOVE_LAYOUT, FoxgloveSink, RunWriter, recording
-from evofsm.io.runs import _column, read_run, schemas_of
+from evofsm.io.runs import read_run, schemas_of
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -251,9 +251,6 @@ def test_a_small_log_that_unpacks_to_hundreds_of_megabytes_is_refused(packing, t
         assert tracemalloc.get_traced_memory()[1] < (96 << 20) + 8 * path.stat().st_size
     finally:
         tracemalloc.stop()
-    rows = [{"belief": [0.0] * 20_000}, *({"belief": []} for _ in range(10_000))]
-    with pytest.raises(ValueError, match="10,001 beliefs in 20,000 states"):
-        _column("belief", "belief", rows)
 
 
 # -- Live -----------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The closed loop on fewer draws, and how its tables are made."""
+"""The closed loop on fewer draws."""
 
 import pytest
 from studies import closed_loop

@@ -113,42 +113,6 @@ def test_the_benchmark_names_what_is_less_than_was_accepted():
     assert set(missed["missed"]) == {"failed"}
 
 
-def rows(judge, **columns):
-    frame = pl.DataFrame(columns)
-    told = {"learnt": "nothing but failures", "rss": "brakes", "unrevised": "nothing"}[judge]
-    given = {"system": "acc", "controller": "c", "judge": judge, "told": told, "without": ""}
-    given |= {"trained": 200, "measure": "return", "episodes": 100, "failed_while_learning": 1}
-    given |= {"failed_late": 0, "score_by_late": 550.0, "kept": 0.5, "mean_change": 0.1}
-    given |= {"p50_ms": 1.0, "p99_ms": 2.0, "speed": 20.0, "failed": 0, "score": 1.0}
-    given |= {"score_low": 0.0, "score_high": 2.0, "failures": None, "seed": 0}
-    given |= {"goals": 0, "steps": 80.0, "steps_learning": 90.0, "goals_alone": 2}
-    given |= {"steps_alone": 100.0, "steps_learning_alone": 100.0, "score_alone": 1.0}
-    missing = [pl.lit(value).alias(name) for name, value in given.items() if name not in columns]
-    return frame.with_columns(missing).select(*given)
-
-
-def test_whoever_fails_less_or_returns_more_is_where_it_loses_and_targets_follow():
-    found = pl.concat(
-        [
-            rows("unrevised", failed=[100]),
-            rows("rss", score=[2.0], kept=[0.6]),
-            rows("learnt", failed=[0] * 20, kept=[0.2] * 20, failed_late=[1, 1] + [0] * 18),
-        ],
-        how="vertical_relaxed",
-    )
-    page = Tasks(task="acc").page({"rows": found})
-    own, others = page.losses
-    assert own.frame["judge"].to_list() == ["learnt"]
-    assert others.frame["judge"].to_list() == ["rss"]
-    assert page.targets.select("measured", "met").rows() == [
-        ("1", True),
-        ("90%", False),
-        ("550", True),
-    ]
-    seconds = dict(zip(page.tables[2].header, page.tables[2].cells[-1], strict=True))
-    assert (seconds["judge"], seconds["of told"]) == ("learnt", "50.0 %")
-
-
 # -- Tasks and judges of one's own ----------------------------------------------------------------
 
 

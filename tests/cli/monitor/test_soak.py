@@ -13,9 +13,3 @@ def test_no_decision_is_lost_or_wrong(learn):
     assert found.wrong == 0
     assert found.rows > 2000
     assert min(found.alarms, found.junk, found.restarts) > 0
-
-
-def test_a_wrong_decision_would_be_found(monkeypatch):
-    monkeypatch.setattr(monitor_soak, "answered", lambda answer: ())
-    found = monitor_soak.soak(0.005)
-    assert found.wrong == found.rows
