@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -61,7 +62,7 @@ def learn(
             "traces of ASAM OSI (.osi, MCAP), bags of ROS 2 (folder, MCAP, db3)."
         ),
     ],
-    reading: Reading,
+    reading: partial[Reading],
     action_range: Annotated[
         str,
         option("Intervals of --action, LOW:HIGH:WIDTH; what lies beyond goes into the end ones."),
@@ -139,11 +140,11 @@ def learn(
 
     _check_out(out)
     _check_out(guard, "--guard")
-    lacking = _look_first(files[0], reading)
+    columns, lengths, topics, acts = read_so = reading()
+    lacking = _look_first(files[0], read_so)
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
-    actions = _actions(action_range if reading.acts else "0:1:1")
-    columns, lengths, topics, acts = reading
+    actions = _actions(action_range if acts else "0:1:1")
     encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
     kind = None if guard is None else _judge_of(judge if acts else "learnt", columns)

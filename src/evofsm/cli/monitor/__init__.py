@@ -6,6 +6,7 @@ import math
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import partial
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
@@ -13,28 +14,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import (
     BRAKES,
-    SKIPPED,
     TOLERANCE,
-    ActionColumn,
-    Failed,
-    Hold,
-    Hole,
     Horizon,
     Json,
-    Lengths,
     ModeName,
-    NoLeader,
     Persist,
-    Resampled,
-    SkipBad,
-    Step,
-    TimeColumn,
-    TopicsFile,
-    Units,
-    Where,
+    Reading,
     argument,
     option,
-    reading_of,
+    reads_logs,
     require,
     split_names,
 )
@@ -43,7 +31,6 @@ from evofsm.cli.show import show, warn
 if TYPE_CHECKING:
     from evofsm.cli.monitor.decider import Decider
     from evofsm.cli.monitor.transports import Transport
-    from evofsm.cli.options import Reading
     from evofsm.guard import Guard
     from evofsm.io import Chunk
 
@@ -53,6 +40,7 @@ _SAME_STEP = 0.05
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
 
 
+@reads_logs
 def monitor(
     file: Annotated[
         Path | None, argument("JSON lines; with --summary a log too. [default: standard input]")
@@ -108,21 +96,10 @@ def monitor(
     ] = False,
     observe: Annotated[
         str | None,
-        option("Columns of a log to observe. [default: the variables of the guard]", "--observe"),
+        option("Columns of a log to observe. [default: the variables of the guard]"),
     ] = None,
-    action: ActionColumn = "a_follower",
-    time: TimeColumn = "time",
-    dt: Step = None,
-    failed: Failed = None,
-    unit: Units = None,
-    topics: TopicsFile = None,
-    no_leader: NoLeader = None,
-    hold: Hold = None,
-    skip_bad: SkipBad = SKIPPED,
-    vehicle_length: Lengths = None,
-    where: Where = None,
-    resample: Resampled = None,
-    hole: Hole = None,
+    *,
+    reading: partial[Reading],
     horizon: Horizon = None,
     persist: Persist = 0.0,
     plot: Annotated[Path | None, option("Of --summary, where nobody acts: a picture.")] = None,
@@ -180,23 +157,22 @@ def monitor(
             from evofsm.fsm import Labels
 
             used = fresh() if guard else None
-            alone = action == "" or isinstance(used and used.judge, Foresight)
+            alone = reading.keywords["action"] == "" or isinstance(used and used.judge, Foresight)
             if (as_json or plot) and not (is_log and alone):
                 raise ValueError("--json and --plot are for logs where nobody acts: --action ''")
             if is_log:
                 own = used.variables if used else VARIABLES
                 if observe is None or set(split_names(observe)) == set(own):  # in its own order
                     observe = ",".join(f'"{name}"' for name in own)
-                action = "" if alone else action
-                asked = observe, action, time, episode, dt, failed, unit, topics
-                more = no_leader, hold, skip_bad, vehicle_length, where, resample, hole
-                reading = reading_of(*asked, *more)
-                chunks, interval = _episodes(file, reading, dated=alone)
+                asked = reading(
+                    observe=observe, episode=episode, **({"action": ""} if alone else {})
+                )
+                chunks, interval = _episodes(file, asked, dated=alone)
                 if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
                     what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
                     warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
             if is_log and alone:
-                labels = Labels(names=reading.columns.observe.names)
+                labels = Labels(names=asked.columns.observe.names)
                 wanted = horizon, persist, tolerance
                 show_foreseen(file, list(chunks), used, labels, wanted, plot, as_json=as_json)
                 return None

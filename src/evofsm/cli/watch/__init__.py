@@ -7,6 +7,7 @@ import re
 import webbrowser
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -66,7 +67,7 @@ def watch(
     learn_first: Annotated[int, option("Episodes to learn from before, at most.", min=0)] = 60,
     brakes: Brakes = BRAKES,
     *,
-    reading: Reading,
+    reading: partial[Reading],
     port: Annotated[int, option("Of the page; 0 for any that is free.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
 ) -> None:
@@ -88,7 +89,7 @@ def watch(
     from evofsm.io import VehicleLengths
 
     is_log = _is_log(what)
-    columns, lengths, topics, _ = reading
+    columns, lengths, topics, _ = read_so = reading()
     given = columns.episode, columns.dt, columns.failed, columns.units, columns.no_leader
     if not is_log and (any(given) or topics or lengths != VehicleLengths()):
         raise ValueError(f"options of columns are for a log, and {what} is none")
@@ -96,7 +97,7 @@ def watch(
     opened: AbstractContextManager[Session | Recording]
     if is_recorded:
         require(scipy="study", mcap="mcap")
-        opened = _recorded(what, case, judge, tolerance, brakes, reading if is_log else None)
+        opened = _recorded(what, case, judge, tolerance, brakes, read_so if is_log else None)
     else:
         opened = _driven(what, case or 1, world, judge, tolerance, seed, learn_first)
     with suppress(KeyboardInterrupt), opened as watched:
