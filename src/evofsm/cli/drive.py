@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
@@ -29,7 +29,6 @@ from evofsm.cli.show import facts, print_json, progress, say, show, warn
 if TYPE_CHECKING:
     from evofsm.cli.driving import Driving, Results, Setup
     from evofsm.guard import Guard
-    from evofsm.io.foxglove import RunWriter
 
 
 def drive(
@@ -168,11 +167,14 @@ def _drive_in_turn(
     from evofsm.driving.sumo import open_world
     from evofsm.guard import AuditLog
 
+    if mcap is not None:
+        from evofsm.io.foxglove import recording
     setup = results.setup
+    about = setup.settings | {"first": setup.first, "episodes": episodes}
     with (
         AuditLog(audit) if audit else nullcontext() as log,
         open_world(setup.world) as place,
-        _recording(setup, episodes, mcap) as run,
+        recording(mcap, about) if mcap else nullcontext() as run,
         _shown(episodes) as move,
     ):
         record = None if run is None else run.add
@@ -194,17 +196,6 @@ def _shown(episodes: int) -> Iterator[Any]:
             move(done, description=f"Driving{rate}")
 
         yield moved
-
-
-def _recording(
-    setup: Setup, episodes: int, mcap: Path | None
-) -> AbstractContextManager[RunWriter | None]:
-    """A log of the run, where one is asked for."""
-    if mcap is None:
-        return nullcontext()
-    from evofsm.io.foxglove import recording
-
-    return recording(mcap, setup.settings | {"first": setup.first, "episodes": episodes})
 
 
 # -- What came of it ------------------------------------------------------------------------------
