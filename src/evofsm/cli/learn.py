@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from shlex import quote
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from evofsm.fsm.model import FSMModel
     from evofsm.fsm.observations import ObservationEncoder
     from evofsm.guard import Guard
-    from evofsm.io import Chunk, LogColumns
+    from evofsm.io import LogColumns
     from evofsm.io.logs import Noted
 
 
@@ -134,14 +134,14 @@ def learn(
     from evofsm.cli.learning import guard_of_log, learn_traces, refusing, teach, warnings_of
     from evofsm.driving.naming import UNITS, VARIABLES
     from evofsm.fsm import Labels
-    from evofsm.io import episodes_of, read_traces
+    from evofsm.io import episodes_of
     from evofsm.io.logs import Noted
     from evofsm.io.tables import SI
 
     _check_out(out)
     _check_out(guard, "--guard")
-    columns, lengths, topics, acts = read_so = reading()
-    lacking = _look_first(files[0], read_so)
+    columns, lengths, _, acts = read = reading()
+    lacking = _look_first(files[0], read)
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
     actions = _actions(action_range if acts else "0:1:1")
@@ -157,27 +157,21 @@ def learn(
         return [SI.get(unit, unit) for unit in units]
 
     with progress("Learning", sum(file["bytes"] for file in known)) as move:  # type: ignore[misc]
-        chunks = read_traces(
-            files, columns, lengths, lambda count: move(advance=count), noted, topics
-        )
-        if not acts:  # before a hole the action is unknown still
-            chunks = (one._replace(actions=0.0 * one.actions) for one in chunks)
-        learning = learn_traces(
-            _saying(chunks, lacking), machine, actions, encoder.names, units_read
-        )
+        chunks = read.traces(files, noted, lambda count: move(advance=count))
+        learning = learn_traces(chunks, machine, actions, encoder.names, units_read)
     provenance = _provenance(learning, known, columns)
     if not acts:
         provenance["action"] = "none: nobody acts"
     warnings = warnings_of(noted, columns)
-    for warning in warnings:
-        warn(f"warning: {warning}")
+    for line in (*lacking, *(f"warning: {warning}" for warning in warnings)):
+        warn(line)
     if out is not None:
         learning.model.save(out, provenance)
     taught = None
     if guard is not None:
         assert kind is not None
         assert learning.model.dt is not None
-        rows = read_traces(files, columns, lengths, topics=topics)
+        rows = read.traces(files)
         if acts:
             reckoned = kind, learning.model.dt, brakes, tolerance
             taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
@@ -192,13 +186,14 @@ def learn(
             taught = guard_where_nobody_acts(episodes, labels, *asked, learning.machine)
         taught.save(guard, provenance)
     if as_json:
-        told = {"files": files, "saved": out, "guard": guard, **_document(learning, provenance)}
-        print_json({**told, "noted": noted, "warnings": warnings})
+        document = {"files": files, "saved": out, "guard": guard}
+        document |= _document(learning, provenance)
+        print_json({**document, "noted": noted, "warnings": warnings})
         return
-    read = [*_read(learning, columns.action * acts), *_read_otherwise(noted, columns, learning)]
+    told = [*_read(learning, columns.action * acts), *_read_otherwise(noted, columns, learning)]
     if lengths.seen:
-        read.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
-    show(facts("What was read", read), *tables_of(learning.model))
+        told.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
+    show(facts("What was read", told), *tables_of(learning.model))
     blind = 1.0 / learning.model.n_states
     if learning.certainty - blind < _UNCERTAIN * (1.0 - blind):
         show(_hardly_told_apart(learning.model, learning.certainty, rule))
@@ -353,14 +348,6 @@ def _look_first(file: str, reading: Reading) -> list[str]:
     said = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
     asked = zip(_UNASKED.items(), said, strict=True)
     return [f"{why}: {a} {quote(could[a])}" for (a, why), b in asked if b is None and a in could]
-
-
-def _saying(chunks: Iterable[Chunk], lines: list[str]) -> Iterator[Chunk]:
-    """The same chunks; lines are said once it is known that something can be read."""
-    for chunk in chunks:
-        while lines:
-            warn(lines.pop(0))
-        yield chunk
 
 
 # -- What came of it ------------------------------------------------------------------------------

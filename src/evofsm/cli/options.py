@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial, wraps
 from importlib.util import find_spec
 from inspect import Parameter, Signature, signature
@@ -19,8 +19,8 @@ from evofsm.extras import install
 if TYPE_CHECKING:
     from evofsm.driving import Family
     from evofsm.fsm.observations import ObservationEncoder
-    from evofsm.io import LogColumns, Topics, VehicleLengths
-    from evofsm.io.logs import Resample
+    from evofsm.io import Chunk, LogColumns, Topics, VehicleLengths
+    from evofsm.io.logs import Noted, Resample
 
 #: Where to drive.
 World = Literal["sumo", "kinematic"]
@@ -136,6 +136,19 @@ class Reading(NamedTuple):
     lengths: VehicleLengths
     topics: Topics | None
     acts: bool = True  #: whether somebody acts; else the action is any column, and means nothing
+
+    def traces(
+        self,
+        files: Iterable[str],
+        noted: Noted | None = None,
+        on_read: Callable[[int], object] = lambda count: None,
+    ) -> Iterator[Chunk]:
+        """What is in files."""
+        from evofsm.io import read_traces
+
+        read = read_traces(files, self.columns, self.lengths, on_read, noted, self.topics)
+        # Before a hole the action is unknown still, where somebody acts.
+        return read if self.acts else (one._replace(actions=0.0 * one.actions) for one in read)
 
 
 def reading_of(

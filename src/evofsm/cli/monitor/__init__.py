@@ -227,20 +227,20 @@ def _episodes(
 ) -> tuple[Iterator[Chunk], float]:
     """The episodes of a log, with dates where they are wanted, and the time of a step [s]."""
     from evofsm.cli.learning import warnings_of
-    from evofsm.io import episodes_of, read_traces
+    from evofsm.io import episodes_of
     from evofsm.io.logs import Noted
 
-    columns, lengths, topics, _ = reading
     noted = Noted()
-    chunks = read_traces([str(file)], columns, lengths, noted=noted, topics=topics)
-    episodes = (one for one in episodes_of(chunks) if len(one.times) > 1)
+    episodes = (
+        one for one in episodes_of(reading.traces([str(file)], noted)) if len(one.times) > 1
+    )
     if (first := next(episodes, None)) is None:
         raise ValueError(f"{file}: no episode has two rows")
 
     def all_of_them() -> Iterator[Chunk]:
         for one in chain([first], episodes):
             yield one._replace(times=one.times + noted.began) if dated else one
-        for warning in warnings_of(noted, columns):
+        for warning in warnings_of(noted, reading.columns):
             warn(f"warning: {warning}")
 
     return all_of_them(), first.dt

@@ -89,7 +89,7 @@ def watch(
     from evofsm.io import VehicleLengths
 
     is_log = _is_log(what)
-    columns, lengths, topics, _ = read_so = reading()
+    columns, lengths, topics, _ = read = reading()
     given = columns.episode, columns.dt, columns.failed, columns.units, columns.no_leader
     if not is_log and (any(given) or topics or lengths != VehicleLengths()):
         raise ValueError(f"options of columns are for a log, and {what} is none")
@@ -97,7 +97,7 @@ def watch(
     opened: AbstractContextManager[Session | Recording]
     if is_recorded:
         require(scipy="study", mcap="mcap")
-        opened = _recorded(what, case, judge, tolerance, brakes, read_so if is_log else None)
+        opened = _recorded(what, case, judge, tolerance, brakes, read if is_log else None)
     else:
         opened = _driven(what, case or 1, world, judge, tolerance, seed, learn_first)
     with suppress(KeyboardInterrupt), opened as watched:
@@ -178,7 +178,7 @@ def _recorded(
                 )
                 if is_cut:
                     warn(f"watched are the first {written:,.0f} s of the simulation")
-            stretches, more = record_log(log, run, *reading[:3], **settings, show=move)
+            stretches, more = record_log(log, run, reading, **settings, show=move)
             if more:
                 warn(f"watched are the first {MOST_ROWS:,} rows; there are more")
             recording = Recording(run, stretches)

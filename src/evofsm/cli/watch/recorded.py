@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.cli.learning import warnings_of
-from evofsm.cli.options import BRAKES
+from evofsm.cli.options import BRAKES, Reading, reading_of
 from evofsm.cli.show import warn
 from evofsm.cli.watch.shown import (
     OF_CARS,
@@ -35,10 +35,8 @@ from evofsm.driving.trials import shadow_drive
 from evofsm.fsm.naming import Labels
 from evofsm.guard import TOLERANCE, Guard, Mode
 from evofsm.io.foxglove import recording
-from evofsm.io.logs import LONGEST_STEP, Chunk, LogColumns, Noted, episodes_of, read_traces
-from evofsm.io.rosbag import Topics
+from evofsm.io.logs import LONGEST_STEP, Chunk, Noted, episodes_of
 from evofsm.io.runs import RecordedEpisode, Run, read_run
-from evofsm.io.vehicles import VehicleLengths
 
 #: More rows of a log are not watched.
 MOST_ROWS = 20_000
@@ -246,9 +244,7 @@ def _held(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 def record_log(
     path: str,
     out: Path,
-    columns: LogColumns | None = None,
-    lengths: VehicleLengths | None = None,
-    topics: Topics | None = None,
+    reading: Reading | None = None,
     *,
     judge: str = "kinematic",
     brakes: float = BRAKES,
@@ -264,19 +260,21 @@ def record_log(
     Returns what they are called, with how each failed, and whether rows after the first `MOST_ROWS`
     were left out; ``show`` is told how many were decided on.
     """
-    names = VARIABLES if columns is None else columns.observe.names
+    reading = reading or reading_of()
+    names = reading.columns.observe.names
     if len(names) != len(VARIABLES):
         raise ValueError(
             f"cars are watched by {', '.join(VARIABLES)}; --observe has to name the three columns "
             f"in this order, and names {', '.join(names)}"
         )
     noted = Noted()
-    reading = read_traces([path], columns, lengths, noted=noted, topics=topics)
     taken, more, written = 0, False, list[tuple[str, str]]()
     about: dict[str, Any] = {"source": Path(path).name, "mode": "shadow", "judge": judge}
     guard = None
     with recording(out, about | {"controller": "as recorded", "tolerance": tolerance}) as log:
-        for number, whole in enumerate(episodes_of(_first(reading, MOST_ROWS + 1)), 1):
+        for number, whole in enumerate(
+            episodes_of(_first(reading.traces([path], noted), MOST_ROWS + 1)), 1
+        ):
             more = taken + len(whole.times) > MOST_ROWS
             whole = whole.rows(0, MOST_ROWS - taken)
             taken += len(whole.times)
@@ -294,7 +292,7 @@ def record_log(
             raise ValueError(f"{path}: nobody follows anybody for {_FEWEST_ROWS} rows")
         if guard.machine is not None:
             log.attach(guard.machine.model(names=VARIABLES))
-    for warning in warnings_of(noted, columns):
+    for warning in warnings_of(noted, reading.columns):
         warn(f"warning: {warning}")
     if judge == "kinematic":
         warn(assumptions(brakes, tolerance))

@@ -172,35 +172,30 @@ class LivePage:
         broadcast([connection], f'{{"kind":"whole","parts":[{parts}]}}')
         self._clients.add(connection)
         if self.player is not None:
-            self.player.attend()
+            self.player.set(awaits=False)
         try:
-            await self._obey_all(connection)
+            async for text in connection:
+                if not isinstance(text, str):
+                    await connection.close(_NOT_TEXT, "commands are text")
+                    return
+                self._obey(msgspec.json.decode(text, type=_Command))
         except ConnectionClosed:
             pass
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            await connection.close(_NOT_UNDERSTOOD, "no such command")
         finally:
             self._clients.discard(connection)
-
-    async def _obey_all(self, connection: ServerConnection) -> None:
-        async for text in connection:
-            if not isinstance(text, str):
-                await connection.close(_NOT_TEXT, "commands are text")
-                return
-            try:
-                self._obey(msgspec.json.decode(text, type=_Command))
-            except (msgspec.MsgspecError, ValueError, RecursionError):
-                await connection.close(_NOT_UNDERSTOOD, "no such command")
-                return
 
     def _obey(self, command: _Command) -> None:
         if self.player is None or self._start is None:
             return
         match (command.do, command.value):
             case ("pause", bool(paused)):
-                self.player.pause(paused)
+                self.player.set(paused=paused)
             case ("step", None):
-                self.player.step()
+                self.player.set(paused=True, steps=True)
             case ("speed", float(speed)) if speed in SPEEDS:
-                self.player.speed(speed)
+                self.player.set(speed=speed)
             case ("revise", bool(on)) if self._start.mode == LIVE:
                 self.player.revise(on)
             case ("restart", None):

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 import re
 import runpy
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self
@@ -65,8 +65,8 @@ from evofsm.guard.actions import Action, Choices, change, is_usable, limits, put
 #: The state rule for looking on: coarse enough that each state can be told from the others.
 WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
 
-# So many draws can be chosen among where there are no cases.
-_DRAWS = 12
+# What can be chosen among where there are no cases.
+_DRAWS = tuple(f"draw {number}" for number in range(1, 13))
 # After a leader's full brake there is nothing left to see once all have stood for so long [s].
 _STANDING = 3.0
 # Steps of an environment in a second where it does not say; wishes that are tolerable for so many
@@ -143,7 +143,7 @@ class OnRoads:
         self.family, self.world, self.seed = family, world, seed
         self.name, self.about, self.interval = family.name, family.about, family.interval
         self.labels = family.labels
-        self.cases = family.variants if family.cases > 1 else _draws()
+        self.cases = family.variants if family.cases > 1 else _DRAWS
         self._closing = ExitStack()
 
     def teach(self, guard: Guard, index: int) -> None:
@@ -232,7 +232,7 @@ class Simulated:
     ) -> None:
         with needs("gymnasium", "gym", "an environment of Gymnasium"):
             from evofsm.guard import gym
-        self.name, self.seed, self.cases = name, seed, _draws()
+        self.name, self.seed, self.cases = name, seed, _DRAWS
         self._gym, self._env, self._controller, self._failed = gym, env, controller, failed
         self.interval = 1.0 / float(env.metadata.get("render_fps") or _STEPS_PER_SECOND)
         acts = "Its own controller" if controller else "A controller that acts at random"
@@ -246,9 +246,10 @@ class Simulated:
         spaces = env.observation_space, env.action_space
         self._terms = gym.Terms(made, *spaces, None, failed, 0.0)
         seen = np.array([z for k in range(_LOOKED_AT) for z in self._run(env, -1 - k)])
+        spreads = [spread or 1.0 for spread in seen.std(0).tolist()]
         machine = EvolvingFSM(
             made.actions.n_actions,
-            rule=Novelty(_STATES_APART * math.sqrt(seen.shape[1]), _scales(seen)),
+            rule=Novelty(_STATES_APART * math.sqrt(seen.shape[1]), spreads),
             max_states=_MOST_STATES,
             belief_tolerance=BELIEF_TOLERANCE,
         )
@@ -339,11 +340,6 @@ def _ends(name: str, space: Any) -> dict[str, Any]:
     return {"low": low, "high": high} if len(low) > 1 else {"low": low[0], "high": high[0]}
 
 
-def _scales(seen: NDArray[np.float64]) -> list[float]:
-    """How far variables spread; 1 of one that did not."""
-    return [spread or 1.0 for spread in seen.std(0).tolist()]
-
-
 def read_simulated(what: str, **settings: Any) -> Simulated | None:
     """An environment by its id, or what a file of Python defines; None where it is none.
 
@@ -352,7 +348,7 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
     `evofsm.guard.RevisedActions` takes it, and ``variables``, their names.
     """
     if what.endswith(".py"):
-        with _of_file(what):
+        try:
             found = runpy.run_path(what)
             if "environment" not in found:
                 if "family" in found:
@@ -360,6 +356,8 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
                 raise ValueError("it defines neither environment() nor a Family called family")
             own = {name: found[name] for name in _PARTS if name in found}
             return Simulated(Path(what).stem, found["environment"](), **own, **settings)
+        except Exception as error:  # of somebody's own
+            raise ValueError(f"{what}: {type(error).__name__}: {error}") from error
     if not re.search(r"-v\d+$", what):
         return None
     with needs("gymnasium", "gym", "an environment of Gymnasium"):
@@ -368,15 +366,6 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
         return Simulated(what, gymnasium.make(what), **settings)
     except gymnasium.error.Error as error:
         raise ValueError(f"{what}: {error}") from error
-
-
-@contextmanager
-def _of_file(path: str) -> Iterator[None]:
-    """Errors of a file of somebody's own tell which file it is."""
-    try:
-        yield
-    except Exception as error:
-        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
 
 
 System = OnRoads | Simulated
@@ -395,7 +384,8 @@ class Session:
         self._tolerance = float(self._reviser.tolerance)  # type: ignore[attr-defined]
         guard.explaining = True
         # As a decision logger it is told of each before anything is learnt from it.
-        told: Any = SimpleNamespace(begin=_ignore, seen=_ignore, decided=self._ask, ended=_ignore)
+        rest = dict.fromkeys(("begin", "seen", "ended"), lambda *_, **__: None)
+        told: Any = SimpleNamespace(decided=self._ask, **rest)
         guard.audit = told
         self.revising = on
         self.start = self.restart()
@@ -539,14 +529,6 @@ class Session:
         if system.failed:
             novel = first_of_its_kind(frame.observation, before, self.known())
         return frame._replace(over=True, failed=system.failed, novel=novel)
-
-
-def _ignore(*told: Any, **named: Any) -> None:
-    """What need not be known."""
-
-
-def _draws() -> tuple[str, ...]:
-    return tuple(f"draw {number}" for number in range(1, _DRAWS + 1))
 
 
 def _judged(judged: Judgement, option: int) -> Judged:
