@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import (
     ByJudge,
@@ -29,6 +29,14 @@ from evofsm.cli.show import facts, print_json, progress, say, show, warn
 if TYPE_CHECKING:
     from evofsm.cli.driving import Driving, Results, Setup
     from evofsm.guard import Guard
+
+# Options that exclude each other, and why.
+_EXCLUDE = {
+    ("learn", "workers"): "whoever learns drives episodes one after the other",
+    ("audit", "workers"): "workers send no decisions",
+    ("mcap", "workers"): "workers send no decisions",
+    ("learn", "frozen"): "whoever is frozen learns nothing",
+}
 
 
 def drive(
@@ -92,7 +100,9 @@ def drive(
 
         run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
-    _refuse_pairs(given)
+    for (one, other), reason in _EXCLUDE.items():
+        if one in given and other in given:
+            raise ValueError(f"--{one} and --{other} exclude each other: {reason}")
     require_world(world, **({"polars": "tables"} if out is not None and workers is None else {}))
     require(**({} if mcap is None else {"mcap": "mcap"}))
     from evofsm.cli.driving import GUARD, Results, Setup, drive_at_once, load_guard, make_guard
@@ -119,7 +129,7 @@ def drive(
             raise ValueError(f"--mcap holds what one run drives, but {found}")
         try:
             if workers is not None:
-                with _shown(episodes) as move:
+                with progress("Driving", episodes) as move:
                     driving = drive_at_once(results, episodes, workers, move)
             else:
                 driving = _drive_in_turn(results, episodes, audit, mcap)
@@ -138,19 +148,6 @@ def drive(
     if mcap is not None:
         say(f"Every episode, for Foxglove: {mcap}")
     return None
-
-
-def _refuse_pairs(given: dict[str, Any]) -> None:
-    """Raise where two options exclude each other."""
-    why = {
-        ("learn", "workers"): "whoever learns drives episodes one after the other",
-        ("audit", "workers"): "workers send no decisions",
-        ("mcap", "workers"): "workers send no decisions",
-        ("learn", "frozen"): "whoever is frozen learns nothing",
-    }
-    for (one, other), reason in why.items():
-        if one in given and other in given:
-            raise ValueError(f"--{one} and --{other} exclude each other: {reason}")
 
 
 # -- Driving --------------------------------------------------------------------------------------
@@ -175,7 +172,7 @@ def _drive_in_turn(
         AuditLog(audit) if audit else nullcontext() as log,
         open_world(setup.world) as place,
         recording(mcap, about) if mcap else nullcontext() as run,
-        _shown(episodes) as move,
+        progress("Driving", episodes) as move,
     ):
         record = None if run is None else run.add
         driving = drive_in_turn(results, episodes, place, move, log, record)
@@ -184,18 +181,6 @@ def _drive_in_turn(
     if log is not None:
         warn(f"head of {audit}, to be kept elsewhere: {log.head}")
     return driving
-
-
-@contextmanager
-def _shown(episodes: int) -> Iterator[Any]:
-    """A bar that shows the collisions so far."""
-    with progress("Driving", episodes) as move:
-
-        def moved(done: int, collisions: int) -> None:
-            rate = f" ({collisions} collisions, {collisions / done:.1%})" if done else ""
-            move(done, description=f"Driving{rate}")
-
-        yield moved
 
 
 # -- What came of it ------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 from evofsm import store
 from evofsm.cli.journal import Journal
+from evofsm.cli.show import Advance
 from evofsm.driving import (
     EnvelopeReviser,
     Episode,
@@ -60,7 +61,6 @@ _EVERY = 60.0
 _BATCH = 20
 
 Outcomes = dict[str, Any]
-Show = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -184,9 +184,11 @@ class Results:
         if self._journal is not None:
             self._journal.append(row)
 
-    def show(self, show: Show) -> None:
+    def show(self, move: Advance) -> None:
         """Tell how many were driven, and with how many collisions."""
-        show(len(self.rows), self._collisions)
+        done, met = len(self.rows), self._collisions
+        rate = f" ({met} collisions, {met / done:.1%})" if done else ""
+        move(done, description=f"Driving{rate}")
 
     def save_guard(self, *, now: bool = False) -> None:
         """Write what was learnt from all rows, if it was not for a while."""
@@ -261,7 +263,7 @@ def drive_in_turn(
     results: Results,
     episodes: int,
     world: World,
-    show: Show = lambda done, collisions: None,
+    move: Advance = lambda *_, **__: None,
     audit: DecisionLogger | None = None,
     record: Callable[[Episode], None] | None = None,
 ) -> Driving:
@@ -280,7 +282,7 @@ def drive_in_turn(
         results.add({**row, "decided": _decided(driven)})
         if setup.learn:
             results.save_guard()
-        results.show(show)
+        results.show(move)
     return results.summed_up(episodes)
 
 
@@ -291,7 +293,7 @@ def drive_at_once(
     results: Results,
     episodes: int,
     workers: int,
-    show: Show = lambda done, collisions: None,
+    move: Advance = lambda *_, **__: None,
 ) -> Driving:
     """Drive those held-out episodes that the results lack, by many workers.
 
@@ -302,13 +304,13 @@ def drive_at_once(
     trial = results.setup.trial(guard, results.setup.world)
     missing = [number for number in range(episodes) if number not in results.rows]
     size = max(1, min(_BATCH, len(missing) // (8 * workers)))
-    results.show(show)
+    results.show(move)
     # Forking a process that has started threads may hang; a fresh one costs a second.
     pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_work)
     try:
         for row in pool.map(trial, missing, chunksize=size):
             results.add(row)
-            results.show(show)
+            results.show(move)
         return results.summed_up(episodes)
     except BrokenExecutor:
         raise ChildProcessError(

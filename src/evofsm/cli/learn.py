@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from shlex import quote
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from evofsm.fsm.model import FSMModel
     from evofsm.fsm.observations import ObservationEncoder
     from evofsm.guard import Guard
-    from evofsm.io import LogColumns
+    from evofsm.io import Chunk, LogColumns
     from evofsm.io.logs import Noted
 
 
@@ -157,14 +157,14 @@ def learn(
         return [SI.get(unit, unit) for unit in units]
 
     with progress("Learning", sum(file["bytes"] for file in known)) as move:  # type: ignore[misc]
-        chunks = read.traces(files, noted, lambda count: move(advance=count))
+        chunks = _saying(read.traces(files, noted, lambda count: move(advance=count)), lacking)
         learning = learn_traces(chunks, machine, actions, encoder.names, units_read)
     provenance = _provenance(learning, known, columns)
     if not acts:
         provenance["action"] = "none: nobody acts"
     warnings = warnings_of(noted, columns)
-    for line in (*lacking, *(f"warning: {warning}" for warning in warnings)):
-        warn(line)
+    for warning in warnings:
+        warn(f"warning: {warning}")
     if out is not None:
         learning.model.save(out, provenance)
     taught = None
@@ -348,6 +348,14 @@ def _look_first(file: str, reading: Reading) -> list[str]:
     said = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
     asked = zip(_UNASKED.items(), said, strict=True)
     return [f"{why}: {a} {quote(could[a])}" for (a, why), b in asked if b is None and a in could]
+
+
+def _saying(chunks: Iterable[Chunk], lines: list[str]) -> Iterator[Chunk]:
+    """The same chunks; lines are said once it is known that something can be read."""
+    for chunk in chunks:
+        while lines:
+            warn(lines.pop(0))
+        yield chunk
 
 
 # -- What came of it ------------------------------------------------------------------------------

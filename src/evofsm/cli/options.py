@@ -6,6 +6,7 @@ import importlib
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial, wraps
 from importlib.util import find_spec
 from inspect import Parameter, Signature, signature
@@ -17,6 +18,8 @@ import typer
 from evofsm.extras import install
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from evofsm.driving import Family
     from evofsm.fsm.observations import ObservationEncoder
     from evofsm.io import Chunk, LogColumns, Topics, VehicleLengths
@@ -74,6 +77,17 @@ def require(**extras: str) -> None:
     if lacking := [package for package in extras if find_spec(package) is None]:
         command = install(*dict.fromkeys(["cli", *(extras[package] for package in lacking)]))
         raise ModuleNotFoundError(f"this needs {' and '.join(lacking)}: {command}")
+
+
+@contextmanager
+def picture(out: Path, width: float, height: float) -> Iterator[Figure]:
+    """A figure [inch] in the house's style, which then is written to a file."""
+    from matplotlib.figure import Figure
+    from matplotlib.style import context
+
+    with context(["default", "evofsm.paper.house"]):
+        yield (figure := Figure((width, height), layout="constrained"))
+        figure.savefig(out)
 
 
 def require_world(world: World, **extras: str) -> None:

@@ -151,42 +151,28 @@ def monitor(
         raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns of a log")
     rows = EPISODE if episode is None or is_log else int(episode)
     with ExitStack() as stack:
-        if summary and file is not None:
+        chunks, saved = None, None
+        if summary and file is not None and is_log:
             from evofsm.cli.foreseen import show_foreseen
-            from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
             from evofsm.fsm import Labels
 
             used = fresh() if guard else None
             alone = reading.keywords["action"] == "" or isinstance(used and used.judge, Foresight)
-            if (as_json or plot) and not (is_log and alone):
-                raise ValueError("--json and --plot are for logs where nobody acts: --action ''")
-            if is_log:
-                own = used.variables if used else VARIABLES
-                if observe is None or set(split_names(observe)) == set(own):  # in its own order
-                    observe = ",".join(f'"{name}"' for name in own)
-                asked = reading(
-                    observe=observe, episode=episode, **({"action": ""} if alone else {})
-                )
-                chunks, interval = _episodes(file, asked, dated=alone)
-                if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
-                    what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
-                    warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
-            if is_log and alone:
+            own = used.variables if used else VARIABLES
+            if observe is None or set(split_names(observe)) == set(own):  # in its own order
+                observe = ",".join(f'"{name}"' for name in own)
+            asked = reading(observe=observe, episode=episode, **({"action": ""} if alone else {}))
+            chunks, interval = _episodes(file, asked, dated=alone)
+            if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
+                what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
+                warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
+            if alone:
                 labels = Labels(names=asked.columns.observe.names)
                 wanted = horizon, persist, tolerance
                 show_foreseen(file, list(chunks), used, labels, wanted, plot, as_json=as_json)
                 return None
-            used = used or fresh()
-            _prepare(used, mode, tolerance, None, stack, learn=learn)
-            warn(_of_saved(guard, used) if guard else assumptions(reckoned, tolerated))
-            decider = Decider(used, episode=rows)
-            if is_log:
-                answers = decided_on_log(decider, chunks)
-            else:
-                answers = decided_on_lines(decider, file)
-            show(*summary_of(decider, answers, str(file)))
-            return None
-        saved = None
+        if summary and (as_json or plot):
+            raise ValueError("--json and --plot are for logs where nobody acts: --action ''")
         if state is not None:
             is_other = guard is not None and guard.resolve() != state.resolve()
             given = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
@@ -194,11 +180,19 @@ def monitor(
             told = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
             saved = State(state, {"guard": given, **made, **told})
             stack.callback(saved.close)
-        elif learn:
+        elif learn and not summary:
             warn("nothing of what is learnt is saved; --state FILE saves it")
         used = fresh() if saved is None else saved.guard(fresh)
         _prepare(used, mode, tolerance, audit, stack, learn=learn)
         decider = Decider(used, episode=rows)
+        assumed = _of_saved(guard, used) if guard else assumptions(reckoned, tolerated)
+        if summary and file is not None:
+            from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
+
+            warn(assumed)
+            answers = decided_on_log(decider, chunks) if chunks else decided_on_lines(decider, file)
+            show(*summary_of(decider, answers, str(file)))
+            return None
         if warm:
             _compile(decider)
         if saved is not None:
@@ -208,7 +202,7 @@ def monitor(
         each = math.inf if heartbeat is None else positive("--heartbeat", heartbeat)
         server = Server(decider, each)
         transport, where = _transport(file, socket, udp, zenoh, stack)
-        warn(_of_saved(guard, used) if guard else assumptions(reckoned, tolerated))
+        warn(assumed)
         if where:
             warn(f"listens to {where}")
         try:
@@ -256,14 +250,13 @@ def _prepare(
     learn: bool,
 ) -> None:
     """Set how far it goes, whether it learns, and who writes it down."""
+    from evofsm.fsm.validation import probability
     from evofsm.guard import ActionReviser, AuditLog, Mode
 
     if isinstance(guard.reviser, ActionReviser):
         guard.reviser.mode = Mode(mode)
         if tolerance is not None:
-            if not 0.0 < tolerance < 1.0:
-                raise ValueError(f"--tolerance is {tolerance:g}; it must be between 0 and 1")
-            guard.reviser.tolerance = tolerance
+            guard.reviser.tolerance = probability("--tolerance", tolerance)
     elif mode != "act":
         name = type(guard.reviser).__name__
         raise ValueError(f"a {name} knows no --mode {mode}: what it says is executed")

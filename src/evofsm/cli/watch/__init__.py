@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import re
 import webbrowser
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, suppress
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,6 +24,7 @@ from evofsm.cli.options import (
     World,
     argument,
     option,
+    reading_of,
     reads_logs,
     require,
     require_world,
@@ -86,21 +87,17 @@ def watch(
     begins when the page is first opened. Ctrl-C ends it.
     """
     require(websockets="watch")
-    from evofsm.io import VehicleLengths
-
-    is_log = _is_log(what)
-    columns, lengths, topics, _ = read = reading()
-    given = columns.episode, columns.dt, columns.failed, columns.units, columns.no_leader
-    if not is_log and (any(given) or topics or lengths != VehicleLengths()):
+    is_log, usual = _is_log(what), signature(reading_of).parameters
+    given = (name for name, one in reading.keywords.items() if one not in (usual[name].default, []))
+    if not is_log and any(given):
         raise ValueError(f"options of columns are for a log, and {what} is none")
-    is_recorded = is_log or what.endswith(".mcap")
-    opened: AbstractContextManager[Session | Recording]
-    if is_recorded:
-        require(scipy="study", mcap="mcap")
-        opened = _recorded(what, case, judge, tolerance, brakes, read if is_log else None)
-    else:
-        opened = _driven(what, case or 1, world, judge, tolerance, seed, learn_first)
-    with suppress(KeyboardInterrupt), opened as watched:
+    read = reading() if is_log else None
+    with suppress(KeyboardInterrupt), ExitStack() as stack:
+        watched: Session | Recording
+        if is_log or what.endswith(".mcap"):
+            watched = _recorded(what, case, judge, tolerance, brakes, read)
+        else:
+            watched = _driven(stack, what, case or 1, world, judge, tolerance, seed, learn_first)
         asyncio.run(_serve(watched, port, browse=not no_browser))
     say("\nThe page is closed.")
 
@@ -158,8 +155,9 @@ def _recorded(
     tolerance: float,
     brakes: float,
     reading: Reading | None,
-) -> AbstractContextManager[Session | Recording]:
+) -> Recording:
     """A run that was recorded, or a log with what a guard would have said; read beforehand."""
+    require(scipy="study", mcap="mcap")
     from tempfile import TemporaryDirectory
 
     from evofsm.cli.sumocfg import trace_configuration
@@ -184,11 +182,11 @@ def _recorded(
             recording = Recording(run, stretches)
     if case is not None:
         recording.choose(case - 1)
-    return nullcontext(recording)
+    return recording
 
 
-@contextmanager
 def _driven(
+    stack: ExitStack,
     what: str,
     case: int,
     world: World,
@@ -196,7 +194,7 @@ def _driven(
     tolerance: float,
     seed: int,
     episodes: int,
-) -> Iterator[Session]:
+) -> Session:
     """A session of cars in a world of their own, or of an environment."""
     from evofsm.cli.watch.session import (
         OnRoads,
@@ -207,18 +205,17 @@ def _driven(
         watched_guard,
     )
 
-    with ExitStack() as stack:
-        simulated = read_simulated(what, seed=seed, tolerance=tolerance)
-        if simulated is None:
-            require_world(world)
-            from evofsm.driving import load_family
-            from evofsm.driving.sumo import open_world
+    simulated = read_simulated(what, seed=seed, tolerance=tolerance)
+    if simulated is None:
+        require_world(world)
+        from evofsm.driving import load_family
+        from evofsm.driving.sumo import open_world
 
-            family = load_family(what)
-            system: System = OnRoads(family, stack.enter_context(open_world(world)), seed)
-            guard = watched_guard(family, judge=judge, tolerance=tolerance)
-        else:
-            system, guard = simulated, simulated.guard
-        with progress("Learning first", episodes) as move:
-            learn_first(guard, system, episodes, move)
-        yield stack.enter_context(Session(system, guard, case=case - 1))
+        family = load_family(what)
+        system: System = OnRoads(family, stack.enter_context(open_world(world)), seed)
+        guard = watched_guard(family, judge=judge, tolerance=tolerance)
+    else:
+        system, guard = simulated, simulated.guard
+    with progress("Learning first", episodes) as move:
+        learn_first(guard, system, episodes, move)
+    return stack.enter_context(Session(system, guard, case=case - 1))

@@ -63,11 +63,13 @@ class Player:
         self._order: Callable[[], object] | None = None  # of what may take time, the latest
         self._news = asyncio.Event()
 
-    def set(self, **changes: bool | float) -> None:
-        """Play on otherwise: ``paused``, at a ``speed``, or no longer as one that ``awaits``.
+    def attend(self) -> None:
+        """Someone looks on: play, if that was waited for."""
+        if self._awaits:
+            self.set(awaits=False)
 
-        With ``steps`` there is one more decision, although it is paused.
-        """
+    def set(self, **changes: bool | float) -> None:
+        """Play on otherwise: ``paused``, or at a ``speed``; with ``steps`` once, though paused."""
         for name, value in changes.items():
             setattr(self, f"_{name}", value)
         self._due = time.monotonic()

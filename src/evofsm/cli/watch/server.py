@@ -172,7 +172,7 @@ class LivePage:
         broadcast([connection], f'{{"kind":"whole","parts":[{parts}]}}')
         self._clients.add(connection)
         if self.player is not None:
-            self.player.set(awaits=False)
+            self.player.attend()
         try:
             async for text in connection:
                 if not isinstance(text, str):

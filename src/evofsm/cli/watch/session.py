@@ -159,7 +159,7 @@ class OnRoads:
         self.alone = float(alone.time[-1]) if alone.collided else math.inf
         self._road = self._closing.enter_context(self.world.open(draw.scenario))
         self._steps = draw.scenario.steps(self.interval)
-        self._row, self._position, self._stood = 0, 0.0, 0.0
+        self._stood = 0.0
         self._held = np.full(3, np.nan)
         self._look()
 
@@ -182,11 +182,9 @@ class OnRoads:
 
     def cars(self) -> Cars:
         """Where they are."""
-        road = self._road
-        record = road.episode(self._row).record
-        speeds, now = record[:, SPEED], record[-1]
-        self._position += float(0.5 * (speeds[1:] + speeds[:-1]).sum() * road.scenario.dt)
-        self._row = road.row
+        road, episode = self._road, self._road.episode()
+        record, speeds, now = episode.record, episode.record[:, SPEED], episode.record[-1]
+        driven = 0.5 * (speeds[1:] + speeds[:-1]).sum() * road.scenario.dt
         a_leader = float(record[-2, LEADER_ACCELERATION]) if len(record) > 1 else math.nan
         stands = now[SPEED] == now[LEADER_SPEED] == 0.0 and a_leader < 0.0
         self._stood = self._stood + self.interval if stands else 0.0
@@ -195,9 +193,9 @@ class OnRoads:
             gap=float(now[GAP]),
             v_follower=float(speeds[-1]),
             v_leader=float(now[LEADER_SPEED]),
-            a_follower=float(road.episode(max(0, road.row - 1)).realised[0]),
+            a_follower=float(episode.realised[-2:][0]),
             a_leader=a_leader,
-            x_follower=self._position,
+            x_follower=float(driven),
             time_to_collision=float(time_to_collision(seen)),
             time_headway=float(time_headway(seen)),
             gap_behind=float(now[GAP_BEHIND]),
