@@ -16,13 +16,12 @@ from evofsm.cli.options import (
     Json,
     ModeName,
     Seed,
-    Switches,
     Tolerance,
     argument,
-    family_of,
     option,
     require,
     require_world,
+    split_names,
 )
 from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
@@ -55,7 +54,9 @@ def drive(
     judge: ByJudge = "kinematic",
     mode: Annotated[ModeName, option("How far least-risk goes.")] = "act",
     tolerance: Tolerance = 0.02,
-    switches: Switches = "",
+    switches: Annotated[
+        str, option("noise, delay, actuator, jerk, third_car; with commas.", "--with")
+    ] = "",
     seed: Seed = 0,
     learn: Annotated[
         Path | None, option("Go on learning from this folder of an earlier --out.")
@@ -106,10 +107,11 @@ def drive(
     require_world(world, **({"polars": "tables"} if out is not None and workers is None else {}))
     require(**({} if mcap is None else {"mcap": "mcap"}))
     from evofsm.cli.driving import GUARD, Results, Setup, drive_at_once, load_guard, make_guard
+    from evofsm.driving import load_family
     from evofsm.guard import Mode
 
     setup = Setup(
-        family_of(family, switches),
+        load_family(family).with_switches(split_names(switches)),
         reviser,
         judge,
         Mode(mode),

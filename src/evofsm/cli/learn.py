@@ -215,16 +215,13 @@ def _actions(text: str) -> IntervalActions:
     from evofsm.fsm.actions import IntervalActions
 
     try:
-        low, high, width = (float(number) for number in text.split(":"))
-    except ValueError:
-        what = "write LOW:HIGH:WIDTH, such as -2.5:2.5:0.3"
-        raise ValueError(f"--action-range is {text!r}; {what}") from None
-    try:
+        low, high, width = map(float, text.split(":"))
         if width > 0.0 and (high - low) / width > _MOST_ACTIONS:
             raise ValueError(f"more than {_MOST_ACTIONS} intervals; make them wider")
         return IntervalActions(low, high, width, outside="clip")
     except ValueError as error:
-        raise ValueError(f"--action-range {text}: {error}") from None
+        what = "write LOW:HIGH:WIDTH, such as -2.5:2.5:0.3"
+        raise ValueError(f"--action-range is {text!r}: {error}; {what}") from None
 
 
 def _machine(

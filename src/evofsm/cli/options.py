@@ -20,7 +20,6 @@ from evofsm.extras import install
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evofsm.driving import Family
     from evofsm.fsm.observations import ObservationEncoder
     from evofsm.io import Chunk, LogColumns, Topics, VehicleLengths
     from evofsm.io.logs import Noted, Resample
@@ -69,7 +68,6 @@ Brakes = Annotated[
     float,
     option("Hardest braking of the own car, that a guard reckons with [m/s²].", min=0.5, max=20.0),
 ]
-Switches = Annotated[str, option("noise, delay, actuator, jerk, third_car; with commas.", "--with")]
 
 
 def require(**extras: str) -> None:
@@ -134,13 +132,6 @@ def _named(text: str) -> list[tuple[str, str]]:
 
     found = re.findall(r'(?:"(?:[^"]|"")*"(?=\s*(?:[,=]|$))|[^,])+', text)
     return [quoted_name(one.strip()) for one in found if one.strip()]
-
-
-def family_of(name: str, switches: str) -> Family:
-    """The family of this name or file, with the switches."""
-    from evofsm.driving import load_family
-
-    return load_family(name).with_switches(split_names(switches))
 
 
 class Reading(NamedTuple):

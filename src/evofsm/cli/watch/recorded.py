@@ -110,11 +110,13 @@ class Recording:
         columns = self._episode.columns
         passed = (np.abs(columns["advised"] - columns["executed"]) > _SAME).any()
         idle = _IDLE.get(self._mode, _PASSED if passed else "")
-        chronicle, frames = Chronicle(self.start.tolerance), list(_moved(self._episode, idle))
-        for number, frame in enumerate(frames):
-            frame = self._decided(frame, number) if number + 1 < len(frames) else self._end(frame)
-            frames[number] = frame._replace(story=chronicle.tell(frame))
-        self._frames = frames
+        chronicle, self._frames = Chronicle(self.start.tolerance), list[Frame]()
+        for number, frame in enumerate(_moved(self._episode, idle)):
+            if number < len(columns["time"]):
+                frame = self._decided(frame, number)
+            else:
+                frame = frame._replace(over=True, failed=bool(self._fail))
+            self._frames.append(frame._replace(story=chronicle.tell(frame)))
         return self.start
 
     def choose(self, number: int) -> Start:
@@ -154,7 +156,6 @@ class Recording:
             names=OF_CARS,
             low=(float(np.nanmin(commands)),),
             high=(float(np.nanmax(commands)),),
-            learnt=0,
             judge=about.get("judge", "kinematic"),
             mode=self._mode,
             unjudged="the reviser was off" if self._mode == "off" else unjudged,
@@ -191,11 +192,6 @@ class Recording:
             executed_risk=executed,
         )
 
-    def _end(self, frame: Frame) -> Frame:
-        assert frame.cars is not None
-        cars = frame.cars._replace(rear_ended=self._episode.rear_ended)
-        return frame._replace(over=True, failed=bool(self._fail), cars=cars)
-
 
 def _moved(episode: RecordedEpisode, idle: str) -> Iterator[Frame]:
     """Where the cars are at each decision and at the end, and how they got there."""
@@ -224,6 +220,7 @@ def _moved(episode: RecordedEpisode, idle: str) -> Iterator[Frame]:
                 x_follower=float(positions[number]),
                 time_to_collision=float(time_to_collision(observed[number])),
                 time_headway=float(time_headway(observed[number])),
+                rear_ended=episode.rear_ended and number == len(columns["time"]),
             ),
         )
 

@@ -9,10 +9,10 @@ import math
 import re
 import runpy
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -372,7 +372,7 @@ System = OnRoads | Simulated
 # -- A run ----------------------------------------------------------------------------------------
 
 
-class Session:
+class Session(AbstractContextManager["Session"]):
     """One run of a system after another, each driven decision by decision."""
 
     def __init__(self, system: System, guard: Guard, *, case: int = 0, on: bool = True) -> None:
@@ -444,9 +444,6 @@ class Session:
         """What is known of failure."""
         return known_of(self.judge)
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *error: object) -> None:
         self.system.close()
 
@@ -477,7 +474,6 @@ class Session:
             cars=is_cars,
             learnt=self._guard.n_episodes,
             judge=name_judge(self.judge),
-            unjudged="no failure was known yet",
         )
 
     def _decide(self, frame: Frame) -> Frame:
