@@ -96,7 +96,6 @@ def drive(
         if given:
             what = "is for families of scenarios, not for a configuration"
             raise ValueError(f"--{next(iter(given))} {what}")
-        require(libsumo="sumo")
         from evofsm.cli.sumocfg import run_configuration
 
         run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)

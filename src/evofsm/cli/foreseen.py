@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evofsm.cli.options import picture, require
+from evofsm.cli.options import picture
 from evofsm.cli.show import facts, print_json, show, table
 from evofsm.fsm import EvolvingFSM, Labels
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
@@ -191,7 +191,6 @@ def _draw(
     out: Path,
 ) -> None:
     """Variables, states, risk, alarms and failures over time: all of it, and the last failure."""
-    require(matplotlib="plot")
     from evofsm import plot
 
     chosen = judge.rate_of(tolerance)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from evofsm.cli.options import Json, Saved, option, picture, require, split_names
+from evofsm.cli.options import Json, Saved, option, picture, split_names
 from evofsm.cli.show import facts, print_json, say, show, table
 
 if TYPE_CHECKING:
@@ -73,7 +73,6 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None, Guard | None]:
             raise FileNotFoundError(f"{place}: there is neither {' nor '.join(_MODELS)} in it")
         return load_model(found)
     if place.suffix == ".mcap":
-        require(mcap="mcap")
         from evofsm.io import read_run
 
         model = read_run(place).model
@@ -99,7 +98,6 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None, Guard | None]:
 
 def _draw(model: FSMModel, guard: Guard | None, out: Path, axes: str | None) -> None:
     """States in the plane of two variables, and what a guard has learnt of failure."""
-    require(matplotlib="plot")
     from evofsm import plot
     from evofsm.guard import LearntRisk
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from shlex import quote
 from typing import NamedTuple
@@ -110,7 +109,7 @@ def learn_traces(
 ) -> Learning:
     """Learn all chunks in their order, each row once; units are known once they are read."""
     machine, read = machine.copy(), Read()
-    for chunk in _ahead(chunks):
+    for chunk in chunks:
         _learn(machine, actions, chunk, read)
     model = machine.model(
         actions=actions, names=names, units=units(), dt=None if np.isnan(read.dt) else read.dt
@@ -251,16 +250,6 @@ def refusing(share: float) -> str:
     why = "what moves the system is not observed (a valve, a set point, a load: name it in "
     why += "--observe), a column is in another unit, or no action in the range averts the failure"
     return f"refuses {share:.0%} of the time: perhaps {why}" if share > 0.5 else ""
-
-
-def _ahead(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-    """The same chunks; another thread reads the next one while one is learnt."""
-    waiting = iter(chunks)
-    with ThreadPoolExecutor(1) as reader:
-        coming = reader.submit(next, waiting, None)
-        while (chunk := coming.result()) is not None:
-            coming = reader.submit(next, waiting, None)
-            yield chunk
 
 
 def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: Read) -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 from evofsm.cli.options import (
     BRAKES,
     TOLERANCE,
+    Brakes,
     Horizon,
     Json,
     ModeName,
@@ -23,7 +24,6 @@ from evofsm.cli.options import (
     argument,
     option,
     reads_logs,
-    require,
     split_names,
 )
 from evofsm.cli.show import show, warn
@@ -47,14 +47,7 @@ def monitor(
     ] = None,
     guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
     interval: Annotated[float, option("Time between two rows [s], without --guard.")] = 0.1,
-    brakes: Annotated[
-        float | None,
-        option(
-            f"Hardest braking of the own car [m/s²], without --guard. [default: {BRAKES:g}]",
-            min=0.5,
-            max=20.0,
-        ),
-    ] = None,
+    brakes: Brakes = BRAKES,
     tolerance: Annotated[
         float | None,
         option(f"Highest risk that is accepted. [default: of --guard, or {TOLERANCE:g}]"),
@@ -126,7 +119,6 @@ def monitor(
         raise ValueError("--traffic learns nothing: it goes with no --guard, --state or --learn")
     if summary and (file is None or state or audit):
         raise ValueError("--summary needs FILE, and goes with no --state or --audit")
-    require(**({} if zenoh is None else {"zenoh": "zenoh"}))
     from evofsm.cli.monitor.decider import EPISODE, Decider
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.transports import Server
@@ -135,14 +127,14 @@ def monitor(
     from evofsm.fsm.validation import positive
     from evofsm.guard import Foresight, Guard
 
-    if guard is not None and brakes is not None:
+    if guard is not None and brakes != BRAKES:
         raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
-    reckoned, tolerated = brakes or BRAKES, TOLERANCE if tolerance is None else tolerance
+    tolerated = TOLERANCE if tolerance is None else tolerance
 
     def fresh() -> Guard:
         if guard is not None:
             return Guard.load(guard)
-        return (guard_of_traffic if traffic else guard_of_monitor)(interval, reckoned, tolerated)
+        return (guard_of_traffic if traffic else guard_of_monitor)(interval, brakes, tolerated)
 
     is_log = file is not None and (file.suffix in _LOGS or file.is_dir())
     if is_log and not summary:
@@ -176,7 +168,7 @@ def monitor(
         if state is not None:
             is_other = guard is not None and guard.resolve() != state.resolve()
             given = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
-            made = {"interval": interval, "brakes": reckoned} if guard is None else {}
+            made = {"interval": interval, "brakes": brakes} if guard is None else {}
             told = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
             saved = State(state, {"guard": given, **made, **told})
             stack.callback(saved.close)
@@ -185,7 +177,7 @@ def monitor(
         used = fresh() if saved is None else saved.guard(fresh)
         _prepare(used, mode, tolerance, audit, stack, learn=learn)
         decider = Decider(used, episode=rows)
-        assumed = _of_saved(guard, used) if guard else assumptions(reckoned, tolerated)
+        assumed = _of_saved(guard, used) if guard else assumptions(brakes, tolerated)
         if summary and file is not None:
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
 

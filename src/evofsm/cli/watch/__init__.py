@@ -157,7 +157,6 @@ def _recorded(
     reading: Reading | None,
 ) -> Recording:
     """A run that was recorded, or a log with what a guard would have said; read beforehand."""
-    require(scipy="study", mcap="mcap")
     from tempfile import TemporaryDirectory
 
     from evofsm.cli.sumocfg import trace_configuration
