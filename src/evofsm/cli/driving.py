@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import logging
 import math
 import os
 import signal
@@ -42,8 +41,6 @@ from evofsm.driving.trials import Row, Trial
 from evofsm.driving.world import World
 from evofsm.extras import needs
 from evofsm.guard import TOLERANCE, DecisionLogger, Guard, Mode, Reviser
-
-_log = logging.getLogger(__name__)
 
 #: Revisers by name: none, ours, and the classic measures.
 REVISERS = ("least-risk", "none", "rss", "aeb", *FIXED_MEASURES)
@@ -200,10 +197,8 @@ class Results:
         try:
             self.guard.save(self.folder / GUARD, {**told, "episodes": reached})
         except OSError as error:
-            if now:
-                error.add_note("what was driven is kept: make room, and run the same command again")
-                raise
-            _log.warning("%s is not saved for now: %s", self.folder / GUARD, error)
+            error.add_note("what was driven is kept: make room, and run the same command again")
+            raise
         self._saved = time.monotonic()
 
     def summed_up(self, episodes: int) -> Driving:

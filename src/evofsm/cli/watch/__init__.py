@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from evofsm.cli.watch.recorded import Recording
     from evofsm.cli.watch.session import Session
 
-# How a file begins, soon, that holds a guard, a machine or a judge.
-_LEARNT = b'{"__metadata__"'
 # Of a simulation of somebody else's that are watched [s], and positions of cars in them.
 _SECONDS, _ENOUGH = 600.0, 100_000
 
@@ -133,19 +131,10 @@ def _is_log(what: str) -> bool:
             f"{what} is neither a file nor one of the families {', '.join(FAMILIES)}; an "
             "environment of Gymnasium is named with its version: CartPole-v1"
         )
-    if place.suffix == ".py":
-        return False
-    if place.is_dir():
-        if not (place / "metadata.yaml").is_file():
-            raise ValueError(f"{what} is a folder, but no bag of ROS 2; name a file in it")
-        return True
-    with place.open("rb") as file:
-        if _LEARNT in file.read(32):
-            raise ValueError(
-                f"{what} holds what was learnt, which nobody drives: evofsm inspect prints it"
-            )
     # What is damaged is no kind of MCAP: whoever reads runs says so.
-    return place.suffix != ".mcap" or file_kind(what) in ("mcap", "bag")
+    if place.suffix == ".mcap":
+        return file_kind(what) in ("mcap", "bag")
+    return place.suffix != ".py"
 
 
 def _recorded(

@@ -50,8 +50,6 @@ _IDLE = {
 }
 _ACTIONS = ("proposed", "executed", "advised")
 _PASSED = "the guard was not shown to help, so what was proposed passed"
-# So many of a log's episodes can be chosen among.
-_MOST_EPISODES = 500
 _NONE = -1
 # Accelerations that differ by less are the same [m/s²].
 _SAME = 0.05
@@ -149,7 +147,7 @@ class Recording:
         return Start(
             system=about.get("family", self._name),
             about="each row was judged afterwards." if self._jumps else f"from {self._name}.",
-            cases=tuple(self._names[k] for k in self._order[:_MOST_EPISODES]),
+            cases=tuple(self._names[k] for k in self._order),
             case=case,
             tolerance=float(about.get("tolerance", TOLERANCE)),
             interval=float(np.median(np.diff(times))),
