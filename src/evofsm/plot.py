@@ -203,9 +203,8 @@ def experience(
     ax, called, red = _given_or_new(ax), judge.labels.variable, COLORS["dead end"]
     dots: Look = {"linestyle": "none", "marker": ".", "markersize": 1.5, "color": ink(0.4)}
     crosses: Look = {"linestyle": "none", "marker": "x", "markersize": 5.0, "color": ink()}
-    survived = np.concatenate([known.survived, known.brinks])
-    for seen, look in ((survived, dots), (known.failures, crosses)):
-        ax.plot(*seen[:, pair].T, **look)
+    ax.plot(*np.concatenate([known.survived, known.brinks])[:, pair].T, **dots)
+    ax.plot(*known.failures[:, pair].T, **crosses)
     sizes = 2.0 * known.radii[:, None] * known.survived.std(0)[pair]
     for centre, (wide, high) in zip(known.centres[:, pair], sizes, strict=True):
         ax.add_patch(Ellipse(centre, wide, high, fill=False, edgecolor=red, zorder=3.0))
@@ -321,10 +320,8 @@ def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = No
     times = [decision.situation.time for decision in drive.decisions]
     when = np.array([*times, float(drive.time[-1])])
     bounds = np.array([revision.interval for revision in revisions]).T
-    low, high, proposed, executed = (
-        np.append(row, row[-1])
-        for row in (*bounds, proposed, executed)  # until the end
-    )
+    until_the_end = (np.append(row, row[-1]) for row in (*bounds, proposed, executed))
+    low, high, proposed, executed = until_the_end
     band: Look = {"step": "post", "alpha": 0.25, "linewidth": 0.0, "label": "90 % interval"}
     ax.fill_between(when, low, high, color=COLORS["follower"], **band)
     dashed: Look = {"color": COLORS["dead end"], "linestyle": "--", "label": "proposed"}

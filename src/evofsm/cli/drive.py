@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing, nullcontext
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
 from statistics import median
@@ -109,21 +109,14 @@ def drive(
     from evofsm.driving import load_family
     from evofsm.guard import Mode
 
-    setup = Setup(
-        load_family(family).with_switches(split_names(switches)),
-        reviser,
-        judge,
-        Mode(mode),
-        tolerance,
-        seed,
-        world,
-        learn=frozen is None and workers is None,
-    )
-    before = None
+    chosen = load_family(family).with_switches(split_names(switches))
+    before, reached, digest = None, 0, ""
     if (start := learn or frozen) is not None:
         before, reached = load_guard(start)
         digest = sha256((start / GUARD).read_bytes()).hexdigest()
-        setup = replace(setup, learnt=reached, digest=digest)
+    learns = frozen is None and workers is None
+    asked = chosen, reviser, judge, Mode(mode), tolerance, seed, world
+    setup = Setup(*asked, learns, reached, digest)
     with closing(Results(setup, make_guard(setup, before), out)) as results:
         if mcap is not None and results.rows:
             found = f"{out} has {len(results.rows):,} episodes already; name another folder"

@@ -157,8 +157,6 @@ class Results:
         """Go on from what is in the folder."""
         setup = self.setup
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (GUARD, _EPISODES, _SUMMARY, _DECISIONS):
-            store.sweep(folder / name)
         self._journal = Journal(folder / _JOURNAL, setup.settings)
         try:
             self._journal.go_on(setup.settings, "run it with those, or name another folder")

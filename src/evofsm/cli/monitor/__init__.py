@@ -78,7 +78,7 @@ def monitor(
         str | None, option("Rows under KEY/row, decisions under KEY/decision.")
     ] = None,
     heartbeat: Annotated[
-        float | None, option("Send a heartbeat after so long without a row [s].")
+        float | None, option("Send a heartbeat after so long without a row [s].", min=0.001)
     ] = None,
     warm: Annotated[bool, option("Compile before the first row comes.", "--warm")] = False,
     summary: Annotated[
@@ -124,7 +124,6 @@ def monitor(
     from evofsm.cli.monitor.transports import Server
     from evofsm.driving.assumed import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
-    from evofsm.fsm.validation import positive
     from evofsm.guard import Foresight, Guard
 
     if guard is not None and brakes != BRAKES:
@@ -191,8 +190,7 @@ def monitor(
             again = saved.begin(decider)
             if decider.n:
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
-        each = math.inf if heartbeat is None else positive("--heartbeat", heartbeat)
-        server = Server(decider, each)
+        server = Server(decider, heartbeat or math.inf)
         transport, where = _transport(file, socket, udp, zenoh, stack)
         warn(assumed)
         if where:

@@ -74,7 +74,6 @@ class State:
 
     def begin(self, decider: Decider) -> int:
         """Go on where it was; returns the number of messages that were taken in again."""
-        store.sweep(self.path)  # of what may be whole where that was not
         decider.keep = lambda told: self._keep(told, decider)
         if self._memory is not None:
             decider.remember(self._memory)

@@ -43,13 +43,7 @@ _FOREIGN = (
 _MOST_FRAMES = 20_000
 # Who leaves more unread is cut off, all of a run is less; a command is short [bytes].
 _MOST_UNREAD, _LONGEST_COMMAND = 1 << 26, 512
-_WELCOME = {
-    "page.html": "text/html",
-    "page.css": "text/css",
-    **dict.fromkeys(
-        ("page.js", "run.js", "road.js", "plots.js", "plane.js", "paint.js"), "text/javascript"
-    ),
-}
+_KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 # Close codes (RFC 6455).
 _NOT_TEXT, _NOT_UNDERSTOOD = 1003, 1008
 
@@ -102,7 +96,8 @@ class LivePage:
         self._frames: deque[str] = deque(maxlen=_MOST_FRAMES)
         self._clients: set[ServerConnection] = set()
         self._start: Start | None = None
-        self._files = {name: (files(__package__) / "live" / name).read_bytes() for name in _WELCOME}
+        found = (files(__package__) / "live").iterdir()
+        self._files = {one.name: one.read_bytes() for one in found}
 
     @property
     def address(self) -> str:
@@ -165,7 +160,8 @@ class LivePage:
             return _refusal(HTTPStatus.NOT_FOUND, "There is no such file.")
         # No policy knows addresses in brackets; 'self' does.
         sockets = "" if hosts[0].startswith("[") else f"ws://{hosts[0]}"
-        return _response(HTTPStatus.OK, self._files[name], _WELCOME[name], sockets)
+        kind = _KINDS[name.rpartition(".")[2]]
+        return _response(HTTPStatus.OK, self._files[name], kind, sockets)
 
     async def _attend(self, connection: ServerConnection) -> None:
         parts = ",".join([*self._latest.values(), *self._frames])  # the start first
