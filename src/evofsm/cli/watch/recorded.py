@@ -263,13 +263,12 @@ def record_log(
             f"in this order, and names {', '.join(names)}"
         )
     noted = Noted()
+    rows = _first(reading.traces([path], noted), MOST_ROWS + 1)
     taken, more, written = 0, False, list[tuple[str, str]]()
     about: dict[str, Any] = {"source": Path(path).name, "mode": "shadow", "judge": judge}
     guard = None
     with recording(out, about | {"controller": "as recorded", "tolerance": tolerance}) as log:
-        for number, whole in enumerate(
-            episodes_of(_first(reading.traces([path], noted), MOST_ROWS + 1)), 1
-        ):
+        for number, whole in enumerate(episodes_of(rows), 1):
             more = taken + len(whole.times) > MOST_ROWS
             whole = whole.rows(0, MOST_ROWS - taken)
             taken += len(whole.times)

@@ -481,12 +481,14 @@ class Session(AbstractContextManager["Session"]):
         revision = guard.decide(self.system.observation, self.system.propose(), frame.time)
         situation, judged = guard.situation, self._judged
         self.system.advance(revision)
+        numbered = zip(judged.risk, judged.low, judged.high, judged.critical, strict=True)
+        wished, done, best = (Judged(*map(float, each)) for each in numbered)
         return frame._replace(
             belief=most_believed(situation.belief),
             state=situation.state,
-            proposed_risk=_judged(judged, 0),
-            executed_risk=_judged(judged, 1),
-            least_risk=float(judged.risk[2]),
+            proposed_risk=wished,
+            executed_risk=done,
+            least_risk=best.risk,
             proposed=numbers(revision.proposed),
             executed=numbers(revision.executed),
             advised=numbers(revision.advised),
@@ -523,8 +525,3 @@ class Session(AbstractContextManager["Session"]):
         if system.failed:
             novel = first_of_its_kind(frame.observation, before, self.known())
         return frame._replace(over=True, failed=system.failed, novel=novel)
-
-
-def _judged(judged: Judgement, option: int) -> Judged:
-    each = judged.risk, judged.low, judged.high, judged.critical
-    return Judged(*(float(values[option]) for values in each))
