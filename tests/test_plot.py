@@ -7,6 +7,7 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cbook import STEP_LOOKUP_MAP
 from matplotlib.figure import Figure
 from studies.judges import run
 from studies.systems import Start, make_system
@@ -201,14 +202,32 @@ def test_in_the_example_another_controller_is_kept_out(monkeypatch, tmp_path):
 
 def test_a_history_marks_alarms_and_failures_and_leaves_holes_blank():
     when = np.array([0.0, 60.0, 120.0, 9000.0, 9060.0, 9120.0])
-    risk, failed = [0, 0, 0.2, 0, 0.9, 0.9], [False] * 5 + [True]
+    risk, failed = [0, 0, 0.9, 0.9, 0.9, 0.9], [False, False, True, False, False, True]
     axes = Figure().subplots(2)
     plot.history(axes, when, when[:, None], ["heat"], risk, failed, 0.5)
     heat, said = axes
-    assert np.isnan(heat.lines[-1].get_ydata()).tolist() == [False] * 3 + [True] + [False] * 2
+    for line in (heat.lines[-1], said.lines[-3]):
+        x, y = STEP_LOOKUP_MAP[line.get_drawstyle()](*line.get_data())
+        x = 60.0 * x
+        whole = np.isfinite(y[1:] + y[:-1])
+        assert np.diff(x)[whole].max() < 1.5  # minutes: nothing leads through the hole
+        assert {*np.round(x[np.isfinite(y)])} >= {0.0, 1.0, 2.0, 150.0, 151.0, 152.0}
     (band,) = heat.collections
-    (path,) = band.get_paths()
-    assert path.get_extents().intervalx == pytest.approx([9060.0 / 3600.0, 9120.0 / 3600.0])
+    ends = [path.get_extents().intervalx * 60.0 for path in band.get_paths()]
+    assert [end.tolist() for end in ends] == [pytest.approx([2, 2]), pytest.approx([150, 152])]
     assert said.get_xlabel() == "time [hours]"
     labels = [text.get_text() for text in said.get_legend().get_texts()]
     assert labels == ["alarm", "tolerance", "failure"]
+
+
+@pytest.mark.parametrize("name", ["pressure behind the second stage of the pump [bar]", "p" * 60])
+def test_however_long_a_name_is_it_stays_beside_its_axes(name):
+    figure = Figure((10.0, 3.9), layout="constrained")
+    axes = figure.subplots(3)
+    rows = np.arange(20.0).reshape(10, 2)
+    plot.history(axes, range(10), rows, [name, name], [0.0] * 10, [False] * 10, 0.5)
+    FigureCanvasAgg(figure).draw()
+    for ax in axes:
+        inside, label = ax.get_window_extent(), ax.yaxis.label.get_window_extent()
+        assert inside.y0 - 5.0 < label.y0 < label.y1 < inside.y1 + 5.0
+        assert label.x0 >= 0.0

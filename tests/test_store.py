@@ -302,8 +302,8 @@ def test_what_a_killed_process_left_behind_is_swept_and_what_is_being_written_is
         one.touch()
         os.utime(one, (0.0, time.time() - 3600.0))
     with store.replacing(path) as file:
-        store.sweep(path)
-        assert sorted(tmp_path.iterdir()) == sorted([tmp_path / file.name, *others])
+        write(path)
+        assert sorted(tmp_path.iterdir()) == sorted([path, tmp_path / file.name, *others])
         file.write(b"whole")
     assert sorted(tmp_path.iterdir()) == sorted([path, *others])
 

@@ -7,6 +7,7 @@ colour alone. The same colours stand in ``io/graphs.py`` and ``cli/watch/live/pa
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -202,9 +203,8 @@ def experience(
     ax, called, red = _given_or_new(ax), judge.labels.variable, COLORS["dead end"]
     dots: Look = {"linestyle": "none", "marker": ".", "markersize": 1.5, "color": ink(0.4)}
     crosses: Look = {"linestyle": "none", "marker": "x", "markersize": 5.0, "color": ink()}
-    survived = np.concatenate([known.survived, known.brinks])
-    for seen, look in ((survived, dots), (known.failures, crosses)):
-        ax.plot(*seen[:, pair].T, **look)
+    ax.plot(*np.concatenate([known.survived, known.brinks])[:, pair].T, **dots)
+    ax.plot(*known.failures[:, pair].T, **crosses)
     sizes = 2.0 * known.radii[:, None] * known.survived.std(0)[pair]
     for centre, (wide, high) in zip(known.centres[:, pair], sizes, strict=True):
         ax.add_patch(Ellipse(centre, wide, high, fill=False, edgecolor=red, zorder=3.0))
@@ -320,10 +320,8 @@ def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = No
     times = [decision.situation.time for decision in drive.decisions]
     when = np.array([*times, float(drive.time[-1])])
     bounds = np.array([revision.interval for revision in revisions]).T
-    low, high, proposed, executed = (
-        np.append(row, row[-1])
-        for row in (*bounds, proposed, executed)  # until the end
-    )
+    until_the_end = (np.append(row, row[-1]) for row in (*bounds, proposed, executed))
+    low, high, proposed, executed = until_the_end
     band: Look = {"step": "post", "alpha": 0.25, "linewidth": 0.0, "label": "90 % interval"}
     ax.fill_between(when, low, high, color=COLORS["follower"], **band)
     dashed: Look = {"color": COLORS["dead end"], "linestyle": "--", "label": "proposed"}
@@ -376,28 +374,33 @@ def history(
     ['heat', 'risk']
     """
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
-    said, fails = np.asarray(risk, np.float64), np.asarray(failed, np.bool_)
-    steps, lasts = np.diff(when, prepend=when[:1]), np.ptp(when)
-    blank = np.where(steps > 3.0 * np.median(steps), np.nan, 0.0)
+    fails, lasts = np.asarray(failed, np.bool_), np.ptp(when)
     unit, size = ("hours", 3600.0) if lasts > 7200.0 else ("minutes", 60.0)
     unit, size = ("days", 86400.0) if lasts > 2e5 else (unit, size)
+    steps = np.diff(when)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    holes = np.flatnonzero(steps > 3.0 * usual) + 1  # before each a row without numbers ends lines
     x, red, orange = (when - when[0]) / size, COLORS["dead end"], COLORS["follower"]
+    drawn = np.insert(x, holes, x[holes - 1] + usual / size)
+    said = np.insert(np.asarray(risk, np.float64), holes, np.nan)
     for ax in axes:
         look: Look = {"color": orange, "alpha": 0.25, "linewidth": 1.0, "label": "alarm"}
         look["transform"] = ax.get_xaxis_transform()
-        ax.fill_between(x, 0.0, 1.0, said > tolerance, **look)
+        ax.fill_between(drawn, 0.0, 1.0, said > tolerance, **look)
         for cross in x[fails]:
             ax.axvline(cross, color=red, linewidth=0.8, linestyle="--")
     for ax, name, values in zip(axes, names, z.T, strict=False):
-        ax.plot(x, values + blank, color=ink(), linewidth=0.6)
-        ax.set_ylabel(name)
+        ax.plot(drawn, np.insert(values, holes, np.nan), color=ink(), linewidth=0.6)
+        height = 72.0 * ax.get_window_extent().height / ax.figure.dpi
+        letters = int(height / (0.65 * float(ax.yaxis.label.get_fontsize())))
+        ax.set_ylabel(textwrap.fill(name, max(letters, 8)))
     if model is not None:
         some = np.arange(0, len(z), max(len(z) // 2000, 1))
         seen = [model.nearest(row).state for row in z[some]]
         axes[-2].plot(x[some], seen, ".", markersize=1.5, color=COLORS["leader"])
         label_states(axes[-2].yaxis, model.n_states)
         axes[-2].set_ylabel("state")
-    axes[-1].step(x, said + blank, where="post", color=orange)
+    axes[-1].step(drawn, said, where="post", color=orange)
     axes[-1].axhline(tolerance, color=ink(), linewidth=0.8, linestyle=":", label="tolerance")
     look = {"linestyle": "none", "marker": "X", "markersize": 4.5, "clip_on": False}
     axes[-1].plot(x[fails], np.ones(fails.sum()), color=red, label="failure", **look)

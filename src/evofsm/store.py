@@ -229,6 +229,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A file, open for writing and reading, that takes its place once it is whole and on the disk.
 
     The last one to end stays. A link is followed, and the mode of a file that was there is kept.
+    What processes that were killed have left beside it is removed.
     Where it cannot be written, an OSError names the file, and what was there is as it was.
 
     No file can take the place of one that is mounted on its own, or whose folder may not be
@@ -269,6 +270,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
         raise
+    sweep(target)
     # Not all systems can flush a folder; the file is whole, if not under its name, without it.
     with suppress(OSError):
         opened = os.open(target.parent, os.O_RDONLY)
@@ -315,8 +317,8 @@ def sweep(path: str | os.PathLike[str]) -> None:
     """Remove what processes that were killed while they wrote a file have left beside it."""
     target = Path(os.path.realpath(path))
     pattern = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{16}}\.part")
-    for beside in target.parent.iterdir():
-        with suppress(OSError):
+    with suppress(OSError):
+        for beside in target.parent.iterdir():
             if pattern.fullmatch(beside.name) and time.time() - beside.stat().st_mtime > _OLD:
                 beside.unlink()
 

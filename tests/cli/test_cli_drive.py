@@ -132,7 +132,7 @@ def test_learning_that_is_stopped_goes_on_bit_for_bit(tmp_path, snapshot, monkey
     plain = in_turn(tmp_path / "plain", 5)
     folder, setup = tmp_path / "stopped", Setup(EMERGENCY)
 
-    def show(done, _):
+    def show(done, **_):
         if done in stops:
             stops.remove(done)
             raise StoppedError

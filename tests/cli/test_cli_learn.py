@@ -134,11 +134,8 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
     options = ("--failed", "hit", "--action-range", "-6:-2:0.5", "--judge", judge)
     told = evofsm("learn", own, *OWN, *options, "--guard", path)
     assert f"--guard {path} takes rows of time [s], {keys[0]}" in told.stdout
-    beyond = (
-        "It judges: fails where dist [m] is below" in told.stdout,
-        "% of the log's" in told.stdout,
-    )
-    assert beyond == (judge == "learnt",) * 2
+    for words in ("It judges: fails where dist [m] is below", "% of the log's"):
+        assert (words in told.stdout) == (judge == "learnt")
     seen = dict(zip(keys, (3.0, 20.0, 15.8), strict=True))
     odd = {keys[0]: "near"}, {}, {"time": 0.1, keys[1]: 72.0}
     sent = [{"time": 0.0, "proposal": 1.0, **seen, **one} for one in odd]
@@ -147,16 +144,8 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
     wrong, answer, fast = map(json.loads, answers)
     assert fast["note"] == f"{keys[1]} is above 60 m/s: is that km/h?"
     assert (wrong["about"], wrong["error"]) == (keys[0], 'is "near"; it must be float or null')
-    summed = evofsm(
-        "monitor",
-        own,
-        *OWN[2:],
-        *options[:2],
-        "--guard",
-        path,
-        "--summary",
-        *(OWN[:2] if judge == "kinematic" else ()),
-    )
+    asked = ("monitor", own, *OWN[2:], *options[:2], "--guard", path, "--summary")
+    summed = evofsm(*asked, *(OWN[:2] if judge == "kinematic" else ()))
     assert "failures  3; 3 in alarm by then, for " in summed.stdout
     assert answer["alarm"]
     assert answer["mode"] == "shadow"
@@ -167,11 +156,8 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
 
 @pytest.mark.parametrize("names", [("gap", "v_follower", "v_leader"), ("d", "own", "lead")])
 def test_columns_that_are_named_in_another_order_are_what_they_are_called(evofsm, tmp_path, names):
-    path, guard, fields = (
-        tmp_path / "log.csv",
-        tmp_path / "car.evofsm",
-        ("time", *names, "a", "hit"),
-    )
+    path, guard = tmp_path / "log.csv", tmp_path / "car.evofsm"
+    fields = ("time", *names, "a", "hit")
     rows = [f"{k / 10:.1f},{30 - 0.4 * k:.2f},20,16,0.0,{int(k > 75)}" for k in range(80)]
     path.write_text("\n".join([",".join(fields), *rows, ""]))
     asked = "--action", "a", "--failed", "hit", "--observe"

@@ -47,8 +47,8 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c(tmp_path, arg
         (["missing.csv"], "missing.csv: no such file or directory"),
         (["missing.py"], "missing.py: no such file or directory"),
         (["CartPole"], "named with its version: CartPole-v1"),
-        (["folder"], "folder is a folder, but no bag of ROS 2; name a file in it"),
-        (["learnt"], "learnt holds what was learnt, which nobody drives: evofsm inspect prints it"),
+        (["folder"], "folder is a folder; name the files in it"),
+        (["learnt"], "learnt holds what was learnt, and is no log: evofsm inspect prints it"),
         (["empty.py"], "it defines neither environment() nor a Family called family"),
     ],
 )

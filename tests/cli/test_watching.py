@@ -7,6 +7,7 @@ import pytest
 
 from evofsm.cli.driving import Setup, make_guard
 from evofsm.cli.monitor.decider import Decider
+from evofsm.cli.options import reading_of
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.recorded import Recording, record_log
 from evofsm.cli.watch.session import (
@@ -19,9 +20,8 @@ from evofsm.cli.watch.session import (
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
 from evofsm.driving.assumed import guard_of_monitor
-from evofsm.fsm.observations import ObservationEncoder
 from evofsm.guard import Mode
-from evofsm.io import LogColumns, read_run, recording
+from evofsm.io import read_run, recording
 from monitor_rows import line, traffic
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -305,8 +305,8 @@ def test_episodes_of_a_log_end_with_a_contact_are_sorted_and_begin_where_it_is_w
 def test_a_failure_that_a_log_tells_of_is_no_collision_but_a_failure(tmp_path):
     rows = [f"{k / 10:.1f},{30 - k},20,10,0.1,{int(k == 25)}" for k in range(26)]
     (tmp_path / "log.csv").write_text("\n".join(["time,gap,v,lead,a,failed", *rows, ""]))
-    columns = LogColumns(ObservationEncoder("gap", "v", "lead"), "a", failed="failed")
-    stretches, _ = record_log(str(tmp_path / "log.csv"), tmp_path / "run.mcap", columns)
+    reading = reading_of("gap,v,lead", "a", failed="failed")
+    stretches, _ = record_log(str(tmp_path / "log.csv"), tmp_path / "run.mcap", reading)
     shown = Recording(tmp_path / "run.mcap", stretches)
     assert shown.start.cases == ("episode 1 (failure)",)
     told = tell(drive(shown)[-1], shown.start)
@@ -318,17 +318,16 @@ def test_a_log_is_watched_by_its_own_columns_and_units(tmp_path, capsys):
     path, out = tmp_path / "own.csv", tmp_path / "run.mcap"
     rows = [f"{100 * k},{40 - k},72,{72 - 3 * k},0.1" for k in range(20)]
     path.write_text("\n".join(["t,dist,ego_kmh,lead_kmh,accel", *rows, ""]))
-    names = ("dist", "ego_kmh", "lead_kmh")
-    units = {"t": "ms", "ego_kmh": "km/h", "lead_kmh": "km/h"}
-    columns = LogColumns(ObservationEncoder(*names), "accel", "t", units=units)
-    record_log(str(path), out, columns, brakes=4.0)
+    units = "t=ms", "ego_kmh=km/h", "lead_kmh=km/h"
+    reading = reading_of("dist,ego_kmh,lead_kmh", "accel", "t", unit=units)
+    record_log(str(path), out, reading, brakes=4.0)
     found = read_run(out).episodes[0].columns
     assert [found[name][0] for name in ("gap", "v_follower", "v_leader")] == [40.0, 20.0, 20.0]
     assert found["time"][1] == pytest.approx(0.1)
     assert found["risk_proposed"][-1] > 0.9
     assert "the own car brakes with 4 m/s² (--brakes)" in capsys.readouterr().err
     with pytest.raises(ValueError, match="has to name the three columns in this order"):
-        record_log(str(path), out, LogColumns(ObservationEncoder("dist"), "accel", "t"))
+        record_log(str(path), out, reading_of("dist", "accel", "t"))
 
 
 def test_what_was_before_is_shown_at_once():
@@ -356,7 +355,7 @@ def test_it_waits_steps_and_goes_on():
         for number in range(4):
             await asyncio.sleep(0.05)
             assert [what.number for kind, what in told if kind == "frame"] == [*range(number)]
-            player.step() if number < 3 else player.pause(False)
+            player.set(paused=number < 3, steps=True)
         while not (told[-1][0] == "clock" and told[-1][1].over):
             await asyncio.sleep(0.01)
         playing.cancel()

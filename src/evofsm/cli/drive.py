@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from dataclasses import asdict, replace
+from contextlib import closing, nullcontext
+from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import (
     ByJudge,
@@ -16,20 +16,26 @@ from evofsm.cli.options import (
     Json,
     ModeName,
     Seed,
-    Switches,
     Tolerance,
     argument,
-    family_of,
     option,
     require,
     require_world,
+    split_names,
 )
 from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
 if TYPE_CHECKING:
     from evofsm.cli.driving import Driving, Results, Setup
     from evofsm.guard import Guard
-    from evofsm.io.foxglove import RunWriter
+
+# Options that exclude each other, and why.
+_EXCLUDE = {
+    ("learn", "workers"): "whoever learns drives episodes one after the other",
+    ("audit", "workers"): "workers send no decisions",
+    ("mcap", "workers"): "workers send no decisions",
+    ("learn", "frozen"): "whoever is frozen learns nothing",
+}
 
 
 def drive(
@@ -48,7 +54,9 @@ def drive(
     judge: ByJudge = "kinematic",
     mode: Annotated[ModeName, option("How far least-risk goes.")] = "act",
     tolerance: Tolerance = 0.02,
-    switches: Switches = "",
+    switches: Annotated[
+        str, option("noise, delay, actuator, jerk, third_car; with commas.", "--with")
+    ] = "",
     seed: Seed = 0,
     learn: Annotated[
         Path | None, option("Go on learning from this folder of an earlier --out.")
@@ -88,39 +96,34 @@ def drive(
         if given:
             what = "is for families of scenarios, not for a configuration"
             raise ValueError(f"--{next(iter(given))} {what}")
-        require(libsumo="sumo")
         from evofsm.cli.sumocfg import run_configuration
 
         run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
-    _refuse_pairs(given)
+    for (one, other), reason in _EXCLUDE.items():
+        if one in given and other in given:
+            raise ValueError(f"--{one} and --{other} exclude each other: {reason}")
     require_world(world, **({"polars": "tables"} if out is not None and workers is None else {}))
     require(**({} if mcap is None else {"mcap": "mcap"}))
     from evofsm.cli.driving import GUARD, Results, Setup, drive_at_once, load_guard, make_guard
+    from evofsm.driving import load_family
     from evofsm.guard import Mode
 
-    setup = Setup(
-        family_of(family, switches),
-        reviser,
-        judge,
-        Mode(mode),
-        tolerance,
-        seed,
-        world,
-        learn=frozen is None and workers is None,
-    )
-    before = None
+    chosen = load_family(family).with_switches(split_names(switches))
+    before, reached, digest = None, 0, ""
     if (start := learn or frozen) is not None:
         before, reached = load_guard(start)
         digest = sha256((start / GUARD).read_bytes()).hexdigest()
-        setup = replace(setup, learnt=reached, digest=digest)
+    learns = frozen is None and workers is None
+    asked = chosen, reviser, judge, Mode(mode), tolerance, seed, world
+    setup = Setup(*asked, learns, reached, digest)
     with closing(Results(setup, make_guard(setup, before), out)) as results:
         if mcap is not None and results.rows:
             found = f"{out} has {len(results.rows):,} episodes already; name another folder"
             raise ValueError(f"--mcap holds what one run drives, but {found}")
         try:
             if workers is not None:
-                with _shown(episodes) as move:
+                with progress("Driving", episodes) as move:
                     driving = drive_at_once(results, episodes, workers, move)
             else:
                 driving = _drive_in_turn(results, episodes, audit, mcap)
@@ -141,19 +144,6 @@ def drive(
     return None
 
 
-def _refuse_pairs(given: dict[str, Any]) -> None:
-    """Raise where two options exclude each other."""
-    why = {
-        ("learn", "workers"): "whoever learns drives episodes one after the other",
-        ("audit", "workers"): "workers send no decisions",
-        ("mcap", "workers"): "workers send no decisions",
-        ("learn", "frozen"): "whoever is frozen learns nothing",
-    }
-    for (one, other), reason in why.items():
-        if one in given and other in given:
-            raise ValueError(f"--{one} and --{other} exclude each other: {reason}")
-
-
 # -- Driving --------------------------------------------------------------------------------------
 
 
@@ -168,12 +158,15 @@ def _drive_in_turn(
     from evofsm.driving.sumo import open_world
     from evofsm.guard import AuditLog
 
+    if mcap is not None:
+        from evofsm.io.foxglove import recording
     setup = results.setup
+    about = setup.settings | {"first": setup.first, "episodes": episodes}
     with (
         AuditLog(audit) if audit else nullcontext() as log,
         open_world(setup.world) as place,
-        _recording(setup, episodes, mcap) as run,
-        _shown(episodes) as move,
+        recording(mcap, about) if mcap else nullcontext() as run,
+        progress("Driving", episodes) as move,
     ):
         record = None if run is None else run.add
         driving = drive_in_turn(results, episodes, place, move, log, record)
@@ -182,29 +175,6 @@ def _drive_in_turn(
     if log is not None:
         warn(f"head of {audit}, to be kept elsewhere: {log.head}")
     return driving
-
-
-@contextmanager
-def _shown(episodes: int) -> Iterator[Any]:
-    """A bar that shows the collisions so far."""
-    with progress("Driving", episodes) as move:
-
-        def moved(done: int, collisions: int) -> None:
-            rate = f" ({collisions} collisions, {collisions / done:.1%})" if done else ""
-            move(done, description=f"Driving{rate}")
-
-        yield moved
-
-
-def _recording(
-    setup: Setup, episodes: int, mcap: Path | None
-) -> AbstractContextManager[RunWriter | None]:
-    """A log of the run, where one is asked for."""
-    if mcap is None:
-        return nullcontext()
-    from evofsm.io.foxglove import recording
-
-    return recording(mcap, setup.settings | {"first": setup.first, "episodes": episodes})
 
 
 # -- What came of it ------------------------------------------------------------------------------

@@ -9,16 +9,13 @@ from __future__ import annotations
 import csv
 import io
 import json
-import logging
 import math
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from functools import partial
-from itertools import chain
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from threading import Thread
@@ -26,6 +23,7 @@ from typing import Any, NamedTuple
 
 from evofsm import store
 from evofsm.cli.journal import Journal
+from evofsm.cli.show import Advance
 from evofsm.driving import (
     EnvelopeReviser,
     Episode,
@@ -44,8 +42,6 @@ from evofsm.driving.world import World
 from evofsm.extras import needs
 from evofsm.guard import TOLERANCE, DecisionLogger, Guard, Mode, Reviser
 
-_log = logging.getLogger(__name__)
-
 #: Revisers by name: none, ours, and the classic measures.
 REVISERS = ("least-risk", "none", "rss", "aeb", *FIXED_MEASURES)
 #: The columns of ``decisions.parquet`` after ``episode``; `driving/naming.py` says which they are.
@@ -62,7 +58,6 @@ _EVERY = 60.0
 _BATCH = 20
 
 Outcomes = dict[str, Any]
-Show = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -88,12 +83,10 @@ class Setup:
     @property
     def settings(self) -> dict[str, Any]:
         """All that an episode depends on, for JSON."""
-        names = ("reviser", "judge", "tolerance", "seed", "world")
-        own = {name: getattr(self, name) for name in (*names, "learn", "learnt", "digest")}
-        own |= {"family": self.family.name, "switches": self.family.switches}
-        own |= {"mode": self.mode.value}
-        source = self.family.source
-        return {**own, "file": source and Path(source).read_text("utf-8")}
+        family, source = self.family, self.family.source
+        own = {**vars(self), "family": family.name, "switches": family.switches}
+        file = source and Path(source).read_text("utf-8")
+        return {**own, "mode": self.mode.value, "file": file}
 
     def trial(self, guard: Guard, world: World | str) -> Trial:
         """Its episodes, by their number: training draws while it learns, held-out ones else."""
@@ -156,35 +149,41 @@ class Results:
         self.rows: dict[int, Outcomes] = {}
         self._journal: Journal | None = None
         self._saved = time.monotonic()
-        if folder is None:
-            return
+        if folder is not None:
+            self._begin(folder)
+        self._collisions = sum(row["collided"] for row in self.rows.values())
+
+    def _begin(self, folder: Path) -> None:
+        """Go on from what is in the folder."""
+        setup = self.setup
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (GUARD, _EPISODES, _SUMMARY, _DECISIONS):
-            store.sweep(folder / name)
         self._journal = Journal(folder / _JOURNAL, setup.settings)
         try:
             self._journal.go_on(setup.settings, "run it with those, or name another folder")
             self.rows = {int(row["episode"]): row for row in self._journal.records}
             if setup.learn and self.rows:
-                self._go_on(folder)
+                learnt = 0
+                if (folder / GUARD).exists():
+                    saved, learnt = load_guard(folder)
+                    self.guard = make_guard(setup, saved)
+                for number in self.rows.keys() - range(setup.first, learnt):
+                    del self.rows[number]  # it came after what was learnt
         except BaseException:
             self._journal.close()
             raise
 
-    def _go_on(self, folder: Path) -> None:
-        """Take what was learnt, and leave out the rows of episodes that came after it."""
-        learnt = 0
-        if (folder / GUARD).exists():
-            saved, learnt = load_guard(folder)
-            self.guard = make_guard(self.setup, saved)
-        done = range(self.setup.first, learnt)
-        self.rows = {number: row for number, row in self.rows.items() if number in done}
-
     def add(self, row: Outcomes) -> None:
         """Take in what came of an episode."""
         self.rows[row["episode"]] = row
+        self._collisions += row["collided"]
         if self._journal is not None:
             self._journal.append(row)
+
+    def show(self, move: Advance) -> None:
+        """Tell how many were driven, and with how many collisions."""
+        done, met = len(self.rows), self._collisions
+        rate = f" ({met} collisions, {met / done:.1%})" if done else ""
+        move(done, description=f"Driving{rate}")
 
     def save_guard(self, *, now: bool = False) -> None:
         """Write what was learnt from all rows, if it was not for a while."""
@@ -196,10 +195,8 @@ class Results:
         try:
             self.guard.save(self.folder / GUARD, {**told, "episodes": reached})
         except OSError as error:
-            if now:
-                error.add_note("what was driven is kept: make room, and run the same command again")
-                raise
-            _log.warning("%s is not saved for now: %s", self.folder / GUARD, error)
+            error.add_note("what was driven is kept: make room, and run the same command again")
+            raise
         self._saved = time.monotonic()
 
     def summed_up(self, episodes: int) -> Driving:
@@ -259,7 +256,7 @@ def drive_in_turn(
     results: Results,
     episodes: int,
     world: World,
-    show: Show = lambda done, collisions: None,
+    move: Advance = lambda *_, **__: None,
     audit: DecisionLogger | None = None,
     record: Callable[[Episode], None] | None = None,
 ) -> Driving:
@@ -278,7 +275,7 @@ def drive_in_turn(
         results.add({**row, "decided": _decided(driven)})
         if setup.learn:
             results.save_guard()
-        show(len(results.rows), sum(row["collided"] for row in results.rows.values()))
+        results.show(move)
     return results.summed_up(episodes)
 
 
@@ -289,7 +286,7 @@ def drive_at_once(
     results: Results,
     episodes: int,
     workers: int,
-    show: Show = lambda done, collisions: None,
+    move: Advance = lambda *_, **__: None,
 ) -> Driving:
     """Drive those held-out episodes that the results lack, by many workers.
 
@@ -300,29 +297,14 @@ def drive_at_once(
     trial = results.setup.trial(guard, results.setup.world)
     missing = [number for number in range(episodes) if number not in results.rows]
     size = max(1, min(_BATCH, len(missing) // (8 * workers)))
-    batches = [missing[place : place + size] for place in range(0, len(missing), size)]
-    driven = _in_processes(partial(_drive_batch, trial), batches, workers)
-    for rows in chain([[]], driven):  # first what was driven before
-        for row in rows:
-            results.add(row)
-        show(len(results.rows), sum(row["collided"] for row in results.rows.values()))
-    return results.summed_up(episodes)
-
-
-def _drive_batch(trial: Trial, numbers: Sequence[int]) -> list[Outcomes]:
-    return [trial(number) for number in numbers]
-
-
-Drive = Callable[[Sequence[int]], list[Outcomes]]
-
-
-def _in_processes(drive: Drive, batches: list[list[int]], workers: int) -> Iterator[list[Outcomes]]:
-    """What comes of batches, as it comes."""
+    results.show(move)
     # Forking a process that has started threads may hang; a fresh one costs a second.
     pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_work)
     try:
-        for future in as_completed([pool.submit(drive, batch) for batch in batches]):
-            yield future.result()
+        for row in pool.map(trial, missing, chunksize=size):
+            results.add(row)
+            results.show(move)
+        return results.summed_up(episodes)
     except BrokenExecutor:
         raise ChildProcessError(
             "a worker died (out of memory? fewer --workers need less); with --out what was driven "

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evofsm.cli.options import require
+from evofsm.cli.options import picture
 from evofsm.cli.show import facts, print_json, show, table
 from evofsm.fsm import EvolvingFSM, Labels
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
@@ -191,10 +191,6 @@ def _draw(
     out: Path,
 ) -> None:
     """Variables, states, risk, alarms and failures over time: all of it, and the last failure."""
-    require(matplotlib="plot")
-    from matplotlib.figure import Figure
-    from matplotlib.style import context
-
     from evofsm import plot
 
     chosen = judge.rate_of(tolerance)
@@ -208,11 +204,9 @@ def _draw(
     near = max(int(runs.starts[runs.starts <= last][-1]), last - 4 * judge.horizon)
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
     model = None if machine is None or not machine.n_states else machine.model()
-    with context(["default", "evofsm.paper.house"]):
-        count = len(names) + 1 + (model is not None)
-        figure = Figure((10.0, 1.3 * count), layout="constrained")
+    count = len(names) + 1 + (model is not None)
+    with picture(out, 10.0, 1.3 * count) as figure:
         axes = figure.subplots(count, 2, sharex="col")
         for column, part in zip(axes.T, (slice(None), slice(near, last + 1)), strict=True):
             seen = times[part], runs.rows[part], names, risk[part], failed[part]
             plot.history(column, *seen, tolerance, model=model)
-        figure.savefig(out)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from evofsm.cli.options import Json, Saved, option, require, split_names
+from evofsm.cli.options import Json, Saved, option, picture, split_names
 from evofsm.cli.show import facts, print_json, say, show, table
 
 if TYPE_CHECKING:
@@ -73,7 +73,6 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None, Guard | None]:
             raise FileNotFoundError(f"{place}: there is neither {' nor '.join(_MODELS)} in it")
         return load_model(found)
     if place.suffix == ".mcap":
-        require(mcap="mcap")
         from evofsm.io import read_run
 
         model = read_run(place).model
@@ -99,10 +98,6 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None, Guard | None]:
 
 def _draw(model: FSMModel, guard: Guard | None, out: Path, axes: str | None) -> None:
     """States in the plane of two variables, and what a guard has learnt of failure."""
-    require(matplotlib="plot")
-    from matplotlib.figure import Figure
-    from matplotlib.style import context
-
     from evofsm import plot
     from evofsm.guard import LearntRisk
 
@@ -110,13 +105,11 @@ def _draw(model: FSMModel, guard: Guard | None, out: Path, axes: str | None) -> 
     pair: Any = [names.index(one) for one in split_names(axes or "") if one in names]
     if len(pair) != 2 * (axes is not None):
         raise ValueError(f"--axes is {axes}; name two of {', '.join(names)}")
-    with context(["default", "evofsm.paper.house"]):
-        figure = Figure((7.2, 5.0), layout="constrained")
+    with picture(out, 7.2, 5.0) as figure:
         if guard is not None and isinstance(guard.judge, LearntRisk):
             plot.experience(guard, figure.subplots(), variables=pair or None)
         else:
             plot.states(model, figure.subplots(), variables=pair or (0, 1))
-        figure.savefig(out)
 
 
 # -- As a whole -----------------------------------------------------------------------------------

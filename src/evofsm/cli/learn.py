@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -61,7 +62,7 @@ def learn(
             "traces of ASAM OSI (.osi, MCAP), bags of ROS 2 (folder, MCAP, db3)."
         ),
     ],
-    reading: Reading,
+    reading: partial[Reading],
     action_range: Annotated[
         str,
         option("Intervals of --action, LOW:HIGH:WIDTH; what lies beyond goes into the end ones."),
@@ -133,17 +134,17 @@ def learn(
     from evofsm.cli.learning import guard_of_log, learn_traces, refusing, teach, warnings_of
     from evofsm.driving.naming import UNITS, VARIABLES
     from evofsm.fsm import Labels
-    from evofsm.io import episodes_of, read_traces
+    from evofsm.io import episodes_of
     from evofsm.io.logs import Noted
     from evofsm.io.tables import SI
 
     _check_out(out)
     _check_out(guard, "--guard")
-    lacking = _look_first(files[0], reading)
+    columns, lengths, _, acts = read = reading()
+    lacking = _look_first(files[0], read)
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
-    actions = _actions(action_range if reading.acts else "0:1:1")
-    columns, lengths, topics, acts = reading
+    actions = _actions(action_range if acts else "0:1:1")
     encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
     kind = None if guard is None else _judge_of(judge if acts else "learnt", columns)
@@ -156,14 +157,8 @@ def learn(
         return [SI.get(unit, unit) for unit in units]
 
     with progress("Learning", sum(file["bytes"] for file in known)) as move:  # type: ignore[misc]
-        chunks = read_traces(
-            files, columns, lengths, lambda count: move(advance=count), noted, topics
-        )
-        if not acts:  # before a hole the action is unknown still
-            chunks = (one._replace(actions=0.0 * one.actions) for one in chunks)
-        learning = learn_traces(
-            _saying(chunks, lacking), machine, actions, encoder.names, units_read
-        )
+        chunks = _saying(read.traces(files, noted, lambda count: move(advance=count)), lacking)
+        learning = learn_traces(chunks, machine, actions, encoder.names, units_read)
     provenance = _provenance(learning, known, columns)
     if not acts:
         provenance["action"] = "none: nobody acts"
@@ -176,7 +171,7 @@ def learn(
     if guard is not None:
         assert kind is not None
         assert learning.model.dt is not None
-        rows = read_traces(files, columns, lengths, topics=topics)
+        rows = read.traces(files)
         if acts:
             reckoned = kind, learning.model.dt, brakes, tolerance
             taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
@@ -191,13 +186,14 @@ def learn(
             taught = guard_where_nobody_acts(episodes, labels, *asked, learning.machine)
         taught.save(guard, provenance)
     if as_json:
-        told = {"files": files, "saved": out, "guard": guard, **_document(learning, provenance)}
-        print_json({**told, "noted": noted, "warnings": warnings})
+        document = {"files": files, "saved": out, "guard": guard}
+        document |= _document(learning, provenance)
+        print_json({**document, "noted": noted, "warnings": warnings})
         return
-    read = [*_read(learning, columns.action * acts), *_read_otherwise(noted, columns, learning)]
+    told = [*_read(learning, columns.action * acts), *_read_otherwise(noted, columns, learning)]
     if lengths.seen:
-        read.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
-    show(facts("What was read", read), *tables_of(learning.model))
+        told.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
+    show(facts("What was read", told), *tables_of(learning.model))
     blind = 1.0 / learning.model.n_states
     if learning.certainty - blind < _UNCERTAIN * (1.0 - blind):
         show(_hardly_told_apart(learning.model, learning.certainty, rule))
@@ -219,16 +215,13 @@ def _actions(text: str) -> IntervalActions:
     from evofsm.fsm.actions import IntervalActions
 
     try:
-        low, high, width = (float(number) for number in text.split(":"))
-    except ValueError:
-        what = "write LOW:HIGH:WIDTH, such as -2.5:2.5:0.3"
-        raise ValueError(f"--action-range is {text!r}; {what}") from None
-    try:
+        low, high, width = map(float, text.split(":"))
         if width > 0.0 and (high - low) / width > _MOST_ACTIONS:
             raise ValueError(f"more than {_MOST_ACTIONS} intervals; make them wider")
         return IntervalActions(low, high, width, outside="clip")
     except ValueError as error:
-        raise ValueError(f"--action-range {text}: {error}") from None
+        what = "write LOW:HIGH:WIDTH, such as -2.5:2.5:0.3"
+        raise ValueError(f"--action-range is {text!r}: {error}; {what}") from None
 
 
 def _machine(

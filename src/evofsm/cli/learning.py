@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from shlex import quote
 from typing import NamedTuple
@@ -29,8 +28,6 @@ from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
 from evofsm.io import Chunk, episodes_of
 from evofsm.io.logs import LogColumns, Noted
 from evofsm.io.tables import SI, TIMES, UNITS
-
-Beliefs = NDArray[np.float64]
 
 #: How far ahead the longer forecast looks [s].
 HORIZON = 1.0
@@ -68,10 +65,9 @@ class Skill(NamedTuple):
 
 
 @dataclass
-class Progress:
-    """How far it has come."""
+class Read:
+    """What was read, and sums over the forecasts of it."""
 
-    blocks: int = 0
     rows: int = 0  #: observations
     episodes: int = 0
     seconds: float = 0.0  #: time between the first and the last row of the episodes, together [s]
@@ -79,22 +75,26 @@ class Progress:
     clipped_above: int = 0  #: actions above the range, put into its last interval
     jumps: int = 0  #: episodes that began because of a hole in time
     failures: int = 0  #: episodes that ended in failure
-    dt: float | None = None  #: usual time between two rows [s]
+    blocks: int = 0
+    dt: float = np.nan  #: usual time between two rows [s]
     last_time: float = np.nan  #: of the latest row [s]
-    scored: int = 0  #: rows of which forecasts were scored
-    certainty: float = 0.0  #: sum over them of the share that the most probable state has
-    #: number, divergence of persistence, and of forecasts: one step, and `HORIZON`
-    one_step: list[float] = field(default_factory=lambda: [0.0] * 3)
-    ahead: list[float] = field(default_factory=lambda: [0.0] * 3)
+    #: number, divergence of persistence, that of forecasts, and the share that the most probable
+    #: state has: one step ahead, and `HORIZON`
+    sums: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 4)))
+
+    @property
+    def steps_ahead(self) -> tuple[int, ...]:
+        """Steps of the forecasts; of one alone where one is about as long as `HORIZON`, or more."""
+        steps = 0 if np.isnan(self.dt) else round(HORIZON / self.dt)
+        return (1, steps) if 1 < steps < _LARGEST_BLOCK // 2 else (1,)
 
 
-@dataclass(frozen=True)
-class Learning:
+class Learning(NamedTuple):
     """What was learnt, and from what."""
 
     machine: EvolvingFSM  #: can go on learning
     model: FSMModel
-    read: Progress
+    read: Read
     transitions: int
     certainty: float  #: mean share of the belief that the most probable state has
     skills: tuple[Skill, ...]  #: of one step, then of `HORIZON`
@@ -108,16 +108,18 @@ def learn_traces(
     units: Callable[[], Sequence[str]] = tuple,
 ) -> Learning:
     """Learn all chunks in their order, each row once; units are known once they are read."""
-    machine, read = machine.copy(), Progress()
-    for chunk in _ahead(chunks):
+    machine, read = machine.copy(), Read()
+    for chunk in chunks:
         _learn(machine, actions, chunk, read)
-    model = machine.model(actions=actions, names=names, units=units(), dt=read.dt)
+    model = machine.model(
+        actions=actions, names=names, units=units(), dt=None if np.isnan(read.dt) else read.dt
+    )
     if (transitions := int(model.uses.sum())) == 0:
         raise ValueError(
             "no transition could be learnt: no row with an action is followed by another row of "
             "its episode (is every row an episode? are the rows sorted by episode and time?)"
         )
-    certainty = read.certainty / read.scored if read.scored else np.nan
+    certainty = float(read.sums[0, 3] / (read.sums[0, 0] or np.nan))
     return Learning(machine, model, read, transitions, certainty, tuple(_skills(read)))
 
 
@@ -250,19 +252,9 @@ def refusing(share: float) -> str:
     return f"refuses {share:.0%} of the time: perhaps {why}" if share > 0.5 else ""
 
 
-def _ahead(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-    """The same chunks; another thread reads the next one while one is learnt."""
-    waiting = iter(chunks)
-    with ThreadPoolExecutor(1) as reader:
-        coming = reader.submit(next, waiting, None)
-        while (chunk := coming.result()) is not None:
-            coming = reader.submit(next, waiting, None)
-            yield chunk
-
-
-def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: Progress) -> None:
+def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: Read) -> None:
     """Learn a chunk block by block, and score the forecasts of each before."""
-    read.dt = None if np.isnan(chunk.dt) else chunk.dt
+    read.dt = chunk.dt
     indices = np.full(len(chunk.times), -1)
     known = ~np.isnan(chunk.actions)
     indices[known] = actions.encode(chunk.actions[known])
@@ -295,7 +287,7 @@ def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: P
 
 
 def _score(
-    model: FSMModel, trace: Trace, block: Chunk, taken: NDArray[np.int64], read: Progress
+    model: FSMModel, trace: Trace, block: Chunk, taken: NDArray[np.int64], read: Read
 ) -> None:
     """Add the divergences of forecasts of rows: of one step as it was learnt, of more by a model.
 
@@ -304,51 +296,31 @@ def _score(
     episode = np.zeros(len(taken), np.int64)
     episode[block.starts] = 1
     episode = episode.cumsum()
-    then = _pairs(episode, taken, 1)
-    then = _some(then[np.isfinite(trace.surprise[then + 1])])
-    beliefs = trace.belief
+    beliefs, n = trace.belief, model.n_states
     assert beliefs is not None
-    _add(read.one_step, beliefs[then], beliefs[then + 1], trace.surprise[then + 1])
-    read.scored += len(then)
-    read.certainty += float(beliefs[then].max(axis=1).sum())
-    if steps := _steps_ahead(read.dt):
-        then, n = _some(_pairs(episode, taken, steps)), model.n_states
-        known = np.einsum("ti,tij->tj", beliefs[then, :n], model.transition_matrices[taken[then]])
-        marginal = model.averaged_matrix("marginal")
-        forecast = beliefs[then]  # of states created since nothing is known: they stay
-        forecast[:, :n] = known @ np.linalg.matrix_power(marginal, steps - 1)
-        came = beliefs[then + steps]
-        _add(read.ahead, beliefs[then], came, jensen_shannon(forecast, came))
+    for sums, steps in zip(read.sums, read.steps_ahead, strict=False):
+        # Rows with an action that so many others of their episode follow; some from all over.
+        then = np.flatnonzero((episode[:-steps] == episode[steps:]) & (taken[:-steps] >= 0))
+        if steps == 1:
+            then = then[np.isfinite(trace.surprise[then + 1])]
+        then = then[:: max(1, -(-len(then) // _SCORED))]
+        now, came = beliefs[then], beliefs[then + steps]
+        if steps == 1:
+            divergence = trace.surprise[then + 1]
+        else:
+            known = np.einsum("ti,tij->tj", now[:, :n], model.transition_matrices[taken[then]])
+            marginal = model.averaged_matrix("marginal")
+            forecast = now.copy()  # of states created since nothing is known: they stay
+            forecast[:, :n] = known @ np.linalg.matrix_power(marginal, steps - 1)
+            divergence = jensen_shannon(forecast, came)
+        found = jensen_shannon(now, came), divergence, now.max(axis=1)
+        sums += len(then), *(each.sum() for each in found)
 
 
-def _some(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """So many of the rows as are scored, from all over the block."""
-    return rows[:: max(1, -(-len(rows) // _SCORED))]
-
-
-def _add(sums: list[float], now: Beliefs, came: Beliefs, divergence: Beliefs) -> None:
-    """The number of forecasts, the divergence of persistence and theirs."""
-    found = len(now), float(jensen_shannon(now, came).sum()), float(divergence.sum())
-    sums[:] = [one + more for one, more in zip(sums, found, strict=True)]
-
-
-def _pairs(episode: NDArray[np.int64], taken: NDArray[np.int64], steps: int) -> NDArray[np.int64]:
-    """Rows with an action that so many others of their episode follow."""
-    return np.flatnonzero((episode[:-steps] == episode[steps:]) & (taken[:-steps] >= 0))
-
-
-def _steps_ahead(dt: float | None) -> int:
-    """Steps of the longer forecast; 0 where one step is about as long, or longer."""
-    steps = 0 if dt is None else round(HORIZON / dt)
-    return steps if 1 < steps < _LARGEST_BLOCK // 2 else 0
-
-
-def _skills(read: Progress) -> Iterator[Skill]:
+def _skills(read: Read) -> Iterator[Skill]:
     """The means, for each kind of forecast."""
-    dt = np.nan if read.dt is None else read.dt
-    for sums, steps in ((read.one_step, 1), (read.ahead, _steps_ahead(read.dt))):
-        if steps:
-            count, persistence, forecast = sums
-            skill = 1.0 - forecast / persistence if persistence > 0.0 else np.nan
-            rows = count or np.nan
-            yield Skill(steps * dt, int(count), forecast / rows, persistence / rows, skill)
+    for sums, steps in zip(read.sums, read.steps_ahead, strict=False):
+        count, persistence, forecast, _ = sums.tolist()
+        skill = 1.0 - forecast / persistence if persistence > 0.0 else np.nan
+        rows = count or np.nan
+        yield Skill(steps * read.dt, int(count), forecast / rows, persistence / rows, skill)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib
 import re
 import sys
-from collections.abc import Callable, Iterable
-from functools import wraps
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial, wraps
 from importlib.util import find_spec
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -17,10 +18,11 @@ import typer
 from evofsm.extras import install
 
 if TYPE_CHECKING:
-    from evofsm.driving import Family
+    from matplotlib.figure import Figure
+
     from evofsm.fsm.observations import ObservationEncoder
-    from evofsm.io import LogColumns, Topics, VehicleLengths
-    from evofsm.io.logs import Resample
+    from evofsm.io import Chunk, LogColumns, Topics, VehicleLengths
+    from evofsm.io.logs import Noted, Resample
 
 #: Where to drive.
 World = Literal["sumo", "kinematic"]
@@ -66,118 +68,6 @@ Brakes = Annotated[
     float,
     option("Hardest braking of the own car, that a guard reckons with [m/s²].", min=0.5, max=20.0),
 ]
-Switches = Annotated[str, option("noise, delay, actuator, jerk, third_car; with commas.", "--with")]
-
-# What the columns of a log mean; `reading_of` takes them.
-Observed = Annotated[
-    str,
-    option(
-        "Columns to observe. A discrete one has its values: light=red/green. A name with a comma "
-        "stands in double quotes.",
-        "--observe",
-    ),
-]
-ActionColumn = Annotated[
-    str,
-    option("Column of the action taken from a row to the next; '': nobody acts.", "--action"),
-]
-TimeColumn = Annotated[
-    str,
-    option(
-        "Column of the time, in seconds or as dates: ISO 8601, or 14.03.2026 09:26:53. Of date and "
-        "time of day with a comma between.",
-        "--time",
-    ),
-]
-EpisodeColumns = Annotated[
-    str | None,
-    option(
-        "An episode begins where one of these columns changes, and in each file; none of them: "
-        "''. [default: those of run,pair,segment,episode there are]",
-        "--episode",
-    ),
-]
-Step = Annotated[float | None, option("From a row to the next [s], without a clock.", "--dt")]
-Failed = Annotated[
-    str | None,
-    option(
-        "What failed: a column of truth values, or a comparison, in SI units, such as 'gap<=0' or "
-        "\"Status=='off'\", with 'and' or 'or' between several. The row with which it becomes true "
-        "ends the episode in failure.",
-        "--failed",
-    ),
-]
-Units = Annotated[
-    list[str] | None,
-    option(
-        "Of a column, or of all that begin so: v=km/h, time=ms; of a date how it is written, "
-        "'time=%m/%d/%Y %H:%M'. May be repeated. [default: of a row of units below the names, if "
-        "there is one]",
-        "--unit",
-    ),
-]
-TopicsFile = Annotated[
-    Path | None,
-    option("TOML: which field of which topic of a bag is which variable.", "--topics"),
-]
-NoLeader = Annotated[
-    str | None,
-    option(
-        "'end': a row in which a number is missing ends the episode, and is left out. A "
-        "condition, such as 'precedingId==0': so does a row in which it holds. "
-        "[default: a missing number is refused]",
-        "--no-leader",
-    ),
-]
-Hold = Annotated[
-    float | None,
-    option(
-        "Signals of several clocks in one table: an empty field has the latest value, not older "
-        "than this [s]; rows are those with an action. [default: 0.5 where no row is whole]",
-        "--hold",
-        min=0.0,
-    ),
-]
-Where = Annotated[
-    str | None,
-    option(
-        "A condition, as of --failed, for rows that count: 'Speed>100', or \"Mode!='service'\". "
-        "Others are left out, and end an episode, but not in failure.",
-        "--where",
-    ),
-]
-Resampled = Annotated[
-    str | None,
-    option(
-        "Rows of so long a time become one, their mean, or of some columns another: 30s, or "
-        "30s,Speed=last,Vibration=max.",
-        "--resample",
-    ),
-]
-Hole = Annotated[
-    str | None,
-    option(
-        "So long a hole in time costs a transition, and no episode: 10min. [default: 1.5 usual "
-        "steps; 10 of --resample]",
-        "--hole",
-    ),
-]
-SkipBad = Annotated[
-    int,
-    option(
-        "Bad rows of a file that are left out, and said; more are refused.", "--skip-bad", min=0
-    ),
-]
-#: As `evofsm.io.logs.SKIPPED`, without what that loads.
-SKIPPED = 10
-Lengths = Annotated[
-    list[str] | None,
-    option(
-        "FCD: of vehicles [m], or of a type; where they drive side by side also their width: "
-        "truck=12, bike=1.6x0.65. May be repeated. [default: 5x1.8]",
-        "--vehicle-length",
-    ),
-]
 
 
 def require(**extras: str) -> None:
@@ -185,6 +75,17 @@ def require(**extras: str) -> None:
     if lacking := [package for package in extras if find_spec(package) is None]:
         command = install(*dict.fromkeys(["cli", *(extras[package] for package in lacking)]))
         raise ModuleNotFoundError(f"this needs {' and '.join(lacking)}: {command}")
+
+
+@contextmanager
+def picture(out: Path, width: float, height: float) -> Iterator[Figure]:
+    """A figure [inch] in the house's style, which then is written to a file."""
+    from matplotlib.figure import Figure
+    from matplotlib.style import context
+
+    with context(["default", "evofsm.paper.house"]):
+        yield (figure := Figure((width, height), layout="constrained"))
+        figure.savefig(out)
 
 
 def require_world(world: World, **extras: str) -> None:
@@ -233,13 +134,6 @@ def _named(text: str) -> list[tuple[str, str]]:
     return [quoted_name(one.strip()) for one in found if one.strip()]
 
 
-def family_of(name: str, switches: str) -> Family:
-    """The family of this name or file, with the switches."""
-    from evofsm.driving import load_family
-
-    return load_family(name).with_switches(split_names(switches))
-
-
 class Reading(NamedTuple):
     """How a log is read."""
 
@@ -248,23 +142,113 @@ class Reading(NamedTuple):
     topics: Topics | None
     acts: bool = True  #: whether somebody acts; else the action is any column, and means nothing
 
+    def traces(
+        self,
+        files: Iterable[str],
+        noted: Noted | None = None,
+        on_read: Callable[[int], object] = lambda count: None,
+    ) -> Iterator[Chunk]:
+        """What is in files."""
+        from evofsm.io import read_traces
+
+        read = read_traces(files, self.columns, self.lengths, on_read, noted, self.topics)
+        # Before a hole the action is unknown still, where somebody acts.
+        return read if self.acts else (one._replace(actions=0.0 * one.actions) for one in read)
+
 
 def reading_of(
-    observe: Observed = "gap,v_follower,v_leader",
-    action: ActionColumn = "a_follower",
-    time: TimeColumn = "time",
-    episode: EpisodeColumns = None,
-    dt: Step = None,
-    failed: Failed = None,
-    unit: Units = None,
-    topics: TopicsFile = None,
-    no_leader: NoLeader = None,
-    hold: Hold = None,
-    skip_bad: SkipBad = SKIPPED,
-    vehicle_length: Lengths = None,
-    where: Where = None,
-    resample: Resampled = None,
-    hole: Hole = None,
+    observe: Annotated[
+        str,
+        option(
+            "Columns to observe. A discrete one has its values: light=red/green. A name with a "
+            "comma stands in double quotes."
+        ),
+    ] = "gap,v_follower,v_leader",
+    action: Annotated[
+        str, option("Column of the action taken from a row to the next; '': nobody acts.")
+    ] = "a_follower",
+    time: Annotated[
+        str,
+        option(
+            "Column of the time, in seconds or as dates: ISO 8601, or 14.03.2026 09:26:53. Of date "
+            "and time of day with a comma between."
+        ),
+    ] = "time",
+    episode: Annotated[
+        str | None,
+        option(
+            "An episode begins where one of these columns changes, and in each file; none of them: "
+            "''. [default: those of run,pair,segment,episode there are]"
+        ),
+    ] = None,
+    dt: Annotated[float | None, option("From a row to the next [s], without a clock.")] = None,
+    failed: Annotated[
+        str | None,
+        option(
+            "What failed: a column of truth values, or a comparison, in SI units, such as 'gap<=0' "
+            "or \"Status=='off'\", with 'and' or 'or' between several. The row with which it "
+            "becomes true ends the episode in failure."
+        ),
+    ] = None,
+    unit: Annotated[
+        list[str] | None,
+        option(
+            "Of a column, or of all that begin so: v=km/h, time=ms; of a date how it is written, "
+            "'time=%m/%d/%Y %H:%M'. May be repeated. [default: of a row of units below the names, "
+            "if there is one]"
+        ),
+    ] = None,
+    topics: Annotated[
+        Path | None, option("TOML: which field of which topic of a bag is which variable.")
+    ] = None,
+    no_leader: Annotated[
+        str | None,
+        option(
+            "'end': a row in which a number is missing ends the episode, and is left out. A "
+            "condition, such as 'precedingId==0': so does a row in which it holds. [default: a "
+            "missing number is refused]"
+        ),
+    ] = None,
+    hold: Annotated[
+        float | None,
+        option(
+            "Signals of several clocks in one table: an empty field has the latest value, not "
+            "older than this [s]; rows are those with an action. [default: 0.5 where no row is "
+            "whole]",
+            min=0.0,
+        ),
+    ] = None,
+    skip_bad: Annotated[
+        int, option("Bad rows of a file that are left out, and said; more are refused.", min=0)
+    ] = 10,  # as `evofsm.io.logs.SKIPPED`, without what that loads
+    vehicle_length: Annotated[
+        list[str] | None,
+        option(
+            "FCD: of vehicles [m], or of a type; where they drive side by side also their width: "
+            "truck=12, bike=1.6x0.65. May be repeated. [default: 5x1.8]"
+        ),
+    ] = None,
+    where: Annotated[
+        str | None,
+        option(
+            "A condition, as of --failed, for rows that count: 'Speed>100', or "
+            "\"Mode!='service'\". Others are left out, and end an episode, but not in failure."
+        ),
+    ] = None,
+    resample: Annotated[
+        str | None,
+        option(
+            "Rows of so long a time become one, their mean, or of some columns another: 30s, or "
+            "30s,Speed=last,Vibration=max."
+        ),
+    ] = None,
+    hole: Annotated[
+        str | None,
+        option(
+            "So long a hole in time costs a transition, and no episode: 10min. [default: 1.5 usual "
+            "steps; 10 of --resample]"
+        ),
+    ] = None,
 ) -> Reading:
     """How a log is read, from the options of those names."""
     from evofsm.driving.naming import VARIABLES
@@ -354,17 +338,22 @@ def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
 
 
 def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
-    """A command that has the options of `reading_of` in place of its parameter ``reading``."""
+    """A command that has the options of `reading_of` in place of its parameter ``reading``.
+
+    That is given `reading_of` with what was typed; an option that a command has itself is its own.
+    """
+    own = signature(command, eval_str=True).parameters
     options = signature(reading_of, eval_str=True).parameters
+    shared = {name: one for name, one in options.items() if name not in own}
 
     @wraps(command)
     def run(**given: Any) -> Any:
-        reading = reading_of(**{name: given.pop(name) for name in options})
-        return command(**given, reading=reading)
+        typed = {name: given.pop(name) for name in shared}
+        return command(**given, reading=partial(reading_of, **typed))
 
     taken = list[Parameter]()
-    for one in signature(command, eval_str=True).parameters.values():
-        taken += options.values() if one.name == "reading" else [one]
+    for one in own.values():
+        taken += shared.values() if one.name == "reading" else [one]
     taken = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in taken]
     run.__dict__["__signature__"] = Signature(taken)
     run.__annotations__ = {one.name: one.annotation for one in taken}

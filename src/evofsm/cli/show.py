@@ -135,22 +135,10 @@ def progress(text: str, total: float | None = None) -> Iterator[Advance]:
     The function takes how much is done, or `advance`, `total` and `description`.
     """
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import Progress
 
-    columns = (TextColumn("{task.description}"), BarColumn(20), TaskProgressColumn(show_speed=True))
-    with Progress(
-        *columns,
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        transient=True,
-        disable=not sys.stderr.isatty(),
-    ) as bars:
+    unwatched = not sys.stderr.isatty()
+    with Progress(console=Console(stderr=True), transient=True, disable=unwatched) as bars:
         task = bars.add_task(text, total=total)
         yield lambda done=None, total=None, **more: bars.update(
             task, completed=done, total=total, **more

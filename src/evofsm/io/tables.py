@@ -132,6 +132,8 @@ def file_kind(path: str) -> Kind:
         beginning = source.read(64).removeprefix(_BYTE_ORDER_MARK).lstrip()
     if not beginning:
         raise ValueError(f"{path} is empty")
+    if b'{"__metadata__"' in beginning:
+        raise ValueError(f"{path} holds what was learnt, and is no log: evofsm inspect prints it")
     if foreign := next((says for mark, says in _FOREIGN.items() if beginning.startswith(mark)), ""):
         raise ValueError(f"{path} {foreign.replace('FILE', path)}")
     if beginning.startswith(_MCAP):

@@ -6,6 +6,7 @@ import math
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import partial
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
@@ -13,29 +14,16 @@ from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import (
     BRAKES,
-    SKIPPED,
     TOLERANCE,
-    ActionColumn,
-    Failed,
-    Hold,
-    Hole,
+    Brakes,
     Horizon,
     Json,
-    Lengths,
     ModeName,
-    NoLeader,
     Persist,
-    Resampled,
-    SkipBad,
-    Step,
-    TimeColumn,
-    TopicsFile,
-    Units,
-    Where,
+    Reading,
     argument,
     option,
-    reading_of,
-    require,
+    reads_logs,
     split_names,
 )
 from evofsm.cli.show import show, warn
@@ -43,7 +31,6 @@ from evofsm.cli.show import show, warn
 if TYPE_CHECKING:
     from evofsm.cli.monitor.decider import Decider
     from evofsm.cli.monitor.transports import Transport
-    from evofsm.cli.options import Reading
     from evofsm.guard import Guard
     from evofsm.io import Chunk
 
@@ -53,20 +40,14 @@ _SAME_STEP = 0.05
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
 
 
+@reads_logs
 def monitor(
     file: Annotated[
         Path | None, argument("JSON lines; with --summary a log too. [default: standard input]")
     ] = None,
     guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
     interval: Annotated[float, option("Time between two rows [s], without --guard.")] = 0.1,
-    brakes: Annotated[
-        float | None,
-        option(
-            f"Hardest braking of the own car [m/s²], without --guard. [default: {BRAKES:g}]",
-            min=0.5,
-            max=20.0,
-        ),
-    ] = None,
+    brakes: Brakes = BRAKES,
     tolerance: Annotated[
         float | None,
         option(f"Highest risk that is accepted. [default: of --guard, or {TOLERANCE:g}]"),
@@ -97,7 +78,7 @@ def monitor(
         str | None, option("Rows under KEY/row, decisions under KEY/decision.")
     ] = None,
     heartbeat: Annotated[
-        float | None, option("Send a heartbeat after so long without a row [s].")
+        float | None, option("Send a heartbeat after so long without a row [s].", min=0.001)
     ] = None,
     warm: Annotated[bool, option("Compile before the first row comes.", "--warm")] = False,
     summary: Annotated[
@@ -108,21 +89,10 @@ def monitor(
     ] = False,
     observe: Annotated[
         str | None,
-        option("Columns of a log to observe. [default: the variables of the guard]", "--observe"),
+        option("Columns of a log to observe. [default: the variables of the guard]"),
     ] = None,
-    action: ActionColumn = "a_follower",
-    time: TimeColumn = "time",
-    dt: Step = None,
-    failed: Failed = None,
-    unit: Units = None,
-    topics: TopicsFile = None,
-    no_leader: NoLeader = None,
-    hold: Hold = None,
-    skip_bad: SkipBad = SKIPPED,
-    vehicle_length: Lengths = None,
-    where: Where = None,
-    resample: Resampled = None,
-    hole: Hole = None,
+    *,
+    reading: partial[Reading],
     horizon: Horizon = None,
     persist: Persist = 0.0,
     plot: Annotated[Path | None, option("Of --summary, where nobody acts: a picture.")] = None,
@@ -149,23 +119,21 @@ def monitor(
         raise ValueError("--traffic learns nothing: it goes with no --guard, --state or --learn")
     if summary and (file is None or state or audit):
         raise ValueError("--summary needs FILE, and goes with no --state or --audit")
-    require(**({} if zenoh is None else {"zenoh": "zenoh"}))
     from evofsm.cli.monitor.decider import EPISODE, Decider
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.transports import Server
     from evofsm.driving.assumed import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
-    from evofsm.fsm.validation import positive
     from evofsm.guard import Foresight, Guard
 
-    if guard is not None and brakes is not None:
+    if guard is not None and brakes != BRAKES:
         raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
-    reckoned, tolerated = brakes or BRAKES, TOLERANCE if tolerance is None else tolerance
+    tolerated = TOLERANCE if tolerance is None else tolerance
 
     def fresh() -> Guard:
         if guard is not None:
             return Guard.load(guard)
-        return (guard_of_traffic if traffic else guard_of_monitor)(interval, reckoned, tolerated)
+        return (guard_of_traffic if traffic else guard_of_monitor)(interval, brakes, tolerated)
 
     is_log = file is not None and (file.suffix in _LOGS or file.is_dir())
     if is_log and not summary:
@@ -174,65 +142,57 @@ def monitor(
         raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns of a log")
     rows = EPISODE if episode is None or is_log else int(episode)
     with ExitStack() as stack:
-        if summary and file is not None:
+        chunks, saved = None, None
+        if summary and file is not None and is_log:
             from evofsm.cli.foreseen import show_foreseen
-            from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
             from evofsm.fsm import Labels
 
             used = fresh() if guard else None
-            alone = action == "" or isinstance(used and used.judge, Foresight)
-            if (as_json or plot) and not (is_log and alone):
-                raise ValueError("--json and --plot are for logs where nobody acts: --action ''")
-            if is_log:
-                own = used.variables if used else VARIABLES
-                if observe is None or set(split_names(observe)) == set(own):  # in its own order
-                    observe = ",".join(f'"{name}"' for name in own)
-                action = "" if alone else action
-                asked = observe, action, time, episode, dt, failed, unit, topics
-                more = no_leader, hold, skip_bad, vehicle_length, where, resample, hole
-                reading = reading_of(*asked, *more)
-                chunks, interval = _episodes(file, reading, dated=alone)
-                if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
-                    what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
-                    warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
-            if is_log and alone:
-                labels = Labels(names=reading.columns.observe.names)
+            alone = reading.keywords["action"] == "" or isinstance(used and used.judge, Foresight)
+            own = used.variables if used else VARIABLES
+            if observe is None or set(split_names(observe)) == set(own):  # in its own order
+                observe = ",".join(f'"{name}"' for name in own)
+            asked = reading(observe=observe, episode=episode, **({"action": ""} if alone else {}))
+            chunks, interval = _episodes(file, asked, dated=alone)
+            if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
+                what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
+                warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
+            if alone:
+                labels = Labels(names=asked.columns.observe.names)
                 wanted = horizon, persist, tolerance
                 show_foreseen(file, list(chunks), used, labels, wanted, plot, as_json=as_json)
                 return None
-            used = used or fresh()
-            _prepare(used, mode, tolerance, None, stack, learn=learn)
-            warn(_of_saved(guard, used) if guard else assumptions(reckoned, tolerated))
-            decider = Decider(used, episode=rows)
-            if is_log:
-                answers = decided_on_log(decider, chunks)
-            else:
-                answers = decided_on_lines(decider, file)
-            show(*summary_of(decider, answers, str(file)))
-            return None
-        saved = None
+        if summary and (as_json or plot):
+            raise ValueError("--json and --plot are for logs where nobody acts: --action ''")
         if state is not None:
             is_other = guard is not None and guard.resolve() != state.resolve()
             given = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
-            made = {"interval": interval, "brakes": reckoned} if guard is None else {}
+            made = {"interval": interval, "brakes": brakes} if guard is None else {}
             told = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
             saved = State(state, {"guard": given, **made, **told})
             stack.callback(saved.close)
-        elif learn:
+        elif learn and not summary:
             warn("nothing of what is learnt is saved; --state FILE saves it")
         used = fresh() if saved is None else saved.guard(fresh)
         _prepare(used, mode, tolerance, audit, stack, learn=learn)
         decider = Decider(used, episode=rows)
+        assumed = _of_saved(guard, used) if guard else assumptions(brakes, tolerated)
+        if summary and file is not None:
+            from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
+
+            warn(assumed)
+            answers = decided_on_log(decider, chunks) if chunks else decided_on_lines(decider, file)
+            show(*summary_of(decider, answers, str(file)))
+            return None
         if warm:
             _compile(decider)
         if saved is not None:
             again = saved.begin(decider)
             if decider.n:
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
-        each = math.inf if heartbeat is None else positive("--heartbeat", heartbeat)
-        server = Server(decider, each)
+        server = Server(decider, heartbeat or math.inf)
         transport, where = _transport(file, socket, udp, zenoh, stack)
-        warn(_of_saved(guard, used) if guard else assumptions(reckoned, tolerated))
+        warn(assumed)
         if where:
             warn(f"listens to {where}")
         try:
@@ -251,20 +211,20 @@ def _episodes(
 ) -> tuple[Iterator[Chunk], float]:
     """The episodes of a log, with dates where they are wanted, and the time of a step [s]."""
     from evofsm.cli.learning import warnings_of
-    from evofsm.io import episodes_of, read_traces
+    from evofsm.io import episodes_of
     from evofsm.io.logs import Noted
 
-    columns, lengths, topics, _ = reading
     noted = Noted()
-    chunks = read_traces([str(file)], columns, lengths, noted=noted, topics=topics)
-    episodes = (one for one in episodes_of(chunks) if len(one.times) > 1)
+    episodes = (
+        one for one in episodes_of(reading.traces([str(file)], noted)) if len(one.times) > 1
+    )
     if (first := next(episodes, None)) is None:
         raise ValueError(f"{file}: no episode has two rows")
 
     def all_of_them() -> Iterator[Chunk]:
         for one in chain([first], episodes):
             yield one._replace(times=one.times + noted.began) if dated else one
-        for warning in warnings_of(noted, columns):
+        for warning in warnings_of(noted, reading.columns):
             warn(f"warning: {warning}")
 
     return all_of_them(), first.dt
@@ -280,14 +240,13 @@ def _prepare(
     learn: bool,
 ) -> None:
     """Set how far it goes, whether it learns, and who writes it down."""
+    from evofsm.fsm.validation import probability
     from evofsm.guard import ActionReviser, AuditLog, Mode
 
     if isinstance(guard.reviser, ActionReviser):
         guard.reviser.mode = Mode(mode)
         if tolerance is not None:
-            if not 0.0 < tolerance < 1.0:
-                raise ValueError(f"--tolerance is {tolerance:g}; it must be between 0 and 1")
-            guard.reviser.tolerance = tolerance
+            guard.reviser.tolerance = probability("--tolerance", tolerance)
     elif mode != "act":
         name = type(guard.reviser).__name__
         raise ValueError(f"a {name} knows no --mode {mode}: what it says is executed")

@@ -53,17 +53,11 @@ _T = TypeVar("_T")
 class Decider:
     """Answers messages by a guard's decisions."""
 
-    def __init__(
-        self,
-        guard: Guard,
-        *,
-        episode: int = EPISODE,
-        keep: Callable[[Message], None] = lambda message: None,
-    ) -> None:
+    def __init__(self, guard: Guard, *, episode: int = EPISODE) -> None:
         self.guard = guard
         self.episode = episode
         self.form = Form(guard)
-        self.keep = keep
+        self.keep: Callable[[Message], None] = lambda message: None
         self.n = 0  #: decisions so far
         self.refused = 0  #: messages that were refused, since the process began
         self.rows = 0  #: of the episode under way; 0 where none is

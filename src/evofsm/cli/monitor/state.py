@@ -74,12 +74,11 @@ class State:
 
     def begin(self, decider: Decider) -> int:
         """Go on where it was; returns the number of messages that were taken in again."""
-        store.sweep(self.path)  # of what may be whole where that was not
         decider.keep = lambda told: self._keep(told, decider)
-        if self._memory is not None:
-            decider.remember(self._memory)
         if self._memory is None:
             self._journal.begin_anew({"mark": self._mark})
+        else:
+            decider.remember(self._memory)
         if self._memory is None or self._journal.settings["mark"] != self._mark:
             self._save(decider)  # what is in a journal of the mark before, is in the guard
             return 0

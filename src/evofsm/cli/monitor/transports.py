@@ -140,9 +140,6 @@ class Stream:
         # A buffer that a thread waits in would not let the process end.
         self._source, self._sink = (getattr(one, "raw", one) for one in (source, sink))
         self._writing = threading.Lock()
-        for one in (source, sink):
-            with suppress(OSError, ValueError):  # they wait, however whoever started it left them
-                os.set_blocking(one.fileno(), True)
 
     def serve(self, server: Server) -> None:
         """Answer line by line."""

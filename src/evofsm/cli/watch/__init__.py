@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import re
 import webbrowser
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, suppress
+from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +24,7 @@ from evofsm.cli.options import (
     World,
     argument,
     option,
+    reading_of,
     reads_logs,
     require,
     require_world,
@@ -33,8 +35,6 @@ if TYPE_CHECKING:
     from evofsm.cli.watch.recorded import Recording
     from evofsm.cli.watch.session import Session
 
-# How a file begins, soon, that holds a guard, a machine or a judge.
-_LEARNT = b'{"__metadata__"'
 # Of a simulation of somebody else's that are watched [s], and positions of cars in them.
 _SECONDS, _ENOUGH = 600.0, 100_000
 
@@ -66,7 +66,7 @@ def watch(
     learn_first: Annotated[int, option("Episodes to learn from before, at most.", min=0)] = 60,
     brakes: Brakes = BRAKES,
     *,
-    reading: Reading,
+    reading: partial[Reading],
     port: Annotated[int, option("Of the page; 0 for any that is free.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
 ) -> None:
@@ -85,21 +85,17 @@ def watch(
     begins when the page is first opened. Ctrl-C ends it.
     """
     require(websockets="watch")
-    from evofsm.io import VehicleLengths
-
-    is_log = _is_log(what)
-    columns, lengths, topics, _ = reading
-    given = columns.episode, columns.dt, columns.failed, columns.units, columns.no_leader
-    if not is_log and (any(given) or topics or lengths != VehicleLengths()):
+    is_log, usual = _is_log(what), signature(reading_of).parameters
+    given = (name for name, one in reading.keywords.items() if one not in (usual[name].default, []))
+    if not is_log and any(given):
         raise ValueError(f"options of columns are for a log, and {what} is none")
-    is_recorded = is_log or what.endswith(".mcap")
-    opened: AbstractContextManager[Session | Recording]
-    if is_recorded:
-        require(scipy="study", mcap="mcap")
-        opened = _recorded(what, case, judge, tolerance, brakes, reading if is_log else None)
-    else:
-        opened = _driven(what, case or 1, world, judge, tolerance, seed, learn_first)
-    with suppress(KeyboardInterrupt), opened as watched:
+    read = reading() if is_log else None
+    with suppress(KeyboardInterrupt), ExitStack() as stack:
+        watched: Session | Recording
+        if is_log or what.endswith(".mcap"):
+            watched = _recorded(what, case, judge, tolerance, brakes, read)
+        else:
+            watched = _driven(stack, what, case or 1, world, judge, tolerance, seed, learn_first)
         asyncio.run(_serve(watched, port, browse=not no_browser))
     say("\nThe page is closed.")
 
@@ -135,19 +131,10 @@ def _is_log(what: str) -> bool:
             f"{what} is neither a file nor one of the families {', '.join(FAMILIES)}; an "
             "environment of Gymnasium is named with its version: CartPole-v1"
         )
-    if place.suffix == ".py":
-        return False
-    if place.is_dir():
-        if not (place / "metadata.yaml").is_file():
-            raise ValueError(f"{what} is a folder, but no bag of ROS 2; name a file in it")
-        return True
-    with place.open("rb") as file:
-        if _LEARNT in file.read(32):
-            raise ValueError(
-                f"{what} holds what was learnt, which nobody drives: evofsm inspect prints it"
-            )
     # What is damaged is no kind of MCAP: whoever reads runs says so.
-    return place.suffix != ".mcap" or file_kind(what) in ("mcap", "bag")
+    if place.suffix == ".mcap":
+        return file_kind(what) in ("mcap", "bag")
+    return place.suffix != ".py"
 
 
 def _recorded(
@@ -157,7 +144,7 @@ def _recorded(
     tolerance: float,
     brakes: float,
     reading: Reading | None,
-) -> AbstractContextManager[Session | Recording]:
+) -> Recording:
     """A run that was recorded, or a log with what a guard would have said; read beforehand."""
     from tempfile import TemporaryDirectory
 
@@ -177,17 +164,17 @@ def _recorded(
                 )
                 if is_cut:
                     warn(f"watched are the first {written:,.0f} s of the simulation")
-            stretches, more = record_log(log, run, *reading[:3], **settings, show=move)
+            stretches, more = record_log(log, run, reading, **settings, show=move)
             if more:
                 warn(f"watched are the first {MOST_ROWS:,} rows; there are more")
             recording = Recording(run, stretches)
     if case is not None:
         recording.choose(case - 1)
-    return nullcontext(recording)
+    return recording
 
 
-@contextmanager
 def _driven(
+    stack: ExitStack,
     what: str,
     case: int,
     world: World,
@@ -195,7 +182,7 @@ def _driven(
     tolerance: float,
     seed: int,
     episodes: int,
-) -> Iterator[Session]:
+) -> Session:
     """A session of cars in a world of their own, or of an environment."""
     from evofsm.cli.watch.session import (
         OnRoads,
@@ -206,18 +193,17 @@ def _driven(
         watched_guard,
     )
 
-    with ExitStack() as stack:
-        simulated = read_simulated(what, seed=seed, tolerance=tolerance)
-        if simulated is None:
-            require_world(world)
-            from evofsm.driving import load_family
-            from evofsm.driving.sumo import open_world
+    simulated = read_simulated(what, seed=seed, tolerance=tolerance)
+    if simulated is None:
+        require_world(world)
+        from evofsm.driving import load_family
+        from evofsm.driving.sumo import open_world
 
-            family = load_family(what)
-            system: System = OnRoads(family, stack.enter_context(open_world(world)), seed)
-            guard = watched_guard(family, judge=judge, tolerance=tolerance)
-        else:
-            system, guard = simulated, simulated.guard
-        with progress("Learning first", episodes) as move:
-            learn_first(guard, system, episodes, move)
-        yield stack.enter_context(Session(system, guard, case=case - 1))
+        family = load_family(what)
+        system: System = OnRoads(family, stack.enter_context(open_world(world)), seed)
+        guard = watched_guard(family, judge=judge, tolerance=tolerance)
+    else:
+        system, guard = simulated, simulated.guard
+    with progress("Learning first", episodes) as move:
+        learn_first(guard, system, episodes, move)
+    return stack.enter_context(Session(system, guard, case=case - 1))

@@ -66,35 +66,24 @@ class Player:
     def attend(self) -> None:
         """Someone looks on: play, if that was waited for."""
         if self._awaits:
-            self._set(awaits=False)
+            self.set(awaits=False)
 
-    def pause(self, paused: bool) -> None:
-        """Wait, or go on."""
-        self._set(paused=paused)
-
-    def step(self) -> None:
-        """One decision, then wait."""
-        self._set(paused=True, steps=True)
-
-    def speed(self, speed: float) -> None:
-        """Play so many times as fast as real time."""
-        self._set(speed=speed)
-
-    def revise(self, on: bool) -> None:
-        """Switch the reviser on or off."""
-        self._watched.revising = on
-        self._set()
-
-    def restart(self, case: int | None = None) -> None:
-        """Begin anew, or another case; and go on if it waited."""
-        self._order = lambda: self._watched.restart(case)
-        self._news.set()
-
-    def _set(self, **changes: bool | float) -> None:
+    def set(self, **changes: bool | float) -> None:
+        """Play on otherwise: ``paused``, or at a ``speed``; with ``steps`` once, though paused."""
         for name, value in changes.items():
             setattr(self, f"_{name}", value)
         self._due = time.monotonic()
         self._audience("clock", self._clock())
+        self._news.set()
+
+    def revise(self, on: bool) -> None:
+        """Switch the reviser on or off."""
+        self._watched.revising = on
+        self.set()
+
+    def restart(self, case: int | None = None) -> None:
+        """Begin anew, or another case; and go on if it waited."""
+        self._order = lambda: self._watched.restart(case)
         self._news.set()
 
     async def play(self) -> None:

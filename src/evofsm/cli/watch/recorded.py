@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.cli.learning import warnings_of
-from evofsm.cli.options import BRAKES
+from evofsm.cli.options import BRAKES, Reading, reading_of
 from evofsm.cli.show import warn
 from evofsm.cli.watch.shown import (
     OF_CARS,
@@ -35,10 +35,8 @@ from evofsm.driving.trials import shadow_drive
 from evofsm.fsm.naming import Labels
 from evofsm.guard import TOLERANCE, Guard, Mode
 from evofsm.io.foxglove import recording
-from evofsm.io.logs import LONGEST_STEP, Chunk, LogColumns, Noted, episodes_of, read_traces
-from evofsm.io.rosbag import Topics
+from evofsm.io.logs import LONGEST_STEP, Chunk, Noted, episodes_of
 from evofsm.io.runs import RecordedEpisode, Run, read_run
-from evofsm.io.vehicles import VehicleLengths
 
 #: More rows of a log are not watched.
 MOST_ROWS = 20_000
@@ -52,8 +50,6 @@ _IDLE = {
 }
 _ACTIONS = ("proposed", "executed", "advised")
 _PASSED = "the guard was not shown to help, so what was proposed passed"
-# So many of a log's episodes can be chosen among.
-_MOST_EPISODES = 500
 _NONE = -1
 # Accelerations that differ by less are the same [m/s²].
 _SAME = 0.05
@@ -112,11 +108,13 @@ class Recording:
         columns = self._episode.columns
         passed = (np.abs(columns["advised"] - columns["executed"]) > _SAME).any()
         idle = _IDLE.get(self._mode, _PASSED if passed else "")
-        chronicle, frames = Chronicle(self.start.tolerance), list(_moved(self._episode, idle))
-        for number, frame in enumerate(frames):
-            frame = self._decided(frame, number) if number + 1 < len(frames) else self._end(frame)
-            frames[number] = frame._replace(story=chronicle.tell(frame))
-        self._frames = frames
+        chronicle, self._frames = Chronicle(self.start.tolerance), list[Frame]()
+        for number, frame in enumerate(_moved(self._episode, idle)):
+            if number < len(columns["time"]):
+                frame = self._decided(frame, number)
+            else:
+                frame = frame._replace(over=True, failed=bool(self._fail))
+            self._frames.append(frame._replace(story=chronicle.tell(frame)))
         return self.start
 
     def choose(self, number: int) -> Start:
@@ -149,14 +147,13 @@ class Recording:
         return Start(
             system=about.get("family", self._name),
             about="each row was judged afterwards." if self._jumps else f"from {self._name}.",
-            cases=tuple(self._names[k] for k in self._order[:_MOST_EPISODES]),
+            cases=tuple(self._names[k] for k in self._order),
             case=case,
             tolerance=float(about.get("tolerance", TOLERANCE)),
             interval=float(np.median(np.diff(times))),
             names=OF_CARS,
             low=(float(np.nanmin(commands)),),
             high=(float(np.nanmax(commands)),),
-            learnt=0,
             judge=about.get("judge", "kinematic"),
             mode=self._mode,
             unjudged="the reviser was off" if self._mode == "off" else unjudged,
@@ -193,11 +190,6 @@ class Recording:
             executed_risk=executed,
         )
 
-    def _end(self, frame: Frame) -> Frame:
-        assert frame.cars is not None
-        cars = frame.cars._replace(rear_ended=self._episode.rear_ended)
-        return frame._replace(over=True, failed=bool(self._fail), cars=cars)
-
 
 def _moved(episode: RecordedEpisode, idle: str) -> Iterator[Frame]:
     """Where the cars are at each decision and at the end, and how they got there."""
@@ -226,6 +218,7 @@ def _moved(episode: RecordedEpisode, idle: str) -> Iterator[Frame]:
                 x_follower=float(positions[number]),
                 time_to_collision=float(time_to_collision(observed[number])),
                 time_headway=float(time_headway(observed[number])),
+                rear_ended=episode.rear_ended and number == len(columns["time"]),
             ),
         )
 
@@ -246,9 +239,7 @@ def _held(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 def record_log(
     path: str,
     out: Path,
-    columns: LogColumns | None = None,
-    lengths: VehicleLengths | None = None,
-    topics: Topics | None = None,
+    reading: Reading | None = None,
     *,
     judge: str = "kinematic",
     brakes: float = BRAKES,
@@ -264,19 +255,20 @@ def record_log(
     Returns what they are called, with how each failed, and whether rows after the first `MOST_ROWS`
     were left out; ``show`` is told how many were decided on.
     """
-    names = VARIABLES if columns is None else columns.observe.names
+    reading = reading or reading_of()
+    names = reading.columns.observe.names
     if len(names) != len(VARIABLES):
         raise ValueError(
             f"cars are watched by {', '.join(VARIABLES)}; --observe has to name the three columns "
             f"in this order, and names {', '.join(names)}"
         )
     noted = Noted()
-    reading = read_traces([path], columns, lengths, noted=noted, topics=topics)
+    rows = _first(reading.traces([path], noted), MOST_ROWS + 1)
     taken, more, written = 0, False, list[tuple[str, str]]()
     about: dict[str, Any] = {"source": Path(path).name, "mode": "shadow", "judge": judge}
     guard = None
     with recording(out, about | {"controller": "as recorded", "tolerance": tolerance}) as log:
-        for number, whole in enumerate(episodes_of(_first(reading, MOST_ROWS + 1)), 1):
+        for number, whole in enumerate(episodes_of(rows), 1):
             more = taken + len(whole.times) > MOST_ROWS
             whole = whole.rows(0, MOST_ROWS - taken)
             taken += len(whole.times)
@@ -294,7 +286,7 @@ def record_log(
             raise ValueError(f"{path}: nobody follows anybody for {_FEWEST_ROWS} rows")
         if guard.machine is not None:
             log.attach(guard.machine.model(names=VARIABLES))
-    for warning in warnings_of(noted, columns):
+    for warning in warnings_of(noted, reading.columns):
         warn(f"warning: {warning}")
     if judge == "kinematic":
         warn(assumptions(brakes, tolerance))

@@ -43,13 +43,7 @@ _FOREIGN = (
 _MOST_FRAMES = 20_000
 # Who leaves more unread is cut off, all of a run is less; a command is short [bytes].
 _MOST_UNREAD, _LONGEST_COMMAND = 1 << 26, 512
-_WELCOME = {
-    "page.html": "text/html",
-    "page.css": "text/css",
-    **dict.fromkeys(
-        ("page.js", "run.js", "road.js", "plots.js", "plane.js", "paint.js"), "text/javascript"
-    ),
-}
+_KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 # Close codes (RFC 6455).
 _NOT_TEXT, _NOT_UNDERSTOOD = 1003, 1008
 
@@ -102,7 +96,8 @@ class LivePage:
         self._frames: deque[str] = deque(maxlen=_MOST_FRAMES)
         self._clients: set[ServerConnection] = set()
         self._start: Start | None = None
-        self._files = {name: (files(__package__) / "live" / name).read_bytes() for name in _WELCOME}
+        found = (files(__package__) / "live").iterdir()
+        self._files = {one.name: one.read_bytes() for one in found}
 
     @property
     def address(self) -> str:
@@ -165,7 +160,8 @@ class LivePage:
             return _refusal(HTTPStatus.NOT_FOUND, "There is no such file.")
         # No policy knows addresses in brackets; 'self' does.
         sockets = "" if hosts[0].startswith("[") else f"ws://{hosts[0]}"
-        return _response(HTTPStatus.OK, self._files[name], _WELCOME[name], sockets)
+        kind = _KINDS[name.rpartition(".")[2]]
+        return _response(HTTPStatus.OK, self._files[name], kind, sockets)
 
     async def _attend(self, connection: ServerConnection) -> None:
         parts = ",".join([*self._latest.values(), *self._frames])  # the start first
@@ -174,33 +170,28 @@ class LivePage:
         if self.player is not None:
             self.player.attend()
         try:
-            await self._obey_all(connection)
+            async for text in connection:
+                if not isinstance(text, str):
+                    await connection.close(_NOT_TEXT, "commands are text")
+                    return
+                self._obey(msgspec.json.decode(text, type=_Command))
         except ConnectionClosed:
             pass
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            await connection.close(_NOT_UNDERSTOOD, "no such command")
         finally:
             self._clients.discard(connection)
-
-    async def _obey_all(self, connection: ServerConnection) -> None:
-        async for text in connection:
-            if not isinstance(text, str):
-                await connection.close(_NOT_TEXT, "commands are text")
-                return
-            try:
-                self._obey(msgspec.json.decode(text, type=_Command))
-            except (msgspec.MsgspecError, ValueError, RecursionError):
-                await connection.close(_NOT_UNDERSTOOD, "no such command")
-                return
 
     def _obey(self, command: _Command) -> None:
         if self.player is None or self._start is None:
             return
         match (command.do, command.value):
             case ("pause", bool(paused)):
-                self.player.pause(paused)
+                self.player.set(paused=paused)
             case ("step", None):
-                self.player.step()
+                self.player.set(paused=True, steps=True)
             case ("speed", float(speed)) if speed in SPEEDS:
-                self.player.speed(speed)
+                self.player.set(speed=speed)
             case ("revise", bool(on)) if self._start.mode == LIVE:
                 self.player.revise(on)
             case ("restart", None):

@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 import re
 import runpy
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,8 +65,8 @@ from evofsm.guard.actions import Action, Choices, change, is_usable, limits, put
 #: The state rule for looking on: coarse enough that each state can be told from the others.
 WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
 
-# So many draws can be chosen among where there are no cases.
-_DRAWS = 12
+# What can be chosen among where there are no cases.
+_DRAWS = tuple(f"draw {number}" for number in range(1, 13))
 # After a leader's full brake there is nothing left to see once all have stood for so long [s].
 _STANDING = 3.0
 # Steps of an environment in a second where it does not say; wishes that are tolerable for so many
@@ -143,7 +143,7 @@ class OnRoads:
         self.family, self.world, self.seed = family, world, seed
         self.name, self.about, self.interval = family.name, family.about, family.interval
         self.labels = family.labels
-        self.cases = family.variants if family.cases > 1 else _draws()
+        self.cases = family.variants if family.cases > 1 else _DRAWS
         self._closing = ExitStack()
 
     def teach(self, guard: Guard, index: int) -> None:
@@ -159,7 +159,7 @@ class OnRoads:
         self.alone = float(alone.time[-1]) if alone.collided else math.inf
         self._road = self._closing.enter_context(self.world.open(draw.scenario))
         self._steps = draw.scenario.steps(self.interval)
-        self._row, self._position, self._stood = 0, 0.0, 0.0
+        self._stood = 0.0
         self._held = np.full(3, np.nan)
         self._look()
 
@@ -182,11 +182,9 @@ class OnRoads:
 
     def cars(self) -> Cars:
         """Where they are."""
-        road = self._road
-        record = road.episode(self._row).record
-        speeds, now = record[:, SPEED], record[-1]
-        self._position += float(0.5 * (speeds[1:] + speeds[:-1]).sum() * road.scenario.dt)
-        self._row = road.row
+        road, episode = self._road, self._road.episode()
+        record, speeds, now = episode.record, episode.record[:, SPEED], episode.record[-1]
+        driven = 0.5 * (speeds[1:] + speeds[:-1]).sum() * road.scenario.dt
         a_leader = float(record[-2, LEADER_ACCELERATION]) if len(record) > 1 else math.nan
         stands = now[SPEED] == now[LEADER_SPEED] == 0.0 and a_leader < 0.0
         self._stood = self._stood + self.interval if stands else 0.0
@@ -195,9 +193,9 @@ class OnRoads:
             gap=float(now[GAP]),
             v_follower=float(speeds[-1]),
             v_leader=float(now[LEADER_SPEED]),
-            a_follower=float(road.episode(max(0, road.row - 1)).realised[0]),
+            a_follower=float(episode.realised[-2:][0]),
             a_leader=a_leader,
-            x_follower=self._position,
+            x_follower=float(driven),
             time_to_collision=float(time_to_collision(seen)),
             time_headway=float(time_headway(seen)),
             gap_behind=float(now[GAP_BEHIND]),
@@ -232,7 +230,7 @@ class Simulated:
     ) -> None:
         with needs("gymnasium", "gym", "an environment of Gymnasium"):
             from evofsm.guard import gym
-        self.name, self.seed, self.cases = name, seed, _draws()
+        self.name, self.seed, self.cases = name, seed, _DRAWS
         self._gym, self._env, self._controller, self._failed = gym, env, controller, failed
         self.interval = 1.0 / float(env.metadata.get("render_fps") or _STEPS_PER_SECOND)
         acts = "Its own controller" if controller else "A controller that acts at random"
@@ -246,9 +244,10 @@ class Simulated:
         spaces = env.observation_space, env.action_space
         self._terms = gym.Terms(made, *spaces, None, failed, 0.0)
         seen = np.array([z for k in range(_LOOKED_AT) for z in self._run(env, -1 - k)])
+        spreads = [spread or 1.0 for spread in seen.std(0).tolist()]
         machine = EvolvingFSM(
             made.actions.n_actions,
-            rule=Novelty(_STATES_APART * math.sqrt(seen.shape[1]), _scales(seen)),
+            rule=Novelty(_STATES_APART * math.sqrt(seen.shape[1]), spreads),
             max_states=_MOST_STATES,
             belief_tolerance=BELIEF_TOLERANCE,
         )
@@ -339,11 +338,6 @@ def _ends(name: str, space: Any) -> dict[str, Any]:
     return {"low": low, "high": high} if len(low) > 1 else {"low": low[0], "high": high[0]}
 
 
-def _scales(seen: NDArray[np.float64]) -> list[float]:
-    """How far variables spread; 1 of one that did not."""
-    return [spread or 1.0 for spread in seen.std(0).tolist()]
-
-
 def read_simulated(what: str, **settings: Any) -> Simulated | None:
     """An environment by its id, or what a file of Python defines; None where it is none.
 
@@ -352,7 +346,7 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
     `evofsm.guard.RevisedActions` takes it, and ``variables``, their names.
     """
     if what.endswith(".py"):
-        with _of_file(what):
+        try:
             found = runpy.run_path(what)
             if "environment" not in found:
                 if "family" in found:
@@ -360,6 +354,8 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
                 raise ValueError("it defines neither environment() nor a Family called family")
             own = {name: found[name] for name in _PARTS if name in found}
             return Simulated(Path(what).stem, found["environment"](), **own, **settings)
+        except Exception as error:  # of somebody's own
+            raise ValueError(f"{what}: {type(error).__name__}: {error}") from error
     if not re.search(r"-v\d+$", what):
         return None
     with needs("gymnasium", "gym", "an environment of Gymnasium"):
@@ -370,22 +366,13 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
         raise ValueError(f"{what}: {error}") from error
 
 
-@contextmanager
-def _of_file(path: str) -> Iterator[None]:
-    """Errors of a file of somebody's own tell which file it is."""
-    try:
-        yield
-    except Exception as error:
-        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
-
-
 System = OnRoads | Simulated
 
 
 # -- A run ----------------------------------------------------------------------------------------
 
 
-class Session:
+class Session(AbstractContextManager["Session"]):
     """One run of a system after another, each driven decision by decision."""
 
     def __init__(self, system: System, guard: Guard, *, case: int = 0, on: bool = True) -> None:
@@ -395,7 +382,8 @@ class Session:
         self._tolerance = float(self._reviser.tolerance)  # type: ignore[attr-defined]
         guard.explaining = True
         # As a decision logger it is told of each before anything is learnt from it.
-        told: Any = SimpleNamespace(begin=_ignore, seen=_ignore, decided=self._ask, ended=_ignore)
+        rest = dict.fromkeys(("begin", "seen", "ended"), lambda *_, **__: None)
+        told: Any = SimpleNamespace(decided=self._ask, **rest)
         guard.audit = told
         self.revising = on
         self.start = self.restart()
@@ -456,9 +444,6 @@ class Session:
         """What is known of failure."""
         return known_of(self.judge)
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *error: object) -> None:
         self.system.close()
 
@@ -489,7 +474,6 @@ class Session:
             cars=is_cars,
             learnt=self._guard.n_episodes,
             judge=name_judge(self.judge),
-            unjudged="no failure was known yet",
         )
 
     def _decide(self, frame: Frame) -> Frame:
@@ -497,12 +481,14 @@ class Session:
         revision = guard.decide(self.system.observation, self.system.propose(), frame.time)
         situation, judged = guard.situation, self._judged
         self.system.advance(revision)
+        numbered = zip(judged.risk, judged.low, judged.high, judged.critical, strict=True)
+        wished, done, best = (Judged(*map(float, each)) for each in numbered)
         return frame._replace(
             belief=most_believed(situation.belief),
             state=situation.state,
-            proposed_risk=_judged(judged, 0),
-            executed_risk=_judged(judged, 1),
-            least_risk=float(judged.risk[2]),
+            proposed_risk=wished,
+            executed_risk=done,
+            least_risk=best.risk,
             proposed=numbers(revision.proposed),
             executed=numbers(revision.executed),
             advised=numbers(revision.advised),
@@ -539,16 +525,3 @@ class Session:
         if system.failed:
             novel = first_of_its_kind(frame.observation, before, self.known())
         return frame._replace(over=True, failed=system.failed, novel=novel)
-
-
-def _ignore(*told: Any, **named: Any) -> None:
-    """What need not be known."""
-
-
-def _draws() -> tuple[str, ...]:
-    return tuple(f"draw {number}" for number in range(1, _DRAWS + 1))
-
-
-def _judged(judged: Judgement, option: int) -> Judged:
-    each = judged.risk, judged.low, judged.high, judged.critical
-    return Judged(*(float(values[option]) for values in each))

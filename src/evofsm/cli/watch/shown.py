@@ -97,10 +97,10 @@ class Start(NamedTuple):
     names: tuple[str, ...]  #: of the variables, with their units
     low: tuple[float, ...]  #: of the components of an action
     high: tuple[float, ...]
-    learnt: int  #: episodes learnt from before
     judge: str  #: by what it was told, a name of `evofsm.driving.cars.TOLD`
+    learnt: int = 0  #: episodes learnt from before
     mode: str = LIVE  #: or how far the reviser went as it was recorded, a name of `Mode`
-    unjudged: str = ""  #: why nothing is judged, where nothing is
+    unjudged: str = "no failure was known yet"  #: why nothing is judged, where nothing is
     fails: str = ""  #: who says that it failed, where a record does
     discrete: bool = False  #: whether an action is an index
     cars: bool = True  #: whether they are cars

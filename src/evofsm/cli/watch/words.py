@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from evofsm.cli.watch.shown import LIVE, Cars, Danger, Frame, Start, Story
+from evofsm.cli.watch.shown import LIVE, Danger, Frame, Start, Story
 from evofsm.fsm.validation import action_name, counted
 from evofsm.guard.actions import action_text
 
@@ -218,16 +218,10 @@ def _action(action: Sequence[float], start: Start) -> str:
 
 
 def _outcome(frame: Frame, start: Start) -> str:
-    when, cars = _seconds(frame.time), frame.cars
-    if cars is not None:
-        return _on_the_road(frame, cars, start)
-    if frame.over:
-        return f"Failed at {when}." if frame.failed else f"It ended at {when} without failure."
-    return ""
-
-
-def _on_the_road(frame: Frame, cars: Cars, start: Start) -> str:
-    story, parts, when = frame.story, [], _seconds(frame.time)
+    story, parts, when, cars = frame.story, [], _seconds(frame.time), frame.cars
+    if cars is None:
+        ended = f"Failed at {when}." if frame.failed else f"It ended at {when} without failure."
+        return ended if frame.over else ""
     if not math.isnan(story.leader_brakes):
         since = _seconds(story.leader_brakes)
         parts.append(f"The leader braked from {since} on, by up to {story.leader_decel:.1f} m/s².")
@@ -256,9 +250,5 @@ def _alone(frame: Frame) -> str:
 
 
 def _seconds(time: float) -> str:
-    return f"{time:.2g} s" if time < 1.0 else f"{_tenths(time):.1f} s"
-
-
-def _tenths(time: float) -> float:
     """A time, rounded as the page does it: 14.25 s becomes 14.3 s."""
-    return math.nan if math.isnan(time) else math.floor(10.0 * time + 0.5) / 10.0
+    return f"{time:.2g} s" if time < 1.0 else f"{math.floor(10.0 * time + 0.5) / 10.0:.1f} s"
