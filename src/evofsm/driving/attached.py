@@ -265,7 +265,6 @@ class Guarding:
         self._sumo, self._vehicle, self._seeing = sumo, sumo.vehicle, seeing
         self._acts, self._report = acts, report
         self._template, self._settings, self._learn = guard, settings, learn
-        self._judges: dict[tuple[float, float, float], TrafficRisk] = {}
         self.cars: dict[str, _Car] = {}  #: by id
         self._watches: dict[str, BrakeWatch] = {}
         #: How hard they were seen to brake.
@@ -285,7 +284,6 @@ class Guarding:
         self._every = steps_between(self.interval, self._seeing.dt)
         self._steps = 0
         self._watches.clear()
-        self._judges.clear()
 
     def add(self, car: str) -> None:
         """Guard it from now on."""
@@ -423,10 +421,13 @@ class Guarding:
     def _guard_for(self, car: str, high: float) -> Guard:
         mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
-            decel = self._vehicle.getDecel(car)
-            limits = -max(self._vehicle.getEmergencyDecel(car), decel), high, decel
-            how: dict[str, Any] = {"tolerance": self._settings["tolerance"], "mode": mode}
-            return guard_for_traffic(*limits, self.interval, judge=self._judge_for(limits), **how)
+            decel, told, dt = self._vehicle.getDecel(car), self._settings, self.interval
+            how = {"margin": _MARGIN, "regain": told["regain"]}
+            judge = TrafficRisk(LatentRisk.given(-decel, decel, told["leader_decel"], dt, **how))
+            judge.ahead.manoeuvres = self.leaders
+            low, tolerance = -max(self._vehicle.getEmergencyDecel(car), decel), told["tolerance"]
+            limits = low, high, decel, dt
+            return guard_for_traffic(*limits, judge=judge, tolerance=tolerance, mode=mode)
         guard = self._template.copy()
         guard.freeze()
         if isinstance(guard.reviser, ActionReviser):
@@ -434,17 +435,6 @@ class Guarding:
         if isinstance(latent := _of_pair(_judge(guard)), LatentRisk):
             latent.manoeuvres = self.leaders
         return guard
-
-    def _judge_for(self, limits: tuple[float, float, float]) -> TrafficRisk:
-        """One for all cars that can do the same: it remembers nothing of any."""
-        judge = self._judges.get(limits)
-        if judge is None:
-            decel, settings = limits[2], self._settings
-            how = {"margin": _MARGIN, "regain": settings["regain"]}
-            given = -decel, decel, settings["leader_decel"], self.interval
-            judge = self._judges[limits] = TrafficRisk(LatentRisk.given(*given, **how))
-            judge.ahead.manoeuvres = self.leaders
-        return judge
 
 
 def _held_back(sumo: Any) -> set[str]:
