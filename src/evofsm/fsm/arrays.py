@@ -215,23 +215,17 @@ def _optional(settings: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-_RULE: dict[str, Any] = {
-    **dict.fromkeys(("radius", "spread"), SIZE),
-    "scales": Numbers(("scales",), 1e-20, 1e20),
-}
-_RULE = _optional(_RULE)
+_SIZES = dict.fromkeys(("radius", "spread"), SIZE)
+_RULE = _optional({**_SIZES, "scales": Numbers(("scales",), 1e-20, 1e20)})
 _BELOW_1, _WEIGHT = math.nextafter(1.0, 0.0), Numbers(least=SMALLEST, most=1e50)
-_OPTIONAL: dict[str, Any] = {
-    "belief_tolerance": Numbers(least=0.0, most=_BELOW_1),
-    **dict.fromkeys(("max_states", "failure_horizon"), FROM_1),
-}
+_LIMITS = dict.fromkeys(("max_states", "failure_horizon"), FROM_1)
 #: Of a machine, with those of its rule.
 _SETTINGS: dict[str, Any] = {
     "n_actions": FROM_1,
-    **dict.fromkeys(("radius", "spread"), SIZE),
+    **_SIZES,
     **dict.fromkeys(("distance_weight", "prior_frequency"), _WEIGHT),
     "learning_rate": _WEIGHT._replace(most=_BELOW_1),
-    **_optional(_OPTIONAL),
+    **_optional({**_LIMITS, "belief_tolerance": Numbers(least=0.0, most=_BELOW_1)}),
     "rule": _RULE,
 }
 OF_MODEL: dict[str, Numbers] = {
