@@ -53,8 +53,9 @@ class _Driver:
     @cached_property
     def parameters(self) -> NDArray[np.float64]:
         """(k, 9) ndarray: of each phase its begin [s], then the arguments of `IDM` in order."""
-        is_changing = isinstance(self, ChangingIDM)
-        phases: Any = ((0.0, self.first), *self.changes) if is_changing else ((0.0, self),)
+        phases: Any = ((0.0, self),)
+        if isinstance(self, ChangingIDM):
+            phases = ((0.0, self.first), *self.changes)
         return np.array([[at, *astuple(driver)] for at, driver in phases])
 
     def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:

@@ -33,6 +33,8 @@ _BLUR, _BLUR_HARDEST, _DOUBT = 0.4, 0.15, 3.0
 _ANOTHER_GAP, _ANOTHER_SPEED = 3.0, 1.0
 # Between two points of the table of `Manoeuvres.harder` [m/s²], and its narrowest kernel.
 _GRID, _NARROWEST = 0.05, 0.1
+# So many of the latest manoeuvres are remembered.
+_MEMORY = 500
 # Of a bin of `LeaderBrakes` [m/s²].
 _WIDTH = 0.25
 
@@ -83,19 +85,17 @@ REAL_DRIVES = LeaderBrakes(
 
 
 class Manoeuvres:
-    """The decelerations of the latest ``memory`` manoeuvres, and how likely harder ones are.
+    """The decelerations of the latest manoeuvres, and how likely harder ones are.
 
     ``width`` is that of the kernel [m/s²]; without it Silverman's.
     """
 
-    def __init__(
-        self, assumed: float, hard: float = 2.5, memory: int = 500, width: float | None = None
-    ) -> None:
+    def __init__(self, assumed: float, hard: float = 2.5, width: float | None = None) -> None:
         self.assumed = positive("assumed", assumed)
         self.hard = positive("hard", hard)
         self.width = width
         self.gentle = 0
-        self.decels: deque[float] = deque(maxlen=memory)
+        self.decels: deque[float] = deque(maxlen=_MEMORY)
         self._tabulate()
 
     def __len__(self) -> int:

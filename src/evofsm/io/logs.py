@@ -518,7 +518,9 @@ def _joined(parts: Sequence[Chunk]) -> Chunk:
 
     return parts[-1]._replace(
         source=parts[0].source,
-        **{name: joined(name) for name in ("observations", "actions", "times")},
+        observations=joined("observations"),
+        actions=joined("actions"),
+        times=joined("times"),
         starts=joined("starts", 1),
         failures=None if parts[0].failures is None else joined("failures", 1),
         names=[name for part in parts for name in part.names],
