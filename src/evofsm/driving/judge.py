@@ -80,7 +80,7 @@ _RISK = Kind(
     {
         "lowest": Numbers(least=-_ASKED, most=-SMALLEST),
         "dt": Numbers(least=_SHORTEST, most=_LONGEST),
-        **dict.fromkeys(("leader_decel", "hard", "comfort"), _ACCELERATION),
+        **dict.fromkeys(("leader_decel", "comfort"), _ACCELERATION),
         "regain": Numbers(least=0.0, most=60.0),
         "own_brakes": Numbers(least=SMALLEST, most=10.0),
         "margin": SIZE,
@@ -113,9 +113,6 @@ class LatentRisk(Retraced):
         Until it was seen, full braking is assumed to bring this share of what was commanded.
     margin : float
         Smallest gap that counts as no collision [m].
-    hard : float
-        Leaders' manoeuvres from which on it learns how hard they brake [m/s²]. Softer ones, of
-        which everyday traffic is full, must not water down the hard ones.
     comfort : float
         Braking that needs no collision to be foreseen [m/s²]. Adaptive cruise control may brake by
         3.5 m/s² at 20 m/s and above (ISO 15622).
@@ -146,7 +143,6 @@ class LatentRisk(Retraced):
         leader_decel: float = 10.0,
         own_brakes: float = 0.6,
         margin: float = 0.5,
-        hard: float = 2.5,
         comfort: float = COMFORT,
         regain: float = REGAIN,
         leaders: LeaderBrakes | None = None,
@@ -158,10 +154,9 @@ class LatentRisk(Retraced):
         self.leader_decel = positive("leader_decel", leader_decel)
         self.own_brakes = positive("own_brakes", own_brakes)
         self.margin = positive("margin", margin)
-        self.hard = positive("hard", hard)
         self.comfort, self.regain = positive("comfort", comfort), positive("regain", regain)
         _RISK.refuse_others(self._settings)
-        self.manoeuvres = Manoeuvres(leader_decel, hard)
+        self.manoeuvres = Manoeuvres(leader_decel)
         if leaders is not None:
             self.manoeuvres.begin_with(leaders)
         self.brakes = OwnBrakes(lowest, own_brakes, dt)
@@ -496,8 +491,8 @@ class LatentRisk(Retraced):
 
     @property
     def _settings(self) -> dict[str, float]:
-        names = ("lowest", "dt", "leader_decel", "own_brakes", "margin", "hard")
-        return {name: getattr(self, name) for name in (*names, "comfort", "regain")}
+        names = ("lowest", "dt", "leader_decel", "own_brakes", "margin", "comfort", "regain")
+        return {name: getattr(self, name) for name in names}
 
     def _learnt(self) -> dict[str, NDArray[np.float64]]:
         return {

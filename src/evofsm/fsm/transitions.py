@@ -162,7 +162,8 @@ def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> No
     now.before = kept if now.before == given else now.before
     _forget(learnt, given, n)
     # The latest observation, from centres of which one has moved.
-    measure_distances(learnt.centers, weights, n, learnt.variables["latest"], learnt.squared_distances)
+    latest = learnt.variables["latest"]
+    measure_distances(learnt.centers, weights, n, latest, learnt.squared_distances)
 
 
 @spliced_kernel
