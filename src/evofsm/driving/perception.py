@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving.rehearsal import Three
+from evofsm.fsm.kernels import compiled
 
 # Standard deviation of what may happen within a decision: the accelerations of the leader, of
 # oneself against what is expected, and of oneself while brakes are not known [m/s²].
@@ -96,7 +97,7 @@ class Perception:
         if self.latest is None:
             return Estimate(now, np.diag(np.square(self.noise)))
         doubt = _OWN if sure else _OWN_UNKNOWN
-        return _filtered(self.latest, now, self.noise, realised, doubt, self.dt)
+        return Estimate(*_filtered(*self.latest, now, self.noise, realised, doubt, self.dt))
 
     def _learn(self, before: Three, now: Three, realised: float) -> None:
         """Take in what kinematics do not explain; of who may stand nothing."""
@@ -133,31 +134,44 @@ def is_whole(observation: Three) -> bool:
 # -- The filter ---------------------------------------------------------------------------------
 
 
+@compiled
 def _filtered(
-    before: Estimate, now: Three, noise: Three, realised: float, doubt: float, dt: float
-) -> Estimate:
-    """One step of the filter, by what was seen (not NaN).
+    before: Three,
+    covariance: NDArray[np.float64],
+    now: Three,
+    noise: Three,
+    realised: float,
+    doubt: float,
+    dt: float,
+) -> tuple[Three, NDArray[np.float64]]:
+    """One step of the filter, to the next mean and covariance, by what was seen (not NaN).
 
     ``doubt`` is the standard deviation of the acceleration that was ``realised`` [m/s²].
     """
-    gap, own, leader = before.mean
+    gap, own, leader = before
     reached = max(own + realised * dt, 0.0)
     mean = np.array([gap + (leader - 0.5 * (own + reached)) * dt, reached, leader])
     moves = np.array([[1.0, -dt, dt], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     # An acceleration changes a speed, and the gap by half an interval of it.
-    caused = np.array([[-0.5 * dt, 0.5 * dt], [1.0, 0.0], [0.0, 1.0]]) * (doubt * dt, _LEADER * dt)
-    spread = moves @ before.covariance @ moves.T + caused @ caused.T
-    spread[0, 0] += _UNEVEN**2
-    variances, seen = np.square(noise), np.array(now)
-    far = (seen - mean) ** 2 > _ANOTHER_LEADER**2 * (spread.diagonal() + variances)
-    if is_whole(now) and (far[0] or far[2]):
-        return Estimate(now, np.diag(variances))
-    for i in np.flatnonzero(~np.isnan(seen)):
-        gain = spread[i] / (spread[i, i] + variances[i])
-        mean += gain * (seen[i] - mean[i])
-        spread -= np.outer(gain, spread[i])
-    gap, own, leader = mean.tolist()
-    return Estimate((gap, max(own, 0.0), max(leader, 0.0)), spread)
+    v, u, half = doubt * dt, _LEADER * dt, 0.5 * dt
+    caused = np.array([[-half * v, half * u, _UNEVEN], [v, 0.0, 0.0], [0.0, u, 0.0]])
+    spread = np.zeros((3, 3))
+    for j, k in np.ndindex(3, 3):
+        for i in range(3):
+            moved = covariance[i, 0] * moves[k, 0] + covariance[i, 1] * moves[k, 1]
+            moved += covariance[i, 2] * moves[k, 2]
+            spread[j, k] += moves[j, i] * moved + caused[j, i] * caused[k, i]
+    if not np.isnan(now[0] + now[1] + now[2]):
+        for i in (0, 2):
+            expected = spread[i, i] + noise[i] ** 2
+            if (now[i] - mean[i]) ** 2 > _ANOTHER_LEADER**2 * expected:
+                return now, np.diag(np.array(noise) ** 2)
+    for i in range(3):
+        if not np.isnan(now[i]):
+            gain = spread[i] / (spread[i, i] + noise[i] ** 2)
+            mean += gain * (now[i] - mean[i])
+            spread -= np.outer(gain, spread[i])
+    return (mean[0], max(mean[1], 0.0), max(mean[2], 0.0)), spread
 
 
 # -- The noise ----------------------------------------------------------------------------------
