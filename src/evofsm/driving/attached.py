@@ -12,7 +12,6 @@ collision before the bumpers touch (``--collision.mingap-factor``), the gap ends
 from __future__ import annotations
 
 import copy
-import itertools
 import math
 import time as clock
 import warnings
@@ -21,6 +20,7 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
+from itertools import chain, count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,7 +64,7 @@ _DEAF = (
     "{} cars were attached to in {} steps, and a guard decided in none: SUMO told nobody ahead or "
     "behind of any. Do they share lanes?"
 )
-_NUMBERS = itertools.count()
+_NUMBERS = count()
 _ATTACHED: weakref.WeakSet[Attachment] = weakref.WeakSet()
 # Two that touched within this time before still do [s].
 _SAME_COLLISION = 5.0
@@ -238,7 +238,6 @@ class _Car:
     guard: Guard
     high: float  # the hardest acceleration
     mode: int | None = None  # SUMO's speed mode before it was taken over
-    leader: str = ""
     speed: float = 0.0
     limit: float = 0.0  # the speed that was set
     wish: float = 0.0  # the speed that its model wants instead
@@ -265,7 +264,6 @@ class Guarding:
         self._sumo, self._vehicle, self._seeing = sumo, sumo.vehicle, seeing
         self._acts, self._report = acts, report
         self._template, self._settings, self._learn = guard, settings, learn
-        self._judges: dict[tuple[float, float, float], TrafficRisk] = {}
         self.cars: dict[str, _Car] = {}  #: by id
         self._watches: dict[str, BrakeWatch] = {}
         #: How hard they were seen to brake.
@@ -285,7 +283,6 @@ class Guarding:
         self._every = steps_between(self.interval, self._seeing.dt)
         self._steps = 0
         self._watches.clear()
-        self._judges.clear()
 
     def add(self, car: str) -> None:
         """Guard it from now on."""
@@ -323,16 +320,14 @@ class Guarding:
 
     def _look(self, one: _Car, speed: float, time: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
-        ahead = self._seeing.ahead(one.id, speed)
+        ahead, before = self._seeing.ahead(one.id, speed), one.around[0]
         scene = isinstance(_judge(one.guard), TrafficRisk)
         # Who is behind matters only where one brakes: if acting, because somebody is ahead.
         alone = ahead is None and self._acts
         behind = self._seeing.behind(one.id, speed) if scene and not alone else None
         one.around = ahead, behind
-        leader = "" if ahead is None else ahead.id
-        if leader != one.leader:  # what is known of the one before does not hold of this one
-            one.leader = leader
-            one.guard.begin()
+        if (ahead and ahead.id) != (before and before.id):
+            one.guard.begin()  # what is known of the one before does not hold of this one
         one.revision = None
         if ahead is None and behind is None:
             one.seen = None
@@ -346,12 +341,10 @@ class Guarding:
         assert one.seen is not None
         one.revision = one.guard.decide(one.seen, proposal)
         self.decisions += 1
-        judge = _judge(one.guard)
-        if isinstance(judge, TrafficRisk) and judge.worst is not None:
-            other = one.around[judge.worst.number - 1]
-            one.about = ("" if other is None else other.id, judge.worst.role)
-        else:
-            one.about = one.leader, Role.AHEAD if one.leader else None
+        worst = judge.worst if isinstance(judge := _judge(one.guard), TrafficRisk) else None
+        other = one.around[worst.number - 1 if worst else 0]
+        role = worst.role if worst else Role.AHEAD
+        one.about = (other.id, role) if other else ("", None)
 
     def _act(self, one: _Car, speed: float) -> None:
         """Set the speed, where the guard allows less than the car might want."""
@@ -404,12 +397,14 @@ class Guarding:
     def _watch(self, speeds: dict[str, float]) -> None:
         """Learn how hard leaders brake, each by itself, whoever follows it.
 
-        What a guard makes a car do is not what leaders do: it is not learnt.
+        What a guard makes a car do, whoever attached it, is not what leaders do: it is not learnt.
         """
         ended = []
-        for held in _held_back(self._sumo):
-            speeds.pop(held, None)
-            self._watches.pop(held, None)
+        guarding = [one.guarding for one in _ATTACHED if one._sumo is self._sumo and one.guarding]
+        for each in chain.from_iterable(one.cars.values() for one in guarding):
+            if each.mode is not None:
+                speeds.pop(each.id, None)
+                self._watches.pop(each.id, None)
         for leader, speed in speeds.items():
             if leader not in self._watches:
                 self._watches[leader] = BrakeWatch(self.interval)
@@ -423,10 +418,13 @@ class Guarding:
     def _guard_for(self, car: str, high: float) -> Guard:
         mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
-            decel = self._vehicle.getDecel(car)
-            limits = -max(self._vehicle.getEmergencyDecel(car), decel), high, decel
-            how: dict[str, Any] = {"tolerance": self._settings["tolerance"], "mode": mode}
-            return guard_for_traffic(*limits, self.interval, judge=self._judge_for(limits), **how)
+            decel, told, dt = self._vehicle.getDecel(car), self._settings, self.interval
+            how = {"margin": _MARGIN, "regain": told["regain"]}
+            judge = TrafficRisk(LatentRisk.given(-decel, decel, told["leader_decel"], dt, **how))
+            judge.ahead.manoeuvres = self.leaders
+            low, tolerance = -max(self._vehicle.getEmergencyDecel(car), decel), told["tolerance"]
+            limits = low, high, decel, dt
+            return guard_for_traffic(*limits, judge=judge, tolerance=tolerance, mode=mode)
         guard = self._template.copy()
         guard.freeze()
         if isinstance(guard.reviser, ActionReviser):
@@ -434,23 +432,6 @@ class Guarding:
         if isinstance(latent := _of_pair(_judge(guard)), LatentRisk):
             latent.manoeuvres = self.leaders
         return guard
-
-    def _judge_for(self, limits: tuple[float, float, float]) -> TrafficRisk:
-        """One for all cars that can do the same: it remembers nothing of any."""
-        judge = self._judges.get(limits)
-        if judge is None:
-            decel, settings = limits[2], self._settings
-            how = {"margin": _MARGIN, "regain": settings["regain"]}
-            given = -decel, decel, settings["leader_decel"], self.interval
-            judge = self._judges[limits] = TrafficRisk(LatentRisk.given(*given, **how))
-            judge.ahead.manoeuvres = self.leaders
-        return judge
-
-
-def _held_back(sumo: Any) -> set[str]:
-    """Cars that a guard makes drive otherwise now, whoever attached it."""
-    guarding = [one.guarding for one in _ATTACHED if one._sumo is sumo and one.guarding]
-    return {car for one in guarding for car, each in one.cars.items() if each.mode is not None}
 
 
 def _judge(guard: Guard) -> ActionJudge | None:

@@ -6,13 +6,9 @@ brakes have weakened since, and how late commands take effect is told by least s
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
-from math import sqrt
-
-import numpy as np
-from numpy.typing import NDArray
-
-from evofsm.fsm.kernels import compiled, kernel
+from math import fsum, sqrt
 
 # Full braking is judged by so many of the latest decisions, and by no fewer than the second number;
 # that it is weaker than before shows in as few, and in no more than the third number.
@@ -39,37 +35,8 @@ def hardest_seen(dt: float) -> float:
     return _HARDEST + _JUMP / dt
 
 
-class Latest:
-    """The latest samples, the oldest first, and what can be said of their mean."""
-
-    def __init__(self, most: int) -> None:
-        self._rows = np.empty((most, 2))  # value, and 1 where a run begins
-        self._count = 0
-
-    def __len__(self) -> int:
-        return self._count
-
-    @property
-    def rows(self) -> NDArray[np.float64]:
-        """(n, 2) ndarray: of each its value, and 1 where a run begins."""
-        return self._rows[: self._count].copy()
-
-    def add(self, value: float, begins: bool) -> None:
-        """Take in one more; the oldest goes where there is no room."""
-        if self._count == len(self._rows):
-            self._rows[:-1] = self._rows[1:]
-            self._count -= 1
-        self._rows[self._count] = value, begins
-        self._count += 1
-
-    def clear(self) -> None:
-        """Forget them."""
-        self._count = 0
-
-    def mean_and_bound(self, errors: float, latest: int | None = None) -> tuple[float, float]:
-        """Mean, and so many standard errors below it; of all, or of the ``latest``."""
-        first = 0 if latest is None else self._count - latest
-        return _mean_and_bound(self._rows[first : self._count], errors)
+#: The latest samples, the oldest first: of each its value, and 1 where a run begins.
+Samples = deque[tuple[float, float]]
 
 
 class OwnBrakes:
@@ -78,9 +45,9 @@ class OwnBrakes:
     def __init__(self, lowest: float, assumed: float, dt: float) -> None:
         self.lowest, self.assumed, self.dt = lowest, assumed, dt
         self._most_change = hardest_seen(dt) * dt  # of a speed within a decision [m/s]
-        self.full = Latest(_MEMORY)  #: samples of full braking
-        self.shortfalls = Latest(_SUSPECT)  #: of any braking against what was to be expected
-        self.brought = Latest(_FEWEST)  #: by the latest of it
+        self.full = Samples(maxlen=_MEMORY)  #: by full braking
+        self.shortfalls = Samples(maxlen=_SUSPECT)  #: of any braking, against what was expected
+        self.brought = Samples(maxlen=_FEWEST)  #: by the latest of that
         #: Whether full braking was seen often and clearly enough to count on what was seen.
         self.known = False
         #: Full braking that can be counted on [m/s²], positive; and as it most likely is.
@@ -98,13 +65,12 @@ class OwnBrakes:
         """Take full braking as known [m/s²], positive."""
         self.remember([(decel, True)] * _FEWEST)
 
-    def remember(self, samples: Iterable[tuple[float, float]] | NDArray[np.float64]) -> None:
+    def remember(self, samples: Iterable[tuple[float, float]]) -> None:
         """Take in what full braking brought, the oldest first, and where a run begins."""
-        for value, begins in samples:
-            self.full.add(float(value), bool(begins))
+        self.full.extend(samples)
         if len(self.full) < _FEWEST:
             return
-        mean, bound = self.full.mean_and_bound(_BOUND)
+        mean, bound = _mean_and_bound(self.full, _BOUND)
         self.known = len(self.full) == _MEMORY or bound >= _CLEAR * mean
         counted_on = bound if self.known else min(bound, -self.assumed * self.lowest)
         self.decel = max(counted_on, -_WEAKEST * self.lowest)
@@ -174,38 +140,26 @@ class OwnBrakes:
         is_braking = ruled < -_GENTLE and len(self.full) >= _FEWEST and not watched
         if is_braking:
             begins = not self._was_braking
-            self.brought.add(-realised, begins)
-            self.shortfalls.add(min(-ruled, self.decel) + realised, begins)
+            self.brought.append((-realised, begins))
+            self.shortfalls.append((min(-ruled, self.decel) + realised, begins))
             if self._is_sure_to_fall_short():  # begin anew
                 self.full.clear()
-                self.remember(self.brought.rows)
+                self.remember(self.brought)
                 self.shortfalls.clear()
         self._was_braking = is_braking
 
     def _is_sure_to_fall_short(self) -> bool:
         """Without noise the latest few tell; in noise it takes more."""
-        seen = self.shortfalls
-        bounds = (seen.mean_and_bound(_SURE, latest)[1] for latest in (_FEWEST, None))
+        seen = [*self.shortfalls]
+        bounds = (_mean_and_bound(some, _SURE)[1] for some in (seen[-_FEWEST:], seen))
         return len(seen) >= _FEWEST and any(bound > _SHORTFALL for bound in bounds)
 
 
-@compiled
-def _mean_and_bound(rows: NDArray[np.float64], errors: float) -> tuple[float, float]:
-    values, count = rows[:, 0], len(rows)
-    mean = _sum(values) / count
-    variance = _sum((values - mean) ** 2) / (count - 1)
-    runs = max(1.0, rows[:, 1].sum())
+def _mean_and_bound(samples: Iterable[tuple[float, float]], errors: float) -> tuple[float, float]:
+    """Mean of samples, and so many standard errors below it."""
+    values, begins = zip(*samples, strict=True)
+    count = len(values)
+    mean = fsum(values) / count  # exact, so that equal samples have no variance
+    variance = fsum([(value - mean) ** 2 for value in values]) / (count - 1)
     few = 1.0 + 1.2 / (count - 1)  # roughly what Student's t adds: few say little of their variance
-    return mean, mean - few * errors * sqrt(variance * runs) / count
-
-
-@kernel
-def _sum(values: NDArray[np.float64]) -> float:
-    """Sum in twice the precision, so that equal samples have no variance (Ogita et al. 2005)."""
-    total = rest = 0.0
-    for value in values:
-        more = total + value
-        part = more - total
-        rest += (total - (more - part)) + (value - part)
-        total = more
-    return total + rest
+    return mean, mean - few * errors * sqrt(variance * max(1.0, sum(begins))) / count

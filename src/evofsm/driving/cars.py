@@ -88,8 +88,13 @@ def guard_for_cars(
     'nothing was learnt yet'
     """
     actions = IntervalActions(low, high, width, outside="clip")
-    if isinstance(judge, str):
-        judge = _judge(judge, actions, interval, seed)
+    if judge == "kinematic":
+        judge = LatentRisk(actions.low, interval)
+    elif judge == "learnt":
+        how: dict[str, Any] = {"seed": seed, "names": VARIABLES, "units": UNITS}
+        judge = LearntRisk(interval, actions.low, actions.high, **how)
+    elif isinstance(judge, str):
+        raise ValueError(f"there is no judge {judge!r}; there are {', '.join(TOLD)}")
     machine = machine or EvolvingFSM(
         actions.n_actions,
         rule=rule,
@@ -98,16 +103,6 @@ def guard_for_cars(
     )
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, machine=machine, judge=judge, **settings)
-
-
-def _judge(name: str, actions: IntervalActions, interval: float, seed: int) -> LearningJudge:
-    if name == "kinematic":
-        return LatentRisk(actions.low, interval)
-    if name == "learnt":
-        return LearntRisk(
-            interval, actions.low, actions.high, seed=seed, names=VARIABLES, units=UNITS
-        )
-    raise ValueError(f"there is no judge {name!r}; there are {', '.join(TOLD)}")
 
 
 def guard_for_family(family: Family, **settings: Any) -> Guard:

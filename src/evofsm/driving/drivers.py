@@ -7,8 +7,9 @@ vehicle can really do is part of the question here, so the bounds are arguments.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,13 +53,10 @@ class _Driver:
     @cached_property
     def parameters(self) -> NDArray[np.float64]:
         """(k, 9) ndarray: of each phase its begin [s], then the arguments of `IDM` in order."""
-        phases: tuple[tuple[float, _Driver], ...] = ((0.0, self),)
+        phases: Any = ((0.0, self),)
         if isinstance(self, ChangingIDM):
             phases = ((0.0, self.first), *self.changes)
-        # As astuple does, which copies each number: made for every draw, that takes long.
-        return np.array(
-            [[at, *(getattr(driver, name) for name in _NAMES)] for at, driver in phases]
-        )
+        return np.array([[at, *astuple(driver)] for at, driver in phases])
 
     def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
         """Acceleration [m/s²] for ``[gap, v_follower, v_leader]`` at ``time`` [s]."""
@@ -112,6 +110,3 @@ class ChangingIDM(_Driver):
         times = [at for at, _ in self.changes]
         if not all(at >= 0.0 for at in times) or times != sorted(times):
             raise ValueError(f"the driver changes at {times} s; it must be 0 or later, in order")
-
-
-_NAMES = tuple(one.name for one in fields(IDM))

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.driving.families import load_family
 from evofsm.driving.family import Draw, Family
 from evofsm.driving.sumo import open_world
-from evofsm.driving.world import Episode, OnRoad
+from evofsm.driving.world import Episode, Road
 from evofsm.extras import needs
 
 with needs("gymnasium", "gym", "an environment of Gymnasium"):
@@ -98,7 +98,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self._open = ExitStack()
         self._world = self._open.enter_context(open_world(world))
         self._run = ExitStack()
-        self._on: OnRoad | None = None
+        self._road: Road | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -116,30 +116,30 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self._run.close()
         scenario = self.draw.scenario
         road = self._run.enter_context(self._world.open(scenario))
-        self._on = OnRoad(road, scenario.steps(self.family.interval))
+        road.every, self._road = scenario.steps(self.family.interval), road
         return np.clip(road.observation, LOW, HIGH), self._info(road.episode())
 
     def step(
         self, action: ArrayLike
     ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
         """Drive for one interval with ``action`` commanded, which must be a finite number."""
-        on = self._on
-        if on is None or on.road.over:
+        road = self._road
+        if road is None or road.over:
             raise RuntimeError("step before reset: no episode is under way")
         acceleration = float(np.asarray(action, dtype=np.float64).reshape(()))
         if not math.isfinite(acceleration):
             raise ValueError(f"action is {acceleration}; an acceleration must be finite")
-        actions, row = self.family.actions, on.road.row
-        seen, _, terminated, truncated, came = on.step(
+        actions, row = self.family.actions, road.row
+        seen, _, terminated, truncated, came = road.step(
             min(max(acceleration, actions.low), actions.high)
         )
-        info = self._info(on.road.episode(first=row)) | {"realised": came["realised"]}
+        info = self._info(road.episode(first=row)) | {"realised": came["realised"]}
         reward = info["distance"] - (self.collision_cost if terminated else 0.0)
         return np.clip(seen, LOW, HIGH), reward, terminated, truncated, info
 
     def close(self) -> None:
         """Leave the road and the world."""
-        self._on = None
+        self._road = None
         self._run.close()
         self._open.close()
 

@@ -32,7 +32,6 @@ from evofsm.driving.naming import LABELS, RANGES
 from evofsm.driving.perception import Estimate, Perception, is_whole
 from evofsm.driving.rehearsal import HARDEST, Body, Three, critical_decelerations, foresee
 from evofsm.driving.revisers import GENTLE_BRAKE
-from evofsm.fsm.kernels import compiled, inner_kernel
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import wilson_bounds
@@ -41,16 +40,7 @@ from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import Action, nearest_bounds
 from evofsm.guard.api import Trial
-from evofsm.store import (
-    COUNT,
-    FLAG,
-    LARGEST_OBSERVATION,
-    SIZE,
-    SMALLEST,
-    Kind,
-    Numbers,
-    Place,
-)
+from evofsm.store import COUNT, FLAG, SIZE, SMALLEST, Kind, Numbers, Place
 
 if TYPE_CHECKING:
     from evofsm.guard import ActionReviser
@@ -90,7 +80,7 @@ _RISK = Kind(
     {
         "lowest": Numbers(least=-_ASKED, most=-SMALLEST),
         "dt": Numbers(least=_SHORTEST, most=_LONGEST),
-        **dict.fromkeys(("leader_decel", "hard", "comfort"), _ACCELERATION),
+        **dict.fromkeys(("leader_decel", "comfort"), _ACCELERATION),
         "regain": Numbers(least=0.0, most=60.0),
         "own_brakes": Numbers(least=SMALLEST, most=10.0),
         "margin": SIZE,
@@ -123,9 +113,6 @@ class LatentRisk(Retraced):
         Until it was seen, full braking is assumed to bring this share of what was commanded.
     margin : float
         Smallest gap that counts as no collision [m].
-    hard : float
-        Leaders' manoeuvres from which on it learns how hard they brake [m/s²]. Softer ones, of
-        which everyday traffic is full, must not water down the hard ones.
     comfort : float
         Braking that needs no collision to be foreseen [m/s²]. Adaptive cruise control may brake by
         3.5 m/s² at 20 m/s and above (ISO 15622).
@@ -156,7 +143,6 @@ class LatentRisk(Retraced):
         leader_decel: float = 10.0,
         own_brakes: float = 0.6,
         margin: float = 0.5,
-        hard: float = 2.5,
         comfort: float = COMFORT,
         regain: float = REGAIN,
         leaders: LeaderBrakes | None = None,
@@ -168,10 +154,9 @@ class LatentRisk(Retraced):
         self.leader_decel = positive("leader_decel", leader_decel)
         self.own_brakes = positive("own_brakes", own_brakes)
         self.margin = positive("margin", margin)
-        self.hard = positive("hard", hard)
         self.comfort, self.regain = positive("comfort", comfort), positive("regain", regain)
         _RISK.refuse_others(self._settings)
-        self.manoeuvres = Manoeuvres(leader_decel, hard)
+        self.manoeuvres = Manoeuvres(leader_decel)
         if leaders is not None:
             self.manoeuvres.begin_with(leaders)
         self.brakes = OwnBrakes(lowest, own_brakes, dt)
@@ -216,24 +201,7 @@ class LatentRisk(Retraced):
         is not gone on with; a TypeError or ValueError leaves what was learnt as it was. It learns
         alike in all states, whatever the ``belief``. ``watched`` is as `watch` says.
         """
-        seen = _three_finite(observation, whole=False)
-        command = _one_finite("acceleration", acceleration)
-        if is_whole(seen):
-            self._learn(seen, command, watched)
-        else:
-            self._keep_up(seen, command)
-
-    @step
-    def _learn(self, seen: Three, command: float, watched: bool) -> None:
-        """Learn from what was seen whole."""
-        estimate = self.perception.see(seen, self._expected, sure=self.brakes.known)
-        self.manoeuvres.remember(self._follow(seen, command))
-        self.brakes.see(seen[1], command, estimate.mean[1], watched=watched)
-        if watched:
-            if not self._watched:
-                self._own_watch.clear()
-            self.brakes.show(self._own_watch.see(0.0, seen[1], seen[1], self._of_change(1)))
-        self._watched = watched
+        self._take_in(observation, acceleration, learn=True, watched=watched)
 
     def watch(
         self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
@@ -246,20 +214,34 @@ class LatentRisk(Retraced):
 
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
         """Keep up with what happens, as `learn`, without learning from it."""
-        command = _one_finite("acceleration", acceleration)
-        self._keep_up(_three_finite(observation, whole=False), command)
+        self._take_in(observation, acceleration, learn=False)
+
+    def _take_in(
+        self, observation: ArrayLike, acceleration: float, *, learn: bool, watched: bool = False
+    ) -> None:
+        seen = _three_finite(observation, whole=False)
+        command = float(_finite("acceleration", [acceleration])[0])
+        self._keep_up(seen, command, learn and is_whole(seen), watched)
 
     @step
-    def _keep_up(self, seen: Three, command: float) -> None:
-        """Keep up with what was seen."""
-        self._watched = False
-        self.perception.see(seen, self._expected, sure=self.brakes.known, learn=False)
+    def _keep_up(self, seen: Three, command: float, learn: bool, watched: bool) -> None:
+        """Keep up with what was seen, and learn from it."""
+        estimate = self.perception.see(seen, self._expected, sure=self.brakes.known, learn=learn)
+        self._commands = (self._commands[1], command)
+        ended = None
         if is_whole(seen):
-            self._follow(seen, command)
+            ended = self._watch.see(*seen, self._of_change(2))
         else:
             self._watch.clear()
             self.brakes.clear()
-            self._commands = (self._commands[1], command)
+        if learn:
+            self.manoeuvres.remember(ended)
+            self.brakes.see(seen[1], command, estimate.mean[1], watched=watched)
+            if watched:
+                if not self._watched:
+                    self._own_watch.clear()
+                self.brakes.show(self._own_watch.see(0.0, seen[1], seen[1], self._of_change(1)))
+        self._watched = learn and watched
 
     @step
     def start_episode(self, *, learn: bool = True) -> None:
@@ -292,10 +274,6 @@ class LatentRisk(Retraced):
         """What comes is not a consequence of what was; how it ended teaches nothing."""
         self.start_episode(learn=True)
 
-    def _follow(self, seen: Three, acceleration: float) -> float | None:
-        self._commands = (self._commands[1], acceleration)
-        return self._watch.see(*seen, self._of_change(2))
-
     def _of_change(self, variable: int) -> float:
         """Standard deviation of the noise on a difference of two of its values."""
         return math.sqrt(2.0) * self.perception.noise[variable]
@@ -324,13 +302,14 @@ class LatentRisk(Retraced):
         """
         here = self._cautious(situation.observation)
         actions = _finite("accelerations", accelerations)
-        table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
+        evidence = float(len(self.manoeuvres))
         if not is_whole(here):  # where one is cannot be told: nothing can be survived for sure
             sure = np.ones(len(actions))
             return Judgement(sure, 0.0 * sure, sure, 0.0 * sure, evidence, situation.seen)
-        judged = np.empty((4, len(actions)))
-        _judge(here, actions, self._commands[1], self.body, self.dt, table, evidence, judged)
-        risk, low, high, critical = judged
+        critical = np.empty(len(actions))
+        critical_decelerations(here, actions, self._commands[1], self.body, self.dt, critical)
+        risk = self.manoeuvres.harder(critical)
+        low, high = np.array([wilson_bounds(one, evidence + 1.0) for one in risk.tolist()]).T
         return Judgement(risk, low, high, critical, evidence, situation.seen)
 
     def why(self, judged: Judgement) -> str:
@@ -501,29 +480,30 @@ class LatentRisk(Retraced):
             risk = cls(**settings)
             risk.manoeuvres.remember(*arrays["decels"].tolist())
             risk.manoeuvres.gentle = int(arrays["gentle"][0])
-            risk.brakes.remember(np.column_stack([arrays["brakes"], arrays["stretches"]]))
+            full = arrays["brakes"].tolist(), arrays["stretches"].tolist()
+            risk.brakes.remember(zip(*full, strict=True))
             risk.perception.restore(arrays)
             risk.brakes.set_lagged(*arrays["lagged"].tolist())
-            for latest in ("brought", "shortfalls"):
-                for value, begins in arrays[f"doubts_{latest}"].reshape(-1, 2).tolist():
-                    getattr(risk.brakes, latest).add(value, bool(begins))
+            for name in ("brought", "shortfalls"):
+                latest = arrays[f"doubts_{name}"].reshape(-1, 2).tolist()
+                getattr(risk.brakes, name).extend(map(tuple, latest))
         return risk
 
     @property
     def _settings(self) -> dict[str, float]:
-        names = ("lowest", "dt", "leader_decel", "own_brakes", "margin", "hard")
-        return {name: getattr(self, name) for name in (*names, "comfort", "regain")}
+        names = ("lowest", "dt", "leader_decel", "own_brakes", "margin", "comfort", "regain")
+        return {name: getattr(self, name) for name in names}
 
     def _learnt(self) -> dict[str, NDArray[np.float64]]:
         return {
             "decels": np.array(self.manoeuvres.decels),
             "gentle": np.array([self.manoeuvres.gentle], dtype=np.float64),
-            "brakes": self.brakes.full.rows[:, 0],
-            "stretches": self.brakes.full.rows[:, 1],
+            "brakes": np.array([value for value, _ in self.brakes.full], np.float64),
+            "stretches": np.array([begins for _, begins in self.brakes.full], np.float64),
             **self.perception.learnt(),
             "lagged": np.array(self.brakes.lagged),
-            "doubts_brought": self.brakes.brought.rows.reshape(-1),
-            "doubts_shortfalls": self.brakes.shortfalls.rows.reshape(-1),
+            "doubts_brought": np.ravel(np.array(self.brakes.brought, np.float64)),
+            "doubts_shortfalls": np.ravel(np.array(self.brakes.shortfalls, np.float64)),
         }
 
 
@@ -600,7 +580,7 @@ def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[State
 
 def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     """Gap and speeds, as they can be judged; unless they must be ``whole``, NaN where not seen."""
-    seen = _series("observation", observation)
+    seen = real_array("observation", observation, 1)
     if len(seen) != 3:
         raise ValueError(
             f"observation has shape {seen.shape}; it must be (3,): gap, speed of the follower "
@@ -612,62 +592,7 @@ def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     return gap, speed, leader_speed
 
 
-def _one_finite(name: str, value: float) -> float:
-    if type(value) is float and abs(value) <= LARGEST_OBSERVATION:  # false of NaN
-        return value
-    return float(_finite(name, [value])[0])
-
-
 def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    array = _series(name, values)
+    array = real_array(name, values, 1)
     refuse_unusable(name, array)
     return array
-
-
-def _series(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Real numbers in a row; what is that already is not looked at for long, nor copied."""
-    if (
-        type(values) is np.ndarray
-        and values.dtype == np.float64
-        and values.ndim == 1
-        and len(values)
-        and values.flags.carray  # a read-only one would be compiled for
-    ):
-        return values
-    return real_array(name, values, 1)
-
-
-@compiled
-def _judge(
-    observation: Three,
-    accelerations: NDArray[np.float64],
-    before: float,
-    body: Body,
-    dt: float,
-    table: NDArray[np.float64],
-    evidence: float,
-    judged: NDArray[np.float64],
-) -> None:
-    """Write risk, its interval and the critical deceleration."""
-    critical_decelerations(observation, accelerations, before, body, dt, judged[3])
-    for k in range(len(accelerations)):
-        judged[0, k] = _interpolated(judged[3, k], table)
-        judged[1, k], judged[2, k] = wilson_bounds(judged[0, k], evidence + 1.0)
-
-
-@inner_kernel
-def _interpolated(x: float, table: NDArray[np.float64]) -> float:
-    """What `numpy.interp` returns for a number, which takes long to compile."""
-    low, high = 0, table.shape[1] - 1
-    if x <= table[0, low]:
-        return float(table[1, low])
-    if x >= table[0, high]:
-        return float(table[1, high])
-    while high - low > 1:
-        middle = (low + high) // 2
-        if table[0, middle] <= x:
-            low = middle
-        else:
-            high = middle
-    slope = (table[1, high] - table[1, low]) / (table[0, high] - table[0, low])
-    return float(slope * (x - table[0, low]) + table[1, low])

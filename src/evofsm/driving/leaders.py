@@ -33,8 +33,11 @@ _BLUR, _BLUR_HARDEST, _DOUBT = 0.4, 0.15, 3.0
 _ANOTHER_GAP, _ANOTHER_SPEED = 3.0, 1.0
 # Between two points of the table of `Manoeuvres.harder` [m/s²], and its narrowest kernel.
 _GRID, _NARROWEST = 0.05, 0.1
-# Of a bin of `LeaderBrakes` [m/s²].
-_WIDTH = 0.25
+# So many of the latest manoeuvres are remembered.
+_MEMORY = 500
+# Manoeuvres from which on it is learnt how hard leaders brake, and the width of a bin of
+# `LeaderBrakes` [m/s²]. Softer ones, of which everyday traffic is full, must not water those down.
+_HARD, _WIDTH = 2.5, 0.25
 
 
 class LeaderBrakes(NamedTuple):
@@ -55,13 +58,11 @@ class LeaderBrakes(NamedTuple):
     source: str  #: whose drives, for people
 
     @classmethod
-    def counted(
-        cls, decels: Sequence[float], gentle: int, hours: float, source: str, hard: float = 2.5
-    ) -> Self:
-        """Count decelerations of at least ``hard`` [m/s²]."""
-        bins = [int((decel - hard) / _WIDTH) for decel in decels]
+    def counted(cls, decels: Sequence[float], gentle: int, hours: float, source: str) -> Self:
+        """Count decelerations of at least 2.5 m/s²."""
+        bins = [int((decel - _HARD) / _WIDTH) for decel in decels]
         counts = np.bincount(np.array(bins, dtype=np.int64)).tolist()
-        return cls(hard, tuple(counts), gentle, positive("hours", hours), source)
+        return cls(_HARD, tuple(counts), gentle, positive("hours", hours), source)
 
     @property
     def decels(self) -> tuple[float, ...]:
@@ -73,7 +74,7 @@ class LeaderBrakes(NamedTuple):
 #: Public drives: 46 waves of braking, the hardest 6.1 m/s². Hardly anyone brakes hard in them, and
 #: no one in an emergency: how hard leaders brake then, they do not tell.
 REAL_DRIVES = LeaderBrakes(
-    hard=2.5,
+    hard=_HARD,
     counts=(25, 15, 14, 14, 7, 7, 3, 2, 1, 1, 1, 0, 0, 0, 2),
     gentle=977,
     hours=16.1,
@@ -83,19 +84,16 @@ REAL_DRIVES = LeaderBrakes(
 
 
 class Manoeuvres:
-    """The decelerations of the latest ``memory`` manoeuvres, and how likely harder ones are.
+    """The decelerations of the latest manoeuvres, and how likely harder ones are.
 
     ``width`` is that of the kernel [m/s²]; without it Silverman's.
     """
 
-    def __init__(
-        self, assumed: float, hard: float = 2.5, memory: int = 500, width: float | None = None
-    ) -> None:
+    def __init__(self, assumed: float, width: float | None = None) -> None:
         self.assumed = positive("assumed", assumed)
-        self.hard = positive("hard", hard)
         self.width = width
         self.gentle = 0
-        self.decels: deque[float] = deque(maxlen=memory)
+        self.decels: deque[float] = deque(maxlen=_MEMORY)
         self._tabulate()
 
     def __len__(self) -> int:
@@ -104,7 +102,7 @@ class Manoeuvres:
     def remember(self, *decels: float | None) -> None:
         """Take in manoeuvres [m/s²], the oldest first; None for none."""
         seen = [min(positive("decel", one), HARDEST) for one in decels if one is not None]
-        hard = [decel for decel in seen if decel >= self.hard]
+        hard = [decel for decel in seen if decel >= _HARD]
         self.gentle += len(seen) - len(hard)
         if hard:
             self.decels = deque([*self.decels, *hard], self.decels.maxlen)
@@ -112,10 +110,10 @@ class Manoeuvres:
 
     def begin_with(self, leaders: LeaderBrakes) -> None:
         """Take in a table of others' manoeuvres as if they had been seen."""
-        if leaders.hard > self.hard:
+        if leaders.hard > _HARD:
             raise ValueError(
-                f"leaders counts from {leaders.hard:g} m/s² on, but hard is {self.hard:g}; a "
-                "table that begins no higher is needed"
+                f"leaders counts from {leaders.hard:g} m/s² on; a table that begins at {_HARD:g} "
+                "m/s² is needed"
             )
         self.remember(*leaders.decels)
         self.gentle += leaders.gentle

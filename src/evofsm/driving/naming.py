@@ -28,27 +28,25 @@ _FAST = ((0.5, "standing"), (8.0, "slow"), (20.0, "at medium speed"), (math.inf,
 _EQUAL = 0.5
 
 
-def name_state(center: ArrayLike, decimals: int = 0) -> str:
+def name_state(center: ArrayLike) -> str:
     """Where a state lies, in words: its gap, its speed, and how fast the gap closes or opens.
 
     Examples
     --------
-    >>> name_state([60.0, 25.0, 27.3], decimals=1)
-    'far (60.0 m), fast (25.0 m/s), opening at 2.3 m/s'
+    >>> name_state([60.0, 25.0, 27.3])
+    'far (60 m), fast (25 m/s), opening at 2 m/s'
     """
     gap, speed, leader = real_array("center", center, 1).tolist()
     closing = speed - leader
-    change = f"{'closing' if closing > 0.0 else 'opening'} at {abs(closing):.{decimals}f} m/s"
-    if abs(closing) < _EQUAL and decimals == 0:
-        change = "at equal speeds"
-    places = _placed(gap, _NEAR, decimals, "m"), _placed(speed, _FAST, decimals, "m/s")
-    return ", ".join([*places, change])
+    change = f"{'closing' if closing > 0.0 else 'opening'} at {abs(closing):.0f} m/s"
+    change = "at equal speeds" if abs(closing) < _EQUAL else change
+    return ", ".join([_placed(gap, _NEAR, "m"), _placed(speed, _FAST, "m/s"), change])
 
 
-def _placed(value: float, bands: Bands, decimals: int, unit: str) -> str:
+def _placed(value: float, bands: Bands, unit: str) -> str:
     word = next((word for most, word in bands if value <= most), bands[-1][1])
     # Adding 0 takes the minus from a zero.
-    return f"{word} ({round(value, decimals) + 0.0:.{decimals}f} {unit})"
+    return f"{word} ({round(value, 0) + 0.0:.0f} {unit})"
 
 
 #: How places and actions of car following are worded: an entry point of ``evofsm.words``.

@@ -195,20 +195,16 @@ class _Road(Road):
             decide(self._plan, self._record, self.row, command)
             if self.over:
                 break
-            accelerations = self._record[self.row, [REALISED, LEADER_ACCELERATION]].tolist()
-            accelerations.append(float(self._record[self.row, ACCELERATION_BEHIND]))
-            self._move(accelerations)
+            did = self._record[self.row, [REALISED, LEADER_ACCELERATION, ACCELERATION_BEHIND]]
+            vehicle = self._sumo.vehicle
+            for car, acceleration in zip(self._cars, did.tolist(), strict=False):
+                speed = max(0.0, vehicle.getSpeed(car) + acceleration * self.scenario.dt)
+                vehicle.setSpeed(car, speed)
+            self._sumo.simulationStep()
             self.row += 1
             if self.row == self._plan.cut_in[0]:
                 self._cut_in(*self._plan.cut_in[1:].tolist())
             self._observe()
-
-    def _move(self, accelerations: list[float]) -> None:
-        vehicle = self._sumo.vehicle
-        for car, acceleration in zip(self._cars, accelerations, strict=False):
-            speed = max(0.0, vehicle.getSpeed(car) + acceleration * self.scenario.dt)
-            vehicle.setSpeed(car, speed)
-        self._sumo.simulationStep()
 
     def _cut_in(self, gap: float, speed: float) -> None:
         vehicle = self._sumo.vehicle

@@ -31,7 +31,6 @@ from evofsm.driving.world import (
     Drives,
     Episode,
     KinematicWorld,
-    OnRoad,
     World,
 )
 from evofsm.extras import needs
@@ -86,7 +85,8 @@ def drive(
         raise ValueError("the guard's actions are vectors, but a car is driven by one number")
     steps = steps_between(guard.interval, scenario.dt)
     with (world or KinematicWorld()).open(scenario) as road:
-        decisions = tuple(run_episode(OnRoad(road, steps), guard, controller))
+        road.every = steps
+        decisions = tuple(run_episode(road, guard, controller))
         return replace(road.episode(), decisions=decisions)
 
 

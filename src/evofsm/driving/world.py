@@ -222,6 +222,7 @@ class Road:
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.row = 0
+        self.every = 1  #: steps from one decision to the next, for `step`
         self._plan = Plan.of(scenario)
         self._record = np.zeros((len(self._plan.times), len(RUN_COLUMNS)))
         self._noise = _noise(scenario, len(self._record))
@@ -270,32 +271,26 @@ class Road:
         rows = slice(first, self.row + 1)
         return Episode(self._plan.times[rows], self._record[rows].copy())
 
-
-class OnRoad:
-    """A road as an environment for `evofsm.guard.run_episode`, deciding every so many steps."""
-
-    def __init__(self, road: Road, steps: int) -> None:
-        self.road, self.steps = road, steps
+    # -- As an environment for `evofsm.guard.run_episode` -----------------------------------------
 
     def reset(self, **_: Any) -> tuple[NDArray[np.float64], dict[str, Any]]:
         """The road as it is."""
-        return self.road.observation, {"time": self.road.time}
+        return self.observation, {"time": self.time}
 
     def step(
         self, action: float, /
     ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
         """Drive on; of two collisions that end a run, running into the leader is a failure."""
-        road = self.road
-        began, speed = road.time, road._record[road.row, SPEED]
-        road.advance(action, self.steps)
-        lasted, failed = road.time - began, road.collided
+        began, speed = self.time, self._record[self.row, SPEED]
+        self.advance(action, self.every)
+        lasted, failed = self.time - began, self.collided
         came = {
-            "time": road.time,
+            "time": self.time,
             "failed": failed,
-            "realised": (road._record[road.row, SPEED] - speed) / lasted if lasted else math.nan,
+            "realised": (self._record[self.row, SPEED] - speed) / lasted if lasted else math.nan,
         }
-        terminated = failed or road.rear_ended
-        return road.observation, 0.0, terminated, road.over and not terminated, came
+        terminated = failed or self.rear_ended
+        return self.observation, 0.0, terminated, self.over and not terminated, came
 
 
 class World(ABC):

@@ -8,7 +8,7 @@ for the matrices of the actions that were used.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -143,30 +143,26 @@ def resized(learnt: Learnt, capacity: int, places: int) -> Learnt:
 def by_name(learnt: Learnt) -> dict[str, NDArray[Any]]:
     """Every array and every field of records, without spare room, as a copy."""
     n, s = int(learnt.now["n_states"][0]), int(learnt.now["n_places"][0])
-    trimmed = resized(learnt, n, s)
-    found: dict[str, NDArray[Any]] = {}
-    for name, array in trimmed._asdict().items():
+    return {name: np.ascontiguousarray(array) for name, array in _named(resized(learnt, n, s))}
+
+
+def _named(learnt: Learnt) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Every array and every field of records, itself."""
+    for name, array in learnt._asdict().items():
         if name == "sums":
-            found |= dict(zip(SUMS, array, strict=True))
+            yield from zip(SUMS, array, strict=True)
         elif array.dtype.names is None:
-            found[name] = array
+            yield name, array
         else:
-            found |= {field: array[field].copy() for field in array.dtype.names}
-    return found
+            yield from ((field, array[field]) for field in array.dtype.names)
 
 
 def from_names(arrays: Mapping[str, NDArray[Any]], m: int, q: int) -> Learnt:
     """What `by_name` gave, if its numbers do not contradict each other."""
     n, s = len(arrays["belief"]), len(arrays["matrices"])
     learnt = blank(m, q, n, s)
-    for name, array in learnt._asdict().items():
-        if name == "sums":
-            array[...] = [arrays[one] for one in SUMS]
-        elif array.dtype.names is None:
-            array[...] = arrays[name]
-        else:
-            for field in array.dtype.names:
-                array[field] = arrays[field]
+    for name, array in _named(learnt):
+        array[...] = arrays[name]
     _refuse_impossible(learnt)
     return resized(learnt, lanes(n), s)
 
@@ -215,23 +211,17 @@ def _optional(settings: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-_RULE: dict[str, Any] = {
-    **dict.fromkeys(("radius", "spread"), SIZE),
-    "scales": Numbers(("scales",), 1e-20, 1e20),
-}
-_RULE = _optional(_RULE)
+_SIZES = dict.fromkeys(("radius", "spread"), SIZE)
+_RULE = _optional({**_SIZES, "scales": Numbers(("scales",), 1e-20, 1e20)})
 _BELOW_1, _WEIGHT = math.nextafter(1.0, 0.0), Numbers(least=SMALLEST, most=1e50)
-_OPTIONAL: dict[str, Any] = {
-    "belief_tolerance": Numbers(least=0.0, most=_BELOW_1),
-    **dict.fromkeys(("max_states", "failure_horizon"), FROM_1),
-}
+_LIMITS = dict.fromkeys(("max_states", "failure_horizon"), FROM_1)
 #: Of a machine, with those of its rule.
 _SETTINGS: dict[str, Any] = {
     "n_actions": FROM_1,
-    **dict.fromkeys(("radius", "spread"), SIZE),
+    **_SIZES,
     **dict.fromkeys(("distance_weight", "prior_frequency"), _WEIGHT),
     "learning_rate": _WEIGHT._replace(most=_BELOW_1),
-    **_optional(_OPTIONAL),
+    **_optional({**_LIMITS, "belief_tolerance": Numbers(least=0.0, most=_BELOW_1)}),
     "rule": _RULE,
 }
 OF_MODEL: dict[str, Numbers] = {

@@ -111,7 +111,10 @@ def explain(
         "" if better is None else f"Better after {labels.action(better)}: {after_better}",
         _of_onsets(known, state, labels),
         "" if is_exact else "States were joined here, so an episode may count twice",
-        "" if came_from is None else _of_origin(arrivals, came_from),
+        ""
+        if came_from is None
+        else f"Most often reached from {state_name(came_from)}: {arrivals[came_from]:,.0f} of "
+        f"{arrivals.sum():,.0f} times",
     ]
     text = " ".join(f"{sentence}." for sentence in sentences if sentence)
     counted = visits, here, came_from, asked, better, after_better
@@ -174,8 +177,3 @@ def _of_onsets(known: Any, state: int, labels: Labels) -> str:
         return f"No disturbance was noticed to begin here, in {while_there}"
     times = "once" if number == 1 else f"{number:,} times"
     return f"A disturbance began here {times} in {while_there}"
-
-
-def _of_origin(arrivals: Floats, came_from: int) -> str:
-    most, all_ = arrivals[came_from], arrivals.sum()
-    return f"Most often reached from {state_name(came_from)}: {most:,.0f} of {all_:,.0f} times"

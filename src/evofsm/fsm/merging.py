@@ -96,11 +96,10 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
     parts = list(machines)
     if not parts:
         raise ValueError("machines is empty; there must be at least one to merge")
+    known: dict[str, tuple[int, Any]] = {}
     for number, part in enumerate(parts):
         if not isinstance(part, EvolvingFSM):
             raise TypeError(f"machine {number} is {part!r}; it must be an EvolvingFSM")
-    known: dict[str, tuple[int, Any]] = {}
-    for number, part in enumerate(parts):
         names = ["n_actions", *Settings._fields[:-1], *["n_variables"][: part.n_states]]
         for name in names:
             given = getattr(part, name)

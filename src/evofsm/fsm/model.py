@@ -21,7 +21,6 @@ from evofsm.fsm.validation import (
     Floats,
     check_action,
     check_index,
-    positive,
     real_array,
     refuse_more_failures,
     refuse_unless_distribution,
@@ -117,8 +116,6 @@ class FSMModel:
         for name in ("names", "units"):
             if len(getattr(self, name)) not in (0, m):
                 raise ValueError(f"{name} are {getattr(self, name)}, but there are {m} variables")
-        if self.dt is not None:
-            object.__setattr__(self, "dt", positive("dt", self.dt))
         if self.actions is not None and self.actions.n_actions != q:
             raise ValueError(f"actions has {self.actions.n_actions} intervals for {q} matrices")
 

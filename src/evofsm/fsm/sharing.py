@@ -49,21 +49,18 @@ def transaction(method: Method) -> Method:
         if self._lock._is_owned():  # within another call, with which it is taken back
             return method(self, *args, **kwargs)
         with self._lock:
-            return attempted(self, *args, **kwargs)
-
-    def attempted(self: Any, *args: Any, **kwargs: Any) -> Any:
-        if self._call is not None:  # an interrupt broke off the taking back, too
-            self._call[1]()
-        rollback: Rollback = self._savepoint()
-        try:
-            self._call = get_ident(), rollback
-            result = method(self, *args, **kwargs)
-            self._call = None
-            return result
-        except BaseException:
-            rollback()
-            self._call = None
-            raise
+            if self._call is not None:  # an interrupt broke off the taking back, too
+                self._call[1]()
+            rollback: Rollback = self._savepoint()
+            try:
+                self._call = get_ident(), rollback
+                result = method(self, *args, **kwargs)
+                self._call = None
+                return result
+            except BaseException:
+                rollback()
+                self._call = None
+                raise
 
     return cast(Method, done)
 

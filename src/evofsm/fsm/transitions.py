@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import Any
 
 from evofsm.fsm.arrays import EPISODES, NO_ACTION, NOT_OPEN, VISITS, Learnt, Settings
+from evofsm.fsm.clusters import measure_distances
 from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced_kernel
 from evofsm.fsm.validation import Floats
 
@@ -161,12 +162,8 @@ def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> No
     now.before = kept if now.before == given else now.before
     _forget(learnt, given, n)
     # The latest observation, from centres of which one has moved.
-    for i in range(n):
-        squared_distance = 0.0
-        for k in range(len(weights)):
-            offset = (learnt.variables[k].latest - learnt.centers[k, i]) * weights[k]
-            squared_distance += offset * offset
-        learnt.squared_distances[i] = squared_distance
+    latest = learnt.variables["latest"]
+    measure_distances(learnt.centers, weights, n, latest, learnt.squared_distances)
 
 
 @spliced_kernel

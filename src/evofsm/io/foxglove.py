@@ -77,11 +77,8 @@ class _Channels:
         situation, revision = decision.situation, decision.revision
         belief = situation.belief.tolist() if situation.state is not None else []
         for topic, names in self._topics.items():
-            message = {
-                field_of(topic, name): self._columns[name].read(decision)
-                for name in names
-                if name != "belief"
-            }
+            read = {name: self._columns[name].read for name in names if name != "belief"}
+            message = {field_of(topic, name): get(decision) for name, get in read.items()}
             message |= {"belief": belief} if topic == "/belief" else {}
             self._send(topic, situation.time, message)
         changed = not same_action(revision.executed, revision.proposed)

@@ -510,22 +510,21 @@ def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterat
 
 def _joined(parts: Sequence[Chunk]) -> Chunk:
     """Chunks as one; ``jumps`` are those of the last one."""
-    if len(parts) == 1:
-        return parts[0]
-    offsets = np.cumsum([0, *(len(part.times) for part in parts[:-1])])
+    before = np.cumsum([0, *(len(part.times) for part in parts[:-1])])
 
-    def rows(name: str) -> NDArray[np.int64]:
-        found = [getattr(part, name) + at for part, at in zip(parts, offsets, strict=True)]
-        return np.concatenate(found)
+    def joined(name: str, rows: int = 0) -> NDArray[Any]:
+        found = zip(parts, rows * before, strict=True)
+        return np.concatenate([getattr(part, name) + first for part, first in found])
 
-    observations, actions, times = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("observations", "actions", "times")
+    return parts[-1]._replace(
+        source=parts[0].source,
+        observations=joined("observations"),
+        actions=joined("actions"),
+        times=joined("times"),
+        starts=joined("starts", 1),
+        failures=None if parts[0].failures is None else joined("failures", 1),
+        names=[name for part in parts for name in part.names],
     )
-    fails = None if parts[0].failures is None else rows("failures")
-    names = [name for part in parts for name in part.names]
-    dt, jumps, source = parts[-1].dt, parts[-1].jumps, parts[0].source
-    return Chunk(source, observations, actions, times, rows("starts"), dt, jumps, fails, names)
 
 
 def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) -> Iterator[Chunk]:

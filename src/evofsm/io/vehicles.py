@@ -263,73 +263,62 @@ def _across(apart: Any, headings: Any) -> Any:
 
 def fcd_of_xml(path: str, on_read: OnRead, skips: Skips) -> Iterator[_Timestep]:
     """Read FCD in XML, with a parser that keeps nothing and knows its line."""
-    reader = _FcdReader(path, skips)
-    with Source(path, on_read, skips) as source:
-        while data := source.read(_BYTES_AT_ONCE):
-            yield from reader.feed(data)
-        yield from reader.feed(b"", last=True)
+    # Told the encoding, it asks no codec for the one that a file names: SUMO writes UTF-8.
+    parser = expat.ParserCreate("utf-8")
+    step: _Timestep = math.nan, str, []
+    depth, whole = 0, list[_Timestep]()
 
-
-class _FcdReader:
-    def __init__(self, path: str, skips: Skips) -> None:
-        self._path, self._skips = path, skips
-        # Told the encoding, it asks no codec for the one that a file names: SUMO writes UTF-8.
-        parser = self._parser = expat.ParserCreate("utf-8")
-        self._fed = self._depth = 0
-        self._step: _Timestep = math.nan, str, []
-        self._steps: list[_Timestep] = []  # which are whole
-        parser.StartElementHandler = self._start
-        parser.EndElementHandler = self._end
-        # Entities could grow without end, or be read from elsewhere.
-        parser.StartDoctypeDeclHandler = self._refuse_doctype
-
-    def feed(self, data: bytes, last: bool = False) -> list[_Timestep]:
-        """Parse more of the file; returns the timesteps that ended in it."""
-        try:
-            self._parser.Parse(data, last)
-        except expat.ExpatError as error:
-            why = expat.ErrorString(error.code)
-            told = f"{self._path}, line {error.lineno}: this XML is cut off or damaged: {why}"
-            told += " (was SUMO or a copy interrupted?)"
-            if not (last and self._fed and why in _CUT):
-                raise ValueError(told) from error
-            self._skips.leave_out("cut", told)
-        self._fed += len(data)
-        if self._fed - self._parser.CurrentByteIndex > _LONGEST_TAG:
-            self._refuse(f"a tag or comment of more than {_LONGEST_TAG:,} bytes begins here")
-        steps, self._steps = self._steps, []
-        return steps
-
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
-        self._depth += 1
-        if self._depth > _DEEPEST:
-            self._refuse(f"there are more than {_DEEPEST} tags within each other")
-        if self._depth == 1 and name != "fcd-export":
-            raise ValueError(
-                f"{self._path} is XML but not SUMO's FCD output: it begins with <{name[:40]}> "
-                "instead of <fcd-export> (written with another option than --fcd-output?)"
-            )
-        if name not in ("timestep", "vehicle"):
-            return
-        place = partial("{}, line {}".format, self._path, self._parser.CurrentLineNumber)
-        if name == "timestep":
-            self._step = (_number(place, "time", attributes.get("time")), place, [])
-            return
-        self._step[2].append((place, attributes))
-
-    def _end(self, name: str) -> None:
-        self._depth -= 1
-        if name == "timestep":
-            self._steps.append(self._step)
-
-    def _refuse_doctype(self, name: str, *_: object) -> None:
-        self._refuse(f"there is a <!DOCTYPE {name[:40]}>, and entities are not read")
-
-    def _refuse(self, why: str) -> NoReturn:
+    def refuse(why: str) -> NoReturn:
         raise ValueError(
-            f"{self._path}, line {self._parser.CurrentLineNumber}: {why}; SUMO writes no such "
-            "thing (is this another program's file?)"
+            f"{path}, line {parser.CurrentLineNumber}: {why}; SUMO writes no such thing (is this "
+            "another program's file?)"
         )
+
+    def start(name: str, attributes: dict[str, str]) -> None:
+        nonlocal depth, step
+        depth += 1
+        if depth > _DEEPEST:
+            refuse(f"there are more than {_DEEPEST} tags within each other")
+        if depth == 1 and name != "fcd-export":
+            raise ValueError(
+                f"{path} is XML but not SUMO's FCD output: it begins with <{name[:40]}> instead of "
+                "<fcd-export> (written with another option than --fcd-output?)"
+            )
+        place = partial("{}, line {}".format, path, parser.CurrentLineNumber)
+        if name == "timestep":
+            step = _number(place, "time", attributes.get("time")), place, []
+        elif name == "vehicle":
+            step[2].append((place, attributes))
+
+    def end(name: str) -> None:
+        nonlocal depth
+        depth -= 1
+        if name == "timestep":
+            whole.append(step)
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    # Entities could grow without end, or be read from elsewhere.
+    parser.StartDoctypeDeclHandler = lambda name, *_: refuse(
+        f"there is a <!DOCTYPE {name[:40]}>, and entities are not read"
+    )
+    fed, data = 0, b" "
+    with Source(path, on_read, skips) as source:
+        while data:
+            data = source.read(_BYTES_AT_ONCE)
+            try:
+                parser.Parse(data, not data)
+            except expat.ExpatError as error:
+                why = expat.ErrorString(error.code)
+                told = f"{path}, line {error.lineno}: this XML is cut off or damaged: {why}"
+                told += " (was SUMO or a copy interrupted?)"
+                if data or not fed or why not in _CUT:
+                    raise ValueError(told) from error
+                skips.leave_out("cut", told)
+            fed += len(data)
+            if fed - parser.CurrentByteIndex > _LONGEST_TAG:
+                refuse(f"a tag or comment of more than {_LONGEST_TAG:,} bytes begins here")
+            yield from whole
+            whole.clear()
 
 
 def fcd_of_table(table: Table) -> Iterator[_Timestep] | None:
