@@ -5,11 +5,14 @@ Constants that a kernel uses stand in a file of kernels: so a cache that is out 
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 import re
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache, partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -195,16 +198,28 @@ def announce_compiling() -> None:
 
 
 def _drop_stale_caches(package: Path) -> None:
-    """Delete cached code that is older than a file of kernels.
+    """Delete cached code where a file of kernels has changed.
 
     Numba compares a cached kernel with its own file only, not with those of the kernels it calls.
     """
+    noted = package / "__pycache__" / "kernels.json"
+    files = [(path, path.stat()) for path in sorted(package.rglob("*.py"))]
+    times = [[str(path), stat.st_size, stat.st_mtime_ns] for path, stat in files]
+    before: dict[str, Any] = {}
+    with suppress(OSError, ValueError):
+        before = json.loads(noted.read_text("utf-8"))
+    if before.get("times") == times:
+        return
+    sources = [path.read_bytes() for path, _ in files]
     uses = re.compile(rb"^@(\w*kernel|compiled)\b", re.MULTILINE)
-    sources = (path for path in package.rglob("*.py") if uses.search(path.read_bytes()))
-    newest = max(path.stat().st_mtime_ns for path in sources)
-    for path in package.rglob("__pycache__/*.nb[ic]"):
-        if path.stat().st_mtime_ns < newest:
+    digest = sha256(b"".join(source for source in sources if uses.search(source))).hexdigest()
+    if before.get("digest") != digest:
+        for path in package.rglob("__pycache__/*.nb[ic]"):
             path.unlink(missing_ok=True)
+    noted.parent.mkdir(exist_ok=True)
+    written = noted.with_name(f"{noted.name}.{os.getpid()}")
+    written.write_text(json.dumps({"times": times, "digest": digest}), "utf-8")
+    written.replace(noted)
 
 
 # Not possible where the installation may not be written, or another process cleans up too.
