@@ -198,7 +198,7 @@ class Foresight(LearningJudge):
         rows, failed = np.delete(log.rows, last[log.failed], 0), log.rows[last[log.failed]]
         unit = np.median(np.abs(np.diff(log.rows, axis=0)), axis=0) + 1e-12
         box, some = np.sort(rows, axis=0), rows[:: max(len(rows) // _ROWS, 1)]
-        survived = failure.Survived(some, box[:2], box[:-3:-1], unit, rows.std(0))
+        survived = failure.Survived(some, box[:2], box[:-3:-1], unit, rows.std(0), rows[:0])
         forms = failure.explain(FAILS, failed, survived)
         judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
         columns = judge._columns(log.rows, log.starts)

@@ -17,8 +17,9 @@ from evofsm.guard.learnt.failure import (
     distances,
     explain,
     inside,
+    rivals,
 )
-from evofsm.guard.learnt.rollout import ENDS, FAILS
+from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS
 
 SHAPES = {
     "disc": lambda z: np.hypot(z[..., 0], z[..., 2]) < 0.8,
@@ -38,10 +39,11 @@ def seen(shape, seed=0):
     return z[fails][:40], z[~fails]
 
 
-def survived_as(rows, unit):
+def survived_as(rows, unit, ended=()):
     """What was survived, as it is asked of."""
     lowest, highest = np.array([rows.min(0)] * 2), np.array([rows.max(0)] * 2)
-    return Survived(rows, lowest, highest, unit, rows.std(0))
+    ended = np.reshape(ended, (-1, rows.shape[1]))
+    return Survived(rows, lowest, highest, unit, rows.std(0), ended)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -147,6 +149,41 @@ def test_a_disc_is_learnt_said_and_no_threshold(taught, content, reloaded):
     assert content(again) == content(taught)
     held = [play(again, 100 + episode) for episode in range(5)]
     assert sum(failed for _, failed in held) <= 1
+
+
+def test_a_rival_reaches_inwards_where_failures_lie_on_a_rim_that_was_skimmed():
+    angle = np.linspace(2.0, 4.3, 6)
+    failures = 0.78 * np.array([np.cos(angle), np.sin(angle)]).T
+    rows = np.random.default_rng(1).uniform(-3.0, 3.0, (3000, 2))
+    rows = rows[np.hypot(*rows.T) > 0.8]
+    rows = rows[rows[:, 0] < 0.5]  # nobody came to the other side yet
+    known = survived_as(rows, np.full(2, 0.02))
+    table = explain(FAILS, failures, known)
+    tried = rivals(table, failures, known)
+    assert inside(tried, failures).any(0).all()
+    assert not inside(tried, rows, blur=0.0).any()
+    far = np.array([[2.0, 0.0], [2.0, 2.0], [2.0, -2.0]])
+    assert not inside(tried, far).any()
+
+
+def test_a_rival_of_a_threshold_asks_each_variable_in_which_failures_are_rare():
+    """A craft fails where it touches fast or tilted; once it touched softly that is what counts."""
+    rng = np.random.default_rng(2)
+    rows = np.column_stack([rng.uniform(0.0, 5.0, 500), rng.normal(0.0, [0.6, 0.3], (500, 2))])
+    failures = np.array([[-0.1, -1.4, 0.6], [-0.1, -1.2, -0.7], [-0.1, -1.1, 0.5]])
+
+    def crashes(z, ended=()):
+        known = survived_as(rows, np.full(3, 0.02), ended)
+        tried = rivals(explain(FAILS, failures, known, bends=False), failures, known)
+        says = tried[:, SAYS]
+        assert inside(tried[says == ENDS], z).any(0).all()
+        return inside(tried[says == CRASHES], z).any(0).tolist()
+
+    touched = np.array(
+        [[-0.1, -0.1, 0.0], [-0.1, -1.3, 0.0], [-0.1, -0.1, 0.6], [-0.1, -0.1, -0.6]]
+    )
+    assert crashes(touched) == [False, True, True, True]
+    assert crashes(np.vstack([touched[0], failures]), ended=touched[0]) == [False, True, True, True]
 
 
 def test_what_refused_for_long_without_a_failure_is_tried_by_its_smallest_rival():

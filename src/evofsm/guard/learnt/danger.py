@@ -114,18 +114,12 @@ def _endings(state: State, table: Floats, known: Survived) -> Floats:
     """Where it ends by itself: nowhere where it went on, nor where it failed like that."""
     rows, ended = failure.without(table[table[:, SAYS] == ENDS], known.rows), state.ended
     if len(known.rows) and not failure.inside(rows, ended).any(0).all():
-        rows = failure.explain(ENDS, ended, _boxed(known, known.rows))
+        rows = failure.explain(ENDS, ended, failure.boxed(known, known.rows))
     rows = rows[failure.inside(rows, ended).sum(1) >= _ENDED]
     failed = state.failures[failure.inside(rows, state.failures).any(0)]
-    crashes = failure.explain(CRASHES, failed, _boxed(known, ended), least=1.0)
+    crashes = failure.crashing(failed, ended, known, *set(rows[:, I].astype(int).tolist()))
     rows = failure.without(rows, failed[~failure.inside(crashes, failed, 0.0).any(0)])
     return np.concatenate([rows, crashes, table[table[:, SAYS] == FAILS]])
-
-
-def _boxed(known: Survived, rows: Floats) -> Survived:
-    """Others (n, m) that forms are to leave outside, in the same units."""
-    low, high = (np.array([end] * 2) for end in (rows.min(0), rows.max(0)))
-    return known._replace(rows=rows, lowest=low, highest=high)
 
 
 def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> State:
@@ -168,7 +162,7 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
 
     table = state.forms
     if differs(table) > 0.0:
-        table = failure.explain(FAILS, failures, _boxed(known, rows), bends=bends)
+        table = failure.explain(FAILS, failures, failure.boxed(known, rows), bends=bends)
     return state._replace(forms=table, differs=differs(table))
 
 

@@ -42,6 +42,8 @@ _FITS, _UNLIKELY, _WORST = 3, 2.0, 100
 # Variables of which all pairs are tried; pairs of which two forms are, and rounds of dealing
 # failures out between two.
 _SCREENED, _IN_TWO, _ROUNDS = 6, 3, 3
+# An ellipse may be moved inwards by so much [standard deviations].
+_INWARDS = 0.1 * 1.5 ** np.arange(8)
 # A rival of a threshold holds less than so much of what was survived.
 _RARE = 0.5
 # Which of x, y, x x, x y, y y a form of one variable has, a line, and a form of two variables.
@@ -56,6 +58,7 @@ class Survived(NamedTuple):
     highest: Floats  #: (2, m)
     unit: Floats  #: (m,) what a distance of 1 is for each variable
     spread: Floats  #: (m,) their standard deviation
+    ended: Floats  #: (e, m) where episodes ended without failing
 
 
 # -- What forms say -------------------------------------------------------------------------------
@@ -132,9 +135,10 @@ def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
     Returns
     -------
     (s, SIZE) ndarray
-        In place of a bent form an ellipse around its failures. In place of a threshold that it
-        *ends* there, and fails only beyond the innermost failure in that other variable in which
-        failures are rarest among what was survived, if one is rare.
+        In place of a bent form ellipses around its failures. In place of a threshold that it
+        *ends* there, and fails only nearer to its failures than to what ended; where nothing ended
+        there, only beyond the innermost failure in another variable in which that is rare among
+        what was survived.
     """
     rows: list[Floats] = []
     for row, is_side, holds in zip(table, are_sides(table), inside(table, failures), strict=True):
@@ -144,42 +148,87 @@ def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
         elif is_side:
             rows += _as_failed(row, own, survived)
         else:
-            rows.append(_ellipse(row, own, survived))
+            rows += _ellipses(row, own, survived)
     return np.array(rows).reshape(-1, SIZE)
 
 
-def _ellipse(row: Floats, own: Floats, survived: Survived) -> Floats:
-    """One around failures that a form holds, without what was survived; or the form as it is."""
+def _ellipses(row: Floats, own: Floats, survived: Survived) -> list[Floats]:
+    """The smallest one around failures that a form holds, without what was survived.
+
+    Where that lies among them it is the nearest circle, in standard deviations, that lies inwards
+    of them; or else each half of them has its own.
+    """
     pair = row[[I, J]].astype(int)
-    unit, centre = survived.unit[pair], own[:, pair].mean(0)
+    unit, centre, one = survived.unit[pair], own[:, pair].mean(0), row[ONE:C]
+    X, Y = (centre - row[AT:ONE]) * one
+    slope = np.array([row[B] + 2 * row[P] * X + row[Q] * Y, row[D] + 2 * row[R] * Y + row[Q] * X])
+    wide = survived.spread[pair] / unit
+    inwards = slope * one * unit * wide
+    inwards *= wide / (np.linalg.norm(inwards) + 1e-300)
     x, y = ((rows[:, pair] - centre) / unit for rows in (own, survived.rows))
-    shape = np.linalg.inv(2.0 * x.T @ x / len(x) + np.eye(2))
-    most, least = (
-        float(f(np.einsum("ni,ij,nj->n", v, shape, v))) for f, v in ((np.max, x), (np.min, y))
-    )
-    size = min(max(1.0, 1.1 * most), 0.99 * least)
-    if size < most:
-        return row
-    new = row.copy()
-    new[AT:ONE], new[ONE:C] = centre, 1.0 / unit
-    new[C:HELD] = size, 0.0, 0.0, -shape[0, 0], -2.0 * shape[0, 1], -shape[1, 1]
-    return new
+    around = np.linalg.inv(2.0 * x.T @ x / len(x) + np.eye(2))
+    for off in (0.0, *_INWARDS):
+        shape = np.diag(wide**-2.0) if off else around
+        most, least = (
+            float(f(np.einsum("ni,ij,nj->n", v - off * inwards, shape, v - off * inwards)))
+            for f, v in ((np.max, x), (np.min, y))
+        )
+        size = min(1.1 * most if off else max(1.0, 1.1 * most), 0.99 * least)
+        if size >= most:
+            new = row.copy()
+            new[AT:ONE], new[ONE:C] = centre + off * inwards * unit, 1.0 / unit
+            new[C:HELD] = size, 0.0, 0.0, -shape[0, 0], -2.0 * shape[0, 1], -shape[1, 1]
+            return [new]
+    mine = _split(x / wide)
+    if mine.all():
+        return [row]
+    return [form for half in (mine, ~mine) for form in _ellipses(row, own[half], survived)]
 
 
 def _as_failed(row: Floats, own: Floats, survived: Survived) -> list[Floats]:
     """That it ends beyond a threshold, and fails only as it did; or the threshold as it is."""
-    i, m, rows = int(row[I]), len(survived.unit), survived.rows
-    low, high = own.min(0) - BLUR * survived.unit, own.max(0) + BLUR * survived.unit
-    share = np.concatenate([(rows >= low).mean(0), (rows <= high).mean(0)])
-    share[np.tile((survived.spread == 0.0) | (np.arange(m) == i), 2)] = np.inf
-    k = int(share.argmin())
-    if share[k] >= _RARE:
-        return [row]
-    end, crash = row.copy(), row.copy()
-    end[SAYS], crash[SAYS] = ENDS, CRASHES
-    crash[[I, J]], crash[[AT, TO]] = k % m, np.concatenate([low, high])[k]
-    crash[[ONE, OTHER]], crash[B] = 1.0 / survived.unit[k % m], 1.0 if k < m else -1.0
-    return [end, crash]
+    ended = survived.ended[inside(row[None], survived.ended)[0]]
+    if len(ended):
+        crashes = crashing(own, ended, survived, int(row[I]))
+        end = row.copy()
+        end[SAYS] = ENDS
+        return [end, *halfway(crashes, own)] if len(crashes) else [row]
+    i, unit, rows = int(row[I]), survived.unit, survived.rows
+    low, high, centre = own.min(0) - BLUR * unit, own.max(0) + BLUR * unit, np.median(rows, 0)
+    off = (np.abs(own - centre).min(0) - BLUR * unit).clip(0.0)
+    share = np.array([rows >= low, rows <= high, np.abs(rows - centre) >= off]).mean(1)
+    share[:, (survived.spread == 0.0) | (np.arange(len(unit)) == i)] = np.inf
+    end = row.copy()
+    end[SAYS] = ENDS
+    found = [end]
+    for k in np.flatnonzero(share.min(0) < _RARE):
+        crash, how = row.copy(), int(share[:, k].argmin())
+        crash[SAYS], crash[[I, J]], crash[[ONE, OTHER]] = CRASHES, k, 1.0 / unit[k]
+        crash[[AT, TO]] = (low, high, centre)[how][k]
+        crash[C:HELD] = (
+            (0.0, 1.0, 0.0, 0.0, 0.0, 0.0),
+            (0.0, -1.0, 0.0, 0.0, 0.0, 0.0),
+            (-((off[k] / unit[k]) ** 2), 0.0, 0.0, 1.0, 0.0, 0.0),
+        )[how]
+        found.append(crash)
+    return found if len(found) > 1 else [row]
+
+
+def boxed(known: Survived, rows: Floats) -> Survived:
+    """Others (n, m) that forms are to leave outside, in the same units."""
+    low, high = (np.array([end] * 2) for end in (rows.min(0), rows.max(0)))
+    return known._replace(rows=rows, lowest=low, highest=high)
+
+
+def crashing(failed: Floats, ended: Floats, survived: Survived, *at: int) -> Floats:
+    """How it fails where it ends: by variables other than those ``at`` which it ends, if it can."""
+    alike = failed.copy()
+    alike[:, at] = ended[:, at].mean(0)
+    known = boxed(survived, ended)
+    table = explain(CRASHES, alike, known, least=1.0)
+    if not inside(table, alike, 0.0).any(0).all():
+        table = explain(CRASHES, failed, known, least=1.0)
+    return table
 
 
 # -- Which forms there are ------------------------------------------------------------------------

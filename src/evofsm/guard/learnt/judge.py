@@ -40,6 +40,7 @@ from evofsm.guard.learnt.rollout import (
     CUT_SHORT,
     FAILS,
     KEPT,
+    NO_LONGER,
     Floats,
     Ints,
     Model,
@@ -321,7 +322,8 @@ class LearntRisk(ActionJudge):
             policies = policies.copy()
             policies[:, ~mask, 0] = _NEVER
         asked = model, here, policies, ranks, parts.residuals, scale
-        how, action, which, left = search(*asked, proposal, margin, allowed, most)
+        longer = self.settings.longer if self.learning else NO_LONGER
+        how, action, which, left = search(*asked, proposal, margin, allowed, most, longer=longer)
         tried = None
         if which != ranks[0]:  # what passed now is asked first the next time
             self._ranks = np.append(which, self._ranks[self._ranks != which])

@@ -46,9 +46,10 @@ _RESERVE = 0.01
 _DISTANCE, _FAR = 0.05, 0.05
 # Halvings between a proposal and an action that passes.
 _HALVINGS = 4
-# Of two backups that last as long up to so much the first is taken; and who takes over has to last
-# longer than the proposal by more than that.
-_EQUAL, _NO_LONGER = 1e-9, 0.002
+# Of two backups that last as long up to so much the first is taken.
+_EQUAL = 1e-9
+#: Who takes over has to last longer than the proposal by more than that.
+NO_LONGER = 1e-4
 
 
 class Model(NamedTuple):
@@ -488,13 +489,14 @@ def search(
     most: float = math.inf,
     *,
     lasting: bool = True,
+    longer: float = NO_LONGER,
 ) -> tuple[int, Floats, int, float]:
     """Find the action closest to a proposal after which a backup survives by the margin.
 
     The proposal itself if one does; else what the first of ``ranks`` does that survives, and from
     there as near to the proposal as halvings come. All disturbances have to be survived but
     ``allowed``, and that none begins. Where no action passes it is that of the backup that lasts
-    longest, if that is asked (``lasting``), or the proposal if none lasts longer than after it.
+    longest, if that is asked (``lasting``), or the proposal if none lasts ``longer`` than after it.
     ``situation`` is (2m + a,), proposal and action are (a,). After ``most`` steps of rollouts it is
     cut short, with the action of the first of ``ranks``.
 
@@ -549,7 +551,7 @@ def search(
             which, longest = q, lasts
         wanted = max(wanted, float(rollout(*asked, proposal[None]).worth.mean()))
     apart = (longest - shortest) / (abs(longest) + 1e-12)
-    if wanted >= longest - _NO_LONGER:
+    if wanted >= longest - longer:
         return NOTHING_PASSES, proposal, which, apart
     return NOTHING_PASSES, action_of(model, policies[which], situation[:m]), which, apart
 

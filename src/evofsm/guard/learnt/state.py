@@ -123,8 +123,9 @@ class LearntSettings:
     drift_fade: float = 0.95
     refused: float = 0.1
     patience: int = 6
-    again: int = 4
-    settled: int = 20
+    again: int = 2
+    settled: int = 12
+    longer: float = 0.002
     work: float = 7e6
     work_rate: float = 8.75e8
 
@@ -264,7 +265,7 @@ def sizes(state: State) -> Survived:
     """What was survived, as forms are fitted to it."""
     rows = np.concatenate([state.survived, state.brinks])
     unit = 1.25 * np.maximum(state.unit, model.FLOOR * _spread(state) + 1e-300)
-    return Survived(rows, state.lowest, state.highest, unit, _spread(state))
+    return Survived(rows, state.lowest, state.highest, unit, _spread(state), state.ended)
 
 
 def _spread(state: State) -> Floats:
