@@ -20,6 +20,7 @@ STUDIES = {
     "falsification": "falsification:Falsification",
     "judges": "judges:Judges",
     "tasks": "judges:Tasks",
+    "good": "good:Good",
     "forecasts": "forecasts:ForecastStudy",
     "machines": "machines:Machines",
     "sensitivity": "sensitivity:Sensitivity",

@@ -1,0 +1,161 @@
+"""Is a good controller left alone? A row for each system, seed, and way: alone, or guarded.
+
+The guard learnt of a careless controller; then a good one takes over, which the guard never saw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain, product
+from typing import Annotated, Any
+
+import numpy as np
+import polars as pl
+from typer import Option
+
+from evofsm.guard import run_episode
+from evofsm.paper import Page, Table
+from studies import lib
+from studies.judges import make_judge, run
+from studies.rivals import Unrevised
+from studies.systems import Start, System, Vector, make_system
+
+ALONE, FROZEN, LEARNING = "alone", "frozen", "learning"
+#: A system, the careless controller of which is learnt, and what a good one does.
+GOOD: dict[tuple[str, str], Callable[[Any, Vector], Any]] = {
+    ("acc", "full throttle"): lambda s, z: np.clip(-1.5 * (z[0] + 0.7) - 2.5 * z[1], -2.0, 2.0),
+    ("cartpole", "random"): lambda s, z: int(z @ [0.1, 0.3, 3.0, 1.0] > 0.0),
+    ("pendulum", "random"): lambda s, z: np.clip(-10.0 * z[0] - 2.0 * z[1], -2.0, 2.0),
+    ("tanks", "exchanged"): lambda s, z: np.clip(0.2 - 0.4 * (z[:2] - 1.0), 0.0, 1.0),
+    ("reactor", "random"): lambda s, z: int(z[0] < 45.0 and z[1] < 0.3),
+    ("disc", "careless"): lambda s, z: s._towards(_around(z[:2], s._goal), 0.7, 1.2, 0.1),
+    ("diamond", "curious"): lambda s, z: s._towards(np.zeros(2), 1.0, 1.2, 0.1),
+    ("landing", "careless"): lambda s, z: s._within(
+        [1.0 + 2.0 * (-0.2 - 0.2 * max(z[0], 0.0) - z[1]), -1.5 * z[2] - 1.5 * z[3]]
+    ),
+}
+
+
+def _around(place: Vector, goal: Vector) -> Vector:
+    """Where to head first, to pass a disc about the middle at a distance."""
+    side = 1.0 if place[1] + goal[1] >= 0.0 else -1.0
+    return goal if place[0] > 0.3 else np.array([0.5, 2.0 * side])
+
+
+class Driver:
+    """A good controller of a system."""
+
+    def __init__(self, system: System, act: Callable[[System, Vector], Any]) -> None:
+        self.system, self.act = system, act
+
+    def propose(self, observation: Vector, time: float = 0.0) -> Any:
+        """What it wants; kept as ``proposed``."""
+        self.proposed = self.act(self.system, observation)
+        return self.proposed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Good(lib.Study):
+    """Whether a good controller is left alone by guards that learnt of a careless one."""
+
+    name = "good"
+    train: Annotated[int, Option(min=10, help="Episodes of the careless controller.")] = 40
+    episodes: Annotated[int, Option(min=1, help="Episodes of the good one, each way.")] = 20
+    seeds: int = 5
+
+    def shortened(self) -> Good:
+        """One seed."""
+        return replace(self, seeds=1, episodes=min(self.episodes, 5))
+
+    def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
+        """Learn of the careless one, then let the good one drive."""
+        tasks = [
+            partial(driven, name, careless, self.seed + seed, self.train, self.episodes)
+            for (name, careless), seed in product(GOOD, range(self.seeds))
+        ]
+        return {"rows": lib.frame_of(chain(*lib.parallel(tasks, workers, "Driving")))}
+
+    def page(self, found: lib.Frames) -> Page:
+        """Sums over seeds, and the seed in which most was spoilt."""
+        each = found["rows"].with_columns(
+            share=pl.col("score") / pl.col("score").filter(way=ALONE).first().over("system", "seed")
+        )
+        sums = each.group_by("system", "way", maintain_order=True).agg(
+            pl.col("failed", "goals", "episodes").sum(),
+            pl.col("kept", "share").mean(),
+            least=pl.col("kept").min(),
+            worst=pl.col("share").min(),
+        )
+        lines = lib.with_share(sums, "failed", "episodes", "rate")
+        shown = {
+            **{"system": "{system}", "way": "{way}", "failed": "{failed} of {episodes}"},
+            **{"at most (95 %)": "{rate_high:p}", "goals": "{goals}"},
+            **{"kept": "{kept:.3f}", "worst seed": "{least:.3f}"},
+            **{"return of alone": "{share:.3f}", "least": "{worst:.3f}"},
+        }
+        guarded = sums.filter(pl.col("way") != ALONE)
+        more = guarded.join(sums.filter(way=ALONE), on="system", suffix="_alone")
+        failures = more.select((pl.col("failed") - pl.col("failed_alone")).max()).item()
+        least, worst = guarded.select(pl.col("least", "worst").min()).row(0)
+        return Page(
+            name=self.name,
+            about=_ABOUT,
+            parts=[Table("Good controllers", lines, shown)],
+            command=lib.command_line(),
+            targets=lib.frame_of(
+                [
+                    lib.at_most("failures more than alone, worst system", failures, 0.0, "{:.0f}"),
+                    lib.at_least("kept, worst seed", least, 0.9, "{:.2f}"),
+                    lib.at_least("return, worst seed", worst, 0.95, "{:.2f}"),
+                ]
+            ),
+            lost=[
+                Table(
+                    "Spoilt: kept below 0.9, return below 0.95, or failures that it had not alone",
+                    lines.join(more.select("system", "way", "failed_alone"), on=["system", "way"])
+                    .filter(
+                        (pl.col("least") < 0.9)
+                        | (pl.col("worst") < 0.95)
+                        | (pl.col("failed") > pl.col("failed_alone"))
+                    )
+                    .drop("failed_alone"),
+                    shown,
+                )
+            ],
+            facts=self.facts,
+        )
+
+
+_ABOUT = """Is a good controller left alone?
+
+A guard learns of a careless controller; then a good one, which it never saw, drives the same draws
+alone, under the frozen guard, and under one that goes on learning."""
+
+
+def driven(name: str, careless: str, seed: int, train: int, episodes: int) -> list[dict[str, Any]]:
+    """What came of a good controller, alone and under a guard that learnt of a careless one."""
+    system = make_system(name, careless)
+    guard = make_judge("learnt", system, (), seed)
+    for k in range(train):
+        run(system, guard, Start.training(0, seed, k))
+    frozen = guard.copy()
+    frozen.freeze()
+    driver, rows = Driver(system, GOOD[name, careless]), []
+    ways: dict[str, Any] = {ALONE: Unrevised(), FROZEN: frozen, LEARNING: guard}
+    for way, judge in ways.items():
+        failed = goals = steps = kept = 0
+        score = 0.0
+        for k in range(episodes):
+            start = Start.training(1, seed, k)
+            for one in run_episode(system, judge, driver, options={"start": start}):
+                steps += 1
+                kept += np.array_equal(one.revision.executed, driver.proposed)
+            failed, goals = failed + one.failed, goals + system.arrived
+            score += system.score
+        rows.append(
+            {"system": name, "seed": seed, "way": way, "episodes": episodes, "failed": failed}
+            | {"goals": goals, "kept": kept / steps, "score": score / episodes}
+        )
+    return rows
