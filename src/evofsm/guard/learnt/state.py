@@ -124,7 +124,7 @@ class LearntSettings:
     refused: float = 0.1
     patience: int = 6
     again: int = 2
-    settled: int = 12
+    settled: int = 20
     longer: float = 0.002
     work: float = 7e6
     work_rate: float = 8.75e8
