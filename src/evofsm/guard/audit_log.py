@@ -231,8 +231,8 @@ def lines(path: Path, longest: int) -> Iterator[bytes]:
         left = status.st_size if stat.S_ISREG(status.st_mode) else sys.maxsize
         while line := file.readline(min(longest + 1, left)):
             if len(line) > longest:
-                what = f"{path} has a line of more than {longest >> 20} MiB"
-                raise ValueError(f"{what}: is it another kind of file?")
+                text = f"{path} has a line of more than {longest >> 20} MiB"
+                raise ValueError(f"{text}: is it another kind of file?")
             left -= len(line)
             yield line
 
@@ -345,10 +345,10 @@ class AuditLog:
         self._raise()
         self._flush()  # of an episode that was broken off
         self._seen = []
-        who = (guard.reviser, guard.machine, guard.judge, guard.failed)
-        if list(map(id, who)) != list(map(id, self._who)) or self._learnt != sums_of(guard):
+        parts = (guard.reviser, guard.machine, guard.judge, guard.failed)
+        if list(map(id, parts)) != list(map(id, self._who)) or self._learnt != sums_of(guard):
             self._write("start", cut_off=self.cut_off, **_start(guard))
-        self._guard, self._who, self._learnt = guard, who, None
+        self._guard, self._who, self._learnt = guard, parts, None
         self._settings = settings_now(guard)
         self._write("begin", settings=self._settings)
         self._force()
@@ -438,8 +438,8 @@ class AuditLog:
 
     def _cut(self) -> None:
         """Cut off what was taken back, or is half of a record."""
-        mine = os.getpid() == self._owner and not self._file.closed
-        if mine and os.fstat(self._file.fileno()).st_size > self._size:
+        is_owner = os.getpid() == self._owner and not self._file.closed
+        if is_owner and os.fstat(self._file.fileno()).st_size > self._size:
             self._file.truncate(self._size)
 
     def _keep_seen(self) -> None:

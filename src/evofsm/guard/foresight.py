@@ -79,7 +79,7 @@ class Runs(NamedTuple):
     @classmethod
     def of(cls, episodes: Sequence[ArrayLike], failed: ArrayLike) -> Runs:
         """Those, (T,) or (T, m) each."""
-        rows = [np.asarray(one, np.float64).reshape(np.shape(one)[0], -1) for one in episodes]
+        rows = [np.asarray(run, np.float64).reshape(np.shape(run)[0], -1) for run in episodes]
         lengths = np.array([*map(len, rows)])
         return cls(np.concatenate(rows), np.cumsum(lengths) - lengths, np.array(failed, np.bool_))
 
@@ -197,8 +197,8 @@ class Foresight(LearningJudge):
         last = np.append(log.starts[1:], len(log.rows)) - 1
         rows, failed = np.delete(log.rows, last[log.failed], 0), log.rows[last[log.failed]]
         unit = np.median(np.abs(np.diff(log.rows, axis=0)), axis=0) + 1e-12
-        box, some = np.sort(rows, axis=0), rows[:: max(len(rows) // _ROWS, 1)]
-        survived = failure.Survived(some, box[:2], box[:-3:-1], unit, rows.std(0), rows[:0])
+        box, sample = np.sort(rows, axis=0), rows[:: max(len(rows) // _ROWS, 1)]
+        survived = failure.Survived(sample, box[:2], box[:-3:-1], unit, rows.std(0), rows[:0])
         forms = failure.explain(FAILS, failed, survived)
         judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
         columns = judge._columns(log.rows, log.starts)
@@ -250,8 +250,8 @@ class Foresight(LearningJudge):
             fitting = np.where(alone[..., 1] <= false, alone[..., 0], -1.0)
             best = divmod(int(fitting.argmax()), _TRIED)
             rules[(best,)] = alone[best]
-            fit = [one for one in rules if rules[one][1] <= false]
-            best_rule = max(fit, key=lambda one: float(rules[one][0]))
+            fit = [choice for choice in rules if rules[choice][1] <= false]
+            best_rule = max(fit, key=lambda choice: float(rules[choice][0]))
             rows += [(rate, plain, *asked[k], asked[k][2] * tried[k][j]) for k, j in best_rule]
         return np.array(rows, np.float64).reshape(-1, 6)
 
@@ -280,8 +280,8 @@ class Foresight(LearningJudge):
     def of_rate(self, rate: int, *, plain: bool | None = None) -> Floats:
         """The limits of an alarm, by default of the kind that did better on what was held out."""
         kind = self.held_out[rate, 2] if plain is None else _PLAIN if plain else _LEARNT
-        which = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
-        return np.asarray(self.limits[which])
+        chosen = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
+        return np.asarray(self.limits[chosen])
 
     def tally(
         self, log: Runs, rate: int, *, plain: bool | None = None, hold: float | None = None
@@ -298,7 +298,7 @@ class Foresight(LearningJudge):
 
     def words(self, rate: int, *, plain: bool | None = None) -> str:
         """Where an alarm is on, as `of_rate` has its limits."""
-        return " or ".join(" ".join(self._words(one)) for one in self.of_rate(rate, plain=plain))
+        return " or ".join(" ".join(self._words(row)) for row in self.of_rate(rate, plain=plain))
 
     def _words(self, limit: Floats) -> tuple[str, str]:
         v, when, sign, at = int(limit[_OF]), int(limit[_WHEN]), limit[_SIGN], limit[_AT]
@@ -312,8 +312,8 @@ class Foresight(LearningJudge):
             row[failure.C] -= at * np.hypot(row[failure.B], row[failure.D])
         there = region(names, row[failure.I : failure.HELD].tolist(), 0).rpartition(" (")[0]
         if is_flat:
-            what, _, beyond = there.removeprefix("where ").partition(" is ")
-            return what, f"{beyond}{soon}"
+            variable, _, beyond = there.removeprefix("where ").partition(" is ")
+            return variable, f"{beyond}{soon}"
         how = "beyond" if at > 0.0 else "within"
         return "it", f"{how} {abs(at):.2g} typical steps of where it fails{soon}: {there}"
 
@@ -325,9 +325,9 @@ class Foresight(LearningJudge):
     def reason(self, rate: int, z: Floats, passed: Floats) -> str:
         """Why an alarm is on at an observation (m,), with the limits (n, 6) that are passed."""
         alarms, right, _ = self.held_out[rate].tolist()
-        mine, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
-        if len(mine):
-            v, (name, there) = int(mine[0, _OF]), self._words(mine[0])
+        limits, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
+        if len(limits):
+            v, (name, there) = int(limits[0, _OF]), self._words(limits[0])
             why = f"{name} {z[v]:.4g}: {there}" if v < len(z) else f"{name} {there}"
         within = span(self.horizon * self.dt)
         return f"{why}; after {right:.0f} of {alarms:.0f} such alarms it failed within {within}"
@@ -401,14 +401,14 @@ class Foresight(LearningJudge):
             risk = float(self.shares[rate])
             reason = self.reason(rate, situation.observation, self._limits[passed])
         low, high = wilson_bounds(risk, evidence) if risk else (0.0, 1.0)
-        risks, lows, highs, none = np.array([[risk], [low], [high], [np.nan]])
-        judged = Judgement(risks, lows, highs, none, evidence)
+        risks, lows, highs, left = np.array([[risk], [low], [high], [np.nan]])
+        judged = Judgement(risks, lows, highs, left, evidence)
         return Search(np.array([float(wanted)]), judged, 0, reason)
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
         """The risk, whatever would be done."""
         found = self.search(situation, 0.0, tolerance=0.0, revising=False).judged
-        every = [np.repeat(one, np.size(actions)) for one in found[:4]]
+        every = [np.repeat(values, np.size(actions)) for values in found[:4]]
         return Judgement(every[0], every[1], every[2], every[3], found.evidence)
 
     def why(self, judged: Judgement, /) -> str:
@@ -442,8 +442,8 @@ class Foresight(LearningJudge):
         settings, arrays = store.read(path, KIND)
         with store.explained(path):
             count = len(settings["names"]) + len(arrays["forms"])
-            which, most = arrays["limits"][:, :_SIGN], (len(RATES), _NONE, count, len(_AHEAD))
-            if not ((which >= 0) & (which < most) & (which % 1.0 == 0.0)).all():
+            indices, most = arrays["limits"][:, :_SIGN], (len(RATES), _NONE, count, len(_AHEAD))
+            if not ((indices >= 0) & (indices < most) & (indices % 1.0 == 0.0)).all():
                 raise ValueError("a limit is of no variable, or of no rate")
             if not (np.isin(arrays["forms"][:, [failure.I, failure.J]], range(count))).all():
                 raise ValueError("a form is of no variable")

@@ -440,7 +440,7 @@ class Guard:
         """What takes back all that is done from now on."""
         kept = _CHANGES(self)
         parts: Any = self.machine, self.judge, self.reviser, self.audit
-        rollbacks = [one.savepoint() for one in parts if hasattr(one, "savepoint")]
+        rollbacks = [part.savepoint() for part in parts if hasattr(part, "savepoint")]
 
         def rollback() -> None:
             for name, value in zip(_CHANGING, kept, strict=True):

@@ -88,12 +88,12 @@ class Harm(NamedTuple):
     @property
     def alone(self) -> list[Outcome]:
         """Of the controller alone."""
-        return [one for one in self.outcomes if not one.guarded]
+        return [outcome for outcome in self.outcomes if not outcome.guarded]
 
     @property
     def guarded(self) -> list[Outcome]:
         """Of the guard that acts."""
-        return [one for one in self.outcomes if one.guarded]
+        return [outcome for outcome in self.outcomes if outcome.guarded]
 
     @property
     def replaces(self) -> bool:
@@ -114,21 +114,21 @@ class Harm(NamedTuple):
         """
         arms = [[*self.guarded, _WELL], [*self.alone, _WELL]]
         random = np.random.default_rng([self.n_episodes, draws])
-        some, others = (
+        guarded, alone = (
             random.gamma(np.append(self._weights(arm[:-1]), hope), size=(draws, len(arm)))
             for arm, hope in zip(arms, _HOPES, strict=True)
         )
-        won = np.einsum("ni,ij,nj->n", some, better(*arms), others)
+        won = np.einsum("ni,ij,nj->n", guarded, better(*arms), alone)
         return float((won >= 0.0).mean())
 
     def _weights(self, outcomes: Sequence[Outcome]) -> NDArray[np.float64]:
-        return _FADES ** np.array([self.n_episodes - one.episode for one in outcomes], np.float64)
+        return _FADES ** np.array([self.n_episodes - o.episode for o in outcomes], np.float64)
 
     def passing(self, *, learning: bool) -> str:
         """Why proposals pass in the episode to come; empty where they are revised."""
         if not learning:
             return "" if self.helps else "was not shown to help"
-        fails = any(one.failed for one in self.outcomes[-1:])
+        fails = any(outcome.failed for outcome in self.outcomes[-1:])
         asked = self.refuses and (fails or self._long_ago or not self.helps)
         return "shadow" if asked and not self.drives(self._draws) else ""
 
@@ -141,7 +141,7 @@ class Harm(NamedTuple):
     def _draws(self) -> int:
         """The guard drives if it does in one of so many draws."""
         latest = self.guarded[-_CAREFUL:]
-        return 1 if self._long_ago or all(one.failed for one in latest) else _CAREFUL
+        return 1 if self._long_ago or all(outcome.failed for outcome in latest) else _CAREFUL
 
     def told(self, *, learning: bool) -> str:
         """How both arms ended, where it is not beyond doubt that the guard helps; else nothing."""
@@ -176,13 +176,13 @@ class Harm(NamedTuple):
     def merged(cls, parts: Sequence[Harm]) -> Harm:
         """Of guards that learnt apart: the newest outcomes of each."""
         outcomes, n_episodes = list[Outcome](), 0
-        each = max(1, _KEPT // len(parts))
+        kept = max(1, _KEPT // len(parts))
         for part in parts:
-            newest = part.alone[-each:] + part.guarded[-each:]
-            outcomes += (one._replace(episode=one.episode + n_episodes) for one in newest)
+            newest = part.alone[-kept:] + part.guarded[-kept:]
+            outcomes += (o._replace(episode=o.episode + n_episodes) for o in newest)
             n_episodes += part.n_episodes
         refuses = any(part.refuses for part in parts)
-        return cls(tuple(sorted(outcomes, key=lambda one: one.episode)), n_episodes, refuses)
+        return cls(tuple(sorted(outcomes, key=lambda o: o.episode)), n_episodes, refuses)
 
     def after(
         self,
@@ -207,9 +207,9 @@ class Harm(NamedTuple):
             return now
         told = math.nan if score is None else score
         new = Outcome(n, acted + watched, failed, refuses and acted > 0, ended, told)
-        alike = [one for one in self.outcomes if one.guarded == new.guarded]
+        alike = [o for o in self.outcomes if o.guarded == new.guarded]
         gone = alike[: max(0, len(alike) - _KEPT + 1)]
-        return now._replace(outcomes=(*(one for one in self.outcomes if one not in gone), new))
+        return now._replace(outcomes=(*(o for o in self.outcomes if o not in gone), new))
 
 
 def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.float64]:
@@ -228,7 +228,7 @@ def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.flo
     array([[0.3]])
     """
     (s_steps, s_fails, s_well, s_score), (o_steps, o_fails, o_well, o_score) = (
-        np.array([(one.steps, one.failed, one.ended, one.score) for one in arm]).reshape(-1, 4).T
+        np.array([(o.steps, o.failed, o.ended, o.score) for o in arm]).reshape(-1, 4).T
         for arm in (some, others)
     )
     s_last, o_last = np.where(s_well > 0, np.inf, s_steps), np.where(o_well > 0, np.inf, o_steps)
@@ -238,17 +238,17 @@ def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.flo
     scored = np.where(np.abs(more) > _ALIKE * size, np.sign(more), 0.0)
     neither = np.where(scored != 0.0, scored, s_well[:, None] - o_well)
     fails = (s_fails[:, None] > 0) | (o_fails > 0)
-    both = (s_fails[:, None] > 0) & (o_fails > 0)
-    return np.where(fails, np.where(both, _SOONER, 1.0) * (best.astype(float) - worse), neither)
+    failed = (s_fails[:, None] > 0) & (o_fails > 0)
+    return np.where(fails, np.where(failed, _SOONER, 1.0) * (best.astype(float) - worse), neither)
 
 
 def _ended(outcomes: Sequence[Outcome]) -> str:
     """After how many steps episodes failed, and how those ended that did not."""
-    steps = [one.steps for one in outcomes if one.failed]
-    n, well = len(outcomes), sum(one.ended for one in outcomes)
+    steps = [o.steps for o in outcomes if o.failed]
+    n, well = len(outcomes), sum(o.ended for o in outcomes)
     said = f"did not fail in {n}"
     if steps:
         said = f"failed after {np.median(steps):g} steps in the median ({len(steps)} of {n})"
-    scores = [one.score for one in outcomes if one.score == one.score]
+    scores = [o.score for o in outcomes if o.score == o.score]
     said += f", {well} ended by themselves" if well else ""
     return said + (f", median score {np.median(scores):.3g}" if any(scores) else "")

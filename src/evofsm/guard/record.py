@@ -34,13 +34,13 @@ _STATE = "the most probable one, from 0; left out where none is known"
 RECORD: Mapping[str, Column] = {
     "time": _of("situation", "time", float, "since the start of the episode [s]"),
     "intake": Column(
-        int, f"what was wrong: a sum of {_INTAKE}", lambda one: int(one.situation.intake)
+        int, f"what was wrong: a sum of {_INTAKE}", lambda d: int(d.situation.intake)
     ),
     "state": _of("situation", "state", int, _STATE),
     "n_states": Column(
         int,
         "how many states there were",
-        lambda one: 0 if one.situation.state is None else len(one.situation.belief),
+        lambda d: 0 if d.situation.state is None else len(d.situation.belief),
     ),
     "surprise": _of(
         "situation", "surprise", float, "divergence of forecast and belief [bit]; left out at first"
@@ -53,10 +53,10 @@ RECORD: Mapping[str, Column] = {
     ),
     "risk_executed": _of("revision", "risk_executed", float, "the same for what is executed"),
     "risk_low": Column(
-        float, "lower end of its 90 % interval", lambda one: one.revision.interval[0]
+        float, "lower end of its 90 % interval", lambda d: d.revision.interval[0]
     ),
     "risk_high": Column(
-        float, "upper end of its 90 % interval", lambda one: one.revision.interval[1]
+        float, "upper end of its 90 % interval", lambda d: d.revision.interval[1]
     ),
     "evidence": _of(
         "revision", "evidence", float, "disturbances that it rests on, such as braking leaders"

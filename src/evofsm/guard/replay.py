@@ -313,8 +313,8 @@ def _action(action: Any) -> Action:
 
 def _differing(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> tuple[Field, ...]:
     """What is not the same to the last bit."""
-    both = {
-        name: tuple(canonical(each[name]) if name in each else "" for each in (recorded, again))
+    fields = {
+        name: tuple(canonical(entry[name]) if name in entry else "" for entry in (recorded, again))
         for name in sorted(recorded.keys() | again.keys())
     }
-    return tuple(Field(name, *values) for name, values in both.items() if values[0] != values[1])
+    return tuple(Field(name, *values) for name, values in fields.items() if values[0] != values[1])

@@ -198,6 +198,6 @@ def dead_ends(state: State, known: Model, z: Floats, episode: Episode) -> State:
     return state._replace(centres=centres[left], radii=radii[left], counts=counts[left])
 
 
-def _between(some: Floats, others: Floats, inverse: Floats) -> Floats:
+def _between(a: Floats, b: Floats, inverse: Floats) -> Floats:
     """(k, n) distances of (k, m) and (n, m), in spreads."""
-    return np.asarray(np.sqrt((((some[:, None] - others) * inverse) ** 2).sum(2)))
+    return np.asarray(np.sqrt((((a[:, None] - b) * inverse) ** 2).sum(2)))

@@ -128,8 +128,8 @@ def learn(
     if given.backup is not None:
         state = fitted(state, known, given.backup)
     if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
-        some = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
-        rest, scale = np.ascontiguousarray(rest[:, :, some]), disturbance_scale(state, settings)
+        picked = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
+        rest, scale = np.ascontiguousarray(rest[:, :, picked]), disturbance_scale(state, settings)
         asked = known, state.situations, rest, scale, settings, random
         policies, linear = evolved(state.policies, state.linear, *asked)
         state = state._replace(policies=policies, linear=linear)
@@ -214,10 +214,10 @@ def disturbances(
     new = model.trimmed(rest[np.arange(H)[:, None] + starts].transpose(0, 2, 1))
     ends = np.empty((0, 0))
     if looks:
-        none = model.undisturbed(H, m, 1)[:, : new.shape[1]]
-        with_none = np.concatenate([none, new], 2)
-        some = S[random.permutation(len(S))[:_TRIED_IN]]
-        ends = worst(known, some, state.policies[:1], with_none, 1.0)
+        calm = model.undisturbed(H, m, 1)[:, : new.shape[1]]
+        with_none = np.concatenate([calm, new], 2)
+        picked = S[random.permutation(len(S))[:_TRIED_IN]]
+        ends = worst(known, picked, state.policies[:1], with_none, 1.0)
     harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_LARGEST]
     starts = starts[harmful]
     longest = settings.horizon_max + 2
@@ -311,8 +311,8 @@ def look_ahead(
             longest = min(s.ahead * longest, s.horizon_max / s.ahead)
             believed = max(believed, longest)
         T = max(min(after, believed), longest)
-    each = known.weights.size * (1 + s.n_disturbances)
-    farthest = min(s.horizon_max, s.work / each / s.n_asked)  # less where a rollout costs more
+    cost = known.weights.size * (1 + s.n_disturbances)
+    farthest = min(s.horizon_max, s.work / cost / s.n_asked)  # less where a rollout costs more
     horizon = int(max(min(s.ahead * T, farthest), s.horizon_min))
     return state._replace(
         time_to_failure=T, believed=believed, horizon=horizon, too_short=too_short

@@ -156,10 +156,10 @@ def disturbed(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
     held = ((to < model.lowest) & (after <= model.lowest)) | (
         (to > model.highest) & (after >= model.highest)
     )
-    none = ~known | (change == 0.0).all(1) | are_jumps(z, unit)
+    no_rest = ~known | (change == 0.0).all(1) | are_jumps(z, unit)
     jumped = jumps(np.diff(z, axis=0), unit)[1:] & known[:, None]
     jumped &= np.abs(change - move) > 0.5 * np.abs(change)
-    rest = np.where(held | none[:, None], 0.0, after - to)
+    rest = np.where(held | no_rest[:, None], 0.0, after - to)
     return np.hstack([rest, np.where(jumped, after, np.inf)])
 
 

@@ -93,10 +93,10 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
         ordinary = ((change >= state.least) & (change <= state.most)).all(1)
         rows = seen & free & ordinary
         state = _drifted(state, known, phi[rows], change[rows], np.diff(z, axis=0), settings)
-    some, weighed = phi[seen], weight[seen, None]
+    x, weighed = phi[seen], weight[seen, None]
     state = state._replace(
-        squares=state.squares + some.T @ (weighed * some),
-        products=state.products + some.T @ (weighed * change[seen]),
+        squares=state.squares + x.T @ (weighed * x),
+        products=state.products + x.T @ (weighed * change[seen]),
     )
     moved = seen[:, None] & ~rests
     if (here := moved.any(1)).sum() < _SOME:
@@ -135,8 +135,8 @@ def misled(
     failed : bool
         Whether it failed in the end: then lags are not exonerated.
     """
-    some = starts[np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))]
-    ahead = some[:, None] + np.arange(-1, state.horizon + 1)
+    begins = starts[np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))]
+    ahead = begins[:, None] + np.arange(-1, state.horizon + 1)
     if not np.isfinite(z[ahead]).all():
         return state
     missed = []
@@ -184,7 +184,7 @@ def told(
 
     at, before, u = z[rows + 1], drawn(), drawn()
     phi = features(known, at, random.permutation(latest[rows]), before, u)
-    change = np.array([move(*each) for each in zip(at, u, strict=True)]).reshape(at.shape) - at
+    change = np.array([move(*pair) for pair in zip(at, u, strict=True)]).reshape(at.shape) - at
     return state._replace(
         squares=state.squares + phi.T @ (1.0 * phi), products=state.products + phi.T @ change
     )

@@ -404,8 +404,8 @@ def unpacked(
                 f"{name} has shape {shape}, not one of {m} variables and actions of {a} numbers"
             )
     forms, steps = state.forms, state.windows.shape[1]
-    which = forms[:, [SAYS, I, J]]
-    if ((which != np.rint(which)) | (which < 0.0) | (which >= [CRASHES + 1, m, m])).any():
+    indices = forms[:, [SAYS, I, J]]
+    if ((indices != np.rint(indices)) | (indices < 0.0) | (indices >= [CRASHES + 1, m, m])).any():
         raise ValueError("forms are of variables that there are not")
     if (forms[:, [ONE, OTHER]] <= 0.0).any() or (forms[:, HELD] < 0.0).any():
         raise ValueError("forms have units that are not positive")
