@@ -20,11 +20,11 @@ _STEPS = 512
 _SHARED: WeakSet[Any] = WeakSet()
 
 
-def share(one: Any) -> None:
+def share(shared: Any) -> None:
     """Give an object a lock, so that threads may share it: its ``_lock``."""
-    one._lock = RLock()
-    one._call = None  # of a transaction under way the thread, and what takes it back
-    _SHARED.add(one)
+    shared._lock = RLock()
+    shared._call = None  # of a transaction under way the thread, and what takes it back
+    _SHARED.add(shared)
 
 
 def alone(method: Method) -> Method:
@@ -113,12 +113,12 @@ def _begin_alone() -> None:
 
     What they were amid is taken back.
     """
-    for one in (every := list(_SHARED)):
-        one._lock = RLock()
-    for one in every:
-        if one._call is not None and one._call[0] != get_ident():
-            one._call[1]()
-            one._call = None
+    for shared in (every := list(_SHARED)):
+        shared._lock = RLock()
+    for shared in every:
+        if shared._call is not None and shared._call[0] != get_ident():
+            shared._call[1]()
+            shared._call = None
 
 
 if hasattr(os, "register_at_fork"):
