@@ -151,7 +151,7 @@ class OwnBrakes:
     def _is_sure_to_fall_short(self) -> bool:
         """Without noise the latest few tell; in noise it takes more."""
         seen = [*self.shortfalls]
-        bounds = (_mean_and_bound(some, _SURE)[1] for some in (seen[-_FEWEST:], seen))
+        bounds = (_mean_and_bound(samples, _SURE)[1] for samples in (seen[-_FEWEST:], seen))
         return len(seen) >= _FEWEST and any(bound > _SHORTFALL for bound in bounds)
 
 

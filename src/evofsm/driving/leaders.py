@@ -101,7 +101,7 @@ class Manoeuvres:
 
     def remember(self, *decels: float | None) -> None:
         """Take in manoeuvres [m/s²], the oldest first; None for none."""
-        seen = [min(positive("decel", one), HARDEST) for one in decels if one is not None]
+        seen = [min(positive("decel", decel), HARDEST) for decel in decels if decel is not None]
         hard = [decel for decel in seen if decel >= _HARD]
         self.gentle += len(seen) - len(hard)
         if hard:

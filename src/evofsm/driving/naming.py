@@ -56,7 +56,7 @@ LABELS = Labels(names=VARIABLES, units=UNITS)
 
 
 def _observed(about: str, of: Callable[[Any], Any], *, in_table: bool = True) -> Column:
-    return Column(float, about, lambda one: float(of(one.situation.observation)), in_table)
+    return Column(float, about, lambda record: float(of(record.situation.observation)), in_table)
 
 
 #: By name, in the order of ``decisions.parquet``, which has those that are `Column.in_table`: what

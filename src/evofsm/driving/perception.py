@@ -103,10 +103,10 @@ class Perception:
         """Take in what kinematics do not explain; of who may stand nothing."""
         dt, (was, last) = self.dt, self._changes
         closing = now[1] + before[1] - now[2] - before[2]
-        self._changes = own, leader = now[1] - before[1] - realised * dt, now[2] - before[2]
+        self._changes = speed, leader = now[1] - before[1] - realised * dt, now[2] - before[2]
         self._sizes[0].add(now[0] - before[0] + 0.5 * dt * closing)
         if min(now[1], before[1]) > _STANDING:
-            self._sizes[1].add(own - was)
+            self._sizes[1].add(speed - was)
         if min(now[2], before[2]) > _STANDING:
             self._sizes[2].add(leader - last)
         self.noise = _noise(self._sizes, dt)
@@ -114,21 +114,21 @@ class Perception:
     def learnt(self) -> dict[str, NDArray[np.float64]]:
         """The residuals by name, the oldest first, for a file."""
         return {
-            name: np.array(each.latest, dtype=np.float64)
-            for name, each in zip(_NAMES, self._sizes, strict=True)
+            name: np.array(sizes.latest, dtype=np.float64)
+            for name, sizes in zip(_NAMES, self._sizes, strict=True)
         }
 
     def restore(self, latest: Mapping[str, Iterable[float]]) -> None:
         """Take over what `learnt` returned."""
-        gap, own, leader = (_Sizes(np.asarray(latest[name]).tolist()) for name in _NAMES)
-        self._sizes = gap, own, leader
+        gap, speed, leader = (_Sizes(np.asarray(latest[name]).tolist()) for name in _NAMES)
+        self._sizes = gap, speed, leader
         self.noise = _noise(self._sizes, self.dt)
 
 
 def is_whole(observation: Three) -> bool:
     """Whether all three are there."""
-    gap, own, leader = observation
-    return not isnan(gap + own + leader)
+    gap, speed, leader = observation
+    return not isnan(gap + speed + leader)
 
 
 # -- The filter ---------------------------------------------------------------------------------
@@ -148,9 +148,9 @@ def _filtered(
 
     ``doubt`` is the standard deviation of the acceleration that was ``realised`` [m/s²].
     """
-    gap, own, leader = before
-    reached = max(own + realised * dt, 0.0)
-    mean = np.array([gap + (leader - 0.5 * (own + reached)) * dt, reached, leader])
+    gap, speed, leader = before
+    reached = max(speed + realised * dt, 0.0)
+    mean = np.array([gap + (leader - 0.5 * (speed + reached)) * dt, reached, leader])
     moves = np.array([[1.0, -dt, dt], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     # An acceleration changes a speed, and the gap by half an interval of it.
     v, u, half = doubt * dt, _LEADER * dt, 0.5 * dt
@@ -203,9 +203,9 @@ def _noise(sizes: Iterable[_Sizes], dt: float) -> Three:
     """Standard deviation of the noise on gap and both speeds, from that of their residuals."""
     # The second difference of a noisy speed has 6 times its variance; that of a gap against
     # the trapezoid of four noisy speeds twice its own, and some of theirs.
-    gap, own, leader = [each.deviation() for each in sizes]
-    own, leader = own / _SIX, leader / _SIX
-    gap = sqrt(max(gap**2 - 0.5 * dt**2 * (own**2 + leader**2), 0.0) / 2.0)
-    found = zip((gap, own, leader), _FINEST, strict=True)
-    gap, own, leader = (size if size >= finest else 0.0 for size, finest in found)
-    return gap, own, leader
+    gap, speed, leader = [s.deviation() for s in sizes]
+    speed, leader = speed / _SIX, leader / _SIX
+    gap = sqrt(max(gap**2 - 0.5 * dt**2 * (speed**2 + leader**2), 0.0) / 2.0)
+    found = zip((gap, speed, leader), _FINEST, strict=True)
+    gap, speed, leader = (size if size >= finest else 0.0 for size, finest in found)
+    return gap, speed, leader
