@@ -93,8 +93,8 @@ class Journal:
             if sync:
                 self.sync()
         except OSError as error:
-            what = "what came before is kept: make room, and run the same command again"
-            raise OSError(error.errno, f"{error.strerror}; {what}", str(self.path)) from error
+            hint = "what came before is kept: make room, and run the same command again"
+            raise OSError(error.errno, f"{error.strerror}; {hint}", str(self.path)) from error
 
     def _read(self) -> int:
         """Read what is there, and say up to where it is good; without a record, nothing is."""

@@ -59,8 +59,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
     rare = [*_rare(frame, [*texts, *values])]
-    likely = [one for one in rare if _FAILURE.search(one[1])]
-    rare = likely or [one for one in rare if one[0] in values]
+    likely = [row for row in rare if _FAILURE.search(row[1])]
+    rare = likely or [row for row in rare if row[0] in values]
     facts += [("a failure?", f"{text} {told}") for _, text, told in rare]
     options += [("--failed", text) for _, text, _ in rare[:1]]
     groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
@@ -98,7 +98,7 @@ def _first_rows(table: CsvTable | ParquetTable) -> tuple[polars.DataFrame, str, 
     scale = 1e-6
     if not clock and (clock := next(filter(_TIME.match, numbers), "")) and len(frame):
         since = frame[clock].abs().max()  # 1970, if it is large
-        unit = next((one for one, least in _EPOCHS.items() if float(str(since)) > least), "s")
+        unit = next((name for name, least in _EPOCHS.items() if float(str(since)) > least), "s")
         form, scale = "" if unit == "s" else f"{_named(clock, '=')}={unit}", TIMES[unit]
     if clock and len(frame):
         frame = frame.with_columns(frame[clock] * scale)
@@ -116,8 +116,8 @@ def _of_steps(times: NDArray[np.float64], facts: Pairs) -> Pairs:
         return []
     facts.append(("other steps", f"{odd.sum():,}, the longest {later.max():,.0f} s"))
     least = max(usual, 3.5 * float(np.median(steps)))  # of few digits many times are the same
-    step = next((one for one in _NICE if one[0] >= least), _NICE[-1])
-    hole = next((one for one in _NICE if one[0] >= 10.0 * step[0]), _NICE[-1])
+    step = next((nice for nice in _NICE if nice[0] >= least), _NICE[-1])
+    hole = next((nice for nice in _NICE if nice[0] >= 10.0 * step[0]), _NICE[-1])
     return [("--resample", step[1]), ("--hole", hole[1])]
 
 

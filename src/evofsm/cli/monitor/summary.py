@@ -93,10 +93,10 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
     if refused:
         pairs.append(("refused", f"{len(refused):,} messages, the first because {refused[0]}"))
     yield facts(title, pairs)
-    own = getattr(decider.guard.reviser, "tolerance", None)
-    known = sorted({*_RISKS, *([] if own is None else [own])})
+    given = getattr(decider.guard.reviser, "tolerance", None)
+    known = sorted({*_RISKS, *([] if given is None else [given])})
     lines = [(f"{risk:g}", *counted(risks > risk)) for risk in known]
-    bold = [place for place, risk in enumerate(known) if risk == own]
+    bold = [place for place, risk in enumerate(known) if risk == given]
     # Whether it would alarm with another tolerance, one pass does not say.
     header = ("above", "times", "an hour", "of the time")
     yield table("\nBy risk of what was proposed", header, lines, bold=bold)

@@ -73,18 +73,16 @@ class Recording:
     ) -> None:
         self._run: Run = read_run(path)
         self._name = self._run.about.get("source", Path(path).name)
-        self._episodes = [one for one in self._run.episodes if len(one.columns["time"])]
+        self._episodes = [e for e in self._run.episodes if len(e.columns["time"])]
         if not self._episodes:
             raise ValueError(f"{path} holds no episode with a decision")
-        self._fails = ["Collision" * one.collided for one in self._episodes]
+        self._fails = ["Collision" * e.collided for e in self._episodes]
         self._names = [f"episode {k + 1}" for k in range(len(self._episodes))]
         self._order = list(range(len(self._episodes)))
         self._jumps = bool(stretches)
         if stretches:
             self._fails = [fails for _, fails in stretches]
-            risks = [
-                float(np.nanmax([0.0, *one.columns["risk_proposed"]])) for one in self._episodes
-            ]
+            risks = [float(np.nanmax([0.0, *e.columns["risk_proposed"]])) for e in self._episodes]
             self._order.sort(key=lambda k: (not self._fails[k], -risks[k]))
             self._names = [
                 f"{name} ({fails.partition(' ')[0].lower() or f'risk {risk:.1%}'})"

@@ -237,8 +237,8 @@ class Simulated:
         fails = "what its file says" if failed else "an episode that is terminated"
         self.about = f"{acts} drives it; failure is {fails}."
         ends = _ends(name, env.action_space)
-        named = [each.partition(" [") for each in variables or _names_of(env)]
-        names, units = [one[0] for one in named], [one[2].rstrip("]") for one in named]
+        named = [text.partition(" [") for text in variables or _names_of(env)]
+        names, units = [parts[0] for parts in named], [parts[2].rstrip("]") for parts in named]
         judge = LearntRisk(self.interval, **ends, names=names, units=units, seed=seed)
         made = Guard(**ends, interval=self.interval, judge=judge, tolerance=tolerance)
         spaces = env.observation_space, env.action_space
@@ -352,8 +352,8 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
                 if "family" in found:
                     return None
                 raise ValueError("it defines neither environment() nor a Family called family")
-            own = {name: found[name] for name in _PARTS if name in found}
-            return Simulated(Path(what).stem, found["environment"](), **own, **settings)
+            parts = {name: found[name] for name in _PARTS if name in found}
+            return Simulated(Path(what).stem, found["environment"](), **parts, **settings)
         except Exception as error:  # of somebody's own
             raise ValueError(f"{what}: {type(error).__name__}: {error}") from error
     if not re.search(r"-v\d+$", what):
@@ -452,7 +452,7 @@ class Session(AbstractContextManager["Session"]):
         labels = self.system.labels
         if len(center) > _FEW:
             two = list(self.known().plane)
-            names, units = (tuple(each[k] for k in two if each) for each in labels[1:3])
+            names, units = (tuple(texts[k] for k in two if texts) for texts in labels[1:3])
             labels, center = Labels(names=names, units=units, dt=labels.dt), center[two]
         return labels.place(center)
 
@@ -482,7 +482,7 @@ class Session(AbstractContextManager["Session"]):
         situation, judged = guard.situation, self._judged
         self.system.advance(revision)
         numbered = zip(judged.risk, judged.low, judged.high, judged.critical, strict=True)
-        wished, done, best = (Judged(*map(float, each)) for each in numbered)
+        wished, done, best = (Judged(*map(float, values)) for values in numbered)
         return frame._replace(
             belief=most_believed(situation.belief),
             state=situation.state,

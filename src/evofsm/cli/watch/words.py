@@ -137,10 +137,10 @@ def _when(story: Story, danger: Danger, knows_leaders: bool) -> str:
         return f"{text}; it was over {'at once' if began == last else f'at {last}'}."
     if math.isnan(danger.dead_end):
         return f"{text}."
-    what = "nothing that it knows to do would most likely have been enough"
+    reason = "nothing that it knows to do would most likely have been enough"
     if knows_leaders:
-        what = "if the leader braked hard, even braking in full at once would come too late"
-    return f"{text}. From {_seconds(danger.dead_end)} on it was a dead end: {what}."
+        reason = "if the leader braked hard, even braking in full at once would come too late"
+    return f"{text}. From {_seconds(danger.dead_end)} on it was a dead end: {reason}."
 
 
 def _why(began: Frame, start: Start) -> str:
@@ -243,10 +243,10 @@ def _alone(frame: Frame) -> str:
     as_alone = frame.failed and math.isclose(alone, frame.time)
     if not math.isfinite(alone) or as_alone or frame.time == 0.0:
         return ""
-    who, fails, failed = "The controller alone", "would fail", "would have failed"
+    driver, fails, failed = "The controller alone", "would fail", "would have failed"
     if frame.cars:
-        who, fails, failed = "This driver", "would hit the leader", "would have hit the leader"
-    return f"{who} {failed if frame.time >= alone else fails} at {_seconds(alone)}."
+        driver, fails, failed = "This driver", "would hit the leader", "would have hit the leader"
+    return f"{driver} {failed if frame.time >= alone else fails} at {_seconds(alone)}."
 
 
 def _seconds(time: float) -> str:
