@@ -95,12 +95,12 @@ def draw_case(study: PaperStudy, run: Run) -> Drawn:
     figure.subplots_adjust(left=0.105, right=0.91, top=0.88, bottom=0.07, hspace=0.16)
     gap, speeds, acceleration, state, action = panels
     episode, settings = run.episode, study.settings
-    time, (gaps, own, leaders) = episode.time, episode.observations.T
+    time, (gaps, followers, leaders) = episode.time, episode.observations.T
     gap.plot(time, gaps, color=COLORS["ink"])
     gap.set(ylim=(0.0, 1.08 * gaps.max()), ylabel="gap [m]")
     if episode.collided:
         plot.draw_collision(gap, float(time[-1]), 0.0)
-    speeds.plot(time, own, label="follower", **_FOLLOWER)
+    speeds.plot(time, followers, label="follower", **_FOLLOWER)
     speeds.plot(time, leaders, label="leader", **_LEADER)
     speeds.set_ylim(bottom=0.0)
     speeds.set_ylabel("speed [m/s]")
@@ -230,7 +230,7 @@ def draw_space(study: PaperStudy) -> Drawn:
         "recognised as the dead end": {**_VEIL, "linestyle": "-"},
     }
     handles = [
-        Line2D([], [], label=name, **{"linestyle": "", **one}) for name, one in looks.items()
+        Line2D([], [], label=name, **{"linestyle": "", **look}) for name, look in looks.items()
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=4)
     _letter(grid.flat)
