@@ -308,8 +308,8 @@ def _place_of(path: str | os.PathLike[str]) -> tuple[Path, int | None]:
     except FileNotFoundError:
         return target, None
     if not stat.S_ISREG(mode):
-        what = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
-        raise OSError(f"{given} is {what}, which no file may take the place of")
+        type_name = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
+        raise OSError(f"{given} is {type_name}, which no file may take the place of")
     return target, stat.S_IMODE(mode)
 
 
@@ -407,7 +407,7 @@ def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
     types = (str, int, str, dict, dict)
     if tuple(map(type, header)) != types or not re.fullmatch("[a-z]{1,20}", header.kind):
         raise ValueError("its header does not say what it holds")
-    entries, begin = {name: _Entry(**one) for name, one in index.items()}, 0
+    entries, begin = {name: _Entry(**fields) for name, fields in index.items()}, 0
     for name, entry in entries.items():
         begin = _end_of(name, entry, begin)
     if begin != size - 8 - length:
@@ -440,8 +440,8 @@ def _read_array(file: BinaryIO, entry: _Entry) -> NDArray[Any]:
 
 def _sha256(header: bytes, numbers: Iterable[Any]) -> str:
     digest = hashlib.sha256(header)
-    for one in numbers:
-        digest.update(one)
+    for array in numbers:
+        digest.update(array)
     return digest.hexdigest()
 
 
@@ -495,7 +495,7 @@ def _refuse_settings(
 
 def _is(value: Any, kind: Any) -> bool:
     if kind == list[str]:
-        return isinstance(value, list) and all(isinstance(one, str) for one in value)
+        return isinstance(value, list) and all(isinstance(item, str) for item in value)
     return isinstance(value, kind)
 
 
