@@ -55,7 +55,7 @@ _UNSIGNED = "0" * 64
 _LARGEST_FILE, _LARGEST_HEADER = 1 << 29, 1 << 24
 # The names of types in a file. No objects: those could run.
 _TYPES = {"BOOL": np.bool_, "U8": np.uint8, "I64": np.int64, "F64": np.float64}
-_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
+_TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
 # Nobody writes a file any more that did not change for so long [s].
 _OLD = 600.0
 # Why no file can take the place of another one.
@@ -180,10 +180,10 @@ def _packed(kind: Kind, header: Header, arrays: Mapping[str, NDArray[Any]]) -> l
     entries: dict[str, _Entry] = {}
     begin = 0
     for name, array in arrays.items():
-        if array.dtype not in _NAMES:
+        if array.dtype not in _TYPE_NAMES:
             raise ValueError(f"{name} is of {array.dtype}, which no file may hold")
         end = begin + array.nbytes
-        entries[name] = _Entry(_NAMES[array.dtype], list(array.shape), [begin, end])
+        entries[name] = _Entry(_TYPE_NAMES[array.dtype], list(array.shape), [begin, end])
         begin = end
     told = json.dumps(header._asdict())
     sizes = _refuse_unfit(kind, json.loads(told)["settings"], entries)
@@ -462,7 +462,7 @@ def _refuse_unfit(
     if unknown := set(entries) - set(kind.arrays):
         raise ValueError(f"it has {', '.join(sorted(unknown))}, which no {kind.name} has")
     for name, numbers in kind.arrays.items():
-        expected = _NAMES[np.dtype(numbers.dtype)]
+        expected = _TYPE_NAMES[np.dtype(numbers.dtype)]
         if entries[name].dtype != expected:
             raise ValueError(f"{name} is of type {entries[name].dtype}, not {expected}")
         numbers.refuse_shape(name, tuple(entries[name].shape), sizes)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 # What folders of results hold, in the order in which it is looked for.
 _MODELS = ("guard.evofsm", "model.evofsm")
 # So many states are listed, those with most of the time.
-_MOST_STATES = 20
+_STATES_LISTED = 20
 _UNTOLD = (
     "Which episodes failed is not known: nothing said so. From a log, evofsm learn "
     "--failed COLUMN or --failed 'gap<=0' says it."
@@ -182,7 +182,7 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
         )
     ]
     title = "States (stays: share of its steps; first seen: at which row)"
-    most = sorted(np.argsort(-model.visits, kind="stable")[:_MOST_STATES].tolist())
+    most = sorted(np.argsort(-model.visits, kind="stable")[:_STATES_LISTED].tolist())
     yield ""
     header = ("", *heads, "share of time", "stays", "first seen")
     yield table(title, header, [states[k] for k in most])

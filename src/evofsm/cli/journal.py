@@ -28,7 +28,7 @@ from evofsm.guard.audit_log import lines
 
 _SEAL = b',"crc":"'
 # A record has at most so many bytes.
-_LONGEST = 1 << 20
+_LONGEST_RECORD = 1 << 20
 
 Record = Mapping[str, Any]
 
@@ -99,7 +99,7 @@ class Journal:
     def _read(self) -> int:
         """Read what is there, and say up to where it is good; without a record, nothing is."""
         good, damaged, begun_with = 0, 0, self.settings
-        for number, line in enumerate(lines(self.path, _LONGEST), 1):
+        for number, line in enumerate(lines(self.path, _LONGEST_RECORD), 1):
             record = _record(line)
             if record is None:
                 if number == 1 and not _line({"settings": self.settings}).startswith(line):

@@ -41,7 +41,7 @@ _TIME_CALLED = re.compile(_WORD + "((?i:ms|us|ns))(?:ec)?[^A-Za-z]*$")
 # Units of time that logs are in, of which that counts by which a row comes every 0.1 s or so.
 _SHORTER = ("ms", "us", "ns")
 # So near must a unit come to what two columns differ by, to be named.
-_FITS = 0.02
+_MATCHES = 0.02
 # What is said of what was left out, where it is no row.
 _LEFT_OUT = {
     "comment": "comments between rows were passed over",
@@ -200,10 +200,10 @@ def _contradictions(noted: Noted, columns: LogColumns) -> Iterator[str]:
     for kind, rate in noted.rates.items():
         is_gap = kind == "gap"
         mend = "is one of them in another unit, or mixed up with another one?"
-        if abs(rate + 1.0) < _FITS:
+        if abs(rate + 1.0) < _MATCHES:
             mend = "are the speeds mixed up?" if is_gap else "is a brake above 0 there?"
         for unit, (names, power) in ((u, of_units[kind].get(SI[u], ([], 1))) for u in SI):
-            if UNITS[unit] != 1.0 and names and abs(rate * UNITS[unit] ** -power - 1.0) < _FITS:
+            if UNITS[unit] != 1.0 and names and abs(rate * UNITS[unit] ** -power - 1.0) < _MATCHES:
                 options = (f"--unit {quote(f'{name}={unit}')}" for name in names)
                 mend = f"{' '.join(options)} converts from {unit}"
         shown, said = ("gap", " and ".join(speeds)) if is_gap else ("v_follower", columns.action)

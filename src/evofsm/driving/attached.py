@@ -41,7 +41,7 @@ _TYPE = "type:"
 # emergency they brake harder, and so does whoever follows.
 _LEADER_DECEL = 4.5
 # What is seen is so exact [m/s²].
-_EXACT = 0.05
+_SEEN_TO = 0.05
 # Braking harder than this is hard [m/s²].
 _HARD = 5.0
 # Clocks of SUMO count thousandths; two times that differ by less are one [s].
@@ -69,14 +69,14 @@ _ATTACHED: weakref.WeakSet[Attachment] = weakref.WeakSet()
 # Two that touched within this time before still do [s].
 _SAME_COLLISION = 5.0
 # How far one looks at least [m]; further by what it takes to stop.
-_NEAR, _GENTLE = 30.0, 3.0
-_WIDTH = 1.8
+_LOOKS_AHEAD, _GENTLE = 30.0, 3.0
+_CAR_WIDTH = 1.8
 # Nobody is nearer in what is judged [m]. SUMO keeps minGap itself: what is kept beside it [m].
 _NEAREST, _MARGIN = 0.05, 0.1
 # Limits are as coarse as that [m/s²], and so far a driver may want more.
 _COARSE = 0.3
 # Slower than this a car stands, and a speed that differs by no more is the same [m/s].
-_STANDS, _SAME = 0.1, 1e-6
+_STANDS, _SAME_SPEED = 0.1, 1e-6
 # So many cars in so many steps without a decision are no accident.
 _MANY_CARS, _MANY_STEPS = 10, 2000
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
@@ -204,17 +204,17 @@ class Seeing:
         """The scene as `Scene.rows` has it, x counted from the front bumper of the car."""
         rows = np.zeros((3, len(COLUMNS)))  # oneself, ahead and behind
         length = self.body(car).length
-        rows[0] = 1.0, -0.5 * length, 0.0, speed, 0.0, length, _WIDTH, 0.0
+        rows[0] = 1.0, -0.5 * length, 0.0, speed, 0.0, length, _CAR_WIDTH, 0.0
         for row, near, from_, way in ((rows[1], ahead, 0.0, 1.0), (rows[2], behind, -length, -1.0)):
             if near is not None:
                 long, ax = self.body(near.id).length, self._vehicle.getAcceleration(near.id)
                 x = from_ + way * (near.room + 0.5 * long)
-                row[:] = 1.0, x, 0.0, near.speed, 0.0, long, _WIDTH, ax
+                row[:] = 1.0, x, 0.0, near.speed, 0.0, long, _CAR_WIDTH, ax
         return rows.ravel()
 
 
 def _far(speed: float) -> float:
-    return _NEAR + speed + 0.5 * speed * speed / _GENTLE
+    return _LOOKS_AHEAD + speed + 0.5 * speed * speed / _GENTLE
 
 
 # -- Guarding ---------------------------------------------------------------------------------
@@ -381,7 +381,7 @@ class Guarding:
                 said = _OVERRULED.format(car.id, _OFTEN)
                 warnings.warn(said, RuntimeWarning, stacklevel=4)
         # Slower than the limit is what SUMO itself wanted, such as to stop at a red light.
-        if car.mode is not None and speed >= car.limit - _SAME:
+        if car.mode is not None and speed >= car.limit - _SAME_SPEED:
             wanted = max(car.wish, speed)
         wish, deed = ((reached - car.speed) / self._seeing.dt for reached in (wanted, speed))
         if not self._acts and car.revision is None:
@@ -453,7 +453,7 @@ def _leaders_of(guard: Guard | None, leader_decel: float) -> Manoeuvres:
             f"TrafficRisk, or observe {', '.join(VARIABLES)}"
         )
     # How hard SUMO's cars brake is exactly known, and has an end.
-    assumed = Manoeuvres(leader_decel, width=_EXACT)
+    assumed = Manoeuvres(leader_decel, width=_SEEN_TO)
     return copy.deepcopy(judge.manoeuvres if isinstance(judge, LatentRisk) else assumed)
 
 

@@ -60,7 +60,7 @@ _CAUTION = 2.5
 # -- What a file may hold -------------------------------------------------------------------------
 # No car is asked to brake harder [m/s²]; decisions are no closer nor farther apart [s].
 
-_ASKED, _SHORTEST, _LONGEST = 100.0, 1e-6, 1e6
+_ASKED, _SHORTEST_DT, _LONGEST_DT = 100.0, 1e-6, 1e6
 _ACCELERATION = Numbers(least=SMALLEST, most=_ASKED)
 _PRODUCT, _NOISE = Numbers(least=-1e300, most=1e300), Numbers(least=0.0, most=1e300)
 _RISK = Kind(
@@ -79,7 +79,7 @@ _RISK = Kind(
     },
     {
         "lowest": Numbers(least=-_ASKED, most=-SMALLEST),
-        "dt": Numbers(least=_SHORTEST, most=_LONGEST),
+        "dt": Numbers(least=_SHORTEST_DT, most=_LONGEST_DT),
         **dict.fromkeys(("leader_decel", "comfort"), _ACCELERATION),
         "regain": Numbers(least=0.0, most=60.0),
         "own_brakes": Numbers(least=SMALLEST, most=10.0),

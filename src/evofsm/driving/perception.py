@@ -29,7 +29,7 @@ _UNEVEN = 0.01
 # Noise below this cannot be told from uneven driving, and counts as none [m, m/s, m/s].
 _FINEST = (0.02, 0.03, 0.03)
 # So many of the latest residuals tell the noise; fewer than the second say nothing.
-_MEMORY, _FEWEST = 500, 20
+_MOST_RESIDUALS, _FEWEST_RESIDUALS = 500, 20
 # Slower than this one may stand still, where sensors seem better than they are [m/s].
 _STANDING = 1.0
 # A gap or a leader's speed that is so many standard deviations off belongs to another leader.
@@ -37,9 +37,9 @@ _ANOTHER_LEADER = 6.0
 # Median of the absolute value of a standard normal variable.
 _MEDIAN = 0.6745
 _SIX = sqrt(6.0)
-_NOTHING = (0.0, 0.0, 0.0)
-_EXACT = np.zeros((3, 3))
-_NAMES = ("noise_gap", "noise_speed", "noise_leader")
+_NO_NOISE = (0.0, 0.0, 0.0)
+_NO_COVARIANCE = np.zeros((3, 3))
+_NOISES = ("noise_gap", "noise_speed", "noise_leader")
 
 
 class Estimate(NamedTuple):
@@ -59,7 +59,7 @@ class Perception:
     def __init__(self, dt: float) -> None:
         self.dt = dt
         #: Standard deviations of observed gap [m], own and leader's speed [m/s].
-        self.noise = _NOTHING
+        self.noise = _NO_NOISE
         # Of what gap and both speeds did that kinematics do not explain.
         self._sizes = _Sizes(), _Sizes(), _Sizes()
         self.clear()
@@ -92,8 +92,8 @@ class Perception:
 
     def estimate(self, now: Three, realised: float, *, sure: bool = True) -> Estimate:
         """What `see` would answer; nothing changes. NaN stays where nothing was seen before."""
-        if self.noise == _NOTHING and is_whole(now):
-            return Estimate(now, _EXACT)
+        if self.noise == _NO_NOISE and is_whole(now):
+            return Estimate(now, _NO_COVARIANCE)
         if self.latest is None:
             return Estimate(now, np.diag(np.square(self.noise)))
         doubt = _OWN if sure else _OWN_UNKNOWN
@@ -115,12 +115,12 @@ class Perception:
         """The residuals by name, the oldest first, for a file."""
         return {
             name: np.array(sizes.latest, dtype=np.float64)
-            for name, sizes in zip(_NAMES, self._sizes, strict=True)
+            for name, sizes in zip(_NOISES, self._sizes, strict=True)
         }
 
     def restore(self, latest: Mapping[str, Iterable[float]]) -> None:
         """Take over what `learnt` returned."""
-        gap, speed, leader = (_Sizes(np.asarray(latest[name]).tolist()) for name in _NAMES)
+        gap, speed, leader = (_Sizes(np.asarray(latest[name]).tolist()) for name in _NOISES)
         self._sizes = gap, speed, leader
         self.noise = _noise(self._sizes, self.dt)
 
@@ -181,14 +181,14 @@ class _Sizes:
     """Absolute values of the latest residuals, and their deviation: robust, from the median."""
 
     def __init__(self, sizes: Iterable[float] = ()) -> None:
-        self.latest = deque(map(abs, sizes), maxlen=_MEMORY)
+        self.latest = deque(map(abs, sizes), maxlen=_MOST_RESIDUALS)
         self._sorted = sorted(self.latest)
 
     def add(self, residual: float) -> None:
         """Take in one more, if it is a number; the oldest goes where there is no room."""
         if isnan(residual):
             return
-        if len(self.latest) == _MEMORY:
+        if len(self.latest) == _MOST_RESIDUALS:
             del self._sorted[bisect_left(self._sorted, self.latest[0])]
         self.latest.append(abs(residual))
         insort(self._sorted, abs(residual))
@@ -196,7 +196,7 @@ class _Sizes:
     def deviation(self) -> float:
         """0 while there are few."""
         n = len(self._sorted)
-        return self._sorted[n // 2] / _MEDIAN if n >= _FEWEST else 0.0
+        return self._sorted[n // 2] / _MEDIAN if n >= _FEWEST_RESIDUALS else 0.0
 
 
 def _noise(sizes: Iterable[_Sizes], dt: float) -> Three:

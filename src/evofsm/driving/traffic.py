@@ -36,7 +36,7 @@ PLACES, SIZES, RATES = (-1e9, 1e9), (0.0, 1e3), (-1e3, 1e3)
 # Who will be in one's path within this time at the present lateral speed cuts in, or crosses [s].
 _AHEAD = 2.0
 # Width of an interval of accelerations, of which one is looked at [m/s²].
-_WIDTH = 0.3
+_INTERVAL_WIDTH = 0.3
 # So hard leaders brake at most, unless told or seen otherwise: SUMO's emergencyDecel [m/s²].
 LEADER_DECEL = 9.0
 # So hard those behind brake [m/s²], once they have kept their speed for so long [s].
@@ -327,6 +327,6 @@ def guard_for_traffic(
     1.0
     """
     judge = judge or TrafficRisk(LatentRisk.given(-decel, decel, LEADER_DECEL, interval))
-    actions = IntervalActions(low, high, _WIDTH, outside="clip")
+    actions = IntervalActions(low, high, _INTERVAL_WIDTH, outside="clip")
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, learn=False)

@@ -29,7 +29,7 @@ _Part: TypeAlias = tuple[dict[str, NDArray[Any]], FSMModel]
 # A row with a smaller share of evidence than this is all prior, and rounding.
 _LEAST_EVIDENCE = 1e-9
 # Frequencies that differ by less than this part of themselves are of the same prior.
-_SAME = 0.01
+_SAME_PRIOR = 0.01
 
 
 def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> EvolvingFSM:
@@ -239,7 +239,7 @@ def _prior_left(joint: Floats, uses: Floats, settings: Settings) -> Floats:
     into = np.minimum.accumulate(between, axis=1).diagonal(axis1=1, axis2=2)
     out_of = np.minimum.accumulate(between, axis=2).diagonal(axis1=1, axis2=2)
     least = np.minimum(into, out_of)
-    agree = np.isfinite(least) & (np.maximum(into, out_of) <= (1.0 + _SAME) * least)
+    agree = np.isfinite(least) & (np.maximum(into, out_of) <= (1.0 + _SAME_PRIOR) * least)
     oldest = _aged_prior(settings, uses)[:, None]
     left = np.where(agree, np.minimum(least, settings.prior_frequency), oldest)
     left = np.minimum.accumulate(left[:, ::-1], axis=1)[:, ::-1]

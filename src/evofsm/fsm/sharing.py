@@ -15,7 +15,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 Rollback: TypeAlias = Callable[[], None]
 
 # So many steps are gone through again at most.
-_STEPS = 512
+_MOST_STEPS = 512
 # All that threads share, for a process that is forked.
 _SHARED: WeakSet[Any] = WeakSet()
 
@@ -100,7 +100,7 @@ def step(method: Method) -> Method:
     def noted(self: Any, *args: Any, **named: Any) -> Any:
         known, self._known = self._known, None  # of a step that is broken off nothing is known
         result = method(self, *args, **named)
-        if known is not None and len(known[1]) < _STEPS:
+        if known is not None and len(known[1]) < _MOST_STEPS:
             known[1].append((method, args, named))
             self._known = known
         return result

@@ -39,11 +39,11 @@ RATES = (0.1, 0.3, 1.0, 3.0)
 # In horizons: how far ahead limits look, over what the rate is taken, how long an alarm stays on.
 _AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.125
 # Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts held out.
-_MOST, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 4.0, 12), 3
+_MOST_LIMITS, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 4.0, 12), 3
 # Blocks of rows in a horizon, as limits are searched for.
 _BLOCKS = 15
 # Kinds of alarms; thresholds are plain unless others warn for longer by so much.
-_LEARNT, _PLAIN, _NONE = range(3)
+_LEARNT, _PLAIN, _NO_KIND = range(3)
 _BETTER = 0.95
 # What a further limit has to add to the share of the horizon that is warned before; survived rows
 # that forms of failure are learnt from.
@@ -188,7 +188,7 @@ class Foresight(LearningJudge):
         alarms, chance = right + false, log.failed.sum() * ahead / len(log.rows)
         for k in range(len(RATES)):  # whether it is better than an alarm at any time
             if not (right[k] and wilson_bounds(right[k] / alarms[k], alarms[k])[0] > chance):
-                kind[k] = _NONE
+                kind[k] = _NO_KIND
         told = np.column_stack([alarms, right, kind])
         return cls(dt, ahead, held, judge.forms, judge.limits, told, names, units)
 
@@ -238,7 +238,7 @@ class Foresight(LearningJudge):
         rules: dict[tuple[tuple[int, int], ...], Floats] = {(): np.zeros(2)}
         for price in _PRICES:
             rule, worth = tuple[tuple[int, int], ...](), 0.0
-            while len(rule) < _MOST:
+            while len(rule) < _MOST_LIMITS:
                 gain = more(rule) @ (1.0, -price)
                 best = divmod(int(gain.argmax()), _TRIED)
                 if gain[best] <= worth + _WORTH:
@@ -336,7 +336,7 @@ class Foresight(LearningJudge):
     def shares(self) -> Floats:
         """(rates,) of the alarms those that were right; 0 where nothing foresees a failure."""
         share = self.held_out[:, 1] / np.maximum(self.held_out[:, 0], 1.0)
-        return np.where(self.held_out[:, 2] == _NONE, 0.0, share)
+        return np.where(self.held_out[:, 2] == _NO_KIND, 0.0, share)
 
     def rate_of(self, tolerance: float) -> int | None:
         """Which of `RATES` the alarm is for, more of which are right; None if there is none."""
@@ -358,7 +358,7 @@ class Foresight(LearningJudge):
     def of(self, rate: int) -> str:
         """What the alarm for one of `RATES` is, and how often it was right, in words."""
         alarms, right, kind = self.held_out[rate].tolist()
-        if kind == _NONE:
+        if kind == _NO_KIND:
             return "nothing was better than chance"
         plain = "plain thresholds do as well: " if kind == _PLAIN else ""
         return f"{plain}{self.words(rate)} ({right:.0f} of {alarms:.0f} were right, held out)"
@@ -442,7 +442,7 @@ class Foresight(LearningJudge):
         settings, arrays = store.read(path, KIND)
         with store.explained(path):
             count = len(settings["names"]) + len(arrays["forms"])
-            indices, most = arrays["limits"][:, :_SIGN], (len(RATES), _NONE, count, len(_AHEAD))
+            indices, most = arrays["limits"][:, :_SIGN], (len(RATES), _NO_KIND, count, len(_AHEAD))
             if not ((indices >= 0) & (indices < most) & (indices % 1.0 == 0.0)).all():
                 raise ValueError("a limit is of no variable, or of no rate")
             if not (np.isin(arrays["forms"][:, [failure.I, failure.J]], range(count))).all():

@@ -45,7 +45,7 @@ _Convert = Callable[[Any], Any]
 # Each value of ``Discrete`` is a variable of its own; more of them would take too long.
 _MOST_VALUES = 64
 # Not in ``info`` where nothing was judged: NaN there is unlike itself.
-_RISKS = "reviser/risk", "reviser/risk_proposed"
+_RISK_INFOS = "reviser/risk", "reviser/risk_proposed"
 # So many steps on end without a decision are told of.
 _SILENT = 200
 # Where ``info`` holds the last observation of an episode, as the one returned is of the next.
@@ -277,7 +277,7 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         if any(decision.cost for decision in decided):
             shape = (-1,) + (1,) * (np.ndim(rewards) - 1)
             rewards = rewards - np.reshape([decision.cost for decision in decided], shape)
-        for name in _RISKS:
+        for name in _RISK_INFOS:
             infos |= {name: np.zeros(self.num_envs), f"_{name}": np.zeros(self.num_envs, bool)}
         for k, (decision, was_open) in enumerate(zip(decided, were_open, strict=True)):
             infos = self._add_info(infos, decision.info, k)
@@ -494,7 +494,7 @@ class Terms:
             "reviser/penalty": size,
             "reviser/reason": revision.reason,
         }
-        risks = zip(_RISKS, (revision.risk_executed, revision.risk_proposed), strict=True)
+        risks = zip(_RISK_INFOS, (revision.risk_executed, revision.risk_proposed), strict=True)
         info |= {name: risk for name, risk in risks if not math.isnan(risk)}
         return Decided(executed, info, self.penalty * size)
 

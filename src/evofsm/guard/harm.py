@@ -42,14 +42,14 @@ _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
 _SOONER = 0.3
 # Scores that differ by less than this share are equal.
-_ALIKE = 0.05
+_SAME_SCORE = 0.05
 # The latest guarded episodes, if all failed, are reason enough for one draw to decide; else it
 # takes as many that agree.
 _CAREFUL = 3
 # Draws by which it is said how often the guard drives; below that it is said at all.
 _DRAWS, _SAID = 300, 0.9
 # Decisions over which the share of proposals that are kept is counted, and at least for a word.
-_DECISIONS, _SOME = 500, 100
+_DECISIONS, _FEWEST_DECISIONS = 500, 100
 # Steps of who never fails.
 _FOREVER = 1 << 52
 
@@ -98,7 +98,7 @@ class Harm(NamedTuple):
     @property
     def replaces(self) -> bool:
         """Whether hardly a proposal is kept."""
-        return self.decided >= _SOME and self.kept < 0.05 * self.decided
+        return self.decided >= _FEWEST_DECISIONS and self.kept < 0.05 * self.decided
 
     @property
     def helps(self) -> bool:
@@ -235,7 +235,7 @@ def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.flo
     worse = (s_fails[:, None] > 0) & (s_steps[:, None] <= o_last)
     best = (o_fails > 0) & (o_steps <= s_last[:, None])
     more, size = s_score[:, None] - o_score, np.maximum(np.abs(s_score)[:, None], np.abs(o_score))
-    scored = np.where(np.abs(more) > _ALIKE * size, np.sign(more), 0.0)
+    scored = np.where(np.abs(more) > _SAME_SCORE * size, np.sign(more), 0.0)
     neither = np.where(scored != 0.0, scored, s_well[:, None] - o_well)
     fails = (s_fails[:, None] > 0) | (o_fails > 0)
     failed = (s_fails[:, None] > 0) & (o_fails > 0)

@@ -39,13 +39,13 @@ _Ints = NDArray[np.int64]
 # Numbers of a place.
 _P = 2
 # Steps that are looked ahead.
-_STEPS = 5
+_STEPS_AHEAD = 5
 # Objects that are remembered, at most; the oldest episodes are forgotten.
-_MOST = 40_000
+_MOST_REMEMBERED = 40_000
 # Analogs of an object, and of oneself.
 _ANALOGS, _OWN_ANALOGS = 20, 3
 # An analog at this squared distance counts a quarter of one that is the same.
-_ALIKE = 0.1
+_ANALOG_SCALE = 0.1
 # Weight of a place, relative to the rest, where objects are linked; and where they are compared.
 _OF_REST, _NEAR_TO = 0.1, 2.0
 # Squared distance from where an object was expected beyond which it is another one.
@@ -53,11 +53,11 @@ _GATE = 0.5
 # Nothing is forecast from an object that went so many times as far astray as is too close.
 _ASTRAY = 2.5
 # Reweightings of a robust fit; the squared residual, in medians, that counts half; the ridge.
-_FITS, _HALF, _RIDGE = 4, 9.0, 1e-6
+_REWEIGHTINGS, _HALF, _RIDGE = 4, 9.0, 1e-6
 # A number varies by so much of its mean square at least, so that two that never change differ.
 _CONSTANT = 1e-6
 # Squared residuals count as this large at least, in squared spreads.
-_EXACT = 1e-4
+_LEAST_SQUARE = 1e-4
 # Objects that have to be seen twice before anything is learnt, times the numbers of oneself.
 _ROWS = 10
 # Points of a step at which a distance is taken, its two ends included.
@@ -69,17 +69,17 @@ _MOST_ACTIONS = 1_000
 # Closest steps that were survived, of which each counts.
 _CLOSEST = 2000
 
-_SOME = Numbers(least=-1e31, most=1e31)
+_BOUNDED = Numbers(least=-1e31, most=1e31)
 _INDEX = Numbers(least=-1.0, most=MOST_COUNTED, whole=True)
 _KIND = Kind(
     "scenerisk",
     {
-        "own": _SOME.of("n", "o"),
+        "own": _BOUNDED.of("n", "o"),
         "actions": _INDEX.of("n"),
         "counts": COUNT.of("n"),
         "lost": FLAG.of("n"),
-        "away": _SOME.of("m", "p"),
-        "other": _SOME.of("m", "r"),
+        "away": _BOUNDED.of("m", "p"),
+        "other": _BOUNDED.of("m", "r"),
         "links": _INDEX.of("m"),
     },
     {
@@ -189,7 +189,7 @@ class SceneRisk(ActionJudge):
         risks, proposed = found.risks.min(1), int(wanted)
         judged = self._judged(risks[[proposed]])
         if risks[proposed] <= tolerance:
-            said = f"risk within {_STEPS * self.dt:g} s is within the tolerance"
+            said = f"risk within {_STEPS_AHEAD * self.dt:g} s is within the tolerance"
             return Search(np.array([wanted]), judged, 0, said)
         why, after = self.why(judged), found.after
         can = risks if mask is None else np.where(mask, risks, math.inf)
@@ -216,7 +216,7 @@ class SceneRisk(ActionJudge):
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
-        ahead, risk = _STEPS * self.dt, 100.0 * judged.risk[0]
+        ahead, risk = _STEPS_AHEAD * self.dt, 100.0 * judged.risk[0]
         return f"whatever follows, an object is met within {ahead:g} s: {risk:.2g} %"
 
     @property
@@ -522,7 +522,7 @@ class Memory:
         """Remember an episode; learn from it at once if it failed, else now and then."""
         failed, past = bool(episode.lost.any()), self.past.and_then(episode)
         starts = past.objects[past.ends]  # of each episode, as objects
-        forgotten = min(int((len(past.away) - starts > _MOST).sum()), len(starts) - 2)
+        forgotten = min(int((len(past.away) - starts > _MOST_REMEMBERED).sum()), len(starts) - 2)
         past = past.between(forgotten, len(starts) - 1)
         self.fitted = max(0, self.fitted - forgotten)
         self.failures += failed
@@ -603,11 +603,11 @@ class Memory:
         weights = np.ones(len(rows))
         spread = np.maximum(x.var(0), _CONSTANT * (x**2).mean(0)) + 1e-12
         ridge = _RIDGE * len(rows) * np.diag(spread)
-        for _ in range(_FITS):
+        for _ in range(_REWEIGHTINGS):
             weighed = x * weights[:, None]
             motion = np.linalg.solve(weighed.T @ x + ridge, weighed.T @ y + ridge @ prior)
             off = (((y - x @ motion) / self._spreads[0]) ** 2).sum(1)
-            middle = max(float(np.median(off)), _EXACT)
+            middle = max(float(np.median(off)), _LEAST_SQUARE)
             weights = 1.0 / (1.0 + off / (_HALF * middle))
         self._motion = np.asarray(motion, np.float64)
 
@@ -667,8 +667,8 @@ class Memory:
                 links[astray], went[astray] = -1, np.nan
                 rows = np.flatnonzero(links >= 0)
         total, at = np.zeros_like(past.away), np.arange(len(past.away))
-        paths = np.empty((len(past.away), _STEPS, _P))
-        for h in range(_STEPS):
+        paths = np.empty((len(past.away), _STEPS_AHEAD, _P))
+        for h in range(_STEPS_AHEAD):
             here = np.where((at >= 0)[:, None], went[at], np.nan)
             step = np.where(np.isnan(here), step, here)
             total = total + step
@@ -699,11 +699,11 @@ class Memory:
         analogs = _nearest(self._objects, self._features(ego, seen.away, seen.other), _ANALOGS)
         for i, (like, share) in enumerate(zip(*analogs, strict=True)):
             faster = (seen.other[i] - self._others[like]) @ self._steady
-            path = self._paths[like] + faster[:, None] * np.arange(1, _STEPS + 1)[:, None]
+            path = self._paths[like] + faster[:, None] * np.arange(1, _STEPS_AHEAD + 1)[:, None]
             to = seen.away[i] + path + gone[:, :, None]
             start = np.broadcast_to(seen.away[i], (*to.shape[:3], 1, _P))
             safe *= share @ (1.0 - self.contact.of(np.concatenate([start, to], axis=-2)))
-        lost = ((1.0 - safe) * weights[:, :, None]).sum(0).reshape(n, n, _STEPS)
+        lost = ((1.0 - safe) * weights[:, :, None]).sum(0).reshape(n, n, _STEPS_AHEAD)
         return Foreseen(lost[:, :, -1], 1.0 - lost.mean(-1), after)
 
     def _own_courses(self, own: _Floats) -> tuple[_Floats, _Floats, _Floats]:
@@ -714,11 +714,11 @@ class Memory:
         n, r = self.n_actions, _OWN_ANALOGS
         first, then = np.repeat(np.arange(n), n), np.tile(np.arange(n), n)
         at = np.broadcast_to(own, (r, n * n, len(own)))
-        gone = np.zeros((r, n * n, _STEPS, _P))
+        gone = np.zeros((r, n * n, _STEPS_AHEAD, _P))
         shares = np.full((r, n * n), 1.0 / r)
         total = np.zeros((r * n * n, _P))
         course = np.arange(r)[:, None, None]
-        for h in range(_STEPS):
+        for h in range(_STEPS_AHEAD):
             to = at.copy()
             for action, (before, change) in enumerate(self._own):
                 rows = np.flatnonzero((then if h else first) == action)
@@ -756,7 +756,7 @@ def _nearest(points: _Floats, around: _Floats, most: int) -> tuple[_Ints, _Float
     like = np.empty((len(around), most), np.int64)
     apart = np.full((len(around), most), np.inf)
     _nearest_into(points, around, like, apart)
-    weight = 1.0 / (_ALIKE + apart) ** 2
+    weight = 1.0 / (_ANALOG_SCALE + apart) ** 2
     return like, weight / weight.sum(-1, keepdims=True)
 
 

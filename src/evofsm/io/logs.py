@@ -49,7 +49,7 @@ _FIRST_ROWS = 8192
 #: Bad rows of a file that are left out where nobody said how many.
 SKIPPED = 10
 # Signals are joined where so many values of each and no whole row are among the first ones.
-_FEWEST = 5
+_FEWEST_VALUES = 5
 #: So old may a value be that is held, as `Topics` has it [s].
 OLDEST = 0.5
 # Share by which the usual steps of two files may differ.
@@ -58,7 +58,7 @@ _SAME_STEP = 0.05
 _FASTEST, _LONGEST_USUAL = 60.0, 5.0
 # Two witnesses of one thing are compared in more rows than so, and where they go up and down
 # together as far as that (a correlation).
-_COMPARED, _ALIKE = 50, 0.9
+_COMPARED, _CORRELATED = 50, 0.9
 _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
 _MICROSECOND = 1e-6
 _NO_CAR = "{!r} cannot be right (another unit? --unit; a stand-in for nobody? --no-leader); in SI "
@@ -182,7 +182,7 @@ class Noted:
             if len(x) > _COMPARED and x.std() > 0.0 < y.std():
                 alike = float(np.corrcoef(x, y)[0, 1])
                 rate = alike * float(y.std() / x.std())
-                if abs(alike) > _ALIKE and not 0.8 < rate < 1.25:
+                if abs(alike) > _CORRELATED and not 0.8 < rate < 1.25:
                     self.rates[kind] = rate
 
 
@@ -823,7 +823,7 @@ class _Reader:
         there = {name: np.isfinite(values) for name, values in piece.numbers.items()}
         if self._hold is None:
             is_whole = np.logical_and.reduce(list(there.values())).any()
-            is_joined = not is_whole and all(seen.sum() > _FEWEST for seen in there.values())
+            is_joined = not is_whole and all(seen.sum() > _FEWEST_VALUES for seen in there.values())
             self._hold = OLDEST if is_joined else 0.0
             if self._hold:
                 self._noted.told.append(

@@ -78,7 +78,7 @@ _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s":
 # Names of columns are looked for in so many lines; what stands before the last line of a comment.
 _MOST_ABOVE, _COMMENT = 100, re.compile(r"\s*(#|%|//)+\s*")
 # What stands in a field where there is no number.
-_NOTHING = ("", "na", "n/a", "null", "none")
+_MISSING = ("", "na", "n/a", "null", "none")
 # By which a comma is known to be a decimal one; groups of three digits it may separate as well.
 _DECIMAL_COMMA = re.compile(r"\s*-?\d+,(\d\d?|\d{4,})\s*")
 # What no text holds.
@@ -376,7 +376,7 @@ class Wanted(NamedTuple):
             if values.dtype == polars.String:
                 fields = values.str.strip_chars()
                 values = fields.cast(polars.Float64, strict=False)
-                wrong = values.is_null() & ~fields.fill_null("").str.to_lowercase().is_in(_NOTHING)
+                wrong = values.is_null() & ~fields.fill_null("").str.to_lowercase().is_in(_MISSING)
                 if wrong.any():
                     piece.leave_out(name, wrong.to_numpy())
             piece.numbers[name] = values.cast(polars.Float64).to_numpy()

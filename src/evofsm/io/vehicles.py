@@ -135,7 +135,7 @@ _BYTES_AT_ONCE = 1 << 16
 _LONGEST_TAG, _DEEPEST = 1_000_000, 16
 # A vehicle as wide as SUMO's passenger car [m], where nobody said; who is less aside is in line;
 # and who is that near may be beside by its place in the plane.
-_WIDTH, _IN_LINE, _NEAR = 1.8, 0.4, 20.0
+_USUAL_WIDTH, _IN_LINE, _BESIDE_WITHIN = 1.8, 0.4, 20.0
 # What the parser says where a file ends early.
 _CUT = {expat.errors.XML_ERROR_NO_ELEMENTS, expat.errors.XML_ERROR_UNCLOSED_TOKEN}
 _CUT |= {expat.errors.XML_ERROR_PARTIAL_CHAR}
@@ -157,7 +157,7 @@ class VehicleLengths:
 
     default: float = 5.0
     by_type: dict[str, float] = field(default_factory=dict)
-    widths: dict[str, float] = field(default_factory=lambda: {"": _WIDTH})
+    widths: dict[str, float] = field(default_factory=lambda: {"": _USUAL_WIDTH})
     seen: set[str] = field(default_factory=set, init=False)  #: types met so far
     #: Times that one of a type was not beside, but not in line either, where it overlaps.
     overlaps: Counter[str] = field(default_factory=Counter, init=False)
@@ -243,7 +243,7 @@ def _queues(cars: Sequence[_Car], lengths: VehicleLengths) -> Iterator[Following
             if leader.lane != car.lane:
                 break
             aside = abs(leader.lateral - car.lateral)
-            if aside != aside and leader.along - car.along < _NEAR:
+            if aside != aside and leader.along - car.along < _BESIDE_WITHIN:
                 aside = float(_across(leader.place - car.place, car.heading + leader.heading))
             if not aside >= 0.5 * (car.width + leader.width):
                 gap = leader.along - leader.length - car.along
@@ -403,7 +403,7 @@ def _refuse_lack(place: str, name: str) -> NoReturn:
 #: middle of the box; units are those of the SI.
 OBJECT_COLUMNS = ("id", "t", "x", "y", "vx", "vy", "length", "lane")
 # Whoever is slower [m/s] points where it pointed before.
-_STANDING = 0.1
+_TURNS_ABOVE = 0.1
 
 
 class Object(NamedTuple):
@@ -486,7 +486,7 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
 def _pointing(obj: Object, pointed: dict[str, float]) -> Object:
     """The same object with a heading, if it is known from now or before."""
     heading = obj.heading if math.isfinite(obj.heading) else math.nan
-    if math.isnan(heading) and math.hypot(obj.vx, obj.vy) >= _STANDING:
+    if math.isnan(heading) and math.hypot(obj.vx, obj.vy) >= _TURNS_ABOVE:
         heading = math.atan2(obj.vy, obj.vx)
     if math.isnan(heading):
         heading = pointed.get(obj.id, math.nan)
@@ -507,11 +507,11 @@ def _following(scene: Scene, lane: Sequence[Object]) -> Iterator[Following]:
     dx, dy = x[None, :] - x[:, None], y[None, :] - y[:, None]
     along = dx * np.cos(headings)[:, None] + dy * np.sin(headings)[:, None]
     widths = np.array([obj.width for obj in lane])
-    widths[~(widths > 0.0)] = _WIDTH
+    widths[~(widths > 0.0)] = _USUAL_WIDTH
     filled = np.where(np.isnan(headings), headings[:, None], headings)
     mean = np.exp(1j * headings[:, None]) + np.exp(1j * filled)
     beside = _across(dx + 1j * dy, mean) >= 0.5 * (widths[:, None] + widths)
-    ahead = (along > 0.0) & ~(beside & (along < _NEAR))
+    ahead = (along > 0.0) & ~(beside & (along < _BESIDE_WITHIN))
     apart = np.where(ahead, np.hypot(dx, dy), np.inf)
     for follower, nearest, distance in zip(lane, apart.argmin(1), apart.min(1), strict=True):
         leader = lane[int(nearest)]

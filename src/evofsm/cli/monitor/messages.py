@@ -28,11 +28,11 @@ SCHEMA = 1
 #: A longer line is refused unread [byte].
 LONGEST = 1 << 16
 # Objects that a guard of whole scenes has room for; of more the closest along the road count.
-_MOST = 64
+_MOST_OBJECTS = 64
 # So much of what is refused is shown, and so long may a name be [letters].
-_SHOWN = 40
+_LETTERS = 40
 # Where a width is not given [m].
-_WIDTH = 1.8
+_USUAL_WIDTH = 1.8
 
 _Number = Annotated[float, Meta(ge=-LARGEST_OBSERVATION, le=LARGEST_OBSERVATION)]
 _Place = Annotated[float, Meta(ge=PLACES[0], le=PLACES[1])]
@@ -40,7 +40,7 @@ _Speed = Annotated[float, Meta(ge=SPEEDS[0], le=SPEEDS[1])]
 _Rate = Annotated[float, Meta(ge=RATES[0], le=RATES[1])]
 _Size = Annotated[float, Meta(ge=SIZES[0], le=SIZES[1])]
 _Seen = _Number | None
-_Name = Annotated[str, Meta(max_length=_SHOWN)] | Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+_Name = Annotated[str, Meta(max_length=_LETTERS)] | Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 
 
 class MessageError(ValueError):
@@ -85,7 +85,7 @@ class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     y: _Place | UnsetType = UNSET
     lane: _Number | _Name | UnsetType = UNSET
     vy: _Speed = 0.0
-    width: _Size = _WIDTH
+    width: _Size = _USUAL_WIDTH
     ax: _Rate | UnsetType = UNSET
 
 
@@ -178,8 +178,8 @@ class Form:
         if self.scenes:
             objects = [_object(car, f"objects[{k}]", along) for k, car in enumerate(told.objects)]
             scene = Scene(_object(ego, "ego", along), objects)
-            names = tuple(obj.id for obj in scene.objects[1 : _MOST + 1])
-            rows = (None if math.isnan(z) else z for z in scene.rows(_MOST).tolist())
+            names = tuple(obj.id for obj in scene.objects[1 : _MOST_OBJECTS + 1])
+            rows = (None if math.isnan(z) else z for z in scene.rows(_MOST_OBJECTS).tolist())
             return Row(told.time, tuple(rows), proposal, objects=names)
         ahead = _nearest_ahead(ego, told.objects, along)
         if ahead is None:
@@ -201,7 +201,7 @@ class Form:
                 return MessageError(about, f"is missing{_missing(about)}", time)
             known = msgspec.structs.fields(_Vehicle if place else kind)
             names = ", ".join(sorted(field.encode_name for field in known))
-            return MessageError(about[:_SHOWN], f"is not known; known are {names}", time)
+            return MessageError(about[:_LETTERS], f"is not known; known are {names}", time)
         value = _shown(_at(told, place))
         if place == "schema":
             fault = f"is {value}; this monitor knows version {SCHEMA} alone"
@@ -320,4 +320,4 @@ def _shown(value: Any) -> str:
         text = json.dumps(value, ensure_ascii=False)
     except (ValueError, RecursionError):  # integers of thousands of digits
         return "something too large to show"
-    return visible(text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}...")
+    return visible(text if len(text) <= _LETTERS else f"{text[: _LETTERS - 3]}...")

@@ -29,16 +29,16 @@ SAYS, I, J, AT, TO, ONE, OTHER, C, B, D, P, Q, R, HELD = range(SIZE)
 # Bent forms at most; a failure so near one [typical steps] is in it, as it is known no better.
 _MAX_FORMS, BLUR = 8, 0.5
 # A side that explains fewer failures, or a smaller share of them, may be challenged.
-_FEW, _SHARE = 3, 0.25
+_FEW_FAILURES, _SHARE = 3, 0.25
 # So many failures may leave two sides undecided.
-_FIRST = 2
+_MOST_UNDECIDED = 2
 # Beyond an end is what is so many typical steps beyond; blurred ends are so wide [scales].
 _BEYOND, _BLURRED = 1e-12, 5.0
 # Survived observations of a fit; steps of Newton, and the ridge for each of them.
-_NEAR, _NEWTON, _RIDGE = 400, 40, 1e-9
+_FIT_ROWS, _NEWTON, _RIDGE = 400, 40, 1e-9
 # Fits of what explains failures with more likelihood than this each; how many survived ones that
 # are wrongly inside are added.
-_FITS, _UNLIKELY, _WORST = 3, 2.0, 100
+_REFITS, _UNLIKELY, _WORST = 3, 2.0, 100
 # Variables of which all pairs are tried; pairs of which two forms are, and rounds of dealing
 # failures out between two.
 _SCREENED, _IN_TWO, _ROUNDS = 6, 3, 3
@@ -270,7 +270,7 @@ def explain(
     by, k = inside(stay, failures), len(failures)
     if not bends or by.any(0).all() or not len(survived.rows) or not k:
         return _counted(stay, failures)
-    strong = by.sum(1) >= max(_FEW, _SHARE * k)
+    strong = by.sum(1) >= max(_FEW_FAILURES, _SHARE * k)
     bent, _ = _bent(says, failures[by[strong].sum(0) == 0], survived)
     if strong.any():
         alone, whole = _bent(says, failures, survived, len(bent) + int(strong.sum()))
@@ -311,7 +311,7 @@ def _sides(says: int, failures: Floats, survived: Survived, blur: Floats, least:
         while (explained := (beyond > clear) & left[:, None]).any():
             tied, best = _most_telling(explained, perhaps, beyond)
             left &= ~(beyond[:, best] > _BEYOND)
-            undecided = len(failures) <= _FIRST and len(tied) == 2
+            undecided = len(failures) <= _MOST_UNDECIDED and len(tied) == 2
             for k in tied if undecided else [best]:
                 found[k] = float(ends[k])
     while (explained := perhaps & left[:, None]).any():
@@ -435,7 +435,7 @@ def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, 
     index = np.array([near[i, j] for i, j, _ in asked.tolist()])
     table, likelihood = np.zeros((len(asked), SIZE)), np.zeros(len(asked))
     again = np.arange(len(asked))
-    for _ in range(_FITS):  # with what the fit before has wrongly inside
+    for _ in range(_REFITS):  # with what the fit before has wrongly inside
         seen = rows[index[..., None], asked[again][:, None, :2]]
         x = np.concatenate([points[again], seen], 1) - at[again][:, None]
         u, v = (x / scale[again][:, None]).transpose(2, 0, 1)
@@ -454,7 +454,7 @@ def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, 
         found[:, C] -= most + 1e-12 * (np.abs(found[:, C]) + np.abs(most))
         table[again] = found
         again, form, index = again[wrong], form[wrong], index[wrong]
-        if not len(again) or len(rows) <= _NEAR:
+        if not len(again) or len(rows) <= _FIT_ROWS:
             break
         index = np.hstack([index, np.argpartition(-form, _WORST, 1)[:, :_WORST]])
     within = inside(table, F)
@@ -465,14 +465,14 @@ def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, 
 
 def _near(survived: Floats, F: Floats, scale: Floats) -> Ints:
     """Of what was survived as much nearest to each failure as to others, and as much evenly."""
-    n, half = len(survived), _NEAR // 2
-    if n <= _NEAR:
+    n, half = len(survived), _FIT_ROWS // 2
+    if n <= _FIT_ROWS:
         return np.arange(n)
     quota = -(-half // len(F))
     x, y = ((survived[:, k] - F[:, [k]]) / scale[k] for k in (0, 1))
     far = x * x + y * y
     near = np.argpartition(far, quota, 1)[:, :quota].ravel()[:half]
-    return np.append(near, np.linspace(0, n - 1, _NEAR - half).astype(int))
+    return np.append(near, np.linspace(0, n - 1, _FIT_ROWS - half).astype(int))
 
 
 def _logistic(phi: Floats, y: Floats) -> tuple[Floats, Floats]:

@@ -65,7 +65,7 @@ from evofsm.guard.learnt.words import Remembered
 from evofsm.store import Place
 
 # Rows of an episode that are learnt from before it ends.
-_LONGEST = 1024
+_MOST_ROWS = 1024
 # No horizon that is given has more steps: memory and the time of a decision grow with it.
 _MAX_STEPS = 10_000
 # Actions among which one is chosen, at most.
@@ -561,7 +561,7 @@ class LearntRisk(ActionJudge):
     def _take_in(self, observation: ArrayLike, action: Any) -> None:
         self.follow(observation, action)
         self._notes.append((self._refused, self._lost, self._certified))
-        if len(self._z) > _LONGEST:
+        if len(self._z) > _MOST_ROWS:
             z, u = self._z, self._u
             self._u = u[:-1]
             self._study(failed=False, terminated=False)

@@ -24,13 +24,13 @@ from evofsm.guard.learnt.state import (
 # Actions of an episode that says how a system moves, at least; situations from which on
 # disturbances are looked for and backups evolve; those that are drawn to look for some;
 # disturbances that mutants are tried on, besides none.
-_SHORTEST, _ENOUGH, _TRIED_IN, _TRIED_ON = 3, 3, 8, 5
+_FEWEST_STEPS, _ENOUGH, _TRIED_IN, _TRIED_ON = 3, 3, 8, 5
 # What is lost in so few steps, whatever one does, is no argument; nor is what is survived by more
 # [typical steps].
 _AT_ONCE, _BY_FAR = 3, 100.0
 # Windows of which all that is known is their size; situations that are kept of a failure, and so
 # many steps before it at least.
-_LARGEST, _BEFORE, _EARLIER = 3, 3, 2
+_MOST_WINDOWS, _BEFORE, _EARLIER = 3, 3, 2
 # An action is used at the end of its range from so far on.
 _LOW, _HIGH = -0.6, 0.6
 
@@ -94,7 +94,7 @@ def learn(
     )
     # Model
     state = motion.steps(state, safe)
-    moves = len(u) >= _SHORTEST
+    moves = len(u) >= _FEWEST_STEPS
     if moves:
         state = motion.dynamics(state, model_of(state, settings), safe, u, settings)
         if given.model is not None:
@@ -218,7 +218,7 @@ def disturbances(
         with_none = np.concatenate([calm, new], 2)
         picked = S[random.permutation(len(S))[:_TRIED_IN]]
         ends = worst(known, picked, state.policies[:1], with_none, 1.0)
-    harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_LARGEST]
+    harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_MOST_WINDOWS]
     starts = starts[harmful]
     longest = settings.horizon_max + 2
     windows, lengths, of = list(state.windows), state.lengths.tolist(), state.seen_in.tolist()

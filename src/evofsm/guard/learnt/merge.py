@@ -23,7 +23,7 @@ from evofsm.guard.learnt.rollout import Floats, crossed, pairs
 from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
 
 # Numbers of which the largest counts.
-_LARGEST = "margin", "time_to_failure", "believed", "too_short"
+_MAXIMA = "margin", "time_to_failure", "believed", "too_short"
 
 
 def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
@@ -98,7 +98,7 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
     drifts = [part.drifts + np.array([0, k, k]) for part, k in zip(parts, after, strict=True)]
     fields: dict[str, Any] = {
         **{name: int(of(name).sum()) for name in ("n_failed", "n_scanned", "n_seen", "n_moves")},
-        **{name: float(of(name).max()) for name in _LARGEST},
+        **{name: float(of(name).max()) for name in _MAXIMA},
         **{name: _average(of(name), moves) for name in ("unit", "power")},
         **{name: _average(of(name), moves * of("scale").any(1)) for name in ("scale", "noise")},
         **{name: rows(name, settings.max_failures) for name in ("failures", "brinks", "ended")},
@@ -125,7 +125,7 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
     merged = State.none(m, a, first.choices, settings, None)._replace(**fields)
     merged = explained(merged, failed=True)
     known = model_of(merged, settings)
-    merged = dead_ends(merged, known, merged.survived[:0], _NOTHING)
+    merged = dead_ends(merged, known, merged.survived[:0], _NO_EPISODE)
     known, scale = model_of(merged, settings), disturbance_scale(merged, settings)
     rest, random = residuals_of(merged, known, merged.horizon), np.random.default_rng(seed)
     harmful = worst(known, merged.situations, merged.policies[:2], rest, scale)
@@ -136,8 +136,8 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
     return kept(merged, keep)._replace(policies=policies, linear=linear)
 
 
-_NONE = np.empty(0)
-_NOTHING = Episode(_NONE, _NONE, False, False, _NONE, _NONE, _NONE, 0.0)
+_NO_ROWS = np.empty(0)
+_NO_EPISODE = Episode(_NO_ROWS, _NO_ROWS, False, False, _NO_ROWS, _NO_ROWS, _NO_ROWS, 0.0)
 
 
 def _average(rows: Floats, weights: Floats) -> Floats:

@@ -49,7 +49,7 @@ NO_LONGER = "no action passes, and no backup lasts longer than the proposal, whi
 # Disturbances that are taken to be harder by a smaller factor are taken as they were.
 _HARDER = 1.05
 # Of more dead ends, those from where most failed are counted.
-_SHOWN = 3
+_ENDS_SHOWN = 3
 # What was seen in a form, by what it says.
 _WHAT = {FAILS: "failure", CRASHES: "failure", ENDS: "ending"}
 
@@ -112,8 +112,8 @@ def dead_ends(counts: Sequence[int]) -> str:
 
 def failed(counts: Sequence[int]) -> str:
     """How many episodes failed from each of some dead ends."""
-    shown = [f"{count:,}" for count in counts[:_SHOWN]] + ["..."] * (len(counts) > _SHOWN)
-    comma = ", " if len(counts) > _SHOWN else " and "
+    shown = [f"{count:,}" for count in counts[:_ENDS_SHOWN]] + ["..."] * (len(counts) > _ENDS_SHOWN)
+    comma = ", " if len(counts) > _ENDS_SHOWN else " and "
     several = comma.join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]
     return f"{several} episode{'s' * (shown != ['1'])} that had been certified failed"
 
