@@ -49,7 +49,7 @@ _NO_FUNCTION = (
 )
 # Where there is a decision logger, decisions that speak are explained.
 _DEAF: Any = SimpleNamespace(
-    **dict.fromkeys(("begin", "seen", "decided", "ended"), lambda *told, **others: None)
+    **dict.fromkeys(("begin", "seen", "decided", "ended"), lambda *told, **rest: None)
 )
 _Failed = Callable[[NDArray[np.float64]], bool]
 
