@@ -1,5 +1,6 @@
 """The house is as CONTRIBUTING.md draws it, and its faces offer what they say."""
 
+import ast
 import subprocess
 import sys
 from importlib import import_module
@@ -17,6 +18,22 @@ def test_no_arrow_goes_up_and_nothing_private_is_touched():
         [sys.executable, ROOT / "tools" / "house.py"], capture_output=True, text=True, check=False
     )
     assert house.returncode == 0, house.stdout + house.stderr
+
+
+def test_locals_named_by_pronouns_and_constants_of_three_modules_are_found(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    house = import_module("house")
+    text = """_SAME, _OF_ALL = 1, 2
+class Pair(NamedTuple):
+    one: int
+def count(own):
+    rows = [each for each in own]
+    for row, (k, what) in rows:
+        one = row.one = k"""
+    trees = {name: ast.parse(text) for name in "abc"} | {"c": ast.parse("_SAME: int = 1")}
+    assert house.repeated_constants(trees) == ["_SAME: a, b, c"]
+    found = ["line 5: each", "line 6: what", "line 7: one"]
+    assert [*house.pronouns(trees)] == [f"{module}, {name}" for module in "ab" for name in found]
 
 
 @pytest.mark.parametrize("face", FACES, ids=lambda face: face.parent.name)

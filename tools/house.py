@@ -3,9 +3,10 @@
 Rooms are the folders and files at the top of the package; their order stands in `pyproject.toml`
 under ``tool.importlinter``, their budgets under ``tool.house``. It fails where a room imports from
 one above it or uses its private names, where modules import in a circle, where a class name stands
-in three rooms, and where a room has more lines, files or public names than its budget. With
-``--draw`` the picture in CONTRIBUTING.md is drawn anew; with ``--lower`` budgets fall to what is
-there and 2 %, as at each release.
+in three rooms or a private constant's in three modules, where a local is named by a pronoun, and
+where a room has more lines, files or public names than its budget. With ``--draw`` the picture in
+CONTRIBUTING.md is drawn anew; with ``--lower`` budgets fall to what is there and 2 %, as at each
+release.
 """
 
 from __future__ import annotations
@@ -30,6 +31,10 @@ SLACK = 1.02
 
 # Of named tuples; with an underscore lest they hide a field.
 _PUBLIC = {"_asdict", "_fields", "_make", "_replace"}
+_PRONOUN = re.compile(
+    "all|any|both|each|he|her|him|his|it|its|mine|none|one|others?|ours|own|same|she|some|something"
+    "|such|that|theirs?|them|these|they|this|those|us|we|what|which|who|whom"
+)
 
 Arrows = Mapping[str, set[str]]
 Trees = Mapping[str, ast.Module]
@@ -169,7 +174,7 @@ def private_names(trees: Trees) -> Iterator[str]:
                 yield f"{module}, line {line}: {name}"
 
 
-def _names_defined(tree: ast.Module) -> Iterator[str]:
+def _names_defined(tree: ast.AST) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.name
@@ -196,6 +201,35 @@ def repeated_classes(trees: Trees) -> list[str]:
     return [
         f"{name}: {', '.join(sorted(rooms))}" for name, rooms in homes.items() if len(rooms) > 2
     ]
+
+
+def repeated_constants(trees: Trees) -> list[str]:
+    """Names of private constants that stand in three modules or more."""
+    homes: dict[str, set[str]] = defaultdict(set)
+    for module, tree in trees.items():
+        for node in tree.body:
+            if isinstance(node, ast.Assign | ast.AnnAssign):
+                for name in filter(re.compile(r"_[A-Z][A-Z\d_]+$").match, _names_defined(node)):
+                    homes[name].add(module)
+    return [
+        f"{name}: {', '.join(sorted(modules))}"
+        for name, modules in homes.items()
+        if len(modules) > 2
+    ]
+
+
+def pronouns(trees: Trees) -> Iterator[str]:
+    """Locals whose names say nothing of what they hold; fields and parameters may."""
+    for module, tree in trees.items():
+        names = {
+            (name.lineno, name.id)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.comprehension)
+            for name in ast.walk(node)
+            if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)
+            if _PRONOUN.fullmatch(name.id)
+        }
+        yield from (f"{module}, line {line}: {name}" for line, name in sorted(names))
 
 
 def imports_past_a_face(trees: Trees) -> Iterator[str]:
@@ -330,6 +364,8 @@ def main() -> int:
         report("arrows up", arrows_up(rooms)),
         report("private names across rooms", private_names(trees)),
         report("class names in three rooms", repeated_classes(trees), faults["classes"]),
+        report("constants' names in three modules", repeated_constants(trees)),
+        report("locals named by pronouns", pronouns(trees)),
         report("imports of studies past a face", imports_past_a_face(studies), faults["past"]),
         report("pictures that are out of date", stale),
     ]

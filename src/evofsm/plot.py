@@ -233,7 +233,7 @@ def experience(
     if elsewhere := sorted({*told} - {*pair}):
         looks[f"not in view: fails by {', '.join(map(called, elsewhere))}"] = {"marker": ""}
     look = {"linestyle": "none"}
-    _explain(ax, [Line2D([], [], label=name, **{**look, **one}) for name, one in looks.items()])
+    _explain(ax, [Line2D([], [], label=name, **{**look, **s}) for name, s in looks.items()])
     ax.set(xlabel=called(pair[0]), ylabel=called(pair[1]))
     return ax
 
@@ -395,9 +395,9 @@ def history(
         letters = int(height / (0.65 * float(ax.yaxis.label.get_fontsize())))
         ax.set_ylabel(textwrap.fill(name, max(letters, 8)))
     if model is not None:
-        some = np.arange(0, len(z), max(len(z) // 2000, 1))
-        seen = [model.nearest(row).state for row in z[some]]
-        axes[-2].plot(x[some], seen, ".", markersize=1.5, color=COLORS["leader"])
+        sample = np.arange(0, len(z), max(len(z) // 2000, 1))
+        seen = [model.nearest(row).state for row in z[sample]]
+        axes[-2].plot(x[sample], seen, ".", markersize=1.5, color=COLORS["leader"])
         label_states(axes[-2].yaxis, model.n_states)
         axes[-2].set_ylabel("state")
     axes[-1].step(drawn, said, where="post", color=orange)
@@ -424,7 +424,7 @@ def _given_or_new(ax: Axes | None) -> Axes:
 
 
 def _refuse_other(variables: Sequence[int], m: int) -> None:
-    if wrong := [one for one in variables if not 0 <= one < m]:
+    if wrong := [index for index in variables if not 0 <= index < m]:
         raise ValueError(f"there is no variable {wrong[0]}: there are {m}")
 
 

@@ -55,7 +55,7 @@ _UNSIGNED = "0" * 64
 _LARGEST_FILE, _LARGEST_HEADER = 1 << 29, 1 << 24
 # The names of types in a file. No objects: those could run.
 _TYPES = {"BOOL": np.bool_, "U8": np.uint8, "I64": np.int64, "F64": np.float64}
-_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
+_TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
 # Nobody writes a file any more that did not change for so long [s].
 _OLD = 600.0
 # Why no file can take the place of another one.
@@ -180,10 +180,10 @@ def _packed(kind: Kind, header: Header, arrays: Mapping[str, NDArray[Any]]) -> l
     entries: dict[str, _Entry] = {}
     begin = 0
     for name, array in arrays.items():
-        if array.dtype not in _NAMES:
+        if array.dtype not in _TYPE_NAMES:
             raise ValueError(f"{name} is of {array.dtype}, which no file may hold")
         end = begin + array.nbytes
-        entries[name] = _Entry(_NAMES[array.dtype], list(array.shape), [begin, end])
+        entries[name] = _Entry(_TYPE_NAMES[array.dtype], list(array.shape), [begin, end])
         begin = end
     told = json.dumps(header._asdict())
     sizes = _refuse_unfit(kind, json.loads(told)["settings"], entries)
@@ -308,8 +308,8 @@ def _place_of(path: str | os.PathLike[str]) -> tuple[Path, int | None]:
     except FileNotFoundError:
         return target, None
     if not stat.S_ISREG(mode):
-        what = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
-        raise OSError(f"{given} is {what}, which no file may take the place of")
+        type_name = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
+        raise OSError(f"{given} is {type_name}, which no file may take the place of")
     return target, stat.S_IMODE(mode)
 
 
@@ -407,7 +407,7 @@ def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
     types = (str, int, str, dict, dict)
     if tuple(map(type, header)) != types or not re.fullmatch("[a-z]{1,20}", header.kind):
         raise ValueError("its header does not say what it holds")
-    entries, begin = {name: _Entry(**one) for name, one in index.items()}, 0
+    entries, begin = {name: _Entry(**fields) for name, fields in index.items()}, 0
     for name, entry in entries.items():
         begin = _end_of(name, entry, begin)
     if begin != size - 8 - length:
@@ -440,8 +440,8 @@ def _read_array(file: BinaryIO, entry: _Entry) -> NDArray[Any]:
 
 def _sha256(header: bytes, numbers: Iterable[Any]) -> str:
     digest = hashlib.sha256(header)
-    for one in numbers:
-        digest.update(one)
+    for array in numbers:
+        digest.update(array)
     return digest.hexdigest()
 
 
@@ -462,7 +462,7 @@ def _refuse_unfit(
     if unknown := set(entries) - set(kind.arrays):
         raise ValueError(f"it has {', '.join(sorted(unknown))}, which no {kind.name} has")
     for name, numbers in kind.arrays.items():
-        expected = _NAMES[np.dtype(numbers.dtype)]
+        expected = _TYPE_NAMES[np.dtype(numbers.dtype)]
         if entries[name].dtype != expected:
             raise ValueError(f"{name} is of type {entries[name].dtype}, not {expected}")
         numbers.refuse_shape(name, tuple(entries[name].shape), sizes)
@@ -495,7 +495,7 @@ def _refuse_settings(
 
 def _is(value: Any, kind: Any) -> bool:
     if kind == list[str]:
-        return isinstance(value, list) and all(isinstance(one, str) for one in value)
+        return isinstance(value, list) and all(isinstance(item, str) for item in value)
     return isinstance(value, kind)
 
 

@@ -100,7 +100,7 @@ def _of_replay(found: Audit, replayed: int) -> Iterator[tuple[str, str]]:
     if difference is None and replayed < decisions:
         yield "", f"{counted(decisions - replayed, 'decision')} compared with nothing"
     if difference is not None and found.other_makers:
-        then = ", ".join(f"{one.name} {one.recorded}" for one in found.other_makers)
+        then = ", ".join(f"{field.name} {field.recorded}" for field in found.other_makers)
         yield "", f"it was recorded with {then}: floats may differ there"
 
 

@@ -24,14 +24,14 @@ def check(
 
     part = imported(name)
     kind, results = kind_of(part), check_results(part)
-    failed = sum(not one.passed for one in results)
+    failed = sum(not result.passed for result in results)
     if as_json:
         print_json(results)
     else:
         say(f"{name}, checked against the contract of a {kind}")
-        for one in results:
-            say(f"  {'passed' if one.passed else 'failed'}  {one.check}")
-            if one.message:
-                show(Padding(one.message, (0, 0, 0, 10)))
+        for result in results:
+            say(f"  {'passed' if result.passed else 'failed'}  {result.check}")
+            if result.message:
+                show(Padding(result.message, (0, 0, 0, 10)))
         say(f"{len(results)} checks: {len(results) - failed} passed, {failed} failed")
     return int(failed > 0)

@@ -94,15 +94,15 @@ def drive(
     given = {name: value for name, value in given.items() if value is not None}
     if family.endswith(".sumocfg"):
         if given:
-            what = "is for families of scenarios, not for a configuration"
-            raise ValueError(f"--{next(iter(given))} {what}")
+            text = "is for families of scenarios, not for a configuration"
+            raise ValueError(f"--{next(iter(given))} {text}")
         from evofsm.cli.sumocfg import run_configuration
 
         run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
-    for (one, other), reason in _EXCLUDE.items():
-        if one in given and other in given:
-            raise ValueError(f"--{one} and --{other} exclude each other: {reason}")
+    for (a, b), reason in _EXCLUDE.items():
+        if a in given and b in given:
+            raise ValueError(f"--{a} and --{b} exclude each other: {reason}")
     require_world(world, **({"polars": "tables"} if out is not None and workers is None else {}))
     require(**({} if mcap is None else {"mcap": "mcap"}))
     from evofsm.cli.driving import GUARD, Results, Setup, drive_at_once, load_guard, make_guard
@@ -212,7 +212,7 @@ def _learnt(guard: Guard) -> str:
     machine, judge = learners_of(guard)
     states = f"{machine.n_states} states"
     if isinstance(judge, LatentRisk):
-        ends = sum(one.is_dead_end for one in assess_states(machine, judge))
+        ends = sum(state.is_dead_end for state in assess_states(machine, judge))
         states += f", {ends} of them dead ends"
     told = getattr(judge, "told_by_experience", "")
     return f"{states}; {told}" if told else states

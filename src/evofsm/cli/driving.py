@@ -84,9 +84,9 @@ class Setup:
     def settings(self) -> dict[str, Any]:
         """All that an episode depends on, for JSON."""
         family, source = self.family, self.family.source
-        own = {**vars(self), "family": family.name, "switches": family.switches}
+        settings = {**vars(self), "family": family.name, "switches": family.switches}
         file = source and Path(source).read_text("utf-8")
-        return {**own, "mode": self.mode.value, "file": file}
+        return {**settings, "mode": self.mode.value, "file": file}
 
     def trial(self, guard: Guard, world: World | str) -> Trial:
         """Its episodes, by their number: training draws while it learns, held-out ones else."""
@@ -115,7 +115,7 @@ def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     machine, judge = (None, None) if before is None else learners_of(before)
     if judge is not None and (found := name_judge(judge)) != setup.judge:
         raise ValueError(f"what was learnt is of the judge {found!r}, not of {setup.judge!r}")
-    ours = guard_for_family(
+    guard = guard_for_family(
         family,
         tolerance=setup.tolerance,
         mode=setup.mode,
@@ -125,13 +125,13 @@ def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
         learn=setup.learn,
     )
     if name == "least-risk":
-        return ours
+        return guard
     reviser: Reviser = Unrevised(family.actions)
     if name != "none":
         if setup.mode is not Mode.ACT:
             raise ValueError(f"reviser {setup.reviser!r} can only act; modes are for least-risk")
         reviser = EnvelopeReviser(FIXED_MEASURES[name], family.actions, family.interval)
-    learners: dict[str, Any] = {"machine": ours.machine, "judge": ours.judge}
+    learners: dict[str, Any] = {"machine": guard.machine, "judge": guard.judge}
     return Guard.of(reviser, interval=family.interval, learn=setup.learn, **learners)
 
 
@@ -246,7 +246,7 @@ def _write_decisions(path: Path, rows: Sequence[Outcomes]) -> None:
 def _decided(driven: Episode) -> dict[str, list[Any]]:
     """The columns of an episode's decisions."""
     columns = {name: DECISION_COLUMNS[name].read for name in DECISION_TABLE}
-    return {name: [read(one) for one in driven.decisions] for name, read in columns.items()}
+    return {name: [read(d) for d in driven.decisions] for name, read in columns.items()}
 
 
 # -- In turn --------------------------------------------------------------------------------------

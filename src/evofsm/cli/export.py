@@ -46,7 +46,7 @@ def export(
 
     model, dead_ends = _learnt(file)
     drawn = {"least": least, "evidence": evidence, "dead_ends": dead_ends if to == "dot" else None}
-    given = {name: one for name, one in drawn.items() if one is not None}
+    given = {name: value for name, value in drawn.items() if value is not None}
     text = visible(getattr(graphs, f"to_{to}")(model, **given))
     if out is None:
         sys.stdout.write(text)
@@ -77,4 +77,4 @@ def _learnt(file: Path) -> tuple[Any, list[int] | None]:
     judge = guard and guard.judge
     if not isinstance(judge, LatentRisk):
         return model, None
-    return model, [one.state for one in assess_states(model, judge) if one.is_dead_end]
+    return model, [s.state for s in assess_states(model, judge) if s.is_dead_end]

@@ -46,7 +46,7 @@ def guard_where_nobody_acts(
     """
     runs, dt = _runs(episodes), float(episodes[0].dt)
     horizon = horizon or max(float(np.median(runs.lengths)) / 20.0, 10.0) * dt
-    rows, names, units = [one.observations for one in episodes], labels.names, labels.units
+    rows, names, units = [e.observations for e in episodes], labels.names, labels.units
     given = {"dt": dt, "horizon": horizon, "hold": hold}
     judge = Foresight.learn_log(rows, runs.failed, **given, names=names, units=units)
     tolerance = judge.tolerance_of(RATE) if tolerance is None else tolerance
@@ -70,7 +70,7 @@ def show_foreseen(
     """
     title = str(file)
     if guard is None:
-        rows = np.cumsum([len(one.times) for one in episodes])
+        rows = np.cumsum([len(e.times) for e in episodes])
         first = int((rows <= LEARNT * rows[-1]).sum())
         if not 0 < first < len(episodes):
             raise ValueError(f"{file}: it takes two episodes at least, to learn and to judge")
@@ -81,7 +81,7 @@ def show_foreseen(
     assert isinstance(reviser, ActionReviser)
     assert isinstance(judge, Foresight)
     tolerance = reviser.tolerance if asked[-1] is None else asked[-1]
-    runs, times = _runs(episodes), np.concatenate([one.times for one in episodes])
+    runs, times = _runs(episodes), np.concatenate([e.times for e in episodes])
     if plot is not None:
         _draw(judge, tolerance, guard.machine, runs, times, plot)
     found = _document(judge, tolerance, runs, times)
@@ -92,8 +92,8 @@ def show_foreseen(
 
 
 def _runs(episodes: Sequence[Chunk]) -> Runs:
-    failed = [one.failures is not None and len(one.failures) > 0 for one in episodes]
-    return Runs.of([one.observations for one in episodes], failed)
+    failed = [e.failures is not None and len(e.failures) > 0 for e in episodes]
+    return Runs.of([e.observations for e in episodes], failed)
 
 
 def _document(
@@ -148,15 +148,15 @@ def _tables(found: dict[str, Any], judge: Foresight, title: str) -> Iterator[Ren
     days = f"{found['seconds'] / 86400.0:.3g} days"
     soon = f"an alarm is right if one comes within {span(found['horizon'])}"
     text, rows, bold = "none: on episodes held out, no alarm was better than chance", [], []
-    for k, one in enumerate(found["alarms"]):
-        row = [f"{one['stated']:g}", span(one["hold"])]
-        for came in (one["learnt"], one["plain"]):
+    for k, alarm in enumerate(found["alarms"]):
+        row = [f"{alarm['stated']:g}", span(alarm["hold"])]
+        for came in (alarm["learnt"], alarm["plain"]):
             share, ahead = f"{came['foreseen']} of {came['failures']}", span(came["lead"])
             row += [share, ahead, f"{came['false_a_day']:.2g}"]
         rows.append(row)
-        if one["is_own"]:
+        if alarm["is_own"]:
             text = f"{row[2]} failures foreseen, {row[3]} ahead (mean; not foreseen: 0)"
-            text += f", {one['learnt']['false']:,} false"
+            text += f", {alarm['learnt']['false']:,} false"
             bold = [k]
     pairs = [("rows", f"{found['rows']:,} in {found['episodes']:,} episodes, {days}")]
     pairs += [("failures", f"{found['failures']:,}; {soon}"), ("alarms", text)]
@@ -164,14 +164,14 @@ def _tables(found: dict[str, Any], judge: Foresight, title: str) -> Iterator[Ren
     title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
     yield table(title, _HEADER, rows, bold=bold)
     said = []
-    for k, one in enumerate(found["limits"]):
-        beside = "" if one["kind"] == "plain" else f"; plain thresholds would be {one['plain']}"
-        said.append((f"{one['stated']:g}", f"{judge.of(k)}{beside}"))
+    for k, limit in enumerate(found["limits"]):
+        beside = "" if limit["kind"] == "plain" else f"; plain thresholds would be {limit['plain']}"
+        said.append((f"{limit['stated']:g}", f"{judge.of(k)}{beside}"))
     yield facts("\nWhere they alarm, by false alarms a day", said)
     rows = []
-    for one in found["listed"][-_LISTED:]:
-        failed, why = "yes" if one["failed"] else "no", one["reason"].partition(";")[0]
-        rows.append([f"{one['episode'] + 1}", _date(one["time"]), span(one["lasts"]), failed, why])
+    for hit in found["listed"][-_LISTED:]:
+        failed, why = "yes" if hit["failed"] else "no", hit["reason"].partition(";")[0]
+        rows.append([f"{hit['episode'] + 1}", _date(hit["time"]), span(hit["lasts"]), failed, why])
     title = f"\nThe last of {len(found['listed'])} alarms"
     yield table(title, ("episode", "time", "lasts", "failed", "why"), rows, left=(0, 4))
 

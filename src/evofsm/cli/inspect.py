@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 # What folders of results hold, in the order in which it is looked for.
 _MODELS = ("guard.evofsm", "model.evofsm")
 # So many states are listed, those with most of the time.
-_MOST_STATES = 20
+_STATES_LISTED = 20
 _UNTOLD = (
     "Which episodes failed is not known: nothing said so. From a log, evofsm learn "
     "--failed COLUMN or --failed 'gap<=0' says it."
@@ -48,8 +48,8 @@ def inspect(
     told = getattr(guard and guard.judge, "told_by_experience", None)
     known = [] if told is None else [("experience", str(told))]
     if as_json:
-        own = {"file": file, "provenance": provenance, **dict(known)}
-        print_json({**own, **model_document(model)})
+        head = {"file": file, "provenance": provenance, **dict(known)}
+        print_json({**head, **model_document(model)})
         return
     of_file = [("file", str(file))]
     if header is not None:
@@ -102,7 +102,7 @@ def _draw(model: FSMModel, guard: Guard | None, out: Path, axes: str | None) -> 
     from evofsm.guard import LearntRisk
 
     names = [model.labels.variable(k).split(" [")[0] for k in range(model.n_variables)]
-    pair: Any = [names.index(one) for one in split_names(axes or "") if one in names]
+    pair: Any = [names.index(name) for name in split_names(axes or "") if name in names]
     if len(pair) != 2 * (axes is not None):
         raise ValueError(f"--axes is {axes}; name two of {', '.join(names)}")
     with picture(out, 7.2, 5.0) as figure:
@@ -182,14 +182,14 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
         )
     ]
     title = "States (stays: share of its steps; first seen: at which row)"
-    most = sorted(np.argsort(-model.visits, kind="stable")[:_MOST_STATES].tolist())
+    most = sorted(np.argsort(-model.visits, kind="stable")[:_STATES_LISTED].tolist())
     yield ""
     header = ("", *heads, "share of time", "stays", "first seen")
     yield table(title, header, [states[k] for k in most])
-    if (others := model.n_states - len(most)) > 0:
+    if (rest := model.n_states - len(most)) > 0:
         share = 1.0 - float(model.visits[most].sum()) / total
         yield (
-            f"and {others:,} more states, together {share:.1%} of the time (--json prints all, "
+            f"and {rest:,} more states, together {share:.1%} of the time (--json prints all, "
             "evofsm explain says what came of one)"
         )
     yield ""
@@ -267,17 +267,17 @@ def explain(
     if observation is not None:
         found = [model.explain(action=done, observation=_values(observation))]
     elif state == "all":
-        found = [model.explain(each, done) for each in range(model.n_states)]
+        found = [model.explain(k, done) for k in range(model.n_states)]
     else:
         found = [model.explain(_index("--state", state, model.n_states), done)]
     if as_json:
-        print_json({"file": file, "situations": [_document(model, each) for each in found]})
+        print_json({"file": file, "situations": [_document(model, e) for e in found]})
         return
     if not model.failures_told:
         print(textwrap.fill(_UNTOLD, 80))
     here = guard.told_here(_values(observation)) if guard and observation is not None else ""
-    for each in found:
-        say(textwrap.fill(f"{each.text} {here}", 80, subsequent_indent="   "))
+    for explanation in found:
+        say(textwrap.fill(f"{explanation.text} {here}", 80, subsequent_indent="   "))
 
 
 def _index(option: str, number: object, count: int) -> int:

@@ -28,7 +28,7 @@ from evofsm.guard.audit_log import lines
 
 _SEAL = b',"crc":"'
 # A record has at most so many bytes.
-_LONGEST = 1 << 20
+_LONGEST_RECORD = 1 << 20
 
 Record = Mapping[str, Any]
 
@@ -93,13 +93,13 @@ class Journal:
             if sync:
                 self.sync()
         except OSError as error:
-            what = "what came before is kept: make room, and run the same command again"
-            raise OSError(error.errno, f"{error.strerror}; {what}", str(self.path)) from error
+            hint = "what came before is kept: make room, and run the same command again"
+            raise OSError(error.errno, f"{error.strerror}; {hint}", str(self.path)) from error
 
     def _read(self) -> int:
         """Read what is there, and say up to where it is good; without a record, nothing is."""
         good, damaged, begun_with = 0, 0, self.settings
-        for number, line in enumerate(lines(self.path, _LONGEST), 1):
+        for number, line in enumerate(lines(self.path, _LONGEST_RECORD), 1):
             record = _record(line)
             if record is None:
                 if number == 1 and not _line({"settings": self.settings}).startswith(line):

@@ -181,7 +181,7 @@ def learn(
                 warn(f"warning: in the later half of the log the guard {refused}")
         else:
             asked = horizon, persist, None if tolerance == TOLERANCE else tolerance
-            episodes = [one for one in episodes_of(rows) if len(one.times) > 1]
+            episodes = [chunk for chunk in episodes_of(rows) if len(chunk.times) > 1]
             labels = Labels(names=encoder.names, units=learning.model.units)
             taught = guard_where_nobody_acts(episodes, labels, *asked, learning.machine)
         taught.save(guard, provenance)
@@ -220,8 +220,8 @@ def _actions(text: str) -> IntervalActions:
             raise ValueError(f"more than {_MOST_ACTIONS} intervals; make them wider")
         return IntervalActions(low, high, width, outside="clip")
     except ValueError as error:
-        what = "write LOW:HIGH:WIDTH, such as -2.5:2.5:0.3"
-        raise ValueError(f"--action-range is {text!r}: {error}; {what}") from None
+        hint = "write LOW:HIGH:WIDTH, such as -2.5:2.5:0.3"
+        raise ValueError(f"--action-range is {text!r}: {error}; {hint}") from None
 
 
 def _machine(
@@ -243,8 +243,8 @@ def _machine(
         novelty = Novelty(1.0 if radius is None else radius, _scales(scale, encoder), **width)
         return EvolvingFSM(n_actions, rule=novelty, max_states=max_states)
     found = imported(rule) if ":" in rule else rule_named(rule)
-    own = found() if isinstance(found, type) else found
-    return EvolvingFSM(n_actions, radius, spread=spread, max_states=max_states, rule=own)
+    chosen = found() if isinstance(found, type) else found
+    return EvolvingFSM(n_actions, radius, spread=spread, max_states=max_states, rule=chosen)
 
 
 def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]:
@@ -260,9 +260,9 @@ def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]
         try:
             given["".join(quoted_name(column))] = positive("it", float(number))
         except ValueError:
-            what = "write COLUMN=NUMBER, such as gap=4"
-            raise ValueError(f"--scale is {text!r}; {what}") from None
-    single = [one for one in encoder.variables if isinstance(one, str)]
+            hint = "write COLUMN=NUMBER, such as gap=4"
+            raise ValueError(f"--scale is {text!r}; {hint}") from None
+    single = [name for name in encoder.variables if isinstance(name, str)]
     if unknown := [column for column in given if column not in single]:
         raise ValueError(f"--scale names {unknown[0]!r}; observed are {', '.join(single)}")
     given = dict(zip(VARIABLES, SAFETY_RULE.scales, strict=True)) | given
@@ -286,7 +286,7 @@ def _judge_of(judge: Judge | None, columns: LogColumns) -> Judge:
     from evofsm.driving.naming import VARIABLES
 
     names = columns.observe.names
-    if any(not isinstance(one, str) for one in columns.observe.variables):
+    if any(not isinstance(variable, str) for variable in columns.observe.variables):
         raise ValueError("--guard takes numbers alone, and --observe names a discrete column")
     judge = judge or ("kinematic" if names == VARIABLES else "learnt")
     if judge == "kinematic" and len(names) != len(VARIABLES):
@@ -318,8 +318,8 @@ def _check_out(out: Path | None, option: str = "--out") -> None:
         try:
             store.read_header(out)
         except (ValueError, OSError):
-            what = "exists and is no file of evofsm; it was left alone"
-            raise ValueError(f"{option} {out}: {what}") from None
+            fault = "exists and is no file of evofsm; it was left alone"
+            raise ValueError(f"{option} {out}: {fault}") from None
 
 
 def _look_first(file: str, reading: Reading) -> list[str]:
@@ -441,11 +441,11 @@ def _hardly_told_apart(model: FSMModel, certainty: float, rule: str) -> str:
     found = [
         f"{name}={float(f'{max(x, 1e-3):.1g}'):g}" for name, x in tenths if name not in VARIABLES
     ]
-    scales = [f"--scale {quote(one)}" for one in found]
-    other = f"Try {' '.join(['--rule novelty', *scales])}, or a" if rule == "paper" else "A"
+    scales = [f"--scale {quote(text)}" for text in found]
+    advice = f"Try {' '.join(['--rule novelty', *scales])}, or a" if rule == "paper" else "A"
     return (
         f"\nStates are hardly told apart: the most probable one has {certainty:.0%} of the belief "
-        f"on average ({1 / model.n_states:.0%} is a blind guess). {other} smaller --spread, which "
+        f"on average ({1 / model.n_states:.0%} is a blind guess). {advice} smaller --spread, which "
         "sharpens recognition."
     )
 
@@ -466,9 +466,9 @@ def _read_otherwise(
     hole = columns.longest_hole
     if columns.resample:
         step, ways = columns.resample
-        others = "".join(f", the {way} of {name}" for name, way in ways.items())
-        what = f"{noted.resampled:,} became means of {step:g} s{others}"
-        yield "resampled", f"{what} (--resample {step:g}s,NAME=max: others are min, last)"
+        rest = "".join(f", the {way} of {name}" for name, way in ways.items())
+        means = f"{noted.resampled:,} became means of {step:g} s{rest}"
+        yield "resampled", f"{means} (--resample {step:g}s,NAME=max: others are min, last)"
     if noted.crossed:
         yield "holes", f"{noted.crossed:,} of at most {hole:g} s (--hole) cost a transition each"
     if jumps := learning.read.jumps:
@@ -484,17 +484,17 @@ def _read_otherwise(
         yield "left out", f"{noted.elsewhere:,} rows: {why}"
     told = {name: unit for name, unit in noted.units.items() if UNITS.get(unit, 1.0) != 1.0}
     if told:
-        given = (f"{name} from {one}" for name, one in told.items())
+        given = (f"{name} from {unit}" for name, unit in told.items())
         yield "converted", f"{', '.join(given)} to units of the SI"
 
 
 def _skills(skills: Sequence[Skill]) -> Iterator[RenderableType]:
     rows = []
-    for one in skills:
-        digits = "+.2f" if abs(one.skill) < 10.0 else "+,.0f"
-        skill = "none" if math.isnan(one.skill) else f"{one.skill:{digits}}"
-        divergences = f"{one.divergence:.2g}", f"{one.persistence:.2g}"
-        rows.append((f"{one.seconds:g} s", *divergences, skill))
+    for result in skills:
+        digits = "+.2f" if abs(result.skill) < 10.0 else "+,.0f"
+        skill = "none" if math.isnan(result.skill) else f"{result.skill:{digits}}"
+        divergences = f"{result.divergence:.2g}", f"{result.persistence:.2g}"
+        rows.append((f"{result.seconds:g} s", *divergences, skill))
     header = ("ahead", "forecast [bit]", "persistence [bit]", "skill")
     yield table("Forecasts compared with persistence", header, rows)
     yield (

@@ -41,7 +41,7 @@ _TIME_CALLED = re.compile(_WORD + "((?i:ms|us|ns))(?:ec)?[^A-Za-z]*$")
 # Units of time that logs are in, of which that counts by which a row comes every 0.1 s or so.
 _SHORTER = ("ms", "us", "ns")
 # So near must a unit come to what two columns differ by, to be named.
-_FITS = 0.02
+_MATCHES = 0.02
 # What is said of what was left out, where it is no row.
 _LEFT_OUT = {
     "comment": "comments between rows were passed over",
@@ -166,16 +166,16 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
         cause = f"is the time in {unit}? --unit {time}={unit} converts it"
         found.append(f"there is a row every {step:,.6g} s: {cause}")
-    same = [one for one in noted.at_once.items() if one[1] in _NOBODY or noted.failed_at_once > 1]
-    if same and noted.failed_at_once >= noted.failed / 2:
-        name, value = min(same, key=lambda one: one[1] not in _NOBODY)
+    constant = [kv for kv in noted.at_once.items() if kv[1] in _NOBODY or noted.failed_at_once > 1]
+    if constant and noted.failed_at_once >= noted.failed / 2:
+        name, value = min(constant, key=lambda kv: kv[1] not in _NOBODY)
         found.append(
             f"{noted.failed_at_once:,} of {noted.failed:,} failed episodes fail with their first "
             f"row, and {name} is {value:g} there each time: does that stand for a missing "
             f"value (no leader)? --no-leader {quote(f'{name}=={value:g}')} leaves such rows out"
         )
-    if alone := [(name, *one) for name, one in noted.below.items() if one[0] and one[1] > 2]:
-        name, value, rows = min(alone, key=lambda one: one[1] not in _NOBODY)
+    if alone := [(name, *pair) for name, pair in noted.below.items() if pair[0] and pair[1] > 2]:
+        name, value, rows = min(alone, key=lambda entry: entry[1] not in _NOBODY)
         found.append(
             f"{name} is {value!r} in {rows:,} rows, and else never below 0: is that a missing "
             f"value (no leader)? --no-leader {quote(f'{name}=={value!r}')} leaves such rows out"
@@ -185,8 +185,8 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         why = "lie in rows that are left out, belong to no episode, and were not counted"
         found.append(f"{noted.unplaced:,} failures {why}")
     for kind, (count, first) in noted.skipped.items():
-        what = _LEFT_OUT.get(kind, "bad rows were left out (--skip-bad)")
-        found.append(f"{count:,} {what}, the first: {first}")
+        text = _LEFT_OUT.get(kind, "bad rows were left out (--skip-bad)")
+        found.append(f"{count:,} {text}, the first: {first}")
     return [*found, *noted.told]
 
 
@@ -197,13 +197,13 @@ def _contradictions(noted: Noted, columns: LogColumns) -> Iterator[str]:
         "gap": {"m/s": (speeds, 1), "m": (["gap"], -1)},
         "action": {"m/s²": ([columns.action], 1), "m/s": (speeds, -1)},
     }
-    for what, rate in noted.rates.items():
-        is_gap = what == "gap"
+    for kind, rate in noted.rates.items():
+        is_gap = kind == "gap"
         mend = "is one of them in another unit, or mixed up with another one?"
-        if abs(rate + 1.0) < _FITS:
+        if abs(rate + 1.0) < _MATCHES:
             mend = "are the speeds mixed up?" if is_gap else "is a brake above 0 there?"
-        for unit, (names, power) in ((u, of_units[what].get(SI[u], ([], 1))) for u in SI):
-            if UNITS[unit] != 1.0 and names and abs(rate * UNITS[unit] ** -power - 1.0) < _FITS:
+        for unit, (names, power) in ((u, of_units[kind].get(SI[u], ([], 1))) for u in SI):
+            if UNITS[unit] != 1.0 and names and abs(rate * UNITS[unit] ** -power - 1.0) < _MATCHES:
                 options = (f"--unit {quote(f'{name}={unit}')}" for name in names)
                 mend = f"{' '.join(options)} converts from {unit}"
         shown, said = ("gap", " and ".join(speeds)) if is_gap else ("v_follower", columns.action)
@@ -314,7 +314,7 @@ def _score(
             forecast[:, :n] = known @ np.linalg.matrix_power(marginal, steps - 1)
             divergence = jensen_shannon(forecast, came)
         found = jensen_shannon(now, came), divergence, now.max(axis=1)
-        sums += len(then), *(each.sum() for each in found)
+        sums += len(then), *(values.sum() for values in found)
 
 
 def _skills(read: Read) -> Iterator[Skill]:

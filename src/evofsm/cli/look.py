@@ -17,9 +17,9 @@ from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_da
 Pairs = list[tuple[str, str]]
 
 # So many fields and rows are looked at; columns of more texts are no list of states.
-_MOST_FIELDS, _MOST_ROWS, _FEW = 20_000_000, 1_000_000, 12
+_MOST_FIELDS, _MOST_ROWS, _MOST_TEXTS = 20_000_000, 1_000_000, 12
 _EPOCHS = {"ns": 1e17, "us": 1e14, "ms": 1e11}  # times since 1970 are larger
-_SHOWN = 40  # columns
+_COLUMNS_SHOWN = 40  # columns
 _SIGNS = "<>=! "  # what in a name of a condition is ambiguous
 # A larger share of steps, and so many, that are no usual one make no clock.
 _ODD, _MANY = 0.001, 10
@@ -45,7 +45,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     texts = [name for name in frame.columns if frame[name].dtype == polars.String]
     shown = {name: f"{np.nanmin(z):.5g} to {np.nanmax(z):.5g}" for name, z in values.items()}
     shown |= {name: _told(frame[name]) for name in texts}
-    facts = [*shown.items()][:_SHOWN]
+    facts = [*shown.items()][:_COLUMNS_SHOWN]
     if more := len(shown) - len(facts):
         facts.append(("...", f"and {more:,} more columns"))
     facts.append(("the clock", clock or "no column (--dt)"))
@@ -59,8 +59,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
     rare = [*_rare(frame, [*texts, *values])]
-    likely = [one for one in rare if _FAILURE.search(one[1])]
-    rare = likely or [one for one in rare if one[0] in values]
+    likely = [row for row in rare if _FAILURE.search(row[1])]
+    rare = likely or [row for row in rare if row[0] in values]
     facts += [("a failure?", f"{text} {told}") for _, text, told in rare]
     options += [("--failed", text) for _, text, _ in rare[:1]]
     groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
@@ -98,7 +98,7 @@ def _first_rows(table: CsvTable | ParquetTable) -> tuple[polars.DataFrame, str, 
     scale = 1e-6
     if not clock and (clock := next(filter(_TIME.match, numbers), "")) and len(frame):
         since = frame[clock].abs().max()  # 1970, if it is large
-        unit = next((one for one, least in _EPOCHS.items() if float(str(since)) > least), "s")
+        unit = next((name for name, least in _EPOCHS.items() if float(str(since)) > least), "s")
         form, scale = "" if unit == "s" else f"{_named(clock, '=')}={unit}", TIMES[unit]
     if clock and len(frame):
         frame = frame.with_columns(frame[clock] * scale)
@@ -116,8 +116,8 @@ def _of_steps(times: NDArray[np.float64], facts: Pairs) -> Pairs:
         return []
     facts.append(("other steps", f"{odd.sum():,}, the longest {later.max():,.0f} s"))
     least = max(usual, 3.5 * float(np.median(steps)))  # of few digits many times are the same
-    step = next((one for one in _NICE if one[0] >= least), _NICE[-1])
-    hole = next((one for one in _NICE if one[0] >= 10.0 * step[0]), _NICE[-1])
+    step = next((nice for nice in _NICE if nice[0] >= least), _NICE[-1])
+    hole = next((nice for nice in _NICE if nice[0] >= 10.0 * step[0]), _NICE[-1])
     return [("--resample", step[1]), ("--hole", hole[1])]
 
 
@@ -174,7 +174,7 @@ def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str
             (kinds % 1.0 == 0.0).all()
             and (kinds.is_in([0.0, 1.0]).all() or _CODE.search(name) is not None)
         )
-        for kind in kinds if is_code and len(kinds) <= _FEW else ():
+        for kind in kinds if is_code and len(kinds) <= _MOST_TEXTS else ():
             here = (frame[name] == kind).to_numpy()
             if kind and here.mean() < 0.25:
                 times = int((here > np.append(False, here[:-1])).sum())
@@ -194,7 +194,7 @@ def _is_in_blocks(values: polars.Series) -> bool:
 
 def _told(texts: polars.Series) -> str:
     """The texts of a column, in words."""
-    if (n := texts.n_unique()) > _FEW:
+    if (n := texts.n_unique()) > _MOST_TEXTS:
         return f"{n:,} different texts, such as {texts[0]!r}"
     counts = texts.value_counts(sort=True, name="rows").rows()
     return ", ".join(f"{text or 'nothing'} {n / len(texts):.2%}" for text, n in counts)

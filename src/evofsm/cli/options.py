@@ -123,7 +123,7 @@ def split_names(text: str) -> list[str]:
     >>> split_names('gap, "v, in m/s"')
     ['gap', 'v, in m/s']
     """
-    return ["".join(one) for one in _named(text)]
+    return ["".join(parts) for parts in _named(text)]
 
 
 def _named(text: str) -> list[tuple[str, str]]:
@@ -131,7 +131,7 @@ def _named(text: str) -> list[tuple[str, str]]:
     from evofsm.io.tables import quoted_name
 
     found = re.findall(r'(?:"(?:[^"]|"")*"(?=\s*(?:[,=]|$))|[^,])+', text)
-    return [quoted_name(one.strip()) for one in found if one.strip()]
+    return [quoted_name(part.strip()) for part in found if part.strip()]
 
 
 class Reading(NamedTuple):
@@ -153,7 +153,7 @@ class Reading(NamedTuple):
 
         read = read_traces(files, self.columns, self.lengths, on_read, noted, self.topics)
         # Before a hole the action is unknown still, where somebody acts.
-        return read if self.acts else (one._replace(actions=0.0 * one.actions) for one in read)
+        return read if self.acts else (part._replace(actions=0.0 * part.actions) for part in read)
 
 
 def reading_of(
@@ -266,7 +266,7 @@ def reading_of(
         return Category(quoted or name, values.split("/")) if discrete else quoted or name
 
     try:
-        variables = [variable(*one) for one in _named(observe)]
+        variables = [variable(*parts) for parts in _named(observe)]
         if sorted(split_names(observe)) == sorted(VARIABLES):  # in whatever order they are named
             variables = [*VARIABLES]
         encoder = ObservationEncoder(*variables)
@@ -342,9 +342,9 @@ def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
 
     That is given `reading_of` with what was typed; an option that a command has itself is its own.
     """
-    own = signature(command, eval_str=True).parameters
+    parameters = signature(command, eval_str=True).parameters
     options = signature(reading_of, eval_str=True).parameters
-    shared = {name: one for name, one in options.items() if name not in own}
+    shared = {name: parameter for name, parameter in options.items() if name not in parameters}
 
     @wraps(command)
     def run(**given: Any) -> Any:
@@ -352,11 +352,11 @@ def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(**given, reading=partial(reading_of, **typed))
 
     taken = list[Parameter]()
-    for one in own.values():
-        taken += shared.values() if one.name == "reading" else [one]
-    taken = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in taken]
+    for parameter in parameters.values():
+        taken += shared.values() if parameter.name == "reading" else [parameter]
+    taken = [p.replace(kind=Parameter.KEYWORD_ONLY) for p in taken]
     run.__dict__["__signature__"] = Signature(taken)
-    run.__annotations__ = {one.name: one.annotation for one in taken}
+    run.__annotations__ = {p.name: p.annotation for p in taken}
     return run
 
 

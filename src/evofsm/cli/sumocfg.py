@@ -53,10 +53,10 @@ def drive_configuration(
                     move(description=f"Driving, {how} ({seconds:,.0f} s, {met})")
             seconds, kinds = float(sumo.simulation.getTime()), sumo.vehicletype.getIDList()
         if not cars.ever:
-            own = ", ".join(kind for kind in kinds if not kind.startswith("DEFAULT_"))
+            types = ", ".join(kind for kind in kinds if not kind.startswith("DEFAULT_"))
             raise ValueError(
                 f"--vehicles {vehicles}: in {seconds:,.0f} s there was no such car, so nothing was "
-                f"guarded; types are {own or 'those of SUMO alone'}"
+                f"guarded; types are {types or 'those of SUMO alone'}"
             )
         return {"seconds": seconds, **cars.summary()}
 
@@ -100,9 +100,9 @@ def trace_configuration(
         begun, written, is_cut = float(sumo.simulation.getTime()), 0, False
         now, dt = begun, float(sumo.simulation.getDeltaT())
         for now in steps:
-            for each in sumo.simulation.getCollisions():
+            for crash in sumo.simulation.getCollisions():
                 # A step is written with the time at which it began.
-                met.setdefault(f"{each.collider} behind {each.victim}", []).append(now - dt)
+                met.setdefault(f"{crash.collider} behind {crash.victim}", []).append(now - dt)
             written += sumo.vehicle.getIDCount()
             if is_cut := now >= begun + seconds or written >= enough:
                 break

@@ -41,7 +41,7 @@ _TYPE = "type:"
 # emergency they brake harder, and so does whoever follows.
 _LEADER_DECEL = 4.5
 # What is seen is so exact [m/s²].
-_EXACT = 0.05
+_SEEN_TO = 0.05
 # Braking harder than this is hard [m/s²].
 _HARD = 5.0
 # Clocks of SUMO count thousandths; two times that differ by less are one [s].
@@ -69,14 +69,14 @@ _ATTACHED: weakref.WeakSet[Attachment] = weakref.WeakSet()
 # Two that touched within this time before still do [s].
 _SAME_COLLISION = 5.0
 # How far one looks at least [m]; further by what it takes to stop.
-_NEAR, _GENTLE = 30.0, 3.0
-_WIDTH = 1.8
+_LOOKS_AHEAD, _GENTLE = 30.0, 3.0
+_CAR_WIDTH = 1.8
 # Nobody is nearer in what is judged [m]. SUMO keeps minGap itself: what is kept beside it [m].
 _NEAREST, _MARGIN = 0.05, 0.1
 # Limits are as coarse as that [m/s²], and so far a driver may want more.
 _COARSE = 0.3
 # Slower than this a car stands, and a speed that differs by no more is the same [m/s].
-_STANDS, _SAME = 0.1, 1e-6
+_STANDS, _SAME_SPEED = 0.1, 1e-6
 # So many cars in so many steps without a decision are no accident.
 _MANY_CARS, _MANY_STEPS = 10, 2000
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
@@ -138,7 +138,7 @@ class Seeing:
         if self._euler and self._kinds.getIDCount() != len(self._known):
             new = set(self._kinds.getIDList()) - self._known
             self._known |= new
-            if any(self._kinds.getActionStepLength(each) > self.dt + _TICK for each in new):
+            if any(self._kinds.getActionStepLength(kind) > self.dt + _TICK for kind in new):
                 self._euler = 0.0
 
     def forget(self, car: str) -> None:
@@ -167,16 +167,16 @@ class Seeing:
         if not found or not found[0]:
             return None
         leader, gap = found
-        its, body = self._vehicle.getSpeed(leader), self.body(car)
-        return Neighbour(leader, gap + body.min_gap, self._room(gap, body, speed - its), its)
+        v, body = self._vehicle.getSpeed(leader), self.body(car)
+        return Neighbour(leader, gap + body.min_gap, self._room(gap, body, speed - v), v)
 
     def behind(self, car: str, speed: float) -> Neighbour | None:
         """Whoever is behind."""
         follower, gap = self._vehicle.getFollower(car, _far(speed))
         if not follower:
             return None
-        its, body = self._vehicle.getSpeed(follower), self.body(follower)
-        return Neighbour(follower, gap + body.min_gap, self._room(gap, body, its - speed), its)
+        v, body = self._vehicle.getSpeed(follower), self.body(follower)
+        return Neighbour(follower, gap + body.min_gap, self._room(gap, body, v - speed), v)
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
         """The speed that a car's own model wants after the next step [m/s], but for red lights."""
@@ -204,17 +204,17 @@ class Seeing:
         """The scene as `Scene.rows` has it, x counted from the front bumper of the car."""
         rows = np.zeros((3, len(COLUMNS)))  # oneself, ahead and behind
         length = self.body(car).length
-        rows[0] = 1.0, -0.5 * length, 0.0, speed, 0.0, length, _WIDTH, 0.0
-        for row, one, from_, way in ((rows[1], ahead, 0.0, 1.0), (rows[2], behind, -length, -1.0)):
-            if one is not None:
-                its, ax = self.body(one.id).length, self._vehicle.getAcceleration(one.id)
-                x = from_ + way * (one.room + 0.5 * its)
-                row[:] = 1.0, x, 0.0, one.speed, 0.0, its, _WIDTH, ax
+        rows[0] = 1.0, -0.5 * length, 0.0, speed, 0.0, length, _CAR_WIDTH, 0.0
+        for row, near, from_, way in ((rows[1], ahead, 0.0, 1.0), (rows[2], behind, -length, -1.0)):
+            if near is not None:
+                long, ax = self.body(near.id).length, self._vehicle.getAcceleration(near.id)
+                x = from_ + way * (near.room + 0.5 * long)
+                row[:] = 1.0, x, 0.0, near.speed, 0.0, long, _CAR_WIDTH, ax
         return rows.ravel()
 
 
 def _far(speed: float) -> float:
-    return _NEAR + speed + 0.5 * speed * speed / _GENTLE
+    return _LOOKS_AHEAD + speed + 0.5 * speed * speed / _GENTLE
 
 
 # -- Guarding ---------------------------------------------------------------------------------
@@ -278,8 +278,8 @@ class Guarding:
 
     def begin_anew(self) -> None:
         """Another simulation, or another moment of it, begins."""
-        own = None if self._template is None else self._template.interval
-        self.interval = self._seeing.dt if own is None else own
+        interval = None if self._template is None else self._template.interval
+        self.interval = self._seeing.dt if interval is None else interval
         self._every = steps_between(self.interval, self._seeing.dt)
         self._steps = 0
         self._watches.clear()
@@ -300,99 +300,99 @@ class Guarding:
         decides = self._steps % self._every == 0
         self._steps += 1
         seen_leaders: dict[str, float] = {}
-        for one in self.cars.values():
-            speed = self._vehicle.getSpeed(one.id)
-            if one.seen is not None:
-                self._look_back(one, speed)
+        for car in self.cars.values():
+            speed = self._vehicle.getSpeed(car.id)
+            if car.seen is not None:
+                self._look_back(car, speed)
             if decides:
-                self._look(one, speed, time)
-                if one.around[0] is not None:
-                    seen_leaders[one.around[0].id] = one.around[0].speed
-                if one.seen is not None and self._acts:
-                    self._decide(one, one.high)
-            one.speed, one.time = speed, time
+                self._look(car, speed, time)
+                if car.around[0] is not None:
+                    seen_leaders[car.around[0].id] = car.around[0].speed
+                if car.seen is not None and self._acts:
+                    self._decide(car, car.high)
+            car.speed, car.time = speed, time
             if self._acts:
-                self._act(one, speed)
+                self._act(car, speed)
         if decides and self._learn:
             self._watch(seen_leaders)
 
     # -- A step ---------------------------------------------------------------------------------
 
-    def _look(self, one: _Car, speed: float, time: float) -> None:
+    def _look(self, car: _Car, speed: float, time: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
-        ahead, before = self._seeing.ahead(one.id, speed), one.around[0]
-        scene = isinstance(_judge(one.guard), TrafficRisk)
+        ahead, before = self._seeing.ahead(car.id, speed), car.around[0]
+        scene = isinstance(_judge(car.guard), TrafficRisk)
         # Who is behind matters only where one brakes: if acting, because somebody is ahead.
         alone = ahead is None and self._acts
-        behind = self._seeing.behind(one.id, speed) if scene and not alone else None
-        one.around = ahead, behind
+        behind = self._seeing.behind(car.id, speed) if scene and not alone else None
+        car.around = ahead, behind
         if (ahead and ahead.id) != (before and before.id):
-            one.guard.begin()  # what is known of the one before does not hold of this one
-        one.revision = None
+            car.guard.begin()  # what is known of the one before does not hold of this one
+        car.revision = None
         if ahead is None and behind is None:
-            one.seen = None
+            car.seen = None
         elif scene:
-            one.seen = self._seeing.rows(one.id, speed, ahead, behind)
+            car.seen = self._seeing.rows(car.id, speed, ahead, behind)
         else:
             assert ahead is not None
-            one.seen = np.array([ahead.room, speed, ahead.speed])
+            car.seen = np.array([ahead.room, speed, ahead.speed])
 
-    def _decide(self, one: _Car, proposal: float) -> None:
-        assert one.seen is not None
-        one.revision = one.guard.decide(one.seen, proposal)
+    def _decide(self, car: _Car, proposal: float) -> None:
+        assert car.seen is not None
+        car.revision = car.guard.decide(car.seen, proposal)
         self.decisions += 1
-        worst = judge.worst if isinstance(judge := _judge(one.guard), TrafficRisk) else None
-        other = one.around[worst.number - 1 if worst else 0]
+        worst = judge.worst if isinstance(judge := _judge(car.guard), TrafficRisk) else None
+        neighbour = car.around[worst.number - 1 if worst else 0]
         role = worst.role if worst else Role.AHEAD
-        one.about = (other.id, role) if other else ("", None)
+        car.about = (neighbour.id, role) if neighbour else ("", None)
 
-    def _act(self, one: _Car, speed: float) -> None:
+    def _act(self, car: _Car, speed: float) -> None:
         """Set the speed, where the guard allows less than the car might want."""
-        revision = one.revision
-        if revision is None or revision.executed >= one.high:
-            self._hand_back(one)
+        revision = car.revision
+        if revision is None or revision.executed >= car.high:
+            self._hand_back(car)
             return
         reached = max(0.0, speed + float(revision.executed) * self._seeing.dt)
         # Nor faster than it would drive on a free road.
-        one.limit = min(reached, self._vehicle.getAllowedSpeed(one.id))
-        one.wish = self._seeing.wish(one.id, speed, one.around[0])
-        late = self._seeing.body(one.id).late
-        if not late and one.wish <= one.limit + _COARSE * self._seeing.dt:
-            self._hand_back(one)  # it drives as it would by itself, with its imperfections
+        car.limit = min(reached, self._vehicle.getAllowedSpeed(car.id))
+        car.wish = self._seeing.wish(car.id, speed, car.around[0])
+        late = self._seeing.body(car.id).late
+        if not late and car.wish <= car.limit + _COARSE * self._seeing.dt:
+            self._hand_back(car)  # it drives as it would by itself, with its imperfections
             return
-        if one.mode is None:
-            one.mode = self._vehicle.getSpeedMode(one.id)
-            self._vehicle.setSpeedMode(one.id, one.mode & ~_OFF | _ON)
+        if car.mode is None:
+            car.mode = self._vehicle.getSpeedMode(car.id)
+            self._vehicle.setSpeedMode(car.id, car.mode & ~_OFF | _ON)
         self.limited += 1
-        self._vehicle.setSpeed(one.id, one.limit)
+        self._vehicle.setSpeed(car.id, car.limit)
 
-    def _hand_back(self, one: _Car) -> None:
-        if one.mode is not None:
-            self._vehicle.setSpeed(one.id, -1.0)
-            self._vehicle.setSpeedMode(one.id, one.mode)
-            one.mode = None
+    def _hand_back(self, car: _Car) -> None:
+        if car.mode is not None:
+            self._vehicle.setSpeed(car.id, -1.0)
+            self._vehicle.setSpeedMode(car.id, car.mode)
+            car.mode = None
 
-    def _look_back(self, one: _Car, speed: float) -> None:
+    def _look_back(self, car: _Car, speed: float) -> None:
         """What the driver wanted, now that it shows; in shadow it is what is judged."""
         wanted = speed
-        if one.mode is not None and speed > one.limit + _FASTER:
+        if car.mode is not None and speed > car.limit + _FASTER:
             self.overruled += 1
             if self.overruled == _OFTEN:
-                said = _OVERRULED.format(one.id, _OFTEN)
+                said = _OVERRULED.format(car.id, _OFTEN)
                 warnings.warn(said, RuntimeWarning, stacklevel=4)
         # Slower than the limit is what SUMO itself wanted, such as to stop at a red light.
-        if one.mode is not None and speed >= one.limit - _SAME:
-            wanted = max(one.wish, speed)
-        wish, deed = ((each - one.speed) / self._seeing.dt for each in (wanted, speed))
-        if not self._acts and one.revision is None:
-            self._decide(one, wish)
-        revision = one.revision
+        if car.mode is not None and speed >= car.limit - _SAME_SPEED:
+            wanted = max(car.wish, speed)
+        wish, deed = ((reached - car.speed) / self._seeing.dt for reached in (wanted, speed))
+        if not self._acts and car.revision is None:
+            self._decide(car, wish)
+        revision = car.revision
         assert revision is not None
-        stands = max(one.speed, speed, wanted) < _STANDS
+        stands = max(car.speed, speed, wanted) < _STANDS
         allowed = deed if self._acts else float(revision.advised)
         self.revised += not stands and allowed < wish - SLIGHT
         if self._report is not None:
-            self._report(GuardedStep(one.time, one.id, wish, deed, revision, *one.about))
+            self._report(GuardedStep(car.time, car.id, wish, deed, revision, *car.about))
 
     def _watch(self, speeds: dict[str, float]) -> None:
         """Learn how hard leaders brake, each by itself, whoever follows it.
@@ -400,11 +400,11 @@ class Guarding:
         What a guard makes a car do, whoever attached it, is not what leaders do: it is not learnt.
         """
         ended = []
-        guarding = [one.guarding for one in _ATTACHED if one._sumo is self._sumo and one.guarding]
-        for each in chain.from_iterable(one.cars.values() for one in guarding):
-            if each.mode is not None:
-                speeds.pop(each.id, None)
-                self._watches.pop(each.id, None)
+        guarding = [a.guarding for a in _ATTACHED if a._sumo is self._sumo and a.guarding]
+        for car in chain.from_iterable(guards.cars.values() for guards in guarding):
+            if car.mode is not None:
+                speeds.pop(car.id, None)
+                self._watches.pop(car.id, None)
         for leader, speed in speeds.items():
             if leader not in self._watches:
                 self._watches[leader] = BrakeWatch(self.interval)
@@ -453,7 +453,7 @@ def _leaders_of(guard: Guard | None, leader_decel: float) -> Manoeuvres:
             f"TrafficRisk, or observe {', '.join(VARIABLES)}"
         )
     # How hard SUMO's cars brake is exactly known, and has an end.
-    assumed = Manoeuvres(leader_decel, width=_EXACT)
+    assumed = Manoeuvres(leader_decel, width=_SEEN_TO)
     return copy.deepcopy(judge.manoeuvres if isinstance(judge, LatentRisk) else assumed)
 
 
@@ -610,8 +610,8 @@ class Attachment:
         if getattr(self._sumo, "__name__", "") == "libsumo":
             # It keeps listeners where a simulation is closed. Whoever attaches anew is not guarded
             # twice, once by what was attached to the one before.
-            for other in [one for one in _ATTACHED if one._sumo is self._sumo and one._is_new()]:
-                other._listen_no_more()
+            for stale in [a for a in _ATTACHED if a._sumo is self._sumo and a._is_new()]:
+                stale._listen_no_more()
         listener = type("Listener", (base,), {"step": step})()
         self._listener = self._sumo.addStepListener(listener)
         self._sumo.simulation.setParameter("", self._key, "1")
@@ -675,12 +675,12 @@ class Attachment:
         ``revised`` (those that changed what the driver wanted, `Guarding.revised`), and
         ``microseconds`` for each decision, all that guarding takes.
         """
-        met, ours, guarding = self.collisions, self.ever, self.guarding
+        met, guarded, guarding = self.collisions, self.ever, self.guarding
         told = {
-            "cars": len(ours),
+            "cars": len(guarded),
             "collisions": len(met),
-            "of_guarded": sum(one.collider in ours for one in met),
-            "into_guarded": sum(one.victim in ours and one.collider not in ours for one in met),
+            "of_guarded": sum(c.collider in guarded for c in met),
+            "into_guarded": sum(c.victim in guarded and c.collider not in guarded for c in met),
             **self._ride.told(),
         }
         if guarding is not None and guarding.decisions:
@@ -718,10 +718,10 @@ class Attachment:
         self._known = here
 
     def _count_collisions(self, now: float) -> None:
-        for each in self._sumo.simulation.getCollisions():
-            pair = each.collider, each.victim
+        for found in self._sumo.simulation.getCollisions():
+            pair = found.collider, found.victim
             if now - self._met.get(pair, -math.inf) > _SAME_COLLISION:
-                self.collisions.append(Collision(now, *pair, each.type))
+                self.collisions.append(Collision(now, *pair, found.type))
             self._met[pair] = now
 
 

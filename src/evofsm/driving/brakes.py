@@ -12,7 +12,7 @@ from math import fsum, sqrt
 
 # Full braking is judged by so many of the latest decisions, and by no fewer than the second number;
 # that it is weaker than before shows in as few, and in no more than the third number.
-_MEMORY, _FEWEST, _SUSPECT = 80, 6, 12
+_MOST_BRAKINGS, _FEWEST, _SUSPECT = 80, 6, 12
 # One-sided bounds, in standard errors: of 95 %, and one that may be asked at every decision.
 _BOUND, _SURE = 1.645, 4.0
 # Full braking is known where its bound comes so close to its mean.
@@ -23,7 +23,7 @@ _WEAKEST = 0.2
 # of what it brought before [m/s²].
 _GENTLE, _SHORTFALL = 1.0, 0.1
 # Commands that differ by less are the same [m/s²].
-_SAME = 0.05
+_SAME_COMMAND = 0.05
 # Slower than this one may stand still, and only noise moves [m/s].
 _STANDING = 1.0
 # No car brakes harder than this [m/s²], nor does its speed jump by more in a decision [m/s].
@@ -45,7 +45,7 @@ class OwnBrakes:
     def __init__(self, lowest: float, assumed: float, dt: float) -> None:
         self.lowest, self.assumed, self.dt = lowest, assumed, dt
         self._most_change = hardest_seen(dt) * dt  # of a speed within a decision [m/s]
-        self.full = Samples(maxlen=_MEMORY)  #: by full braking
+        self.full = Samples(maxlen=_MOST_BRAKINGS)  #: by full braking
         self.shortfalls = Samples(maxlen=_SUSPECT)  #: of any braking, against what was expected
         self.brought = Samples(maxlen=_FEWEST)  #: by the latest of that
         #: Whether full braking was seen often and clearly enough to count on what was seen.
@@ -71,7 +71,7 @@ class OwnBrakes:
         if len(self.full) < _FEWEST:
             return
         mean, bound = _mean_and_bound(self.full, _BOUND)
-        self.known = len(self.full) == _MEMORY or bound >= _CLEAR * mean
+        self.known = len(self.full) == _MOST_BRAKINGS or bound >= _CLEAR * mean
         counted_on = bound if self.known else min(bound, -self.assumed * self.lowest)
         self.decel = max(counted_on, -_WEAKEST * self.lowest)
         self._likely = mean if self.known else self.decel
@@ -132,7 +132,7 @@ class OwnBrakes:
         ruled = max(self._commands) if len(self._commands) == 3 else 0.0
         # What is commanded now must be full braking, too: commands answer to noise, and of braking
         # that noise has ended the brakes would seem better than they are.
-        is_full = max(ruled, now) < self.lowest + _SAME
+        is_full = max(ruled, now) < self.lowest + _SAME_COMMAND
         if is_full:
             self.remember([(-realised, not self._was_full)])
         self._was_full = is_full
@@ -151,7 +151,7 @@ class OwnBrakes:
     def _is_sure_to_fall_short(self) -> bool:
         """Without noise the latest few tell; in noise it takes more."""
         seen = [*self.shortfalls]
-        bounds = (_mean_and_bound(some, _SURE)[1] for some in (seen[-_FEWEST:], seen))
+        bounds = (_mean_and_bound(samples, _SURE)[1] for samples in (seen[-_FEWEST:], seen))
         return len(seen) >= _FEWEST and any(bound > _SHORTFALL for bound in bounds)
 
 

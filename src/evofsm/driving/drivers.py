@@ -18,10 +18,10 @@ from evofsm.fsm.kernels import compiled
 from evofsm.guard import Proposal
 
 
-def refuse_others(one: object, whose: str, positive: str, not_negative: str = "") -> None:
+def refuse_others(settings: object, whose: str, positive: str, not_negative: str = "") -> None:
     """Raise where a field is not positive and finite, or of others not 0 or more and finite."""
     for name in (*positive.split(), *not_negative.split()):
-        value, may_be_zero = getattr(one, name), name in not_negative.split()
+        value, may_be_zero = getattr(settings, name), name in not_negative.split()
         if not 0.0 <= value < math.inf or (value == 0.0 and not may_be_zero):
             must = "finite, 0 or more" if may_be_zero else "positive and finite"
             raise ValueError(f"{whose} {name} is {value}; it must be {must}")

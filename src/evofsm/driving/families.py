@@ -22,7 +22,7 @@ from evofsm.driving.scenarios import Body, CutIn, Leader, Scenario
 MakeFamily = Callable[..., Family]
 _CASES = ("case 1", "case 2", "case 3", "case 4")
 
-_LEADER = IDM(1.2, 25.0, 1.0, 1.0, 2.5)
+_LEADER_MODEL = IDM(1.2, 25.0, 1.0, 1.0, 2.5)
 
 
 def _told_by(function: Callable[..., Any]) -> tuple[str, str]:
@@ -46,7 +46,7 @@ def _paper(numbers: Numbers) -> tuple[Scenario, IDM | ChangingIDM]:
     in the study: there no one could command what its drivers brake by. Unrevised, cases 1 and 4
     collide; 28 % of the time is a dead end.
     """
-    leader = Leader(_LEADER, brake_decel=9.0, brake_speed=24.2)
+    leader = Leader(_LEADER_MODEL, brake_decel=9.0, brake_speed=24.2)
     hasty, calm = _aggressive(-4.0), _normal(-4.0)
     changing = ChangingIDM(hasty, ((15.0, calm),)), ChangingIDM(calm, ((10.0, hasty),))
     drivers = hasty, calm, *changing
@@ -57,7 +57,7 @@ def _emergency(
     low: float, decel: float, softest: float, hardest: float, numbers: Numbers
 ) -> tuple[Scenario, IDM]:
     leader = Leader(
-        _LEADER,
+        _LEADER_MODEL,
         brake_time=numbers.between("leader.brake_time", 5.0, 30.0),
         brake_decel=numbers.between("leader.brake_decel", softest, hardest),
     )
@@ -114,7 +114,7 @@ def _stop_and_go(numbers: Numbers) -> tuple[Scenario, IDM]:
     """
     stops = numbers.one_of("leader.brake_time", (False, True))
     leader = Leader(
-        _LEADER,  # only its waves are driven
+        _LEADER_MODEL,  # only its waves are driven
         brake_time=numbers.between("leader.brake_time", 8.0, 30.0) if stops else math.inf,
         brake_decel=numbers.between("leader.brake_decel", 3.5, 4.5),
         waves=_waves(numbers, 35.0),
@@ -139,7 +139,7 @@ def _cut_in(numbers: Numbers) -> tuple[Scenario, IDM]:
     brakes = numbers.one_of("leader.brake_time", (False, True))
     plus = numbers.between("leader.brake_time.plus", 0.5, 4.0) if brakes else math.inf
     leader = Leader(
-        _LEADER,
+        _LEADER_MODEL,
         initial_speed=speed,
         waves=((0.0, 0.0),),  # until then it keeps its speed
         brake_time=time + plus,
@@ -160,7 +160,7 @@ def _ncap(numbers: Numbers) -> tuple[Scenario, IDM]:
     in full from the start avoids all.
     """
     # They keep their speeds, but for the leader of CCRb.
-    keeps = partial(Leader, _LEADER, waves=((0.0, 0.0),))
+    keeps = partial(Leader, _LEADER_MODEL, waves=((0.0, 0.0),))
     if numbers.variant == 0:  # 10 to 80 km/h towards a standing car, 4 s before the impact
         speed = numbers.between("values.speed", 2.7778, 22.2222)
         leader, gap = keeps(brake_decel=6.0), 4.0 * speed
@@ -197,7 +197,7 @@ def _r157(numbers: Numbers) -> tuple[Scenario, IDM]:
     no start is.
     """
     speed, headway = list(_R157.values())[numbers.variant]
-    leader = Leader(_LEADER, initial_speed=speed, brake_time=0.0, brake_decel=6.0)
+    leader = Leader(_LEADER_MODEL, initial_speed=speed, brake_time=0.0, brake_decel=6.0)
     body, gap = Body(-4.0, 2.5), headway * speed
     scenario = Scenario(leader, gap, duration=15.0, initial_speed=speed, body=body)
     return scenario, _aggressive(-4.0, speed)

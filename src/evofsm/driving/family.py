@@ -212,9 +212,9 @@ def read_family(path: str | Path, switches: Iterable[str] = ()) -> Family:
         if not isinstance(found, Family):
             raise ValueError("it defines no Family that is called family")
         family = replace(found, source=str(path)).with_switches(switches)
-        for one in filter(None, (family, family.shifted)):
-            for variant in range(max(1, len(one.variants))):
-                one.draw_by(Numbers(0, 0), variant)  # so that a mistake shows at once
+        for drawn in filter(None, (family, family.shifted)):
+            for variant in range(max(1, len(drawn.variants))):
+                drawn.draw_by(Numbers(0, 0), variant)  # so that a mistake shows at once
     except Exception as error:
         text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
         where = "" if text.startswith(f"{path}: ") else f"{path}: "

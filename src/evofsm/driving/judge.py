@@ -60,7 +60,7 @@ _CAUTION = 2.5
 # -- What a file may hold -------------------------------------------------------------------------
 # No car is asked to brake harder [m/s²]; decisions are no closer nor farther apart [s].
 
-_ASKED, _SHORTEST, _LONGEST = 100.0, 1e-6, 1e6
+_ASKED, _SHORTEST_DT, _LONGEST_DT = 100.0, 1e-6, 1e6
 _ACCELERATION = Numbers(least=SMALLEST, most=_ASKED)
 _PRODUCT, _NOISE = Numbers(least=-1e300, most=1e300), Numbers(least=0.0, most=1e300)
 _RISK = Kind(
@@ -79,7 +79,7 @@ _RISK = Kind(
     },
     {
         "lowest": Numbers(least=-_ASKED, most=-SMALLEST),
-        "dt": Numbers(least=_SHORTEST, most=_LONGEST),
+        "dt": Numbers(least=_SHORTEST_DT, most=_LONGEST_DT),
         **dict.fromkeys(("leader_decel", "comfort"), _ACCELERATION),
         "regain": Numbers(least=0.0, most=60.0),
         "own_brakes": Numbers(least=SMALLEST, most=10.0),
@@ -286,10 +286,10 @@ class LatentRisk(Retraced):
     @property
     def told_by_experience(self) -> str:
         """What was learnt so far, in words."""
-        own = f"{self.brakes.decel:.1f} m/s²" if self.brakes.known else "not known yet"
+        brakes = f"{self.brakes.decel:.1f} m/s²" if self.brakes.known else "not known yet"
         return (
             f"{len(self.manoeuvres)} manoeuvres of leaders, 1 % brake harder than "
-            f"{self.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {own}"
+            f"{self.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {brakes}"
         )
 
     # -- Judging --------------------------------------------------------------------------------
@@ -309,7 +309,7 @@ class LatentRisk(Retraced):
         critical = np.empty(len(actions))
         critical_decelerations(here, actions, self._commands[1], self.body, self.dt, critical)
         risk = self.manoeuvres.harder(critical)
-        low, high = np.array([wilson_bounds(one, evidence + 1.0) for one in risk.tolist()]).T
+        low, high = np.array([wilson_bounds(r, evidence + 1.0) for r in risk.tolist()]).T
         return Judgement(risk, low, high, critical, evidence, situation.seen)
 
     def why(self, judged: Judgement) -> str:
@@ -526,9 +526,9 @@ def in_proportion(
     """
     gentle, lower = options >= min(-comfort, options[0]), avoids & (options <= options[0])
     passing = [gentle & ((risk <= tolerated) | (lower & regains)) for tolerated in tolerances]
-    for each in (*passing, lower & (options <= -comfort)):
-        if each.any():
-            best = int(np.where(each, np.abs(options - options[0]), np.inf).argmin())
+    for allowed in (*passing, lower & (options <= -comfort)):
+        if allowed.any():
+            best = int(np.where(allowed, np.abs(options - options[0]), np.inf).argmin())
             if risk[best] <= tolerances[-1]:
                 return best, "the closest that can"
             least = "the least braking that regains a safe gap in time"

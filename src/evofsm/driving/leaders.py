@@ -22,7 +22,7 @@ from evofsm.fsm.validation import positive
 
 # Of a manoeuvre the hardest second counts; it shows in the latest half, and takes at least three
 # quarters: less may be noise [s].
-_WINDOW, _RECENT, _SHORTEST = 1.0, 0.5, 0.75
+_WINDOW, _RECENT, _SHORTEST_BRAKING = 1.0, 0.5, 0.75
 # A leader brakes from the first of these decelerations on, until below the second [m/s²].
 _BEGINS, _ENDS = 1.0, 0.4
 # Where speeds are noisy both are looked at for longer: until noise is no more than this [m/s²]; and
@@ -34,10 +34,10 @@ _ANOTHER_GAP, _ANOTHER_SPEED = 3.0, 1.0
 # Between two points of the table of `Manoeuvres.harder` [m/s²], and its narrowest kernel.
 _GRID, _NARROWEST = 0.05, 0.1
 # So many of the latest manoeuvres are remembered.
-_MEMORY = 500
+_MOST_REMEMBERED = 500
 # Manoeuvres from which on it is learnt how hard leaders brake, and the width of a bin of
 # `LeaderBrakes` [m/s²]. Softer ones, of which everyday traffic is full, must not water those down.
-_HARD, _WIDTH = 2.5, 0.25
+_HARD, _BIN_WIDTH = 2.5, 0.25
 
 
 class LeaderBrakes(NamedTuple):
@@ -60,14 +60,14 @@ class LeaderBrakes(NamedTuple):
     @classmethod
     def counted(cls, decels: Sequence[float], gentle: int, hours: float, source: str) -> Self:
         """Count decelerations of at least 2.5 m/s²."""
-        bins = [int((decel - _HARD) / _WIDTH) for decel in decels]
+        bins = [int((decel - _HARD) / _BIN_WIDTH) for decel in decels]
         counts = np.bincount(np.array(bins, dtype=np.int64)).tolist()
         return cls(_HARD, tuple(counts), gentle, positive("hours", hours), source)
 
     @property
     def decels(self) -> tuple[float, ...]:
         """Each as hard as its bin may hold, the softest first [m/s²]."""
-        ends = self.hard + _WIDTH * np.arange(1, len(self.counts) + 1)
+        ends = self.hard + _BIN_WIDTH * np.arange(1, len(self.counts) + 1)
         return tuple(np.repeat(ends, self.counts).tolist())
 
 
@@ -93,7 +93,7 @@ class Manoeuvres:
         self.assumed = positive("assumed", assumed)
         self.width = width
         self.gentle = 0
-        self.decels: deque[float] = deque(maxlen=_MEMORY)
+        self.decels: deque[float] = deque(maxlen=_MOST_REMEMBERED)
         self._tabulate()
 
     def __len__(self) -> int:
@@ -101,7 +101,7 @@ class Manoeuvres:
 
     def remember(self, *decels: float | None) -> None:
         """Take in manoeuvres [m/s²], the oldest first; None for none."""
-        seen = [min(positive("decel", one), HARDEST) for one in decels if one is not None]
+        seen = [min(positive("decel", decel), HARDEST) for decel in decels if decel is not None]
         hard = [decel for decel in seen if decel >= _HARD]
         self.gentle += len(seen) - len(hard)
         if hard:
@@ -148,7 +148,7 @@ class BrakeWatch:
     def __init__(self, dt: float) -> None:
         self.dt = positive("dt", dt)
         self._recently = max(1, round(_RECENT / dt))
-        self._shortest = max(self._recently + 1, round(_SHORTEST / dt))
+        self._shortest = max(self._recently + 1, round(_SHORTEST_BRAKING / dt))
         self._window = max(self._shortest, round(_WINDOW / dt))
         self.clear()
 

@@ -22,10 +22,10 @@ RANGES = (-1e3, 1e6), SPEEDS, SPEEDS
 
 # Up to these a gap [m] and a speed [m/s] are called so.
 Bands = Sequence[tuple[float, str]]
-_NEAR = ((2.0, "nearly touching"), (15.0, "close"), (40.0, "at a distance"), (math.inf, "far"))
+_DISTANCES = ((2.0, "nearly touching"), (15.0, "close"), (40.0, "at a distance"), (math.inf, "far"))
 _FAST = ((0.5, "standing"), (8.0, "slow"), (20.0, "at medium speed"), (math.inf, "fast"))
 # Speeds that differ by less are called equal [m/s].
-_EQUAL = 0.5
+_EQUAL_SPEED = 0.5
 
 
 def name_state(center: ArrayLike) -> str:
@@ -39,8 +39,8 @@ def name_state(center: ArrayLike) -> str:
     gap, speed, leader = real_array("center", center, 1).tolist()
     closing = speed - leader
     change = f"{'closing' if closing > 0.0 else 'opening'} at {abs(closing):.0f} m/s"
-    change = "at equal speeds" if abs(closing) < _EQUAL else change
-    return ", ".join([_placed(gap, _NEAR, "m"), _placed(speed, _FAST, "m/s"), change])
+    change = "at equal speeds" if abs(closing) < _EQUAL_SPEED else change
+    return ", ".join([_placed(gap, _DISTANCES, "m"), _placed(speed, _FAST, "m/s"), change])
 
 
 def _placed(value: float, bands: Bands, unit: str) -> str:
@@ -56,7 +56,7 @@ LABELS = Labels(names=VARIABLES, units=UNITS)
 
 
 def _observed(about: str, of: Callable[[Any], Any], *, in_table: bool = True) -> Column:
-    return Column(float, about, lambda one: float(of(one.situation.observation)), in_table)
+    return Column(float, about, lambda record: float(of(record.situation.observation)), in_table)
 
 
 #: By name, in the order of ``decisions.parquet``, which has those that are `Column.in_table`: what

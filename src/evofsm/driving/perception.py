@@ -29,7 +29,7 @@ _UNEVEN = 0.01
 # Noise below this cannot be told from uneven driving, and counts as none [m, m/s, m/s].
 _FINEST = (0.02, 0.03, 0.03)
 # So many of the latest residuals tell the noise; fewer than the second say nothing.
-_MEMORY, _FEWEST = 500, 20
+_MOST_RESIDUALS, _FEWEST_RESIDUALS = 500, 20
 # Slower than this one may stand still, where sensors seem better than they are [m/s].
 _STANDING = 1.0
 # A gap or a leader's speed that is so many standard deviations off belongs to another leader.
@@ -37,9 +37,9 @@ _ANOTHER_LEADER = 6.0
 # Median of the absolute value of a standard normal variable.
 _MEDIAN = 0.6745
 _SIX = sqrt(6.0)
-_NOTHING = (0.0, 0.0, 0.0)
-_EXACT = np.zeros((3, 3))
-_NAMES = ("noise_gap", "noise_speed", "noise_leader")
+_NO_NOISE = (0.0, 0.0, 0.0)
+_NO_COVARIANCE = np.zeros((3, 3))
+_NOISES = ("noise_gap", "noise_speed", "noise_leader")
 
 
 class Estimate(NamedTuple):
@@ -59,7 +59,7 @@ class Perception:
     def __init__(self, dt: float) -> None:
         self.dt = dt
         #: Standard deviations of observed gap [m], own and leader's speed [m/s].
-        self.noise = _NOTHING
+        self.noise = _NO_NOISE
         # Of what gap and both speeds did that kinematics do not explain.
         self._sizes = _Sizes(), _Sizes(), _Sizes()
         self.clear()
@@ -92,8 +92,8 @@ class Perception:
 
     def estimate(self, now: Three, realised: float, *, sure: bool = True) -> Estimate:
         """What `see` would answer; nothing changes. NaN stays where nothing was seen before."""
-        if self.noise == _NOTHING and is_whole(now):
-            return Estimate(now, _EXACT)
+        if self.noise == _NO_NOISE and is_whole(now):
+            return Estimate(now, _NO_COVARIANCE)
         if self.latest is None:
             return Estimate(now, np.diag(np.square(self.noise)))
         doubt = _OWN if sure else _OWN_UNKNOWN
@@ -103,10 +103,10 @@ class Perception:
         """Take in what kinematics do not explain; of who may stand nothing."""
         dt, (was, last) = self.dt, self._changes
         closing = now[1] + before[1] - now[2] - before[2]
-        self._changes = own, leader = now[1] - before[1] - realised * dt, now[2] - before[2]
+        self._changes = speed, leader = now[1] - before[1] - realised * dt, now[2] - before[2]
         self._sizes[0].add(now[0] - before[0] + 0.5 * dt * closing)
         if min(now[1], before[1]) > _STANDING:
-            self._sizes[1].add(own - was)
+            self._sizes[1].add(speed - was)
         if min(now[2], before[2]) > _STANDING:
             self._sizes[2].add(leader - last)
         self.noise = _noise(self._sizes, dt)
@@ -114,21 +114,21 @@ class Perception:
     def learnt(self) -> dict[str, NDArray[np.float64]]:
         """The residuals by name, the oldest first, for a file."""
         return {
-            name: np.array(each.latest, dtype=np.float64)
-            for name, each in zip(_NAMES, self._sizes, strict=True)
+            name: np.array(sizes.latest, dtype=np.float64)
+            for name, sizes in zip(_NOISES, self._sizes, strict=True)
         }
 
     def restore(self, latest: Mapping[str, Iterable[float]]) -> None:
         """Take over what `learnt` returned."""
-        gap, own, leader = (_Sizes(np.asarray(latest[name]).tolist()) for name in _NAMES)
-        self._sizes = gap, own, leader
+        gap, speed, leader = (_Sizes(np.asarray(latest[name]).tolist()) for name in _NOISES)
+        self._sizes = gap, speed, leader
         self.noise = _noise(self._sizes, self.dt)
 
 
 def is_whole(observation: Three) -> bool:
     """Whether all three are there."""
-    gap, own, leader = observation
-    return not isnan(gap + own + leader)
+    gap, speed, leader = observation
+    return not isnan(gap + speed + leader)
 
 
 # -- The filter ---------------------------------------------------------------------------------
@@ -148,9 +148,9 @@ def _filtered(
 
     ``doubt`` is the standard deviation of the acceleration that was ``realised`` [m/s²].
     """
-    gap, own, leader = before
-    reached = max(own + realised * dt, 0.0)
-    mean = np.array([gap + (leader - 0.5 * (own + reached)) * dt, reached, leader])
+    gap, speed, leader = before
+    reached = max(speed + realised * dt, 0.0)
+    mean = np.array([gap + (leader - 0.5 * (speed + reached)) * dt, reached, leader])
     moves = np.array([[1.0, -dt, dt], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     # An acceleration changes a speed, and the gap by half an interval of it.
     v, u, half = doubt * dt, _LEADER * dt, 0.5 * dt
@@ -181,14 +181,14 @@ class _Sizes:
     """Absolute values of the latest residuals, and their deviation: robust, from the median."""
 
     def __init__(self, sizes: Iterable[float] = ()) -> None:
-        self.latest = deque(map(abs, sizes), maxlen=_MEMORY)
+        self.latest = deque(map(abs, sizes), maxlen=_MOST_RESIDUALS)
         self._sorted = sorted(self.latest)
 
     def add(self, residual: float) -> None:
         """Take in one more, if it is a number; the oldest goes where there is no room."""
         if isnan(residual):
             return
-        if len(self.latest) == _MEMORY:
+        if len(self.latest) == _MOST_RESIDUALS:
             del self._sorted[bisect_left(self._sorted, self.latest[0])]
         self.latest.append(abs(residual))
         insort(self._sorted, abs(residual))
@@ -196,16 +196,16 @@ class _Sizes:
     def deviation(self) -> float:
         """0 while there are few."""
         n = len(self._sorted)
-        return self._sorted[n // 2] / _MEDIAN if n >= _FEWEST else 0.0
+        return self._sorted[n // 2] / _MEDIAN if n >= _FEWEST_RESIDUALS else 0.0
 
 
 def _noise(sizes: Iterable[_Sizes], dt: float) -> Three:
     """Standard deviation of the noise on gap and both speeds, from that of their residuals."""
     # The second difference of a noisy speed has 6 times its variance; that of a gap against
     # the trapezoid of four noisy speeds twice its own, and some of theirs.
-    gap, own, leader = [each.deviation() for each in sizes]
-    own, leader = own / _SIX, leader / _SIX
-    gap = sqrt(max(gap**2 - 0.5 * dt**2 * (own**2 + leader**2), 0.0) / 2.0)
-    found = zip((gap, own, leader), _FINEST, strict=True)
-    gap, own, leader = (size if size >= finest else 0.0 for size, finest in found)
-    return gap, own, leader
+    gap, speed, leader = [s.deviation() for s in sizes]
+    speed, leader = speed / _SIX, leader / _SIX
+    gap = sqrt(max(gap**2 - 0.5 * dt**2 * (speed**2 + leader**2), 0.0) / 2.0)
+    found = zip((gap, speed, leader), _FINEST, strict=True)
+    gap, speed, leader = (size if size >= finest else 0.0 for size, finest in found)
+    return gap, speed, leader

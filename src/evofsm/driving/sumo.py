@@ -39,7 +39,7 @@ _ROAD_LENGTH = 200_000.0
 _FASTEST = 100.0
 _VEHICLE_LENGTH = 5.0
 # Where the front bumper of the last car stands at first.
-_FIRST = 10.0
+_FIRST_PLACE = 10.0
 
 _NET = f"""<net version="1.20">
     <location netOffset="0,0" convBoundary="0,0,{_ROAD_LENGTH:.2f},0"
@@ -163,7 +163,7 @@ def _refuse_what_sumo_cannot_drive(scenario: Scenario) -> None:
 def _start(scenario: Scenario) -> float:
     """Where the follower's front bumper stands at first [m], behind it what else there is."""
     behind = scenario.behind
-    return _FIRST + (behind.gap + _VEHICLE_LENGTH if behind else 0.0)
+    return _FIRST_PLACE + (behind.gap + _VEHICLE_LENGTH if behind else 0.0)
 
 
 class _Road(Road):
@@ -174,7 +174,7 @@ class _Road(Road):
         self._sumo = sumo
         self._cars = [f"{role}{run}" for role in ("follower", "leader", "behind")]
         start, record = _start(scenario), self._record[0]
-        starts = [start, start + scenario.initial_gap + _VEHICLE_LENGTH, _FIRST]
+        starts = [start, start + scenario.initial_gap + _VEHICLE_LENGTH, _FIRST_PLACE]
         speeds = record[[SPEED, LEADER_SPEED, SPEED_BEHIND]].tolist()
         if scenario.behind is None:
             del self._cars[2], starts[2], speeds[2]

@@ -36,7 +36,7 @@ PLACES, SIZES, RATES = (-1e9, 1e9), (0.0, 1e3), (-1e3, 1e3)
 # Who will be in one's path within this time at the present lateral speed cuts in, or crosses [s].
 _AHEAD = 2.0
 # Width of an interval of accelerations, of which one is looked at [m/s²].
-_WIDTH = 0.3
+_INTERVAL_WIDTH = 0.3
 # So hard leaders brake at most, unless told or seen otherwise: SUMO's emergencyDecel [m/s²].
 LEADER_DECEL = 9.0
 # So hard those behind brake [m/s²], once they have kept their speed for so long [s].
@@ -106,7 +106,7 @@ class Scene:
 
     def __init__(self, own: Object, others: Sequence[Object] = ()) -> None:
         #: Oneself, then the others, the closest along the road first.
-        self.objects = (own, *sorted(others, key=lambda each: abs(each.x - own.x)))
+        self.objects = (own, *sorted(others, key=lambda obj: abs(obj.x - own.x)))
 
     def pairs(self) -> list[Pair]:
         """With whom one may meet, the closest first.
@@ -119,8 +119,8 @@ class Scene:
     def rows(self, most: int) -> NDArray[np.float64]:
         """((most + 1) * 8,) ndarray: `COLUMNS` of oneself and the closest others; zeros else."""
         rows = np.zeros((most + 1, len(COLUMNS)))
-        for row, each in zip(rows, self.objects, strict=False):
-            row[:] = 1.0, *each[1:8]
+        for row, obj in zip(rows, self.objects, strict=False):
+            row[:] = 1.0, *obj[1:8]
         return rows.ravel()
 
 
@@ -129,32 +129,32 @@ def pairs_of(rows: ArrayLike) -> list[Pair]:
     flat = real_array("rows", rows, 1)
     if len(flat) % len(COLUMNS):
         raise ValueError(f"{len(flat)} numbers are no rows of {len(COLUMNS)}: {', '.join(COLUMNS)}")
-    own, *others = flat.reshape(-1, len(COLUMNS)).tolist()
+    ego, *objects = flat.reshape(-1, len(COLUMNS)).tolist()
     found = []
-    for index, other in enumerate(others, start=1):
-        if other[0] > 0.5 and not math.isnan(sum(other)):
-            pair = _pair(own, other, index)
+    for index, obj in enumerate(objects, start=1):
+        if obj[0] > 0.5 and not math.isnan(sum(obj)):
+            pair = _pair(ego, obj, index)
             if pair is not None:
                 found.append(pair)
     return sorted(found, key=lambda pair: pair.gap)
 
 
-def _pair(own: list[float], other: list[float], index: int) -> Pair | None:
-    _, x, y, vx, vy, length, width, ax = other
-    apart, aside = x - own[1], y - own[2]
+def _pair(ego: list[float], obj: list[float], index: int) -> Pair | None:
+    _, x, y, vx, vy, length, width, ax = obj
+    apart, aside = x - ego[1], y - ego[2]
     crosses = abs(vy) > abs(vx)
     along, across = (width, length) if crosses else (length, width)
-    free = abs(aside) - 0.5 * (own[6] + across)  # between the sides
-    closing = (own[4] - vy) * math.copysign(1.0, aside)
+    free = abs(aside) - 0.5 * (ego[6] + across)  # between the sides
+    closing = (ego[4] - vy) * math.copysign(1.0, aside)
     if free >= max(0.0, closing * _AHEAD):  # not in one's path, nor soon
         return None
-    gap = abs(apart) - 0.5 * (own[5] + along)
+    gap = abs(apart) - 0.5 * (ego[5] + along)
     if apart < 0.0:
         # Who moves across behind is none of one's business.
-        return None if crosses else Pair(Role.BEHIND, index, gap, vx, own[3])
+        return None if crosses else Pair(Role.BEHIND, index, gap, vx, ego[3])
     role = Role.AHEAD if free < 0.0 else Role.CUTTING_IN
     braking = max(-ax, 0.0) if vx > 0.0 else 0.0
-    return Pair(Role.CROSSING if crosses else role, index, gap, own[3], max(vx, 0.0), braking)
+    return Pair(Role.CROSSING if crosses else role, index, gap, ego[3], max(vx, 0.0), braking)
 
 
 # -- The judge ----------------------------------------------------------------------------------
@@ -213,9 +213,9 @@ class TrafficRisk(ActionJudge):
         for pair in pairs_of(situation.observation):
             if pair.role is Role.BEHIND:
                 # Who does not brake is hit by nobody that it has to mind.
-                its = self._survived(pair) if hardest > 0.0 else math.inf
-                if its < survived:
-                    survived, follower = its, pair
+                bound = self._survived(pair) if hardest > 0.0 else math.inf
+                if bound < survived:
+                    survived, follower = bound, pair
                 continue
             here = Situation(pair.observation, _ONE, None, math.nan, 0.0)
             judged = self.ahead.judge(here, actions)
@@ -275,21 +275,21 @@ class TrafficRisk(ActionJudge):
         pair = self.worst
         if pair is None:
             return "nobody is near"
-        who = f"object {pair.number}, {pair.role.value}"
+        text = f"object {pair.number}, {pair.role.value}"
         if pair.role is Role.BEHIND:
-            return f"{who}, survives no braking harder than {self._survived(pair):.1f} m/s²"
-        return f"{who}: {self.ahead.why(judged)}"
+            return f"{text}, survives no braking harder than {self._survived(pair):.1f} m/s²"
+        return f"{text}: {self.ahead.why(judged)}"
 
     def refuse_unfit(self, low: Action, high: Action) -> None:
         """Raise a ValueError if it counts on harder braking than there is."""
         self.ahead.refuse_unfit(low, high)
 
 
-def _worse(one: Judgement, other: Judgement) -> Judgement:
+def _worse(a: Judgement, b: Judgement) -> Judgement:
     """The higher risk of each action."""
-    risk, low, high = map(np.maximum, one[:3], other[:3])
-    critical = np.minimum(one.critical, other.critical)
-    return Judgement(risk, low, high, critical, max(one.evidence, other.evidence))
+    risk, low, high = map(np.maximum, a[:3], b[:3])
+    critical = np.minimum(a.critical, b.critical)
+    return Judgement(risk, low, high, critical, max(a.evidence, b.evidence))
 
 
 def guard_for_traffic(
@@ -327,6 +327,6 @@ def guard_for_traffic(
     1.0
     """
     judge = judge or TrafficRisk(LatentRisk.given(-decel, decel, LEADER_DECEL, interval))
-    actions = IntervalActions(low, high, _WIDTH, outside="clip")
+    actions = IntervalActions(low, high, _INTERVAL_WIDTH, outside="clip")
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, learn=False)

@@ -170,7 +170,7 @@ def reference_of(family: Family, draw: Draw, world: World | None = None) -> Refe
 def outcome_of(episode: Episode, unrevised: Reference, interval: float) -> Outcome:
     """What came of an episode, against the unrevised controller in the same draw."""
     change = np.abs(episode.executed - episode.proposed)
-    realised = [one.realised for one in episode.decisions if math.isfinite(one.realised)]
+    realised = [d.realised for d in episode.decisions if math.isfinite(d.realised)]
     jerk = np.diff(realised) / interval
     return Outcome(
         episode.collided,

@@ -30,7 +30,7 @@ RUN_COLUMNS = (
 GAP, SPEED, LEADER_SPEED, GAP_BEHIND, SPEED_BEHIND = range(5)
 COMMANDED, REALISED, LEADER_ACCELERATION, ACCELERATION_BEHIND = range(5, 9)
 # Actions that differ by less are the same [m/s²].
-_SAME = 1e-9
+_SAME_ACTION = 1e-9
 
 Drives = Controller | Callable[[NDArray[np.float64]], float | Proposal]
 
@@ -91,7 +91,7 @@ class Episode:
     def changed(self) -> NDArray[np.bool_]:
         """(D,) ndarray: where the proposal was not executed, or was none that could be."""
         change = np.abs(self.executed - self.proposed)
-        return np.asarray(~(change <= _SAME))  # also true of NaN
+        return np.asarray(~(change <= _SAME_ACTION))  # also true of NaN
 
 
 # -- How cars move --------------------------------------------------------------------------------

@@ -96,8 +96,8 @@ class IntervalActions:
             return bisect_right(self._inner_edges, a)
         values = np.asarray(a)
         if values.dtype.kind not in "fiub":
-            what = f"is {a!r}" if values.ndim == 0 else f"has dtype {values.dtype}"
-            raise TypeError(f"action {what}; it must be a real number, or an array of them")
+            fault = f"is {a!r}" if values.ndim == 0 else f"has dtype {values.dtype}"
+            raise TypeError(f"action {fault}; it must be a real number, or an array of them")
         values = values.astype(np.float64, copy=False)
         if np.isnan(values).any():
             raise ValueError("action is NaN; it has no interval")

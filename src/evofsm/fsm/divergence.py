@@ -33,10 +33,10 @@ def jensen_shannon_kernel(p: Floats, q: Floats, n: int, terms: Floats) -> float:
     to vector instructions.
     """
     for i in range(n):
-        both = p[i] + q[i]
-        d = (p[i] - q[i]) / max(both, _TINY)
+        mass = p[i] + q[i]
+        d = (p[i] - q[i]) / max(mass, _TINY)
         x = d * d
-        terms[i] = both * (_series(x) if x < _SERIES_BELOW else _OPEN)
+        terms[i] = mass * (_series(x) if x < _SERIES_BELOW else _OPEN)
     any_open = False
     for i in range(n):
         any_open |= terms[i] < 0.0
@@ -59,10 +59,10 @@ def _series(x: float) -> float:
 def _use_logarithms(p: Floats, q: Floats, n: int, terms: Floats) -> None:
     """Fill in the terms that were left open."""
     for i in range(n):
-        both = p[i] + q[i]
-        less = 2.0 * min(p[i], q[i]) / max(both, _TINY)  # 1 - d, with all of its digits
+        mass = p[i] + q[i]
+        less = 2.0 * min(p[i], q[i]) / max(mass, _TINY)  # 1 - d, with all of its digits
         more = 2.0 - less
-        term = both * (more * logarithm(more) + less * logarithm(max(less, _TINY)))
+        term = mass * (more * logarithm(more) + less * logarithm(max(less, _TINY)))
         terms[i] = terms[i] if terms[i] >= 0.0 else term
 
 

@@ -122,14 +122,14 @@ def explain(
 
 
 def _never_seen(known: Any, belief: Floats, nearest: Nearest, labels: Labels) -> Explanation:
-    state, none = nearest.state, Tally(0, 0, is_told=known.failures_told)
+    state, no_tally = nearest.state, Tally(0, 0, is_told=known.failures_told)
     place = labels.place(known.centers[state])
     place = place if place.startswith("(") else f"({place})"
     text = (
         f"Never seen, as far as the states tell: {nearest.distance:.3g} from the nearest, "
         f"{state_name(state)} {place}, where a state reaches {nearest.reach:.3g}."
     )
-    return Explanation(text, state, float(belief[state]), 0, none, never_seen=True)
+    return Explanation(text, state, float(belief[state]), 0, no_tally, never_seen=True)
 
 
 def _best(after: Sequence[Tally], than: Tally) -> int | None:

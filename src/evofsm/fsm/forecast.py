@@ -147,7 +147,7 @@ class Forecasts:
         block, stays = np.ix_(i, j), i[:, None] == j
         share = self._moving[horizon][1] / self._moving[horizon].sum()
         presumed = share * self._elsewhere[block] + (1.0 - share) * stays
-        for counts in (self._counts[horizon].get(one) for one in {NO_ACTION: 0, action: 0}):
+        for counts in (self._counts[horizon].get(key) for key in {NO_ACTION: 0, action: 0}):
             if counts is not None:
                 weight = 1.0 / (counts[i].sum(axis=1, keepdims=True) + _EVIDENCE)
                 presumed = (counts[block] + _EVIDENCE * presumed) * weight
@@ -158,15 +158,15 @@ class Forecasts:
     ) -> None:
         """Count one transition from states i to states j, by how likely each pair is."""
         moving, counts = self._moving[horizon], self._counts[horizon]
-        both = {NO_ACTION: 0, action: 0}
-        likely = {one: origin[i, None] * self._matrix(horizon, one, i, j) for one in both}
+        keys = {NO_ACTION: 0, action: 0}
+        likely = {key: origin[i, None] * self._matrix(horizon, key, i, j) for key in keys}
         share = moving[1] / moving.sum()
         stayed = (1.0 - share) * origin[j]
         moved = share * (origin[i] @ self._elsewhere[np.ix_(i, j)])
         gain = reached[j] / np.maximum(stayed + moved, _TINY)
         moving += (gain * stayed).sum(), (gain * moved).sum()
-        for one, pairs in likely.items():
-            counts[one][np.ix_(i, j)] += pairs * (reached[j] / np.maximum(pairs.sum(axis=0), _TINY))
+        for key, pairs in likely.items():
+            counts[key][np.ix_(i, j)] += pairs * (reached[j] / np.maximum(pairs.sum(axis=0), _TINY))
 
     def _check_states(self, n: int) -> int:
         """A number of states that can be of the same machine, later on."""

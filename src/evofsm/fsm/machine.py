@@ -536,8 +536,8 @@ class EvolvingFSM(Retraced):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._rule, self._settings = state["rule"], state["settings"]
         # A file that is mapped for reading cannot be written to.
-        own = (np.require(one, requirements=("C", "W")) for one in state["learnt"])
-        self._learnt = Learnt(*own)
+        learnt = (np.require(array, requirements=("C", "W")) for array in state["learnt"])
+        self._learnt = Learnt(*learnt)
         self._share()
 
     def __repr__(self) -> str:
@@ -566,12 +566,12 @@ class EvolvingFSM(Retraced):
         if z.shape != self._learnt.variables.shape:
             self._fit(len(z))
         row = z[None]
-        actions, starts, failures, trace, none = self._one
+        actions, starts, failures, trace, beliefs = self._one
         actions[0], failures[0] = action, bool(failed)
         scratch = np.empty((3, len(self._learnt.belief)))
         given = self._settings, self._limit, row, actions, starts, failures, failed is not None
         learn_row = (_UNLIMITED if self._limit is None else _LIMITED).call
-        while not learn_row(self._learnt, *given, scratch, 0, trace, none):
+        while not learn_row(self._learnt, *given, scratch, 0, trace, beliefs):
             self._make_room()
             scratch = np.empty((3, len(self._learnt.belief)))
         n, surprise = trace.n_states.item(), trace.surprise.item()

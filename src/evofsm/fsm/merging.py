@@ -29,7 +29,7 @@ _Part: TypeAlias = tuple[dict[str, NDArray[Any]], FSMModel]
 # A row with a smaller share of evidence than this is all prior, and rounding.
 _LEAST_EVIDENCE = 1e-9
 # Frequencies that differ by less than this part of themselves are of the same prior.
-_SAME = 0.01
+_SAME_PRIOR = 0.01
 
 
 def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> EvolvingFSM:
@@ -150,7 +150,7 @@ def _densities(
     rho, weights = settings.distance_weight, settings.weights
     counts = np.array([arrays["n_observations"][0] for arrays, _ in parts], np.float64)
     main = parts[int(counts.argmax())][0]
-    means = np.array([one["first"] - main["first"] + one["mean"] for one, _ in parts])
+    means = np.array([arrays["first"] - main["first"] + arrays["mean"] for arrays, _ in parts])
     mean = counts @ means / counts.sum()
     between = counts @ (((means - mean) * weights) ** 2).sum(axis=1)
     centers = np.array([parts[k][1].centers[i] for k, i in leaders])
@@ -164,14 +164,14 @@ def _densities(
                 total[state] = seen + 1.0 + rho * arrays["squared_distances"][i]
         sums += total
     from_latest = (((centers - main["latest"]) * weights) ** 2).sum(axis=1)
-    others = counts.sum() - 1.0  # the latest one counts in the next step
+    earlier = counts.sum() - 1.0  # the latest one counts in the next step
     return {
         "first": main["first"],
         "latest": main["latest"],
         "mean": mean,
         "scatter": np.sum([arrays["scatter"] for arrays, _ in parts], axis=0) + between,
         "centers": centers.T,
-        "potentials": others / np.maximum(sums - 1.0 - rho * from_latest, others),
+        "potentials": earlier / np.maximum(sums - 1.0 - rho * from_latest, earlier),
         "squared_distances": from_latest,
     }
 
@@ -202,7 +202,7 @@ def _counts(
     evidence = np.where(known[..., 0] > 0.0, frequencies / np.maximum(decisions, 1e-300), 0.0)
     together = evidence + n * _aged_prior(settings, uses)[:, None]
     of_prior = np.where(together > 0.0, 1.0 - evidence / np.maximum(together, 1e-300), 0.0)
-    used = np.flatnonzero(np.any([one["place"] != NOT_OPEN for one, _ in parts], axis=0))
+    used = np.flatnonzero(np.any([arrays["place"] != NOT_OPEN for arrays, _ in parts], axis=0))
     place = np.full(q, NOT_OPEN)
     place[used] = np.arange(len(used))
     return {
@@ -239,7 +239,7 @@ def _prior_left(joint: Floats, uses: Floats, settings: Settings) -> Floats:
     into = np.minimum.accumulate(between, axis=1).diagonal(axis1=1, axis2=2)
     out_of = np.minimum.accumulate(between, axis=2).diagonal(axis1=1, axis2=2)
     least = np.minimum(into, out_of)
-    agree = np.isfinite(least) & (np.maximum(into, out_of) <= (1.0 + _SAME) * least)
+    agree = np.isfinite(least) & (np.maximum(into, out_of) <= (1.0 + _SAME_PRIOR) * least)
     oldest = _aged_prior(settings, uses)[:, None]
     left = np.where(agree, np.minimum(least, settings.prior_frequency), oldest)
     left = np.minimum.accumulate(left[:, ::-1], axis=1)[:, ::-1]

@@ -34,7 +34,7 @@ from evofsm.store import Place
 Policy = Literal["marginal", "hold", "observed"]
 
 # In place of counts that are not given.
-_NONE: Any = None
+_BLANK: Any = None
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -83,18 +83,18 @@ class FSMModel:
     names: tuple[str, ...] = ()  #: of the m variables
     units: tuple[str, ...] = ()  #: of the m variables
     dt: float | None = None  #: time between two observations [s]
-    visits: Floats = _NONE  #: (n,) observations in which each state was the most probable
-    created: Floats = _NONE  #: (n,) number of the observation that created each state, from 1
-    changes: Floats = _NONE  #: (n, n) steps from the most probable state to the next (column)
-    decisions: Floats = _NONE  #: (q, n) transitions that began in each state, by belief
-    failures: Floats = _NONE  #: (q, n) those of `decisions` that led straight into failure
-    endings: Floats = _NONE  #: (n,) failures whose last observation was recognised as each state
-    episodes: Floats = _NONE  #: (n,) episodes that came to each state
-    failed_soon: Floats = _NONE  #: (n,) those of `episodes` that failed soon after they were there
-    joined: Floats = _NONE  #: (n,) 1 where states were joined, so that an episode may count twice
-    tried: Floats = _NONE  #: (q, n) episodes that took each action in each state
-    failed_after: Floats = _NONE  #: (q, n) those of `tried` that failed soon after they did
-    onsets: Floats = _NONE  #: (n,) times that something unexpected began there, as it was told
+    visits: Floats = _BLANK  #: (n,) observations in which each state was the most probable
+    created: Floats = _BLANK  #: (n,) number of the observation that created each state, from 1
+    changes: Floats = _BLANK  #: (n, n) steps from the most probable state to the next (column)
+    decisions: Floats = _BLANK  #: (q, n) transitions that began in each state, by belief
+    failures: Floats = _BLANK  #: (q, n) those of `decisions` that led straight into failure
+    endings: Floats = _BLANK  #: (n,) failures whose last observation was recognised as each state
+    episodes: Floats = _BLANK  #: (n,) episodes that came to each state
+    failed_soon: Floats = _BLANK  #: (n,) those of `episodes` that failed soon after they were there
+    joined: Floats = _BLANK  #: (n,) 1 where states were joined, so that an episode may count twice
+    tried: Floats = _BLANK  #: (q, n) episodes that took each action in each state
+    failed_after: Floats = _BLANK  #: (q, n) those of `tried` that failed soon after they did
+    onsets: Floats = _BLANK  #: (n,) times that something unexpected began there, as it was told
 
     def __post_init__(self) -> None:
         m, q, n = self.n_variables, self.n_actions, self.n_states

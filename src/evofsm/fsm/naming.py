@@ -21,7 +21,7 @@ _ODD = re.compile(r"[^\n\t -~]")
 
 def visible(text: str) -> str:
     """A text in which nothing tells a terminal what to do, or cannot be seen: as JSON writes it."""
-    return _ODD.sub(lambda one: one[0] if one[0].isprintable() else json.dumps(one[0])[1:-1], text)
+    return _ODD.sub(lambda m: m[0] if m[0].isprintable() else json.dumps(m[0])[1:-1], text)
 
 
 def in_a_line(text: str) -> str:
@@ -70,7 +70,7 @@ class Labels(NamedTuple):
             return f"({', '.join(values)})"
         units = self.units or ("",) * len(values)
         named = zip(self.names, values, units, strict=True)
-        return ", ".join(" ".join(part for part in one if part) for one in named)
+        return ", ".join(" ".join(part for part in parts if part) for parts in named)
 
     def variable(self, index: int) -> str:
         """Name and unit of a variable (from 0), as far as they are known."""

@@ -83,11 +83,11 @@ class ObservationEncoder:
         self.variables = variables
         #: Of each entry of the vector; ``light=red`` for a category.
         self.names: tuple[str, ...] = ()
-        for one in variables:
-            if isinstance(one, Category):
-                self.names += tuple(f"{one.name}={value}" for value in one.values)
+        for variable in variables:
+            if isinstance(variable, Category):
+                self.names += tuple(f"{variable.name}={value}" for value in variable.values)
             else:
-                self.names += (one,)
+                self.names += (variable,)
         if len(set(self.names)) < len(self.names):
             raise ValueError(f"variables have the same name twice: {', '.join(self.names)}")
 

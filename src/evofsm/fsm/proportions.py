@@ -11,16 +11,16 @@ from evofsm.fsm.kernels import compiled
 from evofsm.fsm.validation import counted
 
 # Two-sided 90 %.
-_WIDTH = 1.645
+_QUANTILE = 1.645
 # From so many events on their distribution is taken to be a power of a normal one.
-_LARGE = 50
-_HALVINGS = 60
+_MANY_EVENTS = 50
+_BISECTIONS = 60
 
 
 @compiled
 def wilson_bounds(share: float, count: float) -> tuple[float, float]:
     """90 % interval, lower and upper, of a share of ``count`` cases (Wilson 1927)."""
-    spread = _WIDTH * _WIDTH / count
+    spread = _QUANTILE * _QUANTILE / count
     centre = (share + 0.5 * spread) / (1.0 + spread)
     reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
     return max(centre - reach, 0.0), min(centre + reach, 1.0)
@@ -37,11 +37,11 @@ def poisson_bounds(count: int) -> tuple[float, float]:
 
 def _mean(most: int, share: float) -> float:
     """Of a Poisson variable that is at most so many with this probability, 0.05 or 0.95."""
-    if most >= _LARGE:  # Wilson & Hilferty 1931, of a gamma variable
-        width, shape = _WIDTH if share < 0.5 else -_WIDTH, most + 1.0
+    if most >= _MANY_EVENTS:  # Wilson & Hilferty 1931, of a gamma variable
+        width, shape = _QUANTILE if share < 0.5 else -_QUANTILE, most + 1.0
         return float(shape * (1.0 - 1.0 / (9.0 * shape) + width / (3.0 * math.sqrt(shape))) ** 3)
     low, high = 0.0, 2.0 * most + 20.0
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTIONS):
         mean = 0.5 * (low + high)
         terms = (mean**k / math.factorial(k) for k in range(most + 1))
         low, high = (mean, high) if math.exp(-mean) * sum(terms) > share else (low, mean)

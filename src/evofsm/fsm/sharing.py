@@ -15,16 +15,16 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 Rollback: TypeAlias = Callable[[], None]
 
 # So many steps are gone through again at most.
-_STEPS = 512
+_MOST_STEPS = 512
 # All that threads share, for a process that is forked.
 _SHARED: WeakSet[Any] = WeakSet()
 
 
-def share(one: Any) -> None:
+def share(shared: Any) -> None:
     """Give an object a lock, so that threads may share it: its ``_lock``."""
-    one._lock = RLock()
-    one._call = None  # of a transaction under way the thread, and what takes it back
-    _SHARED.add(one)
+    shared._lock = RLock()
+    shared._call = None  # of a transaction under way the thread, and what takes it back
+    _SHARED.add(shared)
 
 
 def alone(method: Method) -> Method:
@@ -100,7 +100,7 @@ def step(method: Method) -> Method:
     def noted(self: Any, *args: Any, **named: Any) -> Any:
         known, self._known = self._known, None  # of a step that is broken off nothing is known
         result = method(self, *args, **named)
-        if known is not None and len(known[1]) < _STEPS:
+        if known is not None and len(known[1]) < _MOST_STEPS:
             known[1].append((method, args, named))
             self._known = known
         return result
@@ -113,12 +113,12 @@ def _begin_alone() -> None:
 
     What they were amid is taken back.
     """
-    for one in (every := list(_SHARED)):
-        one._lock = RLock()
-    for one in every:
-        if one._call is not None and one._call[0] != get_ident():
-            one._call[1]()
-            one._call = None
+    for shared in (every := list(_SHARED)):
+        shared._lock = RLock()
+    for shared in every:
+        if shared._call is not None and shared._call[0] != get_ident():
+            shared._call[1]()
+            shared._call = None
 
 
 if hasattr(os, "register_at_fork"):

@@ -132,7 +132,7 @@ def merge_closest(learnt: Learnt, settings: Settings, nearest: int) -> Any:
 @rare_kernel
 def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> None:
     """Add what was learnt of a state to another, whose centre moves between theirs, by visits."""
-    now, sums, one, other = learnt.now[0], learnt.sums, learnt.states[kept], learnt.states[given]
+    now, sums, a, b = learnt.now[0], learnt.sums, learnt.states[kept], learnt.states[given]
     share = sums[VISITS, given] / max(sums[VISITS, kept] + sums[VISITS, given], 1.0)
     for k in range(len(weights)):
         center = learnt.centers[k]
@@ -143,19 +143,19 @@ def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> No
     for i in range(n):
         learnt.changes[i, kept] += learnt.changes[i, given]
     # Of the present episode it is known that it came to both; of those before it is not.
-    sums[EPISODES, kept] -= one.latest_visit >= now.began and other.latest_visit >= now.began
+    sums[EPISODES, kept] -= a.latest_visit >= now.began and b.latest_visit >= now.began
     for k in range(len(sums)):
         sums[k, kept] += sums[k, given]
-    one.latest_visit = max(one.latest_visit, other.latest_visit)
-    one.joined = 1.0
+    a.latest_visit = max(a.latest_visit, b.latest_visit)
+    a.joined = 1.0
     learnt.potentials[kept] = max(learnt.potentials[kept], learnt.potentials[given])
     learnt.belief[kept] += learnt.belief[given]
     for place in range(now.n_places):
         learnt.decisions[place, kept] += learnt.decisions[place, given]
         learnt.failures[place, kept] += learnt.failures[place, given]
         done, more = learnt.tries[place, kept], learnt.tries[place, given]
-        both = done.latest_try >= now.began and more.latest_try >= now.began
-        done.tried += more.tried - both
+        in_both = done.latest_try >= now.began and more.latest_try >= now.began
+        done.tried += more.tried - in_both
         done.failed_after += more.failed_after
         done.latest_try = max(done.latest_try, more.latest_try)
     now.state = kept if now.state == given else now.state

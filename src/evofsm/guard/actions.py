@@ -142,13 +142,13 @@ class BoxActions:
             np.linspace(low, high, count + 1).tolist()
             for low, high, count in zip(self.low, self.high, self.levels, strict=True)
         ]
-        sides = [list(itertools.pairwise(each)) for each in edges]
+        sides = [list(itertools.pairwise(axis)) for axis in edges]
         ends = [
-            [(each[0], each[0]), (each[-1], each[-1])] if len(each) > 2 else [(each[0], each[-1])]
-            for each in edges
+            [(axis[0], axis[0]), (axis[-1], axis[-1])] if len(axis) > 2 else [(axis[0], axis[-1])]
+            for axis in edges
         ]
-        both = [*itertools.product(*sides), *itertools.product(*ends)]
-        cells = np.ascontiguousarray(np.moveaxis(np.array(both), 2, 0))
+        boxes = [*itertools.product(*sides), *itertools.product(*ends)]
+        cells = np.ascontiguousarray(np.moveaxis(np.array(boxes), 2, 0))
         cells.setflags(write=False)
         return cells
 
@@ -198,8 +198,8 @@ def fixed(action: Action) -> Action:
 
 def same_action(one: Action, other: Action) -> bool:
     """Whether two actions are the same; NaN is no action, and the same as none."""
-    same = one == other
-    return bool(same.all()) if isinstance(same, np.ndarray) else bool(same)
+    equal = one == other
+    return bool(equal.all()) if isinstance(equal, np.ndarray) else bool(equal)
 
 
 def no_action(actions: ActionSet) -> Action:
@@ -250,7 +250,7 @@ def action_text(action: Action) -> str:
     """An action as people read it."""
     if np.ndim(action) == 0:
         return f"{action:g}"
-    return f"({', '.join(f'{each:g}' for each in action)})"
+    return f"({', '.join(f'{number:g}' for number in action)})"
 
 
 def distances(

@@ -46,8 +46,8 @@ _log = logging.getLogger(__name__)
 LOG_VERSION = 1
 # Most probable states of a belief that are written; decisions that are held back at most, which a
 # kill loses; and bytes of a line, which holds a machine at most.
-_STATES, _MOST_QUIET, _LONGEST = 3, 240, 1 << 26
-_SEAL, _END = b',"hash":"', b'"}\n'
+_STATES, _MOST_QUIET, _LONGEST_LINE = 3, 240, 1 << 26
+_SEAL, _LINE_END = b',"hash":"', b'"}\n'
 # How a log begins: so a half-written one is told from other people's files.
 _ABOUT = "evofsm audit log"
 _OPENING = b'{"about":"evofsm audit log",'
@@ -128,14 +128,14 @@ def seal(content: Mapping[str, Any], after: Head) -> tuple[bytes, Head]:
     number = after.number + 1
     text = canonical({**content, "number": number, "previous": after.digest}).encode()[:-1]
     digest = sha256(text).hexdigest()
-    return text + _SEAL + digest.encode() + _END, Head(number, digest)
+    return text + _SEAL + digest.encode() + _LINE_END, Head(number, digest)
 
 
 def unseal(line: bytes) -> Record | None:
     """The record that a line holds; None where it is not as `seal` writes it."""
     text, _, end = line.rpartition(_SEAL)
     digest = sha256(text).hexdigest()
-    if end != digest.encode() + _END:
+    if end != digest.encode() + _LINE_END:
         return None
     try:
         content = json.loads(text + b"}")
@@ -185,7 +185,7 @@ class Chain:
     def records(self) -> Iterator[Record]:
         """The records, after which `finding` is known; a ValueError if there is none."""
         known = self._kept in (None, NOTHING)
-        reading = lines(self.path, _LONGEST)
+        reading = lines(self.path, _LONGEST_LINE)
         for line in reading:
             if not line.endswith(b"\n"):
                 self.half_written = len(line)
@@ -231,8 +231,8 @@ def lines(path: Path, longest: int) -> Iterator[bytes]:
         left = status.st_size if stat.S_ISREG(status.st_mode) else sys.maxsize
         while line := file.readline(min(longest + 1, left)):
             if len(line) > longest:
-                what = f"{path} has a line of more than {longest >> 20} MiB"
-                raise ValueError(f"{what}: is it another kind of file?")
+                text = f"{path} has a line of more than {longest >> 20} MiB"
+                raise ValueError(f"{text}: is it another kind of file?")
             left -= len(line)
             yield line
 
@@ -345,10 +345,10 @@ class AuditLog:
         self._raise()
         self._flush()  # of an episode that was broken off
         self._seen = []
-        who = (guard.reviser, guard.machine, guard.judge, guard.failed)
-        if list(map(id, who)) != list(map(id, self._who)) or self._learnt != sums_of(guard):
+        parts = (guard.reviser, guard.machine, guard.judge, guard.failed)
+        if list(map(id, parts)) != list(map(id, self._who)) or self._learnt != sums_of(guard):
             self._write("start", cut_off=self.cut_off, **_start(guard))
-        self._guard, self._who, self._learnt = guard, who, None
+        self._guard, self._who, self._learnt = guard, parts, None
         self._settings = settings_now(guard)
         self._write("begin", settings=self._settings)
         self._force()
@@ -438,8 +438,8 @@ class AuditLog:
 
     def _cut(self) -> None:
         """Cut off what was taken back, or is half of a record."""
-        mine = os.getpid() == self._owner and not self._file.closed
-        if mine and os.fstat(self._file.fileno()).st_size > self._size:
+        is_owner = os.getpid() == self._owner and not self._file.closed
+        if is_owner and os.fstat(self._file.fileno()).st_size > self._size:
             self._file.truncate(self._size)
 
     def _keep_seen(self) -> None:
@@ -515,7 +515,7 @@ def _start(guard: Guard) -> dict[str, Any]:
     file = BytesIO()
     if known := can_be_made_again(guard):
         guard.save(file)
-        if not (known := file.tell() < _LONGEST // 2):
+        if not (known := file.tell() < _LONGEST_LINE // 2):
             _log.warning("the guard is too large for an audit log: it will not be replayed")
     return {
         "about": _ABOUT,

@@ -73,7 +73,7 @@ def check_contract(part: object) -> None:
         ...
     AssertionError: proposes_numbers: it proposes inf at gap inf m, 20.0 and 0.0 m/s ...
     """
-    broken = [f"{one.check}: {one.message}" for one in check_results(part) if not one.passed]
+    broken = [f"{r.check}: {r.message}" for r in check_results(part) if not r.passed]
     if broken:
         raise AssertionError("\n".join(broken))
 
@@ -100,7 +100,7 @@ def _maker(part: Any) -> Make:
         return part if inspect.isroutine(part) else lambda: copy.deepcopy(part)
     by_name = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     parameters = inspect.signature(part).parameters.values()
-    needed = [one.name for one in parameters if one.default is one.empty and one.kind in by_name]
+    needed = [p.name for p in parameters if p.default is p.empty and p.kind in by_name]
     if needed:
         raise TypeError(
             f"{part.__name__} needs arguments ({', '.join(needed)}); give an instance, or a "
@@ -152,14 +152,14 @@ def _common(answers: Callable[[Any, Rows], Answers]) -> Clause:
 
     def answers_hang_on_inputs_alone(make: Make) -> None:
         """It changes no input, keeps no array of its caller, and draws no random numbers."""
-        part, other, buffer, found = make(), make(), np.empty(3), []
+        part, twin, buffer, found = make(), make(), np.empty(3), []
         for row in _drive():
             buffer[:] = row
             found += answers(part, [buffer])
             changed = "it changed an observation that it was given (work in place? copy it first)"
             _insist(_same(buffer, row), changed)
             buffer[:] = 1e6
-        expected = [answer for row in _drive() for answer in answers(other, [row])]
+        expected = [answer for row in _drive() for answer in answers(twin, [row])]
         _insist(
             _same(found, expected),
             "two that saw the same answer otherwise (an array that is kept instead of copied, a "
@@ -171,7 +171,7 @@ def _common(answers: Callable[[Any, Rows], Answers]) -> Clause:
 
 def _proposals(controller: Any, rows: Rows) -> Answers:
     proposals = [controller.propose(row, k * _DT) for k, row in enumerate(rows)]
-    return [(float(one.action),) for one in proposals]
+    return [(float(proposal.action),) for proposal in proposals]
 
 
 def proposes_numbers(make: Make) -> None:
@@ -201,7 +201,7 @@ def _revisions(reviser: Any, rows: Rows) -> Answers:
     actions = np.resize(_ACTIONS, len(rows)).tolist()
     pairs = enumerate(zip(rows, actions, strict=True))
     made = [reviser.revise(_situation(row, k), Proposal(action)) for k, (row, action) in pairs]
-    return [(one.executed, one.risk_executed, one.reason, one.advised) for one in made]
+    return [(r.executed, r.risk_executed, r.reason, r.advised) for r in made]
 
 
 def revises_what_is_proposed(make: Make) -> None:
@@ -212,20 +212,20 @@ def revises_what_is_proposed(make: Make) -> None:
         proposed = wanted[k % len(wanted)]
         of = f"for a proposal of {proposed}"
         try:
-            one = reviser.revise(_situation(row, k), Proposal(proposed))
+            answer = reviser.revise(_situation(row, k), Proposal(proposed))
         except Exception as error:
             why = "a controller that failed must not take the reviser down"
             raise AssertionError(f"{of} it raises {error!r}; {why}") from error
-        _insist(isinstance(one, Revision), f"revise returns {one!r}, not a Revision")
-        is_number = isinstance(one.executed, float) and math.isfinite(one.executed)
-        _insist(is_number, f"{of} it executes {one.executed!r}; it must be a finite float")
-        within = reviser.actions.low <= one.executed <= reviser.actions.high
-        _insist(within, f"{of} it executes {one.executed}, outside its set of actions")
-        _insist(_same(one.proposed, proposed), f"{of} it reports {one.proposed} as proposed")
-        _insist(one.reason, "it gives no reason, and a driver would not learn why")
-        risks = (one.risk_proposed, one.risk_executed, *one.interval)
+        _insist(isinstance(answer, Revision), f"revise returns {answer!r}, not a Revision")
+        is_number = isinstance(answer.executed, float) and math.isfinite(answer.executed)
+        _insist(is_number, f"{of} it executes {answer.executed!r}; it must be a finite float")
+        within = reviser.actions.low <= answer.executed <= reviser.actions.high
+        _insist(within, f"{of} it executes {answer.executed}, outside its set of actions")
+        _insist(_same(answer.proposed, proposed), f"{of} it reports {answer.proposed} as proposed")
+        _insist(answer.reason, "it gives no reason, and a driver would not learn why")
+        risks = (answer.risk_proposed, answer.risk_executed, *answer.interval)
         sound = all(math.isnan(risk) or 0.0 <= risk <= 1.0 for risk in risks)
-        _insist(sound and not one.interval[0] > one.interval[1], f"risk and interval are {risks}")
+        _insist(sound and not risks[2] > risks[3], f"risk and interval are {risks}")
 
 
 def an_episode_starts_anew(make: Make) -> None:
@@ -234,13 +234,13 @@ def an_episode_starts_anew(make: Make) -> None:
     _revisions(used, [np.array([2.0, 25.0, 5.0])] * 3)
     used.start_episode()
     fresh.start_episode()
-    found, expected = (_revisions(one, list(_drive(seed=1))) for one in (used, fresh))
+    found, expected = (_revisions(part, list(_drive(seed=1))) for part in (used, fresh))
     _insist(_same(found, expected), "after start_episode it still depends on the episode before")
 
 
 def _judgements(judge: Any, rows: Rows) -> Answers:
     made = (judge.judge(_situation(row, 1), _ACTIONS.copy()) for row in rows)
-    return [(one.risk, one.low, one.high) for one in made]
+    return [(judged.risk, judged.low, judged.high) for judged in made]
 
 
 def _taught(make: Make, *, ask: bool = False) -> tuple[Guard, Any]:
@@ -297,8 +297,8 @@ def a_file_keeps_it(make: Make) -> None:
     with tempfile.TemporaryDirectory() as folder:
         guard.save(Path(folder) / "guard")
         again = Guard.load(Path(folder) / "guard", judge=type(judge))
-    same = _same(_asked(judge), _asked(again.judge))
-    _insist(same, "one that was saved and loaded judges otherwise (is all that it learns saved?)")
+    equal = _same(_asked(judge), _asked(again.judge))
+    _insist(equal, "one that was saved and loaded judges otherwise (is all that it learns saved?)")
 
 
 def is_frozen(make: Make) -> None:
@@ -307,12 +307,12 @@ def is_frozen(make: Make) -> None:
     _insist(is_dataclass(rule), "it is no dataclass: files could not store its settings")
     _insist(rule == make(), "two rules of the same settings are not equal")
     _insist(dict(rule.table) == dict(rule.table), "its table is another one the second time")
-    for one in fields(rule):
+    for field in fields(rule):
         try:
-            setattr(rule, one.name, getattr(rule, one.name))
+            setattr(rule, field.name, getattr(rule, field.name))
         except FrozenInstanceError:
             continue
-        raise AssertionError(f"{one.name} can be changed under a machine (frozen=True)")
+        raise AssertionError(f"{field.name} can be changed under a machine (frozen=True)")
 
 
 def a_machine_takes_it(make: Make) -> None:

@@ -104,15 +104,15 @@ def write_fmu(guard: Guard, file: Path) -> None:
     texts, library = _texts(guard, name), f"{name}.{_LIBRARIES.get(sys.platform, 'so')}"
     with tempfile.TemporaryDirectory() as place, store.replacing(file) as written:
         folder = Path(place)
-        for each, text in texts.items():
-            (folder / each).write_text(text, "utf-8")
+        for file_name, text in texts.items():
+            (folder / file_name).write_text(text, "utf-8")
         with suppress(OSError):  # there is no compiler
             command = (os.environ.get("CC") or "cc", *_FLAGS, "-o", library)
             subprocess.run([*command, "evofsm.c", "fmi2.c", "-lm"], cwd=place, check=False)
         with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as unit:
             unit.write(folder / "modelDescription.xml", "modelDescription.xml")
-            for each in ("evofsm.h", "evofsm.c", "fmi2.c"):
-                unit.write(folder / each, f"sources/{each}")
+            for file_name in ("evofsm.h", "evofsm.c", "fmi2.c"):
+                unit.write(folder / file_name, f"sources/{file_name}")
             if (folder / library).exists():
                 unit.write(
                     folder / library, f"binaries/{sys.platform.removesuffix('32')}64/{library}"
@@ -183,7 +183,7 @@ def _told(names: Sequence[str]) -> tuple[str, ...]:
 def _variables(names: Sequence[object], a: int, *, whole: bool) -> str:
     """Variables of an FMU for its description, in the order of ``fmi2.c``."""
     m, seen = len(names), [f"observation[{name}]" for name in names]
-    acts = [f"{what}[{i}]" for what in ("proposal", "executed") for i in range(a)]
+    acts = [f"{act}[{i}]" for act in ("proposal", "executed") for i in range(a)]
     kinds = (
         ["Real"] * m + ["Integer" if whole else "Real"] * (2 * a) + ["Real", "Integer", "Boolean"]
     )
@@ -266,7 +266,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         **{name: getattr(model, name) for name in _OF_MODEL},
         "residuals": rest[:, :, [*range(count), *[0] * (lanes - count)]],  # others are undisturbed
         "policies": state.policies,
-        "risks": [risk._risk(one, soon) for one in (math.inf, *map(float, range(count)))],
+        "risks": [risk._risk(n, soon) for n in (math.inf, *map(float, range(count)))],
         "middle": risk.middle,
         "half": risk.half,
     }

@@ -39,11 +39,11 @@ RATES = (0.1, 0.3, 1.0, 3.0)
 # In horizons: how far ahead limits look, over what the rate is taken, how long an alarm stays on.
 _AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.125
 # Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts held out.
-_MOST, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 4.0, 12), 3
+_MOST_LIMITS, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 4.0, 12), 3
 # Blocks of rows in a horizon, as limits are searched for.
 _BLOCKS = 15
 # Kinds of alarms; thresholds are plain unless others warn for longer by so much.
-_LEARNT, _PLAIN, _NONE = range(3)
+_LEARNT, _PLAIN, _NO_KIND = range(3)
 _BETTER = 0.95
 # What a further limit has to add to the share of the horizon that is warned before; survived rows
 # that forms of failure are learnt from.
@@ -79,7 +79,7 @@ class Runs(NamedTuple):
     @classmethod
     def of(cls, episodes: Sequence[ArrayLike], failed: ArrayLike) -> Runs:
         """Those, (T,) or (T, m) each."""
-        rows = [np.asarray(one, np.float64).reshape(np.shape(one)[0], -1) for one in episodes]
+        rows = [np.asarray(run, np.float64).reshape(np.shape(run)[0], -1) for run in episodes]
         lengths = np.array([*map(len, rows)])
         return cls(np.concatenate(rows), np.cumsum(lengths) - lengths, np.array(failed, np.bool_))
 
@@ -188,7 +188,7 @@ class Foresight(LearningJudge):
         alarms, chance = right + false, log.failed.sum() * ahead / len(log.rows)
         for k in range(len(RATES)):  # whether it is better than an alarm at any time
             if not (right[k] and wilson_bounds(right[k] / alarms[k], alarms[k])[0] > chance):
-                kind[k] = _NONE
+                kind[k] = _NO_KIND
         told = np.column_stack([alarms, right, kind])
         return cls(dt, ahead, held, judge.forms, judge.limits, told, names, units)
 
@@ -197,8 +197,8 @@ class Foresight(LearningJudge):
         last = np.append(log.starts[1:], len(log.rows)) - 1
         rows, failed = np.delete(log.rows, last[log.failed], 0), log.rows[last[log.failed]]
         unit = np.median(np.abs(np.diff(log.rows, axis=0)), axis=0) + 1e-12
-        box, some = np.sort(rows, axis=0), rows[:: max(len(rows) // _ROWS, 1)]
-        survived = failure.Survived(some, box[:2], box[:-3:-1], unit, rows.std(0), rows[:0])
+        box, sample = np.sort(rows, axis=0), rows[:: max(len(rows) // _ROWS, 1)]
+        survived = failure.Survived(sample, box[:2], box[:-3:-1], unit, rows.std(0), rows[:0])
         forms = failure.explain(FAILS, failed, survived)
         judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
         columns = judge._columns(log.rows, log.starts)
@@ -238,7 +238,7 @@ class Foresight(LearningJudge):
         rules: dict[tuple[tuple[int, int], ...], Floats] = {(): np.zeros(2)}
         for price in _PRICES:
             rule, worth = tuple[tuple[int, int], ...](), 0.0
-            while len(rule) < _MOST:
+            while len(rule) < _MOST_LIMITS:
                 gain = more(rule) @ (1.0, -price)
                 best = divmod(int(gain.argmax()), _TRIED)
                 if gain[best] <= worth + _WORTH:
@@ -250,8 +250,8 @@ class Foresight(LearningJudge):
             fitting = np.where(alone[..., 1] <= false, alone[..., 0], -1.0)
             best = divmod(int(fitting.argmax()), _TRIED)
             rules[(best,)] = alone[best]
-            fit = [one for one in rules if rules[one][1] <= false]
-            best_rule = max(fit, key=lambda one: float(rules[one][0]))
+            fit = [choice for choice in rules if rules[choice][1] <= false]
+            best_rule = max(fit, key=lambda choice: float(rules[choice][0]))
             rows += [(rate, plain, *asked[k], asked[k][2] * tried[k][j]) for k, j in best_rule]
         return np.array(rows, np.float64).reshape(-1, 6)
 
@@ -280,8 +280,8 @@ class Foresight(LearningJudge):
     def of_rate(self, rate: int, *, plain: bool | None = None) -> Floats:
         """The limits of an alarm, by default of the kind that did better on what was held out."""
         kind = self.held_out[rate, 2] if plain is None else _PLAIN if plain else _LEARNT
-        which = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
-        return np.asarray(self.limits[which])
+        chosen = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
+        return np.asarray(self.limits[chosen])
 
     def tally(
         self, log: Runs, rate: int, *, plain: bool | None = None, hold: float | None = None
@@ -298,7 +298,7 @@ class Foresight(LearningJudge):
 
     def words(self, rate: int, *, plain: bool | None = None) -> str:
         """Where an alarm is on, as `of_rate` has its limits."""
-        return " or ".join(" ".join(self._words(one)) for one in self.of_rate(rate, plain=plain))
+        return " or ".join(" ".join(self._words(row)) for row in self.of_rate(rate, plain=plain))
 
     def _words(self, limit: Floats) -> tuple[str, str]:
         v, when, sign, at = int(limit[_OF]), int(limit[_WHEN]), limit[_SIGN], limit[_AT]
@@ -312,8 +312,8 @@ class Foresight(LearningJudge):
             row[failure.C] -= at * np.hypot(row[failure.B], row[failure.D])
         there = region(names, row[failure.I : failure.HELD].tolist(), 0).rpartition(" (")[0]
         if is_flat:
-            what, _, beyond = there.removeprefix("where ").partition(" is ")
-            return what, f"{beyond}{soon}"
+            variable, _, beyond = there.removeprefix("where ").partition(" is ")
+            return variable, f"{beyond}{soon}"
         how = "beyond" if at > 0.0 else "within"
         return "it", f"{how} {abs(at):.2g} typical steps of where it fails{soon}: {there}"
 
@@ -325,9 +325,9 @@ class Foresight(LearningJudge):
     def reason(self, rate: int, z: Floats, passed: Floats) -> str:
         """Why an alarm is on at an observation (m,), with the limits (n, 6) that are passed."""
         alarms, right, _ = self.held_out[rate].tolist()
-        mine, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
-        if len(mine):
-            v, (name, there) = int(mine[0, _OF]), self._words(mine[0])
+        limits, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
+        if len(limits):
+            v, (name, there) = int(limits[0, _OF]), self._words(limits[0])
             why = f"{name} {z[v]:.4g}: {there}" if v < len(z) else f"{name} {there}"
         within = span(self.horizon * self.dt)
         return f"{why}; after {right:.0f} of {alarms:.0f} such alarms it failed within {within}"
@@ -336,7 +336,7 @@ class Foresight(LearningJudge):
     def shares(self) -> Floats:
         """(rates,) of the alarms those that were right; 0 where nothing foresees a failure."""
         share = self.held_out[:, 1] / np.maximum(self.held_out[:, 0], 1.0)
-        return np.where(self.held_out[:, 2] == _NONE, 0.0, share)
+        return np.where(self.held_out[:, 2] == _NO_KIND, 0.0, share)
 
     def rate_of(self, tolerance: float) -> int | None:
         """Which of `RATES` the alarm is for, more of which are right; None if there is none."""
@@ -358,7 +358,7 @@ class Foresight(LearningJudge):
     def of(self, rate: int) -> str:
         """What the alarm for one of `RATES` is, and how often it was right, in words."""
         alarms, right, kind = self.held_out[rate].tolist()
-        if kind == _NONE:
+        if kind == _NO_KIND:
             return "nothing was better than chance"
         plain = "plain thresholds do as well: " if kind == _PLAIN else ""
         return f"{plain}{self.words(rate)} ({right:.0f} of {alarms:.0f} were right, held out)"
@@ -401,14 +401,14 @@ class Foresight(LearningJudge):
             risk = float(self.shares[rate])
             reason = self.reason(rate, situation.observation, self._limits[passed])
         low, high = wilson_bounds(risk, evidence) if risk else (0.0, 1.0)
-        risks, lows, highs, none = np.array([[risk], [low], [high], [np.nan]])
-        judged = Judgement(risks, lows, highs, none, evidence)
+        risks, lows, highs, left = np.array([[risk], [low], [high], [np.nan]])
+        judged = Judgement(risks, lows, highs, left, evidence)
         return Search(np.array([float(wanted)]), judged, 0, reason)
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
         """The risk, whatever would be done."""
         found = self.search(situation, 0.0, tolerance=0.0, revising=False).judged
-        every = [np.repeat(one, np.size(actions)) for one in found[:4]]
+        every = [np.repeat(values, np.size(actions)) for values in found[:4]]
         return Judgement(every[0], every[1], every[2], every[3], found.evidence)
 
     def why(self, judged: Judgement, /) -> str:
@@ -442,8 +442,8 @@ class Foresight(LearningJudge):
         settings, arrays = store.read(path, KIND)
         with store.explained(path):
             count = len(settings["names"]) + len(arrays["forms"])
-            which, most = arrays["limits"][:, :_SIGN], (len(RATES), _NONE, count, len(_AHEAD))
-            if not ((which >= 0) & (which < most) & (which % 1.0 == 0.0)).all():
+            indices, most = arrays["limits"][:, :_SIGN], (len(RATES), _NO_KIND, count, len(_AHEAD))
+            if not ((indices >= 0) & (indices < most) & (indices % 1.0 == 0.0)).all():
                 raise ValueError("a limit is of no variable, or of no rate")
             if not (np.isin(arrays["forms"][:, [failure.I, failure.J]], range(count))).all():
                 raise ValueError("a form is of no variable")

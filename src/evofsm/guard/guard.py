@@ -69,7 +69,7 @@ _MANY = 100
 _GAP = 1.5
 _LACKING = {Missing.PARTIAL: Intake.PARTIAL, Missing.HOLD: Intake.HELD}
 # Fourth powers of larger observations, summed over a long run, would lose all others.
-_LARGEST = 1e30
+_LARGEST_VALUE = 1e30
 
 
 class InputMonitor(NamedTuple):
@@ -121,7 +121,7 @@ class DecisionLogger(Protocol):
 
 
 # Settings that stand in a file as they are.
-_PLAIN = ("explaining", "interval", "learn", "n_episodes", "n_failed", "shadow")
+_PLAIN_SETTINGS = ("explaining", "interval", "learn", "n_episodes", "n_failed", "shadow")
 # What of a guard changes in an episode.
 _CHANGING = (
     *("_monitor", "_latest", "_under_way", "_passing", "_decisions", "_acted", "_watched", "_kept"),
@@ -440,7 +440,7 @@ class Guard:
         """What takes back all that is done from now on."""
         kept = _CHANGES(self)
         parts: Any = self.machine, self.judge, self.reviser, self.audit
-        rollbacks = [one.savepoint() for one in parts if hasattr(one, "savepoint")]
+        rollbacks = [part.savepoint() for part in parts if hasattr(part, "savepoint")]
 
         def rollback() -> None:
             for name, value in zip(_CHANGING, kept, strict=True):
@@ -860,7 +860,7 @@ class Guard:
             (self.reviser, self.judge),
             {} if self.machine is None else {id(self.machine): machine},
         )
-        names = (*_PLAIN, "failed", "missing")
+        names = (*_PLAIN_SETTINGS, "failed", "missing")
         settings = {name: getattr(self, name) for name in names}
         return type(self).of(reviser, judge=judge, machine=machine if states else None, **settings)
 
@@ -891,7 +891,7 @@ class Guard:
             **described,
             "missing": self.missing.value,
             "failed": self.failed is not None,
-            **{name: getattr(self, name) for name in _PLAIN},
+            **{name: getattr(self, name) for name in _PLAIN_SETTINGS},
         }
         files = {"machine": _bytes(self.machine), "judge": _bytes(self.judge)}
         store.write(path, KIND, kept, files, provenance)
@@ -943,13 +943,13 @@ class Guard:
                 failed=failed,
                 audit=audit,
                 missing=Missing(kept["missing"]),
-                **{name: kept[name] for name in _PLAIN},
+                **{name: kept[name] for name in _PLAIN_SETTINGS},
             )
 
 
 def ends_of(judge: ActionJudge | None, m: int) -> NDArray[np.float64]:
     """(2, m) ndarray: least and most that each of m variables can be."""
-    return _resized(getattr(judge, "ranges", ((-_LARGEST, _LARGEST),)), m)
+    return _resized(getattr(judge, "ranges", ((-_LARGEST_VALUE, _LARGEST_VALUE),)), m)
 
 
 @cache

@@ -45,7 +45,7 @@ _Convert = Callable[[Any], Any]
 # Each value of ``Discrete`` is a variable of its own; more of them would take too long.
 _MOST_VALUES = 64
 # Not in ``info`` where nothing was judged: NaN there is unlike itself.
-_RISKS = "reviser/risk", "reviser/risk_proposed"
+_RISK_INFOS = "reviser/risk", "reviser/risk_proposed"
 # So many steps on end without a decision are told of.
 _SILENT = 200
 # Where ``info`` holds the last observation of an episode, as the one returned is of the next.
@@ -152,7 +152,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         self.guard, self.failed = guard, failed
         terms = Terms(guard, *_spaces(env), observe, failed, penalty)
         self._lane = Lane(terms, shared=False, env=env)
-        self._resets_itself = any(type(one).__name__ == "Autoreset" for one in _layers(env))
+        self._resets_itself = any(type(layer).__name__ == "Autoreset" for layer in _layers(env))
         warn_of(env, guard, failed)
 
     @property
@@ -242,8 +242,8 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         terms = Terms(guard, *_spaces(env), observe, failed, penalty)
         mode = env.metadata.get("autoreset_mode")  # which not everybody names
         self._same_step = getattr(mode, "value", mode) == "SameStep"
-        each = getattr(env.unwrapped, "envs", [None] * self.num_envs)
-        self._lanes = [Lane(terms, shared=True, env=one) for one in each]
+        envs = getattr(env.unwrapped, "envs", [None] * self.num_envs)
+        self._lanes = [Lane(terms, shared=True, env=inner) for inner in envs]
         warn_of(env, guard, failed)
 
     @property
@@ -257,8 +257,8 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         """Begin episodes, in all or those of ``options["reset_mask"]``; those under way end."""
         mask = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
         observations, infos = self.env.reset(seed=seed, options=options)
-        each = iterate(self.env.observation_space, observations)
-        for k, (lane, observation) in enumerate(zip(self._lanes, each, strict=True)):
+        rows = iterate(self.env.observation_space, observations)
+        for k, (lane, observation) in enumerate(zip(self._lanes, rows, strict=True)):
             if mask[k]:
                 lane.end(failed=False)
                 lane.begin(observation, _of_one(infos, k, self.num_envs))
@@ -268,21 +268,21 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         """Execute the guard's revision of each environment's action."""
         proposed = iterate(self.action_space, actions)
         were_open = [lane.is_open for lane in self._lanes]
-        decided = [lane.decide(one) for lane, one in zip(self._lanes, proposed, strict=True)]
+        decided = [lane.decide(action) for lane, action in zip(self._lanes, proposed, strict=True)]
         space = self.single_action_space
         into: Any = create_empty_array(space, self.num_envs)
-        executed = concatenate(space, [one.executed for one in decided], into)
+        executed = concatenate(space, [decision.executed for decision in decided], into)
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         self._learn(observations, rewards, terminated, truncated, infos)
-        if any(one.cost for one in decided):
-            each = (-1,) + (1,) * (np.ndim(rewards) - 1)
-            rewards = rewards - np.reshape([one.cost for one in decided], each)
-        for name in _RISKS:
+        if any(decision.cost for decision in decided):
+            shape = (-1,) + (1,) * (np.ndim(rewards) - 1)
+            rewards = rewards - np.reshape([decision.cost for decision in decided], shape)
+        for name in _RISK_INFOS:
             infos |= {name: np.zeros(self.num_envs), f"_{name}": np.zeros(self.num_envs, bool)}
-        for k, (one, was_open) in enumerate(zip(decided, were_open, strict=True)):
-            infos = self._add_info(infos, one.info, k)
+        for k, (decision, was_open) in enumerate(zip(decided, were_open, strict=True)):
+            infos = self._add_info(infos, decision.info, k)
             if not was_open:
-                for name in one.info:
+                for name in decision.info:
                     infos[f"_{name}"][k] = False
         return observations, rewards, terminated, truncated, infos
 
@@ -290,8 +290,8 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         self, observations: Any, rewards: Any, terminated: Any, truncated: Any, infos: Any
     ) -> None:
         """Tell each environment's lane what followed."""
-        each = iterate(self.env.observation_space, observations)
-        for k, (lane, observation) in enumerate(zip(self._lanes, each, strict=True)):
+        rows = iterate(self.env.observation_space, observations)
+        for k, (lane, observation) in enumerate(zip(self._lanes, rows, strict=True)):
             ends, info = (bool(terminated[k]), bool(truncated[k])), _of_one(infos, k, self.num_envs)
             lane.follow(StepResult(observation, rewards[k], *ends, info), resets=self._same_step)
 
@@ -425,8 +425,8 @@ class Lane:
                 situation = guard.recognise(seen, step * guard.interval)
                 guard.take_in(situation, proposal, executed)
         if decider is guard or (decider is not None and guard.learn):
-            which = self._episode
-            guard.end(failed, self._seen, terminated=terminated, score=score, episode=which)
+            episode = self._episode
+            guard.end(failed, self._seen, terminated=terminated, score=score, episode=episode)
         self._guard, self._past = None, []
 
 
@@ -494,7 +494,7 @@ class Terms:
             "reviser/penalty": size,
             "reviser/reason": revision.reason,
         }
-        risks = zip(_RISKS, (revision.risk_executed, revision.risk_proposed), strict=True)
+        risks = zip(_RISK_INFOS, (revision.risk_executed, revision.risk_proposed), strict=True)
         info |= {name: risk for name, risk in risks if not math.isnan(risk)}
         return Decided(executed, info, self.penalty * size)
 
@@ -518,9 +518,9 @@ class Terms:
             return None
         seen, names = np.array(given, dtype=np.float64), self.guard.variables
         if seen.ndim != 1 or len(seen) != (len(names) or len(seen)) or np.isinf(seen).any():
-            what = f"{' and '.join(names)}, {len(names)} finite numbers" if names else "finite"
+            form = f"{' and '.join(names)}, {len(names)} finite numbers" if names else "finite"
             raise ValueError(
-                f"observe returned {given}; it must be {what}, with NaN for what was not observed, "
+                f"observe returned {given}; it must be {form}, with NaN for what was not observed, "
                 "or None where there is nothing to judge"
             )
         return seen
@@ -540,8 +540,8 @@ def _flat(space: Space[Any]) -> Observe:
                 f"variable, and at most {_MOST_VALUES} are taken; give observe, which makes a few "
                 "numbers of them (row and column of a place)"
             )
-        first, each = int(space.start), np.eye(int(space.n))
-        return lambda observation: each[int(observation) - first]
+        first, unit = int(space.start), np.eye(int(space.n))
+        return lambda observation: unit[int(observation) - first]
     raise ValueError(
         f"the environment's observations are {space}, neither a Box nor Discrete; give observe, "
         "which makes a vector of them"
@@ -603,11 +603,11 @@ def _spaces(env: Any) -> tuple[Space[Any], Space[Any]]:
         return getattr(one, f"single_{what}", getattr(one, what, None))
 
     acts = of(env, "action_space")
-    for one in _layers(env):
-        if of(one, "action_space") != acts:
+    for layer in _layers(env):
+        if of(layer, "action_space") != acts:
             break
-        if type(one).__name__ == "ClipAction":
-            acts = of(one.env, "action_space")
+        if type(layer).__name__ == "ClipAction":
+            acts = of(layer.env, "action_space")
     return of(env, "observation_space"), acts
 
 
@@ -634,17 +634,17 @@ def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
             "failed=lambda step: step.terminated and step.reward <= 0",
             stacklevel=3,
         )
-    for one in _layers(env):
-        name, own, why = type(one).__name__, getattr(one, "__dict__", ()), ""
-        updates = getattr(one, "update_running_mean", getattr(one, "training", True))
+    for layer in _layers(env):
+        name, attributes, why = type(layer).__name__, getattr(layer, "__dict__", ()), ""
+        updates = getattr(layer, "update_running_mean", getattr(layer, "training", True))
         uses_reward = "reward" in getattr(getattr(failed, "__code__", None), "co_names", ())
-        if "obs_rms" in own and updates:
+        if "obs_rms" in attributes and updates:
             why = "rescales observations by statistics that change, so that no threshold stays"
-        elif "return_rms" in own and updates and uses_reward:
+        elif "return_rms" in attributes and updates and uses_reward:
             why = "rescales the reward, which failed looks at, by statistics that change"
         elif name.startswith("Sticky"):
             why = "executes other actions than the guard decides on"
-        elif name == "DelayObservation" and one.delay > 1:
+        elif name == "DelayObservation" and layer.delay > 1:
             why = "shows the guard where the system was, not where it is"
         if why:
             warnings.warn(

@@ -42,14 +42,14 @@ _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
 _SOONER = 0.3
 # Scores that differ by less than this share are equal.
-_ALIKE = 0.05
+_SAME_SCORE = 0.05
 # The latest guarded episodes, if all failed, are reason enough for one draw to decide; else it
 # takes as many that agree.
 _CAREFUL = 3
 # Draws by which it is said how often the guard drives; below that it is said at all.
 _DRAWS, _SAID = 300, 0.9
 # Decisions over which the share of proposals that are kept is counted, and at least for a word.
-_DECISIONS, _SOME = 500, 100
+_DECISIONS, _FEWEST_DECISIONS = 500, 100
 # Steps of who never fails.
 _FOREVER = 1 << 52
 
@@ -88,17 +88,17 @@ class Harm(NamedTuple):
     @property
     def alone(self) -> list[Outcome]:
         """Of the controller alone."""
-        return [one for one in self.outcomes if not one.guarded]
+        return [outcome for outcome in self.outcomes if not outcome.guarded]
 
     @property
     def guarded(self) -> list[Outcome]:
         """Of the guard that acts."""
-        return [one for one in self.outcomes if one.guarded]
+        return [outcome for outcome in self.outcomes if outcome.guarded]
 
     @property
     def replaces(self) -> bool:
         """Whether hardly a proposal is kept."""
-        return self.decided >= _SOME and self.kept < 0.05 * self.decided
+        return self.decided >= _FEWEST_DECISIONS and self.kept < 0.05 * self.decided
 
     @property
     def helps(self) -> bool:
@@ -114,21 +114,21 @@ class Harm(NamedTuple):
         """
         arms = [[*self.guarded, _WELL], [*self.alone, _WELL]]
         random = np.random.default_rng([self.n_episodes, draws])
-        some, others = (
+        guarded, alone = (
             random.gamma(np.append(self._weights(arm[:-1]), hope), size=(draws, len(arm)))
             for arm, hope in zip(arms, _HOPES, strict=True)
         )
-        won = np.einsum("ni,ij,nj->n", some, better(*arms), others)
+        won = np.einsum("ni,ij,nj->n", guarded, better(*arms), alone)
         return float((won >= 0.0).mean())
 
     def _weights(self, outcomes: Sequence[Outcome]) -> NDArray[np.float64]:
-        return _FADES ** np.array([self.n_episodes - one.episode for one in outcomes], np.float64)
+        return _FADES ** np.array([self.n_episodes - o.episode for o in outcomes], np.float64)
 
     def passing(self, *, learning: bool) -> str:
         """Why proposals pass in the episode to come; empty where they are revised."""
         if not learning:
             return "" if self.helps else "was not shown to help"
-        fails = any(one.failed for one in self.outcomes[-1:])
+        fails = any(outcome.failed for outcome in self.outcomes[-1:])
         asked = self.refuses and (fails or self._long_ago or not self.helps)
         return "shadow" if asked and not self.drives(self._draws) else ""
 
@@ -141,7 +141,7 @@ class Harm(NamedTuple):
     def _draws(self) -> int:
         """The guard drives if it does in one of so many draws."""
         latest = self.guarded[-_CAREFUL:]
-        return 1 if self._long_ago or all(one.failed for one in latest) else _CAREFUL
+        return 1 if self._long_ago or all(outcome.failed for outcome in latest) else _CAREFUL
 
     def told(self, *, learning: bool) -> str:
         """How both arms ended, where it is not beyond doubt that the guard helps; else nothing."""
@@ -176,13 +176,13 @@ class Harm(NamedTuple):
     def merged(cls, parts: Sequence[Harm]) -> Harm:
         """Of guards that learnt apart: the newest outcomes of each."""
         outcomes, n_episodes = list[Outcome](), 0
-        each = max(1, _KEPT // len(parts))
+        kept = max(1, _KEPT // len(parts))
         for part in parts:
-            newest = part.alone[-each:] + part.guarded[-each:]
-            outcomes += (one._replace(episode=one.episode + n_episodes) for one in newest)
+            newest = part.alone[-kept:] + part.guarded[-kept:]
+            outcomes += (o._replace(episode=o.episode + n_episodes) for o in newest)
             n_episodes += part.n_episodes
         refuses = any(part.refuses for part in parts)
-        return cls(tuple(sorted(outcomes, key=lambda one: one.episode)), n_episodes, refuses)
+        return cls(tuple(sorted(outcomes, key=lambda o: o.episode)), n_episodes, refuses)
 
     def after(
         self,
@@ -207,9 +207,9 @@ class Harm(NamedTuple):
             return now
         told = math.nan if score is None else score
         new = Outcome(n, acted + watched, failed, refuses and acted > 0, ended, told)
-        alike = [one for one in self.outcomes if one.guarded == new.guarded]
+        alike = [o for o in self.outcomes if o.guarded == new.guarded]
         gone = alike[: max(0, len(alike) - _KEPT + 1)]
-        return now._replace(outcomes=(*(one for one in self.outcomes if one not in gone), new))
+        return now._replace(outcomes=(*(o for o in self.outcomes if o not in gone), new))
 
 
 def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.float64]:
@@ -228,27 +228,27 @@ def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.flo
     array([[0.3]])
     """
     (s_steps, s_fails, s_well, s_score), (o_steps, o_fails, o_well, o_score) = (
-        np.array([(one.steps, one.failed, one.ended, one.score) for one in arm]).reshape(-1, 4).T
+        np.array([(o.steps, o.failed, o.ended, o.score) for o in arm]).reshape(-1, 4).T
         for arm in (some, others)
     )
     s_last, o_last = np.where(s_well > 0, np.inf, s_steps), np.where(o_well > 0, np.inf, o_steps)
     worse = (s_fails[:, None] > 0) & (s_steps[:, None] <= o_last)
     best = (o_fails > 0) & (o_steps <= s_last[:, None])
     more, size = s_score[:, None] - o_score, np.maximum(np.abs(s_score)[:, None], np.abs(o_score))
-    scored = np.where(np.abs(more) > _ALIKE * size, np.sign(more), 0.0)
+    scored = np.where(np.abs(more) > _SAME_SCORE * size, np.sign(more), 0.0)
     neither = np.where(scored != 0.0, scored, s_well[:, None] - o_well)
     fails = (s_fails[:, None] > 0) | (o_fails > 0)
-    both = (s_fails[:, None] > 0) & (o_fails > 0)
-    return np.where(fails, np.where(both, _SOONER, 1.0) * (best.astype(float) - worse), neither)
+    failed = (s_fails[:, None] > 0) & (o_fails > 0)
+    return np.where(fails, np.where(failed, _SOONER, 1.0) * (best.astype(float) - worse), neither)
 
 
 def _ended(outcomes: Sequence[Outcome]) -> str:
     """After how many steps episodes failed, and how those ended that did not."""
-    steps = [one.steps for one in outcomes if one.failed]
-    n, well = len(outcomes), sum(one.ended for one in outcomes)
+    steps = [o.steps for o in outcomes if o.failed]
+    n, well = len(outcomes), sum(o.ended for o in outcomes)
     said = f"did not fail in {n}"
     if steps:
         said = f"failed after {np.median(steps):g} steps in the median ({len(steps)} of {n})"
-    scores = [one.score for one in outcomes if one.score == one.score]
+    scores = [o.score for o in outcomes if o.score == o.score]
     said += f", {well} ended by themselves" if well else ""
     return said + (f", median score {np.median(scores):.3g}" if any(scores) else "")

@@ -35,10 +35,10 @@ def part_class(name: Any) -> Any:
     return _entry_points()[name].load()
 
 
-def part_name(one: object) -> str | None:
+def part_name(part: object) -> str | None:
     """The name of a thing's class, if that stands for this very class."""
-    name = type(one).__name__
-    return name if name in _entry_points() and part_class(name) is type(one) else None
+    name = type(part).__name__
+    return name if name in _entry_points() and part_class(name) is type(part) else None
 
 
 def outline(guard: _Guard) -> dict[str, Any]:

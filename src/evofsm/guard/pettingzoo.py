@@ -65,7 +65,7 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
     @property
     def revisions(self) -> dict[Any, Revision]:
         """The latest decision of each agent that has acted."""
-        return {one: lane.revision for one, lane in self._lanes.items() if lane.revision}
+        return {agent: lane.revision for agent, lane in self._lanes.items() if lane.revision}
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -81,7 +81,7 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
     def step(self, actions: _Each) -> tuple[_Each, _Each, _Each, _Each, _Each]:
         """Execute the guard's revision of each agent's action."""
         decided = {agent: self._enter(agent).decide(action) for agent, action in actions.items()}
-        executed = {agent: one.executed for agent, one in decided.items()}
+        executed = {agent: decision.executed for agent, decision in decided.items()}
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         infos, rewards = dict(infos), dict(rewards)
         alive = {*self.env.agents}
@@ -95,12 +95,12 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
             lane.follow(StepResult(seen, reward, *ends, info))
             if agent not in decided:  # what it does now follows from no action of before
                 lane.end(failed=False)
-        for agent, one in decided.items():
+        for agent, decision in decided.items():
             if agent in rewards:
-                rewards[agent] = one.paid(rewards[agent])
+                rewards[agent] = decision.paid(rewards[agent])
             if agent in infos or agent in terminated:
-                infos[agent] = {**infos.get(agent, {}), **one.info}
-        here = {one: seen for one, seen in observations.items() if one in self.env.agents}
+                infos[agent] = {**infos.get(agent, {}), **decision.info}
+        here = {agent: seen for agent, seen in observations.items() if agent in self.env.agents}
         self._begin(here, infos)
         return observations, rewards, terminated, truncated, infos
 

@@ -33,14 +33,12 @@ _STATE = "the most probable one, from 0; left out where none is known"
 #: By name in tables and in the audit log; MCAP's channel ``/risk`` drops ``risk_``.
 RECORD: Mapping[str, Column] = {
     "time": _of("situation", "time", float, "since the start of the episode [s]"),
-    "intake": Column(
-        int, f"what was wrong: a sum of {_INTAKE}", lambda one: int(one.situation.intake)
-    ),
+    "intake": Column(int, f"what was wrong: a sum of {_INTAKE}", lambda d: int(d.situation.intake)),
     "state": _of("situation", "state", int, _STATE),
     "n_states": Column(
         int,
         "how many states there were",
-        lambda one: 0 if one.situation.state is None else len(one.situation.belief),
+        lambda d: 0 if d.situation.state is None else len(d.situation.belief),
     ),
     "surprise": _of(
         "situation", "surprise", float, "divergence of forecast and belief [bit]; left out at first"
@@ -52,12 +50,8 @@ RECORD: Mapping[str, Column] = {
         "revision", "risk_proposed", float, "probability of failure under the proposal"
     ),
     "risk_executed": _of("revision", "risk_executed", float, "the same for what is executed"),
-    "risk_low": Column(
-        float, "lower end of its 90 % interval", lambda one: one.revision.interval[0]
-    ),
-    "risk_high": Column(
-        float, "upper end of its 90 % interval", lambda one: one.revision.interval[1]
-    ),
+    "risk_low": Column(float, "lower end of its 90 % interval", lambda d: d.revision.interval[0]),
+    "risk_high": Column(float, "upper end of its 90 % interval", lambda d: d.revision.interval[1]),
     "evidence": _of(
         "revision", "evidence", float, "disturbances that it rests on, such as braking leaders"
     ),

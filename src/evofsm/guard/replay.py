@@ -49,7 +49,7 @@ _NO_FUNCTION = (
 )
 # Where there is a decision logger, decisions that speak are explained.
 _DEAF: Any = SimpleNamespace(
-    **dict.fromkeys(("begin", "seen", "decided", "ended"), lambda *told, **others: None)
+    **dict.fromkeys(("begin", "seen", "decided", "ended"), lambda *told, **rest: None)
 )
 _Failed = Callable[[NDArray[np.float64]], bool]
 
@@ -313,8 +313,8 @@ def _action(action: Any) -> Action:
 
 def _differing(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> tuple[Field, ...]:
     """What is not the same to the last bit."""
-    both = {
-        name: tuple(canonical(each[name]) if name in each else "" for each in (recorded, again))
+    fields = {
+        name: tuple(canonical(entry[name]) if name in entry else "" for entry in (recorded, again))
         for name in sorted(recorded.keys() | again.keys())
     }
-    return tuple(Field(name, *values) for name, values in both.items() if values[0] != values[1])
+    return tuple(Field(name, *values) for name, values in fields.items() if values[0] != values[1])

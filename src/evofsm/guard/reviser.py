@@ -283,8 +283,8 @@ class ActionReviser:
 
 def unseen_text(situation: Situation, variables: Sequence[str]) -> str:
     """What is said of a situation that was not seen whole, or not in time."""
-    each = zip(variables, situation.observation, strict=False)
-    if missing := [name for name, value in each if math.isnan(value)]:
+    values = zip(variables, situation.observation, strict=False)
+    if missing := [name for name, value in values if math.isnan(value)]:
         return f"not seen: {', '.join(missing)}"
     return "nothing new was seen" if situation.intake & STALE else ""
 

@@ -39,13 +39,13 @@ _Ints = NDArray[np.int64]
 # Numbers of a place.
 _P = 2
 # Steps that are looked ahead.
-_STEPS = 5
+_STEPS_AHEAD = 5
 # Objects that are remembered, at most; the oldest episodes are forgotten.
-_MOST = 40_000
+_MOST_REMEMBERED = 40_000
 # Analogs of an object, and of oneself.
 _ANALOGS, _OWN_ANALOGS = 20, 3
 # An analog at this squared distance counts a quarter of one that is the same.
-_ALIKE = 0.1
+_ANALOG_SCALE = 0.1
 # Weight of a place, relative to the rest, where objects are linked; and where they are compared.
 _OF_REST, _NEAR_TO = 0.1, 2.0
 # Squared distance from where an object was expected beyond which it is another one.
@@ -53,11 +53,11 @@ _GATE = 0.5
 # Nothing is forecast from an object that went so many times as far astray as is too close.
 _ASTRAY = 2.5
 # Reweightings of a robust fit; the squared residual, in medians, that counts half; the ridge.
-_FITS, _HALF, _RIDGE = 4, 9.0, 1e-6
+_REWEIGHTINGS, _HALF, _RIDGE = 4, 9.0, 1e-6
 # A number varies by so much of its mean square at least, so that two that never change differ.
 _CONSTANT = 1e-6
 # Squared residuals count as this large at least, in squared spreads.
-_EXACT = 1e-4
+_LEAST_SQUARE = 1e-4
 # Objects that have to be seen twice before anything is learnt, times the numbers of oneself.
 _ROWS = 10
 # Points of a step at which a distance is taken, its two ends included.
@@ -69,17 +69,17 @@ _MOST_ACTIONS = 1_000
 # Closest steps that were survived, of which each counts.
 _CLOSEST = 2000
 
-_SOME = Numbers(least=-1e31, most=1e31)
+_BOUNDED = Numbers(least=-1e31, most=1e31)
 _INDEX = Numbers(least=-1.0, most=MOST_COUNTED, whole=True)
 _KIND = Kind(
     "scenerisk",
     {
-        "own": _SOME.of("n", "o"),
+        "own": _BOUNDED.of("n", "o"),
         "actions": _INDEX.of("n"),
         "counts": COUNT.of("n"),
         "lost": FLAG.of("n"),
-        "away": _SOME.of("m", "p"),
-        "other": _SOME.of("m", "r"),
+        "away": _BOUNDED.of("m", "p"),
+        "other": _BOUNDED.of("m", "r"),
         "links": _INDEX.of("m"),
     },
     {
@@ -189,23 +189,23 @@ class SceneRisk(ActionJudge):
         risks, proposed = found.risks.min(1), int(wanted)
         judged = self._judged(risks[[proposed]])
         if risks[proposed] <= tolerance:
-            said = f"risk within {_STEPS * self.dt:g} s is within the tolerance"
+            said = f"risk within {_STEPS_AHEAD * self.dt:g} s is within the tolerance"
             return Search(np.array([wanted]), judged, 0, said)
         why, after = self.why(judged), found.after
         can = risks if mask is None else np.where(mask, risks, math.inf)
-        good, what = np.flatnonzero(can <= tolerance), "the closest in effect that can"
+        good, reason = np.flatnonzero(can <= tolerance), "the closest in effect that can"
         if not len(good):
             good = np.flatnonzero(can <= can.min() + tolerance)
             lasting = found.lasting[good].max(1)
             good = good[lasting >= lasting.max() - tolerance]
-            what = "nothing can, the one that lasts longest"
+            reason = "nothing can, the one that lasts longest"
         if proposed in good:
-            best, what = proposed, "nothing can, nor does anything last longer"
+            best, reason = proposed, "nothing can, nor does anything last longer"
         else:
             best = int(good[self.memory.apart(after[good], after[proposed]).argmin()])
         judged = self._judged(risks[[proposed, best]])
         options = np.array([wanted, float(best)])
-        return Search(options, judged, int(best != proposed), f"{why}; {what}")
+        return Search(options, judged, int(best != proposed), f"{why}; {reason}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each action; NaN as long as nothing can be said."""
@@ -216,7 +216,7 @@ class SceneRisk(ActionJudge):
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
-        ahead, risk = _STEPS * self.dt, 100.0 * judged.risk[0]
+        ahead, risk = _STEPS_AHEAD * self.dt, 100.0 * judged.risk[0]
         return f"whatever follows, an object is met within {ahead:g} s: {risk:.2g} %"
 
     @property
@@ -246,12 +246,12 @@ class SceneRisk(ActionJudge):
         if not observation.size or observation.size % self.columns:
             raise ValueError(f"{observation.size} numbers are no rows of {self.columns}")
         rows = observation.reshape(-1, self.columns)
-        own, objects = rows[0, 1:].copy(), rows[1:]
+        ego, objects = rows[0, 1:].copy(), rows[1:]
         objects = objects[(objects[:, 0] > 0.5) & np.isfinite(objects).all(1), 1:]
-        away, other = objects[:, :_P], objects[:, _P:]
+        away, rest = objects[:, :_P], objects[:, _P:]
         if self.relative:
-            return Seen(own, away, other + own[_P:])
-        return Seen(own, away - own[:_P], other)
+            return Seen(ego, away, rest + ego[_P:])
+        return Seen(ego, away - ego[:_P], rest)
 
     # -- Learning -------------------------------------------------------------------------------
 
@@ -366,14 +366,14 @@ class Past(NamedTuple):
         lost = np.zeros(len(seen), bool)
         lost[-2:-1] = failed
         # In the order in which a file holds them: sums are then the same to the last bit.
-        own = np.array([one.own for one in seen]).reshape(-1, _P + q)
-        away, other = (
-            np.ascontiguousarray(np.concatenate([np.zeros((0, width)), *each]))
-            for width, each in ((_P, [one.away for one in seen]), (q, [one.other for one in seen]))
+        ego = np.array([s.own for s in seen]).reshape(-1, _P + q)
+        away, rest = (
+            np.ascontiguousarray(np.concatenate([np.zeros((0, width)), *rows]))
+            for width, rows in ((_P, [s.away for s in seen]), (q, [s.other for s in seen]))
         )
         acted = np.array([*actions, -1][: len(seen)], np.int64)
-        counts = np.array([len(one.away) for one in seen], np.int64)
-        return cls(own, acted, counts, lost, away, other, np.full(len(away), -1))
+        counts = np.array([len(s.away) for s in seen], np.int64)
+        return cls(ego, acted, counts, lost, away, rest, np.full(len(away), -1))
 
     @property
     def ends(self) -> _Ints:
@@ -393,8 +393,8 @@ class Past(NamedTuple):
     def and_then(self, later: Past) -> Past:
         """These episodes, and others after them."""
         links = np.where(later.links >= 0, later.links + len(self.away), -1)
-        both = zip(self, later._replace(links=links), strict=True)
-        return Past(*(np.concatenate(arrays) for arrays in both))
+        pairs = zip(self, later._replace(links=links), strict=True)
+        return Past(*(np.concatenate(arrays) for arrays in pairs))
 
     def between(self, first: int, last: int) -> Past:
         """Some of the episodes."""
@@ -522,7 +522,7 @@ class Memory:
         """Remember an episode; learn from it at once if it failed, else now and then."""
         failed, past = bool(episode.lost.any()), self.past.and_then(episode)
         starts = past.objects[past.ends]  # of each episode, as objects
-        forgotten = min(int((len(past.away) - starts > _MOST).sum()), len(starts) - 2)
+        forgotten = min(int((len(past.away) - starts > _MOST_REMEMBERED).sum()), len(starts) - 2)
         past = past.between(forgotten, len(starts) - 1)
         self.fitted = max(0, self.fitted - forgotten)
         self.failures += failed
@@ -569,7 +569,7 @@ class Memory:
 
     def _linked(self, past: Past, first: int) -> Past:
         """Which object is which a step later: each is nearest to where the other is expected."""
-        away, other, _ = self._spreads
+        away, rest, _ = self._spreads
         links, ends = past.links.copy(), past.objects
         links[ends[first] :] = -1
         gate = np.inf if self._motion is None else _GATE
@@ -579,13 +579,13 @@ class Memory:
             now, then = slice(ends[t], ends[t + 1]), slice(ends[t + 1], ends[t + 2])
             expected = past.away[now] + self._moved(past.own[t : t + 2], past.other[now])
             off = (expected[:, None] - past.away[then]) / away
-            change = (past.other[now][:, None] - past.other[then]) / other
+            change = (past.other[now][:, None] - past.other[then]) / rest
             apart = (off**2).sum(2)
             unlike = apart + _OF_REST * (change**2).sum(2)
             nearest, back = unlike.argmin(1), unlike.argmin(0)
-            each = np.arange(len(nearest))
-            mutual = (back[nearest] == each) & (apart[each, nearest] < gate)
-            links[ends[t] + each[mutual]] = ends[t + 1] + nearest[mutual]
+            index = np.arange(len(nearest))
+            mutual = (back[nearest] == index) & (apart[index, nearest] < gate)
+            links[ends[t] + index[mutual]] = ends[t + 1] + nearest[mutual]
         return past._replace(links=links)
 
     # -- Learning -------------------------------------------------------------------------------
@@ -596,25 +596,25 @@ class Memory:
         if len(rows) < _ROWS * past.own.shape[1]:
             return
         now, then = moment[rows], past.links[rows]
-        mine = _terms(past.own[now], past.own[now + 1])
-        x = np.hstack([mine, past.other[rows], past.other[then], np.ones((len(rows), 1))])
+        ego = _terms(past.own[now], past.own[now + 1])
+        x = np.hstack([ego, past.other[rows], past.other[then], np.ones((len(rows), 1))])
         y = past.away[then] - past.away[rows]
         prior = _first_motion(x.shape[1])
         weights = np.ones(len(rows))
         spread = np.maximum(x.var(0), _CONSTANT * (x**2).mean(0)) + 1e-12
         ridge = _RIDGE * len(rows) * np.diag(spread)
-        for _ in range(_FITS):
+        for _ in range(_REWEIGHTINGS):
             weighed = x * weights[:, None]
             motion = np.linalg.solve(weighed.T @ x + ridge, weighed.T @ y + ridge @ prior)
             off = (((y - x @ motion) / self._spreads[0]) ** 2).sum(1)
-            middle = max(float(np.median(off)), _EXACT)
+            middle = max(float(np.median(off)), _LEAST_SQUARE)
             weights = 1.0 / (1.0 + off / (_HALF * middle))
         self._motion = np.asarray(motion, np.float64)
 
     def _moved(self, own: _Floats, other: _Floats) -> _Floats:
         """(k, p) expected change of relative places in a step; ``own`` is before and after it."""
-        mine = np.repeat(_terms(own[:1], own[1:]), len(other), axis=0)
-        x = np.hstack([mine, other, other, np.ones((len(other), 1))])
+        ego = np.repeat(_terms(own[:1], own[1:]), len(other), axis=0)
+        x = np.hstack([ego, other, other, np.ones((len(other), 1))])
         motion = _first_motion(x.shape[1]) if self._motion is None else self._motion
         return np.asarray(x @ motion)
 
@@ -653,9 +653,9 @@ class Memory:
         """Where each object went from then on, oneself left out."""
         rows, moment = np.flatnonzero(past.links >= 0), past.moment
         now, then = moment[rows], past.links[rows]
-        mine = self._mine(past.own[now], past.own[now + 1])
+        moved = self._mine(past.own[now], past.own[now + 1])
         went = np.full_like(past.away, np.nan)
-        went[rows] = past.away[then] - past.away[rows] - mine
+        went[rows] = past.away[then] - past.away[rows] - moved
         known = np.hstack([past.other, np.ones((len(past.other), 1))])
         steady = np.linalg.lstsq(known[rows], went[rows], rcond=None)[0]
         self._steady = steady[:-1]
@@ -667,8 +667,8 @@ class Memory:
                 links[astray], went[astray] = -1, np.nan
                 rows = np.flatnonzero(links >= 0)
         total, at = np.zeros_like(past.away), np.arange(len(past.away))
-        paths = np.empty((len(past.away), _STEPS, _P))
-        for h in range(_STEPS):
+        paths = np.empty((len(past.away), _STEPS_AHEAD, _P))
+        for h in range(_STEPS_AHEAD):
             here = np.where((at >= 0)[:, None], went[at], np.nan)
             step = np.where(np.isnan(here), step, here)
             total = total + step
@@ -679,9 +679,9 @@ class Memory:
 
     def _features(self, own: _Floats, away: _Floats, other: _Floats) -> _Floats:
         """(k, f) what two objects are compared by."""
-        far, rest, mine = self._spreads
+        far, rest, ego = self._spreads
         near = _NEAR_TO * away / far, _NEAR_TO * other / rest
-        return np.hstack([*near, (away + own[:, :_P]) / far, own[:, _P:] / mine[_P:]])
+        return np.hstack([*near, (away + own[:, :_P]) / far, own[:, _P:] / ego[_P:]])
 
     # -- Forecasting ----------------------------------------------------------------------------
 
@@ -695,15 +695,15 @@ class Memory:
         n = self.n_actions
         gone, weights, after = self._own_courses(seen.own)
         safe = np.ones(gone.shape[:3])
-        own = np.repeat(seen.own[None], len(seen.away), axis=0)
-        analogs = _nearest(self._objects, self._features(own, seen.away, seen.other), _ANALOGS)
+        ego = np.repeat(seen.own[None], len(seen.away), axis=0)
+        analogs = _nearest(self._objects, self._features(ego, seen.away, seen.other), _ANALOGS)
         for i, (like, share) in enumerate(zip(*analogs, strict=True)):
             faster = (seen.other[i] - self._others[like]) @ self._steady
-            path = self._paths[like] + faster[:, None] * np.arange(1, _STEPS + 1)[:, None]
+            path = self._paths[like] + faster[:, None] * np.arange(1, _STEPS_AHEAD + 1)[:, None]
             to = seen.away[i] + path + gone[:, :, None]
             start = np.broadcast_to(seen.away[i], (*to.shape[:3], 1, _P))
             safe *= share @ (1.0 - self.contact.of(np.concatenate([start, to], axis=-2)))
-        lost = ((1.0 - safe) * weights[:, :, None]).sum(0).reshape(n, n, _STEPS)
+        lost = ((1.0 - safe) * weights[:, :, None]).sum(0).reshape(n, n, _STEPS_AHEAD)
         return Foreseen(lost[:, :, -1], 1.0 - lost.mean(-1), after)
 
     def _own_courses(self, own: _Floats) -> tuple[_Floats, _Floats, _Floats]:
@@ -714,11 +714,11 @@ class Memory:
         n, r = self.n_actions, _OWN_ANALOGS
         first, then = np.repeat(np.arange(n), n), np.tile(np.arange(n), n)
         at = np.broadcast_to(own, (r, n * n, len(own)))
-        gone = np.zeros((r, n * n, _STEPS, _P))
+        gone = np.zeros((r, n * n, _STEPS_AHEAD, _P))
         shares = np.full((r, n * n), 1.0 / r)
         total = np.zeros((r * n * n, _P))
         course = np.arange(r)[:, None, None]
-        for h in range(_STEPS):
+        for h in range(_STEPS_AHEAD):
             to = at.copy()
             for action, (before, change) in enumerate(self._own):
                 rows = np.flatnonzero((then if h else first) == action)
@@ -726,10 +726,10 @@ class Memory:
                     continue
                 here = (at[:, rows] / self._spreads[2]).reshape(-1, len(own))
                 like, share = (of.reshape(r, len(rows), -1) for of in _nearest(before, here, r))
-                which = np.minimum(course, like.shape[-1] - 1)
-                to[:, rows] += change[np.take_along_axis(like, which, -1)[..., 0]]
+                index = np.minimum(course, like.shape[-1] - 1)
+                to[:, rows] += change[np.take_along_axis(like, index, -1)[..., 0]]
                 if h == 0:
-                    shares[:, rows] = np.take_along_axis(share, which, -1)[..., 0]
+                    shares[:, rows] = np.take_along_axis(share, index, -1)[..., 0]
             total = total + self._mine(at.reshape(-1, len(own)), to.reshape(-1, len(own)))
             gone[:, :, h] = total.reshape(r, n * n, _P)
             if h == 0:
@@ -756,7 +756,7 @@ def _nearest(points: _Floats, around: _Floats, most: int) -> tuple[_Ints, _Float
     like = np.empty((len(around), most), np.int64)
     apart = np.full((len(around), most), np.inf)
     _nearest_into(points, around, like, apart)
-    weight = 1.0 / (_ALIKE + apart) ** 2
+    weight = 1.0 / (_ANALOG_SCALE + apart) ** 2
     return like, weight / weight.sum(-1, keepdims=True)
 
 

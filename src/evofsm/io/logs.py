@@ -49,7 +49,7 @@ _FIRST_ROWS = 8192
 #: Bad rows of a file that are left out where nobody said how many.
 SKIPPED = 10
 # Signals are joined where so many values of each and no whole row are among the first ones.
-_FEWEST = 5
+_FEWEST_VALUES = 5
 #: So old may a value be that is held, as `Topics` has it [s].
 OLDEST = 0.5
 # Share by which the usual steps of two files may differ.
@@ -58,7 +58,7 @@ _SAME_STEP = 0.05
 _FASTEST, _LONGEST_USUAL = 60.0, 5.0
 # Two witnesses of one thing are compared in more rows than so, and where they go up and down
 # together as far as that (a correlation).
-_COMPARED, _ALIKE = 50, 0.9
+_COMPARED, _CORRELATED = 50, 0.9
 _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
 _MICROSECOND = 1e-6
 _NO_CAR = "{!r} cannot be right (another unit? --unit; a stand-in for nobody? --no-leader); in SI "
@@ -162,8 +162,8 @@ class Noted:
             self.failed += len(chunk.failures)
             for row in np.intersect1d(chunk.failures, chunk.starts):
                 here = dict(zip(names, chunk.observations[row].tolist(), strict=True))
-                same = self.at_once.items() & here.items() if self.failed_at_once else here
-                self.at_once, self.failed_at_once = dict(same), self.failed_at_once + 1
+                shared = self.at_once.items() & here.items() if self.failed_at_once else here
+                self.at_once, self.failed_at_once = dict(shared), self.failed_at_once + 1
 
     def _compare_rates(self, chunk: Chunk, gap: int, follower: int, leader: int) -> None:
         """The gap changes as speeds differ, and the own speed as the action says."""
@@ -176,14 +176,14 @@ class Noted:
             "gap": (changed[:, gap] / steps, 0.5 * (closing[1:] + closing[:-1])[within]),
             "action": (changed[:, follower] / steps, chunk.actions[:-1][within]),
         }
-        for what, (shown, said) in told.items():
+        for kind, (shown, said) in told.items():
             known = np.isfinite(said)
             x, y = said[known], shown[known]
             if len(x) > _COMPARED and x.std() > 0.0 < y.std():
                 alike = float(np.corrcoef(x, y)[0, 1])
                 rate = alike * float(y.std() / x.std())
-                if abs(alike) > _ALIKE and not 0.8 < rate < 1.25:
-                    self.rates[what] = rate
+                if abs(alike) > _CORRELATED and not 0.8 < rate < 1.25:
+                    self.rates[kind] = rate
 
 
 # -- What columns mean ----------------------------------------------------------------------------
@@ -196,7 +196,7 @@ def units_of(units: Mapping[str, str], used: Sequence[str]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for name in sorted(units, key=lambda name: (name in used, len(name))):
-        fit = [name] if name in used else [one for one in used if one.startswith(name)]
+        fit = [name] if name in used else [column for column in used if column.startswith(name)]
         if not fit:
             raise ValueError(
                 f"--unit {name}={units[name]}: no column that is read is called so, or begins so; "
@@ -277,8 +277,8 @@ class Condition(NamedTuple):
 
     def holds(self, piece: Piece) -> NDArray[np.bool_]:
         """In which rows of a piece it holds."""
-        each = [np.logical_and.reduce([t.holds(piece) for t in terms]) for terms in self.either]
-        return np.asarray(np.logical_or.reduce(each))
+        parts = [np.logical_and.reduce([t.holds(piece) for t in terms]) for terms in self.either]
+        return np.asarray(np.logical_or.reduce(parts))
 
 
 class Resample(NamedTuple):
@@ -417,10 +417,10 @@ def read_traces(
         rows, left_out = 0, noted.leaderless + noted.elsewhere
         skips = Skips(columns.skip_bad, noted.skipped)
         table = open_table(path, columns, lengths, on_read, topics, skips, noted.told)
-        these = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
-        chunks = _Reader(table, these, clock, noted).chunks()
-        if these.longest_hole:
-            chunks = _on_one_clock(chunks, these, noted)
+        used = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
+        chunks = _Reader(table, used, clock, noted).chunks()
+        if used.longest_hole:
+            chunks = _on_one_clock(chunks, used, noted)
         for chunk in chunks:
             rows += len(chunk.times)
             noted.see(chunk, columns.observe.names, first=rows == len(chunk.times))
@@ -504,7 +504,7 @@ def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterat
         begins[chunk.starts] = True
         fails[[] if chunk.failures is None else chunk.failures] = True
         columns = (begins, chunk.times, chunk.observations, chunk.actions, fails)
-        for first, time, values, *rest in zip(*(each.tolist() for each in columns), strict=True):
+        for first, time, values, *rest in zip(*(a.tolist() for a in columns), strict=True):
             yield LoggedRow(first, time, dict(zip(names, values, strict=True)), *rest)
 
 
@@ -542,7 +542,7 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
     hows.append(said.get(columns.action, "mean"))
     rest: Chunk | None = None
     for chunk in chain(chunks, [None]):
-        parts = [one for one in (rest, chunk) if one is not None]
+        parts = [part for part in (rest, chunk) if part is not None]
         if not parts:
             return
         noted.resampled += 0 if chunk is None else len(chunk.times)
@@ -823,7 +823,7 @@ class _Reader:
         there = {name: np.isfinite(values) for name, values in piece.numbers.items()}
         if self._hold is None:
             is_whole = np.logical_and.reduce(list(there.values())).any()
-            is_joined = not is_whole and all(each.sum() > _FEWEST for each in there.values())
+            is_joined = not is_whole and all(seen.sum() > _FEWEST_VALUES for seen in there.values())
             self._hold = OLDEST if is_joined else 0.0
             if self._hold:
                 self._noted.told.append(
@@ -856,12 +856,12 @@ class _Reader:
         if self._clock.ticks:  # a date and a time of day may be two columns
             is_one = columns.time in table.columns
             clock = [columns.time] if is_one else columns.time.split(",")
-        terms = [term for one in self._conditions.values() for term in one.terms]
+        terms = [term for condition in self._conditions.values() for term in condition.terms]
         compared = [term.column for term in terms if term.of_number]
         told = [term.column for term in terms if not term.of_number]
         categories = [v.name for v in self._variables if isinstance(v, Category)]
         options = {
-            **{t.column: option for option, one in self._conditions.items() for t in one.terms},
+            **{t.column: option for option, c in self._conditions.items() for t in c.terms},
             **dict.fromkeys([*self._observed, *categories], "--observe"),
             **dict.fromkeys(self._episode, "--episode"),
             **dict.fromkeys(clock, "--time"),
@@ -872,7 +872,7 @@ class _Reader:
                 shown = ", ".join(name[:40] for name in table.columns[:20])
                 more = f" and {len(table.columns) - 20:,} more" if len(table.columns) > 20 else ""
                 how = ", and --dt stands in for a clock" if option == "--time" else ""
-                if commas := [one for one in table.columns if "," in one and name in one]:
+                if commas := [title for title in table.columns if "," in title and name in title]:
                     how = f"; a name with a comma stands in double quotes: '\"{commas[0]}\"'"
                 raise ValueError(
                     f"{table.path} has no column {name!r}; it has {shown}{more} ({option} names "

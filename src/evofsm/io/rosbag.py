@@ -64,7 +64,7 @@ class Field(NamedTuple):
         steps: list[str | tuple[int | str]] = []
         while step := _STEP.match(way):
             places = re.findall(r"\[([^\]]+)\]", step[2])
-            steps += [step[1], *((int(one) if one.isdecimal() else one,) for one in places)]
+            steps += [step[1], *((int(p) if p.isdecimal() else p,) for p in places)]
             way = way[step.end() :]
         if way or not (steps and topic):
             raise ValueError(
@@ -109,7 +109,7 @@ def _names_in(owner: Any, array: Any) -> list[str]:
             return list(beside)
     for field in _CALLED:
         if len(array) and hasattr(array[0], field):
-            return [str(getattr(one, field)) for one in array]
+            return [str(getattr(item, field)) for item in array]
     return []
 
 
@@ -184,12 +184,12 @@ class Topics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         named, where = given.get("variables"), ""
         try:
             if isinstance(named, Mapping):
-                each: dict[str, Variable] = {}
-                for name, one in named.items():
+                parsed: dict[str, Variable] = {}
+                for name, value in named.items():
                     where = f"variable {name}: "
-                    told = {"field": one} if isinstance(one, str) else one
-                    each[name] = msgspec.convert(told, Variable)
-                given, where = {**given, "variables": each}, ""
+                    told = {"field": value} if isinstance(value, str) else value
+                    parsed[name] = msgspec.convert(told, Variable)
+                given, where = {**given, "variables": parsed}, ""
             return msgspec.convert(given, cls)
         except msgspec.ValidationError as error:
             raise ValueError(f"{where}{error}") from None
@@ -249,10 +249,10 @@ class BagTable(Table):
             known &= (latest >= 0) & (at - of_field[latest] <= oldest)
             values[field] = numbers[latest]
         rows = {"time": (at - stamps[0])[known] / _NANOSECONDS}
-        for name, one in topics.variables.items():
-            value = values[one.field] - (values[one.minus] if one.minus else 0.0)
-            factor = 1.0 if one.unit is None else UNITS[one.unit]
-            rows[name] = (factor * value + one.offset)[known]
+        for name, variable in topics.variables.items():
+            value = values[variable.field] - (values[variable.minus] if variable.minus else 0.0)
+            factor = 1.0 if variable.unit is None else UNITS[variable.unit]
+            rows[name] = (factor * value + variable.offset)[known]
         if self.derives:
             action = np.diff(rows["v_follower"], append=np.nan) / topics.interval
             follows = np.diff(at[known], append=0) == interval
@@ -266,10 +266,10 @@ class BagTable(Table):
             from rosbags.typesys.store import Typestore
         fields = [
             Field.parse(text)
-            for text in {text for one in self._topics.variables.values() for text in one.fields}
+            for text in {text for v in self._topics.variables.values() for text in v.fields}
         ]
-        topics = {one.topic for one in fields}
-        values = {one.text: (array("q"), array("d"), dict[int, str]()) for one in fields}
+        topics = {field.topic for field in fields}
+        values = {field.text: (array("q"), array("d"), dict[int, str]()) for field in fields}
         stores: dict[_Type, Typestore] = {}
         spans: dict[str, list[int]] = {}  # as recorded from and to, and by headers [ns]
         there, counts = set[str](), Counter[str]()
@@ -317,10 +317,10 @@ class BagTable(Table):
     def _compare(self, spans: Mapping[str, Sequence[int]]) -> None:
         """Say where messages are recorded at another rate than the one of their headers."""
         for topic, (first, last, begin, end) in spans.items():
-            recorded, own = (last - first) / _NANOSECONDS, (end - begin) / _NANOSECONDS
-            if own and abs(own - recorded) > max(_SPAN, _SHARE * recorded):
+            recorded, stamped = (last - first) / _NANOSECONDS, (end - begin) / _NANOSECONDS
+            if stamped and abs(stamped - recorded) > max(_SPAN, _SHARE * recorded):
                 self._told.append(
-                    f"{self.path}: messages of {topic} span {own:.3g} s by their headers, and "
+                    f"{self.path}: messages of {topic} span {stamped:.3g} s by their headers, and "
                     f"{recorded:.3g} s as recorded, by which times are (played, or simulated, at "
                     'another speed?): stamp = "header" in the file of --topics goes by the headers'
                 )

@@ -36,7 +36,7 @@ PROFILE = "evofsm"
 MODEL = "model.evofsm"
 FORMAT = "1"
 # Where there is no state.
-_NONE = -1
+_NO_STATE = -1
 # No chunk is larger than this, unpacked [byte], and no episode's beliefs are more numbers.
 _LARGEST_CHUNK, _MOST_BELIEFS = 1 << 24, 1 << 27
 
@@ -321,5 +321,5 @@ def _column(name: str, field: str, messages: list[dict[str, Any]]) -> NDArray[An
     if kind is str:
         return np.array([str(message[field]) for message in messages], dtype=object)
     if kind is int:
-        return np.array([message.get(field, _NONE) for message in messages], np.int64)
+        return np.array([message.get(field, _NO_STATE) for message in messages], np.int64)
     return np.array([message.get(field, math.nan) for message in messages], np.float64)

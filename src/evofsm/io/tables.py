@@ -78,7 +78,7 @@ _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s":
 # Names of columns are looked for in so many lines; what stands before the last line of a comment.
 _MOST_ABOVE, _COMMENT = 100, re.compile(r"\s*(#|%|//)+\s*")
 # What stands in a field where there is no number.
-_NOTHING = ("", "na", "n/a", "null", "none")
+_MISSING = ("", "na", "n/a", "null", "none")
 # By which a comma is known to be a decimal one; groups of three digits it may separate as well.
 _DECIMAL_COMMA = re.compile(r"\s*-?\d+,(\d\d?|\d{4,})\s*")
 # What no text holds.
@@ -99,7 +99,7 @@ def unit_of(text: str) -> str:
     """
     text = text.strip().strip("[]()<>").replace(" ", "").replace("²", "2").replace("^", "")
     return next(
-        (one for one in (text, text.lower()) if one in UNITS), _SPELT.get(text.lower(), text)
+        (name for name in (text, text.lower()) if name in UNITS), _SPELT.get(text.lower(), text)
     )
 
 
@@ -376,7 +376,7 @@ class Wanted(NamedTuple):
             if values.dtype == polars.String:
                 fields = values.str.strip_chars()
                 values = fields.cast(polars.Float64, strict=False)
-                wrong = values.is_null() & ~fields.fill_null("").str.to_lowercase().is_in(_NOTHING)
+                wrong = values.is_null() & ~fields.fill_null("").str.to_lowercase().is_in(_MISSING)
                 if wrong.any():
                     piece.leave_out(name, wrong.to_numpy())
             piece.numbers[name] = values.cast(polars.Float64).to_numpy()
@@ -459,11 +459,11 @@ class CsvTable(Table):
         self._quoted = re.compile(quoted.encode())
         rows = [_fields(row, self._separator) for row in first]
         told = [unit_of(text) for text in rows[0]] if rows else []
-        if any(one in UNITS for one in told) and not any(map(is_number, told)):
+        if any(u in UNITS for u in told) and not any(map(is_number, told)):
             self.units = dict(zip(self.columns, told, strict=False))
             self._above, rows = self._above + 1, rows[1:]
         self._first_row = rows[0] if rows else []
-        commas = map(_DECIMAL_COMMA.fullmatch, [one for row in rows for one in row])
+        commas = map(_DECIMAL_COMMA.fullmatch, [t for row in rows for t in row])
         self._has_commas = self._separator == ";" or (self._separator == "\t" and any(commas))
         if all(is_number(name) for name in self.columns):
             raise ValueError(
@@ -480,7 +480,7 @@ class CsvTable(Table):
                 best, most = at, there
         if most:
             return best
-        rows = [at for at, one in enumerate(lines) if one.strip() and not _COMMENT.match(one)]
+        rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
         counts = [len(_fields(lines[at], _separator(lines[at]))) for at in rows]
         usual = max(counts, key=counts.count, default=0)  # titles above have fewer fields
@@ -532,8 +532,8 @@ class CsvTable(Table):
                         self.skips.leave_out("row" if why else "comment", place, bool(why))
                     fields = zip(*odd.rows, strict=True) if odd.rows else [()] * len(wanted.all)
                     found = {
-                        name: polars.Series(name, each, polars.String)
-                        for name, each in zip(wanted.all, fields, strict=True)
+                        name: polars.Series(name, texts, polars.String)
+                        for name, texts in zip(wanted.all, fields, strict=True)
                     }
                 if self._has_commas:
                     for name in wanted.numbers:
@@ -720,7 +720,7 @@ def _fields(line: str, separator: str) -> list[str]:
 
 
 def _names(fields: Sequence[str]) -> list[str]:
-    first = [_COMMENT.sub("", one, count=1) for one in fields[:1]]
+    first = [_COMMENT.sub("", text, count=1) for text in fields[:1]]
     return [name.strip() for name in (*first, *fields[1:])]
 
 

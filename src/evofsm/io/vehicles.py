@@ -106,14 +106,14 @@ class PairTable(Table):
                 rows.extend((moment.time, pair.gap, pair.v_follower, pair.v_leader))
                 present[pair.who] = rows
             waiting += len(moment.pairs)
-            for who, rows in open_pairs.items():
+            for names, rows in open_pairs.items():
                 waiting -= len(rows) // 4
-                yield who, _with_actions(rows)
+                yield names, _with_actions(rows)
             open_pairs = present
             if waiting > _MOST_WAITING:
-                yield from ((who, _with_actions(rows)) for who, rows in open_pairs.items())
+                yield from ((names, _with_actions(rows)) for names, rows in open_pairs.items())
                 open_pairs, waiting = {}, 0
-        yield from ((who, _with_actions(rows)) for who, rows in open_pairs.items())
+        yield from ((names, _with_actions(rows)) for names, rows in open_pairs.items())
 
 
 def _with_actions(rows: array[float]) -> NDArray[np.float64]:
@@ -135,7 +135,7 @@ _BYTES_AT_ONCE = 1 << 16
 _LONGEST_TAG, _DEEPEST = 1_000_000, 16
 # A vehicle as wide as SUMO's passenger car [m], where nobody said; who is less aside is in line;
 # and who is that near may be beside by its place in the plane.
-_WIDTH, _IN_LINE, _NEAR = 1.8, 0.4, 20.0
+_USUAL_WIDTH, _IN_LINE, _BESIDE_WITHIN = 1.8, 0.4, 20.0
 # What the parser says where a file ends early.
 _CUT = {expat.errors.XML_ERROR_NO_ELEMENTS, expat.errors.XML_ERROR_UNCLOSED_TOKEN}
 _CUT |= {expat.errors.XML_ERROR_PARTIAL_CHAR}
@@ -157,7 +157,7 @@ class VehicleLengths:
 
     default: float = 5.0
     by_type: dict[str, float] = field(default_factory=dict)
-    widths: dict[str, float] = field(default_factory=lambda: {"": _WIDTH})
+    widths: dict[str, float] = field(default_factory=lambda: {"": _USUAL_WIDTH})
     seen: set[str] = field(default_factory=set, init=False)  #: types met so far
     #: Times that one of a type was not beside, but not in line either, where it overlaps.
     overlaps: Counter[str] = field(default_factory=Counter, init=False)
@@ -238,18 +238,18 @@ def _car(place: Place, told: Mapping[str, str], lengths: VehicleLengths) -> _Car
 
 def _queues(cars: Sequence[_Car], lengths: VehicleLengths) -> Iterator[Following]:
     """Each vehicle and the next one ahead on its lane that is not beside its way."""
-    for place, one in enumerate(cars):
-        for other in cars[place + 1 :]:
-            if other.lane != one.lane:
+    for place, car in enumerate(cars):
+        for leader in cars[place + 1 :]:
+            if leader.lane != car.lane:
                 break
-            aside = abs(other.lateral - one.lateral)
-            if aside != aside and other.along - one.along < _NEAR:
-                aside = float(_across(other.place - one.place, one.heading + other.heading))
-            if not aside >= 0.5 * (one.width + other.width):
-                gap = other.along - other.length - one.along
+            aside = abs(leader.lateral - car.lateral)
+            if aside != aside and leader.along - car.along < _BESIDE_WITHIN:
+                aside = float(_across(leader.place - car.place, car.heading + leader.heading))
+            if not aside >= 0.5 * (car.width + leader.width):
+                gap = leader.along - leader.length - car.along
                 if gap <= 0.0 and aside > _IN_LINE:
-                    lengths.overlaps[other.kind] += 1
-                yield Following((one.lane, one.name, other.name), gap, one.speed, other.speed)
+                    lengths.overlaps[leader.kind] += 1
+                yield Following((car.lane, car.name, leader.name), gap, car.speed, leader.speed)
                 break
 
 
@@ -332,7 +332,7 @@ def fcd_of_table(table: Table) -> Iterator[_Timestep] | None:
     if list(columns) == ["timestep_time"]:  # all that SUMO writes of an empty road
         return iter(())
     whose = [name[:-2] for name in columns if name == "id" or name.endswith("_id")]
-    whose.sort(key=lambda one: (f"{one}lane" not in columns, "vehicle" not in one))
+    whose.sort(key=lambda p: (f"{p}lane" not in columns, "vehicle" not in p))
     prefix = whose[0] if whose else "vehicle_"
     needed = [f"{prefix}{name}" for name in ("id", "lane", "pos", "speed")]
     time = "timestep_time" if prefix or "timestep_time" in columns else "time"
@@ -341,8 +341,8 @@ def fcd_of_table(table: Table) -> Iterator[_Timestep] | None:
     for name in needed:
         if name not in columns:
             _refuse_lack(table.path, name)
-    others = [f"{prefix}{name}" for name in ("type", "posLat", "x", "y", "angle")]
-    names = [*needed, *(name for name in others if name in columns)]
+    optional = [f"{prefix}{name}" for name in ("type", "posLat", "x", "y", "angle")]
+    names = [*needed, *(name for name in optional if name in columns)]
     plain = [name.removeprefix(prefix) for name in names]
     return (
         (at, rows[0][0], [(place, dict(zip(plain, row, strict=True))) for place, *row in rows])
@@ -403,7 +403,7 @@ def _refuse_lack(place: str, name: str) -> NoReturn:
 #: middle of the box; units are those of the SI.
 OBJECT_COLUMNS = ("id", "t", "x", "y", "vx", "vy", "length", "lane")
 # Whoever is slower [m/s] points where it pointed before.
-_STANDING = 0.1
+_TURNS_ABOVE = 0.1
 
 
 class Object(NamedTuple):
@@ -432,15 +432,15 @@ class Scene(NamedTuple):
 
 def scenes_of_table(table: Table) -> Iterator[Scene]:
     """Read a table of objects, whose rows of one time stand together."""
-    others = [name for name in ("heading", "width") if name in table.columns]
+    optional = [name for name in ("heading", "width") if name in table.columns]
     numbers = ["x", "y", "vx", "vy", "length"]
-    for time, rows in _by_time(table, Wanted(["t", *numbers, *others], ["id", "lane"])):
+    for time, rows in _by_time(table, Wanted(["t", *numbers, *optional], ["id", "lane"])):
         with table.skips.leaving_out("scene"):
             objects = []
             for place, *values, name, lane in rows:
                 if not lane:  # whoever follows nobody may lack anything
                     continue
-                given = dict(zip([*numbers, *others], values, strict=True))
+                given = dict(zip([*numbers, *optional], values, strict=True))
                 for column in numbers:
                     if not abs(given[column]) <= LARGEST_OBSERVATION:
                         said = explained(f"{given[column]:g}")
@@ -463,16 +463,16 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
     for scene in scenes:
         lanes: defaultdict[str, list[Object]] = defaultdict(list)
         names = set[str]()
-        for one in scene.objects:
-            if one.id in names:
+        for obj in scene.objects:
+            if obj.id in names:
                 skips.leave_out(
                     "twice",
-                    f"{scene.place()}: {one.id[:40]!r} is there twice at {scene.time:g} s (several "
+                    f"{scene.place()}: {obj.id[:40]!r} is there twice at {scene.time:g} s (several "
                     "recordings in one file?)",
                 )
                 continue
-            names.add(one.id)
-            lanes[one.lane].append(_pointing(one, pointed))
+            names.add(obj.id)
+            lanes[obj.lane].append(_pointing(obj, pointed))
         has_lanes = has_lanes or bool(lanes)
         pairs = [pair for lane in lanes.values() for pair in _following(scene, lane)]
         yield Moment(scene.time, scene.place, pairs)
@@ -483,16 +483,16 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
         )
 
 
-def _pointing(one: Object, pointed: dict[str, float]) -> Object:
+def _pointing(obj: Object, pointed: dict[str, float]) -> Object:
     """The same object with a heading, if it is known from now or before."""
-    heading = one.heading if math.isfinite(one.heading) else math.nan
-    if math.isnan(heading) and math.hypot(one.vx, one.vy) >= _STANDING:
-        heading = math.atan2(one.vy, one.vx)
+    heading = obj.heading if math.isfinite(obj.heading) else math.nan
+    if math.isnan(heading) and math.hypot(obj.vx, obj.vy) >= _TURNS_ABOVE:
+        heading = math.atan2(obj.vy, obj.vx)
     if math.isnan(heading):
-        heading = pointed.get(one.id, math.nan)
+        heading = pointed.get(obj.id, math.nan)
     else:
-        pointed[one.id] = heading
-    return one._replace(heading=heading)
+        pointed[obj.id] = heading
+    return obj._replace(heading=heading)
 
 
 def _following(scene: Scene, lane: Sequence[Object]) -> Iterator[Following]:
@@ -503,15 +503,15 @@ def _following(scene: Scene, lane: Sequence[Object]) -> Iterator[Following]:
         )
     if len(lane) == 1:
         return
-    x, y, headings = np.array([(one.x, one.y, one.heading) for one in lane]).T
+    x, y, headings = np.array([(obj.x, obj.y, obj.heading) for obj in lane]).T
     dx, dy = x[None, :] - x[:, None], y[None, :] - y[:, None]
     along = dx * np.cos(headings)[:, None] + dy * np.sin(headings)[:, None]
-    widths = np.array([one.width for one in lane])
-    widths[~(widths > 0.0)] = _WIDTH
-    others = np.where(np.isnan(headings), headings[:, None], headings)
-    mean = np.exp(1j * headings[:, None]) + np.exp(1j * others)
+    widths = np.array([obj.width for obj in lane])
+    widths[~(widths > 0.0)] = _USUAL_WIDTH
+    filled = np.where(np.isnan(headings), headings[:, None], headings)
+    mean = np.exp(1j * headings[:, None]) + np.exp(1j * filled)
     beside = _across(dx + 1j * dy, mean) >= 0.5 * (widths[:, None] + widths)
-    ahead = (along > 0.0) & ~(beside & (along < _NEAR))
+    ahead = (along > 0.0) & ~(beside & (along < _BESIDE_WITHIN))
     apart = np.where(ahead, np.hypot(dx, dy), np.inf)
     for follower, nearest, distance in zip(lane, apart.argmin(1), apart.min(1), strict=True):
         leader = lane[int(nearest)]

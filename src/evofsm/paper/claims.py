@@ -74,8 +74,8 @@ def _of_states(study: PaperStudy) -> Iterator[Claim]:
         len(set(counts[3:])) == 1 and counts == sorted(counts),
     )
     final = counts[-1]
-    what = "Number of states at the end"
-    yield Claim("states_final", what, str(_STATES), str(final), final == _STATES)
+    text = "Number of states at the end"
+    yield Claim("states_final", text, str(_STATES), str(final), final == _STATES)
 
 
 def _of_the_dead_end(study: PaperStudy) -> Iterator[Claim]:
@@ -97,10 +97,10 @@ def _of_the_dead_end(study: PaperStudy) -> Iterator[Claim]:
         f"{inside} of {len(collisions)}",
         0 < inside == len(collisions),
     )
-    what = "Case 3 leaves the dead end when its driver turns normal"
-    yield Claim("case3_leaves_dead_end", what, "yes", *_change(study, 3, leaves=True))
-    what = "Case 4 comes to the dead end when its driver turns aggressive"
-    yield Claim("case4_enters_dead_end", what, "yes", *_change(study, 4, leaves=False))
+    text = "Case 3 leaves the dead end when its driver turns normal"
+    yield Claim("case3_leaves_dead_end", text, "yes", *_change(study, 3, leaves=True))
+    text = "Case 4 comes to the dead end when its driver turns aggressive"
+    yield Claim("case4_enters_dead_end", text, "yes", *_change(study, 4, leaves=False))
 
 
 def _of_divergence(study: PaperStudy) -> Claim:

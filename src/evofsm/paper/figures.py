@@ -23,12 +23,12 @@ with needs("matplotlib", "plot", "drawing figures"):
 
 #: Width of a figure [inch]: that of a page's text.
 WIDTH = 7.2
-_LEADER: Look = {"color": COLORS["leader"], "linestyle": (0, (4, 1.6))}
+_LEADER_LINE: Look = {"color": COLORS["leader"], "linestyle": (0, (4, 1.6))}
 _FOLLOWER: Look = {"color": COLORS["follower"]}
 # What tints time, and what tints a trajectory.
 _TINT: Look = {"color": COLORS["dead end"], "alpha": 0.09, "linewidth": 0.0, "zorder": 0.4}
 _VEIL: Look = {"color": COLORS["dead end"], "alpha": 0.4, "linewidth": 5.0}
-_END: Look = {"marker": "s", "markerfacecolor": "none", "color": COLORS["ink"]}
+_END_MARK: Look = {"marker": "s", "markerfacecolor": "none", "color": COLORS["ink"]}
 
 
 def figures(study: PaperStudy) -> Iterator[Figure]:
@@ -95,13 +95,13 @@ def draw_case(study: PaperStudy, run: Run) -> Drawn:
     figure.subplots_adjust(left=0.105, right=0.91, top=0.88, bottom=0.07, hspace=0.16)
     gap, speeds, acceleration, state, action = panels
     episode, settings = run.episode, study.settings
-    time, (gaps, own, leaders) = episode.time, episode.observations.T
+    time, (gaps, followers, leaders) = episode.time, episode.observations.T
     gap.plot(time, gaps, color=COLORS["ink"])
     gap.set(ylim=(0.0, 1.08 * gaps.max()), ylabel="gap [m]")
     if episode.collided:
         plot.draw_collision(gap, float(time[-1]), 0.0)
-    speeds.plot(time, own, label="follower", **_FOLLOWER)
-    speeds.plot(time, leaders, label="leader", **_LEADER)
+    speeds.plot(time, followers, label="follower", **_FOLLOWER)
+    speeds.plot(time, leaders, label="leader", **_LEADER_LINE)
     speeds.set_ylim(bottom=0.0)
     speeds.set_ylabel("speed [m/s]")
     speeds.legend(loc="upper left")
@@ -224,18 +224,18 @@ def draw_space(study: PaperStudy) -> Drawn:
     grid[0, 0].set_ylabel("follower's speed [m/s]")
     grid[1, 0].set_ylabel("leader's speed [m/s]")
     looks = {
-        "centre of a state": {**_END, "marker": "o"},
-        "end of a run": _END,
+        "centre of a state": {**_END_MARK, "marker": "o"},
+        "end of a run": _END_MARK,
         "collision": {"marker": "X", "color": COLORS["ink"]},
         "recognised as the dead end": {**_VEIL, "linestyle": "-"},
     }
     handles = [
-        Line2D([], [], label=name, **{"linestyle": "", **one}) for name, one in looks.items()
+        Line2D([], [], label=name, **{"linestyle": "", **look}) for name, look in looks.items()
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=4)
     _letter(grid.flat)
     figure.draw_without_rendering()  # discs need to know where everything is
-    for variable, (row, look) in enumerate(zip(grid, (_FOLLOWER, _LEADER), strict=True), 1):
+    for variable, (row, look) in enumerate(zip(grid, (_FOLLOWER, _LEADER_LINE), strict=True), 1):
         for axes, run in zip(row, study.last_round, strict=True):
             gap = np.maximum(run.episode.observations[:, 0], 0.0)
             speed = run.episode.observations[:, variable]
@@ -245,7 +245,7 @@ def draw_space(study: PaperStudy) -> Drawn:
             if run.episode.collided:
                 plot.draw_collision(axes, float(gap[-1]), float(speed[-1]))
             else:
-                plot.mark(axes, gap[-1], speed[-1], markersize=10, zorder=7, **_END)
+                plot.mark(axes, gap[-1], speed[-1], markersize=10, zorder=7, **_END_MARK)
             centers = study.model.centers[:, (0, variable)]
             plot.draw_centers(axes, centers, study.dead_ends, 8.5)
             axes.set_title(run.name.capitalize() if variable == 1 else "")

@@ -52,7 +52,7 @@ class _Cell(Formatter):
         if isinstance(value, bool):
             return "yes" if value else "no"
         if isinstance(value, list | tuple):
-            return ", ".join(self.format_field(one, spec) for one in value) or NONE
+            return ", ".join(self.format_field(item, spec) for item in value) or NONE
         if not isinstance(value, int | float):
             return str(value)
         if math.isinf(value):
@@ -175,7 +175,7 @@ class Page:
     @property
     def text(self) -> list[str]:
         """The paragraphs below it."""
-        return [" ".join(one.split()) for one in self.about.strip().split("\n\n")[1:]]
+        return [" ".join(part.split()) for part in self.about.strip().split("\n\n")[1:]]
 
     @property
     def holds(self) -> bool | None:
@@ -236,7 +236,7 @@ def write_page(path: Path, pages: Sequence[Page], title: str = "", about: str = 
             for page in pages
         },
         summary=_summary(pages),
-        versions=_versions([one for page in pages for one in page.packages]),
+        versions=_versions([package for page in pages for package in page.packages]),
         date=datetime.now(UTC).date().isoformat(),
     )
     path.write_text(text, encoding="utf-8")
@@ -250,12 +250,12 @@ def _drawn(page: Page, folder: Path) -> dict[str, str]:
     folder.mkdir(parents=True, exist_ok=True)
     images = {}
     with matplotlib.style.context(["default", Path(__file__).with_name("house.mplstyle")]):
-        for one in (part for part in page.parts if isinstance(part, Figure)):
-            figure, svg = one.draw(), folder / f"{one.name}.svg"
+        for item in (part for part in page.parts if isinstance(part, Figure)):
+            figure, svg = item.draw(), folder / f"{item.name}.svg"
             figure.savefig(svg.with_suffix(".png"))
             figure.savefig(svg, metadata={"Date": None})
             text = b64encode(svg.read_bytes()).decode("ascii")
-            images[one.name] = f"data:image/svg+xml;base64,{text}"
+            images[item.name] = f"data:image/svg+xml;base64,{text}"
     return images
 
 

@@ -58,12 +58,12 @@ class Reproduction:
         study = self.study
         world = _WORLDS.get(study.world, study.world)
         held = sum(claim.holds for claim in self.claims)
-        first, *others = figures(study)
+        first, *rest = figures(study)
         targets = pl.DataFrame(self.claims).select("claim", "paper", "measured", "holds")
         return Page(
             name="paper",
             about=_ABOUT,
-            parts=[first, *_tables(study), *others, _table_of_settings(study.settings)],
+            parts=[first, *_tables(study), *rest, _table_of_settings(study.settings)],
             command=command,
             lost=[_table_of_losses(study)],
             targets=targets,
@@ -162,9 +162,9 @@ def divergences(study: PaperStudy) -> pl.DataFrame:
         "uniform": [uniform] * len(CASES),
     }
     found = {_OURS: [run.surprise[1:] for run in study.last_round]}
-    for who, said in simple.items():
+    for name, said in simple.items():
         pairs = zip(said, study.last_round, strict=True)
-        found[who] = [np.asarray(jensen_shannon(one, run.belief[1:])) for one, run in pairs]
+        found[name] = [np.asarray(jensen_shannon(row, run.belief[1:])) for row, run in pairs]
     found[f"{_OURS}, a run's first"] = [np.array([run.first_surprise]) for run in study.last_round]
     found[f"{_OURS}, all rounds"] = [
         np.concatenate([run.surprise[1:] for run in study.runs if run.case == case])
@@ -172,22 +172,22 @@ def divergences(study: PaperStudy) -> pl.DataFrame:
     ]
     return pl.DataFrame(
         {
-            "forecast": who,
-            **{f"case {case}": float(one.max()) for case, one in zip(CASES, by_case, strict=True)},
+            "forecast": name,
+            **{f"case {case}": float(v.max()) for case, v in zip(CASES, by_case, strict=True)},
             "mean": float(np.concatenate(by_case).mean()),
         }
-        for who, by_case in found.items()
+        for name, by_case in found.items()
     )
 
 
 def _table_of_losses(study: PaperStudy) -> Table:
     """Every simple forecast that comes closer than the machine's."""
     found = divergences(study).unpivot(index="forecast", variable_name="where")
-    ours = found.filter(forecast=_OURS).select("where", ours="value")
-    others = found.filter(~pl.col("forecast").str.starts_with(_OURS)).join(ours, on="where")
+    machine = found.filter(forecast=_OURS).select("where", ours="value")
+    better = found.filter(~pl.col("forecast").str.starts_with(_OURS)).join(machine, on="where")
     return Table(
         "Simple forecasts of the next belief that are better than the machine's",
-        others.filter(pl.col("value") < pl.col("ours")),
+        better.filter(pl.col("value") < pl.col("ours")),
         {
             "forecast": "{forecast}",
             "where": "{where}",

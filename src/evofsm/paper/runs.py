@@ -124,7 +124,7 @@ def _merge(known: dict[str, Any], changes: Mapping[str, Any], where: str) -> Non
 
 def _kind(value: Any) -> object:
     if isinstance(value, list):
-        return [*{_kind(one) for one in value}]
+        return [*{_kind(item) for item in value}]
     return float if type(value) is int else type(value)
 
 

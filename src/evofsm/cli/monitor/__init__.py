@@ -113,7 +113,7 @@ def monitor(
     Where nobody acts (--action ''), alarms stand beside plain thresholds: failures foreseen, how
     far ahead, false ones a day. Without --guard the first 60 % of the log are learnt from.
     """
-    if sum(one is not None for one in (file, socket, udp, zenoh)) > 1:
+    if sum(source is not None for source in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
     if traffic and (guard or state or learn):
         raise ValueError("--traffic learns nothing: it goes with no --guard, --state or --learn")
@@ -149,14 +149,14 @@ def monitor(
 
             used = fresh() if guard else None
             alone = reading.keywords["action"] == "" or isinstance(used and used.judge, Foresight)
-            own = used.variables if used else VARIABLES
-            if observe is None or set(split_names(observe)) == set(own):  # in its own order
-                observe = ",".join(f'"{name}"' for name in own)
+            names = used.variables if used else VARIABLES
+            if observe is None or set(split_names(observe)) == set(names):  # in its own order
+                observe = ",".join(f'"{name}"' for name in names)
             asked = reading(observe=observe, episode=episode, **({"action": ""} if alone else {}))
             chunks, interval = _episodes(file, asked, dated=alone)
             if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
-                what = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
-                warn(f"warning: {what} {used.interval:g} s: --resample {used.interval:g}s")
+                text = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
+                warn(f"warning: {text} {used.interval:g} s: --resample {used.interval:g}s")
             if alone:
                 labels = Labels(names=asked.columns.observe.names)
                 wanted = horizon, persist, tolerance
@@ -216,14 +216,14 @@ def _episodes(
 
     noted = Noted()
     episodes = (
-        one for one in episodes_of(reading.traces([str(file)], noted)) if len(one.times) > 1
+        chunk for chunk in episodes_of(reading.traces([str(file)], noted)) if len(chunk.times) > 1
     )
     if (first := next(episodes, None)) is None:
         raise ValueError(f"{file}: no episode has two rows")
 
     def all_of_them() -> Iterator[Chunk]:
-        for one in chain([first], episodes):
-            yield one._replace(times=one.times + noted.began) if dated else one
+        for chunk in chain([first], episodes):
+            yield chunk._replace(times=chunk.times + noted.began) if dated else chunk
         for warning in warnings_of(noted, reading.columns):
             warn(f"warning: {warning}")
 
@@ -291,8 +291,8 @@ def _compile(decider: Decider) -> None:
 
     twin, seen = decider.guard.copy(), np.ones(decider.form.count or 1)
     if decider.form.scenes:
-        own, other = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
-        seen = Scene(own, [other, other._replace(x=-20.0)]).rows(2)
+        ego, car = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
+        seen = Scene(ego, [car, car._replace(x=-20.0)]).rows(2)
     for k in range(4):
         twin.decide(seen + 0.1 * k, None)
     twin.end(observation=seen)

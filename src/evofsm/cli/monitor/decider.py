@@ -176,7 +176,7 @@ class Decider:
         notes = self._notes(row) + self._odd_speeds(row)
         note = {"note": "; ".join(notes)} if notes else {}
         self.n += 1
-        who = {} if row.ahead is None else {"ahead": row.ahead}
+        leader = {} if row.ahead is None else {"ahead": row.ahead}
         if row.observation is None:  # nothing is ahead: whatever is wanted is done
             said = dict.fromkeys(("proposed", "executed", "advised"), plain(row.proposal))
             said |= dict.fromkeys(_RISKS) | {"reason": "nothing is ahead in the lane"}
@@ -195,7 +195,7 @@ class Decider:
         said = {name: plain(known[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
         said |= {"reason": revision.reason, "alarm": self._is_alarm(revision)}
         said |= {"mode": self.mode.value}
-        return self._of("decision", time=row.time, **who, **self._worst(row), **said, **note)
+        return self._of("decision", time=row.time, **leader, **self._worst(row), **said, **note)
 
     def _worst(self, row: Row) -> Answer:
         """Who of a scene the proposal is most dangerous with."""
@@ -293,11 +293,11 @@ def _begins_anew(told: Message, before: Message | None, latest: Message | None) 
 def _refuse_stale(row: Row, latest: Row) -> None:
     """Raise if it is no newer than the latest one, unless its sender began anew."""
     if row.time == latest.time:
-        what = f"{row.time:g} s was decided on before, with other values"
-        raise MessageError("time", what, row.time)
+        text = f"{row.time:g} s was decided on before, with other values"
+        raise MessageError("time", text, row.time)
     if latest.time - _LATE <= row.time < latest.time:
-        what = f"{row.time:g} s comes after {latest.time:g} s: late rows are left out"
-        raise MessageError("time", what, row.time)
+        text = f"{row.time:g} s comes after {latest.time:g} s: late rows are left out"
+        raise MessageError("time", text, row.time)
 
 
 def _accelerating(row: Row, before: Message | None) -> NDArray[np.float64]:
@@ -308,9 +308,9 @@ def _accelerating(row: Row, before: Message | None) -> NDArray[np.float64]:
         step = row.time - before.time
         seen = np.array(_numbers(before.observation)).reshape(-1, len(COLUMNS))
         latest = dict(zip(("", *before.objects), seen[:, _VX].tolist(), strict=False))
-    for name, one in zip(("", *row.objects), rows, strict=False):
-        if math.isnan(one[_AX]):
-            one[_AX] = (one[_VX] - latest[name]) / step if name in latest else 0.0
+    for name, values in zip(("", *row.objects), rows, strict=False):
+        if math.isnan(values[_AX]):
+            values[_AX] = (values[_VX] - latest[name]) / step if name in latest else 0.0
     return rows.ravel()
 
 

@@ -28,11 +28,11 @@ SCHEMA = 1
 #: A longer line is refused unread [byte].
 LONGEST = 1 << 16
 # Objects that a guard of whole scenes has room for; of more the closest along the road count.
-_MOST = 64
+_MOST_OBJECTS = 64
 # So much of what is refused is shown, and so long may a name be [letters].
-_SHOWN = 40
+_LETTERS = 40
 # Where a width is not given [m].
-_WIDTH = 1.8
+_USUAL_WIDTH = 1.8
 
 _Number = Annotated[float, Meta(ge=-LARGEST_OBSERVATION, le=LARGEST_OBSERVATION)]
 _Place = Annotated[float, Meta(ge=PLACES[0], le=PLACES[1])]
@@ -40,7 +40,7 @@ _Speed = Annotated[float, Meta(ge=SPEEDS[0], le=SPEEDS[1])]
 _Rate = Annotated[float, Meta(ge=RATES[0], le=RATES[1])]
 _Size = Annotated[float, Meta(ge=SIZES[0], le=SIZES[1])]
 _Seen = _Number | None
-_Name = Annotated[str, Meta(max_length=_SHOWN)] | Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+_Name = Annotated[str, Meta(max_length=_LETTERS)] | Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 
 
 class MessageError(ValueError):
@@ -85,7 +85,7 @@ class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     y: _Place | UnsetType = UNSET
     lane: _Number | _Name | UnsetType = UNSET
     vy: _Speed = 0.0
-    width: _Size = _WIDTH
+    width: _Size = _USUAL_WIDTH
     ax: _Rate | UnsetType = UNSET
 
 
@@ -165,27 +165,27 @@ class Form:
             )
         ego, along = told.ego, "x" if told.ego.s is UNSET else "s"
         _refuse_nowhere(ego, "ego", along)
-        for k, one in enumerate(told.objects):
+        for k, car in enumerate(told.objects):
             where = f"objects[{k}]"
-            _refuse_nowhere(one, where, along)
-            if one.id is UNSET:
+            _refuse_nowhere(car, where, along)
+            if car.id is UNSET:
                 raise MessageError(f"{where}.id", "is missing; it must be an int or a text")
-            in_lanes = one.lane is not UNSET and ego.lane is not UNSET
-            if not in_lanes and (one.y is UNSET or ego.y is UNSET):
-                what = "is given for it or for ego, but not for both; nor is y"
-                raise MessageError(f"{where}.lane", what)
+            in_lanes = car.lane is not UNSET and ego.lane is not UNSET
+            if not in_lanes and (car.y is UNSET or ego.y is UNSET):
+                fault = "is given for it or for ego, but not for both; nor is y"
+                raise MessageError(f"{where}.lane", fault)
         proposal = _frozen(told.proposal)
         if self.scenes:
-            others = [_object(one, f"objects[{k}]", along) for k, one in enumerate(told.objects)]
-            scene = Scene(_object(ego, "ego", along), others)
-            names = tuple(each.id for each in scene.objects[1 : _MOST + 1])
-            rows = (None if math.isnan(z) else z for z in scene.rows(_MOST).tolist())
+            objects = [_object(car, f"objects[{k}]", along) for k, car in enumerate(told.objects)]
+            scene = Scene(_object(ego, "ego", along), objects)
+            names = tuple(obj.id for obj in scene.objects[1 : _MOST_OBJECTS + 1])
+            rows = (None if math.isnan(z) else z for z in scene.rows(_MOST_OBJECTS).tolist())
             return Row(told.time, tuple(rows), proposal, objects=names)
         ahead = _nearest_ahead(ego, told.objects, along)
         if ahead is None:
             return Row(told.time, None, proposal)
-        gap, one = ahead
-        return Row(told.time, (gap, ego.vx, one.vx), proposal, None if one.id is UNSET else one.id)
+        gap, car = ahead
+        return Row(told.time, (gap, ego.vx, car.vx), proposal, None if car.id is UNSET else car.id)
 
     def _refused(self, line: bytes, kind: Any, error: str) -> MessageError:
         """What msgspec refused, with the key and the value, in a sentence."""
@@ -200,15 +200,15 @@ class Form:
             if found[1] == "missing":
                 return MessageError(about, f"is missing{_missing(about)}", time)
             known = msgspec.structs.fields(_Vehicle if place else kind)
-            names = ", ".join(sorted(one.encode_name for one in known))
-            return MessageError(about[:_SHOWN], f"is not known; known are {names}", time)
+            names = ", ".join(sorted(field.encode_name for field in known))
+            return MessageError(about[:_LETTERS], f"is not known; known are {names}", time)
         value = _shown(_at(told, place))
         if place == "schema":
-            what = f"is {value}; this monitor knows version {SCHEMA} alone"
+            fault = f"is {value}; this monitor knows version {SCHEMA} alone"
         else:
             expected = re.sub("^Expected |, got .*|`", "", text).replace(" | ", " or ")
-            what = f"is {value}; it must be {expected}"
-        return MessageError(place or "line", what, time)
+            fault = f"is {value}; it must be {expected}"
+        return MessageError(place or "line", fault, time)
 
 
 def _action(guard: Guard) -> Any:
@@ -229,24 +229,24 @@ def _frozen(proposal: Any) -> Any:
 # -- Scenes ---------------------------------------------------------------------------------------
 
 
-def _refuse_nowhere(one: _Vehicle, where: str, along: str) -> None:
-    if getattr(one, along) is UNSET:
+def _refuse_nowhere(car: _Vehicle, where: str, along: str) -> None:
+    if getattr(car, along) is UNSET:
         raise MessageError(f"{where}.{along}", "is missing; it must be a finite number")
-    if along == "s" and one.lane is UNSET:
-        what = "is missing: without it s does not say who follows whom"
-        raise MessageError(f"{where}.lane", what)
-    if one.lane is UNSET and one.y is UNSET:
+    if along == "s" and car.lane is UNSET:
+        fault = "is missing: without it s does not say who follows whom"
+        raise MessageError(f"{where}.lane", fault)
+    if car.lane is UNSET and car.y is UNSET:
         raise MessageError(f"{where}.y", "is missing, and so is lane; one of them is needed")
 
 
-def _object(one: _Vehicle, where: str, along: str) -> Object:
+def _object(car: _Vehicle, where: str, along: str) -> Object:
     """An object whose sides are known, so that it is known who is in whose way."""
-    if one.y is UNSET:
+    if car.y is UNSET:
         raise MessageError(f"{where}.y", "is missing; it says who is in whose way")
-    name = where if one.id is UNSET else str(one.id)
-    place: float = getattr(one, along)
-    ax = math.nan if one.ax is UNSET else one.ax
-    return Object(name, place, one.y, one.vx, one.vy, one.length, one.width, ax)
+    name = where if car.id is UNSET else str(car.id)
+    place: float = getattr(car, along)
+    ax = math.nan if car.ax is UNSET else car.ax
+    return Object(name, place, car.y, car.vx, car.vy, car.length, car.width, ax)
 
 
 def _nearest_ahead(
@@ -254,18 +254,18 @@ def _nearest_ahead(
 ) -> tuple[float, _Vehicle] | None:
     """The closest object in the own lane whose middle is ahead, after the gap to it [m]."""
     ahead = [
-        (away - 0.5 * (ego.length + one.length), one)
-        for one in objects
-        if (away := getattr(one, along) - getattr(ego, along)) > 0.0 and _in_lane(ego, one)
+        (away - 0.5 * (ego.length + car.length), car)
+        for car in objects
+        if (away := getattr(car, along) - getattr(ego, along)) > 0.0 and _in_lane(ego, car)
     ]
     return min(ahead, key=itemgetter(0), default=None)
 
 
-def _in_lane(ego: Any, one: Any) -> bool:
+def _in_lane(ego: Any, car: Any) -> bool:
     """Whether it is in the own lane; by their widths where a lane is not given."""
-    if ego.lane is not UNSET and one.lane is not UNSET:
-        return bool(ego.lane == one.lane)
-    return bool(abs(one.y - ego.y) < 0.5 * (ego.width + one.width))
+    if ego.lane is not UNSET and car.lane is not UNSET:
+        return bool(ego.lane == car.lane)
+    return bool(abs(car.y - ego.y) < 0.5 * (ego.width + car.width))
 
 
 # -- What was wrong with a line -------------------------------------------------------------------
@@ -282,8 +282,8 @@ def _parsed(line: bytes) -> dict[str, Any]:
             raise MessageError("line", "is empty") from None
         if found := re.search(rb"-?\b(NaN|Infinity)\b", line):
             name = found[0].decode()
-            what = f"holds {name}, which is no JSON; a number that was not seen is null"
-            raise MessageError("line", what) from None
+            fault = f"holds {name}, which is no JSON; a number that was not seen is null"
+            raise MessageError("line", fault) from None
         kind = "not UTF-8" if isinstance(error, UnicodeDecodeError) else "no JSON"
         raise MessageError("line", f"is {kind}: {error}") from None
     if not isinstance(told, dict):
@@ -320,4 +320,4 @@ def _shown(value: Any) -> str:
         text = json.dumps(value, ensure_ascii=False)
     except (ValueError, RecursionError):  # integers of thousands of digits
         return "something too large to show"
-    return visible(text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}...")
+    return visible(text if len(text) <= _LETTERS else f"{text[: _LETTERS - 3]}...")

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 # A line of more bytes is of another kind of file; one that is longer than a message is refused.
-_LONGEST = 1 << 20
+_LONGEST_MESSAGE = 1 << 20
 # Beside the guard's own tolerance.
-_RISKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+_TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 # So many moments and variables are shown; without an alarm a moment lasts so long [s].
-_WORST, _SHOWN, _MOMENT = 10, 4, 5.0
+_WORST, _MOST_VARIABLES, _MOMENT = 10, 4, 5.0
 
 Answers = Iterable[tuple[Answer, Row | None]]
 
@@ -46,7 +46,7 @@ def decided_on_log(decider: Decider, episodes: Iterable[Chunk]) -> Answers:
 
 def decided_on_lines(decider: Decider, file: Path) -> Answers:
     """The answers to messages; of those that are refused, the error."""
-    for line in lines(file, _LONGEST):
+    for line in lines(file, _LONGEST_MESSAGE):
         answer = decider.answer(line.rstrip(b"\r\n"))
         yield answer, decider.latest if isinstance(decider.latest, Row) else None
 
@@ -93,10 +93,10 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
     if refused:
         pairs.append(("refused", f"{len(refused):,} messages, the first because {refused[0]}"))
     yield facts(title, pairs)
-    own = getattr(decider.guard.reviser, "tolerance", None)
-    known = sorted({*_RISKS, *([] if own is None else [own])})
+    given = getattr(decider.guard.reviser, "tolerance", None)
+    known = sorted({*_TOLERANCES, *([] if given is None else [given])})
     lines = [(f"{risk:g}", *counted(risks > risk)) for risk in known]
-    bold = [place for place, risk in enumerate(known) if risk == own]
+    bold = [place for place, risk in enumerate(known) if risk == given]
     # Whether it would alarm with another tolerance, one pass does not say.
     header = ("above", "times", "an hour", "of the time")
     yield table("\nBy risk of what was proposed", header, lines, bold=bold)
@@ -104,7 +104,7 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
     highest = order[np.unique(moments[order], return_index=True)[1]]
     ranked = np.lexsort((-long[highest], -risks[highest]))[:_WORST]
     names = decider.form.variables or [f"{k + 1}" for k in range(len(rows[0].observation or ()))]
-    names = () if decider.form.scenes else names[:_SHOWN]
+    names = () if decider.form.scenes else names[:_MOST_VARIABLES]
     episodes, worst = np.cumsum(begins), []
     for at in highest[ranked].tolist():
         if risks[at] or alarms[at]:

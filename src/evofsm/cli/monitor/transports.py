@@ -75,8 +75,8 @@ class Server:
         if len(lines) <= _MOST_LINES:
             return self.answer(lines)
         with self._turn:
-            what = f"is one of {len(lines)} at once; at most {_MOST_LINES} may be"
-            return _line(self.decider.error("line", what))
+            fault = f"is one of {len(lines)} at once; at most {_MOST_LINES} may be"
+            return _line(self.decider.error("line", fault))
 
     def run(self, transport: Transport) -> None:
         """Serve until the input ends, or SIGTERM, SIGHUP or Ctrl-C comes; no decision is cut short.
@@ -118,14 +118,14 @@ def _stoppable() -> Iterator[None]:
     """Let signals end it; what whoever started it let it ignore, as nohup does, it ignores."""
     names = ("SIGTERM", "SIGINT", "SIGHUP")
     signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    signals = [one for one in signals if signal.getsignal(one) is not signal.SIG_IGN]
-    before = {one: signal.signal(one, signal.default_int_handler) for one in signals}
+    signals = [number for number in signals if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, signal.default_int_handler) for number in signals}
     try:
         with suppress(KeyboardInterrupt):
             yield
     finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _line(answer: Answer) -> bytes:
@@ -138,7 +138,7 @@ class Stream:
 
     def __init__(self, source: Any, sink: Any) -> None:
         # A buffer that a thread waits in would not let the process end.
-        self._source, self._sink = (getattr(one, "raw", one) for one in (source, sink))
+        self._source, self._sink = (getattr(file, "raw", file) for file in (source, sink))
         self._writing = threading.Lock()
 
     def serve(self, server: Server) -> None:
@@ -267,9 +267,9 @@ class UdpTransport:
 
     def send(self, line: bytes) -> None:
         """Send each line to who sent the latest."""
-        for one in line.splitlines(keepends=True) if self._sender else ():
+        for part in line.splitlines(keepends=True) if self._sender else ():
             with suppress(OSError):
-                self._socket.sendto(one, self._sender)
+                self._socket.sendto(part, self._sender)
 
     def close(self) -> None:
         """Let others have the port."""
@@ -311,8 +311,8 @@ class ZenohTransport:
 
     def send(self, line: bytes) -> None:
         """Publish each line."""
-        for one in line.splitlines():
-            self._publisher.put(one)
+        for part in line.splitlines():
+            self._publisher.put(part)
 
     def close(self) -> None:
         """Leave the network."""

@@ -86,7 +86,7 @@ def watch(
     """
     require(websockets="watch")
     is_log, usual = _is_log(what), signature(reading_of).parameters
-    given = (name for name, one in reading.keywords.items() if one not in (usual[name].default, []))
+    given = (name for name, v in reading.keywords.items() if v not in (usual[name].default, []))
     if not is_log and any(given):
         raise ValueError(f"options of columns are for a log, and {what} is none")
     read = reading() if is_log else None

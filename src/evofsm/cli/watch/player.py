@@ -54,7 +54,7 @@ class Player:
     ) -> None:
         if speed is None:  # real time, but no more decisions in a second than can be followed
             pace = min(1.0, _FOLLOWED * watched.start.interval)
-            speed = max((one for one in SPEEDS if one <= pace), default=SPEEDS[0])
+            speed = max((rate for rate in SPEEDS if rate <= pace), default=SPEEDS[0])
         self._watched, self._audience, self._awaits = watched, audience, awaits
         self._paused, self._speed, self._over = paused, speed, False
         self._steps = False  # once, although it is paused

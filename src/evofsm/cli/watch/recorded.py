@@ -50,9 +50,9 @@ _IDLE = {
 }
 _ACTIONS = ("proposed", "executed", "advised")
 _PASSED = "the guard was not shown to help, so what was proposed passed"
-_NONE = -1
+_NO_STATE = -1
 # Accelerations that differ by less are the same [m/s²].
-_SAME = 0.05
+_SAME_ACCEL = 0.05
 # So much is played before what an episode of a log is worth a look for [s].
 _BEFORE = 10.0
 # Whoever wants to see something needs as many.
@@ -73,18 +73,16 @@ class Recording:
     ) -> None:
         self._run: Run = read_run(path)
         self._name = self._run.about.get("source", Path(path).name)
-        self._episodes = [one for one in self._run.episodes if len(one.columns["time"])]
+        self._episodes = [e for e in self._run.episodes if len(e.columns["time"])]
         if not self._episodes:
             raise ValueError(f"{path} holds no episode with a decision")
-        self._fails = ["Collision" * one.collided for one in self._episodes]
+        self._fails = ["Collision" * e.collided for e in self._episodes]
         self._names = [f"episode {k + 1}" for k in range(len(self._episodes))]
         self._order = list(range(len(self._episodes)))
         self._jumps = bool(stretches)
         if stretches:
             self._fails = [fails for _, fails in stretches]
-            risks = [
-                float(np.nanmax([0.0, *one.columns["risk_proposed"]])) for one in self._episodes
-            ]
+            risks = [float(np.nanmax([0.0, *e.columns["risk_proposed"]])) for e in self._episodes]
             self._order.sort(key=lambda k: (not self._fails[k], -risks[k]))
             self._names = [
                 f"{name} ({fails.partition(' ')[0].lower() or f'risk {risk:.1%}'})"
@@ -106,7 +104,7 @@ class Recording:
         self.start = self._begun(case)
         # Where it acts, what is executed is what it advises; else a proposal that can be executed.
         columns = self._episode.columns
-        passed = (np.abs(columns["advised"] - columns["executed"]) > _SAME).any()
+        passed = (np.abs(columns["advised"] - columns["executed"]) > _SAME_ACCEL).any()
         idle = _IDLE.get(self._mode, _PASSED if passed else "")
         chronicle, self._frames = Chronicle(self.start.tolerance), list[Frame]()
         for number, frame in enumerate(_moved(self._episode, idle)):
@@ -174,17 +172,17 @@ class Recording:
         executed = Judged(*map(float, (row["risk_executed"], row["risk_low"], row["risk_high"])))
         risk = float(row["risk_proposed"])
         proposed, executes, advised = (float(row[name]) for name in _ACTIONS)
-        revised = not frame.idle and abs(executes - proposed) > _SAME
+        revised = not frame.idle and abs(executes - proposed) > _SAME_ACCEL
         return frame._replace(
             proposed=(proposed,),
             executed=(proposed if frame.idle else executes,),
             advised=(advised,),
             revised=revised,
-            advises=revised or abs(advised - executes) > _SAME,
+            advises=revised or abs(advised - executes) > _SAME_ACCEL,
             reason=str(row["reason"]),
             explanation=str(row["explanation"]),
             belief=most_believed(row["belief"]),
-            state=None if row["state"] == _NONE else int(row["state"]),
+            state=None if row["state"] == _NO_STATE else int(row["state"]),
             # The log has the interval of what was executed only.
             proposed_risk=executed if risk == executed.risk else Judged(risk),
             executed_risk=executed,

@@ -97,7 +97,7 @@ class LivePage:
         self._clients: set[ServerConnection] = set()
         self._start: Start | None = None
         found = (files(__package__) / "live").iterdir()
-        self._files = {one.name: one.read_bytes() for one in found}
+        self._files = {file.name: file.read_bytes() for file in found}
 
     @property
     def address(self) -> str:
@@ -145,7 +145,7 @@ class LivePage:
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The files of the page; None lets a socket be opened."""
         token, _, name = request.path.removeprefix("/").partition("/")
-        hosts, origins = (request.headers.get_all(each) for each in ("Host", "Origin"))
+        hosts, origins = (request.headers.get_all(header) for header in ("Host", "Origin"))
         if len(hosts) != 1 or not _OWN.fullmatch(hosts[0]):
             return _refusal(HTTPStatus.FORBIDDEN, _FOREIGN.format(self.port))
         if not hmac.compare_digest(token.encode(), self.token.encode()):

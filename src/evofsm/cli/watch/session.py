@@ -68,12 +68,12 @@ WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
 # What can be chosen among where there are no cases.
 _DRAWS = tuple(f"draw {number}" for number in range(1, 13))
 # After a leader's full brake there is nothing left to see once all have stood for so long [s].
-_STANDING = 3.0
+_STOOD = 3.0
 # Steps of an environment in a second where it does not say; wishes that are tolerable for so many
 # decisions are no danger any more.
 _STEPS_PER_SECOND, _CALM = 10.0, 8
 # A change of an action by less is none [half ranges].
-_SAME = 0.02
+_SAME_ACTION = 0.02
 # So many episodes in a row without a failure tell that a guard has learnt.
 _LASTED = 10
 # An environment that does not end by itself is left after so many decisions, where nobody looks on.
@@ -86,11 +86,11 @@ _LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
 # What a file may define besides its environment.
 _PARTS = ("controller", "failed", "variables")
 # Of more variables only those of the plane are named.
-_FEW = 4
+_FEW_VARIABLES = 4
 # What Gymnasium's documentation calls the variables of its environments, with units.
 _LEG = "hip {0} angle [rad], hip {0} speed, knee {0} angle [rad], knee {0} speed, foot {0} contact"
 _LANDER = "x, y, speed x, speed y, angle [rad], angular velocity, left contact, right contact"
-_NAMES = {
+_ENV_NAMES = {
     "CartPole": "cart position [m], cart velocity [m/s], pole angle [rad], "
     "pole angular velocity [rad/s]",
     **dict.fromkeys(("MountainCar", "MountainCarContinuous"), "position [m], velocity"),
@@ -101,7 +101,7 @@ _NAMES = {
     "BipedalWalker": "hull angle [rad], hull angular velocity, speed x, speed y, "
     + ", ".join([_LEG.format(1), _LEG.format(2), *(f"lidar {k}" for k in range(1, 11))]),
 }
-_NAMES["BipedalWalkerHardcore"] = _NAMES["BipedalWalker"]
+_ENV_NAMES["BipedalWalkerHardcore"] = _ENV_NAMES["BipedalWalker"]
 
 
 def watched_guard(family: Family, **settings: Any) -> Guard:
@@ -166,7 +166,7 @@ class OnRoads:
     def _look(self) -> None:
         road = self._road
         self.observation, self.time, self.failed = road.observation, road.time, road.collided
-        self.over = road.over or self._stood >= _STANDING
+        self.over = road.over or self._stood >= _STOOD
         self.terminated = road.collided or road.rear_ended
 
     def propose(self) -> Action:
@@ -237,8 +237,8 @@ class Simulated:
         fails = "what its file says" if failed else "an episode that is terminated"
         self.about = f"{acts} drives it; failure is {fails}."
         ends = _ends(name, env.action_space)
-        named = [each.partition(" [") for each in variables or _names_of(env)]
-        names, units = [one[0] for one in named], [one[2].rstrip("]") for one in named]
+        named = [text.partition(" [") for text in variables or _names_of(env)]
+        names, units = [parts[0] for parts in named], [parts[2].rstrip("]") for parts in named]
         judge = LearntRisk(self.interval, **ends, names=names, units=units, seed=seed)
         made = Guard(**ends, interval=self.interval, judge=judge, tolerance=tolerance)
         spaces = env.observation_space, env.action_space
@@ -321,7 +321,7 @@ class Simulated:
 
 def _names_of(env: Any) -> list[str]:
     """Of an environment's variables, with their units, where it is one that is known."""
-    known = _NAMES.get(env.spec.id.partition("-v")[0], "").split(", ") if env.spec else []
+    known = _ENV_NAMES.get(env.spec.id.partition("-v")[0], "").split(", ") if env.spec else []
     return known if (len(known),) == env.observation_space.shape else []
 
 
@@ -352,8 +352,8 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
                 if "family" in found:
                     return None
                 raise ValueError("it defines neither environment() nor a Family called family")
-            own = {name: found[name] for name in _PARTS if name in found}
-            return Simulated(Path(what).stem, found["environment"](), **own, **settings)
+            parts = {name: found[name] for name in _PARTS if name in found}
+            return Simulated(Path(what).stem, found["environment"](), **parts, **settings)
         except Exception as error:  # of somebody's own
             raise ValueError(f"{what}: {type(error).__name__}: {error}") from error
     if not re.search(r"-v\d+$", what):
@@ -450,9 +450,9 @@ class Session(AbstractContextManager["Session"]):
     def _place(self, center: NDArray[np.float64]) -> str:
         """Where an observation lies, in words; of many variables by two."""
         labels = self.system.labels
-        if len(center) > _FEW:
+        if len(center) > _FEW_VARIABLES:
             two = list(self.known().plane)
-            names, units = (tuple(each[k] for k in two if each) for each in labels[1:3])
+            names, units = (tuple(texts[k] for k in two if texts) for texts in labels[1:3])
             labels, center = Labels(names=names, units=units, dt=labels.dt), center[two]
         return labels.place(center)
 
@@ -482,7 +482,7 @@ class Session(AbstractContextManager["Session"]):
         situation, judged = guard.situation, self._judged
         self.system.advance(revision)
         numbered = zip(judged.risk, judged.low, judged.high, judged.critical, strict=True)
-        wished, done, best = (Judged(*map(float, each)) for each in numbered)
+        wished, done, best = (Judged(*map(float, values)) for values in numbered)
         return frame._replace(
             belief=most_believed(situation.belief),
             state=situation.state,
@@ -492,8 +492,8 @@ class Session(AbstractContextManager["Session"]):
             proposed=numbers(revision.proposed),
             executed=numbers(revision.executed),
             advised=numbers(revision.advised),
-            revised=change(guard.actions, self._wanted, revision.executed) > _SAME,
-            advises=change(guard.actions, self._wanted, revision.advised) > _SAME,
+            revised=change(guard.actions, self._wanted, revision.executed) > _SAME_ACTION,
+            advises=change(guard.actions, self._wanted, revision.advised) > _SAME_ACTION,
             reason=revision.reason,
             explanation=revision.explanation,
             **self._needed(judged),

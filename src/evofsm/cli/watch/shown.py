@@ -193,7 +193,7 @@ def graph_of(
     """
     marked = [ended > 0.5 for ended in known.endings.tolist()]
     if isinstance(judge, LatentRisk):
-        marked = [one.is_dead_end for one in assess_states(known, judge)]
+        marked = [state.is_dead_end for state in assess_states(known, judge)]
     centers = known.centers
     where = map(place, centers), map(tuple, centers.tolist())
     states = map(StateShown, range(known.n_states), *where, known.visits.tolist(), marked)

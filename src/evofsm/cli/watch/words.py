@@ -12,7 +12,7 @@ from evofsm.fsm.validation import action_name, counted
 from evofsm.guard.actions import action_text
 
 # Changes of speed that are smaller are "at the same speed" [m/s], and softer accelerations none.
-_EQUAL, _HARDLY = 0.5, 0.3
+_EQUAL_SPEED, _HARDLY = 0.5, 0.3
 # What the reviser does in a run, or did in one that was recorded, by its mode.
 _REVISER = "This was recorded. The reviser, a safety filter,"
 _INTRODUCED = {
@@ -37,7 +37,7 @@ _HEADLINES = {
 }
 # Where the judge was told how leaders brake.
 _OF_LEADERS = {"dead end": "Dead end, if the leader brakes hard now"}
-_FIRST = "A guard cannot prevent the first failure of a kind; this one is learnt now"
+_FIRST_FAILURE = "A guard cannot prevent the first failure of a kind; this one is learnt now"
 
 
 class Told(NamedTuple):
@@ -82,7 +82,7 @@ def tell(frame: Frame, start: Start) -> Told:
         done += " The controller alone would have lasted longer."
     if frame.novel:
         headline += ", the first of its kind"
-        done += f" {_FIRST}: {frame.novel}."
+        done += f" {_FIRST_FAILURE}: {frame.novel}."
     told = status, headline, when, why, done, _outcome(frame, start), _alone(frame)
     return Told(*(_UNIT.sub("\u00a0", text) for text in told))
 
@@ -137,10 +137,10 @@ def _when(story: Story, danger: Danger, knows_leaders: bool) -> str:
         return f"{text}; it was over {'at once' if began == last else f'at {last}'}."
     if math.isnan(danger.dead_end):
         return f"{text}."
-    what = "nothing that it knows to do would most likely have been enough"
+    reason = "nothing that it knows to do would most likely have been enough"
     if knows_leaders:
-        what = "if the leader braked hard, even braking in full at once would come too late"
-    return f"{text}. From {_seconds(danger.dead_end)} on it was a dead end: {what}."
+        reason = "if the leader braked hard, even braking in full at once would come too late"
+    return f"{text}. From {_seconds(danger.dead_end)} on it was a dead end: {reason}."
 
 
 def _why(began: Frame, start: Start) -> str:
@@ -151,7 +151,7 @@ def _why(began: Frame, start: Start) -> str:
     else:
         closing = cars.v_follower - cars.v_leader
         pace = f"{abs(closing):.1f} m/s {'faster' if closing > 0.0 else 'slower'} than it"
-        if abs(closing) <= _EQUAL:
+        if abs(closing) <= _EQUAL_SPEED:
             pace = "as fast as it"
         at = f"{cars.gap:.1f} m behind the leader at {cars.v_follower:.0f} m/s, {pace}"
         wanted = f"{at}, the driver wanted {_wish(began.proposed[0])}"
@@ -243,10 +243,10 @@ def _alone(frame: Frame) -> str:
     as_alone = frame.failed and math.isclose(alone, frame.time)
     if not math.isfinite(alone) or as_alone or frame.time == 0.0:
         return ""
-    who, fails, failed = "The controller alone", "would fail", "would have failed"
+    driver, fails, failed = "The controller alone", "would fail", "would have failed"
     if frame.cars:
-        who, fails, failed = "This driver", "would hit the leader", "would have hit the leader"
-    return f"{who} {failed if frame.time >= alone else fails} at {_seconds(alone)}."
+        driver, fails, failed = "This driver", "would hit the leader", "would have hit the leader"
+    return f"{driver} {failed if frame.time >= alone else fails} at {_seconds(alone)}."
 
 
 def _seconds(time: float) -> str:

@@ -61,10 +61,10 @@ def fitted(state: State, model: Model, backup: Callable[[Floats], Floats]) -> St
     z = state.survived[::every]
     x = np.column_stack([np.ones(len(z)), (z - model.mean) * model.inverse])
     weights, *_ = np.linalg.lstsq(x, np.array([backup(row) for row in z]), rcond=None)
-    others = state.linear != 2.0
+    rest = state.linear != 2.0
     return state._replace(
-        policies=np.concatenate([weights.T[None], state.policies[others]]),
-        linear=np.append(2.0, state.linear[others]),
+        policies=np.concatenate([weights.T[None], state.policies[rest]]),
+        linear=np.append(2.0, state.linear[rest]),
     )
 
 
@@ -89,34 +89,34 @@ def evolved(
     random: np.random.Generator,
 ) -> tuple[Floats, Floats]:
     """Backups that are worth more, in the order in which they are asked."""
-    policies, each = policies.copy(), residuals.shape[2]
+    policies, n_disturbances = policies.copy(), residuals.shape[2]
 
     def worth(policy: Floats) -> Floats:
         """(S,) how well it ends in each situation, in the mean of all disturbances."""
         found = rollout(model, situations, policy, residuals, scale).worth
-        return np.asarray(found.reshape(-1, each).mean(1))
+        return np.asarray(found.reshape(-1, n_disturbances).mean(1))
 
     values = np.array([worth(policy) for policy in policies])
-    those = np.flatnonzero(linear == 1.0)
+    parents = np.flatnonzero(linear == 1.0)
     shape, m = policies.shape[1:], len(model.origin)
     variables, flips = basis((situations[:, :m] - model.mean) * model.inverse)
     actions, turns = basis(situations[:, 2 * m :], model.choices)
-    own = np.ix_(np.argsort(actions), np.argsort(np.append(0, 1 + variables)))
+    cells = np.ix_(np.argsort(actions), np.argsort(np.append(0, 1 + variables)))
     signs = np.append(1.0, flips) * turns[:, None]
-    for _ in range(settings.n_mutants if len(those) else 0):
-        parent = those[values[those].mean(1).round(_ROUNDED).argmax()]
+    for _ in range(settings.n_mutants if len(parents) else 0):
+        parent = parents[values[parents].mean(1).round(_ROUNDED).argmax()]
         if random.random() >= _OF_BEST:
             parent = int(random.integers(len(policies)))
         size = 10.0 ** random.uniform(*_SIZES)
         drawn = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
-        child = policies[parent] + drawn[own] * signs
+        child = policies[parent] + drawn[cells] * signs
         reached = worth(child)
-        tried = np.repeat(values[None], 1 + len(those), 0)  # as they are, and with the child
-        tried[1 + np.arange(len(those)), those] = reached
+        tried = np.repeat(values[None], 1 + len(parents), 0)  # as they are, and with the child
+        tried[1 + np.arange(len(parents)), parents] = reached
         together = tried.max(1).mean(1) + _BY_ITSELF * tried.mean(2).sum(1)
         best = int(together.round(_ROUNDED).argmax())  # of equals the first: nothing changes
         if best:
-            policies[those[best - 1]], values[those[best - 1]] = child, reached
+            policies[parents[best - 1]], values[parents[best - 1]] = child, reached
     left, most, order = list(range(len(values))), np.full(values.shape[1], -1.0), []
     while left:  # first the one that is worth most, then whichever adds most
         adds = np.maximum(values[left] - most, 0.0).mean(1)

@@ -18,16 +18,16 @@ from evofsm.guard.learnt.state import Episode, LearntSettings, State, sizes
 
 # Episodes of which the end tells where there are any; observations so near the last one [typical
 # steps] cannot be told from it.
-_ENDED, _SAME = 2, 0.5
+_ENDED, _SAME_PLACE = 2, 0.5
 # Dead ends: how near an old one counts once more, how far new ones are apart and their first
 # radius [spreads]; share of the way to what was survived; how many at most.
-_NEAR, _APART, _WAY, _MAX_ENDS = 0.6, 0.15, 0.9, 40
+_LARGEST_RADIUS, _APART, _WAY, _MAX_ENDS = 0.6, 0.15, 0.9, 40
 # Survived rows that are compared, the latest, of which each so many-th; and of an episode that was
 # cut off the last ones, of which it is not known that they were survived.
 _MAX_ROWS, _EACH, _UNPROVEN = 6000, 4, 20
 # Where failure is given as a function: directions in which it is looked for, how far [spreads],
 # halvings to its edge, and how far beyond that it is asked once more.
-_RAYS, _HALVINGS, _DEEP = 64, 40, 0.05
+_RAYS, _EDGE_HALVINGS, _DEEP = 64, 40, 0.05
 _RADII = tuple(0.1 * 1.3**k for k in range(20))
 
 
@@ -45,7 +45,7 @@ def fails(
     rows = rows[np.isfinite(rows).all(1)]
     most, went_on = settings.max_failures, rows
     if episode.terminated and len(rows):
-        far = (np.abs(rows - rows[-1]) > _SAME * sizes(state).unit).any(1)
+        far = (np.abs(rows - rows[-1]) > _SAME_PLACE * sizes(state).unit).any(1)
         went_on = rows[: int(np.flatnonzero(far).max(initial=-1)) + 1]
         state = state._replace(ended=np.vstack([state.ended, rows[-1]])[-most:])
     if len(went_on):
@@ -141,7 +141,7 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
         near = 0.0
         for far in _RADII:
             if given(z + far * off):
-                for _ in range(_HALVINGS):
+                for _ in range(_EDGE_HALVINGS):
                     half = 0.5 * (near + far)
                     near, far = (near, half) if given(z + half * off) else (half, far)
                 deep = far + _DEEP
@@ -176,16 +176,16 @@ def dead_ends(state: State, known: Model, z: Floats, episode: Episode) -> State:
     rows = z[held[-1] + 1 :] if len(held) else z[:0]
     rows = rows[np.isfinite(rows).all(1)]
     if len(rows):
-        counts = counts + (_between(rows, centres, inverse) < _NEAR).any(0)
+        counts = counts + (_between(rows, centres, inverse) < _LARGEST_RADIUS).any(0)
         n = len(centres)
         for row in rows:
             far = _between(row[None], centres, inverse)[0]
             if far.min(initial=np.inf) >= _APART:
-                count = counts[:n][far[:n] < _NEAR].max(initial=1.0)
+                count = counts[:n][far[:n] < _LARGEST_RADIUS].max(initial=1.0)
                 centres, counts = np.vstack([centres, row]), np.append(counts, count)
     if not len(centres):
         return state
-    radii = np.minimum(_NEAR, _APART * 2.0 ** (np.minimum(counts, 9.0) - 1.0))
+    radii = np.minimum(_LARGEST_RADIUS, _APART * 2.0 ** (np.minimum(counts, 9.0) - 1.0))
     went_on = state.survived  # of the latest episode it is not known how it went on
     if not episode.terminated:
         latest = int((state.survived_in == state.n_episodes).sum())
@@ -193,11 +193,11 @@ def dead_ends(state: State, known: Model, z: Floats, episode: Episode) -> State:
     far = _between(centres, went_on[-_MAX_ROWS::_EACH], inverse)
     radii = np.minimum(radii, _WAY * far.min(1, initial=np.inf))
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2)))
-    left = np.flatnonzero(radii > _SAME * typical)
+    left = np.flatnonzero(radii > _SAME_PLACE * typical)
     left = np.sort(left[np.argsort(-counts[left], kind="stable")[:_MAX_ENDS]])
     return state._replace(centres=centres[left], radii=radii[left], counts=counts[left])
 
 
-def _between(some: Floats, others: Floats, inverse: Floats) -> Floats:
+def _between(a: Floats, b: Floats, inverse: Floats) -> Floats:
     """(k, n) distances of (k, m) and (n, m), in spreads."""
-    return np.asarray(np.sqrt((((some[:, None] - others) * inverse) ** 2).sum(2)))
+    return np.asarray(np.sqrt((((a[:, None] - b) * inverse) ** 2).sum(2)))

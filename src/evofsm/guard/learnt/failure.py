@@ -29,16 +29,16 @@ SAYS, I, J, AT, TO, ONE, OTHER, C, B, D, P, Q, R, HELD = range(SIZE)
 # Bent forms at most; a failure so near one [typical steps] is in it, as it is known no better.
 _MAX_FORMS, BLUR = 8, 0.5
 # A side that explains fewer failures, or a smaller share of them, may be challenged.
-_FEW, _SHARE = 3, 0.25
+_FEW_FAILURES, _SHARE = 3, 0.25
 # So many failures may leave two sides undecided.
-_FIRST = 2
+_MOST_UNDECIDED = 2
 # Beyond an end is what is so many typical steps beyond; blurred ends are so wide [scales].
 _BEYOND, _BLURRED = 1e-12, 5.0
 # Survived observations of a fit; steps of Newton, and the ridge for each of them.
-_NEAR, _NEWTON, _RIDGE = 400, 40, 1e-9
+_FIT_ROWS, _NEWTON, _RIDGE = 400, 40, 1e-9
 # Fits of what explains failures with more likelihood than this each; how many survived ones that
 # are wrongly inside are added.
-_FITS, _UNLIKELY, _WORST = 3, 2.0, 100
+_REFITS, _UNLIKELY, _WORST = 3, 2.0, 100
 # Variables of which all pairs are tried; pairs of which two forms are, and rounds of dealing
 # failures out between two.
 _SCREENED, _IN_TWO, _ROUNDS = 6, 3, 3
@@ -67,8 +67,8 @@ class Survived(NamedTuple):
 def forms(table: Floats, z: Floats) -> tuple[Floats, Floats]:
     """(r, n) the forms of a table (r, SIZE) at observations (n, m), and lengths of gradients."""
     i, j = table[:, [I, J]].T.astype(int)
-    at, to, one, other, c, b, d, p, q, r = table[:, AT:HELD, None].transpose(1, 0, 2)
-    x, y = (z.T[i] - at) * one, (z.T[j] - to) * other
+    at, to, inv_x, inv_y, c, b, d, p, q, r = table[:, AT:HELD, None].transpose(1, 0, 2)
+    x, y = (z.T[i] - at) * inv_x, (z.T[j] - to) * inv_y
     slope = (b + 2.0 * p * x + q * y) ** 2 + (d + 2.0 * r * y + q * x) ** 2
     return c + x * (b + p * x + q * y) + y * (d + r * y), np.sqrt(slope + FLAT)
 
@@ -142,30 +142,30 @@ def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
     """
     rows: list[Floats] = []
     for row, is_side, holds in zip(table, are_sides(table), inside(table, failures), strict=True):
-        own = failures[holds]
-        if row[SAYS] != FAILS or not len(own) or not len(survived.rows):
+        held = failures[holds]
+        if row[SAYS] != FAILS or not len(held) or not len(survived.rows):
             rows.append(row)
         elif is_side:
-            rows += _as_failed(row, own, survived)
+            rows += _as_failed(row, held, survived)
         else:
-            rows += _ellipses(row, own, survived)
+            rows += _ellipses(row, held, survived)
     return np.array(rows).reshape(-1, SIZE)
 
 
-def _ellipses(row: Floats, own: Floats, survived: Survived) -> list[Floats]:
+def _ellipses(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
     """The smallest one around failures that a form holds, without what was survived.
 
     Where that lies among them it is the nearest circle, in standard deviations, that lies inwards
     of them; or else each half of them has its own.
     """
     pair = row[[I, J]].astype(int)
-    unit, centre, one = survived.unit[pair], own[:, pair].mean(0), row[ONE:C]
-    X, Y = (centre - row[AT:ONE]) * one
+    unit, centre, inverse = survived.unit[pair], held[:, pair].mean(0), row[ONE:C]
+    X, Y = (centre - row[AT:ONE]) * inverse
     slope = np.array([row[B] + 2 * row[P] * X + row[Q] * Y, row[D] + 2 * row[R] * Y + row[Q] * X])
     wide = survived.spread[pair] / unit
-    inwards = slope * one * unit * wide
+    inwards = slope * inverse * unit * wide
     inwards *= wide / (np.linalg.norm(inwards) + 1e-300)
-    x, y = ((rows[:, pair] - centre) / unit for rows in (own, survived.rows))
+    x, y = ((rows[:, pair] - centre) / unit for rows in (held, survived.rows))
     around = np.linalg.inv(2.0 * x.T @ x / len(x) + np.eye(2))
     for off in (0.0, *_INWARDS):
         shape = np.diag(wide**-2.0) if off else around
@@ -179,23 +179,23 @@ def _ellipses(row: Floats, own: Floats, survived: Survived) -> list[Floats]:
             new[AT:ONE], new[ONE:C] = centre + off * inwards * unit, 1.0 / unit
             new[C:HELD] = size, 0.0, 0.0, -shape[0, 0], -2.0 * shape[0, 1], -shape[1, 1]
             return [new]
-    mine = _split(x / wide)
-    if mine.all():
+    first = _split(x / wide)
+    if first.all():
         return [row]
-    return [form for half in (mine, ~mine) for form in _ellipses(row, own[half], survived)]
+    return [form for half in (first, ~first) for form in _ellipses(row, held[half], survived)]
 
 
-def _as_failed(row: Floats, own: Floats, survived: Survived) -> list[Floats]:
+def _as_failed(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
     """That it ends beyond a threshold, and fails only as it did; or the threshold as it is."""
     ended = survived.ended[inside(row[None], survived.ended)[0]]
     if len(ended):
-        crashes = crashing(own, ended, survived, int(row[I]))
+        crashes = crashing(held, ended, survived, int(row[I]))
         end = row.copy()
         end[SAYS] = ENDS
-        return [end, *halfway(crashes, own)] if len(crashes) else [row]
+        return [end, *halfway(crashes, held)] if len(crashes) else [row]
     i, unit, rows = int(row[I]), survived.unit, survived.rows
-    low, high, centre = own.min(0) - BLUR * unit, own.max(0) + BLUR * unit, np.median(rows, 0)
-    off = (np.abs(own - centre).min(0) - BLUR * unit).clip(0.0)
+    low, high, centre = held.min(0) - BLUR * unit, held.max(0) + BLUR * unit, np.median(rows, 0)
+    off = (np.abs(held - centre).min(0) - BLUR * unit).clip(0.0)
     share = np.array([rows >= low, rows <= high, np.abs(rows - centre) >= off]).mean(1)
     share[:, (survived.spread == 0.0) | (np.arange(len(unit)) == i)] = np.inf
     end = row.copy()
@@ -270,14 +270,14 @@ def explain(
     by, k = inside(stay, failures), len(failures)
     if not bends or by.any(0).all() or not len(survived.rows) or not k:
         return _counted(stay, failures)
-    strong = by.sum(1) >= max(_FEW, _SHARE * k)
+    strong = by.sum(1) >= max(_FEW_FAILURES, _SHARE * k)
     bent, _ = _bent(says, failures[by[strong].sum(0) == 0], survived)
     if strong.any():
         alone, whole = _bent(says, failures, survived, len(bent) + int(strong.sum()))
         if whole:
             bent, strong = alone, np.zeros(len(strong), bool)
     within: Flags = np.asarray(inside(bent, failures).any(0))
-    keep = [bool(s or not within[mine].all()) for s, mine in zip(strong, by, strict=True)]
+    keep = [bool(s or not within[held].all()) for s, held in zip(strong, by, strict=True)]
     return _counted(np.concatenate([stay[keep], bent]), failures)
 
 
@@ -311,7 +311,7 @@ def _sides(says: int, failures: Floats, survived: Survived, blur: Floats, least:
         while (explained := (beyond > clear) & left[:, None]).any():
             tied, best = _most_telling(explained, perhaps, beyond)
             left &= ~(beyond[:, best] > _BEYOND)
-            undecided = len(failures) <= _FIRST and len(tied) == 2
+            undecided = len(failures) <= _MOST_UNDECIDED and len(tied) == 2
             for k in tied if undecided else [best]:
                 found[k] = float(ends[k])
     while (explained := perhaps & left[:, None]).any():
@@ -354,18 +354,18 @@ def _bent(
         count = within.sum(1)
         best = max(range(len(asked)), key=lambda n: (count[n], score[n]))
         if 2 < len(group) and count[best] < len(group):
-            both, mine = _in_two(F, asked, score, survived)
-            if both > count[best]:
-                groups += [group[mine], group[~mine]]
+            by_two, first = _in_two(F, asked, score, survived)
+            if by_two > count[best]:
+                groups += [group[first], group[~first]]
                 continue
         if count[best] >= min(max(2, 0.5 * len(group)), len(group)):
             found.append(rows[best])
             groups += [group[~within[best]]] if count[best] < len(group) else []
             continue
         likeliest = asked[int(score.argmax())][:2]
-        mine = _split(F[:, likeliest] / survived.spread[likeliest])
-        whole &= not mine.all()
-        groups += [] if mine.all() else [group[mine], group[~mine]]
+        first = _split(F[:, likeliest] / survived.spread[likeliest])
+        whole &= not first.all()
+        groups += [] if first.all() else [group[first], group[~first]]
     table = np.array(found).reshape(-1, SIZE)
     table[:, SAYS] = says
     return table, whole and not groups
@@ -376,17 +376,17 @@ def _in_two(F: Floats, asked: Ints, score: Floats, survived: Survived) -> tuple[
     found = 0, np.ones(len(F), bool)
     pairs = np.flatnonzero(asked[:, 2] == 2)
     for n in pairs[np.argsort(-score[pairs], kind="stable")[:_IN_TWO]]:
-        mine = _split(F[:, asked[n, :2]] / survived.spread[asked[n, :2]])
+        first = _split(F[:, asked[n, :2]] / survived.spread[asked[n, :2]])
         for _ in range(_ROUNDS):
-            if mine.all() or not mine.any():
+            if first.all() or not first.any():
                 break
-            each = [_fitted(F[half], asked[[n]], survived) for half in (mine, ~mine)]
-            far = np.concatenate([distances(rows, F) for rows, _, _ in each])
+            fits = [_fitted(F[half], asked[[n]], survived) for half in (first, ~first)]
+            far = np.concatenate([distances(rows, F) for rows, _, _ in fits])
             explained = int((far.min(0) <= BLUR).sum())
-            found = (explained, mine) if explained > found[0] else found
-            if (mine == (far[0] <= far[1])).all():
+            found = (explained, first) if explained > found[0] else found
+            if (first == (far[0] <= far[1])).all():
                 break
-            mine = far[0] <= far[1]
+            first = far[0] <= far[1]
     return found
 
 
@@ -403,21 +403,21 @@ def _asked(failures: Floats, survived: Survived) -> Ints:
         tells = 0.5 * (ratio - 1.0 - np.log(ratio))
         moving = np.sort(moving[np.argsort(-tells, kind="stable")[:_SCREENED]])
     alone = [(j, j, 0) for j in moving]
-    both = [(i, j, kind) for i, j in combinations(moving, 2) for kind in (1, 2)]
-    return np.array(alone + both, np.int64).reshape(-1, 3)
+    bent = [(i, j, kind) for i, j in combinations(moving, 2) for kind in (1, 2)]
+    return np.array(alone + bent, np.int64).reshape(-1, 3)
 
 
 def _split(x: Floats) -> Flags:
     """Rows in two, from the pair that is farthest apart: which are with the first of them."""
     far = ((x[:, None] - x[None]) ** 2).sum(2)
     a, b = x[list(np.unravel_index(int(far.argmax()), far.shape))]
-    mine = np.ones(len(x), bool)
+    first = np.ones(len(x), bool)
     for _ in range(5):
-        mine = ((x - a) ** 2).sum(1) <= ((x - b) ** 2).sum(1)
-        if mine.all() or not mine.any():
+        first = ((x - a) ** 2).sum(1) <= ((x - b) ** 2).sum(1)
+        if first.all() or not first.any():
             return np.ones(len(x), bool)
-        a, b = x[mine].mean(0), x[~mine].mean(0)
-    return mine
+        a, b = x[first].mean(0), x[~first].mean(0)
+    return first
 
 
 # -- One bent form --------------------------------------------------------------------------------
@@ -426,21 +426,21 @@ def _split(x: Floats) -> Flags:
 def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, Floats]:
     """(c, SIZE) the forms that are asked of failures (k, m); which are inside; and scores."""
     rows, unit = survived.rows, survived.unit
-    scale, those = survived.spread[asked[:, :2]], F[:, asked[:, :2]].transpose(1, 0, 2)
-    at, k = those.mean(1), len(F)
+    scale, points = survived.spread[asked[:, :2]], F[:, asked[:, :2]].transpose(1, 0, 2)
+    at, k = points.mean(1), len(F)
     near: dict[tuple[int, int], Ints] = {}
     for i, j, _ in asked.tolist():
         if (i, j) not in near:
             near[i, j] = _near(rows[:, [i, j]], F[:, [i, j]], survived.spread[[i, j]])
-    which = np.array([near[i, j] for i, j, _ in asked.tolist()])
+    index = np.array([near[i, j] for i, j, _ in asked.tolist()])
     table, likelihood = np.zeros((len(asked), SIZE)), np.zeros(len(asked))
     again = np.arange(len(asked))
-    for _ in range(_FITS):  # with what the fit before has wrongly inside
-        seen = rows[which[..., None], asked[again][:, None, :2]]
-        x = np.concatenate([those[again], seen], 1) - at[again][:, None]
+    for _ in range(_REFITS):  # with what the fit before has wrongly inside
+        seen = rows[index[..., None], asked[again][:, None, :2]]
+        x = np.concatenate([points[again], seen], 1) - at[again][:, None]
         u, v = (x / scale[again][:, None]).transpose(2, 0, 1)
         phi = np.stack([u, v, u * u, u * v, v * v], 2) * _KINDS[asked[again, 2]][:, None]
-        w, likelihood[again] = _logistic(phi, np.append(np.ones(k), np.zeros(which.shape[1])))
+        w, likelihood[again] = _logistic(phi, np.append(np.ones(k), np.zeros(index.shape[1])))
         times = unit[asked[again, :2]] / scale[again]
         found = np.zeros((len(again), SIZE))
         found[:, I:AT], found[:, AT:ONE] = asked[again, :2], at[again]
@@ -453,10 +453,10 @@ def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, 
         wrong = (most > 0.0) & (likelihood[again] > -_UNLIKELY * k)
         found[:, C] -= most + 1e-12 * (np.abs(found[:, C]) + np.abs(most))
         table[again] = found
-        again, form, which = again[wrong], form[wrong], which[wrong]
-        if not len(again) or len(rows) <= _NEAR:
+        again, form, index = again[wrong], form[wrong], index[wrong]
+        if not len(again) or len(rows) <= _FIT_ROWS:
             break
-        which = np.hstack([which, np.argpartition(-form, _WORST, 1)[:, :_WORST]])
+        index = np.hstack([index, np.argpartition(-form, _WORST, 1)[:, :_WORST]])
     within = inside(table, F)
     within[2 * (within & (distances(table, F) < 0.0)).sum(1) < within.sum(1)] = False
     score = likelihood - 0.5 * _KINDS[asked[:, 2]].sum(1) * np.log(k + 1.0)
@@ -465,14 +465,14 @@ def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, 
 
 def _near(survived: Floats, F: Floats, scale: Floats) -> Ints:
     """Of what was survived as much nearest to each failure as to others, and as much evenly."""
-    n, half = len(survived), _NEAR // 2
-    if n <= _NEAR:
+    n, half = len(survived), _FIT_ROWS // 2
+    if n <= _FIT_ROWS:
         return np.arange(n)
-    each = -(-half // len(F))
+    quota = -(-half // len(F))
     x, y = ((survived[:, k] - F[:, [k]]) / scale[k] for k in (0, 1))
     far = x * x + y * y
-    near = np.argpartition(far, each, 1)[:, :each].ravel()[:half]
-    return np.append(near, np.linspace(0, n - 1, _NEAR - half).astype(int))
+    near = np.argpartition(far, quota, 1)[:, :quota].ravel()[:half]
+    return np.append(near, np.linspace(0, n - 1, _FIT_ROWS - half).astype(int))
 
 
 def _logistic(phi: Floats, y: Floats) -> tuple[Floats, Floats]:
@@ -488,10 +488,10 @@ def _logistic(phi: Floats, y: Floats) -> tuple[Floats, Floats]:
     hold[:, :p][~(phi != 0.0).any(1)] = 1.0  # features that it has not
     w, to = np.zeros((count, p + 1)), np.where(y > 0.0, -1.0, 1.0)
 
-    def cost(which: Ints, w: Floats) -> Floats:
-        t = np.einsum("cnp,cp->cn", X[which], w) * to
+    def cost(index: Ints, w: Floats) -> Floats:
+        t = np.einsum("cnp,cp->cn", X[index], w) * to
         lost = np.maximum(t, 0.0) + np.log1p(np.exp(-np.abs(t)))
-        return np.asarray(lost.sum(1) + 0.5 * (hold[which] * w**2).sum(1))
+        return np.asarray(lost.sum(1) + 0.5 * (hold[index] * w**2).sum(1))
 
     going, now = np.arange(count), cost(np.arange(count), w)
     for _ in range(_NEWTON):

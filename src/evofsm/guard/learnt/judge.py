@@ -65,7 +65,7 @@ from evofsm.guard.learnt.words import Remembered
 from evofsm.store import Place
 
 # Rows of an episode that are learnt from before it ends.
-_LONGEST = 1024
+_MOST_ROWS = 1024
 # No horizon that is given has more steps: memory and the time of a decision grow with it.
 _MAX_STEPS = 10_000
 # Actions among which one is chosen, at most.
@@ -255,10 +255,10 @@ class LearntRisk(ActionJudge):
 
     def refuse_unfit(self, low: Any, high: Any) -> None:
         """Raise for another range of actions than it learns of."""
-        own = (0, self.choices - 1) if self.choices else (self.low, self.high)
-        if not all(map(np.array_equal, map(np.atleast_1d, own), map(np.atleast_1d, (low, high)))):
+        ends = (0, self.choices - 1) if self.choices else (self.low, self.high)
+        if not all(map(np.array_equal, map(np.atleast_1d, ends), map(np.atleast_1d, (low, high)))):
             raise ValueError(
-                f"the judge was made for actions from {own[0]} to {own[1]}, not from {low} to "
+                f"the judge was made for actions from {ends[0]} to {ends[1]}, not from {low} to "
                 f"{high}: give it low and high, or n_actions, of the guard"
             )
 
@@ -287,8 +287,8 @@ class LearntRisk(ActionJudge):
         assert self.parts is not None
         s, model = self.settings, self.parts.model
         few = s.n_asked if len(pairs(self.n_variables)[0]) else 2
-        each = (model.weights.size + model.dead_ends.size) * self.parts.residuals.shape[2]
-        return few, max(min(s.work, s.work_rate * self.dt) / each, few * self.state.horizon)
+        cost = (model.weights.size + model.dead_ends.size) * self.parts.residuals.shape[2]
+        return few, max(min(s.work, s.work_rate * self.dt) / cost, few * self.state.horizon)
 
     def search(
         self,
@@ -305,13 +305,13 @@ class LearntRisk(ActionJudge):
         or less, which nobody knows.
         ``revising`` changes nothing: a band in which a proposal is refused longer gained nothing.
         """
-        here, one, parts = self._here(situation.observation), np.array([wanted]), self.parts
+        here, options, parts = self._here(situation.observation), np.array([wanted]), self.parts
         if parts is None:
-            return Search(one, _unjudged(1), 0, words.NOTHING_LEARNT)
+            return Search(options, _unjudged(1), 0, words.NOTHING_LEARNT)
         if here is None:
-            return Search(one, _unjudged(1), 0, words.NOTHING_SEEN)
+            return Search(options, _unjudged(1), 0, words.NOTHING_SEEN)
         if not len(self.state.forms):
-            return Search(one, _unjudged(1), 0, self._no_threshold)
+            return Search(options, _unjudged(1), 0, self._no_threshold)
         model = parts.daring if self.learning else parts.model
         proposal, scale, margin = self.encode(wanted), parts.scale, self.state.margin
         few, most = self.effort
@@ -323,10 +323,10 @@ class LearntRisk(ActionJudge):
             policies[:, ~mask, 0] = _NEVER
         asked = model, here, policies, ranks, parts.residuals, scale
         longer = self.settings.longer if self.learning else NO_LONGER
-        how, action, which, left = search(*asked, proposal, margin, allowed, most, longer=longer)
+        how, action, best, left = search(*asked, proposal, margin, allowed, most, longer=longer)
         tried = None
-        if which != ranks[0]:  # what passed now is asked first the next time
-            self._ranks = np.append(which, self._ranks[self._ranks != which])
+        if best != ranks[0]:  # what passed now is asked first the next time
+            self._ranks = np.append(best, self._ranks[self._ranks != best])
         passes, self._refused, cut = how < CUT_SHORT, how != KEPT, how == CUT_SHORT
         self._holds = passes
         if not passes:
@@ -346,9 +346,9 @@ class LearntRisk(ActionJudge):
             left if passes and not allowed else None,
         )
         self._fails_after = max(self._fails_after, fails_after)
-        backup = self.backup_text(which, policies)
+        backup = self.backup_text(best, policies)
         if not self._refused:
-            return Search(one, judged, 0, words.kept(backup, remembered, left, allowed))
+            return Search(options, judged, 0, words.kept(backup, remembered, left, allowed))
         why = words.refused(self._unsurvived, remembered, margin, scale, allowed)
         if not cut and len(model.dead_ends):
             free = model._replace(dead_ends=model.dead_ends[:0])
@@ -366,14 +366,14 @@ class LearntRisk(ActionJudge):
         executed = wanted
         if action is not proposal:
             executed = np.reshape(self.decode(action), np.shape(wanted))
-        return Search(np.array((one[0], executed)), judged, 1, f"{why}; {instead}")
+        return Search(np.array((options[0], executed)), judged, 1, f"{why}; {instead}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each action, (k,) or (k, d); NaN as long as nothing can be said."""
         given, here = np.asarray(actions, np.float64), self._here(situation.observation)
         if here is None or self.parts is None or not len(self.state.forms):
             return _unjudged(len(given))
-        inner = np.array([self.encode(one) for one in given])
+        inner = np.array([self.encode(action) for action in given])
         return self._judged(situation, here, self.state.policies, inner)[0]
 
     def why(self, judged: Judgement) -> str:
@@ -396,14 +396,14 @@ class LearntRisk(ActionJudge):
         """
         asked = actions if passes is None else actions[:-1]
         best = policies[self._ranks[: self._asked]]
-        each = [self._foresee(here, action[None], best) for action in asked]
+        foreseen = [self._foresee(here, action[None], best) for action in asked]
         if passes is not None:
-            each.append((0.0, passes, 0.0))
-        unsurvived, left, after = zip(*each, strict=True)
+            foreseen.append((0.0, passes, 0.0))
+        unsurvived, left, after = zip(*foreseen, strict=True)
         self._unsurvived = -1 if math.isinf(unsurvived[0]) else int(unsurvived[0])
         remembered = self.remembered
         soon = self._soon(remembered.seconds)
-        risk, low, high = np.array([self._risk(one, soon) for one in unsurvived]).T
+        risk, low, high = np.array([self._risk(n, soon) for n in unsurvived]).T
         number = float(remembered.number)
         judged = Judgement(risk, low, high, np.array(left), number, situation.seen)
         return judged, math.isinf(unsurvived[-1]), max(after)
@@ -506,11 +506,11 @@ class LearntRisk(ActionJudge):
 
     def savepoint(self) -> Rollback:
         """What takes back all that it learns from now on."""
-        own = {**self.__dict__}
-        lengths = {name: len(own[name]) for name in ("_z", "_u", "_notes")}
+        saved = {**self.__dict__}
+        lengths = {name: len(saved[name]) for name in ("_z", "_u", "_notes")}
 
         def rollback() -> None:
-            self.__dict__ = {**own}
+            self.__dict__ = {**saved}
             for name, length in lengths.items():
                 del self.__dict__[name][length:]
 
@@ -561,7 +561,7 @@ class LearntRisk(ActionJudge):
     def _take_in(self, observation: ArrayLike, action: Any) -> None:
         self.follow(observation, action)
         self._notes.append((self._refused, self._lost, self._certified))
-        if len(self._z) > _LONGEST:
+        if len(self._z) > _MOST_ROWS:
             z, u = self._z, self._u
             self._u = u[:-1]
             self._study(failed=False, terminated=False)
@@ -625,8 +625,8 @@ class LearntRisk(ActionJudge):
         episode = Episode(*seen, refused, lost, certified, self._fails_after)
         if not self.n_variables:
             now = self.state
-            none = State.none(z.shape[1], self.size, self.choices, self.settings, None)
-            self.state = none._replace(
+            blank = State.none(z.shape[1], self.size, self.choices, self.settings, None)
+            self.state = blank._replace(
                 horizon=now.horizon, margin=now.margin, n_failed=now.n_failed
             )
         self.state = learn(

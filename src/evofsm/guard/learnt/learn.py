@@ -24,13 +24,13 @@ from evofsm.guard.learnt.state import (
 # Actions of an episode that says how a system moves, at least; situations from which on
 # disturbances are looked for and backups evolve; those that are drawn to look for some;
 # disturbances that mutants are tried on, besides none.
-_SHORTEST, _ENOUGH, _TRIED_IN, _TRIED_ON = 3, 3, 8, 5
+_FEWEST_STEPS, _ENOUGH, _TRIED_IN, _TRIED_ON = 3, 3, 8, 5
 # What is lost in so few steps, whatever one does, is no argument; nor is what is survived by more
 # [typical steps].
 _AT_ONCE, _BY_FAR = 3, 100.0
 # Windows of which all that is known is their size; situations that are kept of a failure, and so
 # many steps before it at least.
-_LARGEST, _BEFORE, _EARLIER = 3, 3, 2
+_MOST_WINDOWS, _BEFORE, _EARLIER = 3, 3, 2
 # An action is used at the end of its range from so far on.
 _LOW, _HIGH = -0.6, 0.6
 
@@ -94,7 +94,7 @@ def learn(
     )
     # Model
     state = motion.steps(state, safe)
-    moves = len(u) >= _SHORTEST
+    moves = len(u) >= _FEWEST_STEPS
     if moves:
         state = motion.dynamics(state, model_of(state, settings), safe, u, settings)
         if given.model is not None:
@@ -128,8 +128,8 @@ def learn(
     if given.backup is not None:
         state = fitted(state, known, given.backup)
     if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
-        some = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
-        rest, scale = np.ascontiguousarray(rest[:, :, some]), disturbance_scale(state, settings)
+        picked = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
+        rest, scale = np.ascontiguousarray(rest[:, :, picked]), disturbance_scale(state, settings)
         asked = known, state.situations, rest, scale, settings, random
         policies, linear = evolved(state.policies, state.linear, *asked)
         state = state._replace(policies=policies, linear=linear)
@@ -214,11 +214,11 @@ def disturbances(
     new = model.trimmed(rest[np.arange(H)[:, None] + starts].transpose(0, 2, 1))
     ends = np.empty((0, 0))
     if looks:
-        none = model.undisturbed(H, m, 1)[:, : new.shape[1]]
-        with_none = np.concatenate([none, new], 2)
-        some = S[random.permutation(len(S))[:_TRIED_IN]]
-        ends = worst(known, some, state.policies[:1], with_none, 1.0)
-    harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_LARGEST]
+        calm = model.undisturbed(H, m, 1)[:, : new.shape[1]]
+        with_none = np.concatenate([calm, new], 2)
+        picked = S[random.permutation(len(S))[:_TRIED_IN]]
+        ends = worst(known, picked, state.policies[:1], with_none, 1.0)
+    harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_MOST_WINDOWS]
     starts = starts[harmful]
     longest = settings.horizon_max + 2
     windows, lengths, of = list(state.windows), state.lengths.tolist(), state.seen_in.tolist()
@@ -311,8 +311,8 @@ def look_ahead(
             longest = min(s.ahead * longest, s.horizon_max / s.ahead)
             believed = max(believed, longest)
         T = max(min(after, believed), longest)
-    each = known.weights.size * (1 + s.n_disturbances)
-    farthest = min(s.horizon_max, s.work / each / s.n_asked)  # less where a rollout costs more
+    cost = known.weights.size * (1 + s.n_disturbances)
+    farthest = min(s.horizon_max, s.work / cost / s.n_asked)  # less where a rollout costs more
     horizon = int(max(min(s.ahead * T, farthest), s.horizon_min))
     return state._replace(
         time_to_failure=T, believed=believed, horizon=horizon, too_short=too_short

@@ -23,7 +23,7 @@ from evofsm.guard.learnt.rollout import Floats, crossed, pairs
 from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
 
 # Numbers of which the largest counts.
-_LARGEST = "margin", "time_to_failure", "believed", "too_short"
+_MAXIMA = "margin", "time_to_failure", "believed", "too_short"
 
 
 def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
@@ -58,20 +58,20 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     """
     if not judges:
         raise ValueError("judges is empty; there must be at least one to merge")
-    for one in judges[1:]:
-        if not one.choices:
-            judges[0].refuse_unfit(one.low, one.high)
-    if len({(one.dt, one.choices) for one in judges}) > 1:
+    for judge in judges[1:]:
+        if not judge.choices:
+            judges[0].refuse_unfit(judge.low, judge.high)
+    if len({(judge.dt, judge.choices) for judge in judges}) > 1:
         raise ValueError("judges to merge must be of the same actions and interval")
-    told = [one for one in judges if one.n_variables]
-    if len({one.n_variables for one in told}) > 1:
+    told = [judge for judge in judges if judge.n_variables]
+    if len({judge.n_variables for judge in told}) > 1:
         raise ValueError("judges to merge must have observed the same variables")
-    merged = copy.deepcopy(max(told or judges, key=lambda one: one.state.n_episodes))
+    merged = copy.deepcopy(max(told or judges, key=lambda judge: judge.state.n_episodes))
     merged.start_episode(learn=False)
     if len(told) > 1:
-        merged.state = merge([one.state for one in told], merged.settings, merged.seed)
-        merged.n_violated = sum(one.n_violated for one in told)
-        merged.harm = Harm.merged([one.harm for one in told])
+        merged.state = merge([judge.state for judge in told], merged.settings, merged.seed)
+        merged.n_violated = sum(judge.n_violated for judge in told)
+        merged.harm = Harm.merged([judge.harm for judge in told])
         merged.remake()
     return merged
 
@@ -94,11 +94,11 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
     shared = np.isclose(ends, np.stack([lowest[0], highest[0]], 1), 1e-9, 0.0)
     after = n_episodes - of("n_episodes")  # the latest episode of each is the latest of all
     every = max(1, -(-len(rows("survived")) // settings.max_survived))
-    seen_in = np.concatenate([one.survived_in + k for one, k in zip(parts, after, strict=True)])
-    drifts = [one.drifts + np.array([0, k, k]) for one, k in zip(parts, after, strict=True)]
+    seen_in = np.concatenate([part.survived_in + k for part, k in zip(parts, after, strict=True)])
+    drifts = [part.drifts + np.array([0, k, k]) for part, k in zip(parts, after, strict=True)]
     fields: dict[str, Any] = {
         **{name: int(of(name).sum()) for name in ("n_failed", "n_scanned", "n_seen", "n_moves")},
-        **{name: float(of(name).max()) for name in _LARGEST},
+        **{name: float(of(name).max()) for name in _MAXIMA},
         **{name: _average(of(name), moves) for name in ("unit", "power")},
         **{name: _average(of(name), moves * of("scale").any(1)) for name in ("scale", "noise")},
         **{name: rows(name, settings.max_failures) for name in ("failures", "brinks", "ended")},
@@ -115,7 +115,7 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
         "lowest": lowest[:2],
         "highest": highest[:2],
         "reached": np.where(shared, of("reached"), 0.0).sum(0),
-        "seen_in": np.concatenate([one.seen_in + k for one, k in zip(parts, after, strict=True)]),
+        "seen_in": np.concatenate([part.seen_in + k for part, k in zip(parts, after, strict=True)]),
         "survived": rows("survived")[::every],
         "survived_in": seen_in[::every],
         "situations": rows("situations", settings.n_situations),
@@ -125,7 +125,7 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
     merged = State.none(m, a, first.choices, settings, None)._replace(**fields)
     merged = explained(merged, failed=True)
     known = model_of(merged, settings)
-    merged = dead_ends(merged, known, merged.survived[:0], _NOTHING)
+    merged = dead_ends(merged, known, merged.survived[:0], _NO_EPISODE)
     known, scale = model_of(merged, settings), disturbance_scale(merged, settings)
     rest, random = residuals_of(merged, known, merged.horizon), np.random.default_rng(seed)
     harmful = worst(known, merged.situations, merged.policies[:2], rest, scale)
@@ -136,8 +136,8 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
     return kept(merged, keep)._replace(policies=policies, linear=linear)
 
 
-_NONE = np.empty(0)
-_NOTHING = Episode(_NONE, _NONE, False, False, _NONE, _NONE, _NONE, 0.0)
+_NO_ROWS = np.empty(0)
+_NO_EPISODE = Episode(_NO_ROWS, _NO_ROWS, False, False, _NO_ROWS, _NO_ROWS, _NO_ROWS, 0.0)
 
 
 def _average(rows: Floats, weights: Floats) -> Floats:

@@ -25,7 +25,7 @@ _LEAST, _ALL_ALIKE = 1e-6, 1e-10
 # What leaves a feature out.
 _NEVER = 1e15
 # From so many features on BLAS would call threads, which wait where other processes are busy.
-_LARGE = 100
+_MANY_FEATURES = 100
 
 
 def typical_step(z: Floats) -> Floats:
@@ -115,7 +115,7 @@ def ridge(squares: Floats, products: Floats, held: Floats) -> Floats:
 
 def _solved(squares: Floats, products: Floats) -> Floats:
     """Of a positive definite matrix, halved until its parts are too small for threads."""
-    if len(squares) < _LARGE:
+    if len(squares) < _MANY_FEATURES:
         return np.asarray(np.linalg.solve(squares, products))
     n, columns = len(squares) // 2, products.reshape(len(products), -1)
     upper = _solved(squares[:n, :n], np.hstack([squares[:n, n:], columns[:n]]))
@@ -156,10 +156,10 @@ def disturbed(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
     held = ((to < model.lowest) & (after <= model.lowest)) | (
         (to > model.highest) & (after >= model.highest)
     )
-    none = ~known | (change == 0.0).all(1) | are_jumps(z, unit)
+    no_rest = ~known | (change == 0.0).all(1) | are_jumps(z, unit)
     jumped = jumps(np.diff(z, axis=0), unit)[1:] & known[:, None]
     jumped &= np.abs(change - move) > 0.5 * np.abs(change)
-    rest = np.where(held | none[:, None], 0.0, after - to)
+    rest = np.where(held | no_rest[:, None], 0.0, after - to)
     return np.hstack([rest, np.where(jumped, after, np.inf)])
 
 

@@ -16,16 +16,16 @@ from evofsm.guard.learnt.rollout import Flags, Floats, Ints, Model, features, la
 from evofsm.guard.learnt.state import LearntSettings, State, model_of
 
 # Changes of which the typical step is learnt; a larger one counts as so many times that.
-_STEPS, _LARGE = 5000.0, 6.0
+_MOST_CHANGES, _LARGEST_STEP = 5000.0, 6.0
 # Of what was seen, the share that is the same up to rounding.
-_SAME = 1e-9
+_SAME_SHARE = 1e-9
 # Changes of an episode that tell how large residuals are; how much the latest of them counts.
-_SOME, _LATEST = 5, 0.2
+_FEWEST_CHANGES, _LATEST = 5, 0.2
 # What rests at an end, and was expected to go on by so many scales, is held there.
 _STOPS = 4.0
 # Episodes before it may move otherwise, and after it did, in which it is learnt how; transitions
 # that a correction needs, and how it is held to 0.
-_LEARNT, _FEW, _HELD = 20, 15.0, 0.3
+_LEARNT, _FEWEST_ROWS, _HELD = 20, 15.0, 0.3
 # Steps from which it is tried how much lags foresee, and what is missed counts at most [steps].
 _STARTS, _FAR_OFF = 12, 1e9
 
@@ -36,7 +36,7 @@ def steps(state: State, z: Floats) -> State:
     if not len(rows):
         return state
     low, high = rows.min(0), rows.max(0)
-    close = _SAME * (high - low)
+    close = _SAME_SHARE * (high - low)
     lowest, new_low = _extremes(state.lowest, low, close)
     highest, new_high = _extremes(-state.highest, -high, close)
     reached = np.where(np.array([new_low, new_high]).T, 0.0, state.reached)
@@ -47,8 +47,8 @@ def steps(state: State, z: Floats) -> State:
         return state
     latest = model.typical_step(z)
     unit = state.unit if state.n_moves else latest
-    size = np.minimum(np.abs(change[seen]), _LARGE * np.maximum(unit, latest))
-    n = min(state.n_moves, _STEPS)
+    size = np.minimum(np.abs(change[seen]), _LARGEST_STEP * np.maximum(unit, latest))
+    n = min(state.n_moves, _MOST_CHANGES)
     ordinary = np.where(model.jumps(change, unit) | ~seen[:, None], 0.0, change)
     moving = np.abs(change) > close  # it arrived there, and did not start there
     arrived = [
@@ -93,18 +93,18 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
         ordinary = ((change >= state.least) & (change <= state.most)).all(1)
         rows = seen & free & ordinary
         state = _drifted(state, known, phi[rows], change[rows], np.diff(z, axis=0), settings)
-    some, weighed = phi[seen], weight[seen, None]
+    x, weighed = phi[seen], weight[seen, None]
     state = state._replace(
-        squares=state.squares + some.T @ (weighed * some),
-        products=state.products + some.T @ (weighed * change[seen]),
+        squares=state.squares + x.T @ (weighed * x),
+        products=state.products + x.T @ (weighed * change[seen]),
     )
     moved = seen[:, None] & ~rests
-    if (here := moved.any(1)).sum() < _SOME:
+    if (here := moved.any(1)).sum() < _FEWEST_CHANGES:
         return state
     now = model_of(state, settings)
     rest = np.abs(model.residuals(now, z, u, state.unit))
     size = [
-        1.4826 * np.median(r[h]) if h.sum() >= _SOME else 0.0
+        1.4826 * np.median(r[h]) if h.sum() >= _FEWEST_CHANGES else 0.0
         for r, h in zip(rest.T, moved.T, strict=True)
     ]
     share = _LATEST if is_known else 1.0
@@ -135,8 +135,8 @@ def misled(
     failed : bool
         Whether it failed in the end: then lags are not exonerated.
     """
-    some = starts[np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))]
-    ahead = some[:, None] + np.arange(-1, state.horizon + 1)
+    begins = starts[np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))]
+    ahead = begins[:, None] + np.arange(-1, state.horizon + 1)
     if not np.isfinite(z[ahead]).all():
         return state
     missed = []
@@ -184,7 +184,7 @@ def told(
 
     at, before, u = z[rows + 1], drawn(), drawn()
     phi = features(known, at, random.permutation(latest[rows]), before, u)
-    change = np.array([move(*each) for each in zip(at, u, strict=True)]).reshape(at.shape) - at
+    change = np.array([move(*pair) for pair in zip(at, u, strict=True)]).reshape(at.shape) - at
     return state._replace(
         squares=state.squares + phi.T @ (1.0 * phi), products=state.products + phi.T @ change
     )
@@ -248,7 +248,7 @@ def _anew(state: State, settings: LearntSettings) -> State:
 
 def _correction(state: State, known: Model) -> Floats:
     """(p, m) what is to be added to the weights, by ridge regression about 0."""
-    if state.recent_squares[0, 0] < _FEW:
+    if state.recent_squares[0, 0] < _FEWEST_ROWS:
         return np.zeros_like(known.weights)
     m, a, n = len(state.origin), len(state.used), max(1.0, float(state.squares[0, 0]))
     size = np.diag(state.squares) / n

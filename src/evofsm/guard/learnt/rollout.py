@@ -132,8 +132,8 @@ def features(model: Model, z: Floats, change: Floats, before: Floats, action: Fl
         parts.append(np.abs(action[:, :, None] - KNOTS).reshape(len(z), -1))
     acts = action[:, : crossed(m, action.shape[1]), None]
     parts.append((acts * off[:, None]).reshape(len(z), -1))
-    one, other = pairs(m)
-    return np.concatenate([*parts, off[:, one] * off[:, other]], axis=1)
+    i, j = pairs(m)
+    return np.concatenate([*parts, off[:, i] * off[:, j]], axis=1)
 
 
 @spliced_kernel
@@ -253,15 +253,15 @@ def _measure(
         far[l] = over[l] = np.inf
     for s in range(len(model.forms)):
         says, i, j = model.forms[s, 0], int(model.forms[s, 1]), int(model.forms[s, 2])
-        at, to, one, other = model.forms[s, 3:7]
+        at, to, inv_x, inv_y = model.forms[s, 3:7]
         c, b, d, p, q, r = model.forms[s, 7:13]
         if p == 0.0 and q == 0.0 and r == 0.0:
             for l in range(n):
-                square[l] = -(c + b * (z[i, l] - at) * one + d * (z[j, l] - to) * other)
+                square[l] = -(c + b * (z[i, l] - at) * inv_x + d * (z[j, l] - to) * inv_y)
         else:
             grown = GROWN if says == FAILS else 0.0
             for l in range(n):
-                x, y = (z[i, l] - at) * one, (z[j, l] - to) * other
+                x, y = (z[i, l] - at) * inv_x, (z[j, l] - to) * inv_y
                 form = c + x * (b + p * x + q * y) + y * (d + r * y)
                 u, v = b + 2.0 * p * x + q * y, d + 2.0 * r * y + q * x
                 square[l] = -form / np.sqrt(u * u + v * v + FLAT) - grown
@@ -307,22 +307,22 @@ def _rollout(
     assigned: that takes a second of compiling each.
     """
     m, (a, _), p = len(model.origin), policy.shape, len(model.weights)
-    steps, rows, each = residuals.shape
-    count = len(situations) * each
+    steps, rows, n_disturbances = residuals.shape
+    count = len(situations) * n_disturbances
     n = lanes(count)
     z, change, move = np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
     before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
-    which, survived = np.empty(n, np.int64), np.empty(n, np.int64)
+    column, survived = np.empty(n, np.int64), np.empty(n, np.int64)
     near, far, square, over = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     aside = np.empty((len(model.dead_ends), n))
     for l in range(n):
-        start = l // each if l < count else 0
+        start = l // n_disturbances if l < count else 0
         for j in range(m):
             z[j, l], change[j, l] = situations[start, j], situations[start, m + j]
         for i in range(a):
             before[i, l] = situations[start, 2 * m + i]
         near[l], survived[l] = np.inf, steps if l < count else -1
-        which[l] = l % each if l < count else 0
+        column[l] = l % n_disturbances if l < count else 0
     for s in range(len(aside)):
         _from_centre(model, s, z, square)
         radius = model.dead_ends[s, -2]
@@ -344,10 +344,10 @@ def _rollout(
             low, high = scale * model.least[j], scale * model.most[j]
             lowest, highest = model.lowest[j], model.highest[j]
             for l in range(n):
-                y = move[j, l] + scale * residuals[t, j, which[l]]
+                y = move[j, l] + scale * residuals[t, j, column[l]]
                 y = min(max(z[j, l] + min(max(y, low), high), lowest), highest)
                 if rows > m:  # it jumps
-                    to = residuals[t, m + j, which[l]]
+                    to = residuals[t, m + j, column[l]]
                     y = to if to < np.inf else y
                 change[j, l] = y - z[j, l]
                 z[j, l] = y
@@ -366,7 +366,7 @@ def _rollout(
                 if survived[l] == steps and near[l] < enough:
                     survived[l] = t
                     lost += 1
-                    if allowed < count and which[l] == 0:
+                    if allowed < count and column[l] == 0:
                         lost = count
             if lost >= count or lost > allowed:
                 break
@@ -521,16 +521,16 @@ def search(
         if passes:
             return KEPT, proposal, q, left
     for q in ranks:
-        own = action_of(model, policies[q], situation[:m])
+        fallback = action_of(model, policies[q], situation[:m])
         if done >= most:
             first = action_of(model, policies[ranks[0]], situation[:m])
             return CUT_SHORT, first, ranks[0], math.inf
-        if (own == proposal).all():
+        if (fallback == proposal).all():
             continue  # it was refused
-        passes, left = after(own, q)
+        passes, left = after(fallback, q)
         if not passes:
             continue
-        action, off, refused, share = own, own - proposal, 0.0, 1.0
+        action, off, refused, share = fallback, fallback - proposal, 0.0, 1.0
         for _ in range(0 if choices else _HALVINGS):
             half = 0.5 * (refused + share)
             closer = proposal + half * off
@@ -542,18 +542,18 @@ def search(
         return CHANGED, action, q, left
     if not lasting:
         return NOTHING_PASSES, proposal, ranks[0], math.inf
-    which, longest, shortest, wanted = ranks[0], -np.inf, np.inf, -np.inf
+    best, longest, shortest, wanted = ranks[0], -np.inf, np.inf, -np.inf
     for q in ranks:
         asked = model, situation[None], policies[q], residuals, scale
         lasts = float(rollout(*asked).worth.mean())
         shortest = min(shortest, lasts)
         if lasts > longest + _EQUAL:
-            which, longest = q, lasts
+            best, longest = q, lasts
         wanted = max(wanted, float(rollout(*asked, proposal[None]).worth.mean()))
     apart = (longest - shortest) / (abs(longest) + 1e-12)
     if wanted >= longest - longer:
-        return NOTHING_PASSES, proposal, which, apart
-    return NOTHING_PASSES, action_of(model, policies[which], situation[:m]), which, apart
+        return NOTHING_PASSES, proposal, best, apart
+    return NOTHING_PASSES, action_of(model, policies[best], situation[:m]), best, apart
 
 
 def action_of(model: Model, policy: Floats, z: Floats) -> Floats:

@@ -24,7 +24,7 @@ from evofsm.store import COUNT, FROM_1, SHARE, SIZE, SMALLEST, Kind, Numbers
 
 # What files hold of a field: observations, what is not negative, and ends that may be infinite.
 _SEEN, _ABOVE_0 = Numbers(least=-1e30, most=1e30), Numbers(least=0.0)
-_END = Numbers(least=-np.inf, most=np.inf)
+_BOUNDS = Numbers(least=-np.inf, most=np.inf)
 
 
 @dataclass(frozen=True)
@@ -168,8 +168,8 @@ class State(NamedTuple):
     since: Annotated[Floats, COUNT.of("m")]  #: and since which episode
     drifts: Annotated[Floats, COUNT.of("drifts", 3)]  #: variable, since, noticed
     # failure
-    lowest: Annotated[Floats, _END.of(2, "m")]  #: least observations of two episodes
-    highest: Annotated[Floats, _END.of(2, "m")]
+    lowest: Annotated[Floats, _BOUNDS.of(2, "m")]  #: least observations of two episodes
+    highest: Annotated[Floats, _BOUNDS.of(2, "m")]
     reached: Annotated[Floats, COUNT.of("m", 2)]  #: episodes that came to these ends by moving
     survived: Annotated[Floats, _SEEN.of("survived", "m")]
     survived_in: Annotated[Floats, COUNT.of("survived")]  #: episode
@@ -404,8 +404,8 @@ def unpacked(
                 f"{name} has shape {shape}, not one of {m} variables and actions of {a} numbers"
             )
     forms, steps = state.forms, state.windows.shape[1]
-    which = forms[:, [SAYS, I, J]]
-    if ((which != np.rint(which)) | (which < 0.0) | (which >= [CRASHES + 1, m, m])).any():
+    indices = forms[:, [SAYS, I, J]]
+    if ((indices != np.rint(indices)) | (indices < 0.0) | (indices >= [CRASHES + 1, m, m])).any():
         raise ValueError("forms are of variables that there are not")
     if (forms[:, [ONE, OTHER]] <= 0.0).any() or (forms[:, HELD] < 0.0).any():
         raise ValueError("forms have units that are not positive")

@@ -49,7 +49,7 @@ NO_LONGER = "no action passes, and no backup lasts longer than the proposal, whi
 # Disturbances that are taken to be harder by a smaller factor are taken as they were.
 _HARDER = 1.05
 # Of more dead ends, those from where most failed are counted.
-_SHOWN = 3
+_ENDS_SHOWN = 3
 # What was seen in a form, by what it says.
 _WHAT = {FAILS: "failure", CRASHES: "failure", ENDS: "ending"}
 
@@ -87,8 +87,8 @@ def refused(
     if unsurvived < 0:
         return "no backup prevents failure, even if nothing disturbs it"
     if unsurvived == 0:
-        what = f"no backup survives {remembered.but(spared)} by the margin of {changes(margin)}"
-        return what if scale < _HARDER else f"{what}, were they {scale:.2g} times as hard"
+        text = f"no backup survives {remembered.but(spared)} by the margin of {changes(margin)}"
+        return text if scale < _HARDER else f"{text}, were they {scale:.2g} times as hard"
     if unsurvived < remembered.number:
         return f"no backup survives {unsurvived} of the {remembered}"
     return f"no backup survives {'any of ' if unsurvived > 1 else ''}the {remembered}"
@@ -112,18 +112,18 @@ def dead_ends(counts: Sequence[int]) -> str:
 
 def failed(counts: Sequence[int]) -> str:
     """How many episodes failed from each of some dead ends."""
-    shown = [f"{count:,}" for count in counts[:_SHOWN]] + ["..."] * (len(counts) > _SHOWN)
-    comma = ", " if len(counts) > _SHOWN else " and "
+    shown = [f"{count:,}" for count in counts[:_ENDS_SHOWN]] + ["..."] * (len(counts) > _ENDS_SHOWN)
+    comma = ", " if len(counts) > _ENDS_SHOWN else " and "
     several = comma.join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]
     return f"{several} episode{'s' * (shown != ['1'])} that had been certified failed"
 
 
 def changed(backup: str, remembered: Remembered, margin: float, spared: int = 0) -> str:
     """What is done instead, where another action passes."""
-    them = "all of them" if remembered.number > 1 else "it"
+    cases = "all of them" if remembered.number > 1 else "it"
     if spared and remembered.number > 1:
-        them = f"all but at most {spared} of them"
-    return f"the closest action after which {backup} survives {them}, by {changes(margin)} or more"
+        cases = f"all but at most {spared} of them"
+    return f"the closest action after which {backup} survives {cases}, by {changes(margin)} or more"
 
 
 def lasting(backup: str, *, cut: bool) -> str:
@@ -159,8 +159,8 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
         tried, _ = _where(failure.rivals(state.forms, state.failures, sizes(state)), names)
         more += "; much was refused without a failure: while it learns it tries whether it only "
         more += f"fails {' or '.join(tried)}"
-    them = f"{remembered}, to be survived by {changes(state.margin)}"
-    return f"fails {' or '.join(there)}; {them}{more}{dead_ends(state.counts.astype(int).tolist())}"
+    seen = f"{remembered}, to be survived by {changes(state.margin)}"
+    return f"fails {' or '.join(there)}; {seen}{more}{dead_ends(state.counts.astype(int).tolist())}"
 
 
 def _where(table: Floats, names: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -174,7 +174,7 @@ def _where(table: Floats, names: Sequence[str]) -> tuple[list[str], list[str]]:
         else:
             said[int(row[SAYS])].append(told)
     there = [f"where {' or '.join(sides)}"] if sides else []
-    return there + said[FAILS] + [f"if it ends {one}" for one in said[CRASHES]], said[ENDS]
+    return there + said[FAILS] + [f"if it ends {place}" for place in said[CRASHES]], said[ENDS]
 
 
 def here(
@@ -189,8 +189,8 @@ def here(
     if away.min(initial=math.inf) <= near:
         row, left = forms[int(away.argmin())], float(away.min())
         where = "" if left < 0.0 else f"{changes(left)} from "
-        what = region(names, row[I:HELD].tolist(), int(row[HELD]))
-        told = f"This is {where}where it fails: {what}."
+        place = region(names, row[I:HELD].tolist(), int(row[HELD]))
+        told = f"This is {where}where it fails: {place}."
     off = np.sqrt((((state.centres - z) * model.inverse) ** 2).sum(1)) - state.radii
     off = off * model.dead_ends[:, -1]
     if off.min(initial=math.inf) > near:
@@ -212,23 +212,21 @@ def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "
     'where 0.6 x + 0.8 y is above 1 (1 failure)'
     """
     seen = f"({count:,} {what}{'s' * (count != 1)})"
-    i, j, at, to, one, other, c, b, d, p, q, r = row
+    i, j, at, to, sx, sy, c, b, d, p, q, r = row
     x, y = names[int(i)], names[int(j)]
     if i == j:
         if p == 0.0 and b != 0.0:
-            return f"where {x} is {'above' if b > 0.0 else 'below'} {at - c / (b * one):.4g} {seen}"
+            return f"where {x} is {'above' if b > 0.0 else 'below'} {at - c / (b * sx):.4g} {seen}"
         spare = b * b - 4.0 * p * c
         if p == 0.0 or spare < 0.0:
             return f"where {x} is near {at:.3g} {seen}"
-        low, high = sorted(
-            at + (-b + sign * math.sqrt(spare)) / (2.0 * p * one) for sign in (1, -1)
-        )
+        low, high = sorted(at + (-b + sign * math.sqrt(spare)) / (2.0 * p * sx) for sign in (1, -1))
         if p < 0.0:
             return f"where {x} is between {low:.3g} and {high:.3g} {seen}"
         return f"where {x} is below {low:.3g} or above {high:.3g} {seen}"
     if p == q == r == 0.0:
-        length = math.hypot(b * one, d * other)
-        u, v = b * one / length, d * other / length
+        length = math.hypot(b * sx, d * sy)
+        u, v = b * sx / length, d * sy / length
         beyond = u * at + v * to - c / length
         sign = "+" if v >= 0.0 else "-"
         return f"where {u:.3g} {x} {sign} {abs(v):.3g} {y} is above {beyond:.3g} {seen}"
@@ -237,9 +235,9 @@ def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "
         u, v = (0.25 * q * d - 0.5 * r * b) / inner, (0.25 * q * b - 0.5 * p * d) / inner
         most = c + 0.5 * (b * u + d * v)
         if most * p < 0.0:
-            wide, high = (2.0 * math.sqrt(-most * each / inner) for each in (r, p))
-            where = f"around ({at + u / one:.3g}, {to + v / other:.3g})"
-            size = f"{wide / one:.3g} wide and {high / other:.3g} high"
+            wide, high = (2.0 * math.sqrt(-most * k / inner) for k in (r, p))
+            where = f"around ({at + u / sx:.3g}, {to + v / sy:.3g})"
+            size = f"{wide / sx:.3g} wide and {high / sy:.3g} high"
             side = "inside" if p < 0.0 else "outside"
             return f"{side} an ellipse of {x} and {y} {where}, {size} {seen}"
     return f"beyond a curve of {x} and {y}, as at ({at:.3g}, {to:.3g}) {seen}"
