@@ -187,31 +187,36 @@ def _ellipses(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
 
 def _as_failed(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
     """That it ends beyond a threshold, and fails only as it did; or the threshold as it is."""
-    ended = survived.ended[inside(row[None], survived.ended)[0]]
+    end, ended = row.copy(), survived.ended[inside(row[None], survived.ended)[0]]
+    end[SAYS] = ENDS
     if len(ended):
-        crashes = crashing(held, ended, survived, int(row[I]))
-        end = row.copy()
-        end[SAYS] = ENDS
-        return [end, *halfway(crashes, held)] if len(crashes) else [row]
-    i, unit, rows = int(row[I]), survived.unit, survived.rows
+        crashes = halfway(crashing(held, ended, survived, int(row[I])), held)
+    else:
+        crashes = _rare(held, survived, int(row[I]))
+    return [end, *crashes] if len(crashes) else [row]
+
+
+def _rare(held: Floats, survived: Survived, at: int) -> Floats:
+    """That it crashes as far out as the innermost failure, in each variable where that is rare.
+
+    To one side, or on both sides of the median of what was survived; but of the variable ``at``.
+    """
+    unit, rows, m = survived.unit, survived.rows, len(survived.unit)
     low, high, centre = held.min(0) - BLUR * unit, held.max(0) + BLUR * unit, np.median(rows, 0)
     off = (np.abs(held - centre).min(0) - BLUR * unit).clip(0.0)
     share = np.array([rows >= low, rows <= high, np.abs(rows - centre) >= off]).mean(1)
-    share[:, (survived.spread == 0.0) | (np.arange(len(unit)) == i)] = np.inf
-    end = row.copy()
-    end[SAYS] = ENDS
-    found = [end]
-    for k in np.flatnonzero(share.min(0) < _RARE):
-        crash, how = row.copy(), int(share[:, k].argmin())
-        crash[SAYS], crash[[I, J]], crash[[ONE, OTHER]] = CRASHES, k, 1.0 / unit[k]
-        crash[[AT, TO]] = (low, high, centre)[how][k]
-        crash[C:HELD] = (
-            (0.0, 1.0, 0.0, 0.0, 0.0, 0.0),
-            (0.0, -1.0, 0.0, 0.0, 0.0, 0.0),
-            (-((off[k] / unit[k]) ** 2), 0.0, 0.0, 1.0, 0.0, 0.0),
-        )[how]
-        found.append(crash)
-    return found if len(found) > 1 else [row]
+    share[:, (survived.spread == 0.0) | (np.arange(m) == at)] = np.inf
+    found = np.zeros((m, SIZE))
+    found[:, SAYS], found[:, [I, J]] = CRASHES, np.arange(m)[:, None]
+    found[:, [ONE, OTHER]], found[:, HELD] = 1.0 / unit[:, None], len(held)
+    for k, side in enumerate(share.argmin(0)):
+        found[k, [AT, TO]] = (low, high, centre)[side][k]
+        found[k, [C, B, P]] = (
+            (0.0, 1.0, 0.0),
+            (0.0, -1.0, 0.0),
+            (-((off[k] / unit[k]) ** 2), 0.0, 1.0),
+        )[side]
+    return np.asarray(found[share.min(0) < _RARE])
 
 
 def boxed(known: Survived, rows: Floats) -> Survived:
