@@ -32,6 +32,7 @@ from evofsm.driving.naming import LABELS, RANGES
 from evofsm.driving.perception import Estimate, Perception, is_whole
 from evofsm.driving.rehearsal import HARDEST, Body, Three, critical_decelerations, foresee
 from evofsm.driving.revisers import GENTLE_BRAKE
+from evofsm.fsm.kernels import compiled, inner_kernel
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import wilson_bounds
@@ -40,7 +41,16 @@ from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import Action, nearest_bounds
 from evofsm.guard.api import Trial
-from evofsm.store import COUNT, FLAG, SIZE, SMALLEST, Kind, Numbers, Place
+from evofsm.store import (
+    COUNT,
+    FLAG,
+    LARGEST_OBSERVATION,
+    SIZE,
+    SMALLEST,
+    Kind,
+    Numbers,
+    Place,
+)
 
 if TYPE_CHECKING:
     from evofsm.guard import ActionReviser
@@ -220,7 +230,7 @@ class LatentRisk(Retraced):
         self, observation: ArrayLike, acceleration: float, *, learn: bool, watched: bool = False
     ) -> None:
         seen = _three_finite(observation, whole=False)
-        command = float(_finite("acceleration", [acceleration])[0])
+        command = _one_finite("acceleration", acceleration)
         self._keep_up(seen, command, learn and is_whole(seen), watched)
 
     @step
@@ -302,14 +312,13 @@ class LatentRisk(Retraced):
         """
         here = self._cautious(situation.observation)
         actions = _finite("accelerations", accelerations)
-        evidence = float(len(self.manoeuvres))
+        table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
         if not is_whole(here):  # where one is cannot be told: nothing can be survived for sure
             sure = np.ones(len(actions))
             return Judgement(sure, 0.0 * sure, sure, 0.0 * sure, evidence, situation.seen)
-        critical = np.empty(len(actions))
-        critical_decelerations(here, actions, self._commands[1], self.body, self.dt, critical)
-        risk = self.manoeuvres.harder(critical)
-        low, high = np.array([wilson_bounds(r, evidence + 1.0) for r in risk.tolist()]).T
+        judged = np.empty((4, len(actions)))
+        _judge(here, actions, self._commands[1], self.body, self.dt, table, evidence, judged)
+        risk, low, high, critical = judged
         return Judgement(risk, low, high, critical, evidence, situation.seen)
 
     def why(self, judged: Judgement) -> str:
@@ -580,7 +589,7 @@ def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[State
 
 def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     """Gap and speeds, as they can be judged; unless they must be ``whole``, NaN where not seen."""
-    seen = real_array("observation", observation, 1)
+    seen = _series("observation", observation)
     if len(seen) != 3:
         raise ValueError(
             f"observation has shape {seen.shape}; it must be (3,): gap, speed of the follower "
@@ -592,7 +601,62 @@ def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     return gap, speed, leader_speed
 
 
+def _one_finite(name: str, value: float) -> float:
+    if type(value) is float and abs(value) <= LARGEST_OBSERVATION:  # false of NaN
+        return value
+    return float(_finite(name, [value])[0])
+
+
 def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    array = real_array(name, values, 1)
+    array = _series(name, values)
     refuse_unusable(name, array)
     return array
+
+
+def _series(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Real numbers in a row; what is that already is not looked at for long, nor copied."""
+    if (
+        type(values) is np.ndarray
+        and values.dtype == np.float64
+        and values.ndim == 1
+        and len(values)
+        and values.flags.carray  # a read-only one would be compiled for
+    ):
+        return values
+    return real_array(name, values, 1)
+
+
+@compiled
+def _judge(
+    observation: Three,
+    accelerations: NDArray[np.float64],
+    before: float,
+    body: Body,
+    dt: float,
+    table: NDArray[np.float64],
+    evidence: float,
+    judged: NDArray[np.float64],
+) -> None:
+    """Write risk, its interval and the critical deceleration."""
+    critical_decelerations(observation, accelerations, before, body, dt, judged[3])
+    for k in range(len(accelerations)):
+        judged[0, k] = _interpolated(judged[3, k], table)
+        judged[1, k], judged[2, k] = wilson_bounds(judged[0, k], evidence + 1.0)
+
+
+@inner_kernel
+def _interpolated(x: float, table: NDArray[np.float64]) -> float:
+    """What `numpy.interp` returns for a number, which takes long to compile."""
+    low, high = 0, table.shape[1] - 1
+    if x <= table[0, low]:
+        return float(table[1, low])
+    if x >= table[0, high]:
+        return float(table[1, high])
+    while high - low > 1:
+        middle = (low + high) // 2
+        if table[0, middle] <= x:
+            low = middle
+        else:
+            high = middle
+    slope = (table[1, high] - table[1, low]) / (table[0, high] - table[0, low])
+    return float(slope * (x - table[0, low]) + table[1, low])

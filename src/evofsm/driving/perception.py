@@ -13,13 +13,16 @@ from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Iterable, Mapping
 from math import isnan, nan, sqrt
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving.rehearsal import Three
 from evofsm.fsm.kernels import compiled
+
+# Gap [m], speed of the follower and of the leader [m/s], or what is said of each of them.
+Matrix: TypeAlias = tuple[Three, Three, Three]
 
 # Standard deviation of what may happen within a decision: the accelerations of the leader, of
 # oneself against what is expected, and of oneself while brakes are not known [m/s²].
@@ -38,7 +41,7 @@ _ANOTHER_LEADER = 6.0
 _MEDIAN = 0.6745
 _SIX = sqrt(6.0)
 _NO_NOISE = (0.0, 0.0, 0.0)
-_NO_COVARIANCE = np.zeros((3, 3))
+_NO_COVARIANCE = (_NO_NOISE, _NO_NOISE, _NO_NOISE)
 _NOISES = ("noise_gap", "noise_speed", "noise_leader")
 
 
@@ -46,11 +49,17 @@ class Estimate(NamedTuple):
     """Where one is, and how sure that is."""
 
     mean: Three  #: gap [m], speed of the follower and of the leader [m/s]
-    covariance: NDArray[np.float64]  #: (3, 3)
+    covariance: Matrix
 
     def deviation(self, weights: Three) -> float:
         """Standard deviation of a weighed sum of the three."""
-        return sqrt(max(float(np.dot(weights, np.dot(self.covariance, weights))), 0.0))
+        if self.covariance is _NO_COVARIANCE:
+            return 0.0
+        variance = 0.0
+        for u, row in zip(weights, self.covariance, strict=True):
+            for v, covariance in zip(weights, row, strict=True):
+                variance += u * v * covariance
+        return sqrt(max(variance, 0.0))
 
 
 class Perception:
@@ -95,7 +104,7 @@ class Perception:
         if self.noise == _NO_NOISE and is_whole(now):
             return Estimate(now, _NO_COVARIANCE)
         if self.latest is None:
-            return Estimate(now, np.diag(np.square(self.noise)))
+            return Estimate(now, _diagonal(self.noise))
         doubt = _OWN if sure else _OWN_UNKNOWN
         return Estimate(*_filtered(*self.latest, now, self.noise, realised, doubt, self.dt))
 
@@ -135,15 +144,22 @@ def is_whole(observation: Three) -> bool:
 
 
 @compiled
+def _diagonal(deviations: Three) -> Matrix:
+    """Covariance of what is not correlated."""
+    gap, speed, leader = deviations
+    return (gap * gap, 0.0, 0.0), (0.0, speed * speed, 0.0), (0.0, 0.0, leader * leader)
+
+
+@compiled
 def _filtered(
     before: Three,
-    covariance: NDArray[np.float64],
+    covariance: Matrix,
     now: Three,
     noise: Three,
     realised: float,
     doubt: float,
     dt: float,
-) -> tuple[Three, NDArray[np.float64]]:
+) -> tuple[Three, Matrix]:
     """One step of the filter, to the next mean and covariance, by what was seen (not NaN).
 
     ``doubt`` is the standard deviation of the acceleration that was ``realised`` [m/s²].
@@ -151,27 +167,38 @@ def _filtered(
     gap, speed, leader = before
     reached = max(speed + realised * dt, 0.0)
     mean = np.array([gap + (leader - 0.5 * (speed + reached)) * dt, reached, leader])
-    moves = np.array([[1.0, -dt, dt], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    (gg, gv, gu), (_, vv, vu), (_, _, uu) = covariance
+    # F P Fᵀ, where only the gap changes with the others.
+    to_v, to_u = gv + (vu - vv) * dt, gu + (uu - vu) * dt
+    gg += 2.0 * (gu - gv) * dt + (uu - 2.0 * vu + vv) * dt * dt
     # An acceleration changes a speed, and the gap by half an interval of it.
-    v, u, half = doubt * dt, _LEADER * dt, 0.5 * dt
-    caused = np.array([[-half * v, half * u, _UNEVEN], [v, 0.0, 0.0], [0.0, u, 0.0]])
-    spread = np.zeros((3, 3))
-    for j, k in np.ndindex(3, 3):
-        for i in range(3):
-            moved = covariance[i, 0] * moves[k, 0] + covariance[i, 1] * moves[k, 1]
-            moved += covariance[i, 2] * moves[k, 2]
-            spread[j, k] += moves[j, i] * moved + caused[j, i] * caused[k, i]
-    if not np.isnan(now[0] + now[1] + now[2]):
-        for i in (0, 2):
-            expected = spread[i, i] + noise[i] ** 2
-            if (now[i] - mean[i]) ** 2 > _ANOTHER_LEADER**2 * expected:
-                return now, np.diag(np.array(noise) ** 2)
+    v, u, half = (doubt * dt) ** 2, (_LEADER * dt) ** 2, 0.5 * dt
+    gg += half * half * (v + u) + _UNEVEN**2
+    to_v, to_u = to_v - half * v, to_u + half * u
+    spread = np.array([[gg, to_v, to_u], [to_v, vv + v, vu], [to_u, vu, uu + u]])
+
+    variances = _diagonal(noise)
+    whole = not np.isnan(now[0] + now[1] + now[2])
+    for i in (0, 2):
+        off, expected = now[i] - mean[i], spread[i, i] + variances[i][i]
+        if whole and off * off > _ANOTHER_LEADER * _ANOTHER_LEADER * expected:
+            return now, variances
     for i in range(3):
-        if not np.isnan(now[i]):
-            gain = spread[i] / (spread[i, i] + noise[i] ** 2)
-            mean += gain * (now[i] - mean[i])
-            spread -= np.outer(gain, spread[i])
-    return (mean[0], max(mean[1], 0.0), max(mean[2], 0.0)), spread
+        if np.isnan(now[i]):
+            continue
+        row = spread[i].copy()
+        total = row[i] + variances[i][i]
+        off = (now[i] - mean[i]) / total
+        for j in range(3):
+            mean[j] += row[j] * off
+            gain = row[j] / total
+            for k in range(3):
+                spread[j, k] -= gain * row[k]
+    return (mean[0], max(mean[1], 0.0), max(mean[2], 0.0)), (
+        (spread[0, 0], spread[0, 1], spread[0, 2]),
+        (spread[1, 0], spread[1, 1], spread[1, 2]),
+        (spread[2, 0], spread[2, 1], spread[2, 2]),
+    )
 
 
 # -- The noise ----------------------------------------------------------------------------------
