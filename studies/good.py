@@ -15,7 +15,6 @@ import numpy as np
 import polars as pl
 from typer import Option
 
-from evofsm.guard import run_episode
 from evofsm.paper import Page, Table
 from studies import lib
 from studies.judges import make_judge, run
@@ -51,9 +50,9 @@ class Driver:
         self.system, self.act = system, act
 
     def propose(self, observation: Vector, time: float = 0.0) -> Any:
-        """What it wants; kept as ``proposed``."""
-        self.proposed = self.act(self.system, observation)
-        return self.proposed
+        """What it wants; kept as the system's ``proposed``."""
+        self.system.proposed = self.act(self.system, observation)
+        return self.system.proposed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,17 +144,17 @@ def driven(name: str, careless: str, seed: int, train: int, episodes: int) -> li
     driver, rows = Driver(system, GOOD[name, careless]), []
     ways: dict[str, Any] = {ALONE: Unrevised(), FROZEN: frozen, LEARNING: guard}
     for way, judge in ways.items():
-        failed = goals = steps = kept = 0
-        score = 0.0
-        for k in range(episodes):
-            start = Start.training(1, seed, k)
-            for one in run_episode(system, judge, driver, options={"start": start}):
-                steps += 1
-                kept += np.array_equal(one.revision.executed, driver.proposed)
-            failed, goals = failed + one.failed, goals + system.arrived
-            score += system.score
+        found = [run(system, judge, Start.training(1, seed, k), driver) for k in range(episodes)]
         rows.append(
-            {"system": name, "seed": seed, "way": way, "episodes": episodes, "failed": failed}
-            | {"goals": goals, "kept": kept / steps, "score": score / episodes}
+            {
+                "system": name,
+                "seed": seed,
+                "way": way,
+                "episodes": episodes,
+                "failed": sum(ended.failed for ended in found),
+                "goals": sum(ended.arrived for ended in found),
+                "kept": sum(ended.kept for ended in found) / sum(len(e.times) for e in found),
+                "score": float(np.mean([ended.score for ended in found])),
+            }
         )
     return rows

@@ -229,11 +229,14 @@ class Ended(NamedTuple):
     steps: int  #: to failure; without it, as many as an episode may have
 
 
-def run(system: System, judge: Any, start: Start) -> Ended:
-    """One episode of a system under a judge, which learns from it unless it is frozen."""
+def run(system: System, judge: Any, start: Start, controller: Any = None) -> Ended:
+    """One episode of a system under a judge, which learns from it unless it is frozen.
+
+    Another ``controller`` than the system's own keeps what it wants as the system's ``proposed``.
+    """
     times: list[float] = []
     kept, changes = 0, 0.0
-    for one in run_episode(system, judge, system, options={"start": start}):
+    for one in run_episode(system, judge, controller or system, options={"start": start}):
         executed, proposed = one.revision.executed, system.proposed
         times.append(one.seconds)
         kept += np.array_equal(executed, proposed)
