@@ -114,8 +114,9 @@ class Wall:
 
 
 class NoisyWall(Wall):
-    """The same with a noisy sensor."""
+    """The same with a noisy sensor; it looks far ahead, in steps of two decisions."""
 
+    actions: ClassVar[dict[str, Any]] = {**Wall.actions, "horizon": 20.0}
     noise = np.array([0.01, 0.004])
 
 

@@ -259,7 +259,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "MARGIN": risk.margin,
         "ALLOWED": risk._allowed(reviser.tolerance, remembered),
         "ASKED": asked,
-        "JUDGED": 1 if most < 2 * few * risk.horizon else asked,
+        "JUDGED": 1 if most < 2 * few * state.horizon else asked,
         "MOST_DONE": math.ceil(most),
         "EVIDENCE": float(remembered.number),
         **{name.strip("_"): getattr(rollout, name) for name in _OF_ROLLOUTS},
@@ -278,6 +278,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         f"rollouts of {steps} steps, each of {p} x {m} products in {lanes} lanes\n"
     )
     sizes = {"NUMBERS": a, "FEATURES": p, "LANES": lanes, "BACKUPS": len(names)}
+    sizes["STRIDE"] = state.stride
     sizes["DEAD_ENDS"], sizes["LANDS"] = len(model.dead_ends), int(rows > m)
     return Part(Path(rollout.__file__).with_suffix(".c"), m, sizes, constants, about)
 

@@ -38,6 +38,34 @@ def test_after_a_failure_or_two_it_keeps_a_bad_controller_from_failing(point, se
     assert all(point.play(alone, 90_000 + k)[1] for k in range(10))
 
 
+def test_it_looks_far_ahead_in_steps_of_several_decisions(point):
+    guard = point.guard(horizon=30.0)
+    assert sum(point.play(guard, k)[1] for k in range(12)) <= 4
+    assert sum(point.play(guard, 100 + k)[1] for k in range(5)) <= 1
+    assert guard.judge.horizon >= 300
+    assert "in steps of 4 decisions" in guard.judge.told_by_experience
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_a_pendulum_that_is_decided_every_5_ms_is_held_by_looking_ahead_in_longer_steps(seed):
+    rng, dt, failed = np.random.default_rng(seed), 0.005, []
+    guard = Guard(low=-2.0, high=2.0, interval=dt, seed=seed)
+    for _ in range(24):
+        angle, rate = rng.uniform([-0.1, -0.3], [0.1, 0.3])
+        for _ in range(800):
+            torque = guard.decide([angle, rate], rng.uniform(-2.0, 2.0)).executed
+            rate += dt * (15.0 * math.sin(angle) + 3.0 * torque)
+            angle += dt * rate
+            if abs(angle) > 0.5:
+                break
+        failed.append(abs(angle) > 0.5)
+        guard.end(failed=failed[-1], observation=[angle, rate])
+    assert sum(failed) <= 12
+    assert sum(failed[-8:]) <= 1
+    assert guard.judge.horizon * dt > 0.8
+
+
 def test_nothing_is_revised_before_the_first_failure_and_it_says_why(point):
     guard = point.guard()
     said = [one for k in range(3) for one in point.play(guard, k, steps=10)[0]]

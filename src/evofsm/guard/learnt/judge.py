@@ -113,7 +113,8 @@ class LearntRisk(ActionJudge):
         Number of actions, where an action is an index from 0.
     horizon : float, optional
         How far it looks ahead [s]. Without it, half as far again as it takes to fail where failure
-        can no longer be avoided, from 32 to 144 steps.
+        can no longer be avoided, from 32 to 144 steps. If that is too short a step lasts several
+        decisions, as with a longer horizon that is given.
     seed : int
         Of the draws with which backups evolve and situations are chosen.
     without : sequence of str
@@ -160,7 +161,8 @@ class LearntRisk(ActionJudge):
 
     # Of the present episode.
     _at: Floats | None  # the situation in which one was last, by all that was seen
-    _action: Floats  # what was done there
+    _past: list[Floats]  # observations of the last step, unseen ones as they were taken to be
+    _done: list[Floats]  # and actions after them
     _z: list[Floats]  # observations that are to be learnt from
     _u: list[Floats]  # and actions after them
     # Of each decision: a proposal was refused, nothing helped even undisturbed, some backup held.
@@ -224,7 +226,11 @@ class LearntRisk(ActionJudge):
         self.harm = Harm()  #: how episodes ended, guarded and alone
         self.n_violated = 0  #: certificates that were violated
         #: All that it has learnt, and what decides, made of it.
-        self.state = State.none(0, self.size, self.choices, self.settings, steps)
+        stride = 1
+        while steps is not None and steps > self.settings.horizon_max:
+            steps, stride = -(-steps // 2), 2 * stride
+        blank = State.none(0, self.size, self.choices, self.settings, steps)
+        self.state = blank._replace(stride=stride)
         if "margin" in self.without:
             self.state = self.state._replace(margin=0.0)
         self.parts: Parts | None = None
@@ -242,8 +248,8 @@ class LearntRisk(ActionJudge):
 
     @property
     def horizon(self) -> int:
-        """Steps that it looks ahead."""
-        return self.state.horizon
+        """Decisions that it looks ahead."""
+        return self.state.horizon * self.state.stride
 
     @property
     def fallback(self) -> Fallback:
@@ -279,7 +285,7 @@ class LearntRisk(ActionJudge):
     @property
     def remembered(self) -> Remembered:
         """Disturbances that it counts on, and the time in which they were seen."""
-        return Remembered(len(self.state.windows), self.state.n_seen * self.dt)
+        return Remembered(len(self.state.windows), self.state.n_seen * self.state.stride * self.dt)
 
     @property
     def effort(self) -> tuple[int, float]:
@@ -442,7 +448,7 @@ class LearntRisk(ActionJudge):
 
     def _soon(self, exposure: float) -> float:
         """The horizon, as a share of the time in which all that is remembered was seen."""
-        return self.state.horizon * self.dt / max(exposure, 1e-300)
+        return self.state.horizon * self.state.stride * self.dt / max(exposure, 1e-300)
 
     def _risk(self, unsurvived: float, soon: float) -> tuple[float, float, float]:
         """Probability, with its 90 % interval, that within the horizon something begins of those.
@@ -465,12 +471,14 @@ class LearntRisk(ActionJudge):
 
     def _here(self, z: Floats) -> Floats | None:
         """The situation, if that is seen; what was not is taken to have gone on as before."""
-        at, m, has_gaps = self._at, len(z), math.isnan(z.dot(z))
+        at, past, m, has_gaps = self._at, self._past, len(z), math.isnan(z.dot(z))
         if at is None:
             return None if has_gaps else np.append(z, np.zeros(m + self.size))
+        stride = self.state.stride
         if has_gaps:
-            z = np.where(np.isnan(z), at[:m] + at[m : 2 * m], z)
-        return np.concatenate([z, z - at[:m], self._action])
+            z = np.where(np.isnan(z), at[:m] + at[m : 2 * m] / stride, z)
+        change = (z - past[0]) * (stride / len(past))
+        return np.concatenate([z, change, sum(self._done) / len(past)])
 
     def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
@@ -561,18 +569,22 @@ class LearntRisk(ActionJudge):
     def _take_in(self, observation: ArrayLike, action: Any) -> None:
         self.follow(observation, action)
         self._notes.append((self._refused, self._lost, self._certified))
-        if len(self._z) > _MOST_ROWS:
-            z, u = self._z, self._u
+        if len(self._z) > _MOST_ROWS * (stride := self.state.stride):
+            z, u, rows = self._z, self._u, 2 * stride + 1
             self._u = u[:-1]
             self._study(failed=False, terminated=False)
-            self._z, self._u, self._notes = z[-3:], u[-3:], [(False, False, False)] * 3
+            self._z, self._u = z[-rows:], u[-rows:]
+            self._notes = [(False, False, False)] * rows
             self._ranks = np.arange(len(self.state.policies))
 
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
         here = self._here(np.array(observation, np.float64))
         if here is not None:
-            self._at, self._action = here, self.encode(action)
+            latest = slice(-self.state.stride, None)
+            self._at, z = here, here[: (len(here) - self.size) // 2]
+            self._past = [*self._past, z][latest]
+            self._done = [*self._done, self.encode(action)][latest]
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; the episode before is learnt from."""
@@ -626,9 +638,8 @@ class LearntRisk(ActionJudge):
         if not self.n_variables:
             now = self.state
             blank = State.none(z.shape[1], self.size, self.choices, self.settings, None)
-            self.state = blank._replace(
-                horizon=now.horizon, margin=now.margin, n_failed=now.n_failed
-            )
+            same = ("horizon", "stride", "margin", "n_failed")
+            self.state = blank._replace(**{name: getattr(now, name) for name in same})
         self.state = learn(
             self.state,
             episode,
@@ -647,7 +658,7 @@ class LearntRisk(ActionJudge):
 
     def _forget(self) -> None:
         """Begin an episode."""
-        self._at, self._action = None, np.zeros(0)
+        self._at, self._past, self._done = None, [], []
         self._z, self._u, self._notes = [], [], []
         self._certified = self._holds = self._refused = self._lost = False
         self._unsurvived, self._fails_after, self._asked = 0, 0.0, self.settings.n_asked

@@ -78,6 +78,8 @@ def learn(
     State
         What is known now.
     """
+    decisions, before = episode, state
+    episode = decisions.every(state.stride)
     random = np.random.default_rng([seed, state.n_episodes])
     seen = np.isfinite(episode.observations).all(1)
     if not state.n_seen:
@@ -123,6 +125,9 @@ def learn(
         state = disturbances(state, known, safe, u, settings, random, looks=looks)
     rest = residuals_of(state, known, state.horizon)
     if looks and not has_horizon:
+        if is_too_short(state, known, episode, settings):
+            before = coarser(before, settings)
+            return learn(before, decisions, settings, seed=seed, without=without, given=given)
         state = look_ahead(state, known, rest, episode, settings)
     # Backups
     if given.backup is not None:
@@ -294,7 +299,7 @@ def look_ahead(
     lately. What the model says of failure farther away than that is believed again little by
     little.
     """
-    H, s = state.horizon, settings
+    H, s, most = state.horizon, settings, farthest(known, settings)
     ends = value_of(known, state.situations, state.policies[: s.n_asked], rest)
     after = float(ends[ends < 0.0].max(initial=-1.0 - H) + 1 + H)
     refuted = len(episode.lost) > H and episode.lost[:-H].any()
@@ -311,9 +316,38 @@ def look_ahead(
             longest = min(s.ahead * longest, s.horizon_max / s.ahead)
             believed = max(believed, longest)
         T = max(min(after, believed), longest)
-    cost = known.weights.size * (1 + s.n_disturbances)
-    farthest = min(s.horizon_max, s.work / cost / s.n_asked)  # less where a rollout costs more
-    horizon = int(max(min(s.ahead * T, farthest), s.horizon_min))
+    horizon = int(max(min(s.ahead * T, most), s.horizon_min))
     return state._replace(
         time_to_failure=T, believed=believed, horizon=horizon, too_short=too_short
+    )
+
+
+def farthest(known: Model, settings: LearntSettings) -> float:
+    """How far it looks ahead at most [steps]: less where a rollout costs more."""
+    cost = known.weights.size * (1 + settings.n_disturbances)
+    return min(settings.horizon_max, settings.work / cost / settings.n_asked)
+
+
+def is_too_short(state: State, known: Model, episode: Episode, settings: LearntSettings) -> bool:
+    """Whether a certified episode failed later than it looks ahead, as far as that may be."""
+    held = np.flatnonzero(episode.certified)
+    is_late = len(held) > 0 and len(episode.actions) - held[-1] > state.horizon
+    return bool(episode.failed and is_late and state.horizon + 1 > farthest(known, settings))
+
+
+def coarser(state: State, settings: LearntSettings) -> State:
+    """Make each step last twice as many decisions: how it moves is to be learnt anew."""
+    m = len(state.origin)
+    none = State.none(m, len(state.used), state.choices, settings, max(1, state.horizon // 2))
+    learnt_anew = (
+        *("squares", "products", "least", "most", "scale", "noise", "power"),
+        *("recent_squares", "recent_products", "doubt", "since", "drifts", "misled"),
+        *("n_scanned", "n_moves", "centres", "radii", "counts", "windows", "lengths", "seen_in"),
+        *("situations", "margin", "time_to_failure", "believed", "too_short", "horizon"),
+    )
+    return state._replace(
+        **{name: getattr(none, name) for name in learnt_anew},
+        n_seen=state.n_seen // 2,
+        unit=2.0 * state.unit,
+        stride=2 * state.stride,
     )

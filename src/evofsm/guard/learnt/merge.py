@@ -18,7 +18,7 @@ from evofsm.guard.harm import Harm
 from evofsm.guard.learnt.backups import evolved
 from evofsm.guard.learnt.danger import dead_ends, explained
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.learnt.learn import chosen, disturbance_scale, kept, worst
+from evofsm.guard.learnt.learn import chosen, coarser, disturbance_scale, kept, worst
 from evofsm.guard.learnt.rollout import Floats, crossed, pairs
 from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
 
@@ -85,6 +85,9 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
     def rows(name: str, most: int = 0) -> Floats:
         return np.concatenate([getattr(part, name)[-(most // len(parts)) :] for part in parts])
 
+    stride = max(part.stride for part in parts)
+    while any(part.stride < stride for part in parts):
+        parts = [part if part.stride == stride else coarser(part, settings) for part in parts]
     first, latest = parts[0], max(parts, key=lambda part: part.n_episodes)
     (p, m), a, n_episodes = first.products.shape, len(first.used), int(of("n_episodes").sum())
     T = np.array([_moved(d, a, p) for d in of("origin") - first.origin])
@@ -120,7 +123,7 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
         "survived_in": seen_in[::every],
         "situations": rows("situations", settings.n_situations),
         "used": of("used").sum(0),
-        **{name: int(of(name).max()) for name in ("horizon", "wrong")},
+        **{name: int(of(name).max()) for name in ("horizon", "wrong", "stride")},
     }
     merged = State.none(m, a, first.choices, settings, None)._replace(**fields)
     merged = explained(merged, failed=True)

@@ -170,7 +170,7 @@ def told(
         For its features.
     z : (T + 1, m) ndarray
     move : callable
-        From an observation and an encoded action (a,) to the next observation.
+        From an observation and an encoded action (a,) to the observation a decision later.
     random : numpy.random.Generator
     """
     latest = np.diff(z, axis=0)
@@ -184,7 +184,10 @@ def told(
 
     at, before, u = z[rows + 1], drawn(), drawn()
     phi = features(known, at, random.permutation(latest[rows]), before, u)
-    change = np.array([move(*pair) for pair in zip(at, u, strict=True)]).reshape(at.shape) - at
+    after = at
+    for _ in range(state.stride):
+        after = np.array([move(*pair) for pair in zip(after, u, strict=True)]).reshape(at.shape)
+    change = after - at
     return state._replace(
         squares=state.squares + phi.T @ (1.0 * phi), products=state.products + phi.T @ change
     )

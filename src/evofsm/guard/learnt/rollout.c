@@ -5,8 +5,9 @@
 /* ==== state ==== */
   /* Observation, its change, and the action before: of the decision before, and now. */
   double at[2 * EVOFSM_VARIABLES + EVOFSM_NUMBERS], here[2 * EVOFSM_VARIABLES + EVOFSM_NUMBERS];
-  double action[EVOFSM_NUMBERS]; /* what was done there */
-  int has_past, is_placed;       /* whether there is such a decision; and whether one is now */
+  /* Observations of the last step, the oldest first, and what was done there. */
+  double past[EVOFSM_STRIDE][EVOFSM_VARIABLES], acted[EVOFSM_STRIDE][EVOFSM_NUMBERS];
+  int n_past, is_placed;         /* how many there are; and whether one knows where one is now */
   int ranks[EVOFSM_BACKUPS];     /* backups, those first that passed last */
   int done;                      /* steps of rollouts in this search */
   int ignores;                   /* whether dead ends do not count */
@@ -466,22 +467,27 @@ static int foresee(evofsm_state *s, const double action[A]) {
 
 /* _here: where one is; what was not seen is taken to have gone on as before. */
 static void situate(evofsm_state *s) {
-  int i, j;
+  const int n = s->n_past;
+  int i, j, t;
   s->is_placed = 1;
   for (j = 0; j < M; j++) {
-    const double z = s->observation[j];
-    s->here[j] = s->has_past && isnan(z) ? s->at[j] + s->at[M + j] : z;
-    s->here[M + j] = s->has_past ? s->here[j] - s->at[j] : 0.0;
+    const double z = s->observation[j], times = n > 0 ? (double)EVOFSM_STRIDE / n : 0.0;
+    s->here[j] = n > 0 && isnan(z) ? s->at[j] + s->at[M + j] / EVOFSM_STRIDE : z;
+    s->here[M + j] = n > 0 ? (s->here[j] - s->past[0][j]) * times : 0.0;
     s->is_placed &= !isnan(s->here[j]);
   }
   for (i = 0; i < A; i++) {
-    s->here[2 * M + i] = s->has_past ? s->action[i] : 0.0;
+    double sum = 0.0;
+    for (t = 0; t < n; t++) {
+      sum += s->acted[t][i];
+    }
+    s->here[2 * M + i] = n > 0 ? sum / n : 0.0;
   }
 }
 
 static void forget(evofsm_state *s) {
   int i;
-  s->has_past = 0;
+  s->n_past = 0;
   s->is_placed = 0;
   for (i = 0; i < EVOFSM_BACKUPS; i++) {
     s->ranks[i] = i;
@@ -535,9 +541,15 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
 
 /* LearntRisk.follow: keep up with what is executed. */
 static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
+  int t;
   if (s->is_placed) {
+    for (t = 1; t < EVOFSM_STRIDE && s->n_past == EVOFSM_STRIDE; t++) {
+      copy(s->past[t - 1], s->past[t], M);
+      copy(s->acted[t - 1], s->acted[t], A);
+    }
+    s->n_past += s->n_past < EVOFSM_STRIDE;
     copy(s->at, s->here, 2 * M + A);
-    encode(executed, s->action);
-    s->has_past = 1;
+    copy(s->past[s->n_past - 1], s->here, M);
+    encode(executed, s->acted[s->n_past - 1]);
   }
 }

@@ -142,6 +142,17 @@ class Episode(NamedTuple):
     certified: Floats  #: (T,) 1 where some backup survived all
     fails_after: float  #: steps after which what was refused fails, at the latest
 
+    def every(self, stride: int) -> Episode:
+        """Steps of so many decisions each, to the last observation; their actions in the mean."""
+        if stride == 1:
+            return self
+        n = len(self.actions) // stride
+        first = len(self.actions) - n * stride
+        rows = slice(first, None, stride)
+        actions = self.actions[first:].reshape(n, stride, self.actions.shape[1]).mean(1)
+        notes = {name: getattr(self, name)[rows] for name in ("refused", "lost", "certified")}
+        return self._replace(observations=self.observations[rows], actions=actions, **notes)
+
 
 class State(NamedTuple):
     """What was learnt, of m variables and actions of a numbers; p features."""
@@ -202,6 +213,7 @@ class State(NamedTuple):
     believed: Annotated[float, _ABOVE_0]  #: [steps]
     too_short: Annotated[float, _ABOVE_0]  #: [steps] before a failure that was certified not to be
     horizon: Annotated[int, COUNT._replace(least=1.0, most=1e4)]  #: [steps]
+    stride: Annotated[int, COUNT._replace(least=1.0, most=1e4)]  #: decisions in a step
 
     @classmethod
     def none(
@@ -258,6 +270,7 @@ class State(NamedTuple):
             believed=float(settings.horizon_max),
             too_short=0.0,
             horizon=settings.horizon if horizon is None else horizon,
+            stride=1,
         )
 
 

@@ -148,6 +148,8 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
     there, ends = _where(state.forms, names)
     latest = {int(j): int(since) + 1 for j, since, _ in state.drifts}
     more = "".join(f"; since episode {k} {names[j]} moves otherwise" for j, k in latest.items())
+    if state.stride > 1:
+        more += f"; it looks ahead in steps of {state.stride} decisions"
     if ends:
         more += f"; ends by itself {' or '.join(ends)}"
     if not there:
