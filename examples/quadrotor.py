@@ -131,24 +131,30 @@ def trial(seed: int, episodes: int, held_out: int) -> tuple[Flights, Flights, Fl
     learning = fly(guard, range(1000 * seed, 1000 * seed + episodes))
     guard.freeze()
     others = range(10_000 + 1000 * seed, 10_000 + 1000 * seed + held_out)
-    return (
-        learning,
-        fly(Guard(low=low, high=high, interval=DT, mode=Mode.OFF), others),
-        fly(guard, others),
-    )
+    off = Guard(low=low, high=high, interval=DT, mode=Mode.OFF)
+    return learning, fly(off, others), fly(guard, others)
 
 
 def draw(alone: Flights, guarded: Flights, count: int = 6) -> Figure:
-    """The first flights from above, and how high they are."""
-    figure = Figure(figsize=(7.2, 4.6), layout="constrained")
-    panels = figure.subplots(2, 2, sharex="row", sharey="row", height_ratios=(3, 1.6))
-    for column, name, flights in zip(panels.T, ("alone", "guarded"), (alone, guarded), strict=True):
+    """The first flights from above and from the side; the frames are the room."""
+    figure = Figure(figsize=(6.2, 5.0), layout="constrained")
+    panels = figure.subplots(2, 2, sharex="row", sharey="row", height_ratios=(2.2, 1.0))
+    for column, name, flights in zip(panels.T, "ab", (alone, guarded), strict=True):
         for way, failed in zip(flights.ways[:count], flights.failed, strict=False):
-            color = plot.COLORS["dead end" if failed else "follower"]
-            look = {"color": color, "marker": "X" if failed else "o", "markevery": [-1]}
-            column[0].plot(*way[:, :2].T, **look)
+            look: dict[str, Any] = {"linewidth": 1.2, "markevery": [-1], "clip_on": False}
+            look |= {"color": plot.COLORS["dead end" if failed else "follower"]}
+            look |= {"marker": "X" if failed else "o", "markersize": 7 if failed else 4}
+            column[0].plot(way[:, 0], way[:, 1], **look)
             column[1].plot(DT * np.arange(len(way)), way[:, 2], **look)
-        column[0].set(title=f"{name}: {sum(flights.failed)} of {len(flights.ways)} fail")
+        who = "alone" if flights is alone else "under the guard"
+        title = f"$\\bf{{{name}}}$  {who}: {sum(flights.failed)} of {len(flights.ways)} fail"
+        column[0].set_title(title, pad=12)
+        column[0].set(aspect="equal", xlim=(-3, 3), ylim=(-3, 3), xlabel="x [m]")
+        column[1].set(xlim=(0, DT * STEPS), ylim=(0, 3), yticks=range(4), xlabel="time [s]")
+        for ax in column:
+            ax.spines[:].set_visible(True)
+    panels[0, 0].set_ylabel("y [m]")
+    panels[1, 0].set_ylabel("height [m]")
     return figure
 
 
