@@ -200,6 +200,19 @@ def test_in_the_example_another_controller_is_kept_out(monkeypatch, tmp_path):
     assert (tried[0].failed > 20, tried[40].failed, tried[40].arrived >= 40) == (True, 0, True)
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:this guard was not shown to help")  # after four flights
+def test_in_the_example_a_quadrotor_hovers_where_it_has_to_and_crashes_alone(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "examples")
+    example = importlib.import_module("quadrotor")
+    weight, still = np.full(4, example.MASS * example.G / 4), np.zeros(12)
+    np.testing.assert_allclose(example.change(still, weight, np.zeros(3)), 0.0, atol=1e-12)
+    options = ["--seeds", "1", "--episodes", "4", "--held-out", "3"]
+    ((learning, alone, guarded),) = example.main([*options, "--picture", f"{tmp_path}/it.png"])
+    assert (len(learning.failed), sum(alone.failed), alone.kept, len(guarded.ways)) == (4, 3, 1, 3)
+    assert (tmp_path / "it.png").exists()
+
+
 def test_a_history_marks_alarms_and_failures_and_leaves_holes_blank():
     when = np.array([0.0, 60.0, 120.0, 9000.0, 9060.0, 9120.0])
     risk, failed = [0, 0, 0.9, 0.9, 0.9, 0.9], [False, False, True, False, False, True]
