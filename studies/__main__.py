@@ -21,6 +21,7 @@ STUDIES = {
     "judges": "judges:Judges",
     "tasks": "judges:Tasks",
     "good": "good:Good",
+    "peers": "peers:Peers",
     "forecasts": "forecasts:ForecastStudy",
     "machines": "machines:Machines",
     "sensitivity": "sensitivity:Sensitivity",
