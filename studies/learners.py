@@ -154,9 +154,9 @@ def learning_guard(kind: str, task: str, actions: Any, seed: int) -> Guard:
     return Guard(**ends, interval=interval, seed=seed)
 
 
-def has_failed(terminated: bool, info: dict[str, Any]) -> bool:
-    """Whether an episode failed: as the task says, else where it is terminated."""
-    return bool(info.get("failed", terminated))
+def has_failed(step: Any) -> bool:
+    """Whether a step is a failure: as the task says, else where it is terminated."""
+    return bool(step.info.get("failed", step.terminated))
 
 
 class Episode(NamedTuple):
@@ -189,7 +189,7 @@ class Diary(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._returned += float(reward) + self.penalty * size
         self.changed.append(size > 0.0)
         if terminated or truncated:
-            failed = has_failed(terminated, info)
+            failed = bool(info.get("failed", terminated))
             self.episodes.append(Episode(self._steps, self._returned, failed))
         return seen, reward, terminated, truncated, info
 
@@ -198,10 +198,7 @@ def made(task: str, filtered: Guard | str | None = None, penalty: float = 0.0) -
     """The environment of a task, under a guard, a shield (``"shield"``) or nothing."""
     env = MAKE[task](TASKS[task].episode)
     if isinstance(filtered, Guard):
-        env = RevisedActions(
-            env, filtered, failed=lambda step: has_failed(step.terminated, step.info),
-            penalty=penalty,
-        )  # fmt: skip
+        env = RevisedActions(env, filtered, failed=has_failed, penalty=penalty)
     elif filtered:
         env = Shielded(env, *told_shield(task), penalty)
     if task == "car-following":
@@ -238,13 +235,16 @@ class ExecutedBuffer(ReplayBuffer):  # type: ignore[misc]
         super().add(obs, next_obs, action, reward + self.penalty * size, done, infos)
 
 
-def learner(task: str, env: Env, seed: int, buffer: dict[str, Any], steps: int) -> Any:
-    """PPO, SAC or DDPG with the same settings on all tasks."""
+def learner(task: str, env: Env, seed: int, steps: int, penalty: float | None = None) -> Any:
+    """PPO, SAC or DDPG, set alike on all tasks; with a penalty its memory knows of changes."""
     settings: dict[str, Any] = {"seed": seed, "device": "cpu"}
     if TASKS[task].learner == "PPO":
         return PPO("MlpPolicy", env, n_steps=512, learning_rate=1e-3, **settings)
     settings |= {"policy_kwargs": {"net_arch": [64, 64]}, "learning_starts": 500}
-    settings |= {"buffer_size": 2 * steps, "train_freq": 2, "gradient_steps": 1, **buffer}
+    settings |= {"buffer_size": 2 * steps, "train_freq": 2, "gradient_steps": 1}
+    if penalty is not None:
+        settings["replay_buffer_class"] = ExecutedBuffer
+        settings["replay_buffer_kwargs"] = {"penalty": penalty}
     if TASKS[task].learner == "SAC":
         return SAC("MlpPolicy", env, **settings)
     noise = NormalActionNoise(np.zeros(1), np.full(1, 0.2))
@@ -299,17 +299,16 @@ def trained(task: str, way: str, seed: int, steps: int, held_out: int) -> dict[s
     if kind in ("learnt", "cars"):
         filtered = guard = learning_guard(kind, task, made(task).action_space, seed)
     env = made(task, filtered, penalty)
-    both = stored == "executed" and kind != "alone"
-    buffer = {"replay_buffer_class": ExecutedBuffer, "replay_buffer_kwargs": {"penalty": penalty}}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of networks that a CPU would do better
-        agent = learner(task, env, seed, buffer if both else {}, steps)
-        begun = time.perf_counter()
-        agent.learn(steps)
+    agent = learner(task, env, seed, steps, penalty if stored == "executed" else None)
+    begun = time.perf_counter()
+    agent.learn(steps)
     seconds = time.perf_counter() - begun
+    said: list[Any] = []
     if guard is not None:
         filtered = guard = guard.copy()
-        guard.freeze()
+        with warnings.catch_warnings(record=True) as said:  # that it lets proposals pass
+            warnings.simplefilter("always")
+            guard.freeze()
     alone = tried(agent, made(task), task, held_out)
     under = tried(agent, made(task, filtered), task, held_out) if filtered else {}
     done, quarter = env.changed, max(1, len(env.changed) // 4)
@@ -327,5 +326,6 @@ def trained(task: str, way: str, seed: int, steps: int, held_out: int) -> dict[s
         "held_out": held_out,
         **{f"alone_{name}": value for name, value in alone.items() if name != "changed"},
         **{f"under_{name}": under.get(name) for name in ("failed", "return", "changed")},
+        "passes": bool(said) if guard is not None else None,
         "seconds": seconds,
     }
