@@ -33,15 +33,6 @@ Env = gymnasium.Env[Any, Any]
 # -- Tasks ----------------------------------------------------------------------------------------
 
 
-class Goal(gymnasium.RewardWrapper[Any, Any]):
-    """CartPole that pays for being near a place: exp(-(x - goal)²) a step."""
-
-    def reward(self, reward: Any) -> float:
-        """Of where the cart is."""
-        cart: Any = self.unwrapped
-        return math.exp(-((cart.state[0] - GOAL) ** 2))
-
-
 class Upright(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Pendulum that begins about upright, is paid 1 more a step, and fails where it leans far."""
 
@@ -60,6 +51,14 @@ class Upright(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 def _gym(name: str, steps: int, **given: Any) -> Env:
     return gymnasium.make(name, max_episode_steps=steps, disable_env_checker=True, **given)
+
+
+def _goal(steps: int) -> Env:
+    """CartPole that pays for being near a place."""
+    env = _gym("CartPole-v1", steps)
+    cart: Any = env.unwrapped
+    near = lambda _: math.exp(-((cart.state[0] - GOAL) ** 2))  # noqa: E731
+    return gymnasium.wrappers.TransformReward(env, near)
 
 
 def _upright(interval: float, steps: int) -> Env:
@@ -85,7 +84,7 @@ def _cars(steps: int) -> Env:
 #: Makes the environment of a task, of so many steps an episode at most.
 MAKE: dict[str, Callable[[int], Env]] = {
     "cartpole": partial(_gym, "CartPole-v1"),
-    "cartpole-goal": lambda steps: Goal(_gym("CartPole-v1", steps)),
+    "cartpole-goal": _goal,
     "pendulum": partial(_upright, TASKS["pendulum"].interval),
     "pendulum-5ms": partial(_upright, TASKS["pendulum-5ms"].interval),
     "double-pendulum": _double,
@@ -154,11 +153,6 @@ def learning_guard(kind: str, task: str, actions: Any, seed: int) -> Guard:
     return Guard(**ends, interval=interval, seed=seed)
 
 
-def has_failed(step: Any) -> bool:
-    """Whether a step is a failure: as the task says, else where it is terminated."""
-    return bool(step.info.get("failed", step.terminated))
-
-
 class Episode(NamedTuple):
     """What came of one."""
 
@@ -198,7 +192,8 @@ def made(task: str, filtered: Guard | str | None = None, penalty: float = 0.0) -
     """The environment of a task, under a guard, a shield (``"shield"``) or nothing."""
     env = MAKE[task](TASKS[task].episode)
     if isinstance(filtered, Guard):
-        env = RevisedActions(env, filtered, failed=has_failed, penalty=penalty)
+        failed = lambda step: bool(step.info.get("failed", step.terminated))  # noqa: E731
+        env = RevisedActions(env, filtered, failed=failed, penalty=penalty)
     elif filtered:
         env = Shielded(env, *told_shield(task), penalty)
     if task == "car-following":
