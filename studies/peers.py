@@ -55,7 +55,7 @@ _TOLD = {
     ALONE: "no filter",
     "learnt": "nothing but failures",
     "told": "linear model and limits",
-    "cars": "how cars follow each other, and failures",
+    "cars": "how cars follow; failures",
 }
 
 
@@ -165,7 +165,10 @@ class Peers(lib.Study):
 
     @property
     def jobs(self) -> list[Job]:
-        """All that is asked, longest first; `ValueError` if there is no such task or way."""
+        """All that is asked, seed by seed, of each the longest first.
+
+        `ValueError` if there is no such task or way.
+        """
         known: dict[str, Sequence[str]] = {"task": list(TASKS), "way": list(WAYS)}
         named = dict(known)
         for what, given in {"task": self.tasks, "way": self.ways}.items():
@@ -179,7 +182,7 @@ class Peers(lib.Study):
             for name, seed, way in product(named["task"], seeds, named["way"])
             if way in TASKS[name].ways
         ]
-        return sorted(found, key=lambda job: -job.cost)
+        return sorted(found, key=lambda job: (job.seed, -job.cost))
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Train what is not finished, and gather all that is."""

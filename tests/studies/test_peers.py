@@ -58,9 +58,9 @@ def test_what_is_finished_is_shown_without_training(tmp_path, finished):
     assert not finished
 
 
-def test_the_longest_are_begun_first_and_names_are_checked():
-    costs = [job.cost for job in Peers().jobs]
-    assert costs == sorted(costs, reverse=True)
+def test_of_each_seed_the_longest_are_begun_first_and_names_are_checked():
+    order = [(job.seed, -job.cost) for job in Peers().jobs]
+    assert order == sorted(order)
     assert {job.task for job in Peers().jobs} == set(TASKS)
     with pytest.raises(ValueError, match="there is no task 'kettle'; there are cartpole"):
         _ = Peers(tasks="cartpole,kettle").jobs
