@@ -141,16 +141,13 @@ def told_shield(task: str) -> tuple[Rival, Box | Discrete]:
 
 def learning_guard(kind: str, task: str, actions: Any, seed: int) -> Guard:
     """A guard that is told nothing but failures, or of cars how they follow each other."""
-    interval = TASKS[task].interval
-    if kind == "cars":
-        return guard_for_cars(
-            low=actions.low.item(), high=actions.high.item(), interval=interval, seed=seed
-        )
+    told: dict[str, Any] = {"interval": TASKS[task].interval, "seed": seed}
     if isinstance(actions, gymnasium.spaces.Discrete):
-        return Guard(n_actions=int(actions.n), interval=interval, seed=seed)
-    low, high = (np.asarray(end, np.float64) for end in (actions.low, actions.high))
-    ends = {"low": low, "high": high} if len(low) > 1 else {"low": low.item(), "high": high.item()}
-    return Guard(**ends, interval=interval, seed=seed)
+        return Guard(n_actions=int(actions.n), **told)
+    for name in ("low", "high"):
+        end = getattr(actions, name).astype(np.float64)
+        told[name] = end if len(end) > 1 else end.item()
+    return guard_for_cars(**told) if kind == "cars" else Guard(**told)
 
 
 class Episode(NamedTuple):

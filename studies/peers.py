@@ -319,17 +319,7 @@ def summary(rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def markdown(table: Table) -> str:
-    """A table of a page as one of Markdown.
-
-    Examples
-    --------
-    >>> print(markdown(Table("Few", pl.DataFrame({"task": ["pole"], "failed": [2]}))))
-    ### Few
-    <BLANKLINE>
-    | task | failed |
-    |---|---|
-    | pole | 2 |
-    """
+    """A table of a page as one of Markdown."""
     lines = [f"| {' | '.join(cells)} |" for cells in (table.header, *table.cells)]
     lines.insert(1, "|---" * len(table.header) + "|")
     return "\n\n".join(filter(None, [f"### {table.title}", table.note, "\n".join(lines)]))
