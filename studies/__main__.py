@@ -21,6 +21,7 @@ STUDIES = {
     "judges": "judges:Judges",
     "tasks": "judges:Tasks",
     "good": "good:Good",
+    "peers": "peers:Peers",
     "forecasts": "forecasts:ForecastStudy",
     "machines": "machines:Machines",
     "sensitivity": "sensitivity:Sensitivity",
@@ -28,8 +29,8 @@ STUDIES = {
     "real": "real:Real",
     "leaders": "real:Leaders",
 }
-#: Those that need real drives.
-REAL = ("real", "leaders")
+#: Those that need real drives, and those that need packages that are heavy.
+REAL, HEAVY = ("real", "leaders"), ("peers",)
 _ABOUT = (
     "Each study asks one question and shows the numbers that its answer rests on, and which rows "
     "go against us. These are the short forms, too small for conclusions: the command of each "
@@ -57,9 +58,13 @@ def evidence(
         "evofsm-evidence"
     ),
 ) -> None:
-    """All studies in their short form, on one page: what holds, and where it loses."""
+    """All studies in their short form, on one page: what holds, and where it loses.
+
+    Studies that need torch are left out where it is not installed.
+    """
     with lib.refused():
         kinds = [study(name) for name in STUDIES if name not in REAL or data is not None]
+        kinds = [kind for kind in kinds if kind.name not in HEAVY or not lib.absent(kind.needed)]
         for kind in kinds:
             lib.require(kind.needed)
         pages = []

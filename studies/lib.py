@@ -179,9 +179,14 @@ def require(packages: Mapping[str, str]) -> None:
     ModuleNotFoundError
         That names all that is lacking, and the command that installs it.
     """
-    if lacking := [package for package in packages if find_spec(package) is None]:
-        extras = dict.fromkeys(packages[package] for package in lacking)
-        raise ModuleNotFoundError(f"this needs {' and '.join(lacking)}: {install(*extras)}")
+    if lacks := absent(packages):
+        extras = dict.fromkeys(packages[package] for package in lacks)
+        raise ModuleNotFoundError(f"this needs {' and '.join(lacks)}: {install(*extras)}")
+
+
+def absent(packages: Iterable[str]) -> list[str]:
+    """Those that are not installed."""
+    return [package for package in packages if find_spec(package) is None]
 
 
 def command_line() -> str:

@@ -254,10 +254,10 @@ def cart_shield(actions: Discrete) -> LevelSet:
     return LevelSet(actions, np.eye(4) + dt * change, control, edges, 1.0, cost, push=push)
 
 
-def pendulum_shield(actions: Box, fails: float, circular: bool) -> LevelSet:
-    """Of Pendulum; it fails where the angle is beyond ``fails`` [rad]."""
-    # Step [s], pull of gravity [1/s²] and of a torque [1/(kg m²)] on the rate.
-    dt, falls, torque = 0.05, 15.0, 3.0
+def pendulum_shield(actions: Box, fails: float, circular: bool, dt: float = 0.05) -> LevelSet:
+    """Of Pendulum with steps of ``dt`` [s]; it fails where the angle is beyond ``fails`` [rad]."""
+    # Pull of gravity [1/s²] and of a torque [1/(kg m²)] on the rate.
+    falls, torque = 15.0, 3.0
     # The rate changes first, and the angle by the new rate.
     system = np.array([[1.0 + dt * dt * falls, dt], [dt * falls, 1.0]])
     control = dt * torque * np.array([dt, 1.0])

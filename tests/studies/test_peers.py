@@ -1,0 +1,149 @@
+"""What is finished is not trained again, rows say where the filter loses, and tasks are as said."""
+
+import json
+
+import numpy as np
+import pytest
+from studies import lib, peers
+from studies.peers import TASKS, WAYS, Job, Peers
+from studies.rivals import pendulum_shield
+from studies.systems import Box
+
+pl = pytest.importorskip("polars")
+
+
+def row(task="cartpole", way="alone", seed=0, **what):
+    told = WAYS[way].filter != "alone"
+    found = {"task": task, "way": way, "seed": seed, "steps": 600, "episodes": 30, "failed": 20}
+    found |= {"late_return": 100.0, "reached": None, "changed_first": 0.5 * told}
+    found |= {"changed_last": 0.05 * told, "held_out": 20, "alone_failed": 3, "seconds": 1.0}
+    found |= {"alone_return": 90.0, "under_failed": 0 if told else None, "under_changed": None}
+    return found | {"under_return": 95.0 if told else None, "passes": False, **what}
+
+
+@pytest.fixture
+def finished(monkeypatch):
+    """Jobs that are trained, which takes no time here."""
+    done = []
+
+    def finish(job, runs):
+        done.append(job)
+        job.file(runs).write_text(json.dumps(row(*job[:3])))
+
+    monkeypatch.setattr(peers, "finish", finish)
+    return done
+
+
+def test_what_is_finished_is_not_trained_again(tmp_path, finished):
+    asked = Peers(tasks="cartpole,hopper", ways="alone,filter-1", seeds=2, runs=tmp_path)
+    found = asked.run(workers=1)["rows"]
+    assert len(finished) == len(found) == 8
+    assert found.select("task", "way", "seed").rows() == sorted(
+        found.select("task", "way", "seed").rows()
+    )
+    next(tmp_path.glob("hopper-filter-1-*-1.json")).unlink()
+    finished.clear()
+    assert asked.run(workers=1)["rows"].equals(found)
+    assert [job[:3] for job in finished] == [("hopper", "filter-1", 1)]
+
+
+def test_what_is_finished_is_shown_without_training(tmp_path, finished):
+    shown = Peers(tasks="pendulum", seeds=1, runs=tmp_path, show=True)
+    with pytest.raises(ValueError, match="nothing is finished"):
+        shown.run()
+    Job("pendulum", "told-1", 0, TASKS["pendulum"].steps).file(tmp_path).write_text(
+        json.dumps(row("pendulum", "told-1"))
+    )
+    assert shown.run()["rows"]["way"].to_list() == ["told-1"]
+    assert not finished
+
+
+def test_of_each_seed_the_longest_are_begun_first_and_names_are_checked():
+    order = [(job.seed, -job.cost) for job in Peers().jobs]
+    assert order == sorted(order)
+    assert {job.task for job in Peers().jobs} == set(TASKS)
+    with pytest.raises(ValueError, match="there is no task 'kettle'; there are cartpole"):
+        _ = Peers(tasks="cartpole,kettle").jobs
+
+
+def test_the_page_says_where_the_filter_loses(tmp_path):
+    good = [row("cartpole", way, seed) for way in ("alone", "filter-1") for seed in range(3)]
+    good = [
+        one | {"failed": 0, "alone_failed": 1} if one["way"] != "alone" else one for one in good
+    ]
+    bad = [row("walker2d", "alone"), row("walker2d", "filter-1", changed_last=0.9)]
+    page = Peers().page({"rows": lib.frame_of([*good, *bad])})
+    walker = ["walker2d"]
+    assert [table.frame["task"].to_list() for table in page.lost] == [walker, walker, [], walker]
+    assert page.targets["met"].to_list() == [False, False]
+    (line,) = (one for one in page.parts[0].cells if one[0] == "filter-1")
+    assert line[1:3] == ("nothing but failures", "0.0 (0.0–0.0)")
+    Peers().write({"rows": lib.frame_of(good)}, tmp_path)
+    assert "| filter-1 | nothing but failures | 0.0 (" in (tmp_path / "peers.md").read_text()
+
+
+def test_who_is_told_of_a_pendulum_at_5_ms_holds_it():
+    shield = pendulum_shield(Box((-2.0,), (2.0,)), 0.5, False, 0.005)
+    angle, rate, chance = 0.0, 0.0, np.random.default_rng(0)
+    for _ in range(400):
+        torque = shield.action(np.array([angle, rate]), float(chance.uniform(0.0, 2.0)))
+        rate += 0.005 * (15.0 * np.sin(angle) + 3.0 * torque)
+        angle += 0.005 * rate
+        assert abs(angle) < 0.5
+
+
+# -- With Stable-Baselines3 -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def learners():
+    pytest.importorskip("stable_baselines3")
+    pytest.importorskip("mujoco")
+    from studies import learners
+
+    return learners
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_task_decides_and_begins_as_it_says(learners, task):
+    env = learners.made(task)
+    first = learners.begin(env, task, 3)
+    assert np.array_equal(first, learners.begin(learners.made(task), task, 3))
+    inner = env.unwrapped
+    clock = inner.family.interval if task == "car-following" else getattr(inner, "tau", None)
+    assert (clock or inner.dt) == pytest.approx(TASKS[task].interval)
+    env.action_space.seed(0)
+    while not env.episodes or not env.episodes[-1].failed:  # drawn actions let all of them fail
+        *_, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            learners.begin(env, task, len(env.episodes))
+        assert len(env.episodes) < 20
+
+
+@pytest.mark.parametrize("penalty", [0.0, 0.5])
+def test_a_memory_holds_what_was_executed_with_what_it_earned(learners, penalty):
+    space = learners.gymnasium.spaces.Box(-2.0, 2.0, (1,))
+    memory = learners.ExecutedBuffer(8, space, space, penalty=penalty)
+    seen = np.zeros((1, 1))
+    kept = {"reviser/penalty": 0.0, "reviser/executed_action": np.array([1.0])}
+    memory.add(seen, seen, np.array([[0.5]]), np.array([1.0]), np.array([False]), [kept])
+    changed = {"reviser/penalty": 2.0, "reviser/executed_action": np.array([-2.0])}
+    reward = np.array([1.0 - 2.0 * penalty])
+    memory.add(seen, seen, np.array([[1.0]]), reward, np.array([False]), [changed])
+    held = list(zip(memory.actions.ravel(), memory.rewards.ravel(), strict=True))[: memory.pos]
+    proposed = [(1.0, 0.0)] if penalty else []
+    assert held == [(0.5, 1.0), *proposed, (-1.0, 1.0)]
+
+
+def test_what_is_told_a_pole_lets_no_learner_fail_and_one_that_is_not_learns_from_it(learners):
+    found = {way: learners.trained("pendulum", way, 0, 600, 2) for way in ("alone", "told-1")}
+    assert found["alone"]["failed"] > 10
+    assert found["told-1"]["failed"] == found["told-1"]["under_failed"] == 0
+    json.dumps(found)
+
+
+def test_a_filter_learns_while_a_learner_does(learners):
+    found = learners.trained("cartpole", "filter-1", 0, 600, 1)
+    assert 0 < found["failed"] <= found["episodes"]
+    assert found["changed_last"] > 0.0
+    assert found["held_out"] == 1
