@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -191,7 +192,8 @@ class Peers(lib.Study):
             self.runs.mkdir(parents=True, exist_ok=True)
             warm()  # once, not in each process
             left = [partial(finish, job, self.runs) for job in jobs if not job.row(self.runs)]
-            lib.parallel(left, workers, "Training")
+            for why in filter(None, lib.parallel(left, workers, "Training")):
+                print(f"warning: {why}", file=sys.stderr)
         rows = [row for job in jobs if (row := job.row(self.runs))]
         if not rows:
             raise ValueError(f"nothing is finished in {self.runs}")
@@ -353,10 +355,14 @@ class Job(NamedTuple):
         return found
 
 
-def finish(job: Job, runs: Path) -> None:
-    """Train, and keep the row."""
+def finish(job: Job, runs: Path) -> str:
+    """Train, and keep the row; else why there is none, as others are to go on."""
     from studies.learners import trained
 
-    row = trained(*job, TASKS[job.task].held_out)
+    try:
+        row = trained(*job, TASKS[job.task].held_out)
+    except Exception as error:
+        return f"{job.task}, {job.way}, seed {job.seed} is left out: {error}"
     with replacing(job.file(runs)) as file:
         file.write(json.dumps(row).encode())
+    return ""

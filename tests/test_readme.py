@@ -5,8 +5,6 @@ import re
 import statistics
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")
 CLOSED_LOOP = (ROOT / "docs" / "closed-loop.md").read_text("utf-8")
@@ -31,17 +29,16 @@ def cells_of(page):
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if "|" in line]
 
 
-@pytest.mark.parametrize(("page", "least"), [("README.md", 4), ("docs/closed-loop.md", 7)])
-def test_the_closed_loop_table_is_what_the_study_printed(page, least):
+def test_the_closed_loop_table_is_what_the_study_printed():
     checked = 0
-    for cells in cells_of(page):
+    for cells in cells_of("docs/closed-loop.md"):
         name = re.match(r"`([\w-]+)`", cells[0])
         rows = [row for row in RESULTS if name and row["policy"] == name[1]]
         if rows and len(cells) >= 5:
             numbers = shown(rows)
             assert all(number in cells for number in numbers), (name[1], numbers)
             checked += 1
-    assert checked >= least
+    assert checked >= 7
 
 
 def test_the_bold_row_is_rebuilt_in_ten_lines():
@@ -66,14 +63,20 @@ def test_our_own_lines_are_the_median_and_the_worst_of_the_seeds():
     ours = [row for row in RESULTS if row["policy"] == "evofsm" and row["train_episodes"] == 100]
     assert len(ours) == 20
     worst = max(ours, key=lambda row: (row["collision_rate"], -row["mobility"]))
-    (worst_line,) = [cells for cells in cells_of("README.md") if "100 episodes" in cells[0]]
-    median_line, worst_there = (
+    median_line, worst_line = (
         cells for cells in cells_of("docs/closed-loop.md") if "100 episodes" in cells[0]
     )
     assert all(number in median_line for number in shown(ours, statistics.median))
-    assert all(number in line for number in shown([worst]) for line in (worst_line, worst_there))
+    assert all(number in worst_line for number in shown([worst]))
     changed = statistics.median(row["intervention_rate"] for row in ours)
-    assert f"changes more decisions ({100 * changed:.0f} %)" in README
+    names = ("unrevised", "rss-matched")
+    alone, told = ([row for row in RESULTS if row["policy"] == name] for name in names)
+    (line,) = [cells for cells in cells_of("README.md") if cells[0].startswith("weak brakes")]
+    assert line[1].startswith("{}, mobility {}".format(*shown(alone)))
+    assert f"changes {100 * told[0]['intervention_rate']:.0f} %" in line[2]
+    for rows, cell in ((told, line[2]), ([worst], line[3])):
+        assert all(number in cell for number in shown(rows)[:2])
+    assert f"changes {100 * changed:.0f} %" in line[3]
     assert sum(row["train_collisions"] for row in RESULTS) == 0  # as the text says
 
 

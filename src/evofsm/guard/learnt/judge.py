@@ -638,8 +638,8 @@ class LearntRisk(ActionJudge):
         if not self.n_variables:
             now = self.state
             blank = State.none(z.shape[1], self.size, self.choices, self.settings, None)
-            same = ("horizon", "stride", "margin", "n_failed")
-            self.state = blank._replace(**{name: getattr(now, name) for name in same})
+            kept_names = ("horizon", "stride", "margin", "n_failed")
+            self.state = blank._replace(**{name: getattr(now, name) for name in kept_names})
         self.state = learn(
             self.state,
             episode,

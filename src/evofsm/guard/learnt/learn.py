@@ -338,7 +338,7 @@ def is_too_short(state: State, known: Model, episode: Episode, settings: LearntS
 def coarser(state: State, settings: LearntSettings) -> State:
     """Make each step last twice as many decisions: how it moves is to be learnt anew."""
     m = len(state.origin)
-    none = State.none(m, len(state.used), state.choices, settings, max(1, state.horizon // 2))
+    blank = State.none(m, len(state.used), state.choices, settings, max(1, state.horizon // 2))
     learnt_anew = (
         *("squares", "products", "least", "most", "scale", "noise", "power"),
         *("recent_squares", "recent_products", "doubt", "since", "drifts", "misled"),
@@ -346,7 +346,7 @@ def coarser(state: State, settings: LearntSettings) -> State:
         *("situations", "margin", "time_to_failure", "believed", "too_short", "horizon"),
     )
     return state._replace(
-        **{name: getattr(none, name) for name in learnt_anew},
+        **{name: getattr(blank, name) for name in learnt_anew},
         n_seen=state.n_seen // 2,
         unit=2.0 * state.unit,
         stride=2 * state.stride,
