@@ -482,8 +482,9 @@ class CsvTable(Table):
             return best
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
-        counts = [len(_fields(lines[at], _separator(lines[at]))) for at in rows]
-        usual = max(counts, key=counts.count, default=0)  # titles above have fewer fields
+        fields = (_fields(lines[at], _separator(lines[at])) for at in rows)
+        counts = [sum(map(bool, map(str.strip, found))) for found in fields]
+        usual = max(counts, key=counts.count, default=0)  # titles above fill fewer fields
         first = next((at for at, n in zip(rows, counts, strict=True) if n >= usual), 0)
         separator = _separator(lines[first])
         above, row = (_fields(lines[at], separator) for at in (max(first - 1, 0), first))
