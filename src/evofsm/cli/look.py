@@ -70,7 +70,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
         options.append(("--episode", _named(group, ",")))
     told_by = {group, *(name for name, *_ in rare)}
     ends = {n: np.nanquantile(z[runs], (0.02, 0.98)) for n, z in values.items() if n not in told_by}
-    if still in ends and ends[still][1] < 1.1 * ends[still][0]:  # as it runs it is always the same
+    if still in ends and ends[still][1] < 1.05 * ends[still][0]:  # as it runs it is always the same
         del ends[still]
     # What goes on by the same from row to row is a count of them.
     moved = {n: e.tolist() for n, e in ends.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
