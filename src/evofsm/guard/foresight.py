@@ -40,6 +40,8 @@ RATES = (0.1, 0.3, 1.0, 3.0)
 _AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.125
 # Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts held out.
 _MOST_LIMITS, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 4.0, 12), 3
+# Of a log of more rows some episodes are learnt from, if so many failures are left.
+_MOST_ROWS, _FAILURES = 500_000, 100
 # Blocks of rows in a horizon, as limits are searched for; of a long log fewer, but so many, where
 # there would be more than that in all.
 _BLOCKS, _FEWEST_BLOCKS, _MOST_BLOCKS = 15, 5, 100_000
@@ -215,7 +217,11 @@ class Foresight(LearningJudge):
         names: Sequence[str],
         units: Sequence[str],
     ) -> Self:
-        """Learn from a log in which there are failures."""
+        """Learn from a log in which there are failures; of a long one from some of the episodes."""
+        every = min(-(-len(log.rows) // _MOST_ROWS), int(log.failed.sum()) // _FAILURES)
+        if every > 1:  # of both kinds as many of each
+            of_kind = np.where(log.failed, np.cumsum(log.failed), np.cumsum(~log.failed))
+            log = log.part(of_kind % every == 0)
         if horizon is None:
             horizon = max(float(np.median(log.lengths)) * _SHORT, _FEWEST) * dt
         ahead = max(round(positive("horizon", horizon) / dt), 1)
