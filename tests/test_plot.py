@@ -9,6 +9,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cbook import STEP_LOOKUP_MAP
 from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch
 from studies.judges import run
 from studies.systems import Start, make_system
 
@@ -70,6 +71,22 @@ def test_states_stand_where_their_centres_are_and_what_is_on_the_axes_stays_in_v
     assert low <= -50.0 < 50.0 <= high
     alone = plot.states(model, new())
     assert [text.xy for text in alone.texts] == [pytest.approx(tuple(z)) for z in model.centers]
+
+
+def test_states_over_rows_have_their_reach_and_their_ways_on_in_frame():
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=[2.0, 1.0]))
+    rows = np.array([[0.0, 0.0], [9.0, 0.0], [0.0, 0.0], [5.0, 7.0], [30.0, -9.0]])
+    machine.learn_many(rows[:4], [0] * 4)
+    failed = np.arange(5) == 4
+    ax = plot.states(machine.model(), new(), rows=rows, failed=failed, ways=True)
+    legend = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert legend == ["observed", "failed", "where a state reaches", "likeliest ways on"]
+    ends = zip(ax.axis()[::2], rows.min(0), rows.max(0), ax.axis()[1::2], strict=True)
+    assert all(low <= least <= most <= high for low, least, most, high in ends)
+    arrows = [patch for patch in ax.patches if isinstance(patch, FancyArrowPatch)]
+    assert len(arrows) == 3  # 1 to 2 and back, and on to 3
+    only = plot.states(machine.model(), new(), ways=True)
+    assert only.axis()[0] < -1.0  # so far the first one reaches
 
 
 def test_discs_that_would_meet_move_apart():

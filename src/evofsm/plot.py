@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.driving import Episode
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel, Policy
+from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Trace
 from evofsm.guard import Guard, LearntRisk
 from evofsm.guard.learnt.failure import SAYS, I, J, forms, telling
@@ -61,6 +62,9 @@ def states(
     *,
     variables: tuple[int, int] = (0, 1),
     dead_ends: States = (),
+    rows: ArrayLike = (),
+    failed: ArrayLike = (),
+    ways: bool = False,
 ) -> Axes:
     """Centres of the states in the plane of two variables.
 
@@ -75,6 +79,13 @@ def states(
         Indices of the variables to the right and upward.
     dead_ends : collection of int
         Indices of states to mark by a hexagon, as `assess_states` finds them.
+    rows : (T, m) array_like, optional
+        What was observed, as dots behind.
+    failed : (T,) array_like of bool, optional
+        With which of them an episode failed: crosses.
+    ways : bool
+        Whether to show how far each state of a `Novelty` reaches (an ellipse), the two likeliest
+        ways out of each, as wide as they are likely, and a legend.
 
     Raises
     ------
@@ -94,11 +105,34 @@ def states(
     _refuse_unknown(model.n_states, dead_ends)
     _refuse_other(variables, model.n_variables)
     ax = _given_or_new(ax)
-    centers = model.centers[:, list(variables)]
+    pair = list(variables)
+    centers, seen = model.centers[:, pair], np.reshape(rows, (-1, model.n_variables))[:, pair]
+    fails = np.resize(np.asarray(failed, np.bool_), len(seen)) if np.size(failed) else ()
+    look: Look = {"markersize": 1.5, "color": ink(0.3), "zorder": 0.5, "rasterized": True}
+    if len(seen):
+        ax.plot(*seen.T, ".", label="observed", **look)
+    if np.any(fails):
+        look = {"markersize": 5.0, "color": COLORS["dead end"], "zorder": 4.0}
+        ax.plot(*seen[fails].T, "x", label="failed", **look)
+    if ways and isinstance(model.rule, Novelty):
+        reach = np.sqrt(model.width) * np.resize(model.rule.scales, model.n_variables)[pair]
+        look = {"color": COLORS["leader"], "alpha": 0.1, "linewidth": 0.0, "zorder": 0.4}
+        for k, center in enumerate(centers):
+            label = "" if k else "where a state reaches"
+            ax.add_patch(Ellipse(center, *2.0 * reach, label=label, **look))
+        ax.update_datalim(np.vstack([centers - reach, centers + reach]))
     ax.update_datalim(centers)
     ax.margins(0.1)
     ax.autoscale_view()
     limits = ax.axis()
+    if ways:
+        leaves = model.changes * (1.0 - np.eye(model.n_states))
+        shares = leaves / np.maximum(leaves.sum(1, keepdims=True), 1.0)
+        for i, j in np.argwhere(shares > 0.0):
+            if (shares[i] > shares[i, j]).sum() < _DARK:
+                _arrow(ax, centers[i], centers[j], max(_WIDEST * shares[i, j], 0.4), ink(0.5))
+        ax.plot([], [], color=ink(0.5), label="likeliest ways on")
+        _explain(ax)
     draw_centers(ax, centers, dead_ends, size=13.0)
     ax.axis(limits)
     across, up = map(model.labels.variable, variables)
@@ -148,14 +182,25 @@ def graph(
         pale = rank[i, j] >= _DARK
         if pale and not numbered:
             continue
-        way = places[j] - places[i]
-        bend = 0.28 / float(np.hypot(*way))
-        look: Look = {"connectionstyle": f"arc3,rad={bend}", "arrowstyle": "-|>"}
-        look |= {"mutation_scale": 6.5, "shrinkA": 7.5, "shrinkB": 8.5}
-        look |= {"linewidth": max(_WIDEST * between[i, j] / heaviest, 0.4)}
-        look["color"] = ink(0.19) if pale else COLORS["dead end"] if j in dead_ends else ink(0.69)
-        ax.add_patch(FancyArrowPatch(places[i], places[j], zorder=1.5 if pale else 2.0, **look))
+        color = ink(0.19) if pale else COLORS["dead end"] if j in dead_ends else ink(0.69)
+        wide = max(_WIDEST * between[i, j] / heaviest, 0.4)
+        bend = 0.28 / float(np.hypot(*(places[j] - places[i])))
+        _arrow(ax, places[i], places[j], wide, color, bend, 1.5 if pale else 2.0)
     return ax
+
+
+def _arrow(
+    ax: Axes,
+    origin: Any,
+    target: Any,
+    width: float,
+    color: str,
+    bend: float = 0.2,
+    zorder: float = 2.0,
+) -> None:
+    look: Look = {"connectionstyle": f"arc3,rad={bend}", "arrowstyle": "-|>", "zorder": zorder}
+    look |= {"mutation_scale": 6.5, "shrinkA": 7.5, "shrinkB": 8.5, "linewidth": width}
+    ax.add_patch(FancyArrowPatch(origin, target, color=color, **look))
 
 
 def experience(

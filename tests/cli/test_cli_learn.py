@@ -278,7 +278,7 @@ def test_failures_are_learnt_from_a_column_or_a_comparison(evofsm, crashes, tmp_
     ]
     assert [one["failures"] for one in documents] == [2, 2]
     assert [one["noted"]["after_failure"] for one in documents] == [18, 18]
-    assert documents[1]["model"]["provenance"]["failed"] == "gap<=0"
+    assert documents[1]["model"]["provenance"]["read with"]["failed"] == "gap<=0"
     assert FSMModel.load(path).failed_soon.max() == 2.0
     text = " ".join(evofsm("learn", crashes, "--failed", "hit").stdout.split())
     assert "failures 2 episodes ended with hit; 18 rows after them" in text

@@ -173,6 +173,11 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         (("--interval", -1), "interval"),
         (("--tolerance", 2), "tolerance is 2"),
         (("--guard", "nowhere", "--brakes", 5), "nowhere has learnt its own"),
+        (("--observe", "heat", "--interval", 1), "say who acts: --low and --high, --n-actions"),
+        (("--observe", "heat", "--low", 0, "--high", 1), "say how often rows come [s]"),
+        (("--action", "", "--interval", 1), "say what is observed, the keys of rows: --observe"),
+        (("--observe", "heat", "--low", 0, "--interval", 1), "give either low and high"),
+        (("--n-actions", 2, "--traffic"), "--traffic is of cars"),
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(refused, arguments, said, tmp_path, monkeypatch):
@@ -224,7 +229,7 @@ def test_streams_that_are_closed_or_do_not_wait_end_it_in_a_line_or_not_at_all()
             out += data
         said = process.stderr.read().decode()
     assert (process.returncode, len(out.splitlines())) == (0, 3002)
-    assert [text[:17] for text in said.splitlines()] == ["evofsm: assumed: "]
+    assert [text[:14] for text in said.splitlines()] == ["evofsm: assume", "evofsm: ready:"]
     os.close(source)
     os.close(drain)
 
@@ -341,7 +346,8 @@ def test_a_guard_where_nobody_acts_takes_rows_without_proposals_and_says_why(tri
     assert "nobody acts" in learnt.stdout
     assert f"{VIBRATION} above" in learnt.stdout
     rows = [line({"time": 20.0 * k, VIBRATION: z}) for k, z in enumerate([3.0, 6.9])]
-    calm, near = told(evofsm("--guard", guard, lines=rows))
+    waiting, calm, near = told(evofsm("--guard", guard, lines=rows))
+    assert (waiting["kind"], waiting["alarm"]) == ("waiting", False)  # the 20 s are not over
     assert (calm["alarm"], near["alarm"]) == (False, True)
     said = VIBRATION + r" 6.9: above \d.*; after \d+ of \d+ such alarms it failed within 30 min"
     assert re.fullmatch(said, near["reason"])

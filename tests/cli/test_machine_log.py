@@ -1,5 +1,7 @@
 """A machine's log, as plants export them: from what is in it to what a guard of it says."""
 
+import json
+import random
 import re
 import shlex
 from pathlib import Path
@@ -40,6 +42,7 @@ def written(pump):
             text = frame.with_columns(when.dt.strftime(how))
             text = text.write_csv(None, float_precision=3, **dialect)
             text = text.replace("Zeit", "Datum;Uhrzeit") if form == "two columns" else text
+            text = f"Pumpe 4;;;;\nvom 5.12.;;;;\n{text}" if form == "titles" else text
             Path(path).write_bytes(text.encode("cp1252"))
         return path
 
@@ -47,7 +50,7 @@ def written(pump):
 
 
 @pytest.mark.parametrize(
-    "form", ["german", "two columns", "english", "american", "parquet", "codes"]
+    "form", ["german", "titles", "two columns", "english", "american", "parquet", "codes"]
 )
 def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, written, form):
     path = written(form)
@@ -98,8 +101,11 @@ def test_what_a_log_seems_to_need_is_said_before_the_work(evofsm, refused, writt
     needs = "--where", "Drehzahl>100", "--failed", "Status==Störung"
     told = evofsm(*asked, *needs, "--resample", "30s", "--guard", "guard.evofsm")
     assert told.stderr == ""
-    other = evofsm("monitor", *asked[1:], *needs, "--summary", "--guard", "guard.evofsm")
-    assert "a row every 5 s, and guard.evofsm decides each 30 s: --resample 30s" in other.stderr
+    of_guard = "monitor", path, "--summary", "--guard", "guard.evofsm"
+    as_learnt = evofsm(*of_guard)  # all of which the guard's file knows
+    assert (as_learnt.exit_code, as_learnt.stderr) == (0, "")
+    other = evofsm(*of_guard, "--resample", "1min")
+    assert "a row every 60 s, and guard.evofsm decides each 30 s: --resample 30s" in other.stderr
     hint = refused(*asked[:3], VIBRATION, *asked[4:])
     assert f"""stands in double quotes: '"{VIBRATION}"'""" in hint
 
@@ -119,3 +125,132 @@ def test_what_cannot_be_done_with_rows_is_refused(refused, written, options, mes
     path = written()
     asked = "--observe", BEARING, "--action", "Drehzahl", "--time", "Zeit"
     assert message in refused("learn", path, *asked, "--failed", "Status==Störung", *options)
+
+
+def sent(frame, path, began=None):
+    """Rows of a log as a machine sends them, in the order in which they came."""
+    began = began or frame["Zeit"][0]
+    with Path(path).open("w") as file:
+        for row in frame.iter_rows(named=True):
+            time = (row.pop("Zeit") - began).total_seconds()
+            file.write(json.dumps({"time": time, **row}) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("how", ["20s", f'20s,"{VIBRATION}"=max,{BEARING}=last'])
+def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, pump, how):
+    from evofsm import Guard
+    from evofsm.cli.monitor.decider import Decider
+    from evofsm.cli.monitor.slots import Slots
+    from evofsm.cli.monitor.summary import decided_on_log
+    from evofsm.cli.options import reading_of
+    from evofsm.io import LogColumns, episodes_of
+
+    path, of = written("parquet"), f'"{VIBRATION}",{BEARING}'
+    asked = "--observe", of, "--action", "", "--time", "Zeit", "--resample", how, "--hole", "5min"
+    asked = *asked, "--where", "Drehzahl>100", "--failed", "Status==Störung", "--rule", "novelty"
+    scales = "--scale", f"{VIBRATION}=1", "--scale", f"{BEARING}=2"
+    assert evofsm("learn", path, *asked, *scales, "--guard", "guard.evofsm").exit_code == 0
+    log = pump()
+    live = evofsm("monitor", sent(log, "rows.jsonl"), "--guard", "guard.evofsm")
+    answers = [json.loads(line) for line in live.stdout.splitlines()]
+    assert len(answers) == len(log)  # of which the last stands still
+    ends = [answer for answer in answers if answer["kind"] == "end" and "last" in answer]
+    assert [end["failed"] for end in ends].count(True) == 7
+    # An episode that did not fail ends live only as the next row comes, after its last decision.
+    found = [a.get("last", a) if a.get("failed", True) else a for a in answers]
+    found = [one for one in found if one["kind"] == "decision"]
+    # As the log is read: by the options that are in the guard's file.
+    told = json.loads(evofsm("inspect", "guard.evofsm", "--json").stdout)["provenance"]["read with"]
+    chunks = reading_of(**told).traces([path])
+    decider = Decider(Guard.load("guard.evofsm"), slots=Slots(LogColumns(hole=300.0)))
+    expected = [a for a, row in decided_on_log(decider, episodes_of(chunks)) if row is not None]
+    for name in ("time", "alarm", "risk_proposed", "reason"):
+        assert [one[name] for one in found] == [one[name] for one in expected]
+    assert sum(one["alarm"] for one in found) > 20
+    drawn = evofsm("inspect", "guard.evofsm", "--plot", "states.png", "--log", path)
+    assert (drawn.exit_code, Path("states.png").exists()) == (0, True)
+    assert "as in a log: rows of 20 s become one" in live.stderr
+
+
+def test_a_guard_from_zero_where_nobody_acts_learns_as_it_goes(evofsm, pump):
+    log, of = pump(24), f'"{VIBRATION}",{BEARING}'
+    asked = "--observe", of, "--action", "", "--resample", "20s", "--hole", "5min"
+    asked = *asked, "--where", "Drehzahl>100", "--failed", "Status==Störung"
+    alarmed = []
+    for part in (log[: len(log) // 2], log[len(log) // 2 :]):  # the second one goes on
+        rows = sent(part, "rows.jsonl", began=log["Zeit"][0])
+        done = evofsm("monitor", rows, *asked, "--state", "pump.evofsm")
+        assert done.exit_code == 0, done.stderr
+        for said in (f"a guard of {VIBRATION}, {BEARING} begins", "ready: reads rows.jsonl"):
+            assert said in done.stderr
+        answers = [json.loads(line) for line in done.stdout.splitlines()]
+        alarmed += [a["last"]["alarm"] for a in answers if a["kind"] == "end" and a["failed"]]
+    assert len(alarmed) == 12
+    assert not any(alarmed[:2])
+    assert all(alarmed[-5:])
+    assert f"{VIBRATION} above" in " ".join(evofsm("inspect", "pump.evofsm").stdout.split())
+
+
+@pytest.mark.parametrize("acts", [("--n-actions", 2), ("--low", -1, "--high", 1)])
+def test_a_guard_from_zero_of_who_acts_learns_what_fails(evofsm, acts):
+    chance, time, rows = random.Random(1), 0.0, []
+    for _ in range(25):
+        x, v, pushes = 0.0, 0.0, chance.choices([-1, 1], k=40)
+        for k in range(200):
+            push = pushes[k // 5]
+            proposal = (1 + push) // 2 if len(acts) == 2 else push
+            rows.append({"time": time, "x": x, "v": v, "proposal": proposal})
+            v += 0.1 * push + chance.gauss(0.0, 0.01)
+            x, time = x + 0.1 * v, time + 0.1
+            if abs(rows[-1]["x"]) > 1.0:
+                break
+        time += 10.0
+    Path("rows.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    fails = "--failed", "x>1 or x<-1", "--interval", 0.1, "--state", "cart.evofsm"
+    done = evofsm("monitor", "rows.jsonl", "--observe", "x,v", *acts, *fails)
+    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    ends = [answer for answer in answers if answer["kind"] == "end"]
+    assert all("executed" in end for end in ends)
+    assert [end["time"] for end in ends] == [row["time"] for row in rows if abs(row["x"]) > 1.0]
+    told = evofsm("inspect", "cart.evofsm")
+    assert told.exit_code == 0, told.stderr
+    told = " ".join(told.stdout.split())
+    assert re.search(r"fails where x is (below -1|above 1) or x is (below -1|above 1);", told)
+
+
+def test_a_few_holes_in_an_even_log_are_said(evofsm):
+    times = [k + 7200 * (k > 500) + 60 * (k > 900) for k in range(2000)]
+    Path("even.csv").write_text("\n".join(["t,heat", *(f"{t},{t % 7 + 0.5}" for t in times)]))
+    found = " ".join(evofsm("learn", "even.csv").stdout.split())
+    assert "holes 2, the longest 2 h, together 2.02 h; each begins an episode (--hole)" in found
+    assert "--resample" not in found
+
+
+def test_a_log_of_any_machine_is_watched(written):
+    from evofsm.cli.options import reading_of
+    from evofsm.cli.watch.logged import watched_log
+    from evofsm.cli.watch.words import introduce, tell
+
+    asked = {"time": "Zeit", "resample": "20s", "hole": "5min", "failed": "Status==Störung"}
+    asked |= {"observe": f'"{VIBRATION}",{BEARING}', "where": "Drehzahl>100", "action": ""}
+    with watched_log(written("parquet"), reading_of(**asked), None) as shown:
+        assert shown.start.cases[:2] == ("episode 1 (failure)", "episode 3 (failure)")
+        assert shown.start.cases[-1] == "episode 14"
+        assert "nobody acts" in introduce(shown.start)["intro"]
+        assert shown.graph().states
+        frames = [shown.step()]
+        while not frames[-1].over:
+            frames.append(shown.step())
+        before = [tell(frame, shown.start).headline for frame in frames[:-1]]
+        assert before == sorted(before, key="Alarm".__eq__)  # none, then it is on
+        told = tell(frames[-1], shown.start)
+        assert told.headline == "Failure"
+        assert told.when.startswith("An alarm came at ")
+        assert f"{VIBRATION} above" in shown.known().told
+        assert re.search(VIBRATION + r" \d\S+: above \S+; after \d+ of \d+ such alarms", told.why)
+        shown.restart(len(shown.start.cases) - 1)  # one that went well
+        while not (frame := shown.step()).over:
+            assert tell(frame, shown.start).headline == "No alarm"
+    with pytest.raises(ValueError, match="no episode failed, so"):
+        watched_log(written("parquet"), reading_of(**asked | {"failed": None}), None)

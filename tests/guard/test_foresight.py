@@ -1,5 +1,6 @@
 """Where nobody acts, alarms are no worse than plain thresholds, and say what they rest on."""
 
+import copy
 import re
 
 import numpy as np
@@ -55,10 +56,23 @@ def test_where_one_limit_depends_on_another_it_foresees_more_than_thresholds(sur
     assert re.search(r"0\.\d+ flow above 0\.\d+", surge.told_by_experience)
 
 
+def test_one_failure_is_learnt_from_and_no_later_tolerance_silences_an_alarm(surge):
+    rising = np.linspace(0.0, 1.0, 60)[:, None]
+    for runs in ([rising], [rising * 0.5, rising]):
+        one = Foresight.learn_log(runs, [run.max() == 1.0 for run in runs], dt=DT)
+        assert one.rate_of(0.01) is None  # on nothing held out it was right
+    judge = copy.deepcopy(surge)
+    for right in ([4, 4, 4, 4], [4, 3, 3, 2], [2, 3, 3, 4]):
+        judge.held_out = np.column_stack([[4] * 4, right, [0] * 4])
+        for rate in RATES:
+            assert judge.rate_of(judge.tolerance_of(rate)) is not None
+
+
 def test_where_nothing_foresees_a_failure_there_is_no_alarm():
     judge = learnt(random, 40)
     assert judge.rate_of(0.01) is None
-    assert judge.told_by_experience.count("nothing was better than chance") == len(RATES)
+    for_all = "for 0.1, 0.3, 1, 3 false alarms a day nothing was better than chance"
+    assert judge.told_by_experience == for_all
 
 
 def test_a_guard_alarms_row_by_row_as_the_log_was_judged_also_from_its_file(surge, reloaded):

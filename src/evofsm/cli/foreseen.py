@@ -41,17 +41,34 @@ def guard_where_nobody_acts(
 ) -> Guard:
     """A guard that alarms before failures, as it was learnt from the episodes of a log.
 
-    The horizon [s] is by default a twentieth of the median episode, the tolerance such that there
-    are `RATE` false alarms a day.
+    The tolerance is by default such that there are `RATE` false alarms a day.
     """
     runs, dt = _runs(episodes), float(episodes[0].dt)
-    horizon = horizon or max(float(np.median(runs.lengths)) / 20.0, 10.0) * dt
     rows, names, units = [e.observations for e in episodes], labels.names, labels.units
-    given = {"dt": dt, "horizon": horizon, "hold": hold}
-    judge = Foresight.learn_log(rows, runs.failed, **given, names=names, units=units)
+    asked: dict[str, Any] = {"dt": dt, "horizon": horizon, "hold": hold}
+    judge = Foresight.learn_log(rows, runs.failed, **asked, names=names, units=units)
     tolerance = judge.tolerance_of(RATE) if tolerance is None else tolerance
+    return _guard_of(judge, tolerance, machine, learn=False)
+
+
+def guard_from_zero(
+    dt: float,
+    names: Sequence[str],
+    horizon: float | None,
+    hold: float,
+    tolerance: float | None,
+) -> Guard:
+    """The same, of one that has seen nothing, and learns as it goes."""
+    judge = Foresight.from_zero(dt=dt, names=names, horizon=horizon, hold=hold)
+    machine = EvolvingFSM(1, max_states=200)
+    return _guard_of(judge, 0.5 if tolerance is None else tolerance, machine, learn=True)
+
+
+def _guard_of(
+    judge: Foresight, tolerance: float, machine: EvolvingFSM | None, *, learn: bool
+) -> Guard:
     reviser = ActionReviser(judge, Choices(1), tolerance=tolerance, mode=Mode.SHADOW)
-    return Guard.of(reviser, interval=dt, machine=machine, learn=False)
+    return Guard.of(reviser, interval=judge.dt, machine=machine, learn=learn)
 
 
 def show_foreseen(

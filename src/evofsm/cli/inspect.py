@@ -6,9 +6,10 @@ import math
 import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from evofsm.cli.options import Json, Saved, option, picture, split_names
+from evofsm.cli.options import Json, Saved, option, picture, reading_of, split_names
 from evofsm.cli.show import facts, print_json, say, show, table
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 _MODELS = ("guard.evofsm", "model.evofsm")
 # So many states are listed, those with most of the time.
 _STATES_LISTED = 20
+# Of a longer log so many rows are drawn.
+_ROWS_SHOWN = 20_000
 _UNTOLD = (
     "Which episodes failed is not known: nothing said so. From a log, evofsm learn "
     "--failed COLUMN or --failed 'gap<=0' says it."
@@ -35,6 +38,9 @@ def inspect(
     file: Saved,
     plot: Annotated[Path | None, option("File for a picture: PNG, PDF, SVG.")] = None,
     axes: Annotated[str | None, option("Two variables, of --plot.")] = None,
+    log: Annotated[
+        str | None, option("A log to show beneath, of --plot, read as the one it was learnt from.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Print what was learnt: states, the transitions that matter, where a guard's system fails.
@@ -42,9 +48,9 @@ def inspect(
     evofsm explain says what came of one situation.
     """
     model, header, guard = load_model(file)
-    if plot is not None:
-        _draw(model, guard, plot, axes)
     provenance = {} if header is None else header.provenance
+    if plot is not None:
+        _draw(model, guard, plot, axes, _logged(log, model, provenance.get("read with", {})))
     told = getattr(guard and guard.judge, "told_by_experience", None)
     known = [] if told is None else [("experience", str(told))]
     if as_json:
@@ -90,13 +96,34 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None, Guard | None]:
     else:
         return FSMModel.load(place), header, None
     family = str(header.provenance.get("family"))
+    if not machine.n_states:
+        raise ValueError(f"{place} has seen nothing yet: an episode has to be over")
     labels = getattr(guard and guard.judge, "labels", Labels())
     if family in FAMILIES:
         labels = load_family(family).labels
     return machine.model(**labels._asdict()), header, guard
 
 
-def _draw(model: FSMModel, guard: Guard | None, out: Path, axes: str | None) -> None:
+def _logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> dict[str, Any]:
+    """Rows of a log, some tens of thousands, and with which of them an episode failed."""
+    import numpy as np
+
+    if log is None:
+        return {}
+    rows, failed = list[Any](), list[Any]()
+    known = {**read_with} if read_with else {"observe": ",".join(f'"{n}"' for n in model.names)}
+    for chunk in reading_of(**known).traces([log]):
+        rows.append(chunk.observations)
+        fails = () if chunk.failures is None else chunk.failures
+        failed.append(np.isin(np.arange(len(chunk.times)), fails))
+    every, ended = np.concatenate(rows), np.concatenate(failed)
+    shown = ended | (np.arange(len(every)) % (1 + len(every) // _ROWS_SHOWN) == 0)
+    return {"rows": every[shown], "failed": ended[shown]}
+
+
+def _draw(
+    model: FSMModel, guard: Guard | None, out: Path, axes: str | None, logged: dict[str, Any]
+) -> None:
     """States in the plane of two variables, and what a guard has learnt of failure."""
     from evofsm import plot
     from evofsm.guard import LearntRisk
@@ -108,8 +135,10 @@ def _draw(model: FSMModel, guard: Guard | None, out: Path, axes: str | None) -> 
     with picture(out, 7.2, 5.0) as figure:
         if guard is not None and isinstance(guard.judge, LearntRisk):
             plot.experience(guard, figure.subplots(), variables=pair or None)
+        elif model.n_variables == 1:
+            plot.graph(model, figure.subplots())
         else:
-            plot.states(model, figure.subplots(), variables=pair or (0, 1))
+            plot.states(model, figure.subplots(), variables=pair or (0, 1), ways=True, **logged)
 
 
 # -- As a whole -----------------------------------------------------------------------------------
@@ -232,6 +261,10 @@ def _learnt_from(provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         if name == "files":
             more = f" and {len(value) - 3:,} more" if len(value) > 3 else ""
             text = ", ".join(file["name"] for file in value[:3]) + more
+        if name == "read with":
+            several = ((k, v if isinstance(v, list) else [v]) for k, v in value.items())
+            options = (f"--{k.replace('_', '-')} {quote(str(v))}" for k, vs in several for v in vs)
+            text = " ".join(options)
         is_amount = name in ("files", "rows", "episodes", "transitions")
         yield f"learnt from {name}" if is_amount else name, text
 
@@ -265,6 +298,9 @@ def explain(
     model, _, guard = load_model(file)
     done = None if action is None else _index("--action", action, model.n_actions)
     if observation is not None:
+        if (count := len(_values(observation))) != model.n_variables:
+            names = ", ".join(map(model.labels.variable, range(model.n_variables)))
+            raise ValueError(f"--observation has {count} values; it needs {names}, in this order")
         found = [model.explain(action=done, observation=_values(observation))]
     elif state == "all":
         found = [model.explain(k, done) for k in range(model.n_states)]

@@ -22,7 +22,9 @@ from evofsm.cli.options import (
     Reading,
     Tolerance,
     argument,
+    given_of,
     imported,
+    in_quotes,
     option,
     reads_logs,
 )
@@ -156,12 +158,14 @@ def learn(
         units = [told.get(name, "") for name in encoder.names]
         return [SI.get(unit, unit) for unit in units]
 
+    kept: list[Chunk] | None = [] if guard is not None and not acts else None
     with progress("Learning", sum(file["bytes"] for file in known)) as move:  # type: ignore[misc]
-        chunks = _saying(read.traces(files, noted, lambda count: move(advance=count)), lacking)
+        traces = read.traces(files, noted, lambda count: move(advance=count))
+        chunks = _saying(traces, lacking, kept)
         learning = learn_traces(chunks, machine, actions, encoder.names, units_read)
-    provenance = _provenance(learning, known, columns)
-    if not acts:
-        provenance["action"] = "none: nobody acts"
+    provenance = {"files": known, "rows": learning.read.rows, "episodes": learning.read.episodes}
+    provenance |= {"transitions": learning.transitions, "failures": learning.read.failures}
+    provenance["read with"] = {k: v for k, v in given_of(reading).items() if k != "topics"}
     warnings = warnings_of(noted, columns)
     for warning in warnings:
         warn(f"warning: {warning}")
@@ -171,17 +175,16 @@ def learn(
     if guard is not None:
         assert kind is not None
         assert learning.model.dt is not None
-        rows = read.traces(files)
-        if acts:
+        if kept is None:
             reckoned = kind, learning.model.dt, brakes, tolerance
             taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
             with progress("Teaching the guard", learning.read.rows) as move:
-                share = teach(taught, rows, lambda count: move(count))
+                share = teach(taught, read.traces(files), lambda count: move(count))
             if refused := refusing(share):
                 warn(f"warning: in the later half of the log the guard {refused}")
         else:
             asked = horizon, persist, None if tolerance == TOLERANCE else tolerance
-            episodes = [chunk for chunk in episodes_of(rows) if len(chunk.times) > 1]
+            episodes = [chunk for chunk in episodes_of(kept) if len(chunk.times) > 1]
             labels = Labels(names=encoder.names, units=learning.model.units)
             taught = guard_where_nobody_acts(episodes, labels, *asked, learning.machine)
         taught.save(guard, provenance)
@@ -338,37 +341,28 @@ def _look_first(file: str, reading: Reading) -> list[str]:
     if columns.observe.names == VARIABLES and not {*VARIABLES} & {*table.columns} and options:
         to_file = "--guard" if "--failed" in could else "--out"
         options.append((to_file, f"{to_file[2:]}.evofsm"))
-        command = [f"evofsm learn {quote(file)}", *(f"{a} {quote(b)}" for a, b in options)]
+        command = [f"evofsm learn {quote(file)}", *(f"{a} {in_quotes(b)}" for a, b in options)]
         show(facts(f"What {file} holds", found), "\nA way to learn from it:")
         print("  " + " \\\n      ".join(command), flush=True)
         raise ValueError(f"say what is observed in {file} (--observe names it); a way stands above")
     said = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
     asked = zip(_UNASKED.items(), said, strict=True)
-    return [f"{why}: {a} {quote(could[a])}" for (a, why), b in asked if b is None and a in could]
+    return [
+        f"{why}: {a} {in_quotes(could[a])}" for (a, why), b in asked if b is None and a in could
+    ]
 
 
-def _saying(chunks: Iterable[Chunk], lines: list[str]) -> Iterator[Chunk]:
-    """The same chunks; lines are said once it is known that something can be read."""
+def _saying(chunks: Iterable[Chunk], lines: list[str], kept: list[Chunk] | None) -> Iterator[Chunk]:
+    """The same chunks, kept if asked; lines are said once something can be read."""
     for chunk in chunks:
         while lines:
             warn(lines.pop(0))
+        if kept is not None:
+            kept.append(chunk)
         yield chunk
 
 
 # -- What came of it ------------------------------------------------------------------------------
-
-
-def _provenance(learning: Learning, files: list[Any], columns: LogColumns) -> dict[str, Any]:
-    """What the model's file says of where it comes from."""
-    read = learning.read
-    provenance = {"files": files, "rows": read.rows, "episodes": read.episodes}
-    provenance |= {"transitions": learning.transitions, "action": columns.action}
-    if columns.failed is not None:
-        provenance |= {"failed": columns.failed, "failures": read.failures}
-    if columns.units:
-        units = (f"{name}={unit}" for name, unit in columns.units.items())
-        provenance["units converted"] = ", ".join(units)
-    return provenance
 
 
 def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
@@ -383,8 +377,11 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     yield f"The guard was saved to {path}. {takes}"
     if isinstance(guard.judge, Foresight):
         tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
-        yield f"It alarms where more than {tolerance:.0%} of such alarms were right, held out."
-        yield f"What it learnt: {guard.judge.told_by_experience}."
+        if (rate := guard.judge.rate_of(tolerance)) is None:
+            yield "It never alarms: on episodes held out, no alarm was better than chance."
+        else:
+            yield f"It alarms where {guard.judge.of(rate)}."
+        yield f"All that it learnt (--tolerance chooses): {guard.judge.told_by_experience}."
         return
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."

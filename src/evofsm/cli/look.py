@@ -11,6 +11,7 @@ import polars
 from numpy.typing import NDArray
 
 from evofsm.cli.options import seconds
+from evofsm.guard.foresight import span
 from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
 
@@ -69,7 +70,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
         options.append(("--episode", _named(group, ",")))
     told_by = {group, *(name for name, *_ in rare)}
     ends = {n: np.nanquantile(z[runs], (0.02, 0.98)) for n, z in values.items() if n not in told_by}
-    if still in ends and ends[still][1] < 1.1 * ends[still][0]:  # as it runs it is always the same
+    if still in ends and ends[still][1] < 1.05 * ends[still][0]:  # as it runs it is always the same
         del ends[still]
     # What goes on by the same from row to row is a count of them.
     moved = {n: e.tolist() for n, e in ends.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
@@ -112,9 +113,14 @@ def _of_steps(times: NDArray[np.float64], facts: Pairs) -> Pairs:
     usual = float(np.median(later)) if len(later) else math.nan
     odd = (steps == 0.0) | (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
     facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {usual:.2g} s"
+    holes = steps > LONGEST_STEP * usual
     if odd.sum() < max(_MANY, _ODD * len(steps)):
+        if holes.any():
+            told = f"{holes.sum():,}, the longest {span(later.max())}, together"
+            told += f" {span(float((steps[holes] - usual).sum()))}; each begins an episode (--hole)"
+            facts.append(("holes", told))
         return []
-    facts.append(("other steps", f"{odd.sum():,}, the longest {later.max():,.0f} s"))
+    facts.append(("other steps", f"{odd.sum():,}, the longest {span(later.max())}"))
     least = max(usual, 3.5 * float(np.median(steps)))  # of few digits many times are the same
     step = next((nice for nice in _NICE if nice[0] >= least), _NICE[-1])
     hole = next((nice for nice in _NICE if nice[0] >= 10.0 * step[0]), _NICE[-1])

@@ -11,6 +11,7 @@ from functools import partial, wraps
 from importlib.util import find_spec
 from inspect import Parameter, Signature, signature
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
@@ -115,6 +116,15 @@ def imported(name: str) -> Any:
             raise ValueError(f"{module} has no {path!r}")
         thing = getattr(thing, part)
     return thing
+
+
+def in_quotes(text: str) -> str:
+    """A text as a shell takes it, to be read as well.
+
+    >>> print(in_quotes("Status=='off'"), in_quotes("gap<=0"))
+    "Status=='off'" 'gap<=0'
+    """
+    return f'"{text}"' if "'" in text and not {*text} & {*'"$`\\!'} else quote(text)
 
 
 def split_names(text: str) -> list[str]:
@@ -290,6 +300,12 @@ def reading_of(
     lengths = lengths_given(vehicle_length or ())
     given = None if topics is None else Topics.load(topics)
     return Reading(columns, lengths, given, acts=action != "")
+
+
+def given_of(reading: partial[Reading]) -> dict[str, Any]:
+    """The options of `reading_of` that were typed, by the names of its parameters."""
+    usual = signature(reading_of).parameters
+    return {k: v for k, v in reading.keywords.items() if v not in (usual[k].default, [])}
 
 
 Horizon = Annotated[

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from itertools import product
+from itertools import groupby, product
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -40,14 +40,20 @@ RATES = (0.1, 0.3, 1.0, 3.0)
 _AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.125
 # Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts held out.
 _MOST_LIMITS, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 4.0, 12), 3
-# Blocks of rows in a horizon, as limits are searched for.
-_BLOCKS = 15
+# Of a log of more rows some episodes are learnt from, if so many failures are left.
+_MOST_ROWS, _FAILURES = 500_000, 100
+# Blocks of rows in a horizon, as limits are searched for; of a long log fewer, but so many, where
+# there would be more than that in all.
+_BLOCKS, _FEWEST_BLOCKS, _MOST_BLOCKS = 15, 5, 100_000
 # Kinds of alarms; thresholds are plain unless others warn for longer by so much.
 _LEARNT, _PLAIN, _NO_KIND = range(3)
 _BETTER = 0.95
 # What a further limit has to add to the share of the horizon that is warned before; survived rows
 # that forms of failure are learnt from.
 _WORTH, _ROWS = 2e-3, 4000
+# Without a horizon: the share of the median episode, and the fewest rows. Rows that one that learns
+# as it goes keeps; it learns anew where failures, or rows, are so many times as many.
+_SHORT, _FEWEST, _HELD_ROWS, _MORE = 0.05, 10, 20_000, (1.1, 1.5)
 #: Columns of a limit: which rate it is for, the kind of alarm, the variable or form,
 #: which of `_AHEAD`, whether above (1) or below (-1), and the threshold.
 _RATE, _KIND, _OF, _WHEN, _SIGN, _AT = range(6)
@@ -59,8 +65,14 @@ KIND = Kind(
         "forms": Numbers(("forms", failure.SIZE)),
         "limits": Numbers(("limits", 6)),
         "held_out": COUNT.of("rates", 3),
+        "rows": Numbers(("rows", "variables")),
+        "starts": COUNT.of("episodes"),
+        "failed": COUNT.of("episodes"),
     },
-    {"dt": SIZE, "horizon": FROM_1, "hold": FROM_1, "names": list[str], "units": list[str]},
+    {
+        **{"dt": SIZE, "horizon": FROM_1, "hold": FROM_1, "names": list[str], "units": list[str]},
+        **{"learns": bool, "asked": SIZE._replace(optional=True)},
+    },
 )
 
 
@@ -89,6 +101,10 @@ class Runs(NamedTuple):
         return Runs(rows, np.cumsum(lengths) - lengths, self.failed[which])
 
 
+def _nothing(m: int) -> Runs:
+    return Runs(np.empty((0, m)), np.empty(0, np.int64), np.empty(0, np.bool_))
+
+
 class Tally(NamedTuple):
     """What came of an alarm."""
 
@@ -105,7 +121,10 @@ class Tally(NamedTuple):
 
 
 class Foresight(LearningJudge):
-    """Says that a failure is near, where nobody acts; it learns from whole logs (`learn_log`).
+    """Says that a failure is near, where nobody acts.
+
+    It learns from a whole log (`learn_log`), or with ``log``, the episodes so far, as it goes: of
+    the latest 20,000 rows (half of them of episodes that failed), where enough has come since.
 
     The risk is the share of such alarms that a failure followed, on episodes held out; 0 while none
     is on. Which alarm it is, of those for several rates of false ones, says the tolerance: the one
@@ -137,13 +156,20 @@ class Foresight(LearningJudge):
         held_out: Floats,
         names: Sequence[str] = (),
         units: Sequence[str] = (),
+        log: Runs | None = None,
+        asked: float | None = None,
     ) -> None:
         self.dt = positive("dt", dt)
         self.horizon, self.hold = horizon, hold  #: [rows]
+        self.bridges = 0.0  #: longest hole in time that it goes on across, as in a log [s]
         self.forms, self.limits = forms, limits
         #: (rates, 3) of each of `RATES` alarms, those that were right, and whether it is plain.
         self.held_out = held_out
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=dt)
+        self.log = log  #: what it learns from, if it does as it goes
+        self.asked = asked  #: horizon that was asked for, if any [s]
+        self._seen: list[Floats] = []  # of the episode under way
+        self._learnt = (0, 0) if log is None else (int(log.failed.sum()), len(log.rows))
         self.start_episode()
 
     # -- Learning -------------------------------------------------------------------------------
@@ -155,32 +181,62 @@ class Foresight(LearningJudge):
         failed: ArrayLike,
         *,
         dt: float,
-        horizon: float,
+        horizon: float | None = None,
         hold: float = 0.0,
         names: Sequence[str] = (),
         units: Sequence[str] = (),
     ) -> Self:
         """Learn from episodes, (T,) or (T, m) each; failed are those that ended with a failure.
 
-        ``horizon`` and ``hold`` are in seconds: how long before a failure an alarm is true, and how
-        long a limit has to be passed.
+        ``horizon`` and ``hold`` are in seconds: how long before a failure an alarm is true (by
+        default a twentieth of the median episode), and how long a limit has to be passed.
         """
-        ahead, held = max(round(positive("horizon", horizon) / dt), 1), 1 + round(hold / dt)
         if not np.any(failed):
             raise ValueError("no episode failed, so there is nothing to foresee")
         log = Runs.of(episodes, failed)
         refuse_unusable("observations", log.rows)
+        return cls._of_log(log, dt, horizon, 1 + round(hold / dt), names, units)
+
+    @classmethod
+    def from_zero(
+        cls, *, dt: float, names: Sequence[str], horizon: float | None = None, hold: float = 0.0
+    ) -> Self:
+        """One that has seen nothing, and learns as it goes; all as in `learn_log`."""
+        learnt = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((len(RATES), 3))
+        learnt[2][:, 2] = _NO_KIND
+        given: dict[str, Any] = {"log": _nothing(len(names)), "asked": horizon}
+        return cls(dt, _FEWEST, 1 + round(hold / dt), *learnt, names, **given)
+
+    @classmethod
+    def _of_log(
+        cls,
+        log: Runs,
+        dt: float,
+        horizon: float | None,
+        held: int,
+        names: Sequence[str],
+        units: Sequence[str],
+    ) -> Self:
+        """Learn from a log in which there are failures; of a long one from some of the episodes."""
+        every = min(-(-len(log.rows) // _MOST_ROWS), int(log.failed.sum()) // _FAILURES)
+        if every > 1:  # of both kinds as many of each
+            of_kind = np.where(log.failed, np.cumsum(log.failed), np.cumsum(~log.failed))
+            log = log.part(of_kind % every == 0)
+        if horizon is None:
+            horizon = max(float(np.median(log.lengths)) * _SHORT, _FEWEST) * dt
+        ahead = max(round(positive("horizon", horizon) / dt), 1)
         names = names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
         nothing = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 3))
         fresh = cls(dt, ahead, held, *nothing)
         number = np.arange(len(log.failed)) * _PARTS // len(log.failed)
         tallies = np.zeros((2, len(RATES), 3))  # of both kinds: warned, foreseen, false
         for k in range(_PARTS):
-            if (number == k).all() or not log.failed[number != k].any():
+            if not (number == k).any() or not log.failed[number != k].any():
                 continue
             judge, rest = fresh._fitted(log.part(number != k)), log.part(number == k)
+            columns = judge._columns(rest.rows, rest.starts)
             for plain, rate in np.ndindex(2, len(RATES)):
-                found, _ = judge.tally(rest, rate, plain=bool(plain))
+                found, _ = judge.tally(rest, rate, plain=bool(plain), columns=columns)
                 tallies[plain, rate] += found.lead * found.failures, found.foreseen, found.false
         judge = fresh._fitted(log)
         kind = (tallies[1, :, 0] >= _BETTER * tallies[0, :, 0]).astype(int)
@@ -212,7 +268,8 @@ class Foresight(LearningJudge):
         above = product(range(1 if plain else len(_AHEAD)), range(m if plain else of), (1, -1))
         asked = [(v, when, sign) for when, v, sign in above if v < m or sign > 0]
         # Rows are looked at by blocks, in which it is enough that one of them is beyond.
-        size = max(self.horizon // _BLOCKS, 1)
+        coarse = min(len(log.rows) // _MOST_BLOCKS, self.horizon // _FEWEST_BLOCKS)
+        size = max(self.horizon // _BLOCKS, coarse, 1)
         since = np.arange(len(log.rows)) - np.repeat(log.starts, log.lengths)
         blocks = np.flatnonzero(since % size == 0)
         shares = 1.0 - np.geomspace(0.3, max(3.0 / len(log.rows), 1e-5), _TRIED)
@@ -284,11 +341,18 @@ class Foresight(LearningJudge):
         return np.asarray(self.limits[chosen])
 
     def tally(
-        self, log: Runs, rate: int, *, plain: bool | None = None, hold: float | None = None
+        self,
+        log: Runs,
+        rate: int,
+        *,
+        plain: bool | None = None,
+        hold: float | None = None,
+        columns: Floats | None = None,
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,)."""
         limits = self.of_rate(rate, plain=plain)
-        on = np.asarray(self._passed(self._columns(log.rows, log.starts), limits).any(axis=0))
+        columns = self._columns(log.rows, log.starts) if columns is None else columns
+        on = np.asarray(self._passed(columns, limits).any(axis=0))
         spans, leads = self._spans, np.zeros(len(log.starts))
         spans[1] = self.hold if hold is None else 1 + round(hold / self.dt)
         false = _tally(on, log.starts, log.failed, spans, leads, on)
@@ -346,14 +410,16 @@ class Foresight(LearningJudge):
     def tolerance_of(self, rate: float) -> float:
         """The tolerance with which there are at most so many false alarms a day, if it can be."""
         k = max(int(np.searchsorted(RATES, rate, "right")) - 1, 0)
-        more = float(self.shares[k + 1 :].max(initial=0.0))
-        return float(np.clip(0.5 * (self.shares[k] + more), 0.01, 0.99))
+        more = self.shares[k + 1 :]
+        below = float(more[more < self.shares[k]].max(initial=0.0))
+        return float(np.clip(0.5 * (self.shares[k] + below), 0.01, 0.99))
 
     @property
     def told_by_experience(self) -> str:
         """What each alarm is, and how often it was right."""
-        rates = enumerate(RATES[: len(self.held_out)])
-        return "; ".join(f"for {rate:g} false alarms a day {self.of(k)}" for k, rate in rates)
+        alike = groupby(range(len(self.held_out)), self.of)
+        told = ((", ".join(f"{RATES[k]:g}" for k in rates), text) for text, rates in alike)
+        return "; ".join(f"for {rates} false alarms a day {text}" for rates, text in told)
 
     def of(self, rate: int) -> str:
         """What the alarm for one of `RATES` is, and how often it was right, in words."""
@@ -366,7 +432,10 @@ class Foresight(LearningJudge):
     # -- Beside a machine -----------------------------------------------------------------------
 
     def start_episode(self, *, learn: bool = True) -> None:
-        """Nothing was seen yet."""
+        """Nothing was seen yet; what was before, of an episode that nobody ended, went well."""
+        if self._seen and self.log is not None:
+            seen, self._seen = self._seen, []
+            self._learn_from(seen, self.log, failed=False)
         kept = [self.of_rate(rate) for rate in range(len(self.held_out))]
         self._limits = np.concatenate([np.empty((0, 6)), *kept])
         # Variables smoothed once and twice; rows since limits were passed, and not; what is on.
@@ -419,11 +488,41 @@ class Foresight(LearningJudge):
         """Keep up with what happens; it learns from whole logs alone."""
         self._now = self._next(np.asarray(observation, np.float64))[1]
 
-    learn = watch = follow
+    def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike = (), /) -> None:
+        """Keep up with what happens, and what it learns from."""
+        self.follow(observation, action)
+        if self.log is not None:
+            self._seen.append(np.asarray(observation, np.float64))
+
+    watch = learn
 
     def end(self, observation: Floats | None, *, failed: bool) -> None:
-        """The episode is over."""
+        """The episode is over; it learns anew where it learns as it goes, and there is enough."""
+        if self.log is not None:
+            last = [] if observation is None else [np.asarray(observation, np.float64)]
+            self._learn_from([*self._seen, *last], self.log, failed=failed)
+        self._seen = []
         self.start_episode()
+
+    def _learn_from(self, seen: Sequence[Floats], log: Runs, *, failed: bool) -> None:
+        """Add an episode, of whose rows those are left out in which something was not seen."""
+        rows = np.array(seen).reshape(len(seen), -1)
+        rows = rows[np.isfinite(rows).all(axis=1)][-_HELD_ROWS // 4 :]
+        if not len(rows):
+            return
+        joined = np.concatenate([log.rows, rows]), np.append(log.starts, len(log.rows))
+        log = Runs(*joined, np.append(log.failed, failed))
+        if len(log.rows) > _HELD_ROWS:  # of failures and of others the latest
+            sides = [np.where(side, log.lengths, 0) for side in (log.failed, ~log.failed)]
+            recent = [np.cumsum(side[::-1])[::-1] <= _HELD_ROWS // 2 for side in sides]
+            log = log.part(np.where(log.failed, *recent))
+        count = int(log.failed.sum()), len(log.rows)
+        if count[0] and any(np.array(count) > np.multiply(_MORE, self._learnt)):
+            known = self.labels.names, self.labels.units
+            new = self._of_log(log, self.dt, self.asked, self.hold, *known)
+            self.horizon, self.forms, self.limits = new.horizon, new.forms, new.limits
+            self.held_out, self._learnt = new.held_out, count
+        self.log = log
 
     def sums(self, n_states: int, /) -> dict[str, float]:
         """What it has learnt, in a few sums."""
@@ -431,8 +530,11 @@ class Foresight(LearningJudge):
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
-        arrays = {name: getattr(self, name) for name in KIND.arrays}
-        settings = {name: getattr(self, name) for name in ("dt", "horizon", "hold")}
+        log = _nothing(0) if self.log is None else self.log
+        arrays = {name: getattr(self, name) for name in ("forms", "limits", "held_out")}
+        arrays |= {name: np.asarray(values, np.float64) for name, values in log._asdict().items()}
+        settings = {name: getattr(self, name) for name in ("dt", "horizon", "hold", "asked")}
+        settings["learns"] = self.log is not None
         settings |= {name: list(getattr(self.labels, name)) for name in ("names", "units")}
         store.write(path, KIND, settings, arrays, provenance)
 
@@ -447,7 +549,16 @@ class Foresight(LearningJudge):
                 raise ValueError("a limit is of no variable, or of no rate")
             if not (np.isin(arrays["forms"][:, [failure.I, failure.J]], range(count))).all():
                 raise ValueError("a form is of no variable")
+            rows, starts, failed = (arrays.pop(name) for name in Runs._fields)
+            if (
+                (np.diff(starts) <= 0).any()
+                or (starts[:1] != 0).any()
+                or (starts >= len(rows)).any()
+            ):
+                raise ValueError("an episode begins beyond its rows")
+            log = Runs(rows, starts.astype(np.int64), failed > 0.0)
             known: dict[str, Any] = {**settings, **arrays}
+            known["log"] = log if known.pop("learns") else None
             return cls(**known)
 
 

@@ -551,6 +551,7 @@ class Guard:
         z, time = self._checked(observation), self._seconds(time)
         if not self._under_way:
             self._begin()
+        step = time - self._monitor.time
         intake, self._monitor = self._monitor.take(z, time)
         if intake and intake & STALE and self._latest is not None:
             situation = self._latest._replace(intake=intake)
@@ -560,7 +561,7 @@ class Guard:
             if intake and intake & Intake.GAP:
                 if self.machine is not None and self._learn:
                     self.machine.start_episode()
-                if self.judge is not None:
+                if self.judge is not None and not step <= getattr(self.judge, "bridges", 0.0):
                     self.judge.start_episode(learn=self._learn)
             situation = self._latest = self._recognised(z, time, intake)
         if self.audit is not None:

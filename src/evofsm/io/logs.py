@@ -252,6 +252,16 @@ class Term(NamedTuple):
             )
         return np.asarray(values > 0)
 
+    def holds_of(self, value: Any) -> bool:
+        """Whether it holds of one value, a number, a text, a truth value or None."""
+        value = value.strip() if isinstance(value, str) else value
+        if value in (None, ""):
+            return False
+        if self.sign:
+            is_alike = isinstance(value, str) != self.of_number
+            return is_alike and bool(_SIGNS[self.sign](value, self.value))
+        return _TRUTHS.get(str(value).strip().lower()) == 1
+
 
 class Condition(NamedTuple):
     """What holds of some rows: any of these, of each of which all terms hold."""
@@ -279,6 +289,10 @@ class Condition(NamedTuple):
         """In which rows of a piece it holds."""
         parts = [np.logical_and.reduce([t.holds(piece) for t in terms]) for terms in self.either]
         return np.asarray(np.logical_or.reduce(parts))
+
+    def holds_of(self, row: Mapping[str, Any]) -> bool:
+        """Whether it holds of one row, of values by column."""
+        return any(all(t.holds_of(row.get(t.column)) for t in terms) for terms in self.either)
 
 
 class Resample(NamedTuple):

@@ -482,8 +482,9 @@ class CsvTable(Table):
             return best
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
-        counts = [len(_fields(lines[at], _separator(lines[at]))) for at in rows]
-        usual = max(counts, key=counts.count, default=0)  # titles above have fewer fields
+        fields = (_fields(lines[at], _separator(lines[at])) for at in rows)
+        counts = [sum(map(bool, map(str.strip, found))) for found in fields]
+        usual = max(counts, key=counts.count, default=0)  # titles above fill fewer fields
         first = next((at for at, n in zip(rows, counts, strict=True) if n >= usual), 0)
         separator = _separator(lines[first])
         above, row = (_fields(lines[at], separator) for at in (max(first - 1, 0), first))
@@ -759,14 +760,16 @@ def _microseconds(
 
     why = f"{{!r}} is not read as a date; all must be {_ISO}, and all have a zone, or none"
     if dates.dtype == polars.String:
-        texts = dates.str.strip_chars()
+        texts, parts = dates.str.strip_chars(), ""
         if not form and (found := _DAY_FIRST.match(str(texts.first()))):
-            texts = texts.str.replace(", ", " ", literal=True)
-            form = f"%d.%m.%{'Y' if found[1] else 'y'} %H:%M{':%S%.f' if found[2] else ''}"
-        if "," not in form:
-            texts = texts.str.replace(",", ".", literal=True)
+            form = f"%d.%m.%{'Y' if found[1] else 'y'} %H:%M{':%S' if found[2] else ''}"
+            parts = "%.f" if found[2] else ""
+        if "," not in form and texts.str.contains(",", literal=True).any():
+            texts = texts.str.replace(r",\s+", " ").str.replace(",", ".", literal=True)
         try:
             dates = texts.str.to_datetime(form or None, strict=False)
+            if parts and dates.null_count():  # which is slower
+                dates = texts.str.to_datetime(form + parts, strict=False)
         except polars.exceptions.ComputeError:  # it knows no form from the first one
             dates = polars.Series(name, [None] * len(texts), polars.Datetime("us"))
     if dates.null_count():

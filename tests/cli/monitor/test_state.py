@@ -4,10 +4,13 @@ import msgspec
 import pytest
 
 from evofsm.cli.monitor.decider import Decider
+from evofsm.cli.monitor.slots import Slots
 from evofsm.cli.monitor.state import State
 from evofsm.cli.monitor.transports import Server
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.guard import Guard, Mode
+from evofsm.io import LogColumns
+from evofsm.io.logs import Resample
 from monitor_rows import JUNK, line, scenes, traffic
 
 SETTINGS = {"learn": True, "guard": None}
@@ -29,7 +32,7 @@ def opened(tmp_path):
     """Opens a state as a monitor does; in the end all are abandoned."""
     states = []
 
-    def open_state(path=tmp_path / "state.evofsm", learn=True, fresh=made):
+    def open_state(path=tmp_path / "state.evofsm", learn=True, fresh=made, **settings):
         states.append(state := State(path, SETTINGS))
         try:
             guard = state.guard(fresh)
@@ -37,7 +40,7 @@ def opened(tmp_path):
             state.close()
             raise
         guard.learn = learn
-        decider = Decider(guard, episode=700)
+        decider = Decider(guard, **{"episode": 700, **settings})
         state.begin(decider)
         return decider, state
 
@@ -64,6 +67,26 @@ def test_it_goes_on_bit_for_bit_wherever_it_is_killed(opened, learn, mode):
         if k % 50 == 0:
             assert decider.answer(JUNK[k // 50 % len(JUNK)])["kind"] == "error"
         assert decider.answer(line(row)) == plain.answer(line(row)), k
+
+
+def test_rows_that_wait_for_their_slot_go_on_waiting(opened):
+    def settings():  # each its own slots
+        columns = LogColumns(resample=Resample(0.3), failed="gap<=0", where="gap<300")
+        return {"episode": 30, "slots": Slots(columns)}
+
+    plain = Decider(made(), **settings())
+    decider, state = opened(**settings())
+    kinds = set()
+    for k, row in enumerate(traffic(1600)):
+        if k in (3, 4, 601, 690, 1401, 1402, 1403):
+            abandoned(state)
+            decider, state = opened(**settings())
+        answer = decider.answer(line(row))
+        assert answer == plain.answer(line(row)), k
+        kinds.add(answer["kind"])
+        if k % 100 == 50:
+            assert decider.lapse() == plain.lapse() is not None
+    assert kinds >= {"waiting", "decision", "error"}
 
 
 def test_a_last_record_that_was_half_written_is_left_out(opened):

@@ -16,6 +16,7 @@ import pytest
 
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.messages import LONGEST
+from evofsm.cli.monitor.slots import Slots
 from evofsm.cli.monitor.transports import (
     Server,
     SocketTransport,
@@ -24,6 +25,8 @@ from evofsm.cli.monitor.transports import (
     ZenohTransport,
 )
 from evofsm.driving.assumed import guard_of_monitor
+from evofsm.io import LogColumns
+from evofsm.io.logs import Resample
 from monitor_rows import JUNK, closing_in, line
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="sockets and signals of POSIX")
@@ -95,6 +98,31 @@ def test_it_ends_after_the_message_under_way_however_many_came_at_once(monkeypat
     begun = time.monotonic()
     server.run(Stream(Pieces(b"x\n" * 5000), io.BytesIO()))
     assert time.monotonic() - begun < PATIENCE
+
+
+def test_what_waits_for_its_slot_is_decided_on_where_nothing_comes_and_rows_after_it_are_late():
+    slots = Slots(LogColumns(resample=Resample(0.3)))
+    decider = Decider(guard_of_monitor(0.3, 6.0), slots=slots)
+    (source, feed), (drain, sink) = os.pipe(), os.pipe()
+    reader, writer = (os.fdopen(end, mode, 0) for end, mode in ((source, "rb"), (sink, "wb")))
+    server = Server(decider)
+    thread = threading.Thread(target=server.run, args=(Stream(reader, writer),))
+    with os.fdopen(drain) as answers, unittest.mock.patch("signal.signal"):
+        thread.start()
+        os.write(feed, b"".join(ROWS[:4]))  # of 0.0 to 0.3 s
+        kinds = [json.loads(answers.readline())["kind"] for _ in range(4)]
+        assert kinds == ["waiting", "waiting", "waiting", "decision"]
+        late = json.loads(answers.readline())  # nobody asked for it
+        assert (late["kind"], late["n"], late["time"]) == ("decision", 2, pytest.approx(0.3))
+        os.write(feed, ROWS[4] + ROWS[6])
+        refused, waiting = (json.loads(answers.readline()) for _ in range(2))
+        assert "comes after its 0.3 s were decided on" in refused["error"]
+        assert waiting["kind"] == "waiting"
+        os.close(feed)
+        assert json.loads(answers.readline())["n"] == 3  # as the input ends
+        thread.join(PATIENCE)
+    reader.close()
+    writer.close()
 
 
 def connected(path):

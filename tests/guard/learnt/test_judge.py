@@ -310,3 +310,16 @@ def test_names_are_for_words_alone_and_are_kept(reloaded):
     named = LearntRisk(0.1, n_actions=2, names=("place", "speed"), units=("m", "m/s"))
     labels = reloaded(named).labels
     assert (labels.names, labels.units) == (("place", "speed"), ("m", "m/s"))
+
+
+def test_where_there_is_but_one_action_reasons_name_no_backup():
+    rng, guard, said = np.random.default_rng(0), Guard(n_actions=1, interval=1.0), []
+    for episode in range(6):
+        rises = float(episode % 2)
+        z = np.cumsum(rng.normal(0.2 * rises, 0.05, 60))
+        z = z[: np.append(z > 8.0, True).argmax() + 1]
+        said += [guard.decide([one, rises], 0).reason for one in z[:-1]]
+        guard.end(failed=bool(z[-1] > 8.0), observation=[z[-1], rises])
+    refused = [reason for reason in said if reason.endswith("; nobody acts")]
+    assert any(reason.startswith("it does not survive ") for reason in refused)
+    assert not any("no backup" in reason for reason in said)

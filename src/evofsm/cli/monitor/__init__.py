@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.options import (
     BRAKES,
@@ -22,7 +22,9 @@ from evofsm.cli.options import (
     Persist,
     Reading,
     argument,
+    given_of,
     option,
+    reading_of,
     reads_logs,
     split_names,
 )
@@ -36,6 +38,8 @@ if TYPE_CHECKING:
 
 # Share by which the step of a log may differ from that of the guard.
 _SAME_STEP = 0.05
+# Of rows of cars, where nobody said another one [s].
+_INTERVAL = 0.1
 # What other files end with is read as JSON lines.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
 
@@ -46,7 +50,18 @@ def monitor(
         Path | None, argument("JSON lines; with --summary a log too. [default: standard input]")
     ] = None,
     guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
-    interval: Annotated[float, option("Time between two rows [s], without --guard.")] = 0.1,
+    low: Annotated[
+        str | None,
+        option("Lowest action, to begin a guard of any system; with commas: of each component."),
+    ] = None,
+    high: Annotated[str | None, option("Highest action, as --low.")] = None,
+    n_actions: Annotated[
+        int | None, option("Number of actions, where one is an index from 0.", min=2)
+    ] = None,
+    interval: Annotated[
+        float | None,
+        option("Time between two rows [s], without --guard. [default: of cars 0.1]", min=0.0),
+    ] = None,
     brakes: Brakes = BRAKES,
     tolerance: Annotated[
         float | None,
@@ -89,7 +104,7 @@ def monitor(
     ] = False,
     observe: Annotated[
         str | None,
-        option("Columns of a log to observe. [default: the variables of the guard]"),
+        option("Variables that are observed, in this order. [default: those of the guard]"),
     ] = None,
     *,
     reading: partial[Reading],
@@ -106,7 +121,12 @@ def monitor(
 
     Rows come from standard input, a file, a socket, UDP or Zenoh. Nothing is learnt without
     --learn, and nothing is changed without --mode act. Ctrl-C or SIGTERM ends it, with everything
-    saved.
+    saved. Rows are read as the log was that the guard learnt from, by --resample, --hole, --where
+    and --failed, or as these say.
+
+    To begin a guard of any system say what is observed (--observe), how often (--interval or
+    --resample), and who acts: --low and --high, --n-actions, or nobody (--action ''). It learns
+    from what comes, and from which episodes failed (--failed, or a message).
 
     With --summary it reads FILE, such lines or a log as evofsm learn reads it (by the options from
     --observe to --hole), and prints how often it would have alarmed and how risky it was.
@@ -119,7 +139,9 @@ def monitor(
         raise ValueError("--traffic learns nothing: it goes with no --guard, --state or --learn")
     if summary and (file is None or state or audit):
         raise ValueError("--summary needs FILE, and goes with no --state or --audit")
+    from evofsm.cli.foreseen import RATE
     from evofsm.cli.monitor.decider import EPISODE, Decider
+    from evofsm.cli.monitor.slots import Slots
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.transports import Server
     from evofsm.driving.assumed import assumptions, guard_of_monitor, guard_of_traffic
@@ -133,9 +155,23 @@ def monitor(
     def fresh() -> Guard:
         if guard is not None:
             return Guard.load(guard)
-        return (guard_of_traffic if traffic else guard_of_monitor)(interval, brakes, tolerated)
+        if begun is not None:
+            return begun
+        made = guard_of_traffic if traffic else guard_of_monitor
+        return made(interval or _INTERVAL, brakes, tolerated)
 
     is_log = file is not None and (file.suffix in _LOGS or file.is_dir())
+    parts = {"low": low, "high": high, "n_actions": n_actions, "observe": observe}
+    told, begun = {name: part for name, part in parts.items() if part is not None}, None
+    if guard is None and not is_log and (told or "action" in given_of(reading)):
+        if traffic:
+            raise ValueError("--traffic is of cars, and goes with no --observe or --action")
+        begun, learn = _begun({**told}, reading, interval, tolerance, horizon, persist), True
+    kept = _read_with(guard or state)
+    if is_log and episode is None:
+        episode = kept.get("episode")
+    given = {k: v for k, v in kept.items() if k not in ("observe", "episode")}
+    reading = partial(reading_of, **{**reading.keywords, **given, **given_of(reading)})
     if is_log and not summary:
         warn(f"warning: {file} is read as JSON lines; of a log, --summary says where it alarms")
     elif episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
@@ -151,8 +187,10 @@ def monitor(
             alone = reading.keywords["action"] == "" or isinstance(used and used.judge, Foresight)
             names = used.variables if used else VARIABLES
             if observe is None or set(split_names(observe)) == set(names):  # in its own order
-                observe = ",".join(f'"{name}"' for name in names)
-            asked = reading(observe=observe, episode=episode, **({"action": ""} if alone else {}))
+                observe = _quoted(names)
+            if alone:
+                reading = partial(reading, action="")
+            asked = reading(observe=observe, episode=episode)
             chunks, interval = _episodes(file, asked, dated=alone)
             if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
                 text = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
@@ -166,17 +204,24 @@ def monitor(
             raise ValueError("--json and --plot are for logs where nobody acts: --action ''")
         if state is not None:
             is_other = guard is not None and guard.resolve() != state.resolve()
-            given = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
+            digest = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
             made = {"interval": interval, "brakes": brakes} if guard is None else {}
-            told = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
-            saved = State(state, {"guard": given, **made, **told})
+            how = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
+            read = {k: v for k, v in given_of(reading).items() if k != "topics"}
+            saved = State(state, {"guard": digest, **made, **how, **told, **read})
             stack.callback(saved.close)
         elif learn and not summary:
             warn("nothing of what is learnt is saved; --state FILE saves it")
-        used = fresh() if saved is None else saved.guard(fresh)
+        used = fresh() if saved is None else saved.guard(fresh, begun.failed if begun else None)
         _prepare(used, mode, tolerance, audit, stack, learn=learn)
-        decider = Decider(used, episode=rows)
+        slots = None
+        if not (is_log or traffic):
+            slots = Slots(reading(observe=_quoted(used.variables or VARIABLES), dt=None).columns)
+        rate = RATE if begun and tolerance is None else None
+        decider = Decider(used, episode=rows, slots=slots, rate=rate)
         assumed = _of_saved(guard, used) if guard else assumptions(brakes, tolerated)
+        if begun:
+            assumed = f"a guard of {', '.join(used.variables)} begins, and learns from what comes"
         if summary and file is not None:
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
 
@@ -190,18 +235,21 @@ def monitor(
             again = saved.begin(decider)
             if decider.n:
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
-        server = Server(decider, heartbeat or math.inf)
+        server = Server(decider, heartbeat or math.inf, keeps=saved is not None)
         transport, where = _transport(file, socket, udp, zenoh, stack)
         warn(assumed)
-        if where:
-            warn(f"listens to {where}")
+        if slots is not None and (words := slots.words()):
+            warn(f"as in a log: {words}")
+        warn(f"ready: {where}")
         try:
             server.run(transport)
         except BrokenPipeError:
             warn("nobody reads the decisions any more")
             return 1
         finally:
-            if saved is None and decider.rows:
+            if saved is not None:
+                saved.rest(decider)
+            elif decider.rows:
                 decider.end()
     return None
 
@@ -255,6 +303,68 @@ def _prepare(
         guard.audit = stack.enter_context(AuditLog(audit, sync="episode"))
 
 
+def _read_with(guard: Path | None) -> dict[str, Any]:
+    """The options by which evofsm learn read the log of a guard."""
+    from evofsm import store
+
+    if guard is None or not guard.is_file():
+        return {}
+    return dict(store.read_header(guard).provenance.get("read with", {}))
+
+
+def _begun(
+    told: dict[str, Any],
+    reading: partial[Reading],
+    interval: float | None,
+    tolerance: float | None,
+    horizon: float | None,
+    persist: float,
+) -> Guard:
+    """A guard that knows nothing yet, from what was told of a system."""
+    from evofsm.cli.foreseen import guard_from_zero
+    from evofsm.guard import Guard, LearntRisk, Mode
+    from evofsm.io.logs import Condition
+
+    if "observe" not in told:
+        raise ValueError("say what is observed, the keys of rows: --observe temperature,load")
+    columns, *_, acts = reading(observe=told.pop("observe"), dt=None)
+    names, made = columns.observe.names, columns.resample
+    if (step := made.step if made else interval) is None:
+        raise ValueError("say how often rows come [s]: --interval 1; or --resample 10s of jittered")
+    if not acts and told:
+        raise ValueError("--action '' says that nobody acts, and goes with no range of actions")
+    if not acts:
+        return guard_from_zero(step, names, horizon, persist, tolerance)
+    if not told:
+        raise ValueError("say who acts: --low and --high, --n-actions; or --action '', if nobody")
+    for name in {"low", "high"} & {*told}:
+        try:
+            ends = [float(end) for end in told[name].split(",")]
+        except ValueError:
+            raise ValueError(f"--{name} is {told[name]!r}; write a number, or -1,-1") from None
+        told[name] = ends if len(ends) > 1 else ends[0]
+    condition = Condition.parse(columns.failed or names[0])
+
+    def failed(z: Any) -> bool:
+        return condition.holds_of(dict(zip(names, z, strict=True)))
+
+    is_told = columns.failed and {term.column for term in condition.terms} <= {*names}
+    judge = LearntRisk(step, horizon=horizon, names=names, **told)
+    return Guard(
+        **told,
+        interval=step,
+        judge=judge,
+        failed=failed if is_told else None,
+        tolerance=TOLERANCE if tolerance is None else tolerance,
+        mode=Mode.SHADOW,
+    )
+
+
+def _quoted(names: Iterable[str]) -> str:
+    """Names, as --observe takes them."""
+    return ",".join('"' + name.replace('"', '""') + '"' for name in names)
+
+
 def _of_saved(path: Path, guard: Guard) -> str:
     """What a guard that was saved reckons with, in a line."""
     tolerance = getattr(guard.reviser, "tolerance", None)
@@ -265,22 +375,22 @@ def _of_saved(path: Path, guard: Guard) -> str:
 def _transport(
     file: Path | None, socket: Path | None, udp: int | None, zenoh: str | None, stack: ExitStack
 ) -> tuple[Transport, str]:
-    """Where rows come from; and, where it listens, to what."""
+    """Where rows come from, and that in words."""
     from evofsm.cli.monitor.transports import SocketTransport, Stream, UdpTransport, ZenohTransport
 
     if socket is not None:
-        return SocketTransport(socket), str(socket)
+        return SocketTransport(socket), f"listens to {socket}"
     if udp is not None:
         by_udp = UdpTransport(udp)
-        return by_udp, f"UDP port {by_udp.port}"
+        return by_udp, f"listens to UDP port {by_udp.port}"
     if zenoh is not None:
-        return ZenohTransport(zenoh), f"{zenoh}/row"
+        return ZenohTransport(zenoh), f"listens to {zenoh}/row"
     if file is None and sys.stdin is None:
         raise ValueError("standard input is closed; give FILE, --socket, --udp or --zenoh")
     if sys.stdout is None:
         raise ValueError("standard output is closed; give --socket, --udp or --zenoh")
     source = sys.stdin.buffer if file is None else stack.enter_context(file.open("rb"))
-    return Stream(source, sys.stdout.buffer), ""
+    return Stream(source, sys.stdout.buffer), f"reads {file or 'standard input'}"
 
 
 def _compile(decider: Decider) -> None:

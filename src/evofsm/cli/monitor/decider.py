@@ -16,13 +16,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
+from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Pause, Row, Taken
+from evofsm.cli.monitor.slots import Slots
 from evofsm.cli.show import plain
 from evofsm.driving.judge import SLIGHT, LatentRisk
 from evofsm.driving.traffic import COLUMNS, TrafficRisk
 from evofsm.guard import (
     ActionReviser,
     BoxActions,
+    Foresight,
     Guard,
     Mode,
     Proposal,
@@ -53,21 +55,34 @@ _T = TypeVar("_T")
 class Decider:
     """Answers messages by a guard's decisions."""
 
-    def __init__(self, guard: Guard, *, episode: int = EPISODE) -> None:
+    def __init__(
+        self,
+        guard: Guard,
+        *,
+        episode: int = EPISODE,
+        slots: Slots | None = None,
+        rate: float | None = None,
+    ) -> None:
         self.guard = guard
         self.episode = episode
-        self.form = Form(guard)
-        self.keep: Callable[[Message], None] = lambda message: None
+        self.slots = slots or Slots()
+        self.rate = rate  #: false alarms a day, where nobody acts, that the tolerance is set to
+        self.form = Form(guard, self.slots.keys)
+        self.keep: Callable[[Taken], None] = lambda taken: None
         self.n = 0  #: decisions so far
         self.refused = 0  #: messages that were refused, since the process began
-        self.rows = 0  #: of the episode under way; 0 where none is
+        self.rows = 0  #: decisions of the episode under way; 0 where none is
+        self.decided_on: Row | None = None  #: latest
         self._recent: deque[tuple[Message, Answer]] = deque(maxlen=_RECENT)
         self._next: int | None = None  # of the recent ones, where they are being sent again
-        self._said_often = self._said_fast = self._has_failed = False
+        self._said_often = self._said_fast = self._has_failed = self._alarm = False
         reviser = guard.reviser
         judge = reviser.risk if isinstance(reviser, ActionReviser) else None
         self._units = () if judge is None else judge.labels.units
         self._drives = isinstance(judge, LatentRisk | TrafficRisk)
+        self._is_alone = isinstance(judge, Foresight)  # nobody acts
+        if isinstance(judge, Foresight):
+            judge.bridges = self.slots.hole or 0.0
 
     @property
     def mode(self) -> Mode:
@@ -92,6 +107,11 @@ class Decider:
                 return self._recent[self._next][1]
             if isinstance(told, Row) and isinstance(self.latest, Row):
                 _refuse_stale(told, self.latest)
+            if isinstance(told, Row) and self.slots.is_over(told):
+                fault = f"comes after its {self.slots.step:g} s were decided on, as nothing came"
+                raise MessageError("time", fault, told.time)
+            if self.slots.step and isinstance(told, Row) and (told.ahead or not told.observation):
+                raise MessageError("objects", "are not resampled; send rows of the variables")
             if isinstance(told, Row) and not told.time < told.time + self.guard.interval:
                 raise MessageError("time", "is too large to tell rows apart", told.time)
         except MessageError as refused:
@@ -141,18 +161,54 @@ class Decider:
 
     # -- What it does ---------------------------------------------------------------------------
 
-    def act(self, told: Message) -> Answer:
+    def act(self, told: Taken) -> Answer:
         """Take in what was accepted, and answer it."""
-        if isinstance(told, End):
-            if self.rows or (told.failed and not isinstance(self.latest, End)):
-                self.end(told.failed, _numbers(told.observation))
-            answer = self._of("end", failed=told.failed)
-        else:
-            answer = self._decided(told)
+        if isinstance(told, Pause):
+            return dict(self._waited(early=True).get("last", {}))
+        answer = self._ended(told) if isinstance(told, End) else self._taken(told)
         self._recent.append((told, answer))
         if self.rows >= self.episode and (not answer.get("alarm") or self.rows >= 2 * self.episode):
             self._end_unasked()
         return answer
+
+    def lapse(self) -> Answer | None:
+        """Decide on what waits, as nothing came for long; None where nothing waits."""
+        if not self.slots.waiting:
+            return None
+        answer = self.act(Pause())
+        self.keep(Pause())
+        return answer
+
+    def _waited(self, *, early: bool = False) -> Answer:
+        """What is decided on rows that waited, if there are some, as the entry of an answer."""
+        row = self.slots.take(early=early)
+        return {} if row is None else {"last": self._decided(row)}
+
+    def _ended(self, told: End) -> Answer:
+        last = self._waited()
+        if self.rows or (told.failed and not isinstance(self.latest, End)):
+            self.end(told.failed, _numbers(told.observation))
+        return self._of("end", failed=told.failed, **last)
+
+    def _taken(self, row: Row) -> Answer:
+        """What a row brings, as it would in a log."""
+        slots, before = self.slots, self.latest
+        counts, fails = slots.counts(row), slots.fails(row)
+        if fails or not counts:
+            is_new = fails and not slots.fails(before)
+            last, was = self._waited(), bool(self.rows)
+            if was or (is_new and counts):
+                self.end(is_new, _numbers(row.observation) if is_new and counts else None)
+            columns = slots.columns
+            why = f"--failed {columns.failed}" if fails else f"not --where {columns.where}"
+            done = {} if self._is_alone else {"executed": plain(row.proposal)}
+            told = {"failed": is_new and (was or counts), **done, "reason": why, **last}
+            return self._of("end", time=row.time, **told)
+        if not slots.step:
+            return self._decided(row)
+        if (whole := slots.add(row)) is not None:
+            return self._decided(whole)
+        return self._of("waiting", time=row.time, alarm=self._alarm)
 
     @property
     def latest(self) -> Message | None:
@@ -163,6 +219,9 @@ class Decider:
         """End the episode under way."""
         self._without_lost_audit(lambda: self.guard.end(failed, observation))
         self.rows, self._said_often, self._said_fast = 0, False, False
+        self._alarm, judge = False, self.guard.judge
+        if self.rate is not None and isinstance(judge, Foresight):
+            self.guard.reviser.tolerance = judge.tolerance_of(self.rate)  # type: ignore[attr-defined]
 
     def _end_unasked(self) -> None:
         """The same where nobody waits for an answer to it; what somebody's judge raises is said."""
@@ -173,7 +232,8 @@ class Decider:
             self.rows = 0
 
     def _decided(self, row: Row) -> Answer:
-        notes = self._notes(row) + self._odd_speeds(row)
+        before, self.decided_on = self.decided_on, row
+        notes = self._notes(row, before) + self._odd_speeds(row)
         note = {"note": "; ".join(notes)} if notes else {}
         self.n += 1
         leader = {} if row.ahead is None else {"ahead": row.ahead}
@@ -183,7 +243,7 @@ class Decider:
             said |= {"alarm": False, "mode": self.mode.value}
             return self._of("decision", time=row.time, ahead=None, **said, **note)
         try:
-            revision = self._revision(row)
+            revision = self._revision(row, before)
         except Exception as error:  # whatever a judge of somebody's own raises
             if not self._has_failed:  # once, as it may fail at each row
                 _log.exception("the guard failed at %s s", row.time)
@@ -193,7 +253,8 @@ class Decider:
         low, high = revision.interval
         known = {**revision._asdict(), "risk_low": low, "risk_high": high}
         said = {name: plain(known[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
-        said |= {"reason": revision.reason, "alarm": self._is_alarm(revision)}
+        self._alarm = self._is_alarm(revision)
+        said |= {"reason": revision.reason, "alarm": self._alarm}
         said |= {"mode": self.mode.value}
         return self._of("decision", time=row.time, **leader, **self._worst(row), **said, **note)
 
@@ -206,10 +267,10 @@ class Decider:
             return {"object": None, "role": None}
         return {"object": row.objects[pair.number - 1], "role": pair.role.value}
 
-    def _notes(self, row: Row) -> list[str]:
+    def _notes(self, row: Row, latest: Row | None) -> list[str]:
         """What is odd about when a row comes, and what it follows; may end the episode."""
-        latest, interval = self.latest, self.guard.interval
-        if not isinstance(latest, Row) or not self.rows:
+        interval, hole = self.guard.interval, self.slots.hole
+        if latest is None or not self.rows:
             return []
         step = row.time - latest.time
         if step < 0.0:
@@ -218,11 +279,15 @@ class Decider:
         if row.ahead != latest.ahead:
             self._end_unasked()
             return ["another one is ahead: a new episode"] if row.observation else []
+        if hole is not None and step > max(hole, HOLE * interval):
+            self._end_unasked()
+            return [f"{step:.3g} s without a row: a new episode (--hole {hole:g}s)"]
         if step > HOLE * interval:
             return [f"{step:.3g} s without a row: nothing is learnt or carried across"]
         if step < _OFTEN * interval and not self._said_often:
             self._said_often = True
-            return [f"rows come every {step:.3g} s, but the guard was made for {interval:g} s"]
+            made = f"the guard was made for {interval:g} s: --resample {interval:g}s"
+            return [f"rows come every {step:.3g} s, but {made}"]
         return []
 
     def _odd_speeds(self, row: Row) -> list[str]:
@@ -232,13 +297,13 @@ class Decider:
         was_said, self._said_fast = self._said_fast, self._said_fast or bool(fast)
         return [f"{fast[0]} is above {_FAST:g} m/s: is that km/h?"] if fast and not was_said else []
 
-    def _revision(self, row: Row) -> Revision:
-        proposal: Any = row.proposal
+    def _revision(self, row: Row, before: Row | None) -> Revision:
+        proposal: Any = 0 if self._is_alone else row.proposal
         if isinstance(self.guard.actions, BoxActions) and proposal is not None:
             proposal = np.array(proposal)
-        seen: Any = (
-            _accelerating(row, self.latest) if self.form.scenes else _numbers(row.observation)
-        )
+        seen: Any = _numbers(row.observation)
+        if self.form.scenes:
+            seen = _accelerating(row, before if isinstance(self.latest, Row) else None)
         return self._without_lost_audit(lambda: self.guard.decide(seen, proposal, row.time))
 
     def _without_lost_audit(self, call: Callable[[], _T]) -> _T:
@@ -261,7 +326,7 @@ class Decider:
         reviser: Any = self.guard.reviser
         if not self._drives:
             return is_spoken(reviser, revision)
-        if self.rows > 1 and self._recent[-1][1].get("alarm"):
+        if self.rows > 1 and self._alarm:
             return bool(reviser.refuses or revision.risk_proposed > reviser.tolerance)
         wanted = make_usable(Proposal(revision.proposed), reviser.actions, reviser.fallback).action
         change = abs(float(revision.advised) - float(wanted))
@@ -271,13 +336,16 @@ class Decider:
 
     def memory(self) -> dict[str, Any]:
         """What it knows between two episodes, beside the guard: for JSON."""
-        return {"n": self.n, "recent": msgspec.to_builtins(list(self._recent))}
+        known = {"recent": list(self._recent), "waiting": self.slots.waiting}
+        return {"n": self.n, **msgspec.to_builtins(known)}
 
     def remember(self, memory: Mapping[str, Any]) -> None:
         """Go on from what `memory` returned."""
         self.n = int(memory["n"])
+        self.slots.waiting = msgspec.convert(memory["waiting"], list[Row])
         for told, answer in memory["recent"]:
             self._recent.append((msgspec.convert(told, Message), dict(answer)))
+        self.decided_on = self.latest if isinstance(self.latest, Row) else None
 
 
 def _begins_anew(told: Message, before: Message | None, latest: Message | None) -> bool:
@@ -300,11 +368,11 @@ def _refuse_stale(row: Row, latest: Row) -> None:
         raise MessageError("time", text, row.time)
 
 
-def _accelerating(row: Row, before: Message | None) -> NDArray[np.float64]:
+def _accelerating(row: Row, before: Row | None) -> NDArray[np.float64]:
     """A scene with the accelerations that were not sent: since the scene before, else 0."""
     rows = np.array(_numbers(row.observation)).reshape(-1, len(COLUMNS))
     latest, step = {}, math.nan
-    if isinstance(before, Row) and before.time < row.time:
+    if before is not None and before.time < row.time:
         step = row.time - before.time
         seen = np.array(_numbers(before.observation)).reshape(-1, len(COLUMNS))
         latest = dict(zip(("", *before.objects), seen[:, _VX].tolist(), strict=False))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Sequence
 from operator import itemgetter
 from typing import Annotated, Any, Literal
 
@@ -61,6 +62,7 @@ class Row(msgspec.Struct, frozen=True, tag="row"):
     proposal: float | int | tuple[float, ...] | None  #: None where nothing was proposed
     ahead: str | int | None = None  #: id of the object that is followed, in a scene
     objects: tuple[str, ...] = ()  #: ids of all objects, where all are judged: number 1 first
+    told: tuple[Any, ...] = ()  #: what other keys say, of `Form.others`
 
 
 class End(msgspec.Struct, frozen=True, tag="end"):
@@ -71,7 +73,12 @@ class End(msgspec.Struct, frozen=True, tag="end"):
     time: float | None = None  #: [s]
 
 
+class Pause(msgspec.Struct, frozen=True, tag="pause"):
+    """Nothing came for so long that what waits is decided on."""
+
+
 Message = Row | End
+Taken = Message | Pause
 
 
 class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -90,9 +97,9 @@ class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 
 
 class Form:
-    """Reads lines, for one guard."""
+    """Reads lines, for one guard; ``others`` are keys that rows may have beside its variables."""
 
-    def __init__(self, guard: Guard) -> None:
+    def __init__(self, guard: Guard, others: Sequence[str] = ()) -> None:
         reviser = guard.reviser
         #: Names of what is observed; empty where they have none, and come as a list.
         self.variables: tuple[str, ...] = guard.variables
@@ -105,21 +112,27 @@ class Form:
         several: Any = Annotated[list[_Seen], length]
         # By keys of our own: a column may be called "Tank 1 [mm]", which no attribute can be.
         self._keys = {f"v{k}": name for k, name in enumerate(self.variables or ["observation"])}
+        self._others = {f"w{k}": name for k, name in enumerate(others)}
         seen = [(key, _Seen if self.variables else several) for key in self._keys]
         action: Any = ("proposal", _action(guard))
         if isinstance(guard.actions, Choices) and guard.actions.n_actions == 1:  # nobody acts
             action = (*action, 0)
         version = ("schema", Literal[1], SCHEMA)
-        self._row = self._struct("Row", ("time", _Number), action, *seen, version)
+        also = [(key, float | bool | str | None, None) for key in self._others]
+        self._row = self._struct("Row", ("time", _Number), action, *seen, *also, version)
         placed = ("ego", _Vehicle), ("objects", list[_Vehicle])
         self._scene = self._struct("Scene", ("time", _Number), action, *placed, version)
         last = [(key, kind | UnsetType, UNSET) for key, kind in seen]
         ended = ("end", bool), ("failed", bool, False), ("time", _Seen, None)
-        self._end = self._struct("End", *ended, *last, version)
+        self._end = self._struct("End", *ended, *last, *also, version)
         self._decoders = {kind: msgspec.json.Decoder(kind) for kind in (self._row, self._scene)}
 
     def _struct(self, name: str, *fields: Any) -> Any:
-        strict: Any = {"forbid_unknown_fields": True, "kw_only": True, "rename": self._keys}
+        strict: Any = {
+            "forbid_unknown_fields": True,
+            "kw_only": True,
+            "rename": self._keys | self._others,
+        }
         return msgspec.defstruct(name, fields, **strict)
 
     def read(self, line: bytes) -> Message:
@@ -137,7 +150,8 @@ class Form:
             told = self._decoders[kind].decode(line)
             if kind is self._scene:
                 return self._of_scene(told)
-            return Row(told.time, self._observed(told), _frozen(told.proposal))
+            also = tuple(getattr(told, key) for key in self._others)
+            return Row(told.time, self._observed(told), _frozen(told.proposal), told=also)
         except MessageError as error:
             error.time = _time(_parsed(line))
             raise

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import msgspec
 from evofsm import store
 from evofsm.cli.journal import Journal, differences
 from evofsm.cli.monitor.decider import Decider
-from evofsm.cli.monitor.messages import Message
+from evofsm.cli.monitor.messages import Taken
 from evofsm.guard import Guard
 
 _log = logging.getLogger(__name__)
@@ -46,8 +47,11 @@ class State:
         self._memory: Mapping[str, Any] | None = None
         self._count = 0  # messages in the journal
 
-    def guard(self, fresh: Callable[[], Guard]) -> Guard:
+    def guard(
+        self, fresh: Callable[[], Guard], failed: Callable[[Any], bool] | None = None
+    ) -> Guard:
         """The guard as it was saved; a fresh one where there is none."""
+        load = partial(Guard.load, self.path, failed=failed)
         journal, is_there = self._journal, self.path.exists()
         if is_there:
             self._provenance = dict(store.read_header(self.path).provenance)
@@ -58,7 +62,7 @@ class State:
                     f"{journal.path} holds what came after a guard that is not in {self.path}; put "
                     "that back, or delete the journal to begin anew"
                 )
-            return Guard.load(self.path) if is_there else fresh()
+            return load() if is_there else fresh()
         if found := differences(saved["settings"], self.settings):
             raise ValueError(
                 f"{self.path} was saved with other settings: {found}; go on with those, or name "
@@ -70,7 +74,7 @@ class State:
                 f"{journal.path} is missing or empty: rows that came after {self.path} was saved "
                 "are lost; put it back, or give the guard as --guard and name another --state"
             )
-        return Guard.load(self.path)
+        return load()
 
     def begin(self, decider: Decider) -> int:
         """Go on where it was; returns the number of messages that were taken in again."""
@@ -85,10 +89,15 @@ class State:
         self._count = len(self._journal.records)
         for record in self._journal.records:
             try:
-                decider.act(msgspec.convert(record["told"], Message))
+                decider.act(msgspec.convert(record["told"], Taken))
             except Exception as error:  # of another version: no reason not to begin
                 _log.error("%s: a message is left out: %s", self._journal.path, error)
         return self._count
+
+    def rest(self, decider: Decider) -> None:
+        """Write the guard as it is, unless it is within an episode."""
+        if self._count and not (self.failure or decider.rows):
+            self._save(decider)
 
     def close(self) -> None:
         """Force the journal onto the disk, and let others have the files."""
@@ -96,7 +105,7 @@ class State:
             self._journal.sync()
         self._journal.close()
 
-    def _keep(self, told: Message, decider: Decider) -> None:
+    def _keep(self, told: Taken, decider: Decider) -> None:
         """Write down what was acted on, and the guard, if an episode has just ended."""
         if self.failure:
             return

@@ -47,8 +47,13 @@ def decided_on_log(decider: Decider, episodes: Iterable[Chunk]) -> Answers:
 def decided_on_lines(decider: Decider, file: Path) -> Answers:
     """The answers to messages; of those that are refused, the error."""
     for line in lines(file, _LONGEST_MESSAGE):
-        answer = decider.answer(line.rstrip(b"\r\n"))
-        yield answer, decider.latest if isinstance(decider.latest, Row) else None
+        before, answer = decider.n, decider.answer(line.rstrip(b"\r\n"))
+        row = decider.decided_on if decider.n > before else None  # sent again, it counts once
+        if "last" in answer:
+            yield answer["last"], row
+        yield answer, row
+    if (last := decider.lapse()) is not None:
+        yield last, decider.decided_on
 
 
 def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[RenderableType]:

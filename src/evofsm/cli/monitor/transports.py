@@ -39,8 +39,11 @@ _LONGEST_WAIT = 0.5
 class Server:
     """A decider that threads share: lines in, lines out, a sign of life where nothing comes."""
 
-    def __init__(self, decider: Decider, heartbeat: float = math.inf) -> None:
+    def __init__(
+        self, decider: Decider, heartbeat: float = math.inf, *, keeps: bool = False
+    ) -> None:
         self.decider = decider
+        self.keeps = keeps  #: what waits as the input ends, for whoever goes on
         self.heartbeat = heartbeat  #: where so long nothing came, it says that it is there [s]
         self._heard = self._said = time.monotonic()
         self._turn = threading.Lock()
@@ -87,6 +90,8 @@ class Server:
         try:
             with _stoppable():
                 while not self._over.wait(min(self._patience(), _LONGEST_WAIT)):
+                    if time.monotonic() - self._heard > (self.decider.slots.step or math.inf):
+                        transport.send(self._lapse())
                     if self._patience() == 0.0:
                         transport.send(self._beat())
         finally:
@@ -99,6 +104,8 @@ class Server:
     def _serve(self, transport: Transport) -> None:
         try:
             transport.serve(self)
+            if not self.keeps:
+                transport.send(self._lapse())
         except Exception as error:
             self._failure = error
         self._over.set()
@@ -106,6 +113,12 @@ class Server:
     def _patience(self) -> float:
         """Time until a sign of life is due [s]."""
         return max(0.0, self._said + self.heartbeat - time.monotonic())
+
+    def _lapse(self) -> bytes:
+        """What is decided on rows that wait, as nothing comes."""
+        with self._turn:
+            answer = self.decider.lapse()
+        return b"" if answer is None else _line(answer)
 
     def _beat(self) -> bytes:
         with self._turn:

@@ -7,7 +7,6 @@ import re
 import webbrowser
 from contextlib import ExitStack, suppress
 from functools import partial
-from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,8 +22,8 @@ from evofsm.cli.options import (
     Tolerance,
     World,
     argument,
+    given_of,
     option,
-    reading_of,
     reads_logs,
     require,
     require_world,
@@ -85,14 +84,18 @@ def watch(
     begins when the page is first opened. Ctrl-C ends it.
     """
     require(websockets="watch")
-    is_log, usual = _is_log(what), signature(reading_of).parameters
-    given = (name for name, v in reading.keywords.items() if v not in (usual[name].default, []))
-    if not is_log and any(given):
+    from evofsm.cli.watch.logged import is_of_cars, watched_log
+
+    is_log = _is_log(what)
+    if not is_log and given_of(reading):
         raise ValueError(f"options of columns are for a log, and {what} is none")
     read = reading() if is_log else None
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         watched: Session | Recording
-        if is_log or what.endswith(".mcap"):
+        if read is not None and not (what.endswith(".sumocfg") or is_of_cars(read, judge)):
+            given = None if tolerance == TOLERANCE else tolerance
+            watched = stack.enter_context(watched_log(what, read, given, case))
+        elif is_log or what.endswith(".mcap"):
             watched = _recorded(what, case, judge, tolerance, brakes, read)
         else:
             watched = _driven(stack, what, case or 1, world, judge, tolerance, seed, learn_first)

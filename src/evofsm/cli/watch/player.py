@@ -15,9 +15,6 @@ if TYPE_CHECKING:
     from evofsm.cli.watch.recorded import Recording
     from evofsm.cli.watch.session import Session
 
-#: Speeds that can be chosen, as multiples of real time.
-SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-
 # Between two graphs, unless a state was created [decisions].
 _GRAPH_EVERY = 8
 # Decisions in a second that can be followed.
@@ -53,8 +50,9 @@ class Player:
         awaits: bool = False,
     ) -> None:
         if speed is None:  # real time, but no more decisions in a second than can be followed
-            pace = min(1.0, _FOLLOWED * watched.start.interval)
-            speed = max((rate for rate in SPEEDS if rate <= pace), default=SPEEDS[0])
+            speeds, pace = watched.start.speeds, _FOLLOWED * watched.start.interval
+            pace = min(1.0, pace) if 1.0 in speeds else pace
+            speed = max((rate for rate in speeds if rate <= pace), default=speeds[0])
         self._watched, self._audience, self._awaits = watched, audience, awaits
         self._paused, self._speed, self._over = paused, speed, False
         self._steps = False  # once, although it is paused

@@ -52,6 +52,7 @@ from evofsm.fsm.rules import Novelty
 from evofsm.guard import (
     BELIEF_TOLERANCE,
     TOLERANCE,
+    Foresight,
     Guard,
     Judgement,
     LearntRisk,
@@ -61,6 +62,7 @@ from evofsm.guard import (
     Situation,
 )
 from evofsm.guard.actions import Action, Choices, change, is_usable, limits, put_into
+from evofsm.io import Chunk
 
 #: The state rule for looking on: coarse enough that each state can be told from the others.
 WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
@@ -83,6 +85,8 @@ _APART = 1_000_000
 # Episodes from which is known how far variables spread; states are so many spreads apart, times the
 # root of the number of variables, and there are at most so many.
 _LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
+# So many rows of a long episode are played one by one, and so many in a second.
+_PLAYED, _A_SECOND = 400, 10.0
 # What a file may define besides its environment.
 _PARTS = ("controller", "failed", "variables")
 # Of more variables only those of the plane are named.
@@ -207,6 +211,17 @@ class OnRoads:
         self._closing.close()
 
 
+def system_machine(n_actions: int, seen: NDArray[np.float64]) -> EvolvingFSM:
+    """A machine for looking on at any system of which some rows (T, m) are known."""
+    spreads = [spread or 1.0 for spread in seen.std(0).tolist()]
+    return EvolvingFSM(
+        n_actions,
+        rule=Novelty(_STATES_APART * math.sqrt(seen.shape[1]), spreads),
+        max_states=_MOST_STATES,
+        belief_tolerance=BELIEF_TOLERANCE,
+    )
+
+
 # -- Any environment ------------------------------------------------------------------------------
 
 
@@ -244,13 +259,7 @@ class Simulated:
         spaces = env.observation_space, env.action_space
         self._terms = gym.Terms(made, *spaces, None, failed, 0.0)
         seen = np.array([z for k in range(_LOOKED_AT) for z in self._run(env, -1 - k)])
-        spreads = [spread or 1.0 for spread in seen.std(0).tolist()]
-        machine = EvolvingFSM(
-            made.actions.n_actions,
-            rule=Novelty(_STATES_APART * math.sqrt(seen.shape[1]), spreads),
-            max_states=_MOST_STATES,
-            belief_tolerance=BELIEF_TOLERANCE,
-        )
+        machine = system_machine(made.actions.n_actions, seen)
         self.guard = Guard.of(made.reviser, interval=self.interval, machine=machine)
         names = names or [f"variable {k + 1}" for k in range(seen.shape[1])]
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.interval)
@@ -366,6 +375,77 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
         raise ValueError(f"{what}: {error}") from error
 
 
+# -- A log -----------------------------------------------------------------------------------------
+
+
+class Logged:
+    """What a log says happened, whoever asks."""
+
+    alone, terminated = math.nan, True
+
+    def __init__(
+        self, path: str, episodes: Sequence[Chunk], names: Sequence[str], *, acts: bool
+    ) -> None:
+        first = [*filter(is_failed, episodes), *(e for e in episodes if not is_failed(e))]
+        self.name, self.interval = path, float(episodes[0].dt)
+        self.about = "each row as it was read."
+        self.labels = Labels(names=tuple(names), dt=self.interval)
+        self.acts = acts
+        numbers = {id(episode): number for number, episode in enumerate(episodes, 1)}
+        order = [numbers[id(episode)] for episode in first]
+        self.places = {number: place for place, number in enumerate(order)}
+        ended = (" (failure)" * is_failed(episode) for episode in first)
+        self.cases = tuple(f"episode {k}{how}" for k, how in zip(order, ended, strict=True))
+        self._episodes = first
+        self.speeds = tuple(_A_SECOND * self.interval * by for by in (0.25, 0.5, 1.0, 2.0, 4.0))
+
+    def begin(self, case: int) -> None:
+        """Go to the first row of an episode."""
+        self._episode, self._row = self._episodes[case], 0
+        times = self._episode.times - self._episode.times[0]
+        self._times = times.tolist()
+        self.begins = float(times[max(len(times) - _PLAYED, 0)])
+
+    @property
+    def time(self) -> float:
+        """Since the episode began [s]."""
+        return float(self._times[self._row])
+
+    @property
+    def observation(self) -> NDArray[np.float64]:
+        """The row."""
+        return np.asarray(self._episode.observations[self._row])
+
+    @property
+    def over(self) -> bool:
+        """Whether it is the last one."""
+        return self._row == len(self._times) - 1
+
+    @property
+    def failed(self) -> bool:
+        """Whether that failed."""
+        return self.over and is_failed(self._episode)
+
+    def propose(self) -> Action:
+        """What was done."""
+        return float(self._episode.actions[self._row]) if self.acts else 0.0
+
+    def advance(self, revision: Revision) -> None:
+        """Go to the next row."""
+        self._row += 1
+
+    def cars(self) -> None:
+        """It is none that it knows of."""
+
+    def close(self) -> None:
+        """There is nothing to leave."""
+
+
+def is_failed(episode: Chunk) -> bool:
+    """Whether an episode of a log failed."""
+    return episode.failures is not None and len(episode.failures) > 0
+
+
 System = OnRoads | Simulated
 
 
@@ -375,8 +455,11 @@ System = OnRoads | Simulated
 class Session(AbstractContextManager["Session"]):
     """One run of a system after another, each driven decision by decision."""
 
-    def __init__(self, system: System, guard: Guard, *, case: int = 0, on: bool = True) -> None:
+    def __init__(
+        self, system: System | Logged, guard: Guard, *, case: int = 0, on: bool = True
+    ) -> None:
         self.system, self.case = system, case
+        self._is_log = isinstance(system, Logged)
         self.machine, self.judge = learners_of(guard)
         self._guard, self._reviser = guard, guard.reviser
         self._tolerance = float(self._reviser.tolerance)  # type: ignore[attr-defined]
@@ -400,7 +483,7 @@ class Session(AbstractContextManager["Session"]):
     def _idle(self) -> str:
         """Why the reviser does not act; empty where it does."""
         if not self.revising:
-            return "the reviser is off"
+            return "the reviser only watched" if self._is_log else "the reviser is off"
         passing: str = self._reviser.passing  # type: ignore[attr-defined]
         why = "was not shown to help yet" if passing == "shadow" else passing
         return passing and f"the guard {why}, so what is proposed passes"
@@ -460,7 +543,12 @@ class Session(AbstractContextManager["Session"]):
         system, actions = self.system, self._guard.actions
         low, high = limits(actions)
         count, is_cars = len(system.observation), isinstance(system, OnRoads)
+        given: dict[str, Any] = {}
+        if isinstance(system, Logged):
+            given = {"mode": "shadow", "acts": system.acts, "speeds": system.speeds}
+            given |= {"begins": system.begins}
         return Start(
+            **given,
             system=system.name,
             about=system.about,
             cases=system.cases,
@@ -473,7 +561,7 @@ class Session(AbstractContextManager["Session"]):
             discrete=isinstance(actions, Choices),
             cars=is_cars,
             learnt=self._guard.n_episodes,
-            judge=name_judge(self.judge),
+            judge="learnt" if self._is_log else name_judge(self.judge),
         )
 
     def _decide(self, frame: Frame) -> Frame:
@@ -488,7 +576,7 @@ class Session(AbstractContextManager["Session"]):
             state=situation.state,
             proposed_risk=wished,
             executed_risk=done,
-            least_risk=best.risk,
+            least_risk=math.nan if isinstance(self.judge, Foresight) else best.risk,
             proposed=numbers(revision.proposed),
             executed=numbers(revision.executed),
             advised=numbers(revision.advised),
@@ -514,6 +602,8 @@ class Session(AbstractContextManager["Session"]):
         if isinstance(judge, LatentRisk):
             expected = judge.manoeuvres.exceeded_by
             return {"needed": expected(self._tolerance), "usual": expected(0.5)}
+        if isinstance(judge, Foresight):
+            return {}
         assert isinstance(judge, LearntRisk)
         why = judge.why(judged) if judged.risk[0] > self._tolerance else ""
         return {"needed": judge.margin, "why": why}

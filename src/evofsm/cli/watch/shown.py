@@ -13,7 +13,7 @@ from evofsm.driving import LatentRisk, assess_states
 from evofsm.driving.measures import TimeHeadway, TimeToCollision
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.guard import LearningJudge, LearntRisk
+from evofsm.guard import Foresight, LearningJudge, LearntRisk
 from evofsm.guard.learnt.failure import SAYS, SIZE, B, I, J, are_sides, inside, telling
 from evofsm.guard.learnt.rollout import FAILS
 from evofsm.guard.learnt.state import State
@@ -108,6 +108,8 @@ class Start(NamedTuple):
     ttc_threshold: float = _TTC.threshold  #: time to collision below which it warns [s]
     headway_threshold: float = _HEADWAY.threshold  #: the same of time headway [s]
     begins: float = 0.0  #: what was before is shown at once [s]
+    acts: bool = True  #: whether somebody acts; else risk is how often such alarms were right
+    speeds: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  #: multiples of real time
 
 
 class Cars(NamedTuple):
@@ -233,6 +235,8 @@ class Known(NamedTuple):
 
 def known_of(judge: LearningJudge) -> Known:
     """What a judge knows that learns of failure; nothing of another."""
+    if isinstance(judge, Foresight):
+        return Known(told=judge.told_by_experience)
     if not isinstance(judge, LearntRisk) or not judge.n_variables:
         return Known()
     learnt, survived = judge.state, judge.state.survived

@@ -21,6 +21,7 @@ _INTRODUCED = {
     "act": f"{_REVISER} replaced actions that it found too risky.",
     "off": f"{_REVISER} was off.",
     "shadow": f"{_REVISER} did not act; it says which actions it would have replaced.",
+    "alone": "This was recorded, and nobody acts. A guard that learnt from the log alarms.",
 }
 # Components of an action that are told.
 _COMPONENTS = 3
@@ -58,7 +59,8 @@ def introduce(start: Start) -> dict[str, str]:
     learning = f"{before}, and goes on learning."
     if start.mode != LIVE:
         learning = "Recorded: the states as they were at its end."
-    return {"intro": _INTRODUCED.get(start.mode, _INTRODUCED["shadow"]), "learning": learning}
+    mode = start.mode if start.acts else "alone"
+    return {"intro": _INTRODUCED.get(mode, _INTRODUCED["shadow"]), "learning": learning}
 
 
 def tell(frame: Frame, start: Start) -> Told:
@@ -69,6 +71,8 @@ def tell(frame: Frame, start: Start) -> Told:
     headlines = _HEADLINES | (_OF_LEADERS if knows_leaders else {})
     if frame.cars:
         headlines |= {"failure": start.fails or "Collision", "ended": "No collision"}
+    if not start.acts:
+        headlines |= {"danger": "Alarm", "safe": "No alarm"}
     headline = headlines[status]
     if danger is None:
         when = "No danger was seen." if frame.over else "No danger so far."
@@ -76,6 +80,8 @@ def tell(frame: Frame, start: Start) -> Told:
     else:
         when, why = _when(story, danger, knows_leaders), _why(danger.began, start)
         done = _done(danger, frame, start)
+    if not start.acts:
+        when = when.replace("Danger began", "An alarm came").replace("No danger", "No alarm")
     if frame.over and danger and story.revised:
         done += f" In all it changed {story.revised} of {counted(frame.number, 'decision')}."
     if frame.failed and story.revised and story.alone > frame.time:
@@ -101,6 +107,8 @@ def _status(frame: Frame, tolerance: float) -> str:
 
 
 def _no_danger(frame: Frame, start: Start) -> str:
+    if not start.acts:
+        return "Nothing was near where it failed."
     if not frame.story.judged:
         return f"Nothing was judged, for {start.unjudged}."
     if math.isnan(frame.needed) or start.judge == "learnt":  # which recordings do not hold
@@ -113,6 +121,8 @@ def _no_danger(frame: Frame, start: Start) -> str:
 
 def _quiet(frame: Frame, start: Start) -> str:
     """What was done where the judge saw no danger; classic measures may have."""
+    if not start.acts:
+        return "No alarm: nobody acts here."
     story = frame.story
     if not story.advised:
         had = "Nothing had to be done" if story.judged else "Nothing was done"
@@ -146,6 +156,8 @@ def _when(story: Story, danger: Danger, knows_leaders: bool) -> str:
 def _why(began: Frame, start: Start) -> str:
     """Where it was, and what could not be survived there."""
     risk, cars = began.proposed_risk, began.cars
+    if not start.acts:
+        return f"At {began.here}: {began.reason}."
     if cars is None:
         wanted = f"At {began.here}, the controller wanted {_action(began.proposed, start)}"
     else:
@@ -167,6 +179,8 @@ def _why(began: Frame, start: Start) -> str:
 
 
 def _done(danger: Danger, frame: Frame, start: Start) -> str:
+    if not start.acts:
+        return f"Alarm in {counted(danger.wishes, 'row')}: nobody acts here."
     first, called = danger.stepped_in, danger.called
     n = danger.wishes
     risky = f"of {n} wishes that were too risky" if n > 1 else "wish that was too risky"

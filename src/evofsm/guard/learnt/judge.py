@@ -369,6 +369,8 @@ class LearntRisk(ActionJudge):
             instead = words.TRIED
         else:
             instead = words.NO_LONGER if action is proposal else words.lasting(backup, cut=cut)
+        if self.choices == 1:
+            why, instead = words.alone(why), words.NOBODY
         executed = wanted
         if action is not proposal:
             executed = np.reshape(self.decode(action), np.shape(wanted))
@@ -385,7 +387,8 @@ class LearntRisk(ActionJudge):
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
         scale = 1.0 if self.parts is None else self.parts.scale
-        return words.refused(self._unsurvived, self.remembered, self.margin, scale)
+        why = words.refused(self._unsurvived, self.remembered, self.margin, scale)
+        return words.alone(why) if self.choices == 1 else why
 
     def _judged(
         self,

@@ -45,6 +45,8 @@ NO_FAILURE = "no failure is known yet, so nothing is refused"
 TRIED = "no action passes; what this one does is hardly known, so it is tried"
 #: What is done where no backup lasts longer than the proposal.
 NO_LONGER = "no action passes, and no backup lasts longer than the proposal, which passes"
+#: The same where there is but one action.
+NOBODY = "nobody acts"
 
 # Disturbances that are taken to be harder by a smaller factor are taken as they were.
 _HARDER = 1.05
@@ -92,6 +94,16 @@ def refused(
     if unsurvived < remembered.number:
         return f"no backup survives {unsurvived} of the {remembered}"
     return f"no backup survives {'any of ' if unsurvived > 1 else ''}the {remembered}"
+
+
+def alone(why: str) -> str:
+    """Why it is dangerous where there is but one action, and so no backup.
+
+    >>> alone("no backup prevents failure, even if nothing disturbs it")
+    'it fails, even if nothing disturbs it'
+    """
+    why = why.replace("no backup survives", "it does not survive")
+    return why.replace("no backup prevents failure", "it fails")
 
 
 def comes_near(backup: str) -> str:

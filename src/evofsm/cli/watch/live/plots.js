@@ -5,6 +5,7 @@ import { colour, fresh, line, niceStep, seconds, shown, text } from "./paint.js"
 const LEFT = 40, RIGHT = 12;
 const MOST_BAND = 0.3; // a wider interval says little, and would fill the panel
 const MOST_COMPONENTS = 4; // of an action
+const MOST_VARIABLES = 4; // of a log
 const LEAST_HEIGHT = 104; // of a panel [px]
 
 /** What is drawn in each panel; `value` answers a frame's value, null where there is none. */
@@ -18,7 +19,7 @@ function panels(run) {
   const changed = (k) => ({ ...wish((f) => (f.revised ? f.proposed[k] : null)), label: "proposed, where changed", dots: true });
   const byLeaders = start.judge !== "learnt", fails = cars ? "collision" : "failure";
   const risk = {
-    title: "Risk", about: `${byLeaders ? "of collision if the leader brakes now" : `that ${fails} can't be avoided any more`}; ${percent(start.tolerance)} is accepted`,
+    title: "Risk", about: !start.acts ? `share of such alarms that were right; above ${percent(start.tolerance)} it alarms` : `${byLeaders ? "of collision if the leader brakes now" : `that ${fails} can't be avoided any more`}; ${percent(start.tolerance)} is accepted`,
     low: 0, high: 1, ticks: [0, 0.5, 1], show: percent,
     lines: [wish((f) => f.proposed_risk.risk), ...(acts ? [executed((f) => f.executed_risk.risk)] : [])],
     bands: [{ ink: colour.band, ends: ({ proposed_risk: { low, high } }) => (high === null || high - low > MOST_BAND ? null : [low, high]) }],
@@ -55,8 +56,33 @@ function panels(run) {
       bands: [], limits: low < 0 && high > 0 ? [{ at: 0, ink: soft }] : [],
     };
   });
+  const seen = start.live || cars ? [] : start.names.slice(0, MOST_VARIABLES).map((title, k) => variable(run, title, k));
+  if (!start.acts) return [...seen, { ...risk, lines: [{ ...risk.lines[0], label: "risk" }] }, states(run)];
   const hasMargin = run.frames.some((frame) => frame.proposed_risk.critical !== null);
-  return [risk, ...(hasMargin ? [margin] : []), ...(cars ? [classic] : []), ...actions];
+  return [...seen, risk, ...(hasMargin ? [margin] : []), ...(cars ? [classic] : []), ...actions];
+}
+
+/** A variable over time. */
+function variable(run, title, k) {
+  const value = (frame) => frame.observation[k] ?? null;
+  const all = run.frames.map(value).filter((one) => one !== null);
+  const low = Math.min(...all), high = Math.max(...all, low + 1e-9), step = niceStep((high - low) / 3);
+  const ticks = [];
+  for (let n = Math.ceil(low / step); n * step <= high; n++) ticks.push(n * step);
+  return {
+    title, about: "", low: low - 0.05 * (high - low), high: high + 0.05 * (high - low), ticks, show: shown,
+    lines: [{ label: "observed", ink: colour.ink, width: 1.4, dash: [], value }], bands: [], limits: [],
+  };
+}
+
+/** The state that it was in. */
+function states(run) {
+  const most = Math.max(1, ...run.frames.map((frame) => frame.state ?? 0));
+  return {
+    title: "State", about: "as it was recognised", low: -0.5, high: most + 0.5, ticks: [0, Math.round(most / 2), most],
+    show: (value) => `#${value + 1}`, steps: true, bands: [], limits: [],
+    lines: [{ label: "most probable", ink: colour.follower, width: 1.4, dash: [], value: (frame) => frame.state }],
+  };
 }
 
 /** Seconds on the axis: a round number that leaves some room. */
@@ -84,7 +110,7 @@ export function drawPlots(canvas, run) {
   const most = span(run);
   const x = (time) => placeOf(canvas, run, time);
   const visible = run.frames.slice(0, run.index(run.shown + 1e-6) + 1);
-  const marks = marksOf(run.frame);
+  const marks = marksOf(run.frame, run.start);
   const top = 4 + 16 * place(pen, marks, x, width), bottom = height - 32;
   const heading = width < 560 ? 33 : 20;
   const each = (bottom - top) / all.length;
@@ -113,10 +139,10 @@ export function drawPlots(canvas, run) {
   return top;
 }
 
-function marksOf(frame) {
+function marksOf(frame, start) {
   const story = frame.story;
   return [
-    { at: story.first, label: "▲ first danger", ink: colour.danger },
+    { at: story.first, label: start.acts ? "▲ first danger" : "▲ first alarm", ink: colour.danger },
     { at: story.time_headway, label: "time headway warns", ink: colour.third },
     { at: story.dead_end, label: "⬢ dead end", ink: colour.danger },
     { at: story.leader_brakes, label: "leader brakes", ink: colour.ink },
