@@ -96,7 +96,7 @@ def test_a_guard_that_saves_drives_nearly_always(wrong):
     rows = drive(guard, 40)
     assert sum(row == (60, "") for row in rows[1:]) >= 37
     assert "in shadow where in doubt" in str(guard)
-    assert "it replaces the controller: 0% of proposals are kept; that is no filter" in str(guard)
+    assert "it refuses nearly everything: 0% of proposals pass; that is no filter" in str(guard)
 
 
 def test_saved_copied_and_replayed_from_a_log_it_goes_on_the_same(wrong, reloaded, tmp_path):

@@ -263,7 +263,7 @@ def harm(known: Harm, *, learning: bool) -> str:
     said = f"; {said}" if said else ""
     if known.replaces:
         share = f"{known.kept / known.decided:.0%}"
-        said += f"; it replaces the controller: {share} of proposals are kept; that is no filter"
+        said += f"; it refuses nearly everything: {share} of proposals pass; that is no filter"
     return said
 
 
