@@ -36,7 +36,7 @@ from evofsm.store import COUNT, Numbers
 # Episodes of each arm that are kept, the latest; what is left of the weight of one an episode
 # later; and the weights of those that ended well, with which guarded and alone begin: who drives
 # alone until the first refusal is known already.
-_KEPT, _FADES, _HOPES = 20, 0.98, (0.5, 0.05)
+_KEPT, _FADES, _HOPES = 20, 0.98, (0.5, 0.5)
 # So many episodes after the latest of the controller alone one is drawn, and then as often.
 _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
@@ -140,8 +140,9 @@ class Harm(NamedTuple):
     @property
     def _draws(self) -> int:
         """The guard drives if it does in one of so many draws."""
-        latest = self.guarded[-_CAREFUL:]
-        return 1 if self._long_ago or all(outcome.failed for outcome in latest) else _CAREFUL
+        latest, is_new = self.guarded[-_CAREFUL:], len(self.alone) < _CAREFUL
+        is_bold = is_new or self._long_ago or all(outcome.failed for outcome in latest)
+        return 1 if is_bold else _CAREFUL
 
     def told(self, *, learning: bool) -> str:
         """How both arms ended, where it is not beyond doubt that the guard helps; else nothing."""

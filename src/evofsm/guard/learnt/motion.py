@@ -21,6 +21,9 @@ _MOST_CHANGES, _LARGEST_STEP = 5000.0, 6.0
 _SAME_SHARE = 1e-9
 # Changes of an episode that tell how large residuals are; how much the latest of them counts.
 _FEWEST_CHANGES, _LATEST = 5, 0.2
+# A variable that rests in more of the steps, such as a contact, is not held at an end as long as
+# nothing is known.
+_MOSTLY = 0.5
 # What rests at an end, and was expected to go on by so many scales, is held there.
 _STOPS = 4.0
 # Episodes before it may move otherwise, and after it did, in which it is learnt how; transitions
@@ -83,9 +86,10 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
         return state
     rest, jumped = model.residuals(known, z, u, state.unit), model.are_jumps(z, state.unit)
     after, rests = z[2:], z[2:] == z[1:-1]
-    held = _held(state, z[1:-1] + phi @ known.weights, after).any(0)
-    weight = np.where(jumped | (rests & held).any(1), 0.0, 1.0)
-    is_known = bool(state.scale.any())
+    to, is_known = z[1:-1] + phi @ known.weights, bool(state.scale.any())
+    is_beyond = np.abs(to - after) > state.scale if is_known else rests.mean(0) <= _MOSTLY
+    held = rests & _held(state, to, after).any(0) & is_beyond
+    weight = np.where(jumped | held.any(1), 0.0, 1.0)
     if is_known:
         off = np.abs(rest) / np.maximum(state.scale, model.FLOOR * state.unit + 1e-300)
         weight *= np.minimum(1.0, settings.outlier / np.maximum(off.max(1), 1e-12))
