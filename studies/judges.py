@@ -258,10 +258,8 @@ def alone(name: str, controller: str, start: Start) -> Ended:
 def _reached(who: str, held_out: Sequence[Ended], late: Sequence[Ended]) -> dict[str, Any]:
     """What came of episodes, in columns that end in ``who``; means of none are null."""
     means = {"steps": held_out, "score": held_out, "steps_learning": late}
-    found: dict[str, Any] = {
-        "failed": sum(one.failed for one in held_out),
-        "goals": sum(one.arrived for one in held_out),
-    }
+    found: dict[str, Any] = {"failed": sum(one.failed for one in held_out)}
+    found["goals"] = sum(one.arrived for one in held_out)
     for of, some in means.items():
         steps = [getattr(one, of.removesuffix("_learning")) for one in some]
         found[of] = float(np.mean(steps)) if steps else None

@@ -23,11 +23,12 @@ def test_the_ceiling_does_not_see_what_the_episode_will_draw():
     for loud in (1.0, 50.0):
         system = make_system("acc")
         system.reset(options={"start": Start.held_out(0, 0)})
-        system._noise, state, system._v = loud * system._noise, system.chance.__getstate__(), 1.0
+        system._noise, system._v = loud * system._noise, 1.0
+        state = system.chance.bit_generator.state
         ceiling, decided = told.Ceiling(system), []
         for system._x in np.linspace(-0.8, -0.2, 7):
             decided.append(ceiling.action(np.array([system._x, 1.0]), 2.0))
         found.append(decided)
-        assert system.chance.__getstate__() == state
+        assert system.chance.bit_generator.state == state
     assert found[0] == found[1]
     assert 2.0 in found[0]
