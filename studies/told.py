@@ -151,25 +151,21 @@ def _grid(actions: Any, each: int) -> list[Action]:
 
 # -- Beside the learnt guard ----------------------------------------------------------------------
 
-_SAID = ("failed", "kept", "goals", "score", "failed_alone", "goals_alone", "score_alone")
-_BY = ["system", "controller"]
-
-
-def computed(system: str, controller: str, episodes: int) -> dict[str, Any]:
-    """The row of a system and a controller (the first if empty): the ceiling, and it alone."""
-    asked = partial(trial, train=0, test=episodes, base=BASE, rounds=2)
-    row = asked(system, controller or None, "studies.told:Ceiling")
-    found = {name: round(row[name], 4) for name in ("episodes", *_SAID)}
-    return {"system": system, "controller": controller, **found}
+_BY, _SAID = ["system", "controller"], ("failed", "goals", "score")
+_ALL = ("episodes", "kept", *_SAID, *(f"{name}_alone" for name in _SAID))
 
 
 def renew(cases: Iterable[Case], episodes: int, workers: int | None) -> None:
     """Compute the ceilings of cases that do not change anew, at most 20 episodes; others stay."""
-    some = dict.fromkeys(case[:2] for case in cases if not case.change)
-    tasks = [partial(computed, *case, min(episodes, 20)) for case in some]
-    rows = [*lib.parallel(tasks, workers), *json.loads(CEILINGS.read_text("utf-8"))]
-    kept = {(one["system"], one["controller"]): json.dumps(one) for one in reversed(rows)}
-    CEILINGS.write_text("[\n" + ",\n".join(sorted(kept.values())) + "\n]\n", "utf-8")
+    asked = partial(trial, judge="studies.told:Ceiling", train=0, base=BASE, rounds=2)
+    some = list(dict.fromkeys(case[:2] for case in cases if not case.change))
+    tasks = [partial(asked, name, one or None, test=min(episodes, 20)) for name, one in some]
+    then = json.loads(CEILINGS.read_text("utf-8"))
+    rows = {tuple(old[name] for name in _BY): old for old in then}
+    for case, row in zip(some, lib.parallel(tasks, workers), strict=True):
+        rows[case] = dict(zip(_BY, case, strict=True)) | {k: round(row[k], 4) for k in _ALL}
+    lines = ",\n".join(json.dumps(rows[case]) for case in sorted(rows))
+    CEILINGS.write_text(f"[\n{lines}\n]\n", "utf-8")
 
 
 def table(lines: pl.DataFrame) -> Table:
@@ -196,6 +192,4 @@ def table(lines: pl.DataFrame) -> Table:
         "Of: what a filter reaches that tries copies of the simulator; %: the share of that. It "
         f"and the controller alone: held-out episodes of seed {BASE}, computed once."
     )
-    return Table(
-        "Beside a filter that is told the dynamics", both.with_columns(shares), shown, note
-    )
+    return Table("Beside one that is told the dynamics", both.with_columns(shares), shown, note)
