@@ -253,6 +253,7 @@ def compared(rows: pl.DataFrame) -> pl.DataFrame:
     error of both means, one-sided 95 %).
     """
     known = ["seed", *_BY]
+    rows = rows.cast({"train": pl.Int64})  # all null where every system has its own
     theirs = accepted().join(rows.select(known).unique(), on=known, nulls_equal=True)
     lines = _summed(rows, [*_BY, "without"])
     lines = lines.join(_summed(theirs, _BY), on=_BY, how="left", nulls_equal=True, suffix="_then")
