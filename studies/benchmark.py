@@ -218,15 +218,19 @@ def _shifted(case: Case, seed: int, base: int, parts: Sequence[str]) -> dict[str
     }
 
 
+def chosen(only: str) -> list[Case]:
+    """Of systems ``only`` those, with commas, if any are named."""
+    return [one for one in CASES if not only or one.system in lib.names_in(only)]
+
+
 def run(
     seeds: int, base: int, judge: str, without: Sequence[str], workers: int | None, only: str
 ) -> pl.DataFrame:
-    """All rows; of systems ``only`` those, with commas, if any are named."""
-    chosen = [one for one in CASES if not only or one.system in lib.names_in(only)]
+    """All rows of the cases that are `chosen`."""
     tasks = [
         partial(tried, case, seed, base, judge, part)
         for part in ("", *without)
-        for case in chosen
+        for case in chosen(only)
         for seed in range(seeds)
     ]
     return lib.frame_of(lib.parallel(tasks, workers, "Learning and trying"))
@@ -249,6 +253,7 @@ def compared(rows: pl.DataFrame) -> pl.DataFrame:
     error of both means, one-sided 95 %).
     """
     known = ["seed", *_BY]
+    rows = rows.cast({"train": pl.Int64})  # all null where every system has its own
     theirs = accepted().join(rows.select(known).unique(), on=known, nulls_equal=True)
     lines = _summed(rows, [*_BY, "without"])
     lines = lines.join(_summed(theirs, _BY), on=_BY, how="left", nulls_equal=True, suffix="_then")
@@ -285,7 +290,9 @@ def _summed(rows: pl.DataFrame, by: Sequence[str]) -> pl.DataFrame:
 
 
 def page(rows: pl.DataFrame, facts: dict[str, str]) -> Page:
-    """All lines beside what was accepted, and those that miss it."""
+    """All lines beside what was accepted and the ceilings, and those that miss it."""
+    from studies.told import table
+
     lines = lib.with_share(compared(rows), "failed", "episodes", "rate")
     shown = {
         "system": "{system}",
@@ -313,7 +320,7 @@ def page(rows: pl.DataFrame, facts: dict[str, str]) -> Page:
     return Page(
         name="judges",
         about="Is the learnt judge as good as it was?\n\nThe frozen benchmark, case by case.",
-        parts=[Table("The benchmark", lines, shown, note)],
+        parts=[Table("The benchmark", lines, shown, note), table(lines)],
         command=lib.command_line(),
         lost=[
             Table(

@@ -258,7 +258,8 @@ def alone(name: str, controller: str, start: Start) -> Ended:
 def _reached(who: str, held_out: Sequence[Ended], late: Sequence[Ended]) -> dict[str, Any]:
     """What came of episodes, in columns that end in ``who``; means of none are null."""
     means = {"steps": held_out, "score": held_out, "steps_learning": late}
-    found: dict[str, Any] = {"goals": sum(one.arrived for one in held_out)}
+    found: dict[str, Any] = {"failed": sum(one.failed for one in held_out)}
+    found["goals"] = sum(one.arrived for one in held_out)
     for of, some in means.items():
         steps = [getattr(one, of.removesuffix("_learning")) for one in some]
         found[of] = float(np.mean(steps)) if steps else None
@@ -344,7 +345,6 @@ def trial(
         "failures": failures,
         "score_by_late": float(np.mean(by_late)) if by_late else None,
         "episodes": test,
-        "failed": sum(one.failed for one in held_out),
         "measure": system.measure,
         "score_low": low,
         "score_high": high,
@@ -506,6 +506,9 @@ class Judges(Study):
     quick: Annotated[
         bool, Option("--quick", help="The frozen benchmark, beside what was accepted; one seed.")
     ] = False
+    ceiling: Annotated[
+        bool, Option("--ceiling", help="First compute anew what a filter told the dynamics does.")
+    ] = False
 
     def shortened(self) -> Self:
         """One seed, one controller of each system, no part taken away."""
@@ -542,6 +545,10 @@ class Judges(Study):
             without = () if self.without == ALL else self.parts
             seeds, base = self.seeds or 1, self.seed or benchmark.DRAWS
             only = "" if self.systems == ALL else self.systems
+            if self.ceiling:
+                from studies.told import renew
+
+                renew(benchmark.chosen(only), self.test, workers)
             found = benchmark.run(seeds, base, self.judges, without, workers, only)
             return {"rows": found}
         tasks: list[partial[dict[str, Any]]] = []

@@ -52,8 +52,13 @@ class Shape(Careless):
 
     def _begin(self, start: Start) -> None:
         super()._begin(start)
-        self._noise = self.chance.normal(size=(self.steps, 2))
+        Shape.redraw(self, self.chance)
         self._first()
+
+    def redraw(self, chance: np.random.Generator) -> None:
+        """Draw the noise, which is drawn for all steps at once."""
+        super().redraw(chance)
+        self._noise = chance.normal(size=(self.steps, 2))
 
     def _advance(self, action: Action) -> tuple[float, bool]:
         self._move(self._within(action), self._noise[self.decisions - 1])
@@ -310,9 +315,18 @@ class Drift(Shape):
 
     def _first(self) -> None:
         self._state = self.chance.uniform(-0.1, 0.1, 2)
-        gusts = self.chance.normal(0.0, 0.4, self.steps // 10 + 1)
-        lasts = self.chance.integers(10, 30, len(gusts))
-        self._gust = np.repeat(gusts, lasts)
+        self._gust = self._blows(self.chance)
+
+    def _blows(self, chance: np.random.Generator) -> Vector:
+        gusts = chance.normal(0.0, 0.4, self.steps // 10 + 1)
+        return np.repeat(gusts, chance.integers(10, 30, len(gusts)))
+
+    def redraw(self, chance: np.random.Generator) -> None:
+        """Draw for how long the gust of now goes on, and those that follow."""
+        super().redraw(chance)
+        past = self._gust[: max(self.decisions, 1)]
+        goes_on = np.full(chance.integers(20), past[-1])
+        self._gust = np.concatenate([past, goes_on, self._blows(chance)])
 
     def _observation(self) -> Vector:
         return np.array(self._state)

@@ -166,6 +166,10 @@ class System(ABC):
         self._begin(start)
         return self._observation(), {}
 
+    def redraw(self, chance: np.random.Generator) -> None:
+        """Draw anew what is still to come; where the system is now stays."""
+        self.chance = chance
+
     def propose(self, observation: Vector, time: float = 0.0) -> Action:
         """What the controller wants; it is kept as ``proposed``."""
         self.proposed = self.controllers[self.controller](observation)
@@ -248,8 +252,13 @@ class Acc(System):
     def _begin(self, start: Start) -> None:
         self._x = float(self.chance.uniform(-1.1, -0.9))
         self._v = float(self.chance.uniform(-0.1, 0.1))
-        self._noise = self.chance.normal(0.0, self.noise, self._STEPS)
+        self.redraw(self.chance)
         self._step = 0
+
+    def redraw(self, chance: np.random.Generator) -> None:
+        """Draw the noise, which is drawn for all steps at once."""
+        super().redraw(chance)
+        self._noise = chance.normal(0.0, self.noise, self._STEPS)
 
     def _observation(self) -> Vector:
         return np.array([self._x, self._v])
