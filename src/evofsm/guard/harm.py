@@ -16,7 +16,8 @@ the guard drives if then it wins no fewer pairs than it loses. What is older wei
 and controllers change. Each arm begins with a part of an episode that ended well, so that it is
 tried. The controller drives alone, in *shadow*, only where that costs little: after an episode that
 failed, where it does better by what is known, or every tenth time, as it may have become better;
-and in the first case three draws have to agree, unless the latest three guarded episodes failed.
+and in the first case three draws have to agree, unless the latest three guarded episodes failed, or
+less than three are known of the controller alone.
 
 Frozen, it acts unless its record says that it harms: that it loses more pairs than it wins. A
 guard, or a controller, that was never tried has no record, and then it acts.
