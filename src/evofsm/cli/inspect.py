@@ -114,8 +114,7 @@ def _logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> d
     known = {**read_with} if read_with else {"observe": ",".join(f'"{n}"' for n in model.names)}
     for chunk in reading_of(**known).traces([log]):
         rows.append(chunk.observations)
-        fails = () if chunk.failures is None else chunk.failures
-        failed.append(np.isin(np.arange(len(chunk.times)), fails))
+        failed.append(chunk.fails)
     every, ended = np.concatenate(rows), np.concatenate(failed)
     shown = ended | (np.arange(len(every)) % (1 + len(every) // _ROWS_SHOWN) == 0)
     return {"rows": every[shown], "failed": ended[shown]}

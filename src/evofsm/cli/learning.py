@@ -240,7 +240,7 @@ def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) 
         for row, proposal, at in zip(seen[:-1], episode.actions, times, strict=False):
             guard.decide(row, proposal, at)
             refused.append(reviser.refuses)
-        guard.end(episode.failures is not None and len(episode.failures) > 0, seen[-1])
+        guard.end(episode.failed, seen[-1])
         show(taken := taken + len(times))
     return float(np.mean(np.array(refused[len(refused) // 2 :])))
 
