@@ -17,6 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.cli.options import Reading
+from evofsm.cli.show import warn
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
@@ -208,6 +210,30 @@ def _contradictions(noted: Noted, columns: LogColumns) -> Iterator[str]:
                 mend = f"{' '.join(options)} converts from {unit}"
         shown, said = ("gap", " and ".join(speeds)) if is_gap else ("v_follower", columns.action)
         yield f"{shown} changes {rate:.3g} times as fast as {said} say in the first rows: {mend}"
+
+
+def episodes_read(
+    path: str, reading: Reading, *, dated: bool = False, most: int | None = None
+) -> Iterator[Chunk]:
+    """The episodes of a log that have two rows, of so many rows at most; then what was noticed.
+
+    They have dates where these are wanted, and where the log has some.
+    """
+    noted = Noted()
+    chunks = reading.traces([path], noted)
+    for episode in episodes_of(chunks if most is None else _first(chunks, most)):
+        if len(episode.times) > 1:
+            yield episode._replace(times=episode.times + noted.began) if dated else episode
+    for warning in warnings_of(noted, reading.columns):
+        warn(f"warning: {warning}")
+
+
+def _first(chunks: Iterable[Chunk], most: int) -> Iterator[Chunk]:
+    for chunk in chunks:
+        yield chunk.rows(0, most)
+        most -= len(chunk.times)
+        if most <= 0:
+            return
 
 
 # -- A guard --------------------------------------------------------------------------------------

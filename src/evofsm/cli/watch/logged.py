@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from evofsm.cli.foreseen import guard_where_nobody_acts
-from evofsm.cli.learning import guard_of_log, teach, warnings_of
+from evofsm.cli.learning import episodes_read, guard_of_log, teach
 from evofsm.cli.options import BRAKES, TOLERANCE, Reading
 from evofsm.cli.show import progress, warn
 from evofsm.cli.watch.session import Logged, Played, Session, system_machine
-from evofsm.driving.assumed import Given, assumptions, guard_of_monitor
+from evofsm.driving.assumed import assumptions, guard_of_monitor
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.naming import Labels
 from evofsm.guard import Guard
-from evofsm.io.logs import LONGEST_STEP, Chunk, Noted, episodes_of
+from evofsm.io.logs import LONGEST_STEP, Chunk
 
 # Intervals of an action.
 _INTERVALS = 17
@@ -41,15 +43,11 @@ def watched_log(
     it is with ``collisions`` that a simulation counted [s], by the name of who follows whom.
     ``case`` is the number of the episode to begin with, in the log and from 1.
     """
-    noted, names = Noted(), reading.columns.observe.names
+    names = reading.columns.observe.names
     is_kinematic = reading.acts and judge == "kinematic" and len(names) == len(VARIABLES)
     of_cars = is_kinematic or (reading.acts and names == VARIABLES)
-    chunks = reading.traces([path], noted)
-    chunks = _first(chunks, _MOST_ROWS + 1) if of_cars else chunks
-    episodes = (e for e in episodes_of(chunks) if len(e.times) > 1)
+    episodes = episodes_read(path, reading, most=_MOST_ROWS + 1 if of_cars else None)
     found = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
-    for warning in warnings_of(noted, reading.columns):
-        warn(f"warning: {warning}")
     if not found:
         why = f"nobody follows anybody for {_FEWEST_ROWS}" if of_cars else "no episode has two"
         raise ValueError(f"{path}: {why} rows")
@@ -60,16 +58,19 @@ def watched_log(
             f"{path}: no episode failed, so there is nothing to foresee; --failed says what did"
         )
     labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
-    if is_kinematic:
-        risk = TOLERANCE if tolerance is None else tolerance
-        guard = guard_of_monitor(found[0].rows.dt, brakes, risk, Given)
+    rows = [one.rows for one in found]
+    risk = TOLERANCE if tolerance is None else tolerance
+    if not reading.acts:
+        guard = _guard_where_nobody_acts(rows, labels, tolerance)
+    elif is_kinematic:
+        guard = guard_of_monitor(rows[0].dt, brakes, risk)
+        assert guard.machine is not None
+        _learn_states(guard.machine, rows, guard.actions)
         warn(assumptions(brakes, risk))
     else:
-        guard = _guard_of([one.rows for one in found], labels, tolerance, acts=reading.acts)
-        guard.learn = False
-    if of_cars:  # in closed form, states are learnt with that
-        found = list(_judged(guard, found))
+        guard = _learnt_guard(rows, labels, risk)
     guard.learn = False
+    found = list(_judged(guard, found)) if of_cars else found
     system = Logged(path, found, labels, acts=reading.acts, of_cars=of_cars)
     return Session(system, guard, case=system.places.get(case or 0, 0), on=False)
 
@@ -90,9 +91,8 @@ def _of_cars(
             began = f", from {rows.times[0]:.1f} s" if whole.names else ""
             yield Played(name + began, rows, fails)
         left -= len(whole.times)
-        if left < 0:
-            warn(f"watched are the first {_MOST_ROWS:,} rows; there are more")
-            return
+    if left < 0:
+        warn(f"watched are the first {_MOST_ROWS:,} rows; there are more")
 
 
 def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Chunk, str]]:
@@ -130,33 +130,30 @@ def _judged(guard: Guard, found: Sequence[Played]) -> Iterator[Played]:
             yield one._replace(risks=risks)
 
 
-def _first(chunks: Iterable[Chunk], most: int) -> Iterator[Chunk]:
-    """No more rows than that."""
-    for chunk in chunks:
-        yield chunk.rows(0, most)
-        most -= len(chunk.times)
-        if most <= 0:
-            return
-
-
-def _guard_of(
-    episodes: Sequence[Chunk], labels: Labels, tolerance: float | None, *, acts: bool
-) -> Guard:
-    rows, dt = np.concatenate([e.observations for e in episodes]), episodes[0].dt
-    starts = np.cumsum([0, *(len(e.times) for e in episodes[:-1])])
+def _learnt_guard(episodes: Sequence[Chunk], labels: Labels, tolerance: float) -> Guard:
     did = np.concatenate([e.actions for e in episodes])
     known = did[np.isfinite(did)]
-    low, high = (float(known.min()), float(known.max())) if acts and len(known) else (0.0, 1.0)
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
     high = high if high > low else low + 1.0
-    actions = IntervalActions(low, high, (high - low) / (_INTERVALS if acts else 1), outside="clip")
-    machine = system_machine(actions.n_actions, rows)
-    if acts:
-        risk = TOLERANCE if tolerance is None else tolerance
-        of = actions, machine, labels.names, labels.units
-        guard = guard_of_log("learnt", dt, BRAKES, risk, *of)
-        teach(guard, episodes, lambda done: None)
-        return guard
-    ends = starts + [len(e.times) - 1 for e in episodes]
-    failures = ends[[episode.failed for episode in episodes]]
-    machine.learn_many(rows, np.zeros(len(rows), np.int64), starts, failures)
+    actions = IntervalActions(low, high, (high - low) / _INTERVALS, outside="clip")
+    machine = system_machine(_INTERVALS, np.concatenate([e.observations for e in episodes]))
+    of = actions, machine, labels.names, labels.units
+    guard = guard_of_log("learnt", episodes[0].dt, BRAKES, tolerance, *of)
+    teach(guard, episodes, lambda done: None)
+    return guard
+
+
+def _guard_where_nobody_acts(
+    episodes: Sequence[Chunk], labels: Labels, tolerance: float | None
+) -> Guard:
+    machine = system_machine(1, np.concatenate([e.observations for e in episodes]))
+    _learn_states(machine, episodes, IntervalActions(0.0, 1.0, 1.0, outside="clip"))
     return guard_where_nobody_acts(episodes, labels, None, 0.0, tolerance, machine)
+
+
+def _learn_states(machine: EvolvingFSM, episodes: Sequence[Chunk], actions: Any) -> None:
+    for rows in episodes:
+        did = np.full(len(rows.times), -1)
+        known = np.isfinite(rows.actions)
+        did[known] = actions.encode(rows.actions[known])
+        machine.learn_many(rows.observations, did, [0], rows.failures)

@@ -430,33 +430,19 @@ class Logged:
         """Go to the first row of an episode."""
         _, self._rows, fails, risks = self._played[case]
         times = self._rows.times - self._rows.times[0]
-        self._row, self._times, self._fails = 0, times.tolist(), fails
+        self._times, self._fails = times.tolist(), fails
         self._cars = list(cars_of(times, self._rows.observations)) if self.of_cars else None
         begins = self._times[max(len(times) - _PLAYED, 0)]
         if self.of_cars:
             seen = not fails and np.isfinite(risks).any()
             begins = self._times[int(np.nanargmax(risks)) if seen else -1] - _BEFORE
         self.told |= {"begins": begins, "fails": fails}
+        self._go_to(0)
 
-    @property
-    def time(self) -> float:
-        """Since the episode began [s]."""
-        return float(self._times[self._row])
-
-    @property
-    def observation(self) -> NDArray[np.float64]:
-        """The row."""
-        return np.asarray(self._rows.observations[self._row])
-
-    @property
-    def over(self) -> bool:
-        """Whether it is the last one."""
-        return self._row == len(self._times) - 1
-
-    @property
-    def failed(self) -> bool:
-        """Whether that failed."""
-        return self.over and bool(self._fails)
+    def _go_to(self, row: int) -> None:
+        self._row, self.over = row, row == len(self._times) - 1
+        self.time, self.observation = self._times[row], self._rows.observations[row]
+        self.failed = self.over and bool(self._fails)
 
     def propose(self) -> Action:
         """What was done."""
@@ -464,7 +450,7 @@ class Logged:
 
     def advance(self, revision: Revision) -> None:
         """Go to the next row."""
-        self._row += 1
+        self._go_to(self._row + 1)
 
     def cars(self) -> Cars | None:
         """Where they are, if it is of cars."""
