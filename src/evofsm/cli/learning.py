@@ -26,7 +26,7 @@ from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.step import Trace
-from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
+from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode, Revision
 from evofsm.io import Chunk, episodes_of
 from evofsm.io.logs import LogColumns, Noted
 from evofsm.io.tables import SI, TIMES, UNITS
@@ -257,17 +257,21 @@ def guard_of_log(
     return Guard.of(reviser, interval=dt, machine=machine.copy())
 
 
+def decided_on(guard: Guard, episode: Chunk) -> Iterator[Revision]:
+    """What a guard says of each row of an episode but the last one, with which it ends."""
+    seen, times = episode.observations, episode.times - episode.times[0]
+    for row, proposal, at in zip(seen[:-1], episode.actions, times, strict=False):
+        yield guard.decide(row, proposal, at)
+    guard.end(episode.failed, seen[-1])
+
+
 def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) -> float:
     """The share in which a guard refuses, of the later half of a log; ``show`` is told of rows."""
     taken, refused, reviser = 0, bytearray(), guard.reviser
     assert isinstance(reviser, ActionReviser)
     for episode in episodes_of(chunks):
-        seen, times = episode.observations, episode.times - episode.times[0]
-        for row, proposal, at in zip(seen[:-1], episode.actions, times, strict=False):
-            guard.decide(row, proposal, at)
-            refused.append(reviser.refuses)
-        guard.end(episode.failed, seen[-1])
-        show(taken := taken + len(times))
+        refused.extend(reviser.refuses for _ in decided_on(guard, episode))
+        show(taken := taken + len(episode.times))
     return float(np.mean(np.array(refused[len(refused) // 2 :])))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from evofsm.cli.foreseen import guard_where_nobody_acts
-from evofsm.cli.learning import episodes_read, guard_of_log, teach
+from evofsm.cli.learning import decided_on, episodes_read, guard_of_log, teach
 from evofsm.cli.options import BRAKES, TOLERANCE, Reading
 from evofsm.cli.show import progress, warn
 from evofsm.cli.watch.session import Logged, Played, Session, system_machine
@@ -24,7 +24,7 @@ from evofsm.io.logs import LONGEST_STEP, Chunk
 # Intervals of an action.
 _INTERVALS = 17
 # More rows of cars are not watched, and fewer of an episode; times that differ by less are one [s].
-_MOST_ROWS, _FEWEST_ROWS, _TICK = 20_000, 10, 5e-4
+_ROWS_OF_CARS, _FEWEST_ROWS, _TICK = 20_000, 10, 5e-4
 
 
 def watched_log(
@@ -46,22 +46,24 @@ def watched_log(
     names = reading.columns.observe.names
     is_kinematic = reading.acts and judge == "kinematic" and len(names) == len(VARIABLES)
     of_cars = is_kinematic or (reading.acts and names == VARIABLES)
-    episodes = episodes_read(path, reading, most=_MOST_ROWS + 1 if of_cars else None)
+    episodes = episodes_read(path, reading, most=_ROWS_OF_CARS + 1 if of_cars else None)
     found = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
     if not found:
         why = f"nobody follows anybody for {_FEWEST_ROWS}" if of_cars else "no episode has two"
         raise ValueError(f"{path}: {why} rows")
     if case is not None and not 1 <= case <= len(found):
         raise ValueError(f"episode is {case}; there are 1 to {len(found)}")
-    if not (of_cars or any(one.fails for one in found)):
+    if not (of_cars or any(played.fails for played in found)):
         raise ValueError(
             f"{path}: no episode failed, so there is nothing to foresee; --failed says what did"
         )
     labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
-    rows = [one.rows for one in found]
+    rows = [played.rows for played in found]
     risk = TOLERANCE if tolerance is None else tolerance
     if not reading.acts:
-        guard = _guard_where_nobody_acts(rows, labels, tolerance)
+        machine = system_machine(1, np.concatenate([chunk.observations for chunk in rows]))
+        _learn_states(machine, rows, IntervalActions(0.0, 1.0, 1.0))
+        guard = guard_where_nobody_acts(rows, labels, None, 0.0, tolerance, machine)
     elif is_kinematic:
         guard = guard_of_monitor(rows[0].dt, brakes, risk)
         assert guard.machine is not None
@@ -84,7 +86,7 @@ def _of_cars(
     episodes: Iterable[Chunk], collisions: Mapping[str, Sequence[float]]
 ) -> Iterator[Played]:
     """Their stretches, of the first rows."""
-    left = _MOST_ROWS
+    left = _ROWS_OF_CARS
     for number, whole in enumerate(episodes, 1):
         name = "".join(whole.names) or f"episode {number}"
         for rows, fails in _stretches(whole.rows(0, left), collisions.get(name, ())):
@@ -92,7 +94,7 @@ def _of_cars(
             yield Played(name + began, rows, fails)
         left -= len(whole.times)
     if left < 0:
-        warn(f"watched are the first {_MOST_ROWS:,} rows; there are more")
+        warn(f"watched are the first {_ROWS_OF_CARS:,} rows; there are more")
 
 
 def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Chunk, str]]:
@@ -119,15 +121,10 @@ def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Ch
 def _judged(guard: Guard, found: Sequence[Played]) -> Iterator[Played]:
     """With the risk of each row, as the guard finds it."""
     with progress("Judging", len(found)) as move:
-        for number, one in enumerate(found, 1):
-            rows = one.rows
-            decided = zip(
-                rows.observations[:-1], rows.actions, rows.times - rows.times[0], strict=False
-            )
-            risks = [guard.decide(*row).risk_proposed for row in decided]
-            guard.end(rows.failed, rows.observations[-1])
+        for number, played in enumerate(found, 1):
+            risks = [said.risk_proposed for said in decided_on(guard, played.rows)]
             move(number)
-            yield one._replace(risks=risks)
+            yield played._replace(risks=risks)
 
 
 def _learnt_guard(episodes: Sequence[Chunk], labels: Labels, tolerance: float) -> Guard:
@@ -141,14 +138,6 @@ def _learnt_guard(episodes: Sequence[Chunk], labels: Labels, tolerance: float) -
     guard = guard_of_log("learnt", episodes[0].dt, BRAKES, tolerance, *of)
     teach(guard, episodes, lambda done: None)
     return guard
-
-
-def _guard_where_nobody_acts(
-    episodes: Sequence[Chunk], labels: Labels, tolerance: float | None
-) -> Guard:
-    machine = system_machine(1, np.concatenate([e.observations for e in episodes]))
-    _learn_states(machine, episodes, IntervalActions(0.0, 1.0, 1.0, outside="clip"))
-    return guard_where_nobody_acts(episodes, labels, None, 0.0, tolerance, machine)
 
 
 def _learn_states(machine: EvolvingFSM, episodes: Sequence[Chunk], actions: Any) -> None:

@@ -416,11 +416,11 @@ class Logged:
         self.name, self.interval = Path(path).name, float(played[0].rows.dt)
         self.about = "each row as it was read."
         self.labels, self.of_cars = labels._replace(dt=self.interval), of_cars
-        ranks = [(not one.fails, -one.highest) for one in played]
+        ranks = [(not part.fails, -part.highest) for part in played]
         order = sorted(range(len(played)), key=ranks.__getitem__)
         self._played = [played[number] for number in order]
         self.places = {number + 1: place for place, number in enumerate(order)}
-        self.cases = tuple(one.called for one in self._played)
+        self.cases = tuple(part.called for part in self._played)
         self.told: dict[str, Any] = {"mode": "shadow", "acts": acts}
         if not of_cars:  # which move in real time
             pace = _A_SECOND * self.interval

@@ -138,11 +138,11 @@ def cars_of(
     moved = 0.5 * (speeds[1:, 0] + speeds[:-1, 0]) * lasted[1:]
     positions = np.insert(np.cumsum(moved), 0, 0.0)
     rows = np.column_stack([observed, accelerations, positions]).tolist()
-    for number, (gap, own, leader, a_own, a_leader, x) in enumerate(rows, 1):
-        seen = np.array([gap, own, leader])
+    for number, (gap, follower, leader, a_follower, a_leader, x) in enumerate(rows, 1):
+        seen = np.array([gap, follower, leader])
         measures = float(time_to_collision(seen)), float(time_headway(seen))
         ended = rear_ended and number == len(rows)
-        yield Cars(gap, own, leader, a_own, a_leader, x, *measures, rear_ended=ended)
+        yield Cars(gap, follower, leader, a_follower, a_leader, x, *measures, rear_ended=ended)
 
 
 class Frame(NamedTuple):
