@@ -46,7 +46,7 @@ def watched_log(
     names = reading.columns.observe.names
     is_kinematic = reading.acts and judge == "kinematic" and len(names) == len(VARIABLES)
     of_cars = is_kinematic or (reading.acts and names == VARIABLES)
-    episodes = episodes_read(path, reading, most=_ROWS_OF_CARS + 1 if of_cars else None)
+    episodes = episodes_read(path, reading, most=_ROWS_OF_CARS + 2 if of_cars else None)
     found = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
     if not found:
         why = f"nobody follows anybody for {_FEWEST_ROWS}" if of_cars else "no episode has two"
@@ -89,7 +89,8 @@ def _of_cars(
     left = _ROWS_OF_CARS
     for number, whole in enumerate(episodes, 1):
         name = "".join(whole.names) or f"episode {number}"
-        for rows, fails in _stretches(whole.rows(0, left), collisions.get(name, ())):
+        stretches = _stretches(whole.rows(0, left), collisions.get(name, ())) if left else ()
+        for rows, fails in stretches:
             began = f", from {rows.times[0]:.1f} s" if whole.names else ""
             yield Played(name + began, rows, fails)
         left -= len(whole.times)

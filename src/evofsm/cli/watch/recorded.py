@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from evofsm.cli.watch.shown import (
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.fsm.naming import Labels
 from evofsm.guard import TOLERANCE
-from evofsm.io.runs import RecordedEpisode, Run, read_run
+from evofsm.io.runs import Run, read_run
 
 _LABELS = Labels(names=VARIABLES, units=UNITS)
 # Why a reviser did not act, by its mode.
@@ -67,15 +66,22 @@ class Recording:
         self._episode, self._number = self._episodes[case], 0
         self.start = self._begun(case)
         # Where it acts, what is executed is what it advises; else a proposal that can be executed.
-        columns = self._episode.columns
+        episode, columns = self._episode, self._episode.columns
         passed = (np.abs(columns["advised"] - columns["executed"]) > _SAME_ACCEL).any()
         idle = _IDLE.get(self._mode, _PASSED if passed else "")
         chronicle, self._frames = Chronicle(self.start.tolerance), list[Frame]()
-        for number, frame in enumerate(_moved(self._episode, idle)):
+        times = np.append(columns["time"], episode.end_time)
+        seen = np.column_stack([columns[name] for name in VARIABLES])
+        seen = _held(np.vstack([seen, episode.end]))
+        rows = zip(times.tolist(), seen, cars_of(times, seen), strict=True)
+        for number, (time, row, cars) in enumerate(rows):
+            here, observation = _LABELS.place(row), tuple(row.tolist())
+            frame = Frame(number, time, observation, here=here, idle=idle, cars=cars)
             if number < len(columns["time"]):
                 frame = self._decided(frame, number)
             else:
-                frame = frame._replace(over=True, failed=self._episode.collided)
+                cars = cars._replace(rear_ended=episode.rear_ended)
+                frame = frame._replace(over=True, failed=episode.collided, cars=cars)
             self._frames.append(frame._replace(story=chronicle.tell(frame)))
         return self.start
 
@@ -138,20 +144,6 @@ class Recording:
             proposed_risk=executed if risk == executed.risk else Judged(risk),
             executed_risk=executed,
         )
-
-
-def _moved(episode: RecordedEpisode, idle: str) -> Iterator[Frame]:
-    """Where the cars are at each decision and at the end, and how they got there."""
-    columns = episode.columns
-    times = np.append(columns["time"], episode.end_time)
-    observed = np.column_stack([columns[name] for name in VARIABLES])
-    observed = _held(np.vstack([observed, episode.end]))
-    rows = zip(
-        times, observed, cars_of(times, observed, rear_ended=episode.rear_ended), strict=True
-    )
-    for number, (time, seen, cars) in enumerate(rows):
-        here, values = _LABELS.place(seen), tuple(seen.tolist())
-        yield Frame(number, float(time), values, here=here, idle=idle, cars=cars)
 
 
 def _held(rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -128,9 +128,7 @@ class Cars(NamedTuple):
     decel: float = math.nan  #: of the follower if it brakes in full, as far as is known [m/s²]
 
 
-def cars_of(
-    times: NDArray[np.float64], observed: NDArray[np.float64], *, rear_ended: bool = False
-) -> Iterator[Cars]:
+def cars_of(times: NDArray[np.float64], observed: NDArray[np.float64]) -> Iterator[Cars]:
     """Where cars were at each time [s] of a record, and how they got there, by the variables."""
     lasted, speeds = np.diff(times, prepend=math.nan), observed[:, 1:]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -138,11 +136,10 @@ def cars_of(
     moved = 0.5 * (speeds[1:, 0] + speeds[:-1, 0]) * lasted[1:]
     positions = np.insert(np.cumsum(moved), 0, 0.0)
     rows = np.column_stack([observed, accelerations, positions]).tolist()
-    for number, (gap, follower, leader, a_follower, a_leader, x) in enumerate(rows, 1):
+    for gap, follower, leader, a_follower, a_leader, x in rows:
         seen = np.array([gap, follower, leader])
         measures = float(time_to_collision(seen)), float(time_headway(seen))
-        ended = rear_ended and number == len(rows)
-        yield Cars(gap, follower, leader, a_follower, a_leader, x, *measures, rear_ended=ended)
+        yield Cars(gap, follower, leader, a_follower, a_leader, x, *measures)
 
 
 class Frame(NamedTuple):
