@@ -9,7 +9,7 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from evofsm.cli.options import Json, Saved, option, picture, reading_of, split_names
+from evofsm.cli.options import Json, Saved, option, picture, quoted, reading_of, split_names
 from evofsm.cli.show import facts, print_json, say, show, table
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def _logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> d
     if log is None:
         return {}
     rows, failed = list[Any](), list[Any]()
-    known = {**read_with} if read_with else {"observe": ",".join(f'"{n}"' for n in model.names)}
+    known = {**read_with} if read_with else {"observe": quoted(model.names)}
     for chunk in reading_of(**known).traces([log]):
         rows.append(chunk.observations)
         failed.append(chunk.fails)

@@ -10,7 +10,7 @@ import numpy as np
 import polars
 from numpy.typing import NDArray
 
-from evofsm.cli.options import seconds
+from evofsm.cli.options import quoted, seconds
 from evofsm.guard.foresight import span
 from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
@@ -160,8 +160,7 @@ def _round(number: float) -> float:
 
 def _named(name: str, signs: str) -> str:
     """A column's name as options take it, in double quotes where one of these is in it."""
-    quoted = '"' + name.replace('"', '""') + '"'
-    return quoted if set(name) & {*signs, '"'} else name
+    return quoted([name]) if set(name) & {*signs, '"'} else name
 
 
 def _stands(z: NDArray[np.float64]) -> bool:

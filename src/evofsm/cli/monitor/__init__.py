@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable
 from contextlib import ExitStack
 from functools import partial
 from hashlib import sha256
@@ -24,6 +23,7 @@ from evofsm.cli.options import (
     argument,
     given_of,
     option,
+    quoted,
     reading_of,
     reads_logs,
     split_names,
@@ -187,7 +187,7 @@ def monitor(
             alone = reading.keywords["action"] == "" or isinstance(used and used.judge, Foresight)
             names = used.variables if used else VARIABLES
             if observe is None or set(split_names(observe)) == set(names):  # in its own order
-                observe = _quoted(names)
+                observe = quoted(names)
             if alone:
                 reading = partial(reading, action="")
             asked = reading(observe=observe, episode=episode)
@@ -219,7 +219,7 @@ def monitor(
         _prepare(used, mode, tolerance, audit, stack, learn=learn)
         slots = None
         if not (is_log or traffic):
-            slots = Slots(reading(observe=_quoted(used.variables or VARIABLES), dt=None).columns)
+            slots = Slots(reading(observe=quoted(used.variables or VARIABLES), dt=None).columns)
         rate = RATE if begun and tolerance is None else None
         decider = Decider(used, episode=rows, slots=slots, rate=rate)
         assumed = _of_saved(guard, used) if guard else assumptions(brakes, tolerated)
@@ -337,11 +337,6 @@ def _begun(
         tolerance=TOLERANCE if tolerance is None else tolerance,
         mode=Mode.SHADOW,
     )
-
-
-def _quoted(names: Iterable[str]) -> str:
-    """Names, as --observe takes them."""
-    return ",".join('"' + name.replace('"', '""') + '"' for name in names)
 
 
 def _of_saved(path: Path, guard: Guard) -> str:
