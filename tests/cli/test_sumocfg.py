@@ -8,9 +8,10 @@ import pytest
 pytest.importorskip("typer")
 pytest.importorskip("libsumo")
 
+from evofsm.cli.options import reading_of
 from evofsm.cli.sumocfg import trace_configuration
 from evofsm.cli.watch import _is_log
-from evofsm.cli.watch.recorded import Recording, record_log
+from evofsm.cli.watch.logged import watched_log
 from evofsm.cli.watch.words import tell
 
 CARS = """<routes>
@@ -80,13 +81,12 @@ def test_a_configuration_that_sumo_refuses_is_one_line(refused, configuration):
 @pytest.mark.parametrize("afterwards", ["teleport", "warn"])
 def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tmp_path, afterwards):
     configuration.write_text(CONFIGURATION.replace('"warn"', f'"{afterwards}"'))
-    log, run = tmp_path / "my.xml", tmp_path / "run.mcap"
+    log = tmp_path / "my.xml"
     assert trace_configuration(configuration, log, 30.0, 10**6)[:2] == (30.0, True)
     assert trace_configuration(configuration, log, 30.0, 40)[0] < 30.0
     *whole, collisions = trace_configuration(configuration, log, 600.0, 10**6)
     assert whole == [80.0, False]
-    stretches, _ = record_log(str(log), run, collisions=collisions)
-    recorded = Recording(run, stretches)
+    recorded = watched_log(str(log), reading_of(), collisions=collisions)
     assert recorded.start.cases[0] == "ego behind lead, from 0.0 s (collision)"
     frames = [recorded.step()]
     while not frames[-1].over:

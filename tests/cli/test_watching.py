@@ -8,8 +8,9 @@ import pytest
 from evofsm.cli.driving import Setup, make_guard
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.options import reading_of
+from evofsm.cli.watch.logged import watched_log
 from evofsm.cli.watch.player import Player
-from evofsm.cli.watch.recorded import Recording, record_log
+from evofsm.cli.watch.recorded import Recording
 from evofsm.cli.watch.session import (
     OnRoads,
     Session,
@@ -21,7 +22,7 @@ from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.guard import Mode
-from evofsm.io import read_run, recording
+from evofsm.io import recording
 from monitor_rows import line, traffic
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -256,19 +257,16 @@ def objects(path, rows=80):
 
 
 def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
-    out = tmp_path / "run.mcap"
-    found = record_log(objects(tmp_path / "objects.csv"), out)
-    assert found == ([("ego behind other, from 0.0 s", "Collision")], False)
-    columns = read_run(out).episodes[0].columns
-    assert (columns["executed"] == columns["proposed"]).all()
-    assert columns["gap"][0] == pytest.approx(36.0)
-    # The leader brakes, nobody else does: in the end the guard would have.
-    assert columns["advised"][60] < -2.0
-    assert columns["risk_proposed"][60] > columns["risk_proposed"][0]
-    shown = Recording(out)
+    shown = watched_log(objects(tmp_path / "objects.csv"), reading_of())
+    assert shown.start.cases == ("ego behind other, from 0.0 s (collision)",)
     assert not shown.revising
     first, *_, last = frames = drive(shown)
     assert not any(frame.revised for frame in frames)
+    assert first.cars.gap == pytest.approx(36.0)
+    # The leader brakes, nobody else does: in the end the guard would have.
+    assert frames[60].advised[0] < -2.0
+    assert frames[60].proposed_risk.risk > first.proposed_risk.risk
+    assert shown.graph().states
     assert first.cars.v_follower == pytest.approx(20.0)
     found = last.cars.a_follower, last.cars.a_leader, last.cars.x_follower
     assert found == pytest.approx((0.0, -5.0, 158.0))
@@ -287,8 +285,8 @@ def test_episodes_of_a_log_end_with_a_contact_are_sorted_and_begin_where_it_is_w
             slow = crashed and gap < 0.0
             lines.append(f"{pair},{k / 10:.1f},{gap:.2f},{12 if slow else 20},{20 - 3 * closing},0")
     (tmp_path / "log.csv").write_text("\n".join([*lines, ""]))
-    stretches, _ = record_log(str(tmp_path / "log.csv"), tmp_path / "run.mcap")
-    shown = Recording(tmp_path / "run.mcap", stretches)
+    path = str(tmp_path / "log.csv")
+    shown = watched_log(path, reading_of())
     worst, second, *rest = shown.start.cases
     assert worst == "episode 2 (collision)"
     assert second.startswith("episode 2 (risk ")  # after they came apart
@@ -299,15 +297,14 @@ def test_episodes_of_a_log_end_with_a_contact_are_sorted_and_begin_where_it_is_w
     told = tell(frames[-1], shown.start)
     assert "Collision at 26.7\xa0s, 3.0\xa0m/s faster than the leader." in told.outcome
     assert "only watched, in shadow mode" in told.done
-    assert shown.choose(3).case == 2  # the fourth that was written
+    assert watched_log(path, reading_of(), case=4).start.case == 2  # the fourth in the log
 
 
 def test_a_failure_that_a_log_tells_of_is_no_collision_but_a_failure(tmp_path):
     rows = [f"{k / 10:.1f},{30 - k},20,10,0.1,{int(k == 25)}" for k in range(26)]
     (tmp_path / "log.csv").write_text("\n".join(["time,gap,v,lead,a,failed", *rows, ""]))
     reading = reading_of("gap,v,lead", "a", failed="failed")
-    stretches, _ = record_log(str(tmp_path / "log.csv"), tmp_path / "run.mcap", reading)
-    shown = Recording(tmp_path / "run.mcap", stretches)
+    shown = watched_log(str(tmp_path / "log.csv"), reading)
     assert shown.start.cases == ("episode 1 (failure)",)
     told = tell(drive(shown)[-1], shown.start)
     assert told.headline == "Failure (by the log)"
@@ -315,19 +312,16 @@ def test_a_failure_that_a_log_tells_of_is_no_collision_but_a_failure(tmp_path):
 
 
 def test_a_log_is_watched_by_its_own_columns_and_units(tmp_path, capsys):
-    path, out = tmp_path / "own.csv", tmp_path / "run.mcap"
+    path = tmp_path / "own.csv"
     rows = [f"{100 * k},{40 - k},72,{72 - 3 * k},0.1" for k in range(20)]
     path.write_text("\n".join(["t,dist,ego_kmh,lead_kmh,accel", *rows, ""]))
     units = "t=ms", "ego_kmh=km/h", "lead_kmh=km/h"
     reading = reading_of("dist,ego_kmh,lead_kmh", "accel", "t", unit=units)
-    record_log(str(path), out, reading, brakes=4.0)
-    found = read_run(out).episodes[0].columns
-    assert [found[name][0] for name in ("gap", "v_follower", "v_leader")] == [40.0, 20.0, 20.0]
-    assert found["time"][1] == pytest.approx(0.1)
-    assert found["risk_proposed"][-1] > 0.9
+    first, second, *_, before, _ = drive(watched_log(str(path), reading, brakes=4.0))
+    assert first.observation == (40.0, 20.0, 20.0)
+    assert second.time == pytest.approx(0.1)
+    assert before.proposed_risk.risk > 0.9
     assert "the own car brakes with 4 m/s² (--brakes)" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="has to name the three columns in this order"):
-        record_log(str(path), out, reading_of("dist", "accel", "t"))
 
 
 def test_what_was_before_is_shown_at_once():
@@ -409,14 +403,14 @@ def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
 
 
 def test_the_same_rows_get_the_same_risks_as_from_the_monitor(tmp_path):
-    path, out = tmp_path / "drive.csv", tmp_path / "run.mcap"
+    path = tmp_path / "drive.csv"
     told = ["time,gap,v_follower,v_leader,a_follower"]
     for k, row in enumerate(traffic(2500)):  # leaders brake hard now and then: it could learn
         values = (row[name] for name in ("gap", "v_follower", "v_leader", "proposal"))
         told.append(",".join(map(str, (k / 10, *values))))
     path.write_text("\n".join([*told, ""]))
-    record_log(str(path), out)
-    watched = read_run(out).episodes[0].columns["risk_proposed"]
+    *decided, _ = drive(watched_log(str(path), reading_of()))
+    watched = [frame.proposed_risk.risk for frame in decided]
     guard = guard_of_monitor(0.1, 6.0)
     guard.learn = False
     decider = Decider(guard)

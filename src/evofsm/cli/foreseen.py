@@ -109,8 +109,7 @@ def show_foreseen(
 
 
 def _runs(episodes: Sequence[Chunk]) -> Runs:
-    failed = [e.failures is not None and len(e.failures) > 0 for e in episodes]
-    return Runs.of([e.observations for e in episodes], failed)
+    return Runs.of([e.observations for e in episodes], [e.failed for e in episodes])
 
 
 def _document(

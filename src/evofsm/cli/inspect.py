@@ -9,7 +9,7 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from evofsm.cli.options import Json, Saved, option, picture, reading_of, split_names
+from evofsm.cli.options import Json, Saved, option, picture, quoted, reading_of, split_names
 from evofsm.cli.show import facts, print_json, say, show, table
 
 if TYPE_CHECKING:
@@ -111,11 +111,10 @@ def _logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> d
     if log is None:
         return {}
     rows, failed = list[Any](), list[Any]()
-    known = {**read_with} if read_with else {"observe": ",".join(f'"{n}"' for n in model.names)}
+    known = {**read_with} if read_with else {"observe": quoted(model.names)}
     for chunk in reading_of(**known).traces([log]):
         rows.append(chunk.observations)
-        fails = () if chunk.failures is None else chunk.failures
-        failed.append(np.isin(np.arange(len(chunk.times)), fails))
+        failed.append(chunk.fails)
     every, ended = np.concatenate(rows), np.concatenate(failed)
     shown = ended | (np.arange(len(every)) % (1 + len(every) // _ROWS_SHOWN) == 0)
     return {"rows": every[shown], "failed": ended[shown]}

@@ -17,6 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.cli.options import Reading
+from evofsm.cli.show import warn
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
@@ -24,7 +26,7 @@ from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.step import Trace
-from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
+from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode, Revision
 from evofsm.io import Chunk, episodes_of
 from evofsm.io.logs import LogColumns, Noted
 from evofsm.io.tables import SI, TIMES, UNITS
@@ -210,6 +212,30 @@ def _contradictions(noted: Noted, columns: LogColumns) -> Iterator[str]:
         yield f"{shown} changes {rate:.3g} times as fast as {said} say in the first rows: {mend}"
 
 
+def episodes_read(
+    path: str, reading: Reading, *, dated: bool = False, most: int | None = None
+) -> Iterator[Chunk]:
+    """The episodes of a log that have two rows, of so many rows at most; then what was noticed.
+
+    They have dates where these are wanted, and where the log has some.
+    """
+    noted = Noted()
+    chunks = reading.traces([path], noted)
+    for episode in episodes_of(chunks if most is None else _first(chunks, most)):
+        if len(episode.times) > 1:
+            yield episode._replace(times=episode.times + noted.began) if dated else episode
+    for warning in warnings_of(noted, reading.columns):
+        warn(f"warning: {warning}")
+
+
+def _first(chunks: Iterable[Chunk], most: int) -> Iterator[Chunk]:
+    for chunk in chunks:
+        yield chunk.rows(0, most)
+        most -= len(chunk.times)
+        if most <= 0:
+            return
+
+
 # -- A guard --------------------------------------------------------------------------------------
 
 
@@ -231,17 +257,21 @@ def guard_of_log(
     return Guard.of(reviser, interval=dt, machine=machine.copy())
 
 
+def decided_on(guard: Guard, episode: Chunk) -> Iterator[Revision]:
+    """What a guard says of each row of an episode but the last one, with which it ends."""
+    seen, times = episode.observations, episode.times - episode.times[0]
+    for row, proposal, at in zip(seen[:-1], episode.actions, times, strict=False):
+        yield guard.decide(row, proposal, at)
+    guard.end(episode.failed, seen[-1])
+
+
 def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) -> float:
     """The share in which a guard refuses, of the later half of a log; ``show`` is told of rows."""
     taken, refused, reviser = 0, bytearray(), guard.reviser
     assert isinstance(reviser, ActionReviser)
     for episode in episodes_of(chunks):
-        seen, times = episode.observations, episode.times - episode.times[0]
-        for row, proposal, at in zip(seen[:-1], episode.actions, times, strict=False):
-            guard.decide(row, proposal, at)
-            refused.append(reviser.refuses)
-        guard.end(episode.failures is not None and len(episode.failures) > 0, seen[-1])
-        show(taken := taken + len(times))
+        refused.extend(reviser.refuses for _ in decided_on(guard, episode))
+        show(taken := taken + len(episode.times))
     return float(np.mean(np.array(refused[len(refused) // 2 :])))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import polars
 from numpy.typing import NDArray
 
-from evofsm.cli.options import seconds
+from evofsm.cli.options import quoted, seconds
 from evofsm.guard.foresight import span
 from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
@@ -18,7 +18,7 @@ from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_da
 Pairs = list[tuple[str, str]]
 
 # So many fields and rows are looked at; columns of more texts are no list of states.
-_MOST_FIELDS, _MOST_ROWS, _MOST_TEXTS = 20_000_000, 1_000_000, 12
+_MOST_FIELDS, _ROWS_LOOKED_AT, _MOST_TEXTS = 20_000_000, 1_000_000, 12
 _EPOCHS = {"ns": 1e17, "us": 1e14, "ms": 1e11}  # times since 1970 are larger
 _COLUMNS_SHOWN = 40  # columns
 _SIGNS = "<>=! "  # what in a name of a condition is ambiguous
@@ -90,7 +90,7 @@ def _first_rows(table: CsvTable | ParquetTable) -> tuple[polars.DataFrame, str, 
     table.skips, frame = Skips(1 << 60), polars.DataFrame()
     for piece in table.pieces(Wanted(numbers, texts, dates)):
         frame.vstack(polars.DataFrame({**piece.numbers, **piece.texts}), in_place=True)
-        if len(frame) >= min(_MOST_ROWS, _MOST_FIELDS // len(firsts)):
+        if len(frame) >= min(_ROWS_LOOKED_AT, _MOST_FIELDS // len(firsts)):
             break
     if not clock and (form := next(filter(None, map(_form, map(frame.get_column, texts))), "")):
         clock, _, written = form.partition("=")
@@ -160,8 +160,7 @@ def _round(number: float) -> float:
 
 def _named(name: str, signs: str) -> str:
     """A column's name as options take it, in double quotes where one of these is in it."""
-    quoted = '"' + name.replace('"', '""') + '"'
-    return quoted if set(name) & {*signs, '"'} else name
+    return quoted([name]) if set(name) & {*signs, '"'} else name
 
 
 def _stands(z: NDArray[np.float64]) -> bool:

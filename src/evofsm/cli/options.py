@@ -136,6 +136,15 @@ def split_names(text: str) -> list[str]:
     return ["".join(parts) for parts in _named(text)]
 
 
+def quoted(names: Iterable[str]) -> str:
+    """Names as `split_names` takes them, whatever is in them.
+
+    >>> split_names(quoted(['v, "fast"', "gap"]))
+    ['v, "fast"', 'gap']
+    """
+    return ",".join('"' + name.replace('"', '""') + '"' for name in names)
+
+
 def _named(text: str) -> list[tuple[str, str]]:
     """What stands between commas: a name in quotes, if there is one, and the rest."""
     from evofsm.io.tables import quoted_name
@@ -271,9 +280,10 @@ def reading_of(
         if value is not None and dt is not None:
             raise ValueError(f"{name} goes by a clock, and --dt stands in for one; give one")
 
-    def variable(quoted: str, rest: str) -> str | Category:
+    def variable(told: str, rest: str) -> str | Category:
         name, discrete, values = rest.partition("=")
-        return Category(quoted or name, values.split("/")) if discrete else quoted or name
+        name = told or name
+        return Category(name, values.split("/")) if discrete else name
 
     try:
         variables = [variable(*parts) for parts in _named(observe)]
@@ -344,8 +354,8 @@ def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
 
     step, *told = _named(text) or [("", "")]
     how = {}
-    for quoted, rest in told:
-        name, _, become = f"{quoted}{rest}".rpartition("=")
+    for parts in told:
+        name, _, become = "".join(parts).rpartition("=")
         if name not in (*encoder.variables, action) or become not in BECOME:
             may = f"NAME=HOW with one of {', '.join(BECOME)}, of a number that is read"
             raise ValueError(f"--resample is {text!r}; write 30s, or 30s and behind commas {may}")

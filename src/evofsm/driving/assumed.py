@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from numpy.typing import ArrayLike
-
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.leaders import REAL_DRIVES
@@ -22,14 +20,9 @@ _FULL = 10.0
 LEADERS = REAL_DRIVES._replace(counts=(*REAL_DRIVES.counts, *(0,) * 14, 4))
 
 
-def guard_of_monitor(
-    interval: float,
-    brakes: float,
-    tolerance: float = TOLERANCE,
-    given: type[LatentRisk] = LatentRisk,
-) -> Guard:
+def guard_of_monitor(interval: float, brakes: float, tolerance: float = TOLERANCE) -> Guard:
     """A guard of car following that is given how hard its car brakes, in shadow mode."""
-    judge = _ahead(interval, brakes, given)
+    judge = _ahead(interval, brakes)
     return guard_for_cars(
         -brakes, HIGHEST, interval, judge=judge, tolerance=tolerance, mode=Mode.SHADOW
     )
@@ -52,18 +45,6 @@ def assumptions(brakes: float, tolerance: float) -> str:
     )
 
 
-class Given(LatentRisk):
-    """Keeps to what it was given, whatever it sees, while a machine learns."""
-
-    def learn(self, observation: ArrayLike, acceleration: float, *_: Any, **__: Any) -> None:
-        """Only follow."""
-        self.follow(observation, acceleration)
-
-    def start_episode(self, *, learn: bool = True) -> None:
-        """Learn nothing."""
-        super().start_episode(learn=False)
-
-
-def _ahead(interval: float, brakes: float, given: type[LatentRisk] = LatentRisk) -> LatentRisk:
+def _ahead(interval: float, brakes: float) -> LatentRisk:
     braking, step = positive("brakes", brakes), positive("interval", interval)
-    return given.given(-braking, braking, _FULL, step, leaders=LEADERS)
+    return LatentRisk.given(-braking, braking, _FULL, step, leaders=LEADERS)

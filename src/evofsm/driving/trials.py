@@ -13,20 +13,13 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from evofsm.driving.family import Draw, Family
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.scenarios import Scenario, steps_between
 from evofsm.driving.sumo import open_world
 from evofsm.driving.world import (
-    COMMANDED,
-    GAP,
-    GAP_BEHIND,
     LEADER_ACCELERATION,
-    LEADER_SPEED,
-    REALISED,
-    RUN_COLUMNS,
     SPEED,
     Drives,
     Episode,
@@ -35,7 +28,7 @@ from evofsm.driving.world import (
 )
 from evofsm.extras import needs
 from evofsm.fsm.proportions import FailureRecord
-from evofsm.guard import TOLERANCE, BoxActions, Decision, Guard, Mode, run_episode
+from evofsm.guard import TOLERANCE, BoxActions, Guard, run_episode
 
 
 def drive(
@@ -93,41 +86,6 @@ def drive(
 def teach(guard: Guard, draws: Iterable[Draw]) -> list[Episode]:
     """Drive each draw in turn, in closed form."""
     return [drive(guard, draw) for draw in draws]
-
-
-# -- What was recorded ----------------------------------------------------------------------------
-
-
-def shadow_drive(
-    guard: Guard,
-    times: ArrayLike,
-    observations: ArrayLike,
-    accelerations: ArrayLike,
-    *,
-    failed: bool = False,
-) -> Episode:
-    """Let a guard in shadow mode decide on each row of a recorded episode, and learn from it."""
-    mode = getattr(guard.reviser, "mode", Mode.ACT)
-    if mode not in (Mode.SHADOW, Mode.OFF):
-        raise ValueError(f"the guard's mode is {mode.value}; what was recorded needs shadow or off")
-    time, seen, did = (np.asarray(x, np.float64) for x in (times, observations, accelerations))
-    if len(time) < 2 or seen.shape != (len(time), 3) or did.shape != time.shape:
-        raise ValueError(
-            f"times, observations and accelerations have the shapes {time.shape}, {seen.shape} and "
-            f"{did.shape}; they must be (T,), (T, 3) and (T,), with T of 2 or more"
-        )
-    record = np.zeros((len(time), len(RUN_COLUMNS)))
-    record[:, [GAP, SPEED, LEADER_SPEED]], record[:, GAP_BEHIND] = seen, np.inf
-    record[:-1, COMMANDED] = did[:-1]
-    for column, speed in ((REALISED, SPEED), (LEADER_ACCELERATION, LEADER_SPEED)):
-        record[:-1, column] = np.diff(record[:, speed]) / np.diff(time)
-    guard.begin()
-    decisions = list[Decision]()
-    for row, wanted, at, realised in zip(seen[:-1], did, time, record[:, REALISED], strict=False):
-        revision = guard.decide(row, wanted, float(at))
-        decisions.append(Decision(guard.situation, revision, float(realised)))
-    guard.end(failed or bool(seen[-1, 0] <= 0.0), seen[-1])
-    return Episode(time, record, tuple(decisions))
 
 
 # -- What came of an episode ----------------------------------------------------------------------

@@ -100,6 +100,18 @@ class Chunk(NamedTuple):
     #: (E,) who followed whom in them, in a recording of many vehicles
     names: Sequence[str] = ()
 
+    @property
+    def failed(self) -> bool:
+        """Whether an episode of it ended in failure."""
+        return self.failures is not None and len(self.failures) > 0
+
+    @property
+    def fails(self) -> NDArray[np.bool_]:
+        """(T,) with which rows an episode failed."""
+        fails = np.zeros(len(self.times), np.bool_)
+        fails[[] if self.failures is None else self.failures] = True
+        return fails
+
     def rows(self, first: int, end: int) -> Chunk:
         """Some of its rows."""
 
@@ -486,42 +498,6 @@ def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         yield _joined(parts)
 
 
-class LoggedRow(NamedTuple):
-    """A row of a trace, for whoever decides on each."""
-
-    begins: bool  #: an episode
-    time: float  #: [s]
-    values: dict[str, float]  #: of the variables, by their names
-    action: float  #: taken after it, NaN where none is known
-    failed: bool  #: whether the episode ended with it in failure
-
-
-def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterator[LoggedRow]:
-    """The rows of chunks, one by one.
-
-    Parameters
-    ----------
-    chunks : iterable of Chunk
-        As `read_traces` yields them.
-    names : sequence of str
-        Of the variables: ``columns.observe.names``.
-
-    Examples
-    --------
-    >>> z, u = np.array([[9.0, 20.0, 19.0]]), np.array([-1.0])
-    >>> chunk = Chunk("a.csv", z, u, np.zeros(1), np.zeros(1, np.int64), dt=0.1)
-    >>> next(rows_of([chunk])).values
-    {'gap': 9.0, 'v_follower': 20.0, 'v_leader': 19.0}
-    """
-    for chunk in chunks:
-        begins, fails = np.zeros((2, len(chunk.times)), np.bool_)
-        begins[chunk.starts] = True
-        fails[[] if chunk.failures is None else chunk.failures] = True
-        columns = (begins, chunk.times, chunk.observations, chunk.actions, fails)
-        for first, time, values, *rest in zip(*(a.tolist() for a in columns), strict=True):
-            yield LoggedRow(first, time, dict(zip(names, values, strict=True)), *rest)
-
-
 def _joined(parts: Sequence[Chunk]) -> Chunk:
     """Chunks as one; ``jumps`` are those of the last one."""
     before = np.cumsum([0, *(len(part.times) for part in parts[:-1])])
@@ -561,8 +537,7 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
             return
         noted.resampled += 0 if chunk is None else len(chunk.times)
         whole = _joined(parts)
-        times, fails = whole.times, np.zeros(len(whole.times), np.bool_)
-        fails[[] if whole.failures is None else whole.failures] = True
+        times, fails = whole.times, whole.fails
         begins = fails | (not step)  # the row that failed stays as it is
         begins[whole.starts] = begins[0] = True
         if step:

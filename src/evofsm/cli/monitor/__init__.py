@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from hashlib import sha256
@@ -24,6 +23,7 @@ from evofsm.cli.options import (
     argument,
     given_of,
     option,
+    quoted,
     reading_of,
     reads_logs,
     split_names,
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from evofsm.cli.monitor.decider import Decider
     from evofsm.cli.monitor.transports import Transport
     from evofsm.guard import Guard
-    from evofsm.io import Chunk
 
 # Share by which the step of a log may differ from that of the guard.
 _SAME_STEP = 0.05
@@ -181,17 +180,21 @@ def monitor(
         chunks, saved = None, None
         if summary and file is not None and is_log:
             from evofsm.cli.foreseen import show_foreseen
+            from evofsm.cli.learning import episodes_read
             from evofsm.fsm import Labels
 
             used = fresh() if guard else None
             alone = reading.keywords["action"] == "" or isinstance(used and used.judge, Foresight)
             names = used.variables if used else VARIABLES
             if observe is None or set(split_names(observe)) == set(names):  # in its own order
-                observe = _quoted(names)
+                observe = quoted(names)
             if alone:
                 reading = partial(reading, action="")
             asked = reading(observe=observe, episode=episode)
-            chunks, interval = _episodes(file, asked, dated=alone)
+            episodes = episodes_read(str(file), asked, dated=alone)
+            if (first := next(episodes, None)) is None:
+                raise ValueError(f"{file}: no episode has two rows")
+            chunks, interval = chain([first], episodes), first.dt
             if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
                 text = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
                 warn(f"warning: {text} {used.interval:g} s: --resample {used.interval:g}s")
@@ -216,7 +219,7 @@ def monitor(
         _prepare(used, mode, tolerance, audit, stack, learn=learn)
         slots = None
         if not (is_log or traffic):
-            slots = Slots(reading(observe=_quoted(used.variables or VARIABLES), dt=None).columns)
+            slots = Slots(reading(observe=quoted(used.variables or VARIABLES), dt=None).columns)
         rate = RATE if begun and tolerance is None else None
         decider = Decider(used, episode=rows, slots=slots, rate=rate)
         assumed = _of_saved(guard, used) if guard else assumptions(brakes, tolerated)
@@ -252,30 +255,6 @@ def monitor(
             elif decider.rows:
                 decider.end()
     return None
-
-
-def _episodes(
-    file: Path, reading: Reading, *, dated: bool = False
-) -> tuple[Iterator[Chunk], float]:
-    """The episodes of a log, with dates where they are wanted, and the time of a step [s]."""
-    from evofsm.cli.learning import warnings_of
-    from evofsm.io import episodes_of
-    from evofsm.io.logs import Noted
-
-    noted = Noted()
-    episodes = (
-        chunk for chunk in episodes_of(reading.traces([str(file)], noted)) if len(chunk.times) > 1
-    )
-    if (first := next(episodes, None)) is None:
-        raise ValueError(f"{file}: no episode has two rows")
-
-    def all_of_them() -> Iterator[Chunk]:
-        for chunk in chain([first], episodes):
-            yield chunk._replace(times=chunk.times + noted.began) if dated else chunk
-        for warning in warnings_of(noted, reading.columns):
-            warn(f"warning: {warning}")
-
-    return all_of_them(), first.dt
 
 
 def _prepare(
@@ -358,11 +337,6 @@ def _begun(
         tolerance=TOLERANCE if tolerance is None else tolerance,
         mode=Mode.SHADOW,
     )
-
-
-def _quoted(names: Iterable[str]) -> str:
-    """Names, as --observe takes them."""
-    return ",".join('"' + name.replace('"', '""') + '"' for name in names)
 
 
 def _of_saved(path: Path, guard: Guard) -> str:

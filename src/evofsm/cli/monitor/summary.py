@@ -40,8 +40,7 @@ def decided_on_log(decider: Decider, episodes: Iterable[Chunk]) -> Answers:
         for here, wanted, time in zip(seen, episode.actions.tolist(), episode.times, strict=False):
             row = Row(float(time), here, None if math.isnan(wanted) else wanted)
             yield decider.act(row), row
-        failed = episode.failures is not None and len(episode.failures) > 0
-        yield decider.act(End(failed, last)), None
+        yield decider.act(End(episode.failed, last)), None
 
 
 def decided_on_lines(decider: Decider, file: Path) -> Answers:

@@ -84,19 +84,21 @@ def watch(
     begins when the page is first opened. Ctrl-C ends it.
     """
     require(websockets="watch")
-    from evofsm.cli.watch.logged import is_of_cars, watched_log
+    from evofsm.cli.watch.recorded import Recording
 
     is_log = _is_log(what)
     if not is_log and given_of(reading):
         raise ValueError(f"options of columns are for a log, and {what} is none")
-    read = reading() if is_log else None
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         watched: Session | Recording
-        if read is not None and not (what.endswith(".sumocfg") or is_of_cars(read, judge)):
+        if is_log:
             given = None if tolerance == TOLERANCE else tolerance
-            watched = stack.enter_context(watched_log(what, read, given, case))
-        elif is_log or what.endswith(".mcap"):
-            watched = _recorded(what, case, judge, tolerance, brakes, read)
+            logged = _logged(what, reading(), given, case, judge=judge, brakes=brakes)
+            watched = stack.enter_context(logged)
+        elif what.endswith(".mcap"):
+            watched = Recording(what)
+            if case is not None:
+                watched.restart(case - 1)
         else:
             watched = _driven(stack, what, case or 1, world, judge, tolerance, seed, learn_first)
         asyncio.run(_serve(watched, port, browse=not no_browser))
@@ -140,40 +142,21 @@ def _is_log(what: str) -> bool:
     return place.suffix != ".py"
 
 
-def _recorded(
-    what: str,
-    case: int | None,
-    judge: Judge,
-    tolerance: float,
-    brakes: float,
-    reading: Reading | None,
-) -> Recording:
-    """A run that was recorded, or a log with what a guard would have said; read beforehand."""
+def _logged(what: str, reading: Reading, *asked: Any, **settings: Any) -> Session:
+    """A log, or what a configuration of SUMO drives."""
     from tempfile import TemporaryDirectory
 
     from evofsm.cli.sumocfg import trace_configuration
-    from evofsm.cli.watch.recorded import MOST_ROWS, Recording, record_log
+    from evofsm.cli.watch.logged import watched_log
 
-    if reading is None:
-        recording = Recording(what)
-    else:
-        with TemporaryDirectory() as folder, progress("Reading", MOST_ROWS) as move:
-            run, log = Path(folder) / "run.mcap", what
-            settings: dict[str, Any] = {"judge": judge, "brakes": brakes, "tolerance": tolerance}
-            if log.endswith(".sumocfg"):
-                log = str(Path(folder) / Path(what).name)
-                written, is_cut, settings["collisions"] = trace_configuration(
-                    Path(what), Path(log), _SECONDS, _ENOUGH
-                )
-                if is_cut:
-                    warn(f"watched are the first {written:,.0f} s of the simulation")
-            stretches, more = record_log(log, run, reading, **settings, show=move)
-            if more:
-                warn(f"watched are the first {MOST_ROWS:,} rows; there are more")
-            recording = Recording(run, stretches)
-    if case is not None:
-        recording.choose(case - 1)
-    return recording
+    if not what.endswith(".sumocfg"):
+        return watched_log(what, reading, *asked, **settings)
+    with TemporaryDirectory() as folder:
+        log = Path(folder) / Path(what).name
+        written, is_cut, met = trace_configuration(Path(what), log, _SECONDS, _ENOUGH)
+        if is_cut:
+            warn(f"watched are the first {written:,.0f} s of the simulation")
+        return watched_log(str(log), reading, *asked, collisions=met, **settings)
 
 
 def _driven(

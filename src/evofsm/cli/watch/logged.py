@@ -1,74 +1,149 @@
-"""A log of any machine, played row by row beside a guard that has learnt from it."""
+"""A log, played row by row beside a guard: of cars, or one that has learnt from it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from evofsm.cli.foreseen import guard_where_nobody_acts
-from evofsm.cli.learning import guard_of_log, teach, warnings_of
+from evofsm.cli.learning import decided_on, episodes_read, guard_of_log, teach
 from evofsm.cli.options import BRAKES, TOLERANCE, Reading
-from evofsm.cli.show import warn
-from evofsm.cli.watch.session import Logged, Session, is_failed, system_machine
-from evofsm.driving.naming import VARIABLES
+from evofsm.cli.show import progress, warn
+from evofsm.cli.watch.session import Logged, Played, Session, system_machine
+from evofsm.driving.assumed import assumptions, guard_of_monitor
+from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.naming import Labels
 from evofsm.guard import Guard
-from evofsm.io.logs import Chunk, Noted, episodes_of
+from evofsm.io.logs import LONGEST_STEP, Chunk
 
 # Intervals of an action.
 _INTERVALS = 17
-
-
-def is_of_cars(reading: Reading, judge: str) -> bool:
-    """Whether a log is one of a car and its leader."""
-    names = reading.columns.observe.names
-    is_named = names == VARIABLES or (judge == "kinematic" and len(names) == len(VARIABLES))
-    return reading.acts and is_named
+# More rows of cars are not watched, and fewer of an episode; times that differ by less are one [s].
+_ROWS_OF_CARS, _FEWEST_ROWS, _TICK = 20_000, 10, 5e-4
 
 
 def watched_log(
-    path: str, reading: Reading, tolerance: float | None, case: int | None = None
+    path: str,
+    reading: Reading,
+    tolerance: float | None = None,
+    case: int | None = None,
+    *,
+    judge: str = "kinematic",
+    brakes: float = BRAKES,
+    collisions: Mapping[str, Sequence[float]] = MappingProxyType({}),
 ) -> Session:
-    """The episodes of a log, those that failed first, with a guard that learnt from all of them.
+    """The episodes of a log, with a guard that learnt from all of them.
 
+    Of cars an episode is over with a contact; where they come apart again, another one begins. So
+    it is with ``collisions`` that a simulation counted [s], by the name of who follows whom.
     ``case`` is the number of the episode to begin with, in the log and from 1.
     """
-    noted = Noted()
-    every = [e for e in episodes_of(reading.traces([path], noted)) if len(e.times) > 1]
-    for warning in warnings_of(noted, reading.columns):
-        warn(f"warning: {warning}")
-    if case is not None and not 1 <= case <= len(every):
-        raise ValueError(f"episode is {case}; there are 1 to {len(every)}")
-    if not any(is_failed(episode) for episode in every):
+    names = reading.columns.observe.names
+    is_kinematic = reading.acts and judge == "kinematic" and len(names) == len(VARIABLES)
+    of_cars = is_kinematic or (reading.acts and names == VARIABLES)
+    episodes = episodes_read(path, reading, most=_ROWS_OF_CARS + 2 if of_cars else None)
+    found = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
+    if not found:
+        why = f"nobody follows anybody for {_FEWEST_ROWS}" if of_cars else "no episode has two"
+        raise ValueError(f"{path}: {why} rows")
+    if case is not None and not 1 <= case <= len(found):
+        raise ValueError(f"episode is {case}; there are 1 to {len(found)}")
+    if not (of_cars or any(played.fails for played in found)):
         raise ValueError(
             f"{path}: no episode failed, so there is nothing to foresee; --failed says what did"
         )
-    system = Logged(path, every, reading.columns.observe.names, acts=reading.acts)
-    guard = _guard_of(every, system.labels, tolerance, acts=reading.acts)
+    labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
+    rows = [played.rows for played in found]
+    risk = TOLERANCE if tolerance is None else tolerance
+    if not reading.acts:
+        machine = system_machine(1, np.concatenate([chunk.observations for chunk in rows]))
+        _learn_states(machine, rows, IntervalActions(0.0, 1.0, 1.0))
+        guard = guard_where_nobody_acts(rows, labels, None, 0.0, tolerance, machine)
+    elif is_kinematic:
+        guard = guard_of_monitor(rows[0].dt, brakes, risk)
+        assert guard.machine is not None
+        _learn_states(guard.machine, rows, guard.actions)
+        warn(assumptions(brakes, risk))
+    else:
+        guard = _learnt_guard(rows, labels, risk)
     guard.learn = False
+    found = list(_judged(guard, found)) if of_cars else found
+    system = Logged(path, found, labels, acts=reading.acts, of_cars=of_cars)
     return Session(system, guard, case=system.places.get(case or 0, 0), on=False)
 
 
-def _guard_of(
-    episodes: Sequence[Chunk], labels: Labels, tolerance: float | None, *, acts: bool
-) -> Guard:
-    rows, dt = np.concatenate([e.observations for e in episodes]), episodes[0].dt
-    starts = np.cumsum([0, *(len(e.times) for e in episodes[:-1])])
+def _whole(episodes: Iterable[Chunk]) -> Iterator[Played]:
+    for number, episode in enumerate(episodes, 1):
+        yield Played(f"episode {number}", episode, "Failure (by the log)" * episode.failed)
+
+
+def _of_cars(
+    episodes: Iterable[Chunk], collisions: Mapping[str, Sequence[float]]
+) -> Iterator[Played]:
+    """Their stretches, of the first rows."""
+    left = _ROWS_OF_CARS
+    for number, whole in enumerate(episodes, 1):
+        name = "".join(whole.names) or f"episode {number}"
+        stretches = _stretches(whole.rows(0, left), collisions.get(name, ())) if left else ()
+        for rows, fails in stretches:
+            began = f", from {rows.times[0]:.1f} s" if whole.names else ""
+            yield Played(name + began, rows, fails)
+        left -= len(whole.times)
+    if left < 0:
+        warn(f"watched are the first {_ROWS_OF_CARS:,} rows; there are more")
+
+
+def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Chunk, str]]:
+    """Those of an episode that are long enough, and how each failed."""
+    counted = np.zeros(len(episode.times), np.bool_)
+    for time in collisions:  # who collides may be taken off the road before it is written down
+        row = int(np.searchsorted(episode.times, time + _TICK)) - 1
+        counted[row] |= row >= 0 and time - episode.times[row] < LONGEST_STEP * episode.dt
+    touching = counted | (episode.observations[:, 0] <= 0.0)
+    begins = np.flatnonzero(~touching & np.append(True, touching[:-1]))
+    for first in begins.tolist():
+        ends = np.flatnonzero(touching[first:])
+        last = first + int(ends[0]) if len(ends) else len(touching) - 1
+        if last + 1 - first < _FEWEST_ROWS:
+            continue
+        fails = "Failure (by the log)" * bool(episode.fails[last])
+        if touching[last]:
+            fails = "Collision (by SUMO)" if episode.observations[last, 0] > 0.0 else "Collision"
+        rows = episode.rows(first, last + 1)
+        failures = np.array([last - first] if fails else [], np.int64)
+        yield rows._replace(starts=np.zeros(1, np.int64), failures=failures), fails
+
+
+def _judged(guard: Guard, found: Sequence[Played]) -> Iterator[Played]:
+    """With the risk of each row, as the guard finds it."""
+    with progress("Judging", len(found)) as move:
+        for number, played in enumerate(found, 1):
+            risks = [said.risk_proposed for said in decided_on(guard, played.rows)]
+            move(number)
+            yield played._replace(risks=risks)
+
+
+def _learnt_guard(episodes: Sequence[Chunk], labels: Labels, tolerance: float) -> Guard:
     did = np.concatenate([e.actions for e in episodes])
     known = did[np.isfinite(did)]
-    low, high = (float(known.min()), float(known.max())) if acts and len(known) else (0.0, 1.0)
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
     high = high if high > low else low + 1.0
-    actions = IntervalActions(low, high, (high - low) / (_INTERVALS if acts else 1), outside="clip")
-    machine = system_machine(actions.n_actions, rows)
-    if acts:
-        risk = TOLERANCE if tolerance is None else tolerance
-        of = actions, machine, labels.names, labels.units
-        guard = guard_of_log("learnt", dt, BRAKES, risk, *of)
-        teach(guard, episodes, lambda done: None)
-        return guard
-    ends = starts + [len(e.times) - 1 for e in episodes]
-    failures = ends[[is_failed(episode) for episode in episodes]]
-    machine.learn_many(rows, np.zeros(len(rows), np.int64), starts, failures)
-    return guard_where_nobody_acts(episodes, labels, None, 0.0, tolerance, machine)
+    actions = IntervalActions(low, high, (high - low) / _INTERVALS, outside="clip")
+    machine = system_machine(_INTERVALS, np.concatenate([e.observations for e in episodes]))
+    of = actions, machine, labels.names, labels.units
+    guard = guard_of_log("learnt", episodes[0].dt, BRAKES, tolerance, *of)
+    teach(guard, episodes, lambda done: None)
+    return guard
+
+
+def _learn_states(machine: EvolvingFSM, episodes: Sequence[Chunk], actions: Any) -> None:
+    for rows in episodes:
+        did = np.full(len(rows.times), -1)
+        known = np.isfinite(rows.actions)
+        did[known] = actions.encode(rows.actions[known])
+        machine.learn_many(rows.observations, did, [0], rows.failures)

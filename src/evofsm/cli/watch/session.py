@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from evofsm.cli.watch.shown import (
     Judged,
     Known,
     Start,
+    cars_of,
     first_of_its_kind,
     graph_of,
     known_of,
@@ -85,8 +86,9 @@ _APART = 1_000_000
 # Episodes from which is known how far variables spread; states are so many spreads apart, times the
 # root of the number of variables, and there are at most so many.
 _LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
-# So many rows of a long episode are played one by one, and so many in a second.
-_PLAYED, _A_SECOND = 400, 10.0
+# So many rows of a long episode are played one by one, and so many in a second; of cars so much
+# before what is worst [s].
+_PLAYED, _A_SECOND, _BEFORE = 400, 10.0, 10.0
 # What a file may define besides its environment.
 _PARTS = ("controller", "failed", "variables")
 # Of more variables only those of the plane are named.
@@ -142,6 +144,8 @@ def learn_first(
 
 class OnRoads:
     """A family of scenarios for cars in some world; what is learnt first is in closed form."""
+
+    of_cars = True
 
     def __init__(self, family: Family, world: World, seed: int = 0) -> None:
         self.family, self.world, self.seed = family, world, seed
@@ -231,6 +235,8 @@ class Simulated:
     Its guard is given nothing but which episodes failed: those that are terminated, or of which
     ``failed`` says so after a step, as in `evofsm.guard.RevisedActions`.
     """
+
+    of_cars = False
 
     def __init__(
         self,
@@ -378,72 +384,80 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
 # -- A log -----------------------------------------------------------------------------------------
 
 
+class Played(NamedTuple):
+    """An episode of a log, or a stretch of one."""
+
+    name: str
+    rows: Chunk
+    fails: str  #: who says that it failed; empty where it did not
+    risks: Sequence[float] = ()  #: of what was done, where that was judged before
+
+    @property
+    def highest(self) -> float:
+        """The highest risk."""
+        return float(np.nanmax([0.0, *self.risks]))
+
+    @property
+    def called(self) -> str:
+        """Its name, with what is worst in it."""
+        risk = f"risk {self.highest:.1%}" if self.risks else ""
+        worst = self.fails.partition(" ")[0].lower() or risk
+        return f"{self.name} ({worst})" if worst else self.name
+
+
 class Logged:
-    """What a log says happened, whoever asks."""
+    """What a log says happened, whoever asks: what failed first, then the riskiest."""
 
     alone, terminated = math.nan, True
 
     def __init__(
-        self, path: str, episodes: Sequence[Chunk], names: Sequence[str], *, acts: bool
+        self, path: str, played: Sequence[Played], labels: Labels, *, acts: bool, of_cars: bool
     ) -> None:
-        first = [*filter(is_failed, episodes), *(e for e in episodes if not is_failed(e))]
-        self.name, self.interval = path, float(episodes[0].dt)
+        self.name, self.interval = Path(path).name, float(played[0].rows.dt)
         self.about = "each row as it was read."
-        self.labels = Labels(names=tuple(names), dt=self.interval)
-        self.acts = acts
-        numbers = {id(episode): number for number, episode in enumerate(episodes, 1)}
-        order = [numbers[id(episode)] for episode in first]
-        self.places = {number: place for place, number in enumerate(order)}
-        ended = (" (failure)" * is_failed(episode) for episode in first)
-        self.cases = tuple(f"episode {k}{how}" for k, how in zip(order, ended, strict=True))
-        self._episodes = first
-        self.speeds = tuple(_A_SECOND * self.interval * by for by in (0.25, 0.5, 1.0, 2.0, 4.0))
+        self.labels, self.of_cars = labels._replace(dt=self.interval), of_cars
+        ranks = [(not part.fails, -part.highest) for part in played]
+        order = sorted(range(len(played)), key=ranks.__getitem__)
+        self._played = [played[number] for number in order]
+        self.places = {number + 1: place for place, number in enumerate(order)}
+        self.cases = tuple(part.called for part in self._played)
+        self.told: dict[str, Any] = {"mode": "shadow", "acts": acts}
+        if not of_cars:  # which move in real time
+            pace = _A_SECOND * self.interval
+            self.told["speeds"] = tuple(pace * by for by in (0.25, 0.5, 1.0, 2.0, 4.0))
 
     def begin(self, case: int) -> None:
         """Go to the first row of an episode."""
-        self._episode, self._row = self._episodes[case], 0
-        times = self._episode.times - self._episode.times[0]
-        self._times = times.tolist()
-        self.begins = float(times[max(len(times) - _PLAYED, 0)])
+        _, self._rows, fails, risks = self._played[case]
+        times = self._rows.times - self._rows.times[0]
+        self._times, self._fails = times.tolist(), fails
+        self._cars = list(cars_of(times, self._rows.observations)) if self.of_cars else None
+        begins = self._times[max(len(times) - _PLAYED, 0)]
+        if self.of_cars:
+            seen = not fails and np.isfinite(risks).any()
+            begins = self._times[int(np.nanargmax(risks)) if seen else -1] - _BEFORE
+        self.told |= {"begins": begins, "fails": fails}
+        self._go_to(0)
 
-    @property
-    def time(self) -> float:
-        """Since the episode began [s]."""
-        return float(self._times[self._row])
-
-    @property
-    def observation(self) -> NDArray[np.float64]:
-        """The row."""
-        return np.asarray(self._episode.observations[self._row])
-
-    @property
-    def over(self) -> bool:
-        """Whether it is the last one."""
-        return self._row == len(self._times) - 1
-
-    @property
-    def failed(self) -> bool:
-        """Whether that failed."""
-        return self.over and is_failed(self._episode)
+    def _go_to(self, row: int) -> None:
+        self._row, self.over = row, row == len(self._times) - 1
+        self.time, self.observation = self._times[row], self._rows.observations[row]
+        self.failed = self.over and bool(self._fails)
 
     def propose(self) -> Action:
         """What was done."""
-        return float(self._episode.actions[self._row]) if self.acts else 0.0
+        return float(self._rows.actions[self._row]) if self.told["acts"] else 0.0
 
     def advance(self, revision: Revision) -> None:
         """Go to the next row."""
-        self._row += 1
+        self._go_to(self._row + 1)
 
-    def cars(self) -> None:
-        """It is none that it knows of."""
+    def cars(self) -> Cars | None:
+        """Where they are, if it is of cars."""
+        return None if self._cars is None else self._cars[self._row]
 
     def close(self) -> None:
         """There is nothing to leave."""
-
-
-def is_failed(episode: Chunk) -> bool:
-    """Whether an episode of a log failed."""
-    return episode.failures is not None and len(episode.failures) > 0
 
 
 System = OnRoads | Simulated
@@ -483,7 +497,9 @@ class Session(AbstractContextManager["Session"]):
     def _idle(self) -> str:
         """Why the reviser does not act; empty where it does."""
         if not self.revising:
-            return "the reviser only watched" if self._is_log else "the reviser is off"
+            return (
+                "the reviser only watched, in shadow mode" if self._is_log else "the reviser is off"
+            )
         passing: str = self._reviser.passing  # type: ignore[attr-defined]
         why = "was not shown to help yet" if passing == "shadow" else passing
         return passing and f"the guard {why}, so what is proposed passes"
@@ -542,26 +558,22 @@ class Session(AbstractContextManager["Session"]):
     def _begun(self) -> Start:
         system, actions = self.system, self._guard.actions
         low, high = limits(actions)
-        count, is_cars = len(system.observation), isinstance(system, OnRoads)
-        given: dict[str, Any] = {}
-        if isinstance(system, Logged):
-            given = {"mode": "shadow", "acts": system.acts, "speeds": system.speeds}
-            given |= {"begins": system.begins}
+        names = tuple(map(system.labels.variable, range(len(system.observation))))
         return Start(
-            **given,
+            **(system.told if isinstance(system, Logged) else {}),
             system=system.name,
             about=system.about,
             cases=system.cases,
             case=self.case,
             tolerance=self._tolerance,
             interval=system.interval,
-            names=OF_CARS if is_cars else tuple(map(system.labels.variable, range(count))),
+            names=OF_CARS if system.of_cars else names,
             low=numbers(low),
             high=numbers(high),
             discrete=isinstance(actions, Choices),
-            cars=is_cars,
+            cars=system.of_cars,
             learnt=self._guard.n_episodes,
-            judge="learnt" if self._is_log else name_judge(self.judge),
+            judge="learnt" if isinstance(self.judge, Foresight) else name_judge(self.judge),
         )
 
     def _decide(self, frame: Frame) -> Frame:

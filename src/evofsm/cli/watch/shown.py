@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving import LatentRisk, assess_states
-from evofsm.driving.measures import TimeHeadway, TimeToCollision
+from evofsm.driving.measures import TimeHeadway, TimeToCollision, time_headway, time_to_collision
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.guard import Foresight, LearningJudge, LearntRisk
@@ -126,6 +126,20 @@ class Cars(NamedTuple):
     gap_behind: float = math.inf  #: to the car behind [m]; infinite where there is none
     rear_ended: bool = False  #: by the car behind
     decel: float = math.nan  #: of the follower if it brakes in full, as far as is known [m/s²]
+
+
+def cars_of(times: NDArray[np.float64], observed: NDArray[np.float64]) -> Iterator[Cars]:
+    """Where cars were at each time [s] of a record, and how they got there, by the variables."""
+    lasted, speeds = np.diff(times, prepend=math.nan), observed[:, 1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        accelerations = np.diff(speeds, axis=0, prepend=math.nan) / lasted[:, None]
+    moved = 0.5 * (speeds[1:, 0] + speeds[:-1, 0]) * lasted[1:]
+    positions = np.insert(np.cumsum(moved), 0, 0.0)
+    rows = np.column_stack([observed, accelerations, positions]).tolist()
+    for gap, follower, leader, a_follower, a_leader, x in rows:
+        seen = np.array([gap, follower, leader])
+        measures = float(time_to_collision(seen)), float(time_headway(seen))
+        yield Cars(gap, follower, leader, a_follower, a_leader, x, *measures)
 
 
 class Frame(NamedTuple):
