@@ -53,6 +53,7 @@ from evofsm.driving import (
 from evofsm.fsm import Edges, Novelty, StateRule
 from evofsm.guard import TOLERANCE, ActionReviser, Guard, Mode, Reviser, RiskMeasure
 from evofsm.paper import Figure, Page, Table
+from evofsm.plot import COLORS
 from studies import lib
 from studies.lib import Frames, Study, Target, at_least, at_most, frame_of
 from studies.policies import TUNED_MEASURES, Group, RiskByState, fixed_policies
@@ -806,14 +807,6 @@ def _parts(study: ClosedLoop, found: Frames, lines: pl.DataFrame) -> Iterator[Ta
         "test's episodes collide. Learning: collisions while learning.",
         ours,
     )
-    yield Figure(
-        "policies",
-        "Collisions and mobility of all policies",
-        "Held-out episodes, with 95 % intervals; of learners the median seed after all training. "
-        "Collisions are linear up to 1 % and logarithmic beyond, to show 0; a mobility below 0.5 "
-        "is left out.",
-        partial(_draw_policies, lines),
-    )
     best = found["settings"].sort("collision_rate", pl.col("mobility").neg(), maintain_order=True)
     chosen = best.unique("policy", keep="first", maintain_order=True)
     yield Table(
@@ -944,60 +937,29 @@ def _table_of_learning(curve: pl.DataFrame) -> Table:
     )
 
 
-# -- Figures --------------------------------------------------------------------------------------
+# -- The figure -----------------------------------------------------------------------------------
 
-_LOOKS: dict[str, lib.Look] = {
-    Group.BOUND: lib.PLAIN,
-    Group.FIXED: lib.FIXED,
-    Group.TUNED: {**lib.TOLD, "marker": "^"},
-    Group.MATCHED: {**lib.OTHER, "marker": "D"},
-    Group.LEARNT: lib.OURS,
-}
-
-
-def _draw_policies(lines: pl.DataFrame) -> Drawn:
-    """Collisions and mobility, a line for each policy."""
-    last = pl.col("train_episodes") == pl.col("train_episodes").max().over("policy")
-    is_worst = pl.col("which").fill_null("").str.starts_with("worst")
-    shown = lines.filter(last & ~is_worst)
-    names = shown["policy"].to_list()
-    figure, grid = lib.panels(1, 2, 0.7 + 0.2 * len(names), sharey=True)
-    collisions, mobility = grid[0]
-    for group, look in _LOOKS.items():
-        place = np.flatnonzero(shown["group"] == group)
-        some = shown[place]
-        rate = [100.0 * some[f"collision_{end}"].to_numpy() for end in ("rate", "low", "high")]
-        lib.dots(collisions, look, place, *rate)
-        moves = some.with_columns(pl.when(pl.col("mobility") > 0.5).then(pl.col("^mobility.*$")))
-        far = [moves[name].to_numpy() for name in ("mobility", "mobility_low", "mobility_high")]
-        lib.dots(mobility, look, place, *far)
-    lib.name_lines(collisions, names, bold=(OURS, MACHINE))
-    lib.scale_percent(collisions)
-    collisions.set_xlabel("collisions [% of episodes]")
-    mobility.set_xlabel("mobility: distance, in that of the unrevised driver")
-    lib.legend(figure, {str(group): look for group, look in _LOOKS.items()}, 3)
-    return figure
-
-
-_CURVES: dict[str, lib.Look] = {
-    OURS: lib.OURS,
-    MACHINE: {"color": lib.GREEN, "marker": "s", "linestyle": (0, (4, 1.6))},
-    "rss-unchanged": {"color": lib.RED, "linestyle": (0, (1, 1.2))},
+_CURVES: dict[str, dict[str, Any]] = {
+    OURS: {"color": COLORS["follower"]},
+    MACHINE: {"color": COLORS["leader"], "linestyle": (0, (4, 1.6))},
+    "rss-unchanged": {"color": COLORS["dead end"], "linestyle": (0, (1, 1.2))},
 }
 
 
 def _draw_stream(stream: pl.DataFrame) -> Drawn:
     """Collisions along the stream, averaged over episodes and seeds."""
-    figure, ((axes,),) = lib.panels(1, 1, 3.1)
+    figure = Drawn(figsize=(7.2, 3.1), layout="constrained")
+    axes = figure.subplots()
     rates = along_stream(stream)
     for (policy,), one in rates.group_by("policy", maintain_order=True):
+        look = _CURVES[str(policy)]
         for shifted in (False, True):  # the average begins anew
             part = one.filter((pl.col("place") >= 0) == shifted)
             mean, low, high = (100.0 * part[name].to_numpy() for name in ("mean", "low", "high"))
-            look = {**_CURVES[str(policy)], "marker": ""}
-            label = str(policy) if shifted else None
-            lib.curve(axes, look, part["place"].to_numpy() + 1, mean, low, high, label)
-    axes.axvline(0.5, color=lib.INK, linewidth=0.8)
+            at, label = part["place"].to_numpy() + 1, str(policy) if shifted else None
+            axes.fill_between(at, low, high, color=look["color"], alpha=0.18, linewidth=0.0)
+            axes.plot(at, mean, label=label, clip_on=False, zorder=4.0, **look)
+    axes.axvline(0.5, color=COLORS["ink"], linewidth=0.8)
     axes.annotate("shift, unsaid", (0.5, 103.0), ha="center", va="bottom", annotation_clip=False)
     axes.set(xlabel="episode, counted from the shift", ylabel="collisions [%], last 10 episodes")
     axes.set_ylim(-3.0, 103.0)

@@ -1,4 +1,4 @@
-"""What all studies share: their commands, work over processes, intervals, scores and figures.
+"""What all studies share: their commands, work over processes, intervals and scores.
 
 A study is a frozen dataclass that derives from `Study`, in a file of its own. Its fields are the
 options of its command, as Typer takes them; `run` returns rows as polars frames, one row per unit
@@ -27,9 +27,6 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeVar, get_orig
 import numpy as np
 import polars as pl
 import typer
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure as Drawn
-from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import isotonic_regression
 from scipy.stats import beta
@@ -37,7 +34,6 @@ from scipy.stats import beta
 from evofsm.cli import print_json
 from evofsm.extras import install
 from evofsm.paper import Page, print_page, write_page
-from evofsm.plot import COLORS
 
 #: Rows of a study by name; those of its main table are called ``"rows"``.
 Frames = Mapping[str, pl.DataFrame]
@@ -515,90 +511,3 @@ def isotonic(score: ArrayLike, truth: ArrayLike) -> Calibration:
     came = np.bincount(which, weights=np.asarray(truth, dtype=np.float64)) / cases
     fitted = isotonic_regression(came, weights=cases.astype(np.float64)).x
     return Calibration(scores, np.clip(fitted, 0.0, 1.0))
-
-
-# -- Figures --------------------------------------------------------------------------------------
-# Colours are those of all figures of evofsm; a line differs from others in its marker or dashes as
-# well, so that neither is needed.
-
-Look = dict[str, Any]
-_NAMES = ("follower", "leader", "dead end", "third", "ink", "soft")
-BLUE, GREEN, RED, PINK, INK, SOFT = (COLORS[name] for name in _NAMES)
-#: Of who is ours, of fixed constants, of what is tuned or told, of another learner, and of chance.
-OURS: Look = {"color": BLUE, "marker": "o"}
-FIXED: Look = {"color": RED, "marker": "s"}
-TOLD: Look = {"color": GREEN, "marker": "D"}
-OTHER: Look = {"color": PINK, "marker": "^"}
-PLAIN: Look = {"color": SOFT, "marker": "X"}
-
-
-def panels(rows: int, columns: int, height: float, **shared: Any) -> tuple[Drawn, Any]:
-    """A figure as wide as a page, ``height`` inches high, and its (rows, columns) axes.
-
-    Several have letters.
-    """
-    figure = Drawn(figsize=(7.2, height), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, **shared)
-    for letter, axes in zip("abcdef" if grid.size > 1 else "", grid.flat, strict=False):
-        axes.set_title(letter, fontweight="bold")
-    return figure, grid
-
-
-def legend(figure: Drawn, looks: Mapping[str, Look], columns: int | None = None) -> None:
-    """Explain looks above all panels."""
-    usual: Look = {"linestyle": "none", "markersize": 4.5}
-    figure.legend(
-        handles=[Line2D([], [], label=name, **{**usual, **look}) for name, look in looks.items()],
-        loc="outside upper center",
-        ncols=columns or len(looks),
-        columnspacing=1.1,
-        handletextpad=0.4,
-    )
-
-
-def level(axes: Axes, value: float, *, across: bool = True) -> None:
-    """A broken line at a height, or at a place on the lower axis, behind all else."""
-    draw = axes.axhline if across else axes.axvline
-    draw(value, color=SOFT, linewidth=0.8, linestyle=(0, (4, 2)), zorder=1.0)
-
-
-def name_lines(axes: Axes, names: Sequence[str], bold: Sequence[str] = ()) -> None:
-    """Name the lines 0, 1, ... of a panel, from above."""
-    axes.set_ylim(len(names) - 0.5, -0.5)
-    axes.set_yticks(range(len(names)), names)
-    axes.tick_params(axis="y", length=0.0)
-    axes.grid(visible=False, axis="y")
-    for label in axes.get_yticklabels():
-        label.set_fontweight("bold" if label.get_text() in bold else "normal")
-
-
-def dots(
-    axes: Axes, look: Look, lines: ArrayLike, values: ArrayLike, low: ArrayLike, high: ArrayLike
-) -> None:
-    """Dots with intervals, each on its line of the panel (see `name_lines`); NaN is left out."""
-    axes.hlines(lines, low, high, color=look["color"], linewidth=1.1, zorder=3.0)
-    usual: Look = {"linestyle": "none", "clip_on": False, "zorder": 4.0, "markersize": 4.5}
-    axes.plot(values, lines, **{**usual, **look})
-
-
-def curve(
-    axes: Axes,
-    look: Look,
-    x: ArrayLike,
-    y: ArrayLike,
-    low: ArrayLike | None = None,
-    high: ArrayLike | None = None,
-    label: str | None = None,
-) -> None:
-    """A curve, with a band from ``low`` to ``high`` where they are given."""
-    if low is not None and high is not None:
-        axes.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0.0)
-    axes.plot(x, y, label=label, **{"markersize": 3.5, "clip_on": False, "zorder": 4.0, **look})
-
-
-def scale_percent(axes: Axes, along: str = "x") -> None:
-    """Percent from 0 to 100 with room for what is rare: linear up to 1 %, logarithmic beyond."""
-    getattr(axes, f"set_{along}scale")("symlog", linthresh=1.0, linscale=0.7)
-    getattr(axes, f"set_{along}lim")(-0.12, 130.0)
-    getattr(axes, f"set_{along}ticks")([0, 1, 10, 100], ["0", "1", "10", "100"])
-    axes.minorticks_off()

@@ -192,8 +192,9 @@ class Peers(lib.Study):
             self.runs.mkdir(parents=True, exist_ok=True)
             warm()  # once, not in each process
             left = [partial(finish, job, self.runs) for job in jobs if not job.row(self.runs)]
-            for why in filter(None, lib.parallel(left, workers, "Training")):
-                print(f"warning: {why}", file=sys.stderr)
+            for why in lib.parallel(left, workers, "Training"):
+                if why:
+                    print(f"warning: {why}", file=sys.stderr)
         rows = [row for job in jobs if (row := job.row(self.runs))]
         if not rows:
             raise ValueError(f"nothing is finished in {self.runs}")
