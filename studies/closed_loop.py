@@ -6,8 +6,7 @@ each other, `evofsm-machine` nothing but which episodes failed.
 
 Frames: ``rows`` (a policy and learning seed on the held-out draws), ``curve`` (a test while it
 learns), ``settings`` (what a policy reaches at one setting), ``rules`` (risk read through states
-alone), ``separation`` (a measure, at telling dead ends apart), ``cases`` (a run of the paper's
-cases), ``worlds`` (the same model in SUMO and in closed form), ``stream`` (an episode around a
+alone), ``cases`` (a run of the paper's cases), ``worlds`` (the same model in SUMO and in closed form), ``stream`` (an episode around a
 shift), ``checks`` (a test around it). Rates are shares, accelerations m/s², jerk m/s³.
 """
 
@@ -51,7 +50,7 @@ from evofsm.driving import (
     unrevised_guard,
 )
 from evofsm.fsm import Edges, Novelty, StateRule
-from evofsm.guard import TOLERANCE, ActionReviser, Guard, Mode, Reviser, RiskMeasure
+from evofsm.guard import TOLERANCE, ActionReviser, Guard, Reviser
 from evofsm.paper import Figure, Page, Table
 from evofsm.plot import COLORS
 from studies import lib
@@ -115,8 +114,7 @@ class ClosedLoop(Study):
     rule_test: int = 100  #: held-out episodes in it, and in the trade-off
     rule_train: int = 60  #: training episodes in it
     check_test: int = 200  #: held-out episodes of the tests on the way
-    side_train: int = 100  #: training episodes of all that stands below the table
-    side_test: int = 300  #: held-out episodes of it
+    side_train: int = 100  #: training episodes of what is driven in both worlds
     world_test: int = 50  #: episodes driven in both worlds
     machine_test: int = 1000  #: held-out episodes of `MACHINE` at most
     machine_check: int = 50  #: held-out episodes of its tests on the way
@@ -137,7 +135,6 @@ class ClosedLoop(Study):
             rule_seeds=min(self.rule_seeds, 1),
             rule_test=20,
             side_train=40,
-            side_test=60,
             world_test=5,
             machine_test=40,
             machine_check=10,
@@ -168,7 +165,6 @@ class ClosedLoop(Study):
             *(partial(_test_learner, self, OURS, seed) for seed in seeds),
             *(partial(_test_rule, self, r, s) for r in RULES for s in seeds[: self.rule_seeds]),
             *(partial(_test_learner, self, one, s) for one in learners[1:] for s in seeds),
-            partial(_separate, self),
         ]
         if find_spec("libsumo") is not None:
             tasks.append(partial(_drive_both_worlds, self))
@@ -392,39 +388,6 @@ def _test_rule(study: ClosedLoop, rule: str, seed: int) -> Found:
 # -- Below the table; each learns with one seed ---------------------------------------------------
 
 
-def _separate(study: ClosedLoop) -> Found:
-    """Score every measure at every decision of unrevised runs; ours has watched, without acting.
-
-    The truth is a dead end: both cars brake as hard as they can from now on, and still collide.
-    """
-    family, test = study.drawn_from, study.side_test
-    risk = LatentRisk(family.low, family.interval)
-    watching = guard_for_family(family, tolerance=0.01, mode=Mode.SHADOW, judge=risk)
-    teach(watching, training(family, study.seed, 0, study.side_train))
-    compared: dict[tuple[str, str], RiskMeasure] = {
-        (OURS, Group.LEARNT): risk,
-        ("rss-matched", Group.MATCHED): _true_limits(family),
-        **{(name, Group.FIXED): measure for name, measure in measures.FIXED_MEASURES.items()},
-    }
-    alone = teach(unrevised_guard(family), held_out(family, study.seed, test))
-    seen = [np.array([one.situation.observation for one in run.decisions]) for run in alone]
-    truth = measures.is_dead_end(np.concatenate(seen), family.decel, family.leader_decel)
-    episode = np.repeat(np.arange(test), [len(rows) for rows in seen])
-    found = []
-    for (name, group), measure in compared.items():
-        scores = np.concatenate([measure.score(rows, family.interval) for rows in seen])
-        ranked = lib.Ranked(scores, truth, episode)
-        low, high = ranked.interval()[0]
-        row = {"measure": name, "group": group, "auroc": ranked.areas().auroc}
-        share = {"dead_end_share": float(truth.mean()), "episodes": test}
-        found.append(row | {"auroc_low": low, "auroc_high": high} | share)
-    return {"separation": found}
-
-
-def _true_limits(family: Family) -> measures.ResponsibilitySensitiveSafety:
-    return measures.ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
-
-
 def _drive_both_worlds(study: ClosedLoop) -> Found:
     """Learn in closed form, then drive the same draws in every world with learning frozen."""
     family = study.drawn_from
@@ -520,7 +483,8 @@ def _shift(study: ClosedLoop, policy: str, seed: int) -> Found:
 def _shift_unchanged(study: ClosedLoop, seed: int) -> Found:
     """The same with a safe distance whose constants were right before; it learns nothing."""
     family, name = study.drawn_from, "rss-unchanged"
-    reviser = EnvelopeReviser(_true_limits(family), family.actions, family.interval)
+    told = measures.ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
+    reviser = EnvelopeReviser(told, family.actions, family.interval)
     guard = Guard.of(reviser, interval=family.interval, learn=False)
     places, draws = zip(*_stream(study, seed), strict=True)
     drives = teach(guard, draws)
@@ -737,13 +701,6 @@ def _lost(found: Frames, lines: pl.DataFrame) -> Iterator[Table]:
             worse.filter(pl.col("median") > pl.col("theirs") + _ROUNDING),
             {"episodes after": "{after}", "evofsm, median": "{median:%}", "theirs": "{theirs:%}"},
         )
-    apart = lib.compared(found["separation"].with_columns(one=1), _LEARNT, ["one"])
-    yield Table(
-        "Measures that tell dead ends apart better",
-        apart.filter(pl.col("auroc") > pl.col("auroc_ours")),
-        {"measure": "{measure}", "told": "{group}", "AUROC": "{auroc:.4f}"}
-        | {"evofsm": "{auroc_ours:.4f}", "95 %": "{auroc_low_ours:.4f}–{auroc_high_ours:.4f}"},
-    )
     if "cases" in found:
         needless = ~pl.col("unrevised_collided") & (pl.col("changed") > 0.0)
         yield Table(
@@ -845,20 +802,6 @@ def _parts(study: ClosedLoop, found: Frames, lines: pl.DataFrame) -> Iterator[Ta
             "safe distance with the limits that were true before it.",
             partial(_draw_stream, found["stream"]),
         )
-    yield Table(
-        "Telling dead ends from the rest",
-        found["separation"].sort("auroc", descending=True, nulls_last=True),
-        {
-            "measure": "{measure}",
-            "told": "{group}",
-            "AUROC": "{auroc:.4f}",
-            "95 %": "{auroc_low:.4f}–{auroc_high:.4f}",
-            "dead ends": "{dead_end_share:%}",
-        },
-        "Every decision of unrevised held-out episodes; the truth is the oracle's dead end. 0.5 is "
-        "chance, 1 perfect. Intervals by bootstrap over episodes.",
-        pl.when(_LEARNT).then(pl.lit("ours")),
-    )
     if "rules" in found:
         yield Table(
             "Steering by the states alone",

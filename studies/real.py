@@ -181,8 +181,6 @@ FIXED: Mapping[str, RiskMeasure] = {
     "headway": measures.TimeHeadway(),
     "rss-r157": measures.ResponsibilitySensitiveSafety.r157(),
 }
-# Of drivers' own braking manoeuvres so many are at least as hard as their everyday braking.
-_EVERYDAY = 0.9
 # Cases of the overall share that are added to those of a state.
 _LEAN = 2.0
 # Closing rate [1/s], leader's acceleration [m/s²] and logarithm of the time headway in which a
@@ -323,19 +321,6 @@ def learn_logistic(training: Sequence[Case], held_out: Sequence[Case]) -> Learnt
     return {"logistic": scores}
 
 
-def _fit_logistic(rows: Floats, came: Bools) -> Floats:
-    """Weights by Newton's method, with a ridge that keeps them finite where few events came."""
-    weights = np.zeros(rows.shape[1])
-    penalty = _RIDGE * max(float(came.sum()), 1.0) * np.eye(len(weights))
-    for _ in range(_NEWTON_STEPS):
-        share = 1.0 / (1.0 + np.exp(-np.clip(rows @ weights, -30.0, 30.0)))
-        slope = rows.T @ (came - share) - penalty @ weights
-        curve = (rows * (share * (1.0 - share))[:, None]).T @ rows + penalty
-        step = np.linalg.solve(curve, slope)
-        weights += step
-        if np.abs(step).max() < 1e-8:
-            break
-    return weights
 
 
 _LEARNERS: tuple[Callable[[Sequence[Case], Sequence[Case]], Learnt], ...] = (

@@ -11,7 +11,6 @@ TINY = ClosedLoop(
     rule_seeds=1,
     rule_test=3,
     side_train=10,
-    side_test=10,
     world_test=2,
     machine_check=4,
     machine_train=10,
