@@ -6,8 +6,9 @@ each other, `evofsm-machine` nothing but which episodes failed.
 
 Frames: ``rows`` (a policy and learning seed on the held-out draws), ``curve`` (a test while it
 learns), ``settings`` (what a policy reaches at one setting), ``rules`` (risk read through states
-alone), ``cases`` (a run of the paper's cases), ``worlds`` (the same model in SUMO and in closed form), ``stream`` (an episode around a
-shift), ``checks`` (a test around it). Rates are shares, accelerations m/s², jerk m/s³.
+alone), ``cases`` (a run of the paper's cases), ``worlds`` (the same model in SUMO and in closed
+form), ``stream`` (an episode around a shift), ``checks`` (a test around it). Rates are shares,
+accelerations m/s², jerk m/s³.
 """
 
 from __future__ import annotations
@@ -114,7 +115,7 @@ class ClosedLoop(Study):
     rule_test: int = 100  #: held-out episodes in it, and in the trade-off
     rule_train: int = 60  #: training episodes in it
     check_test: int = 200  #: held-out episodes of the tests on the way
-    side_train: int = 100  #: training episodes of what is driven in both worlds
+    world_train: int = 100  #: training episodes of what is driven in both worlds
     world_test: int = 50  #: episodes driven in both worlds
     machine_test: int = 1000  #: held-out episodes of `MACHINE` at most
     machine_check: int = 50  #: held-out episodes of its tests on the way
@@ -134,7 +135,7 @@ class ClosedLoop(Study):
             machine_train=min(self.machine_train, 40),
             rule_seeds=min(self.rule_seeds, 1),
             rule_test=20,
-            side_train=40,
+            world_train=40,
             world_test=5,
             machine_test=40,
             machine_check=10,
@@ -392,7 +393,7 @@ def _drive_both_worlds(study: ClosedLoop) -> Found:
     """Learn in closed form, then drive the same draws in every world with learning frozen."""
     family = study.drawn_from
     guard = guard_for_family(family, tolerance=study.tolerance)
-    teach(guard, training(family, study.seed, 0, study.side_train))
+    teach(guard, training(family, study.seed, 0, study.world_train))
     found = []
     for name, opened in (("sumo", SumoWorld()), ("kinematic", nullcontext(KinematicWorld()))):
         tested, draws = _frozen(guard), held_out(family, study.seed, study.world_test)

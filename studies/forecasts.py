@@ -509,8 +509,8 @@ def cases(runs: Sequence[Run], every: int) -> Cases:
 REPLAY = "evofsm-replay"  #: ours
 # Recorded behaviours that are replayed after an action, and neighbours that are asked.
 _BEHAVIOURS, _NEIGHBOURS = 8, 25
-# Of the logistic regression: penalty of each standardised weight, and iterations.
-_RIDGE, _ITERATIONS = 1e-2, 25
+# Of the logistic regression: penalty of each standardised weight.
+_RIDGE = 1e-2
 # Extrapolation looks so far [steps].
 _FARTHEST = 200
 
@@ -570,28 +570,14 @@ class Replays:
 
 
 class Logistic:
-    """Logistic regression on observation, change, action and the products of all of them.
-
-    Fitted by iteratively reweighted least squares with a small ridge.
-    """
+    """Logistic regression on observation, change, action and the products of all of them."""
 
     def __init__(self, train: Cases, truth: Bools) -> None:
         raw = _products(_inputs(train))
         self._mean, self._scale = raw.mean(axis=0), _spread(raw)
         X = self._features(train)
-        penalty = _RIDGE * np.eye(X.shape[1])
-        penalty[0, 0] = 1e-9
-        self.weights = np.zeros(X.shape[1])
-        y = truth.astype(np.float64)
-        for _ in range(_ITERATIONS):
-            p = expit(X @ self.weights)
-            w = np.maximum(p * (1.0 - p), 1e-6)
-            gradient = X.T @ (y - p) - penalty @ self.weights
-            step = np.linalg.solve((X.T * w) @ X + penalty, gradient)
-            size = np.abs(step).max()
-            self.weights += step * min(1.0, 5.0 / max(size, 1e-12))
-            if size < 1e-6:
-                break
+        ridge = np.append(1e-9, np.full(X.shape[1] - 1, _RIDGE))
+        self.weights = lib.logistic(X, truth, ridge)
 
     def __call__(self, some: Cases) -> Floats:
         """(n,) probability."""

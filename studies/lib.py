@@ -29,6 +29,7 @@ import polars as pl
 import typer
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import isotonic_regression
+from scipy.special import expit
 from scipy.stats import beta
 
 from evofsm.cli import print_json
@@ -468,16 +469,6 @@ class Ranked:
         return interval(found[:, 0]), interval(found[:, 1])
 
 
-def brier(probability: ArrayLike, truth: ArrayLike) -> float:
-    """Mean squared error of probabilities (G. W. Brier, Monthly Weather Review 78, 1950).
-
-    >>> brier([0.0, 0.5, 1.0], [False, True, True])
-    0.08333333333333333
-    """
-    error = np.asarray(probability, dtype=np.float64) - np.asarray(truth, dtype=np.float64)
-    return float((error**2).mean()) if error.size else math.nan
-
-
 class Calibration(NamedTuple):
     """Turns a score into a probability that never falls as the score rises; see `isotonic`."""
 
@@ -511,3 +502,25 @@ def isotonic(score: ArrayLike, truth: ArrayLike) -> Calibration:
     came = np.bincount(which, weights=np.asarray(truth, dtype=np.float64)) / cases
     fitted = isotonic_regression(came, weights=cases.astype(np.float64)).x
     return Calibration(scores, np.clip(fitted, 0.0, 1.0))
+
+
+def logistic(rows: ArrayLike, came: ArrayLike, ridge: ArrayLike) -> NDArray[np.float64]:
+    """(k,) weights of a logistic regression on ``rows`` (n, k), by Newton's method.
+
+    The ridge, one of each weight, keeps them finite where few cases came.
+
+    >>> logistic([[1.0], [1.0], [1.0], [1.0]], [True, True, True, False], [0.0]).round(4)
+    array([1.0986])
+    """
+    X, y, penalty = (np.asarray(one, dtype=np.float64) for one in (rows, came, ridge))
+    weights = np.zeros(X.shape[1])
+    for _ in range(25):
+        p = expit(X @ weights)
+        slope = X.T @ (y - p) - penalty * weights
+        curve = (X.T * np.maximum(p * (1.0 - p), 1e-6)) @ X + np.diag(penalty)
+        step = np.linalg.solve(curve, slope)
+        size = float(np.abs(step).max())
+        weights += step * min(1.0, 5.0 / max(size, 1e-12))
+        if size < 1e-6:
+            break
+    return weights
