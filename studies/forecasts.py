@@ -5,11 +5,10 @@ method forecasts the same rows of held-out drives. Failures: of tasks that other
 three rivals learn the same episodes of mixed controllers, and say how likely it is to fail within
 so many steps if an action is taken now.
 
-Frame ``rows``: a ``method`` on a ``source``, so many seconds ahead (``horizon``). ``jsd`` is the
-mean divergence from the belief that came, ``log_score`` the mean log score [bit]; ``skill`` and
-``log_skill`` are those against persistence in the same states, with 95 % intervals over test
-episodes; ``over_batch`` is the skill against the batch fit, ``worst`` that of the worst learning
-seed or part of the runs.
+Frame ``rows``: a ``method`` on a ``source``, so many seconds ahead (``horizon``). ``skill`` (of the
+mean divergence from the belief that came) and ``log_skill`` (of the mean log score) are those
+against persistence in the same states, with 95 % intervals over test episodes; ``over_batch`` is
+the skill against the batch fit, ``worst`` that of the worst learning seed or part of the runs.
 
 Frame ``failures``: a ``method`` on a ``task`` within so many ``steps``, with the Brier score of
 calibrated probabilities; ``base`` is that of always saying the share of failures.
@@ -298,7 +297,6 @@ def score(
                 "episode": number,
                 "divergence": float(np.sum(jensen_shannon(predicted, came))),
                 "excess": float((logs - best).sum()),
-                "log_score": float(logs.sum()),
                 "forecasts": len(origins),
             }
 
@@ -351,7 +349,7 @@ def add_up(sums: pl.DataFrame, rounds: int, seed: int) -> Iterator[dict[str, Any
     parts = sums.partition_by(*key, as_dict=True, maintain_order=True)
     added = {
         name: part.group_by("part", "episode", maintain_order=True)
-        .agg(pl.col("divergence", "excess", "log_score", "forecasts").sum())
+        .agg(pl.col("divergence", "excess", "forecasts").sum())
         .sort("part", "episode")
         for name, part in parts.items()
     }
@@ -363,8 +361,6 @@ def add_up(sums: pl.DataFrame, rounds: int, seed: int) -> Iterator[dict[str, Any
         still, rival = ((source, horizon, name) for name in REFERENCES[str(method)])
         n = int(mine["forecasts"].sum())
         row = dict(zip(key, (source, horizon, method), strict=True))
-        row |= {"jsd": float(mine["divergence"].sum()) / n}
-        row |= {"log_score": float(mine["log_score"].sum()) / n}
         for kind, prefix in (("divergence", ""), ("excess", "log_")):
             scores, reference = mine[kind].to_numpy(), added[still][kind].to_numpy()
             drawn = partial(_skill_of, scores, reference)
