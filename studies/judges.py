@@ -313,7 +313,7 @@ def trial(
     >>> row["failed"], row["kept"], row["mean_change"]
     (5, 1.0, 0.0)
     """
-    system = make_system(name, controller)
+    system: Any = make_system(name, controller)
     system = benchmark.Changed(system, change) if change else system
     made = make_judge(judge, system, lib.names_in(without), seed)
     train = system.train if train is None else train
