@@ -5,10 +5,9 @@ learning seeds; tuned baselines are tuned on the training draws. `evofsm` is tol
 each other, `evofsm-machine` nothing but which episodes failed.
 
 Frames: ``rows`` (a policy and learning seed on the held-out draws), ``curve`` (a test while it
-learns), ``settings`` (what a policy reaches at one setting), ``rules`` (risk read through states
-alone), ``cases`` (a run of the paper's cases), ``worlds`` (the same model in SUMO and in closed
-form), ``stream`` (an episode around a shift), ``checks`` (a test around it). Rates are shares,
-accelerations m/s², jerk m/s³.
+learns), ``rules`` (risk read through states alone), ``cases`` (a run of the paper's cases),
+``worlds`` (the same model in SUMO and in closed form), ``stream`` (an episode around a shift),
+``checks`` (a test around it). Rates are shares, accelerations m/s², jerk m/s³.
 """
 
 from __future__ import annotations
@@ -67,8 +66,6 @@ SAFE_RATE = 0.01
 #: After so many training episodes a learner is tested, and so many after a shift.
 CHECKPOINTS = {OURS: (0, 1, 2, 5, 10, 20, 50, 100, 200, 300), MACHINE: (0, 2, 5, 10, 30, 100)}
 AFTER = {OURS: (0, 1, 2, 5, 10, 20, 30), MACHINE: (0, 10, 30)}
-#: Tolerances of the trade-off.
-TOLERANCES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
 #: State rules that are compared, by name.
 RULES: dict[str, StateRule | None] = {
     "paper": None,
@@ -112,7 +109,7 @@ class ClosedLoop(Study):
     rule_seeds: Annotated[
         int, Option(min=0, help="Learning seeds in the comparison of state rules; 0: none.")
     ] = 2
-    rule_test: int = 100  #: held-out episodes in it, and in the trade-off
+    rule_test: int = 100  #: held-out episodes in it
     rule_train: int = 60  #: training episodes in it
     check_test: int = 200  #: held-out episodes of the tests on the way
     world_train: int = 100  #: training episodes of what is driven in both worlds
@@ -260,12 +257,6 @@ def _collisions(outcomes: Sequence[Outcome]) -> int:
     return sum(one.collided for one in outcomes)
 
 
-def _setting(policy: str, setting: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    rate = _collisions(outcomes) / len(outcomes)
-    mobility = _mobility(outcomes)
-    return {"policy": policy, "setting": setting, "collision_rate": rate, "mobility": mobility}
-
-
 def _frozen(guard: Guard) -> Guard:
     """A copy that decides by what was learnt so far, and learns nothing."""
     copy = guard.copy(states=False)
@@ -291,16 +282,15 @@ def _test_tuned(study: ClosedLoop, name: str) -> Found:
         EnvelopeReviser(measure, family.actions, family.interval)
         for measure in TUNED_MEASURES[name]
     ]
-    tried = [
-        _setting(name, repr(reviser.measure), course.under(repeat(reviser))) for reviser in revisers
-    ]
-    best = min(range(len(tried)), key=lambda i: (tried[i]["collision_rate"], -tried[i]["mobility"]))
-    tests, driven = _tests(study, study.test), len(course.draws) * len(tried)
-    outcomes = tests.under(repeat(revisers[best]))
-    return {
-        "rows": [tests.row(name, Group.TUNED, outcomes, train_episodes=driven)],
-        "settings": tried,
-    }
+
+    def loses(reviser: Reviser) -> tuple[int, float]:
+        outcomes = course.under(repeat(reviser))
+        return _collisions(outcomes), -_mobility(outcomes)
+
+    best = min(revisers, key=loses)
+    tests, driven = _tests(study, study.test), len(course.draws) * len(revisers)
+    outcomes = tests.under(repeat(best))
+    return {"rows": [tests.row(name, Group.TUNED, outcomes, train_episodes=driven)]}
 
 
 def _learner(study: ClosedLoop, policy: str, seed: int) -> Guard:
@@ -354,12 +344,6 @@ def _test_learner(study: ClosedLoop, policy: str, seed: int) -> Found:
             found["rows"].append(row)
     if is_machine and tests.family.name == "paper":
         found["cases"] = _revised_cases(study, policy, guard, seed)
-    if policy == OURS and seed == 0:
-        found["settings"] = []
-        for tolerance in TOLERANCES:
-            other = guard_for_family(tests.family, tolerance=tolerance, judge=guard.judge)
-            outcomes = tests.first(study.rule_test).by(other)
-            found["settings"].append(_setting(OURS, f"tolerance {tolerance:g}", outcomes))
     return found
 
 
@@ -764,20 +748,6 @@ def _parts(study: ClosedLoop, found: Frames, lines: pl.DataFrame) -> Iterator[Ta
         "proposed| over all decisions. Until safe: training episodes until at most 1 % of a "
         "test's episodes collide. Learning: collisions while learning.",
         ours,
-    )
-    best = found["settings"].sort("collision_rate", pl.col("mobility").neg(), maintain_order=True)
-    chosen = best.unique("policy", keep="first", maintain_order=True)
-    yield Table(
-        "Settings: ours over its tolerance, and what tuning chose",
-        pl.concat([found["settings"].filter(policy=OURS), chosen.filter(pl.col("policy") != OURS)]),
-        {
-            "policy": "{policy}",
-            "setting": "{setting}",
-            "collisions": "{collision_rate:%}",
-            "mobility": "{mobility:.3f}",
-        },
-        "Ours: one learning seed after all training, on the first held-out episodes. The others: "
-        "on training episodes.",
     )
     yield _table_of_learning(found["curve"])
     if "checks" in found:
