@@ -261,10 +261,8 @@ def frame_of(rows: Iterable[Any]) -> pl.DataFrame:
     return pl.DataFrame(plain, infer_schema_length=None)
 
 
-def with_share(
-    frame: pl.DataFrame, held: str, tried: str, name: str, confidence: float = 0.95
-) -> pl.DataFrame:
-    """Add a share and its exact interval (C. Clopper, E. Pearson, Biometrika 26, 1934).
+def with_share(frame: pl.DataFrame, held: str, tried: str, name: str) -> pl.DataFrame:
+    """Add a share and its exact 95 % interval (C. Clopper, E. Pearson, Biometrika 26, 1934).
 
     Parameters
     ----------
@@ -273,7 +271,6 @@ def with_share(
         Columns: so many of so many.
     name : str
         Columns ``name``, ``name_low`` and ``name_high`` are added; of none tried the share is null.
-    confidence : float
 
     Examples
     --------
@@ -281,7 +278,7 @@ def with_share(
     >>> with_share(frame, "failed", "episodes", "rate")["rate_high"].round(4).to_list()
     [0.0037, 0.6525]
     """
-    low, high = exact_interval(frame[held].to_numpy(), frame[tried].to_numpy(), confidence)
+    low, high = exact_interval(frame[held].to_numpy(), frame[tried].to_numpy())
     share = pl.when(pl.col(tried) > 0).then(pl.col(held) / pl.col(tried))
     return frame.with_columns(
         share.alias(name), pl.Series(f"{name}_low", low), pl.Series(f"{name}_high", high)
@@ -289,12 +286,11 @@ def with_share(
 
 
 def exact_interval(
-    held: ArrayLike, tried: ArrayLike, confidence: float = 0.95
+    held: ArrayLike, tried: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ends of the exact interval of a share, so many of so many; 0 and 1 of none."""
+    """Ends of the exact 95 % interval of a share, so many of so many; 0 and 1 of none."""
     k, n = np.asarray(held, np.float64), np.asarray(tried, np.float64)
-    tail = 0.5 * (1.0 - confidence)
-    low, high = beta.ppf(tail, k, n - k + 1.0), beta.ppf(1.0 - tail, k + 1.0, n - k)
+    low, high = beta.ppf(0.025, k, n - k + 1.0), beta.ppf(0.975, k + 1.0, n - k)
     return np.where(k == 0.0, 0.0, low), np.where(k == n, 1.0, high)
 
 
