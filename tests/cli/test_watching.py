@@ -309,6 +309,7 @@ def test_a_failure_that_a_log_tells_of_is_no_collision_but_a_failure(tmp_path):
     stretches, _ = record_log(str(tmp_path / "log.csv"), tmp_path / "run.mcap", reading)
     shown = Recording(tmp_path / "run.mcap", stretches)
     assert shown.start.cases == ("episode 1 (failure)",)
+    assert read_run(tmp_path / "run.mcap").model.endings.sum() == 1.0  # and it was learnt
     told = tell(drive(shown)[-1], shown.start)
     assert told.headline == "Failure (by the log)"
     assert "at 2.5\xa0s, 10.0\xa0m/s faster than the leader, 5.0\xa0m behind it." in told.outcome
