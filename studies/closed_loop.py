@@ -178,8 +178,9 @@ class ClosedLoop(Study):
             for name, rows in some.items():
                 found.setdefault(name, []).extend(rows)
         frames = {name: frame_of(rows) for name, rows in found.items()}
-        told = pl.when(pl.col("group") != Group.LEARNT).then("group").otherwise(_told("policy"))
-        frames["rows"] = frames["rows"].with_columns(told.alias("told"))
+        nothing, kinematics = pl.lit("nothing but failures"), pl.lit("how cars follow each other")
+        told = pl.when(~_LEARNT).then("group").when(policy=MACHINE).then(nothing)
+        frames["rows"] = frames["rows"].with_columns(told=told.otherwise(kinematics))
         return frames
 
     def page(self, found: Frames) -> Page:
@@ -513,16 +514,6 @@ _LEARNT = pl.col("group") == Group.LEARNT
 _IS_RIVAL = ~_LEARNT & (pl.col("group") != Group.BOUND) & ~pl.col("policy").is_in(OURS_TOLD)
 
 
-def _told(policy: str) -> pl.Expr:
-    """What a policy that learnt was told."""
-    machine = pl.col(policy) == MACHINE
-    return (
-        pl.when(machine)
-        .then(pl.lit("nothing but failures"))
-        .otherwise(pl.lit("how cars follow each other"))
-    )
-
-
 def lines_of(rows: pl.DataFrame) -> pl.DataFrame:
     """The lines of the table: baselines, then each learner's median and worst seed.
 
@@ -596,7 +587,7 @@ def _targets(study: ClosedLoop, found: Frames, lines: pl.DataFrame) -> Iterator[
     if study.drawn_from.name == "emergency":
         yield at_least("mobility, median seed", mine["mobility"], 0.8, "{:.3f}")
     yield at_most("collisions, worst seed", worst["collision_rate"], study.tolerance, percent)
-    fixed = _compared(lines, mine).filter(_BETTER_ON_BOTH, pl.col("group") == Group.FIXED)
+    fixed = _compared(lines.filter(group=Group.FIXED), mine).filter(_BETTER_ON_BOTH)
     yield at_most("fixed constants that are better on both axes", len(fixed), 0)
     machine, its_worst = final(lines, MACHINE), final(lines, MACHINE, "worst")
     if machine and machine["train_episodes"] >= 100 and study.family in _MACHINE_ASKED:
@@ -652,9 +643,9 @@ _AGAINST_OURS = {
 
 
 def _compared(lines: pl.DataFrame, mine: dict[str, Any]) -> pl.DataFrame:
-    """All rivals, with our line beside each."""
+    """Lines, with ours beside each."""
     ours = pl.DataFrame([mine]).rename(lambda name: f"{name}_ours")
-    return lines.filter(_IS_RIVAL).join(ours, how="cross")
+    return lines.join(ours, how="cross")
 
 
 def _lost(found: Frames, lines: pl.DataFrame) -> Iterator[Table]:
@@ -662,13 +653,12 @@ def _lost(found: Frames, lines: pl.DataFrame) -> Iterator[Table]:
     who = {"policy": "{policy}", "told": "{told}"}
     yield Table(
         "Baselines that collide less than evofsm, or pay less while colliding no more often",
-        _compared(lines, mine).filter(_IS_BETTER),
+        _compared(lines.filter(_IS_RIVAL), mine).filter(_IS_BETTER),
         who | _AGAINST_OURS,
         "Theirs against ours: after all training, each column's median over seeds.",
         pl.when(_BETTER_ON_BOTH & (pl.col("group") == Group.FIXED)).then(pl.lit("fails")),
     )
-    machines = lines.filter(pl.col("policy") == MACHINE)
-    both = machines.join(pl.DataFrame([mine]).rename(lambda n: f"{n}_ours"), how="cross")
+    both = _compared(lines.filter(policy=MACHINE), mine)
     falls_short = (_FEWER < -_ROUNDING) | (_FURTHER < -_ROUNDING)
     columns = {"evofsm-machine": "{which}"} | _AGAINST_OURS
     columns["collisions while learning"] = (
