@@ -307,8 +307,9 @@ def _log_scores(predicted: Floats, came: Floats, spread_out: float = _SPREAD_OUT
     return np.asarray(-(came * logs).sum(axis=1))
 
 
-def compare(source: Source, learning_seed: int) -> list[dict[str, Any]]:
+def compare(make: Callable[[], Source], learning_seed: int = 0) -> list[dict[str, Any]]:
     """Let all methods forecast one source, in the safety rule's states and in the paper's."""
+    source = make()
     pace = source.pace
     own = Forecasts(source.n_actions, [pace.steps(seconds) for seconds in pace.horizons])
     safe, paper = teach(source, SAFETY_RULE, own), teach(source, None)
@@ -772,13 +773,15 @@ class ForecastStudy(Study):
             files = [logs.files[k * len(logs.files) // most] for k in range(most)]
             some = Logs(logs.name, tuple(files))
             parts = min(self.parts, most)
-            tasks += [partial(_of_logs, some, self.seed, part, parts) for part in range(parts)]
+            made = (partial(read_part, some, self.seed, part, parts) for part in range(parts))
+            tasks += [partial(compare, one) for one in made]
         for pace, train, test, seeds in (
             (DECISIONS, self.train, self.test, self.seeds),
             (FINE, self.fine_train, self.fine_test, -(-self.seeds // 4)),
         ):
             for name, seed in product(FAMILIES, range(seeds)):
-                tasks.append(partial(_of_family, name, pace, self.seed, seed, train, test))
+                made_of = partial(drive, name, pace, self.seed, seed, train, test)
+                tasks.append(partial(compare, made_of, seed))
         sums = [one for some in lib.parallel(tasks, workers, "Forecasting") for one in some]
         rows = lib.frame_of(add_up(lib.frame_of(sums), self.rounds, self.seed))
         rows = rows.sort("source", "horizon", maintain_order=True)
@@ -905,16 +908,6 @@ are held for a while, and on cartpole and pendulum of feedback that would hold t
 same episodes, with the actions that were executed, and say how likely it is to fail within so many
 steps if an action is taken now, whatever is done after it. All probabilities are calibrated by
 isotonic regression on episodes of their own."""
-
-
-def _of_logs(logs: Logs, seed: int, part: int, parts: int) -> list[dict[str, Any]]:
-    return compare(read_part(logs, seed, part, parts), 0)
-
-
-def _of_family(
-    name: str, pace: Pace, seed: int, learning_seed: int, train: int, test: int
-) -> list[dict[str, Any]]:
-    return compare(drive(name, pace, seed, learning_seed, train, test), learning_seed)
 
 
 def _against(failures: pl.DataFrame) -> pl.DataFrame:
