@@ -12,7 +12,6 @@ import json
 import time
 from collections.abc import Sequence
 from functools import lru_cache, partial
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +21,7 @@ import polars as pl
 from evofsm.driving import Draw, drive, held_out, load_family, teach, training
 from evofsm.paper import Page, Table
 from studies import lib
-from studies.systems import Start, System, Vector
+from studies.systems import System, Vector
 
 #: What was accepted, and with which draws.
 ACCEPTED = Path(__file__).parents[1] / "docs" / "results" / "benchmark.json"
@@ -48,7 +47,7 @@ _NOISE = {  # standard deviations of sensors
 }
 
 
-class Changed(System):
+class Changed:
     """A system as it is seen, or acts, after a change (one of `CHANGES`)."""
 
     def __init__(self, system: System, change: str) -> None:
@@ -97,38 +96,6 @@ class Changed(System):
         self._held = seen
         return seen
 
-    # What `System` has of its own is that of what is changed.
-    @property
-    def controllers(self) -> Any:
-        """As of the system."""
-        return self._system.controllers
-
-    @property
-    def score(self) -> float:
-        """As of the system."""
-        return self._system.score
-
-    @property
-    def speed(self) -> float:
-        """As of the system."""
-        return self._system.speed
-
-    def propose(self, observation: Vector, time: float = 0.0) -> Any:
-        """What the controller wants, of what it sees."""
-        return self._system.propose(observation, time)
-
-    def _begin(self, start: Start) -> None: ...
-
-    def _observation(self) -> Vector:
-        raise NotImplementedError
-
-    def _advance(self, action: Any) -> tuple[float, bool]:
-        raise NotImplementedError
-
-
-# Class attributes, which `__getattr__` is not asked for.
-for _name in ("train", "horizon", "measure", "has_failed", "rivals", "learners"):
-    setattr(Changed, _name, property(attrgetter(f"_system.{_name}")))
 
 _VALUES = {"huge": 65535.0, "missing": -999.0, "minus": -1.0}
 #: What may be wrong in one episode, and what changes a system for good.

@@ -5,10 +5,9 @@ learning seeds; tuned baselines are tuned on the training draws. `evofsm` is tol
 each other, `evofsm-machine` nothing but which episodes failed.
 
 Frames: ``rows`` (a policy and learning seed on the held-out draws), ``curve`` (a test while it
-learns), ``settings`` (what a policy reaches at one setting), ``rules`` (risk read through states
-alone), ``separation`` (a measure, at telling dead ends apart), ``cases`` (a run of the paper's
-cases), ``worlds`` (the same model in SUMO and in closed form), ``stream`` (an episode around a
-shift), ``checks`` (a test around it). Rates are shares, accelerations m/s², jerk m/s³.
+learns), ``rules`` (risk read through states alone), ``cases`` (a run of the paper's cases),
+``worlds`` (the same model in SUMO and in closed form), ``stream`` (an episode around a shift),
+``checks`` (a test around it). Rates are shares, accelerations m/s², jerk m/s³.
 """
 
 from __future__ import annotations
@@ -51,8 +50,9 @@ from evofsm.driving import (
     unrevised_guard,
 )
 from evofsm.fsm import Edges, Novelty, StateRule
-from evofsm.guard import TOLERANCE, ActionReviser, Guard, Mode, Reviser, RiskMeasure
+from evofsm.guard import TOLERANCE, ActionReviser, Guard, Reviser
 from evofsm.paper import Figure, Page, Table
+from evofsm.plot import COLORS
 from studies import lib
 from studies.lib import Frames, Study, Target, at_least, at_most, frame_of
 from studies.policies import TUNED_MEASURES, Group, RiskByState, fixed_policies
@@ -66,8 +66,6 @@ SAFE_RATE = 0.01
 #: After so many training episodes a learner is tested, and so many after a shift.
 CHECKPOINTS = {OURS: (0, 1, 2, 5, 10, 20, 50, 100, 200, 300), MACHINE: (0, 2, 5, 10, 30, 100)}
 AFTER = {OURS: (0, 1, 2, 5, 10, 20, 30), MACHINE: (0, 10, 30)}
-#: Tolerances of the trade-off.
-TOLERANCES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
 #: State rules that are compared, by name.
 RULES: dict[str, StateRule | None] = {
     "paper": None,
@@ -111,11 +109,10 @@ class ClosedLoop(Study):
     rule_seeds: Annotated[
         int, Option(min=0, help="Learning seeds in the comparison of state rules; 0: none.")
     ] = 2
-    rule_test: int = 100  #: held-out episodes in it, and in the trade-off
+    rule_test: int = 100  #: held-out episodes in it
     rule_train: int = 60  #: training episodes in it
     check_test: int = 200  #: held-out episodes of the tests on the way
-    side_train: int = 100  #: training episodes of all that stands below the table
-    side_test: int = 300  #: held-out episodes of it
+    world_train: int = 100  #: training episodes of what is driven in both worlds
     world_test: int = 50  #: episodes driven in both worlds
     machine_test: int = 1000  #: held-out episodes of `MACHINE` at most
     machine_check: int = 50  #: held-out episodes of its tests on the way
@@ -135,8 +132,7 @@ class ClosedLoop(Study):
             machine_train=min(self.machine_train, 40),
             rule_seeds=min(self.rule_seeds, 1),
             rule_test=20,
-            side_train=40,
-            side_test=60,
+            world_train=40,
             world_test=5,
             machine_test=40,
             machine_check=10,
@@ -167,7 +163,6 @@ class ClosedLoop(Study):
             *(partial(_test_learner, self, OURS, seed) for seed in seeds),
             *(partial(_test_rule, self, r, s) for r in RULES for s in seeds[: self.rule_seeds]),
             *(partial(_test_learner, self, one, s) for one in learners[1:] for s in seeds),
-            partial(_separate, self),
         ]
         if find_spec("libsumo") is not None:
             tasks.append(partial(_drive_both_worlds, self))
@@ -183,8 +178,9 @@ class ClosedLoop(Study):
             for name, rows in some.items():
                 found.setdefault(name, []).extend(rows)
         frames = {name: frame_of(rows) for name, rows in found.items()}
-        told = pl.when(pl.col("group") != Group.LEARNT).then("group").otherwise(_told("policy"))
-        frames["rows"] = frames["rows"].with_columns(told.alias("told"))
+        nothing, kinematics = pl.lit("nothing but failures"), pl.lit("how cars follow each other")
+        told = pl.when(~_LEARNT).then("group").when(policy=MACHINE).then(nothing)
+        frames["rows"] = frames["rows"].with_columns(told=told.otherwise(kinematics))
         return frames
 
     def page(self, found: Frames) -> Page:
@@ -262,12 +258,6 @@ def _collisions(outcomes: Sequence[Outcome]) -> int:
     return sum(one.collided for one in outcomes)
 
 
-def _setting(policy: str, setting: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    rate = _collisions(outcomes) / len(outcomes)
-    mobility = _mobility(outcomes)
-    return {"policy": policy, "setting": setting, "collision_rate": rate, "mobility": mobility}
-
-
 def _frozen(guard: Guard) -> Guard:
     """A copy that decides by what was learnt so far, and learns nothing."""
     copy = guard.copy(states=False)
@@ -293,16 +283,15 @@ def _test_tuned(study: ClosedLoop, name: str) -> Found:
         EnvelopeReviser(measure, family.actions, family.interval)
         for measure in TUNED_MEASURES[name]
     ]
-    tried = [
-        _setting(name, repr(reviser.measure), course.under(repeat(reviser))) for reviser in revisers
-    ]
-    best = min(range(len(tried)), key=lambda i: (tried[i]["collision_rate"], -tried[i]["mobility"]))
-    tests, driven = _tests(study, study.test), len(course.draws) * len(tried)
-    outcomes = tests.under(repeat(revisers[best]))
-    return {
-        "rows": [tests.row(name, Group.TUNED, outcomes, train_episodes=driven)],
-        "settings": tried,
-    }
+
+    def loses(reviser: Reviser) -> tuple[int, float]:
+        outcomes = course.under(repeat(reviser))
+        return _collisions(outcomes), -_mobility(outcomes)
+
+    best = min(revisers, key=loses)
+    tests, driven = _tests(study, study.test), len(course.draws) * len(revisers)
+    outcomes = tests.under(repeat(best))
+    return {"rows": [tests.row(name, Group.TUNED, outcomes, train_episodes=driven)]}
 
 
 def _learner(study: ClosedLoop, policy: str, seed: int) -> Guard:
@@ -356,12 +345,6 @@ def _test_learner(study: ClosedLoop, policy: str, seed: int) -> Found:
             found["rows"].append(row)
     if is_machine and tests.family.name == "paper":
         found["cases"] = _revised_cases(study, policy, guard, seed)
-    if policy == OURS and seed == 0:
-        found["settings"] = []
-        for tolerance in TOLERANCES:
-            other = guard_for_family(tests.family, tolerance=tolerance, judge=guard.judge)
-            outcomes = tests.first(study.rule_test).by(other)
-            found["settings"].append(_setting(OURS, f"tolerance {tolerance:g}", outcomes))
     return found
 
 
@@ -391,44 +374,11 @@ def _test_rule(study: ClosedLoop, rule: str, seed: int) -> Found:
 # -- Below the table; each learns with one seed ---------------------------------------------------
 
 
-def _separate(study: ClosedLoop) -> Found:
-    """Score every measure at every decision of unrevised runs; ours has watched, without acting.
-
-    The truth is a dead end: both cars brake as hard as they can from now on, and still collide.
-    """
-    family, test = study.drawn_from, study.side_test
-    risk = LatentRisk(family.low, family.interval)
-    watching = guard_for_family(family, tolerance=0.01, mode=Mode.SHADOW, judge=risk)
-    teach(watching, training(family, study.seed, 0, study.side_train))
-    compared: dict[tuple[str, str], RiskMeasure] = {
-        (OURS, Group.LEARNT): risk,
-        ("rss-matched", Group.MATCHED): _true_limits(family),
-        **{(name, Group.FIXED): measure for name, measure in measures.FIXED_MEASURES.items()},
-    }
-    alone = teach(unrevised_guard(family), held_out(family, study.seed, test))
-    seen = [np.array([one.situation.observation for one in run.decisions]) for run in alone]
-    truth = measures.is_dead_end(np.concatenate(seen), family.decel, family.leader_decel)
-    episode = np.repeat(np.arange(test), [len(rows) for rows in seen])
-    found = []
-    for (name, group), measure in compared.items():
-        scores = np.concatenate([measure.score(rows, family.interval) for rows in seen])
-        ranked = lib.Ranked(scores, truth, episode)
-        low, high = ranked.interval()[0]
-        row = {"measure": name, "group": group, "auroc": ranked.areas().auroc}
-        share = {"dead_end_share": float(truth.mean()), "episodes": test}
-        found.append(row | {"auroc_low": low, "auroc_high": high} | share)
-    return {"separation": found}
-
-
-def _true_limits(family: Family) -> measures.ResponsibilitySensitiveSafety:
-    return measures.ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
-
-
 def _drive_both_worlds(study: ClosedLoop) -> Found:
     """Learn in closed form, then drive the same draws in every world with learning frozen."""
     family = study.drawn_from
     guard = guard_for_family(family, tolerance=study.tolerance)
-    teach(guard, training(family, study.seed, 0, study.side_train))
+    teach(guard, training(family, study.seed, 0, study.world_train))
     found = []
     for name, opened in (("sumo", SumoWorld()), ("kinematic", nullcontext(KinematicWorld()))):
         tested, draws = _frozen(guard), held_out(family, study.seed, study.world_test)
@@ -519,7 +469,8 @@ def _shift(study: ClosedLoop, policy: str, seed: int) -> Found:
 def _shift_unchanged(study: ClosedLoop, seed: int) -> Found:
     """The same with a safe distance whose constants were right before; it learns nothing."""
     family, name = study.drawn_from, "rss-unchanged"
-    reviser = EnvelopeReviser(_true_limits(family), family.actions, family.interval)
+    told = measures.ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
+    reviser = EnvelopeReviser(told, family.actions, family.interval)
     guard = Guard.of(reviser, interval=family.interval, learn=False)
     places, draws = zip(*_stream(study, seed), strict=True)
     drives = teach(guard, draws)
@@ -561,16 +512,6 @@ _MEASURED = (
 )
 _LEARNT = pl.col("group") == Group.LEARNT
 _IS_RIVAL = ~_LEARNT & (pl.col("group") != Group.BOUND) & ~pl.col("policy").is_in(OURS_TOLD)
-
-
-def _told(policy: str) -> pl.Expr:
-    """What a policy that learnt was told."""
-    machine = pl.col(policy) == MACHINE
-    return (
-        pl.when(machine)
-        .then(pl.lit("nothing but failures"))
-        .otherwise(pl.lit("how cars follow each other"))
-    )
 
 
 def lines_of(rows: pl.DataFrame) -> pl.DataFrame:
@@ -646,7 +587,7 @@ def _targets(study: ClosedLoop, found: Frames, lines: pl.DataFrame) -> Iterator[
     if study.drawn_from.name == "emergency":
         yield at_least("mobility, median seed", mine["mobility"], 0.8, "{:.3f}")
     yield at_most("collisions, worst seed", worst["collision_rate"], study.tolerance, percent)
-    fixed = _compared(lines, mine).filter(_BETTER_ON_BOTH, pl.col("group") == Group.FIXED)
+    fixed = _compared(lines.filter(group=Group.FIXED), mine).filter(_BETTER_ON_BOTH)
     yield at_most("fixed constants that are better on both axes", len(fixed), 0)
     machine, its_worst = final(lines, MACHINE), final(lines, MACHINE, "worst")
     if machine and machine["train_episodes"] >= 100 and study.family in _MACHINE_ASKED:
@@ -702,9 +643,9 @@ _AGAINST_OURS = {
 
 
 def _compared(lines: pl.DataFrame, mine: dict[str, Any]) -> pl.DataFrame:
-    """All rivals, with our line beside each."""
+    """Lines, with ours beside each."""
     ours = pl.DataFrame([mine]).rename(lambda name: f"{name}_ours")
-    return lines.filter(_IS_RIVAL).join(ours, how="cross")
+    return lines.join(ours, how="cross")
 
 
 def _lost(found: Frames, lines: pl.DataFrame) -> Iterator[Table]:
@@ -712,13 +653,12 @@ def _lost(found: Frames, lines: pl.DataFrame) -> Iterator[Table]:
     who = {"policy": "{policy}", "told": "{told}"}
     yield Table(
         "Baselines that collide less than evofsm, or pay less while colliding no more often",
-        _compared(lines, mine).filter(_IS_BETTER),
+        _compared(lines.filter(_IS_RIVAL), mine).filter(_IS_BETTER),
         who | _AGAINST_OURS,
         "Theirs against ours: after all training, each column's median over seeds.",
         pl.when(_BETTER_ON_BOTH & (pl.col("group") == Group.FIXED)).then(pl.lit("fails")),
     )
-    machines = lines.filter(pl.col("policy") == MACHINE)
-    both = machines.join(pl.DataFrame([mine]).rename(lambda n: f"{n}_ours"), how="cross")
+    both = _compared(lines.filter(policy=MACHINE), mine)
     falls_short = (_FEWER < -_ROUNDING) | (_FURTHER < -_ROUNDING)
     columns = {"evofsm-machine": "{which}"} | _AGAINST_OURS
     columns["collisions while learning"] = (
@@ -736,13 +676,6 @@ def _lost(found: Frames, lines: pl.DataFrame) -> Iterator[Table]:
             worse.filter(pl.col("median") > pl.col("theirs") + _ROUNDING),
             {"episodes after": "{after}", "evofsm, median": "{median:%}", "theirs": "{theirs:%}"},
         )
-    apart = lib.compared(found["separation"].with_columns(one=1), _LEARNT, ["one"])
-    yield Table(
-        "Measures that tell dead ends apart better",
-        apart.filter(pl.col("auroc") > pl.col("auroc_ours")),
-        {"measure": "{measure}", "told": "{group}", "AUROC": "{auroc:.4f}"}
-        | {"evofsm": "{auroc_ours:.4f}", "95 %": "{auroc_low_ours:.4f}–{auroc_high_ours:.4f}"},
-    )
     if "cases" in found:
         needless = ~pl.col("unrevised_collided") & (pl.col("changed") > 0.0)
         yield Table(
@@ -806,28 +739,6 @@ def _parts(study: ClosedLoop, found: Frames, lines: pl.DataFrame) -> Iterator[Ta
         "test's episodes collide. Learning: collisions while learning.",
         ours,
     )
-    yield Figure(
-        "policies",
-        "Collisions and mobility of all policies",
-        "Held-out episodes, with 95 % intervals; of learners the median seed after all training. "
-        "Collisions are linear up to 1 % and logarithmic beyond, to show 0; a mobility below 0.5 "
-        "is left out.",
-        partial(_draw_policies, lines),
-    )
-    best = found["settings"].sort("collision_rate", pl.col("mobility").neg(), maintain_order=True)
-    chosen = best.unique("policy", keep="first", maintain_order=True)
-    yield Table(
-        "Settings: ours over its tolerance, and what tuning chose",
-        pl.concat([found["settings"].filter(policy=OURS), chosen.filter(pl.col("policy") != OURS)]),
-        {
-            "policy": "{policy}",
-            "setting": "{setting}",
-            "collisions": "{collision_rate:%}",
-            "mobility": "{mobility:.3f}",
-        },
-        "Ours: one learning seed after all training, on the first held-out episodes. The others: "
-        "on training episodes.",
-    )
     yield _table_of_learning(found["curve"])
     if "checks" in found:
         yield Table(
@@ -852,20 +763,6 @@ def _parts(study: ClosedLoop, found: Frames, lines: pl.DataFrame) -> Iterator[Ta
             "safe distance with the limits that were true before it.",
             partial(_draw_stream, found["stream"]),
         )
-    yield Table(
-        "Telling dead ends from the rest",
-        found["separation"].sort("auroc", descending=True, nulls_last=True),
-        {
-            "measure": "{measure}",
-            "told": "{group}",
-            "AUROC": "{auroc:.4f}",
-            "95 %": "{auroc_low:.4f}–{auroc_high:.4f}",
-            "dead ends": "{dead_end_share:%}",
-        },
-        "Every decision of unrevised held-out episodes; the truth is the oracle's dead end. 0.5 is "
-        "chance, 1 perfect. Intervals by bootstrap over episodes.",
-        pl.when(_LEARNT).then(pl.lit("ours")),
-    )
     if "rules" in found:
         yield Table(
             "Steering by the states alone",
@@ -944,60 +841,29 @@ def _table_of_learning(curve: pl.DataFrame) -> Table:
     )
 
 
-# -- Figures --------------------------------------------------------------------------------------
+# -- The figure -----------------------------------------------------------------------------------
 
-_LOOKS: dict[str, lib.Look] = {
-    Group.BOUND: lib.PLAIN,
-    Group.FIXED: lib.FIXED,
-    Group.TUNED: {**lib.TOLD, "marker": "^"},
-    Group.MATCHED: {**lib.OTHER, "marker": "D"},
-    Group.LEARNT: lib.OURS,
-}
-
-
-def _draw_policies(lines: pl.DataFrame) -> Drawn:
-    """Collisions and mobility, a line for each policy."""
-    last = pl.col("train_episodes") == pl.col("train_episodes").max().over("policy")
-    is_worst = pl.col("which").fill_null("").str.starts_with("worst")
-    shown = lines.filter(last & ~is_worst)
-    names = shown["policy"].to_list()
-    figure, grid = lib.panels(1, 2, 0.7 + 0.2 * len(names), sharey=True)
-    collisions, mobility = grid[0]
-    for group, look in _LOOKS.items():
-        place = np.flatnonzero(shown["group"] == group)
-        some = shown[place]
-        rate = [100.0 * some[f"collision_{end}"].to_numpy() for end in ("rate", "low", "high")]
-        lib.dots(collisions, look, place, *rate)
-        moves = some.with_columns(pl.when(pl.col("mobility") > 0.5).then(pl.col("^mobility.*$")))
-        far = [moves[name].to_numpy() for name in ("mobility", "mobility_low", "mobility_high")]
-        lib.dots(mobility, look, place, *far)
-    lib.name_lines(collisions, names, bold=(OURS, MACHINE))
-    lib.scale_percent(collisions)
-    collisions.set_xlabel("collisions [% of episodes]")
-    mobility.set_xlabel("mobility: distance, in that of the unrevised driver")
-    lib.legend(figure, {str(group): look for group, look in _LOOKS.items()}, 3)
-    return figure
-
-
-_CURVES: dict[str, lib.Look] = {
-    OURS: lib.OURS,
-    MACHINE: {"color": lib.GREEN, "marker": "s", "linestyle": (0, (4, 1.6))},
-    "rss-unchanged": {"color": lib.RED, "linestyle": (0, (1, 1.2))},
+_CURVES: dict[str, dict[str, Any]] = {
+    OURS: {"color": COLORS["follower"]},
+    MACHINE: {"color": COLORS["leader"], "linestyle": (0, (4, 1.6))},
+    "rss-unchanged": {"color": COLORS["dead end"], "linestyle": (0, (1, 1.2))},
 }
 
 
 def _draw_stream(stream: pl.DataFrame) -> Drawn:
     """Collisions along the stream, averaged over episodes and seeds."""
-    figure, ((axes,),) = lib.panels(1, 1, 3.1)
+    figure = Drawn(figsize=(7.2, 3.1), layout="constrained")
+    axes = figure.subplots()
     rates = along_stream(stream)
     for (policy,), one in rates.group_by("policy", maintain_order=True):
+        look = _CURVES[str(policy)]
         for shifted in (False, True):  # the average begins anew
             part = one.filter((pl.col("place") >= 0) == shifted)
             mean, low, high = (100.0 * part[name].to_numpy() for name in ("mean", "low", "high"))
-            look = {**_CURVES[str(policy)], "marker": ""}
-            label = str(policy) if shifted else None
-            lib.curve(axes, look, part["place"].to_numpy() + 1, mean, low, high, label)
-    axes.axvline(0.5, color=lib.INK, linewidth=0.8)
+            at, label = part["place"].to_numpy() + 1, str(policy) if shifted else None
+            axes.fill_between(at, low, high, color=look["color"], alpha=0.18, linewidth=0.0)
+            axes.plot(at, mean, label=label, clip_on=False, zorder=4.0, **look)
+    axes.axvline(0.5, color=COLORS["ink"], linewidth=0.8)
     axes.annotate("shift, unsaid", (0.5, 103.0), ha="center", va="bottom", annotation_clip=False)
     axes.set(xlabel="episode, counted from the shift", ylabel="collisions [%], last 10 episodes")
     axes.set_ylim(-3.0, 103.0)

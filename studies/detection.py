@@ -274,9 +274,9 @@ def _is_fixed(family: Family) -> bool:
 # -- Measures -------------------------------------------------------------------------------------
 
 #: Ours: latent risk of the situation, behind the filter of noise, and the same at the centres of
-#: states; then failures counted in the states, and in those of the paper's rule.
+#: states; then failures counted in the states of the paper's rule.
 OURS = "evofsm"
-STATES, COUNTS, PAPER = READINGS = (f"{OURS}-states", f"{OURS}-counts", f"{OURS}-paper")
+STATES, PAPER = READINGS = (f"{OURS}-states", f"{OURS}-paper")
 
 
 class Chain:
@@ -348,7 +348,7 @@ class Watcher:
             if not self.states:
                 drive_(None, self.risk)
                 continue
-            self.default.count(drive_(self.default.machine, self.risk), family.interval)
+            drive_(self.default.machine, self.risk)
             self.paper.count(drive_(self.paper.machine, None), family.interval)
         return self
 
@@ -357,7 +357,7 @@ class Watcher:
         found: Scores = {OURS: self.latent_risk}
         if self.states:
             found[STATES] = partial(self.default.latent, self.risk)
-            found |= {COUNTS: self.default.counted, PAPER: self.paper.counted}
+            found[PAPER] = self.paper.counted
         return found
 
     def latent_risk(self, exposure: Exposure) -> Floats:
@@ -430,17 +430,6 @@ def classics(family: Family) -> Scores:
         name: partial(_scores, measures.FIXED_MEASURES[key]) for name, key in _SHOWN.items()
     }
     return found | {"rss-matched": partial(_scores, matched)}
-
-
-def behind_filter(family: Family, risk: LatentRisk) -> Score:
-    """The matched safe distance behind our filter of noise, to tell what is owed to the filter."""
-    told = _RSS.matched(family.decel, family.leader_decel)
-
-    def score(exposure: Exposure) -> Floats:
-        estimates = (one._replace(seen=_estimates(risk, one)[0]) for one in exposure.watched)
-        return _scores(told, exposure._replace(watched=tuple(estimates)))
-
-    return score
 
 
 def tuned(training: Exposure, danger: Danger) -> Score:
@@ -631,8 +620,6 @@ def _judge_world(study: Detection, name: str) -> list[dict[str, Any]]:
     draws = islice(here.training(study.seed, 0, study.train), study.train)
     training = Exposure(here.watched, tuple(watch(family, draw) for family, draw in draws))
     scores = watcher.scores() | classics(here.family)
-    if any(watcher.risk.perception.noise):
-        scores["rss-matched-filtered"] = behind_filter(here.family, watcher.risk)
 
     def scored(score: Score) -> tuple[Floats, Floats]:
         return score(held_out), score(calibration)
@@ -735,7 +722,7 @@ An alarm holds for 1 s after it was raised, and is false if the danger does not 
 
 # Measures that stand in the columns of tables over worlds.
 _AREAS = (OURS, STATES, PAPER, "rss-r157", "rss-tuned", "rss-matched", "ttc")
-_LEADS = (OURS, COUNTS, PAPER, "rss-r157", "rss-matched", "headway", "ttc")
+_LEADS = (OURS, STATES, PAPER, "rss-r157", "rss-matched", "headway", "ttc")
 _IS_OURS = pl.col("measure") == OURS
 # Other readings of ours are no rivals.
 _RIVALS = ~pl.col("measure").is_in(READINGS)

@@ -28,7 +28,6 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import polars as pl
-from matplotlib.figure import Figure as Drawn
 from scipy.stats import chi2
 from scipy.stats import t as student
 from typer import Argument, Option
@@ -52,7 +51,7 @@ from evofsm.driving import (
     unrevised_guard,
 )
 from evofsm.guard import Guard
-from evofsm.paper import Figure, Page, Table
+from evofsm.paper import Page, Table
 from studies import lib
 from studies.lib import Frames, Study, Target, frame_of
 
@@ -516,14 +515,6 @@ class Falsification(Study):
                     .when(guarded)
                     .then(pl.lit("ours")),
                 ),
-                Figure(
-                    "falsification",
-                    "How likely a failure is, by both ways",
-                    "Dots with 95 % intervals. Where no failure was seen there is no dot: plain "
-                    "sampling shows the upper end of its interval as a line from the left, "
-                    "splitting nothing, as it bounds nothing then.",
-                    partial(_draw, rows, self.least),
-                ),
                 *_tables_of_cases(found.get("cases")),
             ],
             command=lib.command_line(),
@@ -671,7 +662,6 @@ _COLUMNS = {
     "known": "{known:.2g}",
     "agree": "{agrees}",
 }
-_ENDS = ("low", "high")
 #: Units of numbers by the last part of their place; others have none.
 _UNITS = {
     **dict.fromkeys(("initial_gap", "gap"), "m"),
@@ -719,26 +709,3 @@ def _tables_of_cases(cases: pl.DataFrame | None) -> Iterable[Table]:
             "the middle of all. A number stands where the family's file has it; behind it the "
             "percentage of ordinary draws with a smaller one.",
         )
-
-
-def _draw(rows: pl.DataFrame, least: float) -> Drawn:
-    """A line for each row, on a logarithmic scale."""
-    figure, ((axes,),) = lib.panels(1, 1, 1.1 + 0.34 * len(rows))
-    lib.name_lines(axes, [f"{family}, {judge}" for family, judge in rows[:, :2].iter_rows()])
-    positive = rows.select("low", "probability", "plain_low", "known").to_numpy().astype(float)
-    lowest = min(least, positive[positive > 0.0].min(initial=1.0)) / 3.0
-    axes.set(xscale="log", xlim=(lowest, 1.5), xlabel="probability of a failure")
-    found, sampled = (pl.when(pl.col(name) > 0) for name in ("probability", "plain"))
-    share = sampled.then(pl.col("plain_failed") / pl.col("plain"))
-    ends = [sampled.then(pl.col(end)) for end in ("plain_low", "plain_high")]
-    ways: dict[str, tuple[lib.Look, float, Sequence[pl.Expr]]] = {
-        "splitting": (lib.OURS, -0.2, [found.then(pl.col(c)) for c in ("probability", *_ENDS)]),
-        "plain sampling": (lib.OTHER, 0.0, [share, *ends]),
-        "known": (lib.TOLD, 0.2, [pl.col("known")] * 3),
-    }
-    for look, shift, columns in ways.values():
-        value, low, high = (rows.select(one).to_series().to_numpy() for one in columns)
-        shown = np.where(value > 0.0, value, math.nan)
-        lib.dots(axes, look, np.arange(len(rows)) + shift, shown, np.maximum(low, lowest), high)
-    lib.legend(figure, {name: look for name, (look, *_) in ways.items()})
-    return figure

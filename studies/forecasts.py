@@ -5,11 +5,10 @@ method forecasts the same rows of held-out drives. Failures: of tasks that other
 three rivals learn the same episodes of mixed controllers, and say how likely it is to fail within
 so many steps if an action is taken now.
 
-Frame ``rows``: a ``method`` on a ``source``, so many seconds ahead (``horizon``). ``jsd`` is the
-mean divergence from the belief that came, ``log_score`` the mean log score [bit]; ``skill`` and
-``log_skill`` are those against persistence in the same states, with 95 % intervals over test
-episodes; ``over_batch`` is the skill against the batch fit, ``worst`` that of the worst learning
-seed or part of the runs.
+Frame ``rows``: a ``method`` on a ``source``, so many seconds ahead (``horizon``). ``skill`` (of the
+mean divergence from the belief that came) and ``log_skill`` (of the mean log score) are those
+against persistence in the same states, with 95 % intervals over test episodes; ``over_batch`` is
+the skill against the batch fit, ``worst`` that of the worst learning seed or part of the runs.
 
 Frame ``failures``: a ``method`` on a ``task`` within so many ``steps``, with the Brier score of
 calibrated probabilities; ``base`` is that of always saying the share of failures.
@@ -298,7 +297,6 @@ def score(
                 "episode": number,
                 "divergence": float(np.sum(jensen_shannon(predicted, came))),
                 "excess": float((logs - best).sum()),
-                "log_score": float(logs.sum()),
                 "forecasts": len(origins),
             }
 
@@ -309,8 +307,9 @@ def _log_scores(predicted: Floats, came: Floats, spread_out: float = _SPREAD_OUT
     return np.asarray(-(came * logs).sum(axis=1))
 
 
-def compare(source: Source, learning_seed: int) -> list[dict[str, Any]]:
+def compare(make: Callable[[], Source], learning_seed: int = 0) -> list[dict[str, Any]]:
     """Let all methods forecast one source, in the safety rule's states and in the paper's."""
+    source = make()
     pace = source.pace
     own = Forecasts(source.n_actions, [pace.steps(seconds) for seconds in pace.horizons])
     safe, paper = teach(source, SAFETY_RULE, own), teach(source, None)
@@ -351,7 +350,7 @@ def add_up(sums: pl.DataFrame, rounds: int, seed: int) -> Iterator[dict[str, Any
     parts = sums.partition_by(*key, as_dict=True, maintain_order=True)
     added = {
         name: part.group_by("part", "episode", maintain_order=True)
-        .agg(pl.col("divergence", "excess", "log_score", "forecasts").sum())
+        .agg(pl.col("divergence", "excess", "forecasts").sum())
         .sort("part", "episode")
         for name, part in parts.items()
     }
@@ -363,8 +362,6 @@ def add_up(sums: pl.DataFrame, rounds: int, seed: int) -> Iterator[dict[str, Any
         still, rival = ((source, horizon, name) for name in REFERENCES[str(method)])
         n = int(mine["forecasts"].sum())
         row = dict(zip(key, (source, horizon, method), strict=True))
-        row |= {"jsd": float(mine["divergence"].sum()) / n}
-        row |= {"log_score": float(mine["log_score"].sum()) / n}
         for kind, prefix in (("divergence", ""), ("excess", "log_")):
             scores, reference = mine[kind].to_numpy(), added[still][kind].to_numpy()
             drawn = partial(_skill_of, scores, reference)
@@ -509,8 +506,8 @@ def cases(runs: Sequence[Run], every: int) -> Cases:
 REPLAY = "evofsm-replay"  #: ours
 # Recorded behaviours that are replayed after an action, and neighbours that are asked.
 _BEHAVIOURS, _NEIGHBOURS = 8, 25
-# Of the logistic regression: penalty of each standardised weight, and iterations.
-_RIDGE, _ITERATIONS = 1e-2, 25
+# Of the logistic regression: penalty of each standardised weight.
+_RIDGE = 1e-2
 # Extrapolation looks so far [steps].
 _FARTHEST = 200
 
@@ -570,28 +567,14 @@ class Replays:
 
 
 class Logistic:
-    """Logistic regression on observation, change, action and the products of all of them.
-
-    Fitted by iteratively reweighted least squares with a small ridge.
-    """
+    """Logistic regression on observation, change, action and the products of all of them."""
 
     def __init__(self, train: Cases, truth: Bools) -> None:
         raw = _products(_inputs(train))
         self._mean, self._scale = raw.mean(axis=0), _spread(raw)
         X = self._features(train)
-        penalty = _RIDGE * np.eye(X.shape[1])
-        penalty[0, 0] = 1e-9
-        self.weights = np.zeros(X.shape[1])
-        y = truth.astype(np.float64)
-        for _ in range(_ITERATIONS):
-            p = expit(X @ self.weights)
-            w = np.maximum(p * (1.0 - p), 1e-6)
-            gradient = X.T @ (y - p) - penalty @ self.weights
-            step = np.linalg.solve((X.T * w) @ X + penalty, gradient)
-            size = np.abs(step).max()
-            self.weights += step * min(1.0, 5.0 / max(size, 1e-12))
-            if size < 1e-6:
-                break
+        ridge = np.append(1e-9, np.full(X.shape[1] - 1, _RIDGE))
+        self.weights = lib.logistic(X, truth, ridge)
 
     def __call__(self, some: Cases) -> Floats:
         """(n,) probability."""
@@ -790,13 +773,15 @@ class ForecastStudy(Study):
             files = [logs.files[k * len(logs.files) // most] for k in range(most)]
             some = Logs(logs.name, tuple(files))
             parts = min(self.parts, most)
-            tasks += [partial(_of_logs, some, self.seed, part, parts) for part in range(parts)]
+            made = (partial(read_part, some, self.seed, part, parts) for part in range(parts))
+            tasks += [partial(compare, one) for one in made]
         for pace, train, test, seeds in (
             (DECISIONS, self.train, self.test, self.seeds),
             (FINE, self.fine_train, self.fine_test, -(-self.seeds // 4)),
         ):
             for name, seed in product(FAMILIES, range(seeds)):
-                tasks.append(partial(_of_family, name, pace, self.seed, seed, train, test))
+                made_of = partial(drive, name, pace, self.seed, seed, train, test)
+                tasks.append(partial(compare, made_of, seed))
         sums = [one for some in lib.parallel(tasks, workers, "Forecasting") for one in some]
         rows = lib.frame_of(add_up(lib.frame_of(sums), self.rounds, self.seed))
         rows = rows.sort("source", "horizon", maintain_order=True)
@@ -923,16 +908,6 @@ are held for a while, and on cartpole and pendulum of feedback that would hold t
 same episodes, with the actions that were executed, and say how likely it is to fail within so many
 steps if an action is taken now, whatever is done after it. All probabilities are calibrated by
 isotonic regression on episodes of their own."""
-
-
-def _of_logs(logs: Logs, seed: int, part: int, parts: int) -> list[dict[str, Any]]:
-    return compare(read_part(logs, seed, part, parts), 0)
-
-
-def _of_family(
-    name: str, pace: Pace, seed: int, learning_seed: int, train: int, test: int
-) -> list[dict[str, Any]]:
-    return compare(drive(name, pace, seed, learning_seed, train, test), learning_seed)
 
 
 def _against(failures: pl.DataFrame) -> pl.DataFrame:

@@ -25,14 +25,13 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import polars as pl
-from matplotlib.figure import Figure as Drawn
 from typer import Option
 
 from evofsm.cli import imported
 from evofsm.driving import guard_for_family
 from evofsm.fsm import EvolvingFSM
 from evofsm.guard import Guard, LearntRisk, LearntSettings, SceneRisk, run_episode
-from evofsm.paper import Figure, Page, Table
+from evofsm.paper import Page, Table
 from studies import benchmark, lib
 from studies.lib import ALL, FIRST, Frames, Study, Target, at_least, at_most, frame_of
 from studies.rivals import Counted, Unrevised, rivals_of
@@ -315,7 +314,7 @@ def trial(
     >>> row["failed"], row["kept"], row["mean_change"]
     (5, 1.0, 0.0)
     """
-    system = make_system(name, controller)
+    system: Any = make_system(name, controller)
     system = benchmark.Changed(system, change) if change else system
     made = make_judge(judge, system, lib.names_in(without), seed)
     train = system.train if train is None else train
@@ -425,34 +424,6 @@ _NOTE_BESIDE = (
 )
 _IS_OURS = pl.col("judge").is_in(OURS) & _WHOLE
 _MARK = pl.when(_IS_OURS).then(pl.lit("ours"))
-
-
-def _draw_failed(lines: pl.DataFrame) -> Drawn:
-    """Held-out episodes that failed, a line for each system and controller."""
-    who = lines.select("system", "controller").unique(maintain_order=True)
-    names = [f"{system}, {controller}" for system, controller in who.iter_rows()]
-    figure, ((axes,),) = lib.panels(1, 1, 0.8 + 0.26 * len(names))
-    told = (pl.col("judge") == "unrevised", ~pl.col("told").str.starts_with("nothing"))
-    looks: dict[str, tuple[lib.Look, pl.Expr]] = {
-        "controller alone": (lib.PLAIN, told[0]),
-        "told more": (lib.TOLD, told[1]),
-        "counted matrices": (lib.OTHER, pl.col("judge") == "counted"),
-        "ours, told nothing but failures": (lib.OURS, _IS_OURS),
-    }
-    for shift, (look, which) in zip((-0.24, -0.08, 0.08, 0.24), looks.values(), strict=True):
-        some = lines.filter(which)
-        at = [names.index(f"{one['system']}, {one['controller']}") for one in some.to_dicts()]
-        rate, low, high = (100.0 * some[name].to_numpy() for name in ("rate", *_RATE))
-        lib.dots(axes, look, np.array(at) + shift, rate, low, high)
-    lib.name_lines(axes, names)
-    lib.scale_percent(axes)
-    axes.set_xlabel("failed [% of held-out episodes]")
-    shown = {name: look for name, (look, which) in looks.items() if len(lines.filter(which))}
-    lib.legend(figure, shown)
-    return figure
-
-
-_RATE = ("rate_low", "rate_high")
 
 
 def _present(names: Iterable[str]) -> tuple[list[str], dict[str, str]]:
@@ -573,20 +544,13 @@ class Judges(Study):
         if self.quick:
             return benchmark.page(rows, self.facts)
         whole = summary(rows.filter(_WHOLE))
-        parts: list[Table | Figure] = [
+        parts = [
             Table(
                 "The judges on every system",
                 whole,
                 _WHO | _FAILS | _COSTS | _BESIDE,
                 _NOTE + _NOTE_BESIDE,
                 _MARK,
-            ),
-            Figure(
-                "judges-failed",
-                "How often systems fail",
-                "Held-out episodes of all learning seeds, with 95 % intervals as if they were "
-                "independent; linear up to 1 %, logarithmic beyond.",
-                partial(_draw_failed, whole),
             ),
         ]
         if self.parts:
@@ -744,13 +708,6 @@ class Tasks(Study):
                     "Of told: the score, as a share of the highest one of those judges that are "
                     "told more and never failed.",
                     _MARK,
-                ),
-                Figure(
-                    "tasks-failed",
-                    "How often tasks fail",
-                    "Held-out episodes of all learning seeds, with 95 % intervals as if they were "
-                    "independent; linear up to 1 %, logarithmic beyond.",
-                    partial(_draw_failed, lines),
                 ),
                 Table(
                     "While learning, seed by seed",

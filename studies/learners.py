@@ -258,22 +258,6 @@ def tried(agent: Any, env: Diary, task: str, episodes: int) -> dict[str, Any]:
     }
 
 
-def reached(episodes: list[Episode], level: float) -> int | None:
-    """Steps until the mean return of ten episodes on end was ``level`` or more.
-
-    Examples
-    --------
-    >>> reached([Episode(5, 1.0, True)] * 10 + [Episode(5, 9.0, False)] * 10, 5.0)
-    75
-    """
-    returns = np.array([one.returned for one in episodes])
-    steps = np.cumsum([one.steps for one in episodes])
-    for last in range(9, len(returns)):
-        if returns[last - 9 : last + 1].mean() >= level:
-            return int(steps[last])
-    return None
-
-
 def late_return(episodes: list[Episode], steps: int) -> float | None:
     """Mean return of the episodes that ended in the last tenth; of the last one if none did."""
     ends = np.cumsum([one.steps for one in episodes])
@@ -312,7 +296,6 @@ def trained(task: str, way: str, seed: int, steps: int, held_out: int) -> dict[s
         "episodes": len(env.episodes),
         "failed": sum(one.failed for one in env.episodes),
         "late_return": late_return(env.episodes, len(done)),
-        "reached": reached(env.episodes, TASKS[task].level),
         "changed_first": float(np.mean(done[:quarter])),
         "changed_last": float(np.mean(done[-quarter:])),
         "held_out": held_out,

@@ -1,4 +1,4 @@
-"""What all studies share: their commands, work over processes, intervals, scores and figures.
+"""What all studies share: their commands, work over processes, intervals and scores.
 
 A study is a frozen dataclass that derives from `Study`, in a file of its own. Its fields are the
 options of its command, as Typer takes them; `run` returns rows as polars frames, one row per unit
@@ -27,17 +27,14 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeVar, get_orig
 import numpy as np
 import polars as pl
 import typer
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure as Drawn
-from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import isotonic_regression
+from scipy.special import expit
 from scipy.stats import beta
 
 from evofsm.cli import print_json
 from evofsm.extras import install
 from evofsm.paper import Page, print_page, write_page
-from evofsm.plot import COLORS
 
 #: Rows of a study by name; those of its main table are called ``"rows"``.
 Frames = Mapping[str, pl.DataFrame]
@@ -264,10 +261,8 @@ def frame_of(rows: Iterable[Any]) -> pl.DataFrame:
     return pl.DataFrame(plain, infer_schema_length=None)
 
 
-def with_share(
-    frame: pl.DataFrame, held: str, tried: str, name: str, confidence: float = 0.95
-) -> pl.DataFrame:
-    """Add a share and its exact interval (C. Clopper, E. Pearson, Biometrika 26, 1934).
+def with_share(frame: pl.DataFrame, held: str, tried: str, name: str) -> pl.DataFrame:
+    """Add a share and its exact 95 % interval (C. Clopper, E. Pearson, Biometrika 26, 1934).
 
     Parameters
     ----------
@@ -276,7 +271,6 @@ def with_share(
         Columns: so many of so many.
     name : str
         Columns ``name``, ``name_low`` and ``name_high`` are added; of none tried the share is null.
-    confidence : float
 
     Examples
     --------
@@ -284,7 +278,7 @@ def with_share(
     >>> with_share(frame, "failed", "episodes", "rate")["rate_high"].round(4).to_list()
     [0.0037, 0.6525]
     """
-    low, high = exact_interval(frame[held].to_numpy(), frame[tried].to_numpy(), confidence)
+    low, high = exact_interval(frame[held].to_numpy(), frame[tried].to_numpy())
     share = pl.when(pl.col(tried) > 0).then(pl.col(held) / pl.col(tried))
     return frame.with_columns(
         share.alias(name), pl.Series(f"{name}_low", low), pl.Series(f"{name}_high", high)
@@ -292,12 +286,11 @@ def with_share(
 
 
 def exact_interval(
-    held: ArrayLike, tried: ArrayLike, confidence: float = 0.95
+    held: ArrayLike, tried: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ends of the exact interval of a share, so many of so many; 0 and 1 of none."""
+    """Ends of the exact 95 % interval of a share, so many of so many; 0 and 1 of none."""
     k, n = np.asarray(held, np.float64), np.asarray(tried, np.float64)
-    tail = 0.5 * (1.0 - confidence)
-    low, high = beta.ppf(tail, k, n - k + 1.0), beta.ppf(1.0 - tail, k + 1.0, n - k)
+    low, high = beta.ppf(0.025, k, n - k + 1.0), beta.ppf(0.975, k + 1.0, n - k)
     return np.where(k == 0.0, 0.0, low), np.where(k == n, 1.0, high)
 
 
@@ -472,16 +465,6 @@ class Ranked:
         return interval(found[:, 0]), interval(found[:, 1])
 
 
-def brier(probability: ArrayLike, truth: ArrayLike) -> float:
-    """Mean squared error of probabilities (G. W. Brier, Monthly Weather Review 78, 1950).
-
-    >>> brier([0.0, 0.5, 1.0], [False, True, True])
-    0.08333333333333333
-    """
-    error = np.asarray(probability, dtype=np.float64) - np.asarray(truth, dtype=np.float64)
-    return float((error**2).mean()) if error.size else math.nan
-
-
 class Calibration(NamedTuple):
     """Turns a score into a probability that never falls as the score rises; see `isotonic`."""
 
@@ -517,88 +500,23 @@ def isotonic(score: ArrayLike, truth: ArrayLike) -> Calibration:
     return Calibration(scores, np.clip(fitted, 0.0, 1.0))
 
 
-# -- Figures --------------------------------------------------------------------------------------
-# Colours are those of all figures of evofsm; a line differs from others in its marker or dashes as
-# well, so that neither is needed.
+def logistic(rows: ArrayLike, came: ArrayLike, ridge: ArrayLike) -> NDArray[np.float64]:
+    """(k,) weights of a logistic regression on ``rows`` (n, k), by Newton's method.
 
-Look = dict[str, Any]
-_NAMES = ("follower", "leader", "dead end", "third", "ink", "soft")
-BLUE, GREEN, RED, PINK, INK, SOFT = (COLORS[name] for name in _NAMES)
-#: Of who is ours, of fixed constants, of what is tuned or told, of another learner, and of chance.
-OURS: Look = {"color": BLUE, "marker": "o"}
-FIXED: Look = {"color": RED, "marker": "s"}
-TOLD: Look = {"color": GREEN, "marker": "D"}
-OTHER: Look = {"color": PINK, "marker": "^"}
-PLAIN: Look = {"color": SOFT, "marker": "X"}
+    The ridge, one of each weight, keeps them finite where few cases came.
 
-
-def panels(rows: int, columns: int, height: float, **shared: Any) -> tuple[Drawn, Any]:
-    """A figure as wide as a page, ``height`` inches high, and its (rows, columns) axes.
-
-    Several have letters.
+    >>> logistic([[1.0], [1.0], [1.0], [1.0]], [True, True, True, False], [0.0]).round(4)
+    array([1.0986])
     """
-    figure = Drawn(figsize=(7.2, height), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, **shared)
-    for letter, axes in zip("abcdef" if grid.size > 1 else "", grid.flat, strict=False):
-        axes.set_title(letter, fontweight="bold")
-    return figure, grid
-
-
-def legend(figure: Drawn, looks: Mapping[str, Look], columns: int | None = None) -> None:
-    """Explain looks above all panels."""
-    usual: Look = {"linestyle": "none", "markersize": 4.5}
-    figure.legend(
-        handles=[Line2D([], [], label=name, **{**usual, **look}) for name, look in looks.items()],
-        loc="outside upper center",
-        ncols=columns or len(looks),
-        columnspacing=1.1,
-        handletextpad=0.4,
-    )
-
-
-def level(axes: Axes, value: float, *, across: bool = True) -> None:
-    """A broken line at a height, or at a place on the lower axis, behind all else."""
-    draw = axes.axhline if across else axes.axvline
-    draw(value, color=SOFT, linewidth=0.8, linestyle=(0, (4, 2)), zorder=1.0)
-
-
-def name_lines(axes: Axes, names: Sequence[str], bold: Sequence[str] = ()) -> None:
-    """Name the lines 0, 1, ... of a panel, from above."""
-    axes.set_ylim(len(names) - 0.5, -0.5)
-    axes.set_yticks(range(len(names)), names)
-    axes.tick_params(axis="y", length=0.0)
-    axes.grid(visible=False, axis="y")
-    for label in axes.get_yticklabels():
-        label.set_fontweight("bold" if label.get_text() in bold else "normal")
-
-
-def dots(
-    axes: Axes, look: Look, lines: ArrayLike, values: ArrayLike, low: ArrayLike, high: ArrayLike
-) -> None:
-    """Dots with intervals, each on its line of the panel (see `name_lines`); NaN is left out."""
-    axes.hlines(lines, low, high, color=look["color"], linewidth=1.1, zorder=3.0)
-    usual: Look = {"linestyle": "none", "clip_on": False, "zorder": 4.0, "markersize": 4.5}
-    axes.plot(values, lines, **{**usual, **look})
-
-
-def curve(
-    axes: Axes,
-    look: Look,
-    x: ArrayLike,
-    y: ArrayLike,
-    low: ArrayLike | None = None,
-    high: ArrayLike | None = None,
-    label: str | None = None,
-) -> None:
-    """A curve, with a band from ``low`` to ``high`` where they are given."""
-    if low is not None and high is not None:
-        axes.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0.0)
-    axes.plot(x, y, label=label, **{"markersize": 3.5, "clip_on": False, "zorder": 4.0, **look})
-
-
-def scale_percent(axes: Axes, along: str = "x") -> None:
-    """Percent from 0 to 100 with room for what is rare: linear up to 1 %, logarithmic beyond."""
-    getattr(axes, f"set_{along}scale")("symlog", linthresh=1.0, linscale=0.7)
-    getattr(axes, f"set_{along}lim")(-0.12, 130.0)
-    getattr(axes, f"set_{along}ticks")([0, 1, 10, 100], ["0", "1", "10", "100"])
-    axes.minorticks_off()
+    X, y, penalty = (np.asarray(one, dtype=np.float64) for one in (rows, came, ridge))
+    weights = np.zeros(X.shape[1])
+    for _ in range(25):
+        p = expit(X @ weights)
+        slope = X.T @ (y - p) - penalty * weights
+        curve = (X.T * np.maximum(p * (1.0 - p), 1e-6)) @ X + np.diag(penalty)
+        step = np.linalg.solve(curve, slope)
+        size = float(np.abs(step).max())
+        weights += step * min(1.0, 5.0 / max(size, 1e-12))
+        if size < 1e-6:
+            break
+    return weights

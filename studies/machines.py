@@ -85,6 +85,7 @@ def _planned(random: Random) -> int:
 
 
 def _pump(random: Random, clock: float) -> Run:
+    """Vibration [mm/s], bearing [°C] and speed; it trips above 7.1 or 95."""
     n = _planned(random)
     day = np.sin(2.0 * np.pi * (clock + STEP * np.arange(n)) / _DAY)
     speed = 1480.0 + _wander(random, n, 12.0, 600.0)
@@ -98,7 +99,7 @@ def _pump(random: Random, clock: float) -> Run:
 
 
 def _compressor(random: Random, clock: float) -> Run:
-    """At a high pressure it needs more flow: below the surge line it trips."""
+    """Pressure, flow and speed; below the surge line, which rises with the pressure, it trips."""
     n = _planned(random)
     load = np.clip(0.7 + _wander(random, n, 0.22, 2.0 * _HOUR), 0.35, 1.0)
     fault = _faults(random, n, 14.0 * _HOUR, (900.0, 5400.0))
@@ -111,7 +112,7 @@ def _compressor(random: Random, clock: float) -> Run:
 
 
 def _conveyor(random: Random, clock: float) -> Run:
-    """Its motor grows hot long after the current rose."""
+    """Current, motor and speed; it trips above 130 °C, which follow the current by 40 min."""
     n = _planned(random)
     day = np.sin(2.0 * np.pi * (clock + STEP * np.arange(n)) / _DAY)
     jam = _faults(random, n, 18.0 * _HOUR, (1200.0, 5400.0))
@@ -124,7 +125,7 @@ def _conveyor(random: Random, clock: float) -> Run:
 
 
 def _mill(random: Random, clock: float) -> Run:
-    """A stone comes without a word."""
+    """Power, bearing and speed; a stone trips it without a word."""
     n = _planned(random)
     power = 310.0 + _wander(random, n, 25.0, 1200.0)
     bearing = _follow(40.0 + 0.08 * power, 1800.0, 40.0) + random.normal(0.0, 0.3, n)
@@ -133,20 +134,12 @@ def _mill(random: Random, clock: float) -> Run:
     return _until(np.column_stack([power, bearing, speed]), trips)
 
 
-#: By name: a run that begins at a time of day [s], what is measured, and what it trips at.
-MACHINES: dict[str, tuple[Callable[[Random, float], Run], tuple[str, ...], str]] = {
-    "pump": (_pump, ("vibration", "bearing", "speed"), "vibration above 7.1 or bearing above 95"),
-    "compressor": (
-        _compressor,
-        ("pressure", "flow", "speed"),
-        "flow below the surge line, which rises with the pressure",
-    ),
-    "conveyor": (
-        _conveyor,
-        ("current", "motor", "speed"),
-        "motor above 130 °C, which follows the current by 40 min",
-    ),
-    "mill": (_mill, ("power", "bearing", "speed"), "nothing that is measured"),
+#: By name: a run that begins at a time of day [s].
+MACHINES: dict[str, Callable[[Random, float], Run]] = {
+    "pump": _pump,
+    "compressor": _compressor,
+    "conveyor": _conveyor,
+    "mill": _mill,
 }
 
 
@@ -155,7 +148,7 @@ def log_of(name: str, days: float, seed: int) -> list[Run]:
     random = np.random.default_rng([seed, list(MACHINES).index(name)])
     runs, clock = list[Run](), 6.0 * _HOUR
     while clock < days * _DAY:
-        runs.append(MACHINES[name][0](random, clock))
+        runs.append(MACHINES[name](random, clock))
         clock += len(runs[-1].values) * STEP + random.uniform(0.3, 3.0) * _HOUR
     return runs
 

@@ -30,7 +30,6 @@ from typer import Option
 from evofsm.driving import (
     REAL_DRIVES,
     SAFETY_RULE,
-    BrakeWatch,
     LatentRisk,
     LeaderBrakes,
     measures,
@@ -181,8 +180,6 @@ FIXED: Mapping[str, RiskMeasure] = {
     "headway": measures.TimeHeadway(),
     "rss-r157": measures.ResponsibilitySensitiveSafety.r157(),
 }
-# Of drivers' own braking manoeuvres so many are at least as hard as their everyday braking.
-_EVERYDAY = 0.9
 # Cases of the overall share that are added to those of a state.
 _LEAN = 2.0
 # Closing rate [1/s], leader's acceleration [m/s²] and logarithm of the time headway in which a
@@ -190,7 +187,8 @@ _LEAN = 2.0
 _APPROACH_RULE = Novelty(radius=1.0, scales=(0.05, 0.7, 0.4))
 # Below this speed a time headway says nothing [m/s].
 _SLOWEST = 1.0
-_RIDGE, _NEWTON_STEPS = 1e-3, 25
+# Of the logistic regression: penalty of each weight, for an event.
+_RIDGE = 1e-3
 
 #: What a measure says of the decisions of a case, (T,) for each question.
 Scores = dict[Question, Floats]
@@ -213,29 +211,14 @@ def score_fixed(cases: Sequence[Case]) -> Learnt:
 
 
 def learn_risk(training: Sequence[Case], held_out: Sequence[Case]) -> Learnt:
-    """Watch the training runs, and score held-out ones by the latent risk.
-
-    Twice: braking as hard as is taken as possible, and no harder than drivers brake every day,
-    which is learnt from their own manoeuvres.
-    """
+    """Watch the training runs, and score held-out ones by the latent risk."""
     risk = LatentRisk(LOWEST, INTERVAL)
-    own: list[float] = []
     for case in training:
-        speed = case.observations[:, 1]
-        realised = np.append(np.diff(speed) / INTERVAL, 0.0)
+        realised = np.append(np.diff(case.observations[:, 1]) / INTERVAL, 0.0)
         for row, acceleration in zip(case.observations, realised.tolist(), strict=True):
             risk.learn(row, acceleration)
         risk.start_episode()
-        watch = BrakeWatch(INTERVAL)
-        ended = [*(watch.see(0.0, v, v) for v in speed.tolist()), watch.end()]
-        own += [decel for decel in ended if decel is not None]
-    everyday = float(np.quantile(own, 1.0 - _EVERYDAY)) if own else 1.0
-    gentle = LatentRisk(-everyday, INTERVAL, own_brakes=1.0)
-    gentle.manoeuvres = risk.manoeuvres
-    return {
-        name: [_whatever_is_asked(one.score(case.observations)) for case in held_out]
-        for name, one in (("evofsm", risk), ("evofsm-everyday", gentle))
-    }
+    return {"evofsm": [_whatever_is_asked(risk.score(case.observations)) for case in held_out]}
 
 
 def as_they_are(case: Case) -> Floats:
@@ -317,25 +300,12 @@ def learn_logistic(training: Sequence[Case], held_out: Sequence[Case]) -> Learnt
     for question in QUESTIONS:
         rows = np.concatenate([x[case.answers[question].known] for x, case in learning])
         answers = [case.answers[question] for case in training]
-        weights = _fit_logistic(rows, np.concatenate([a.came[a.known] for a in answers]))
+        came = np.concatenate([a.came[a.known] for a in answers])
+        ridge = np.full(rows.shape[1], _RIDGE * max(float(came.sum()), 1.0))
+        weights = lib.logistic(rows, came, ridge)
         for test, found in zip(tests, scores, strict=True):
             found[question] = test @ weights
     return {"logistic": scores}
-
-
-def _fit_logistic(rows: Floats, came: Bools) -> Floats:
-    """Weights by Newton's method, with a ridge that keeps them finite where few events came."""
-    weights = np.zeros(rows.shape[1])
-    penalty = _RIDGE * max(float(came.sum()), 1.0) * np.eye(len(weights))
-    for _ in range(_NEWTON_STEPS):
-        share = 1.0 / (1.0 + np.exp(-np.clip(rows @ weights, -30.0, 30.0)))
-        slope = rows.T @ (came - share) - penalty @ weights
-        curve = (rows * (share * (1.0 - share))[:, None]).T @ rows + penalty
-        step = np.linalg.solve(curve, slope)
-        weights += step
-        if np.abs(step).max() < 1e-8:
-            break
-    return weights
 
 
 _LEARNERS: tuple[Callable[[Sequence[Case], Sequence[Case]], Learnt], ...] = (

@@ -21,13 +21,12 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import polars as pl
-from matplotlib.figure import Figure as Drawn
 from numpy.typing import NDArray
 from scipy.stats import qmc
 from typer import Option
 
 from evofsm.driving import Episode, KinematicWorld, Scenario
-from evofsm.paper import Figure, Page, Settings, Table, check_claims, run_paper
+from evofsm.paper import Page, Settings, Table, check_claims, run_paper
 from studies import lib
 from studies.lib import Frames, Study, Target, at_least
 
@@ -416,12 +415,6 @@ class Sensitivity(Study):
                     "recovered ones. In brackets: 95 % intervals by Clopper and Pearson.",
                     pl.when(pl.col("claim") == "all of them").then(pl.lit("ours")),
                 ),
-                Figure(
-                    "shares",
-                    "In what share of settings each claim holds",
-                    "Bars: 95 % intervals, often smaller than the mark.",
-                    partial(_draw_shares, shares),
-                ),
                 Table(
                     "How far each parameter alone may move",
                     reaches,
@@ -511,23 +504,3 @@ def reach(rows: pl.DataFrame, one: Parameter) -> dict[str, Any]:
     at_low, at_high = all_hold[0] and ends[0] > 0.0, all_hold[1]
     text = f"{'≤' * at_low}{ends[0]:.4g} to {'≥' * at_high}{ends[1]:.4g}"
     return told | {"all_hold": text}
-
-
-# -- Figures --------------------------------------------------------------------------------------
-
-
-def _draw_shares(shares: pl.DataFrame) -> Drawn:
-    """A line for each claim, and one for all of them."""
-    figure, ((axes,),) = lib.panels(1, 1, 4.5)
-    looks = dict(zip(_COLUMNS, (lib.OURS, lib.OTHER, lib.FIXED, lib.TOLD), strict=True))
-    for shift, (space, look) in zip((-0.28, -0.09, 0.09, 0.28), looks.items(), strict=True):
-        values = [100.0 * shares[space + end].cast(float).to_numpy() for end in _ENDS]
-        lib.dots(axes, {**look, "markersize": 3.6}, np.arange(len(shares)) + shift, *values)
-    lib.name_lines(axes, shares["claim"].to_list(), bold=("all of them",))
-    axes.set_xlim(0.0, 100.0)
-    axes.set_xlabel("settings with which it holds [%]")
-    lib.legend(figure, looks)
-    return figure
-
-
-_ENDS = ("", "_low", "_high")

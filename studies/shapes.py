@@ -352,10 +352,8 @@ class Peer(Careless):
 
     steps = 300
 
-    def __init__(
-        self, controller: str | None = None, *, task: str, name: str, **given: Any
-    ) -> None:
-        self.name, self._env = name, gymnasium_of(task, **given)
+    def __init__(self, controller: str | None = None, *, task: str, name: str) -> None:
+        self.name, self._env = name, gymnasium_of(task)
         space = self._env.action_space
         discrete = hasattr(space, "n")
         self.actions = (
@@ -376,7 +374,7 @@ class Peer(Careless):
         if isinstance(self.actions, Box):
             given = self._within(wanted)
             return float(given[0]) if len(given) == 1 else given
-        main, side = wanted  # nothing, left, main engine, right: as the continuous one is switched
+        main, side = wanted  # nothing, left, main engine, right
         return 2 if main > 0.0 else 1 if side < -0.5 else 3 if side > 0.5 else 0
 
     def _begin(self, start: Start) -> None:
@@ -431,14 +429,12 @@ _CARELESS: dict[str, tuple[Callable[[Vector, float], Any], Callable[[Vector], An
 SHAPES: dict[str, Callable[[str | None], System]] = {
     one.name: one for one in (Disc, Moving, Oblique, Diamond, Unicycle, Landing, Drift)
 }
-_LANDER = partial(Peer, task="LunarLander-v3")
 PEERS: dict[str, Callable[[str | None], System]] = {
     "inverted-pendulum": partial(Peer, task="InvertedPendulum-v5", name="inverted-pendulum"),
     "double-pendulum": partial(Peer, task="InvertedDoublePendulum-v5", name="double-pendulum"),
     "hopper": partial(Peer, task="Hopper-v5", name="hopper"),
-    "lander": partial(_LANDER, name="lander"),
-    "lander-box": partial(_LANDER, name="lander-box", continuous=True),
+    "lander": partial(Peer, task="LunarLander-v3", name="lander"),
 }
 #: What each needs beside Gymnasium: a package, and the extra of Gymnasium that has it.
 NEEDS = dict.fromkeys(PEERS, ("mujoco", "mujoco"))
-NEEDS |= dict.fromkeys(("lander", "lander-box"), ("Box2D", "box2d"))
+NEEDS["lander"] = ("Box2D", "box2d")

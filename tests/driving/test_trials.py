@@ -17,7 +17,6 @@ from evofsm.driving.trials import (
     reference_of,
     summarise,
     teach,
-    try_out,
     unrevised_guard,
 )
 from evofsm.guard.guard import Guard
@@ -44,15 +43,6 @@ def test_a_judge_is_made_by_its_name():
         assert name_judge(judge) == name
     with pytest.raises(ValueError, match="no judge 'wise'; there are kinematic, learnt"):
         guard_for_family(EMERGENCY, judge="wise")
-
-
-@pytest.mark.slow
-def test_told_nothing_but_failures_it_learns_to_prevent_them():
-    guard, collisions = taught(15)
-    assert 1 <= collisions <= 6  # it can know of none before the first
-    outcomes = try_out(guard, EMERGENCY, held_out(EMERGENCY, 0, 10))
-    assert not any(one.collided for one in outcomes)
-    assert np.mean([one.mobility for one in outcomes]) > 0.6
 
 
 @pytest.mark.slow

@@ -228,13 +228,6 @@ def test_who_is_asked_at_an_interval_keeps_its_command_between():
 HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
 
 
-def test_acceleration_follows_the_papers_equations():
-    gap, speed, leader_speed = 30.0, 20.0, 15.0
-    desired = 2.0 + 20.0 * 1.5 + 20.0 * 5.0 / (2.0 * math.sqrt(1.25 * 2.0))
-    expected = 1.25 * (1.0 - (20.0 / 25.0) ** 4 - (desired / 30.0) ** 2)
-    assert NORMAL.propose(np.array([gap, speed, leader_speed])).action == pytest.approx(expected)
-
-
 @pytest.mark.parametrize("gap", [0.5, 0.0, -3.0])
 def test_bounds_hold_also_at_and_after_a_collision(gap):
     assert HASTY.propose(np.array([gap, 20.0, 0.0])).action == -4.0

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 from studies import detection, lib
-from studies.detection import COUNTS, OURS, PAPER, STATES, Danger, Detection, Exposure, Watched
+from studies.detection import OURS, PAPER, STATES, Danger, Detection, Exposure, Watched
 
 from evofsm.driving import load_family
 from evofsm.paper import write_page
@@ -87,7 +87,7 @@ def test_scores_know_nothing_of_what_comes_later_and_ours_tells_dead_ends(name, 
     )
     rows = (some.first[:-1, None] + np.arange(20)).ravel()
     scores = watcher.scores()
-    assert set(scores) == {OURS, STATES, COUNTS, PAPER}
+    assert set(scores) == {OURS, STATES, PAPER}
     for measure, score in (scores | detection.classics(some.family)).items():
         np.testing.assert_allclose(score(half), score(some)[rows], atol=1e-12, err_msg=measure)
     truth = some.cases(Danger.DEAD_END).truth
@@ -106,12 +106,12 @@ def test_every_measure_is_judged_in_every_world(found):
     rows = found["rows"]
     assert set(rows["family"]) == {"r157", "cut_in"}
     assert set(rows["danger"]) == {str(one) for one in Danger}
-    names = {OURS, STATES, COUNTS, PAPER, "rss-tuned", *detection.classics(load_family("r157"))}
+    names = {OURS, STATES, PAPER, "rss-tuned", *detection.classics(load_family("r157"))}
     assert set(rows["measure"]) == names
     assert set(rows.filter(family="r157")["episodes"]) == {7}
     assert rows["lead"].null_count() == len(rows)  # so few hours cannot tell one alarm per hour
     assert rows.filter(measure=OURS, danger=Danger.DEAD_END)["auroc"].min() > 0.9
-    assert len(found["seeds"]) == 2 * 4
+    assert len(found["seeds"]) == 2 * 3
     assert set(found["grid"]["measure"]) == {OURS, "rss-r157", "rss-matched"}
 
 

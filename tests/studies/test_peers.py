@@ -15,7 +15,7 @@ pl = pytest.importorskip("polars")
 def row(task="cartpole", way="alone", seed=0, **what):
     told = WAYS[way].filter != "alone"
     found = {"task": task, "way": way, "seed": seed, "steps": 600, "episodes": 30, "failed": 20}
-    found |= {"late_return": 100.0, "reached": None, "changed_first": 0.5 * told}
+    found |= {"late_return": 100.0, "changed_first": 0.5 * told}
     found |= {"changed_last": 0.05 * told, "held_out": 20, "alone_failed": 3, "seconds": 1.0}
     found |= {"alone_return": 90.0, "under_failed": 0 if told else None, "under_changed": None}
     return found | {"under_return": 95.0 if told else None, "passes": False, **what}

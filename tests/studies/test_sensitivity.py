@@ -43,4 +43,3 @@ def test_the_study_tries_what_it_says_and_its_page_shows_it():
     assert (shares["claim"][-1], shares["everything"][-1]) == ("all of them", held)
     page = study.page(found)
     assert len(page.tables[1].cells) == len(shares) == 11
-    assert page.parts[1].draw()

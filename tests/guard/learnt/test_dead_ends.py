@@ -57,9 +57,10 @@ def test_where_a_certificate_was_refuted_is_a_dead_end_that_is_named_and_kept_aw
 def test_what_is_survived_there_takes_it_back(wary):
     few = wary.judge.state
     guard = wary.copy()
-    for _ in range(3):  # someone else goes there slowly, and comes back
+    speed = few.centres[0, 1]
+    for _ in range(3):  # someone else goes there as fast, and comes back
         for place in [*np.linspace(0.0, TRAP + 0.2, 20), *np.linspace(TRAP + 0.2, 0.0, 20)]:
-            guard.judge.observe(np.array([place, 0.02, ICE]))
+            guard.judge.observe(np.array([place, speed, ICE]))
             guard.judge.act(0.0)
         guard.judge.end(None, failed=False)
     assert guard.judge.state.radii.sum() < few.radii.sum()
