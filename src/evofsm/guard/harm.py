@@ -37,7 +37,7 @@ from evofsm.store import COUNT, Numbers
 # Episodes of each arm that are kept, the latest; what is left of the weight of one an episode
 # later; and the weights of those that ended well, with which guarded and alone begin: who drives
 # alone until the first refusal is known already.
-_KEPT, _FADES, _HOPES = 20, 0.98, (0.5, 0.5)
+_KEPT, _FADES, _HOPES = 20, 0.98, (0.5, 0.25)
 # So many episodes after the latest of the controller alone one is drawn, and then as often.
 _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
