@@ -17,7 +17,7 @@ from evofsm.cli.learning import warnings_of
 from evofsm.cli.options import reading_of, units_given
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import tables
-from evofsm.io.logs import LogColumns, Noted, Resample, episodes_of, read_traces
+from evofsm.io.logs import LogColumns, Noted, Resample, episodes_of, read_traces, rows_of
 from evofsm.io.tables import CsvTable, Wanted
 
 polars = pytest.importorskip("polars")
@@ -50,12 +50,10 @@ def read(*paths, noted=None, **columns):
 
 def together(*paths, noted=None, **columns):
     """Of all chunks as one: gaps, starts, failures."""
-    gaps, starts, fails = [], [], []
-    for chunk in read(*paths, noted=noted, **columns):
-        starts += [len(gaps) + row for row in chunk.starts.tolist()]
-        fails += [len(gaps) + row for row in np.flatnonzero(chunk.fails).tolist()]
-        gaps += chunk.observations[:, 0].tolist()
-    return gaps, starts, fails
+    rows = list(rows_of(read(*paths, noted=noted, **columns)))
+    starts = [k for k, row in enumerate(rows) if row.begins]
+    fails = [k for k, row in enumerate(rows) if row.failed]
+    return [row.values["gap"] for row in rows], starts, fails
 
 
 def refusal(*paths, **columns):

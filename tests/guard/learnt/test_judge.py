@@ -66,7 +66,7 @@ def test_a_pendulum_that_is_decided_every_5_ms_is_held_by_looking_ahead_in_longe
     assert guard.judge.horizon * dt > 0.8
 
 
-def test_a_variable_that_rests_at_an_end_keeps_it_from_learning_nothing(point):
+def test_it_learns_beside_a_variable_that_rests_at_an_end(point):
     guard, failures = point.guard(), []
     for episode in range(9):
         steps = point.walk(episode)
