@@ -117,6 +117,39 @@ def test_a_function_of_failures_is_asked_around_what_was_survived(points, failed
     assert "otherwise" not in told
 
 
+def test_what_was_seen_twice_before_a_decision_is_learnt_of_at_once(points):
+    guard = points["box"].guard(failed=lambda z: z[0] >= 0.4)
+    for k, proposal in enumerate(np.random.default_rng(0).uniform(-1.0, 1.0, 20)):
+        guard.decide([0.02 * k, 0.02], proposal, 0.1 * k)
+    guard.recognise([0.4, 0.02], 2.0)
+    reason = guard.revise(guard.recognise([0.42, 0.02], 2.1), Proposal(1.0)).reason
+    assert "no backup prevents failure" in reason
+
+
+def test_where_it_is_switched_off_nothing_counts_as_refused(points):
+    guard = points["box"].taught(4)
+    held = guard.judge.state.held
+    while guard.decide([0.9, 0.05], 1.0).advised == 1.0:
+        pass
+    guard.reviser.mode = Mode.OFF
+    for _ in range(60):
+        guard.decide([0.0, 0.0], 1.0)
+    guard.end(False)
+    assert guard.judge.state.held == held
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_of_a_long_episode_every_change_is_learnt_once(stride):
+    guard = Guard(-1.0, 1.0, interval=0.1, horizon=10.0 * stride, mode=Mode.OFF)
+    proposals, z = np.random.default_rng(0).uniform(-1.0, 1.0, 2100 * stride), 0.0
+    for proposal in proposals:
+        guard.decide([z], proposal)
+        z = 0.9 * z + 0.1 * proposal
+    guard.end(False, [z])
+    assert guard.judge.state.stride == stride
+    assert guard.judge.state.squares[0, 0] == 2100 - 1
+
+
 def test_failures_that_no_threshold_explains_are_not_denied():
     guard = Guard(-1.0, 1.0, interval=0.1)
     rng = np.random.default_rng(0)

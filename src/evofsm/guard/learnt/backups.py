@@ -1,4 +1,4 @@
-"""Backups: constant actions, and linear feedback u = clip(b + K'z) that evolves by mutation.
+"""Backups: constant actions, and linear feedback that evolves by mutation (`rollout`).
 
 With the share v_q(s) of the horizon that backup q survives from situation s, over some
 disturbances, and a little for the distance to failure, backups Q together are worth

@@ -174,7 +174,6 @@ class LearntRisk(ActionJudge):
     _lost: bool  # whether nothing helped, even without any disturbance
     _fails_after: float  # steps after which what was refused fails, at the latest
     _unsurvived: int
-    _asked: int  # number of backups under which it is judged
     _ranks: Ints  # of backups, those first that passed last
 
     def __init__(
@@ -312,12 +311,11 @@ class LearntRisk(ActionJudge):
         ``revising`` changes nothing: a band in which a proposal is refused longer gained nothing.
         """
         here, options, parts = self._here(situation.observation), np.array([wanted]), self.parts
-        if parts is None:
-            return Search(options, _unjudged(1), 0, words.NOTHING_LEARNT)
-        if here is None:
-            return Search(options, _unjudged(1), 0, words.NOTHING_SEEN)
-        if not len(self.state.forms):
-            return Search(options, _unjudged(1), 0, self._no_threshold)
+        if parts is None or here is None or not len(self.state.forms):
+            self._certified = False
+            why = words.NOTHING_LEARNT if parts is None else words.NOTHING_SEEN
+            why = why if parts is None or here is None else self._no_threshold
+            return Search(options, _unjudged(1), 0, why)
         model = parts.daring if self.learning else parts.model
         proposal, scale, margin = self.encode(wanted), parts.scale, self.state.margin
         few, most = self.effort
@@ -343,7 +341,6 @@ class LearntRisk(ActionJudge):
             is_alike = self.learning and left < self.settings.alike
             tried = self._untried(action, mask) if is_alike else None
             action = action if tried is None else tried
-        self._asked = 1 if most < 2 * few * self.state.horizon else few
         judged, self._lost, fails_after = self._judged(
             situation,
             here,
@@ -404,7 +401,8 @@ class LearntRisk(ActionJudge):
         latest.
         """
         asked = actions if passes is None else actions[:-1]
-        best = policies[self._ranks[: self._asked]]
+        few, most = self.effort
+        best = policies[self._ranks[: 1 if most < 2 * few * self.state.horizon else few]]
         foreseen = [self._foresee(here, action[None], best) for action in asked]
         if passes is not None:
             foreseen.append((0.0, passes, 0.0))
@@ -542,6 +540,7 @@ class LearntRisk(ActionJudge):
         if len(self._z) > len(self._u):  # nothing was executed: it does not follow
             self._study(failed=False, terminated=False)
         self._z.append(observation.copy())
+        self._holds = self._refused = self._lost = False  # as long as nothing was asked
         return False
 
     def act(self, action: Any) -> None:
@@ -573,12 +572,10 @@ class LearntRisk(ActionJudge):
         self.follow(observation, action)
         self._notes.append((self._refused, self._lost, self._certified))
         if len(self._z) > _MOST_ROWS * (stride := self.state.stride):
-            z, u, rows = self._z, self._u, 2 * stride + 1
-            self._u = u[:-1]
+            z, u, latest = self._z, self._u, self._notes[-1]
             self._study(failed=False, terminated=False)
-            self._z, self._u = z[-rows:], u[-rows:]
-            self._notes = [(False, False, False)] * rows
-            self._ranks = np.arange(len(self.state.policies))
+            self._z, self._u = z[-1 - stride :], u[-1 - stride :]  # the next change needs a step
+            self._notes = [(False, False, False)] * stride + [latest]
 
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
@@ -653,6 +650,7 @@ class LearntRisk(ActionJudge):
             given=self._given,
         )
         self.parts = Parts.of(self.state, self.settings)
+        self._used, self._ranks = np.zeros((self.size, 2)), np.arange(len(self.state.policies))
 
     def remake(self) -> None:
         """Decide by `state`, between two episodes."""
@@ -664,9 +662,8 @@ class LearntRisk(ActionJudge):
         self._at, self._past, self._done = None, [], []
         self._z, self._u, self._notes = [], [], []
         self._certified = self._holds = self._refused = self._lost = False
-        self._unsurvived, self._fails_after, self._asked = 0, 0.0, self.settings.n_asked
-        self._used = np.zeros((self.size, 2))
-        self._ranks = np.arange(len(self.state.policies))
+        self._unsurvived, self._fails_after = 0, 0.0
+        self._used, self._ranks = np.zeros((self.size, 2)), np.arange(len(self.state.policies))
 
     # -- For people, and in a file --------------------------------------------------------------
 

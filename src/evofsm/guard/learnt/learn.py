@@ -43,18 +43,15 @@ class Given(NamedTuple):
     backup: Callable[[Floats], Floats] | None = None  #: action, of an observation
 
 
-NOTHING_GIVEN = Given()
-
-
 def learn(
     state: State,
     episode: Episode,
     settings: LearntSettings,
     *,
-    seed: int = 0,
-    without: Set[str] = frozenset(),
-    has_horizon: bool = False,
-    given: Given = NOTHING_GIVEN,
+    seed: int,
+    without: Set[str],
+    has_horizon: bool,
+    given: Given,
 ) -> State:
     """Learn from an episode, or from a part of a long one.
 
@@ -126,8 +123,9 @@ def learn(
     rest = residuals_of(state, known, state.horizon)
     if looks and not has_horizon:
         if is_too_short(state, known, episode, settings):
-            before = coarser(before, settings)
-            return learn(before, decisions, settings, seed=seed, without=without, given=given)
+            decisions = decisions._replace(fails_after=0.5 * decisions.fails_after)
+            known_now = coarser(before, settings), decisions, settings
+            return learn(*known_now, seed=seed, without=without, has_horizon=False, given=given)
         state = look_ahead(state, known, rest, episode, settings)
     # Backups
     if given.backup is not None:
@@ -348,6 +346,5 @@ def coarser(state: State, settings: LearntSettings) -> State:
     return state._replace(
         **{name: getattr(blank, name) for name in learnt_anew},
         n_seen=state.n_seen // 2,
-        unit=2.0 * state.unit,
         stride=2 * state.stride,
     )

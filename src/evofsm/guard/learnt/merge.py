@@ -16,14 +16,14 @@ import numpy as np
 
 from evofsm.guard.harm import Harm
 from evofsm.guard.learnt.backups import evolved
-from evofsm.guard.learnt.danger import dead_ends, explained
+from evofsm.guard.learnt.danger import dead_ends, explained, fails
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.learn import chosen, coarser, disturbance_scale, kept, worst
 from evofsm.guard.learnt.rollout import Floats, crossed, pairs
-from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
+from evofsm.guard.learnt.state import Episode, State, model_of, residuals_of
 
 # Numbers of which the largest counts.
-_MAXIMA = "margin", "time_to_failure", "believed", "too_short"
+_MAXIMA = "margin", "time_to_failure", "believed", "too_short", "misled"
 
 
 def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
@@ -69,26 +69,28 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     merged = copy.deepcopy(max(told or judges, key=lambda judge: judge.state.n_episodes))
     merged.start_episode(learn=False)
     if len(told) > 1:
-        merged.state = merge([judge.state for judge in told], merged.settings, merged.seed)
+        merged.state = merge([judge.state for judge in told], merged)
         merged.n_violated = sum(judge.n_violated for judge in told)
         merged.harm = Harm.merged([judge.harm for judge in told])
         merged.remake()
     return merged
 
 
-def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
-    """Merge what was learnt apart of systems of one kind, counted from the origin of the first."""
+def merge(parts: Sequence[State], judge: LearntRisk) -> State:
+    """Merge what was learnt apart of systems of one kind, as a judge that learns on from there."""
+    settings = judge.settings
 
     def of(name: str) -> Floats:
         return np.array([getattr(part, name) for part in parts])
 
     def rows(name: str, most: int = 0) -> Floats:
-        return np.concatenate([getattr(part, name)[-(most // len(parts)) :] for part in parts])
+        share = max(min(most, 1), most // len(parts))
+        return np.concatenate([getattr(part, name)[-share:] for part in parts])[-most:]
 
     stride = max(part.stride for part in parts)
     while any(part.stride < stride for part in parts):
         parts = [part if part.stride == stride else coarser(part, settings) for part in parts]
-    first, latest = parts[0], max(parts, key=lambda part: part.n_episodes)
+    first, latest = parts[0], max(parts, key=lambda part: (len(part.linear) > 0, part.n_episodes))
     (p, m), a, n_episodes = first.products.shape, len(first.used), int(of("n_episodes").sum())
     T = np.array([_moved(d, a, p) for d in of("origin") - first.origin])
     moves = of("n_moves")
@@ -126,21 +128,27 @@ def merge(parts: Sequence[State], settings: LearntSettings, seed: int) -> State:
         **{name: int(of(name).max()) for name in ("horizon", "wrong", "stride")},
     }
     merged = State.none(m, a, first.choices, settings, None)._replace(**fields)
-    merged = explained(merged, failed=True)
-    known = model_of(merged, settings)
-    merged = dead_ends(merged, known, merged.survived[:0], _NO_EPISODE)
+    no_rows = merged.survived[:0]
+    nothing = Episode(no_rows, no_rows, False, False, no_rows, no_rows, no_rows, 0.0)
+    if judge.failed is None:
+        merged = explained(merged, failed=True, bends="regions" not in judge.without)
+    else:
+        merged = fails(merged, no_rows, nothing, settings, judge.without, judge.failed)
+    merged = merged._replace(held=int(min(0, of("held").max())))  # doubted is what all doubt
+    merged = dead_ends(merged, model_of(merged, settings), no_rows, nothing)
+    if not len(merged.situations):
+        return merged
     known, scale = model_of(merged, settings), disturbance_scale(merged, settings)
-    rest, random = residuals_of(merged, known, merged.horizon), np.random.default_rng(seed)
+    rest, random = residuals_of(merged, known, merged.horizon), np.random.default_rng(judge.seed)
     harmful = worst(known, merged.situations, merged.policies[:2], rest, scale)
     keep = chosen(harmful, settings.n_disturbances)
+    merged = kept(merged, keep)
+    if "backups" in judge.without:
+        return merged
     amid = np.ascontiguousarray(rest[:, :, [0, *(1 + k for k in keep)]])
     given = known, merged.situations, amid, scale, settings, random
     policies, linear = evolved(merged.policies, merged.linear, *given)
-    return kept(merged, keep)._replace(policies=policies, linear=linear)
-
-
-_NO_ROWS = np.empty(0)
-_NO_EPISODE = Episode(_NO_ROWS, _NO_ROWS, False, False, _NO_ROWS, _NO_ROWS, _NO_ROWS, 0.0)
+    return merged._replace(policies=policies, linear=linear)
 
 
 def _average(rows: Floats, weights: Floats) -> Floats:

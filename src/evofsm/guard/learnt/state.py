@@ -219,56 +219,23 @@ class State(NamedTuple):
     def none(
         cls, m: int, a: int, choices: int, settings: LearntSettings, horizon: int | None
     ) -> State:
-        """Before anything was learnt."""
-        p, e = n_features(m, a, box=not choices), np.empty
-        return cls(
+        """Before anything was learnt: zeros, and no rows, but for what is named here."""
+        p, steps = n_features(m, a, box=not choices), settings.horizon_max + 2
+        size = {"m": m, "a": a, "p": p, "policy": 1 + m, "situation": 2 * m + a}
+        size |= {"seen": m + a, "steps": steps}
+        fields: dict[str, Any] = {
+            name: np.zeros([n if isinstance(n, int) else size.get(n, 0) for n in numbers.shape])
+            if kind == Floats
+            else kind()
+            for name, (kind, numbers) in _FIELDS.items()
+        }
+        return cls(**fields)._replace(
             choices=choices,
-            n_episodes=0,
-            n_failed=0,
-            n_scanned=0,
-            n_seen=0,
-            n_moves=0,
-            origin=np.zeros(m),
-            squares=np.zeros((p, p)),
-            products=np.zeros((p, m)),
-            unit=np.zeros(m),
-            least=np.zeros(m),
-            most=np.zeros(m),
-            scale=np.zeros(m),
-            noise=np.zeros(m),
-            power=np.zeros(m),
-            recent_squares=np.zeros((p, p)),
-            recent_products=np.zeros((p, m)),
-            doubt=np.zeros(m),
-            since=np.zeros(m),
-            drifts=e((0, 3)),
             lowest=np.full((2, m), np.inf),
             highest=np.full((2, m), -np.inf),
-            reached=np.zeros((m, 2)),
-            survived=e((0, m)),
-            survived_in=e(0),
-            brinks=e((0, m)),
-            failures=e((0, m)),
-            ended=e((0, m)),
-            forms=e((0, failure.SIZE)),
-            differs=0.0,
-            held=0,
-            wrong=0,
-            misled=0.0,
-            centres=e((0, m)),
-            radii=e(0),
-            counts=e(0),
-            windows=e((0, settings.horizon_max + 2, m + a)),
-            lengths=e(0),
-            seen_in=e(0),
-            situations=e((0, 2 * m + a)),
-            policies=e((0, a, 1 + m)),
-            linear=e(0),
-            used=np.zeros((a, 2)),
             margin=settings.margin,
             time_to_failure=settings.horizon / settings.ahead,
             believed=float(settings.horizon_max),
-            too_short=0.0,
             horizon=settings.horizon if horizon is None else horizon,
             stride=1,
         )
