@@ -378,7 +378,7 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     if isinstance(guard.judge, Foresight):
         tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
         if (rate := guard.judge.rate_of(tolerance)) is None:
-            yield "It never alarms: on episodes held out, no alarm was better than chance."
+            yield "It never alarms: cross-validated, no alarm was better than chance."
         else:
             yield f"It alarms where {guard.judge.of(rate)}."
         yield f"All that it learnt (--tolerance chooses): {guard.judge.told_by_experience}."

@@ -47,7 +47,8 @@ _MOST_ROWS, _FAILURES = 500_000, 100
 # Blocks of rows in a horizon, as limits are searched for; of a long log fewer, but so many, where
 # there would be more than that in all.
 _BLOCKS, _FEWEST_BLOCKS, _MOST_BLOCKS = 15, 5, 100_000
-# Kinds of alarms; thresholds are plain unless others warn for longer by so much.
+# Kinds of alarms; thresholds are plain unless others, with as many false ones, warn for so much
+# longer.
 _LEARNT, _PLAIN, _NO_KIND = range(3)
 _BETTER = 0.95
 # What a further limit has to add to the share of the horizon that is warned before; survived rows
@@ -238,11 +239,13 @@ class Foresight(LearningJudge):
                 continue
             judge, rest = fresh._fitted(log.part(number != k)), log.part(number == k)
             columns = judge._columns(rest.rows, rest.starts)
-            for plain, rate in np.ndindex(2, len(RATES)):
-                found, _ = judge.tally(rest, rate, plain=bool(plain), columns=columns)
-                tallies[plain, rate] += found.lead * found.failures, found.foreseen, found.false
+            for kind, rate in np.ndindex(2, len(RATES)):
+                found, _ = judge.tally(rest, rate, plain=bool(kind), columns=columns)
+                tallies[kind, rate] += found.lead * found.failures, found.foreseen, found.false
         judge = fresh._fitted(log)
-        kind = (tallies[1, :, 0] >= _BETTER * tallies[0, :, 0]).astype(int)
+        learnt, plain = tallies  # with as many false ones
+        as_many = np.minimum((plain[:, 2] + 1.0) / (learnt[:, 2] + 1.0), 1.0)
+        kind = (plain[:, 0] >= _BETTER * as_many * learnt[:, 0]).astype(int)
         found = [
             [judge.of_rate(k, plain=x)[:, _OF:] for x in (False, True)] for k in range(len(RATES))
         ]

@@ -889,8 +889,8 @@ class _Reader:
             **dict.fromkeys([*self._observed, *categories], "--observe"),
             **dict.fromkeys(self._episode, "--episode"),
             **dict.fromkeys(clock, "--time"),
-            columns.action: "--action",
         }
+        options.setdefault(columns.action, "--action")  # one that is observed, where nobody acts
         for name, option in options.items():
             if name not in table.columns:
                 shown = ", ".join(name[:40] for name in table.columns[:20])
