@@ -50,7 +50,7 @@ _BLOCKS, _FEWEST_BLOCKS, _MOST_BLOCKS = 15, 5, 100_000
 # Kinds of alarms; thresholds are plain unless others, with as many false ones, warn for so much
 # longer.
 _LEARNT, _PLAIN, _NO_KIND = range(3)
-_BETTER = 0.95
+_BETTER = 0.9
 # What a further limit has to add to the share of the horizon that is warned before; survived rows
 # that forms of failure are learnt from.
 _WORTH, _ROWS = 2e-3, 4000

@@ -466,7 +466,7 @@ class CsvTable(Table):
         self._first_row = rows[0] if rows else []
         commas = map(_DECIMAL_COMMA.fullmatch, [t for row in rows for t in row])
         self._has_commas = self._separator == ";" or (self._separator == "\t" and any(commas))
-        if all(is_number(name) for name in self.columns):
+        if any(map(is_date, self.columns)) or all(map(is_number, self.columns)):
             raise ValueError(
                 f"{path}, line {at + 1}: {header.strip()[:200]!r} is no header; a line above the "
                 "rows must name the columns"
