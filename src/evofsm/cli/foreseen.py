@@ -145,9 +145,9 @@ def _document(
     head |= {"failures": int(runs.failed.sum()), "seconds": len(times) * judge.dt}
     head |= {"horizon": judge.horizon * judge.dt, "tolerance": tolerance}
     listed = [] if chosen is None else list(_listed(judge, chosen, runs, times))
-    missed = [row for row in listed if "lasts" not in row]
-    listed = [row for row in listed if "lasts" in row]
-    return {**head, "alarms": alarms, "limits": limits, "listed": listed, "missed": missed}
+    came = {"listed": [row for row in listed if "lasts" in row]}
+    came["missed"] = [row for row in listed if "lasts" not in row]
+    return {**head, "alarms": alarms, "limits": limits, **came}
 
 
 def _listed(
@@ -210,21 +210,17 @@ def _tables(
     rows = []
     for hit in found["listed"][-_LISTED:]:
         false = {0: [], 1: ["no"]}.get(hit["false"], [f"{hit['false']} times no"])
-        failed, why = ", then ".join([*false, *["yes"] * hit["failed"]]), _why(hit)
+        failed, why = (
+            ", then ".join([*false, *["yes"] * hit["failed"]]),
+            hit["reason"].partition("; after")[0],
+        )
         rows.append([f"{hit['episode'] + 1}", _date(hit["time"]), span(hit["lasts"]), failed, why])
-    header = "episode", "time", "lasts", "failed", "why"
-    yield table(_last(found["listed"], "Alarms"), header, rows, left=(0, 4))
-    rows = [
-        [f"{hit['episode'] + 1}", _date(hit["time"]), _why(hit)]
-        for hit in found["missed"][-_LISTED:]
-    ]
-    if rows:
-        title = _last(found["missed"], "Failures that were not foreseen")
-        yield table(title, ("episode", "time", "why"), rows, left=(0, 2))
-
-
-def _why(hit: dict[str, Any]) -> str:
-    return str(hit["reason"].partition("; after")[0])
+    title = _last(found["listed"], "Alarms")
+    yield table(title, ("episode", "time", "lasts", "failed", "why"), rows, left=(0, 4))
+    if missed := found["missed"]:
+        rows = [[f"{x['episode'] + 1}", _date(x["time"]), x["reason"]] for x in missed[-_LISTED:]]
+        header = "episode", "time", "why"
+        yield table(_last(missed, "Failures that were not foreseen"), header, rows, left=(0, 2))
 
 
 def _last(hits: Sequence[Any], what: str) -> str:

@@ -24,11 +24,6 @@ _COLUMNS_SHOWN = 40  # columns
 _SIGNS = "<>=! "  # what in a name of a condition is ambiguous
 # Far outside is what lies so many ranges of 99 % of the rows beyond them.
 _FAR = 2.0
-_STEPS = {
-    "same time": "one row counts of each (rows twice, or a clock of too few digits?)",
-    "goes back": "rows that are earlier are left out (unsorted, or --episode?)",
-}
-_SKIPPED = {"comment": "comments", "row": "bad rows", "cut": "cut off"}
 # A larger share of steps, and so many, that are no usual one make no clock.
 _ODD, _MANY = 0.001, 10
 _TIME = re.compile("(t|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
@@ -61,8 +56,9 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     if more := len(shown) - len(facts):
         facts.append(("...", f"and {more:,} more columns"))
     facts += odd
-    for kind, (count, first) in skipped.items():
-        facts.append((_SKIPPED.get(kind, "bad cells"), f"{count:,}, the first: {first}"))
+    facts += [
+        (f"bad {kind}s", f"{n:,}, the first: {first}") for kind, (n, first) in skipped.items()
+    ]
     facts.append(("the clock", clock or "no column (--dt)"))
     facts.append(("rows looked at", f"{len(frame):,}"))
     options = [("--time", clock) if clock else ("--dt", "1"), *([("--unit", form)] if form else [])]
@@ -112,9 +108,8 @@ def _first_rows(table: CsvTable | ParquetTable, odd: Pairs) -> tuple[polars.Data
         others = fields.filter(read.is_null() & fields.is_not_null())
         if read.n_unique() > _MOST_TEXTS and 2 * len(others) < len(fields.drop_nulls()):
             frame = frame.with_columns(read.fill_null(math.nan).alias(name))
-            if len(others):
-                told = f"{len(others):,} cells are no numbers, such as {others[0]!r}"
-                odd.append(("bad cells", f"column {name!r}: {told}"))
+            told = f"{len(others):,} in column {name!r}, the first: {str(others.first())!r}"
+            odd += [("bad fields", told)] * (len(others) > 0)
     texts = [name for name in texts if len(frame) and frame[name].dtype == polars.String]
     numbers = [name for name in firsts if name in frame.columns and frame[name].dtype.is_numeric()]
     if not clock and (form := next(filter(None, map(_form, map(frame.get_column, texts))), "")):
@@ -138,12 +133,11 @@ def _of_steps(steps: NDArray[np.float64], facts: Pairs) -> Pairs:
     odd = (steps == 0.0) | (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
     facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {usual:.2g} s"
     holes = steps > LONGEST_STEP * usual
-    for name, count in {
-        "same time": (steps == 0.0).sum(),
-        "goes back": (steps < 0.0).sum(),
-    }.items():
-        if count:
-            facts.append((name, f"{count:,} times; {_STEPS[name]}"))
+    if len(late := steps[steps <= 0.0]):
+        told = (
+            f"{(late == 0.0).sum():,} at the time of the row before, {(late < 0.0).sum():,} earlier"
+        )
+        facts.append(("late rows", f"{told} (rows twice, unsorted, or --episode?)"))
     if odd.sum() < max(_MANY, _ODD * len(steps)):
         if holes.any():
             told = f"{holes.sum():,}, the longest {span(later.max())}, together"
@@ -232,15 +226,13 @@ def _range(name: str, values: NDArray[np.float64], seen: NDArray[np.float64]) ->
     told = f"{np.nanmin(values):.5g} to {np.nanmax(values):.5g}"
     seen = seen[np.isfinite(seen)]
     low, high = np.quantile(seen, (0.005, 0.995)) if len(seen) else (0.0, 0.0)
-    unit = _round(high - low) or 1.0
-    ends = np.array([low, high]) + _FAR * (high - low) * np.array([-1.0, 1.0])
-    ends = np.array([math.floor(ends[0] / unit), math.ceil(ends[1] / unit)]) * unit
-    far = np.array([(seen < ends[0]).sum(), (seen > ends[1]).sum()])
-    if not high > low or not far.any():
+    unit, beyond, column = _round(high - low) or 1.0, _FAR * (high - low), _named(name, _SIGNS)
+    least, most = math.floor((low - beyond) / unit) * unit, math.ceil((high + beyond) / unit) * unit
+    below, above = int((seen < least).sum()), int((seen > most).sum())
+    if not high > low or not below + above:
         return told
-    column = _named(name, _SIGNS)
-    parts = [f"{column}{sign}{end:.6g}" for sign, end, n in zip("><", ends, far, strict=True) if n]
-    told += f"; 99 % in {low:.5g} to {high:.5g}, {far.sum():,} far outside"
+    parts = [f"{column}>{least:.6g}"] * (below > 0) + [f"{column}<{most:.6g}"] * (above > 0)
+    told += f"; 99 % in {low:.5g} to {high:.5g}, {below + above:,} far outside"
     return f"{told} (--where {in_quotes(' and '.join(parts))} leaves them out)"
 
 

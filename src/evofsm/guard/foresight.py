@@ -47,8 +47,7 @@ _MOST_ROWS, _FAILURES = 500_000, 100
 # Blocks of rows in a horizon, as limits are searched for; of a long log fewer, but so many, where
 # there would be more than that in all.
 _BLOCKS, _FEWEST_BLOCKS, _MOST_BLOCKS = 15, 5, 100_000
-# Kinds of alarms; thresholds are plain unless others, with as many false ones, warn for so much
-# longer.
+# Kinds of alarms; plain thresholds are taken unless others, as often false, warn for longer.
 _LEARNT, _PLAIN, _NO_KIND = range(3)
 _BETTER = 0.9
 # What a further limit has to add to the share of the horizon that is warned before; survived rows
@@ -166,8 +165,7 @@ class Foresight(LearningJudge):
         self.horizon, self.hold = horizon, hold  #: [rows]
         self.bridges = 0.0  #: longest hole in time that it goes on across, as in a log [s]
         self.forms, self.limits = forms, limits
-        #: (rates, 3) of each of `RATES` alarms, those that were right (both cross-validated), and
-        #: whether it is plain.
+        #: (rates, 3) of each of `RATES`, cross-validated, alarms, those that were right; its kind
         self.held_out = held_out
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=dt)
         self.log = log  #: what it learns from, if it does as it goes
@@ -246,18 +244,14 @@ class Foresight(LearningJudge):
         learnt, plain = tallies  # with as many false ones
         as_many = np.minimum((plain[:, 2] + 1.0) / (learnt[:, 2] + 1.0), 1.0)
         kind = (plain[:, 0] >= _BETTER * as_many * learnt[:, 0]).astype(int)
-        found = [
-            [judge.of_rate(k, plain=x)[:, _OF:] for x in (False, True)] for k in range(len(RATES))
-        ]
+        rates = range(len(RATES))
+        found = [[judge.of_rate(k, plain=x)[:, _OF:] for x in (False, True)] for k in rates]
         kind |= [np.array_equal(*both) for both in found]
-        _, right, false = tallies[kind, np.arange(len(RATES))].T
+        _, right, false = tallies[kind, rates].T
+        right = right * [len(found[k][kind[k]]) > 0 for k in rates]
         alarms, chance = right + false, log.failed.sum() * ahead / len(log.rows)
-        for k in range(len(RATES)):  # whether it is better than an alarm at any time
-            if not (
-                len(found[k][kind[k]])
-                and right[k]
-                and wilson_bounds(right[k] / alarms[k], alarms[k])[0] > chance
-            ):
+        for k in rates:  # whether it is better than an alarm at any time
+            if not (right[k] and wilson_bounds(right[k] / alarms[k], alarms[k])[0] > chance):
                 kind[k] = _NO_KIND
         told = np.column_stack([alarms, right, kind])
         return cls(dt, ahead, held, judge.forms, judge.limits, told, names, units)
@@ -466,17 +460,15 @@ class Foresight(LearningJudge):
             *_, last = rates = [*group]
             at = f"{self.tolerance_of(RATES[last]):.3g}"
             which = f" (tolerance {at})" if self.rate_of(float(at)) == last else ""
-            told.append(
-                f"for {', '.join(f'{RATES[k]:g}' for k in rates)} false alarms a day{which} {text}"
-            )
+            stated = ", ".join(f"{RATES[k]:g}" for k in rates)
+            told.append(f"for {stated} false alarms a day{which} {text}")
         return "; ".join([_AS_GOOD] * self.is_plain + told)
 
     @property
     def is_plain(self) -> bool:
         """Whether all its alarms are plain thresholds."""
-        return bool(
-            (self.held_out[:, 2] == _PLAIN).any() and (self.held_out[:, 2] != _LEARNT).all()
-        )
+        kinds = self.held_out[:, 2]
+        return bool((kinds == _PLAIN).any() and (kinds != _LEARNT).all())
 
     def of(self, rate: int) -> str:
         """What the alarm for one of `RATES` is, and how often it was right, in words."""
@@ -484,9 +476,8 @@ class Foresight(LearningJudge):
         if kind == _NO_KIND:
             return "nothing was better than chance"
         plain = f"{_AS_GOOD}: " if kind == _PLAIN and not self.is_plain else ""
-        return (
-            f"{plain}{self.words(rate)} ({right:.0f} of {alarms:.0f} were right, cross-validated)"
-        )
+        told = f"{right:.0f} of {alarms:.0f} were right, cross-validated"
+        return f"{plain}{self.words(rate)} ({told})"
 
     # -- Beside a machine -----------------------------------------------------------------------
 
@@ -661,12 +652,8 @@ def _look_ahead(
 
 @kernel
 def false_times(begun: int, over: int, fails: int, horizon: int) -> int:
-    """How often an alarm of such rows was false: at its begin, and after each horizon.
-
-    Where it was right in the end, that is less often than it was on for a part of a horizon.
-    """
-    said = (over - begun + horizon - 1) // horizon
-    return min(max(fails - begun - 1, 0) // horizon, said)
+    """How often an alarm of such rows was false: as it began, and after each horizon of it."""
+    return min(max(fails - begun - 1, 0) // horizon, (over - begun + horizon - 1) // horizon)
 
 
 @kernel
