@@ -140,6 +140,44 @@ def test_a_first_look_says_what_is_odd_in_a_log(evofsm, refused):
     assert "say what is observed in odd.csv" in unsaid.stderr
 
 
+def test_failures_right_after_a_hole_are_counted_wherever_others_are(evofsm):
+    chance, time, rows = random.Random(1), 0, []
+    for run in range(24):
+        for k in range(60):
+            rises = max(0, k - 50) * 0.3 * (run % 2 == 0)
+            rows.append(f"{time},{5 + rises + chance.gauss(0, 0.1):.2f},0")
+            time += 60
+        time += 7200 * (run % 2)
+        rows.append(f"{time},{chance.gauss(9, 0.1):.2f},1")
+        time += 7200
+    Path("holes.csv").write_text("\n".join(["t,heat,trip", *rows]))
+    asked = (
+        "--observe",
+        "heat",
+        "--action",
+        "",
+        "--time",
+        "t",
+        "--failed",
+        "trip",
+        "--hole",
+        "10min",
+    )
+    novelty = "--rule", "novelty", "--scale", "heat=1", "--guard", "holes.evofsm"
+    learnt = evofsm("learn", "holes.csv", *asked, *novelty)
+    assert "24 episodes ended with trip" in " ".join(learnt.stdout.split())
+    for read, failures in ((asked, 5), (("--guard", "holes.evofsm"), 12)):
+        told = evofsm("monitor", "holes.csv", "--summary", *read)
+        found = json.loads(evofsm("monitor", "holes.csv", "--summary", *read, "--json").stdout)
+        assert (found["failures"], found["failures_at_once"]) == (failures, failures)
+        assert f"{failures}, and {failures} right after a hole or standstill" in told.stdout
+        foreseen = {one["episode"] for one in found["listed"] if one["failed"]}
+        assert len(foreseen) + len(found["missed"]) == failures
+        assert re.search(rf"Alarms: (all|the last 12 of) {len(found['listed'])}\n", told.stdout)
+        for stderr in (learnt.stderr, told.stderr):
+            assert "12 of 24 failures came right after a hole or standstill: what led" in stderr
+
+
 def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(evofsm):
     begun = "--observe", "heat", "--action", "", "--interval", 60, "--time", "Zeit"
     begun = *begun, "--failed", "trip==1", "--where", "runs"

@@ -145,9 +145,9 @@ def _document(
     head |= {"failures": int(runs.failed.sum()), "seconds": len(times) * judge.dt}
     head |= {"horizon": judge.horizon * judge.dt, "tolerance": tolerance}
     listed = [] if chosen is None else list(_listed(judge, chosen, runs, times))
-    came = {"listed": [row for row in listed if "lasts" in row]}
-    came["missed"] = [row for row in listed if "lasts" not in row]
-    return {**head, "alarms": alarms, "limits": limits, **came}
+    missed = [row for row in listed if "lasts" not in row]
+    listed = [row for row in listed if "lasts" in row]
+    return {**head, "alarms": alarms, "limits": limits, "listed": listed, "missed": missed}
 
 
 def _listed(

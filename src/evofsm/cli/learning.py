@@ -176,7 +176,7 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
             f"row, and {name} is {value:g} there each time: does that stand for a missing "
             f"value (no leader)? --no-leader {quote(f'{name}=={value:g}')} leaves such rows out"
         )
-    elif noted.failed_at_once:
+    if noted.failed_at_once:
         found.append(
             f"{noted.failed_at_once:,} of {noted.failed:,} failures came right after a hole or "
             "standstill: what led there was not recorded, so no alarm could foresee them"

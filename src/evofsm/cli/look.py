@@ -39,8 +39,9 @@ _NICE = [(seconds("", text), text) for text in _LONG.split()]
 
 def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     """What the first rows hold, by column and in all, and options that could be asked for."""
-    table.skips, facts = Skips(1 << 60, skipped := {}), Pairs()
-    frame, clock, form = _first_rows(table, facts)
+    skipped, odd = dict[str, tuple[int, str]](), Pairs()
+    table.skips = Skips(1 << 60, skipped)
+    frame, clock, form = _first_rows(table, odd)
     if not len(frame):
         return [], []
     numbers = [name for name, kind in frame.schema.items() if kind.is_numeric() and name != clock]
@@ -52,7 +53,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     runs = values[still] > limit if still else runs
     shown = {name: _range(name, z, z if name == still else z[runs]) for name, z in values.items()}
     shown |= {name: _told(frame[name]) for name in texts}
-    odd, facts = facts, [*shown.items()][:_COLUMNS_SHOWN]
+    facts = [*shown.items()][:_COLUMNS_SHOWN]
     if more := len(shown) - len(facts):
         facts.append(("...", f"and {more:,} more columns"))
     facts += odd

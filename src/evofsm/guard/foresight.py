@@ -49,7 +49,7 @@ _MOST_ROWS, _FAILURES = 500_000, 100
 _BLOCKS, _FEWEST_BLOCKS, _MOST_BLOCKS = 15, 5, 100_000
 # Kinds of alarms; plain thresholds are taken unless others, as often false, warn for longer.
 _LEARNT, _PLAIN, _NO_KIND = range(3)
-_BETTER = 0.9
+_BETTER = 0.95
 # What a further limit has to add to the share of the horizon that is warned before; survived rows
 # that forms of failure are learnt from.
 _WORTH, _ROWS = 2e-3, 4000
@@ -237,18 +237,18 @@ class Foresight(LearningJudge):
                 continue
             judge, rest = fresh._fitted(log.part(number != k)), log.part(number == k)
             columns = judge._columns(rest.rows, rest.starts)
-            for kind, rate in np.ndindex(2, len(RATES)):
-                found, _ = judge.tally(rest, rate, plain=bool(kind), columns=columns)
-                tallies[kind, rate] += found.lead * found.failures, found.foreseen, found.false
+            for which, rate in np.ndindex(2, len(RATES)):
+                found, _ = judge.tally(rest, rate, plain=bool(which), columns=columns)
+                tallies[which, rate] += found.lead * found.failures, found.foreseen, found.false
         judge = fresh._fitted(log)
         learnt, plain = tallies  # with as many false ones
         as_many = np.minimum((plain[:, 2] + 1.0) / (learnt[:, 2] + 1.0), 1.0)
-        kind = (plain[:, 0] >= _BETTER * as_many * learnt[:, 0]).astype(int)
+        is_plain = (plain[:, 0] >= _BETTER * as_many * learnt[:, 0]) | (plain[:, 1] > learnt[:, 1])
         rates = range(len(RATES))
-        found = [[judge.of_rate(k, plain=x)[:, _OF:] for x in (False, True)] for k in rates]
-        kind |= [np.array_equal(*both) for both in found]
+        limits = [[judge.of_rate(k, plain=x)[:, _OF:] for x in (False, True)] for k in rates]
+        kind = (is_plain | [np.array_equal(a, b) for a, b in limits]).astype(int)
         _, right, false = tallies[kind, rates].T
-        right = right * [len(found[k][kind[k]]) > 0 for k in rates]
+        right = right * [len(limits[k][kind[k]]) > 0 for k in rates]
         alarms, chance = right + false, log.failed.sum() * ahead / len(log.rows)
         for k in rates:  # whether it is better than an alarm at any time
             if not (right[k] and wilson_bounds(right[k] / alarms[k], alarms[k])[0] > chance):
@@ -319,7 +319,7 @@ class Foresight(LearningJudge):
 
         def beyond(rule: Sequence[tuple[int, int]]) -> Flags:
             parts = [signed[k] > tried[k][j] for k, j in rule]
-            return np.logical_or.reduce([np.zeros(len(log.rows), np.bool_), *parts])
+            return np.asarray(np.logical_or.reduce([np.zeros(len(log.rows), np.bool_), *parts]))
 
         counted, rows = dict[tuple[tuple[int, int], ...], tuple[float, int, float]](), []
         for rule in rules:  # row by row

@@ -123,8 +123,8 @@ class Form:
         self._keys = {f"v{k}": name for k, name in enumerate(self.variables or ["observation"])}
         self._others = {f"w{k}": name for k, name in enumerate(others)}
         clocks = dict.fromkeys([clock, *clock.split(",")])  # of date and time of day
-        known = {"time", *self._keys.values(), *others}
-        self._clocks = {f"x{k}": name for k, name in enumerate(clocks) if name not in known}
+        taken = {"time", *self._keys.values(), *others}
+        self._clocks = {f"x{k}": name for k, name in enumerate(clocks) if name not in taken}
         self._form, self._unit = unit if "%" in unit else "", TIMES.get(unit, 1.0)
         seen = [(key, _Seen if self.variables else several) for key in self._keys]
         action: Any = ("proposal", _action(guard))
@@ -138,8 +138,8 @@ class Form:
         self._scene = self._struct("Scene", ("time", _Number), action, *placed, version)
         last = [(key, kind | UnsetType, UNSET) for key, kind in seen]
         ended = ("end", bool), ("failed", bool, False), ("time", _Seen | str | UnsetType, UNSET)
-        also = [(*field, None) for field in also]
-        self._end = self._struct("End", *ended, *when[1:], *last, *also, version)
+        unasked = [(*field, None) for field in also]
+        self._end = self._struct("End", *ended, *when[1:], *last, *unasked, version)
         self._decoders = {kind: msgspec.json.Decoder(kind) for kind in (self._row, self._scene)}
 
     def _struct(self, name: str, *fields: Any) -> Any:
