@@ -385,7 +385,7 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
             yield "It never alarms: cross-validated, no alarm was better than chance."
         else:
             yield f"It alarms where {guard.judge.of(rate)}."
-        yield f"All that it learnt (--tolerance chooses): {guard.judge.told_by_experience}."
+        yield f"All that it learnt (--tolerance takes one): {guard.judge.told_by_experience}."
         return
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."

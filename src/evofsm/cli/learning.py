@@ -219,12 +219,7 @@ def _contradictions(noted: Noted, columns: LogColumns) -> Iterator[str]:
 
 
 def episodes_read(
-    path: str,
-    reading: Reading,
-    *,
-    dated: bool = False,
-    most: int | None = None,
-    fewest: int = 2,
+    path: str, reading: Reading, *, dated: bool = False, most: int | None = None, fewest: int = 2
 ) -> Iterator[Chunk]:
     """The episodes of a log that have so many rows, of ``most`` in all; then what was noticed.
 

@@ -40,7 +40,7 @@ from evofsm.store import COUNT, FROM_1, SIZE, Kind, Numbers, Place
 RATES = (0.1, 0.3, 1.0, 3.0)
 # In horizons: how far ahead limits look, over what the rate is taken, how long an alarm stays on.
 _AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.125
-# Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts held out.
+# Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts of a log.
 _MOST_LIMITS, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 4.0, 12), 3
 # Of a log of more rows some episodes are learnt from, if so many failures are left.
 _MOST_ROWS, _FAILURES = 500_000, 100
@@ -243,7 +243,7 @@ class Foresight(LearningJudge):
         judge = fresh._fitted(log)
         learnt, plain = tallies  # with as many false ones
         as_many = np.minimum((plain[:, 2] + 1.0) / (learnt[:, 2] + 1.0), 1.0)
-        is_plain = (plain[:, 0] >= _BETTER * as_many * learnt[:, 0]) | (plain[:, 1] > learnt[:, 1])
+        is_plain = plain[:, 0] >= _BETTER * as_many * learnt[:, 0]
         rates = range(len(RATES))
         limits = [[judge.of_rate(k, plain=x)[:, _OF:] for x in (False, True)] for k in rates]
         kind = (is_plain | [np.array_equal(a, b) for a, b in limits]).astype(int)
@@ -361,7 +361,7 @@ class Foresight(LearningJudge):
         return np.asarray(sign[:, None] * x > (sign * limits[:, _AT])[:, None])
 
     def of_rate(self, rate: int, *, plain: bool | None = None) -> Floats:
-        """The limits of an alarm, by default of the kind that did better on what was held out."""
+        """The limits of an alarm, by default of the kind that did better, cross-validated."""
         kind = self.held_out[rate, 2] if plain is None else _PLAIN if plain else _LEARNT
         chosen = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
         return np.asarray(self.limits[chosen])
