@@ -106,11 +106,11 @@ def _first_rows(table: CsvTable | ParquetTable, odd: Pairs) -> tuple[polars.Data
     for name in texts if len(frame) else ():  # of which the first alone is no number
         fields = frame[name].str.strip_chars().replace("", None)
         read = fields.str.replace(",", ".", literal=True).cast(polars.Float64, strict=False)
-        others = fields.filter(read.is_null() & fields.is_not_null())
-        if read.n_unique() > _MOST_TEXTS and 2 * len(others) < len(fields.drop_nulls()):
+        bad = fields.filter(read.is_null() & fields.is_not_null())
+        if read.n_unique() > _MOST_TEXTS and 2 * len(bad) < len(fields.drop_nulls()):
             frame = frame.with_columns(read.fill_null(math.nan).alias(name))
-            told = f"{len(others):,} in column {name!r}, the first: {str(others.first())!r}"
-            odd += [("bad fields", told)] * (len(others) > 0)
+            told = f"{len(bad):,} in column {name!r}, the first: {str(bad.first())!r}"
+            odd += [("bad fields", told)] * (len(bad) > 0)
     texts = [name for name in texts if len(frame) and frame[name].dtype == polars.String]
     numbers = [name for name in firsts if name in frame.columns and frame[name].dtype.is_numeric()]
     if not clock and (form := next(filter(None, map(_form, map(frame.get_column, texts))), "")):

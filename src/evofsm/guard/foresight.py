@@ -60,6 +60,8 @@ _SHORT, _FEWEST, _HELD_ROWS, _MORE = 0.05, 10, 20_000, (1.1, 1.5)
 #: which of `_AHEAD`, whether above (1) or below (-1), and the threshold.
 _RATE, _KIND, _OF, _WHEN, _SIGN, _AT = range(6)
 _DAY, _AS_GOOD = 86400.0, "plain thresholds do as well"
+# Limits by their places, each with that of its threshold.
+_Rule = tuple[tuple[int, int], ...]
 #: The file of such a judge.
 KIND = Kind(
     "foresight",
@@ -237,9 +239,9 @@ class Foresight(LearningJudge):
                 continue
             judge, rest = fresh._fitted(log.part(number != k)), log.part(number == k)
             columns = judge._columns(rest.rows, rest.starts)
-            for which, rate in np.ndindex(2, len(RATES)):
-                found, _ = judge.tally(rest, rate, plain=bool(which), columns=columns)
-                tallies[which, rate] += found.lead * found.failures, found.foreseen, found.false
+            for side, rate in np.ndindex(2, len(RATES)):
+                found, _ = judge.tally(rest, rate, plain=bool(side), columns=columns)
+                tallies[side, rate] += found.lead * found.failures, found.foreseen, found.false
         judge = fresh._fitted(log)
         learnt, plain = tallies  # with as many false ones
         as_many = np.minimum((plain[:, 2] + 1.0) / (learnt[:, 2] + 1.0), 1.0)
@@ -290,7 +292,7 @@ class Foresight(LearningJudge):
         most = spans[0] * log.failed.sum(), len(log.rows) * self.dt / _DAY
 
         @cache
-        def more(rule: tuple[tuple[int, int], ...]) -> Floats:
+        def more(rule: _Rule) -> Floats:
             """(limits, thresholds, 2) share that is warned, and false alarms a day, of one more."""
             above, found = np.zeros(len(blocks), np.bool_), np.zeros((len(asked), _TRIED, 2))
             for k, j in rule:
@@ -301,40 +303,37 @@ class Foresight(LearningJudge):
                 found[k, j] = leads.sum(), false
             return np.asarray(found / most)
 
-        rules: dict[tuple[tuple[int, int], ...], Floats] = {(): np.zeros(2)}
+        rules = [nothing := _Rule()]
         for price in _PRICES:
-            rule, worth = tuple[tuple[int, int], ...](), 0.0
+            rule, worth = nothing, 0.0
             while len(rule) < _MOST_LIMITS:
                 gain = more(rule) @ (1.0, -price)
                 best = divmod(int(gain.argmax()), _TRIED)
                 if gain[best] <= worth + _WORTH:
                     break
-                worth, told, rule = gain[best], more(rule)[best], (*rule, best)
-                rules[rule] = told
-        alone = more(())
+                worth, rule = gain[best], (*rule, best)
+                rules.append(rule)
+        alone = more(nothing)
         for false in RATES:
             fitting = np.where(alone[..., 1] <= false, alone[..., 0], -1.0)
-            best = divmod(int(fitting.argmax()), _TRIED)
-            rules[(best,)] = alone[best]
+            rules.append((divmod(int(fitting.argmax()), _TRIED),))
 
-        def beyond(rule: Sequence[tuple[int, int]]) -> Flags:
+        def beyond(rule: _Rule) -> Flags:
             parts = [signed[k] > tried[k][j] for k, j in rule]
             return np.asarray(np.logical_or.reduce([np.zeros(len(log.rows), np.bool_), *parts]))
 
-        counted, rows = dict[tuple[tuple[int, int], ...], tuple[float, int, float]](), []
+        counted, rows, chosen = dict[_Rule, tuple[float, int, float]](), [], nothing
         for rule in rules:  # row by row
             false = _tally(on := beyond(rule), log.starts, log.failed, self._spans, leads, on)
             counted[rule] = leads.sum(), int((leads > 0.0).sum()), false / most[1]
-        chosen = tuple[tuple[int, int], ...]()
         for rate, false in enumerate(RATES):
             fewest = counted[chosen][1]
             fit = [rule for rule, (_, n, f) in counted.items() if f <= false and n >= fewest]
             chosen = max(fit, key=lambda rule: (counted[rule][0], -counted[rule][2], -len(rule)))
-            kept = list(chosen)
+            kept = chosen
             for part in chosen:  # what others imply is no part of it
-                others = [other for other in kept if other != part]
-                if others and not (beyond([part]) & ~beyond(others)).any():
-                    kept = others
+                rest = tuple(known for known in kept if known != part)
+                kept = kept if not rest or (beyond((part,)) & ~beyond(rest)).any() else rest
             rows += [(rate, plain, *asked[k], asked[k][2] * tried[k][j]) for k, j in kept]
         return np.array(rows, np.float64).reshape(-1, 6)
 
@@ -459,9 +458,9 @@ class Foresight(LearningJudge):
         for text, group in groupby(range(len(self.held_out)), self.of):
             *_, last = rates = [*group]
             at = f"{self.tolerance_of(RATES[last]):.3g}"
-            which = f" (tolerance {at})" if self.rate_of(float(at)) == last else ""
+            taken = f" (tolerance {at})" if self.rate_of(float(at)) == last else ""
             stated = ", ".join(f"{RATES[k]:g}" for k in rates)
-            told.append(f"for {stated} false alarms a day{which} {text}")
+            told.append(f"for {stated} false alarms a day{taken} {text}")
         return "; ".join([_AS_GOOD] * self.is_plain + told)
 
     @property

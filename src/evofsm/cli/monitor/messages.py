@@ -35,7 +35,7 @@ _MOST_OBJECTS = 64
 _LETTERS = 40
 # What is later than this is in another unit [s]; what is said of lines of another kind.
 _LATEST = 1e11
-_ROWS = "rows are JSON, one per line; a log in a file: evofsm monitor FILE --summary"
+_NO_ROW = "rows are JSON, one per line; a log in a file: evofsm monitor FILE --summary"
 # Where a width is not given [m].
 _USUAL_WIDTH = 1.8
 
@@ -179,22 +179,18 @@ class Form:
     def _when(self, told: Any) -> float | None:
         """The time of a message [s], as it or a log has it."""
         keys = {"time": "time", **self._clocks}
-        said = {key: getattr(told, key) for key in keys}
-        said = {key: value for key, value in said.items() if value not in (UNSET, None)}
-        if not said:
-            return None
-        key, time = next(iter(said.items()))
+        found = {name: getattr(told, key) for key, name in keys.items()}
+        said = {name: value for name, value in found.items() if value not in (UNSET, None)}
+        name, time = next(iter(said.items()), ("time", None))
         if isinstance(time, str):
-            text = " ".join(map(str, said.values()))
             try:
-                return seconds_of_date(text, self._form)
+                return seconds_of_date(" ".join(map(str, said.values())), self._form)
             except ValueError:
-                fault = f"is {_shown(text)}; it must be float [s], or a date as logs have them"
-                raise MessageError(keys[key], fault) from None
-        seconds = float(time) * (1.0 if key == "time" else self._unit)
-        if seconds >= _LATEST:
-            fault = f"is {time:.15g}: milliseconds? It must be in seconds"
-            raise MessageError(keys[key], fault, seconds)
+                fault = f"is {_shown(time)}; it must be float [s], or a date as logs have them"
+                raise MessageError(name, fault) from None
+        seconds = time if time is None or name == "time" else time * self._unit
+        if seconds is not None and seconds >= _LATEST:
+            raise MessageError(name, f"is {time:.15g}: milliseconds? It must be in seconds", time)
         return seconds
 
     def _observed(self, told: Any) -> tuple[float | None, ...]:
@@ -341,7 +337,7 @@ def _parsed(line: bytes) -> dict[str, Any]:
             fault = f"holds {name}, which is no JSON; a number that was not seen is null"
             raise MessageError("line", fault) from None
         kind = "not UTF-8" if isinstance(error, UnicodeDecodeError) else "no JSON"
-        hint = "" if line.lstrip().startswith(b"{") else f"; {_ROWS}"
+        hint = "" if line.lstrip().startswith(b"{") else f"; {_NO_ROW}"
         raise MessageError("line", f"is {kind}: {error}{hint}") from None
     if not isinstance(told, dict):
         raise MessageError("line", f"is {_shown(told)}; it must be a JSON object")
