@@ -167,7 +167,10 @@ class Decider:
         """Take in what was accepted, and answer it."""
         if isinstance(told, Pause):
             return dict(self._waited(early=True).get("last", {}))
+        lacking = "" if self.rows or self.slots.waiting else self.slots.lacking(told)  # once
         answer = self._ended(told) if isinstance(told, End) else self._taken(told)
+        if lacking:
+            answer["note"] = "; ".join(filter(None, [answer.get("note"), lacking]))
         self._recent.append((told, answer))
         if self.rows >= self.episode and (not answer.get("alarm") or self.rows >= 2 * self.episode):
             self._end_unasked()

@@ -101,7 +101,7 @@ class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 
 
 class Form:
-    """Reads lines, for one guard; ``others`` are keys that rows have beside its variables.
+    """Reads lines, for one guard; ``others`` are keys that rows may have beside its variables.
 
     The time may stand in the column of a log, ``clock``, in this unit, or in dates of this form.
     """
@@ -131,15 +131,14 @@ class Form:
         if isinstance(guard.actions, Choices) and guard.actions.n_actions == 1:  # nobody acts
             action = (*action, 0)
         version = ("schema", Literal[1], SCHEMA)
-        also = [(key, float | bool | str | None) for key in self._others]
+        also = [(key, float | bool | str | None, None) for key in self._others]
         when = [(key, _Number | str | UnsetType, UNSET) for key in ("time", *self._clocks)]
         self._row = self._struct("Row", *when, action, *seen, *also, version)
         placed = ("ego", _Vehicle), ("objects", list[_Vehicle])
         self._scene = self._struct("Scene", ("time", _Number), action, *placed, version)
         last = [(key, kind | UnsetType, UNSET) for key, kind in seen]
         ended = ("end", bool), ("failed", bool, False), ("time", _Seen | str | UnsetType, UNSET)
-        unasked = [(*field, None) for field in also]
-        self._end = self._struct("End", *ended, *when[1:], *last, *unasked, version)
+        self._end = self._struct("End", *ended, *when[1:], *last, *also, version)
         self._decoders = {kind: msgspec.json.Decoder(kind) for kind in (self._row, self._scene)}
 
     def _struct(self, name: str, *fields: Any) -> Any:

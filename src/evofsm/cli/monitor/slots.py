@@ -53,7 +53,7 @@ class Slots:
         if columns.failed:
             said.append(f"an episode fails with {columns.failed} (--failed)")
         if self.keys:
-            said.append(f"rows tell {', '.join(self.keys)}")
+            said.append(f"rows may tell {', '.join(self.keys)}")
         return "; ".join(said)
 
     def refuse(self, row: Row) -> None:
@@ -63,6 +63,12 @@ class Slots:
             for term in condition.terms:
                 if fault := term.fault(told.get(term.column)):
                     raise MessageError(term.column, f"{fault} ({option})", row.time)
+
+    def lacking(self, row: Message) -> str:
+        """What a row does not tell of what conditions name, in words."""
+        told = zip(self.keys, row.told, strict=False) if isinstance(row, Row) else ()
+        names = ", ".join(name for name, value in told if value is None)
+        return f"no {names} in the row, which --failed or --where names" if names else ""
 
     def fails(self, row: Message | None) -> bool:
         """Whether a row meets what tells of failures."""
