@@ -215,7 +215,7 @@ _ABOUT = """Does an alarm that was learnt foresee more than plain thresholds?
 Nobody acts. The first 60 % of each log are learnt from, the rest is judged. Both are searched for
 in the same way, for a rate of false alarms that is stated: thresholds, of which any may be passed,
 or also of what is to come at the present rate, and of the forms of failure. An alarm is right if a
-failure comes within 30 min; ahead is how long it was on by then, 0 if it was not."""
+failure comes within 30 min after it began; ahead counts from the first, 0 if there is none."""
 _AT_AS_MANY = """At as many: how far ahead the learnt alarm is with as many false alarms a day as
 thresholds really had, between the rates that were stated."""
 

@@ -93,7 +93,7 @@ OPTIONS = {
     "another clock": (table(CARS.replace("time", "t")), "", r"\((--time) names the right", "t"),
     "no clock": (table(CARS[5:]), "", r"and (--dt) stands in for a clock", "0.1"),
     "another action": (table("time,gap,v_follower,v_leader,u"), "", r"\((--action) names", "u"),
-    "others": (table("time,level,a_follower"), "", r"\((--observe) names", "level"),
+    "others": (table("time,level,a_follower"), "", r"(--observe) level", "level"),
     "bad rows": (table() + "1,2\n" * 12, "", r"; (--skip-bad) 10 leaves out", "12"),
 }
 

@@ -56,11 +56,32 @@ def test_where_one_limit_depends_on_another_it_foresees_more_than_thresholds(sur
     assert re.search(r"0\.\d+ flow above 0\.\d+", surge.told_by_experience)
 
 
+def test_an_alarm_for_more_false_ones_is_no_worse_where_it_learnt(surge):
+    log = Runs.of(*log_of(surging, 0, 40))
+    for plain in (False, True):
+        came = [surge.tally(log, rate, plain=plain)[0] for rate in range(len(RATES))]
+        assert [x.foreseen for x in came] == sorted(x.foreseen for x in came)
+        assert [x.lead for x in came] == sorted(x.lead for x in came)
+        for rate in range(len(RATES)):
+            of = surge.of_rate(rate, plain=plain)[:, 2:5].tolist()
+            assert len({*map(tuple, of)}) == len(of) > 0  # no part of it implies another one
+
+
+def test_a_warning_of_one_row_is_found_where_the_horizon_is_long():
+    rng = np.random.default_rng(0)
+    runs = [np.append(rng.normal(5.0, 0.1, 150), rng.normal(9.0, 1.0, 2)) for _ in range(12)]
+    judge = Foresight.learn_log(runs, [True] * 12, dt=DT, horizon=60 * DT)
+    told, _ = judge.tally(Runs.of(runs, [True] * 12), 0, plain=True)
+    assert told.foreseen > 8
+    assert told.false == 0
+    assert judge.told_by_experience.count("plain thresholds do as well") == 1  # said once
+
+
 def test_one_failure_is_learnt_from_and_no_later_tolerance_silences_an_alarm(surge):
     rising = np.linspace(0.0, 1.0, 60)[:, None]
     for runs in ([rising], [rising * 0.5, rising]):
         one = Foresight.learn_log(runs, [run.max() == 1.0 for run in runs], dt=DT)
-        assert one.rate_of(0.01) is None  # on nothing held out it was right
+        assert one.rate_of(0.01) is None  # cross-validated it was never right
     judge = copy.deepcopy(surge)
     for right in ([4, 4, 4, 4], [4, 3, 3, 2], [2, 3, 3, 4]):
         judge.held_out = np.column_stack([[4] * 4, right, [0] * 4])
@@ -110,6 +131,10 @@ def test_what_is_repeated_or_missing_changes_no_alarm(surge):
         ([9] * 41, True, 0.0, (1, 20.0, 1)),  # the horizon before the failure is right
         ([9, 0, 9, 0, 9], True, 0.0, (1, 4.0, 0)),  # it stays on for a while
         ([0, 0, 0, 0, 9], True, 0.0, (0, 0.0, 0)),  # no warning
+        ([0, 0, 9] + [0] * 12, True, 0.0, (1, 12.0, 0)),  # it is over long before, and right
+        ([9] + [0] * 30, True, 0.0, (0, 0.0, 1)),  # it came too early
+        ([9] + [0] * 14 + [9] + [0] * 14, True, 0.0, (1, 14.0, 1)),  # each by itself
+        ([9] * 25 + [0] * 9, True, 0.0, (1, 20.0, 1)),  # it said so again within the horizon
     ],
 )
 def test_what_counts_as_foreseen_and_as_false(heat, failed, hold, told):

@@ -542,7 +542,7 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, pieces, nothing):
     assert "line 3, column 'a_follower'" in refusal(path, no_leader="end")
     path = write(tmp_path / "d.csv", lines, SHORT)  # what leads on from a last row is not needed
     read(path, noted=noted, no_leader="end", failed="crash")
-    assert "1 failures lie in rows that are left out" in " ".join(warnings_of(noted))
+    assert "1 failure lies in rows that are left out" in " ".join(warnings_of(noted))
 
 
 @pytest.mark.parametrize("odd", ["", ";;;;"])

@@ -14,7 +14,7 @@ from evofsm.cli.options import picture
 from evofsm.cli.show import facts, print_json, show, table
 from evofsm.fsm import EvolvingFSM, Labels
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
-from evofsm.guard.foresight import RATES, Runs, span
+from evofsm.guard.foresight import RATES, Runs, false_times, span
 from evofsm.io import Chunk
 
 if TYPE_CHECKING:
@@ -85,15 +85,18 @@ def show_foreseen(
 
     What is asked for are the horizon, the hold time and the tolerance.
     """
-    title = str(file)
+    title, held_out = str(file), ""
     if guard is None:
         rows = np.cumsum([len(e.times) for e in episodes])
         first = int((rows <= LEARNT * rows[-1]).sum())
-        if not 0 < first < len(episodes):
+        first_part, episodes = _of_two_rows(episodes[:first]), episodes[first:]
+        if not (first_part and _of_two_rows(episodes)):
             raise ValueError(f"{file}: it takes two episodes at least, to learn and to judge")
-        first_part, episodes = episodes[:first], episodes[first:]
         guard = guard_where_nobody_acts(first_part, labels, *asked)
-        title += f": learnt from its first {first:,} episodes, judged by the rest"
+        title += f": learnt from its first {len(first_part):,} episodes, judged by the rest"
+        held_out = f", held out (the last {1.0 - LEARNT:.0%} of the rows)"
+    at_once = sum(e.failed for e in episodes if len(e.times) == 1)
+    episodes = _of_two_rows(episodes)
     reviser, judge = guard.reviser, guard.judge
     assert isinstance(reviser, ActionReviser)
     assert isinstance(judge, Foresight)
@@ -101,11 +104,16 @@ def show_foreseen(
     runs, times = _runs(episodes), np.concatenate([e.times for e in episodes])
     if plot is not None:
         _draw(judge, tolerance, guard.machine, runs, times, plot)
-    found = _document(judge, tolerance, runs, times)
+    found = {**_document(judge, tolerance, runs, times), "failures_at_once": at_once}
     if as_json:
         print_json({"file": file, **found})
     else:
-        show(*_tables(found, judge, title))
+        show(*_tables(found, judge, title, held_out))
+
+
+def _of_two_rows(episodes: Sequence[Chunk]) -> Sequence[Chunk]:
+    """Those of which something can be foreseen."""
+    return [episode for episode in episodes if len(episode.times) > 1]
 
 
 def _runs(episodes: Sequence[Chunk]) -> Runs:
@@ -137,33 +145,44 @@ def _document(
     head |= {"failures": int(runs.failed.sum()), "seconds": len(times) * judge.dt}
     head |= {"horizon": judge.horizon * judge.dt, "tolerance": tolerance}
     listed = [] if chosen is None else list(_listed(judge, chosen, runs, times))
-    return {**head, "alarms": alarms, "limits": limits, "listed": listed}
+    missed = [row for row in listed if "lasts" not in row]
+    listed = [row for row in listed if "lasts" in row]
+    return {**head, "alarms": alarms, "limits": limits, "listed": listed, "missed": missed}
 
 
 def _listed(
     judge: Foresight, rate: int, runs: Runs, times: NDArray[np.float64]
 ) -> Iterator[dict[str, Any]]:
-    """Each alarm, and each failure that none was before."""
+    """Each alarm, and each failure that none was before, which lasts for no time."""
     _, on = judge.tally(runs, rate)
+    horizon = judge.horizon
     for k, (first, end) in enumerate(pairwise([*runs.starts.tolist(), len(times)])):
         edges = np.flatnonzero(np.diff(on[first:end], prepend=False, append=False)) + first
-        foreseen = False
+        fails, why = end - 1 if runs.failed[k] else end + horizon, ""
+        foreseen = not runs.failed[k]
         for begun, over in edges.reshape(-1, 2).tolist():
-            foreseen = bool(runs.failed[k]) and over == end and begun < end - 1
+            if begun == fails:
+                why = "; one came with it"
+                continue
+            false = false_times(begun, over, fails, horizon)
+            right = bool(runs.failed[k]) and false * horizon < over - begun
+            foreseen |= right
             passed = judge.passed(runs.rows[first : begun + 1])
-            row = {"episode": k, "row": begun, "time": times[begun]}
-            row |= {"lasts": (over - begun) * judge.dt, "failed": foreseen}
+            row = {"episode": k, "row": begun, "time": times[begun], "failed": right}
+            row |= {"lasts": (over - begun) * judge.dt, "false": int(false)}
             yield {**row, "reason": judge.reason(rate, runs.rows[begun], passed)}
-        if runs.failed[k] and not foreseen:
-            row = {"episode": k, "row": end - 1, "time": times[end - 1], "lasts": 0.0}
-            yield {**row, "reason": "no alarm was on", "failed": True}
+        if not foreseen:
+            row = {"episode": k, "row": fails, "time": times[fails]}
+            yield {**row, "reason": f"no alarm within {span(horizon * judge.dt)} before it{why}"}
 
 
-def _tables(found: dict[str, Any], judge: Foresight, title: str) -> Iterator[RenderableType]:
+def _tables(
+    found: dict[str, Any], judge: Foresight, title: str, held_out: str
+) -> Iterator[RenderableType]:
     """The same for people."""
     days = f"{found['seconds'] / 86400.0:.3g} days"
     soon = f"an alarm is right if one comes within {span(found['horizon'])}"
-    text, rows, bold = "none: on episodes held out, no alarm was better than chance", [], []
+    text, rows, bold = "none: cross-validated, no alarm was better than chance", [], []
     for k, alarm in enumerate(found["alarms"]):
         row = [f"{alarm['stated']:g}", span(alarm["hold"])]
         for came in (alarm["learnt"], alarm["plain"]):
@@ -174,22 +193,39 @@ def _tables(found: dict[str, Any], judge: Foresight, title: str) -> Iterator[Ren
             text = f"{row[2]} failures foreseen, {row[3]} ahead (mean; not foreseen: 0)"
             text += f", {alarm['learnt']['false']:,} false"
             bold = [k]
-    pairs = [("rows", f"{found['rows']:,} in {found['episodes']:,} episodes, {days}")]
-    pairs += [("failures", f"{found['failures']:,}; {soon}"), ("alarms", text)]
+    pairs = [("rows", f"{found['rows']:,} in {found['episodes']:,} episodes, {days}{held_out}")]
+    at_once = f", and {found['failures_at_once']:,} right after a hole or standstill"
+    failures = f"{found['failures']:,}{at_once * (found['failures_at_once'] > 0)}; {soon}"
+    pairs += [("failures", failures), ("alarms", text)]
     yield facts(title, pairs)
     title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
     yield table(title, _HEADER, rows, bold=bold)
     said = []
     for k, limit in enumerate(found["limits"]):
-        beside = "" if limit["kind"] == "plain" else f"; plain thresholds would be {limit['plain']}"
+        is_other = limit["kind"] != "plain" and limit["plain"] != "none"
+        beside = f"; plain thresholds would be {limit['plain']}" if is_other else ""
         said.append((f"{limit['stated']:g}", f"{judge.of(k)}{beside}"))
-    yield facts("\nWhere they alarm, by false alarms a day", said)
+    alike = "; plain thresholds do as well" * judge.is_plain
+    yield facts(f"\nWhere they alarm, by false alarms a day{alike}", said)
     rows = []
     for hit in found["listed"][-_LISTED:]:
-        failed, why = "yes" if hit["failed"] else "no", hit["reason"].partition(";")[0]
+        false = {0: [], 1: ["no"]}.get(hit["false"], [f"{hit['false']} times no"])
+        failed, why = (
+            ", then ".join([*false, *["yes"] * hit["failed"]]),
+            hit["reason"].partition("; after")[0],
+        )
         rows.append([f"{hit['episode'] + 1}", _date(hit["time"]), span(hit["lasts"]), failed, why])
-    title = f"\nThe last of {len(found['listed'])} alarms"
+    title = _last(found["listed"], "Alarms")
     yield table(title, ("episode", "time", "lasts", "failed", "why"), rows, left=(0, 4))
+    if missed := found["missed"]:
+        rows = [[f"{x['episode'] + 1}", _date(x["time"]), x["reason"]] for x in missed[-_LISTED:]]
+        header = "episode", "time", "why"
+        yield table(_last(missed, "Failures that were not foreseen"), header, rows, left=(0, 2))
+
+
+def _last(hits: Sequence[Any], what: str) -> str:
+    n = len(hits)
+    return f"\n{what}: {'all' if n <= _LISTED else f'the last {_LISTED} of'} {n:,}"
 
 
 def _date(time: float) -> str:

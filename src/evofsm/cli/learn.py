@@ -144,6 +144,10 @@ def learn(
     _check_out(guard, "--guard")
     columns, lengths, _, acts = read = reading()
     lacking = _look_first(files[0], read)
+    if lacking is None:
+        if out or guard or given_of(reading):
+            raise ValueError(f"say what is observed in {files[0]}: --observe; a way stands above")
+        return
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
     actions = _actions(action_range if acts else "0:1:1")
@@ -325,8 +329,8 @@ def _check_out(out: Path | None, option: str = "--out") -> None:
             raise ValueError(f"{option} {out}: {fault}") from None
 
 
-def _look_first(file: str, reading: Reading) -> list[str]:
-    """What a log seems to need that was not asked for; where nothing was, a way to learn."""
+def _look_first(file: str, reading: Reading) -> list[str] | None:
+    """What a log seems to need that was not asked for; None where a way to learn was printed."""
     from evofsm.cli.look import look_at
     from evofsm.driving.naming import VARIABLES
     from evofsm.io.logs import open_table
@@ -344,7 +348,7 @@ def _look_first(file: str, reading: Reading) -> list[str]:
         command = [f"evofsm learn {quote(file)}", *(f"{a} {in_quotes(b)}" for a, b in options)]
         show(facts(f"What {file} holds", found), "\nA way to learn from it:")
         print("  " + " \\\n      ".join(command), flush=True)
-        raise ValueError(f"say what is observed in {file} (--observe names it); a way stands above")
+        return None
     said = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
     asked = zip(_UNASKED.items(), said, strict=True)
     return [
@@ -378,10 +382,10 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     if isinstance(guard.judge, Foresight):
         tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
         if (rate := guard.judge.rate_of(tolerance)) is None:
-            yield "It never alarms: on episodes held out, no alarm was better than chance."
+            yield "It never alarms: cross-validated, no alarm was better than chance."
         else:
             yield f"It alarms where {guard.judge.of(rate)}."
-        yield f"All that it learnt (--tolerance chooses): {guard.judge.told_by_experience}."
+        yield f"All that it learnt (--tolerance takes one): {guard.judge.told_by_experience}."
         return
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."

@@ -176,6 +176,11 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
             f"row, and {name} is {value:g} there each time: does that stand for a missing "
             f"value (no leader)? --no-leader {quote(f'{name}=={value:g}')} leaves such rows out"
         )
+    if noted.failed_at_once:
+        found.append(
+            f"{noted.failed_at_once:,} of {noted.failed:,} failures came right after a hole or "
+            "standstill: what led there was not recorded, so no alarm could foresee them"
+        )
     if alone := [(name, *pair) for name, pair in noted.below.items() if pair[0] and pair[1] > 2]:
         name, value, rows = min(alone, key=lambda entry: entry[1] not in _NOBODY)
         found.append(
@@ -184,8 +189,9 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         )
     found += _contradictions(noted, columns)
     if noted.unplaced:
-        why = "lie in rows that are left out, belong to no episode, and were not counted"
-        found.append(f"{noted.unplaced:,} failures {why}")
+        lie = "failure lies" if noted.unplaced == 1 else "failures lie"
+        why = "in rows that are left out, outside of any episode: not counted"
+        found.append(f"{noted.unplaced:,} {lie} {why}")
     for kind, (count, first) in noted.skipped.items():
         text = _LEFT_OUT.get(kind, "bad rows were left out (--skip-bad)")
         found.append(f"{count:,} {text}, the first: {first}")
@@ -213,16 +219,16 @@ def _contradictions(noted: Noted, columns: LogColumns) -> Iterator[str]:
 
 
 def episodes_read(
-    path: str, reading: Reading, *, dated: bool = False, most: int | None = None
+    path: str, reading: Reading, *, dated: bool = False, most: int | None = None, fewest: int = 2
 ) -> Iterator[Chunk]:
-    """The episodes of a log that have two rows, of so many rows at most; then what was noticed.
+    """The episodes of a log that have so many rows, of ``most`` in all; then what was noticed.
 
     They have dates where these are wanted, and where the log has some.
     """
     noted = Noted()
     chunks = reading.traces([path], noted)
     for episode in episodes_of(chunks if most is None else _first(chunks, most)):
-        if len(episode.times) > 1:
+        if len(episode.times) >= fewest:
             yield episode._replace(times=episode.times + noted.began) if dated else episode
     for warning in warnings_of(noted, reading.columns):
         warn(f"warning: {warning}")

@@ -10,7 +10,7 @@ import numpy as np
 import polars
 from numpy.typing import NDArray
 
-from evofsm.cli.options import quoted, seconds
+from evofsm.cli.options import in_quotes, quoted, seconds
 from evofsm.guard.foresight import span
 from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
@@ -22,6 +22,8 @@ _MOST_FIELDS, _ROWS_LOOKED_AT, _MOST_TEXTS = 20_000_000, 1_000_000, 12
 _EPOCHS = {"ns": 1e17, "us": 1e14, "ms": 1e11}  # times since 1970 are larger
 _COLUMNS_SHOWN = 40  # columns
 _SIGNS = "<>=! "  # what in a name of a condition is ambiguous
+# Far outside is what lies so many ranges of 99 % of the rows beyond them.
+_FAR = 2.0
 # A larger share of steps, and so many, that are no usual one make no clock.
 _ODD, _MANY = 0.001, 10
 _TIME = re.compile("(t|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
@@ -37,26 +39,36 @@ _NICE = [(seconds("", text), text) for text in _LONG.split()]
 
 def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     """What the first rows hold, by column and in all, and options that could be asked for."""
-    frame, clock, form = _first_rows(table)
+    skipped, odd = dict[str, tuple[int, str]](), Pairs()
+    table.skips = Skips(1 << 60, skipped)
+    frame, clock, form = _first_rows(table, odd)
     if not len(frame):
         return [], []
     numbers = [name for name, kind in frame.schema.items() if kind.is_numeric() and name != clock]
     values = {name: frame[name].to_numpy() for name in numbers}
     values = {name: z for name, z in values.items() if np.isfinite(z).any()}
     texts = [name for name in frame.columns if frame[name].dtype == polars.String]
-    shown = {name: f"{np.nanmin(z):.5g} to {np.nanmax(z):.5g}" for name, z in values.items()}
+    runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
+    limit = _round(0.1 * float(np.nanquantile(np.abs(values[still]), 0.95))) if still else 0.0
+    runs = values[still] > limit if still else runs
+    shown = {name: _range(name, z, z if name == still else z[runs]) for name, z in values.items()}
     shown |= {name: _told(frame[name]) for name in texts}
     facts = [*shown.items()][:_COLUMNS_SHOWN]
     if more := len(shown) - len(facts):
         facts.append(("...", f"and {more:,} more columns"))
+    facts += odd
+    facts += [
+        (f"bad {kind}s", f"{n:,}, the first: {first}") for kind, (n, first) in skipped.items()
+    ]
     facts.append(("the clock", clock or "no column (--dt)"))
     facts.append(("rows looked at", f"{len(frame):,}"))
     options = [("--time", clock) if clock else ("--dt", "1"), *([("--unit", form)] if form else [])]
-    options += _of_steps(frame[clock].to_numpy(), facts) if clock else []
-    runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
+    groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
+    group = next((name for name in groups if _is_in_blocks(frame[name])), "")
+    if clock:
+        within = ~np.diff(frame[group].rle_id().to_numpy()).astype(bool) if group else slice(None)
+        options += _of_steps(np.diff(frame[clock].to_numpy())[within], facts)
     if still:
-        limit = _round(0.1 * float(np.nanquantile(np.abs(values[still]), 0.95)))
-        runs = values[still] > limit
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
     rare = [*_rare(frame, [*texts, *values])]
@@ -64,8 +76,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     rare = likely or [row for row in rare if row[0] in values]
     facts += [("a failure?", f"{text} {told}") for _, text, told in rare]
     options += [("--failed", text) for _, text, _ in rare[:1]]
-    groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
-    if group := next((name for name in groups if _is_in_blocks(frame[name])), ""):
+    if group:
         facts.append(("an episode?", f"each {group}"))
         options.append(("--episode", _named(group, ",")))
     told_by = {group, *(name for name, *_ in rare)}
@@ -77,7 +88,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     return facts, _of_numbers(moved, options)
 
 
-def _first_rows(table: CsvTable | ParquetTable) -> tuple[polars.DataFrame, str, str]:
+def _first_rows(table: CsvTable | ParquetTable, odd: Pairs) -> tuple[polars.DataFrame, str, str]:
     """Their columns, the clock in seconds, which one that is, and how it is written if oddly."""
     firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
     pairs = zip(firsts, [*firsts][1:], strict=False)
@@ -87,11 +98,21 @@ def _first_rows(table: CsvTable | ParquetTable) -> tuple[polars.DataFrame, str, 
     dates = clock.split(",") if clock else []
     numbers = [name for name in firsts if table.holds(name) == "number"]
     texts = [name for name in firsts if name not in {*numbers, *dated, *dates}]
-    table.skips, frame = Skips(1 << 60), polars.DataFrame()
+    frame = polars.DataFrame()
     for piece in table.pieces(Wanted(numbers, texts, dates)):
         frame.vstack(polars.DataFrame({**piece.numbers, **piece.texts}), in_place=True)
         if len(frame) >= min(_ROWS_LOOKED_AT, _MOST_FIELDS // len(firsts)):
             break
+    for name in texts if len(frame) else ():  # of which the first alone is no number
+        fields = frame[name].str.strip_chars().replace("", None)
+        read = fields.str.replace(",", ".", literal=True).cast(polars.Float64, strict=False)
+        bad = fields.filter(read.is_null() & fields.is_not_null())
+        if read.n_unique() > _MOST_TEXTS and 2 * len(bad) < len(fields.drop_nulls()):
+            frame = frame.with_columns(read.fill_null(math.nan).alias(name))
+            told = f"{len(bad):,} in column {name!r}, the first: {str(bad.first())!r}"
+            odd += [("bad fields", told)] * (len(bad) > 0)
+    texts = [name for name in texts if len(frame) and frame[name].dtype == polars.String]
+    numbers = [name for name in firsts if name in frame.columns and frame[name].dtype.is_numeric()]
     if not clock and (form := next(filter(None, map(_form, map(frame.get_column, texts))), "")):
         clock, _, written = form.partition("=")
         at = frame[clock].str.to_datetime(written, strict=False)
@@ -106,14 +127,18 @@ def _first_rows(table: CsvTable | ParquetTable) -> tuple[polars.DataFrame, str, 
     return frame, clock, form
 
 
-def _of_steps(times: NDArray[np.float64], facts: Pairs) -> Pairs:
-    """What makes one clock of such steps."""
-    steps = np.diff(times)
+def _of_steps(steps: NDArray[np.float64], facts: Pairs) -> Pairs:
+    """What makes one clock of such steps within episodes."""
     later = steps[steps > 0.0]
     usual = float(np.median(later)) if len(later) else math.nan
     odd = (steps == 0.0) | (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
     facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {usual:.2g} s"
     holes = steps > LONGEST_STEP * usual
+    if len(late := steps[steps <= 0.0]):
+        told = (
+            f"{(late == 0.0).sum():,} at the time of the row before, {(late < 0.0).sum():,} earlier"
+        )
+        facts.append(("late rows", f"{told} (rows twice, unsorted, or --episode?)"))
     if odd.sum() < max(_MANY, _ODD * len(steps)):
         if holes.any():
             told = f"{holes.sum():,}, the longest {span(later.max())}, together"
@@ -195,6 +220,21 @@ def _is_in_blocks(values: polars.Series) -> bool:
     """Whether the rows of each of several values stand together, some of them at least."""
     blocks = int(str(values.rle_id().max())) + 1
     return 1 < values.n_unique() == blocks <= len(values) / 10
+
+
+def _range(name: str, values: NDArray[np.float64], seen: NDArray[np.float64]) -> str:
+    """From where to where numbers go; where some seen are far outside, what leaves those out."""
+    told = f"{np.nanmin(values):.5g} to {np.nanmax(values):.5g}"
+    seen = seen[np.isfinite(seen)]
+    low, high = np.quantile(seen, (0.005, 0.995)) if len(seen) else (0.0, 0.0)
+    unit, beyond, column = _round(high - low) or 1.0, _FAR * (high - low), _named(name, _SIGNS)
+    least, most = math.floor((low - beyond) / unit) * unit, math.ceil((high + beyond) / unit) * unit
+    below, above = int((seen < least).sum()), int((seen > most).sum())
+    if not high > low or not below + above:
+        return told
+    parts = [f"{column}>{least:.6g}"] * (below > 0) + [f"{column}<{most:.6g}"] * (above > 0)
+    told += f"; 99 % in {low:.5g} to {high:.5g}, {below + above:,} far outside"
+    return f"{told} (--where {in_quotes(' and '.join(parts))} leaves them out)"
 
 
 def _told(texts: polars.Series) -> str:

@@ -3,13 +3,15 @@
 A *limit* is a threshold of a variable, or of the nearness to a form of failure as `failure.explain`
 learns them: now, or as it will be at the present rate in half the horizon, or in all of it. An
 alarm is on while one of its limits is passed; it comes after a hold time, and stays on for an
-eighth of the horizon after the last of them. It is true if a failure comes within the horizon, and
-false once for each horizon that passes without one.
+eighth of the horizon after the last of them. It is right if a failure comes within the horizon
+after it began, whether or not it is on by then. Where it stays on, it says so once in each horizon,
+and is false as often as no failure came. A failure is foreseen by the first of those before it.
 
 For each rate of false alarms that may be stated there is an alarm, of at most so many limits, and
 beside it one of plain thresholds. Both are searched for in the same way, for the longest warning on
-average (none counts as 0). Which of them it is, and how often it was right, is told by episodes
-that were held out of it, a third of the log at a time.
+average (none counts as 0), with no fewer failures foreseen than by one with fewer false alarms.
+Which of them it is, and how often it was right, is told by cross-validation: of each third of the
+log, as it was learnt from the others. Alarms before the same failure count as one there.
 """
 
 from __future__ import annotations
@@ -38,14 +40,14 @@ from evofsm.store import COUNT, FROM_1, SIZE, Kind, Numbers, Place
 RATES = (0.1, 0.3, 1.0, 3.0)
 # In horizons: how far ahead limits look, over what the rate is taken, how long an alarm stays on.
 _AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.125
-# Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts held out.
+# Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts of a log.
 _MOST_LIMITS, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 4.0, 12), 3
 # Of a log of more rows some episodes are learnt from, if so many failures are left.
 _MOST_ROWS, _FAILURES = 500_000, 100
 # Blocks of rows in a horizon, as limits are searched for; of a long log fewer, but so many, where
 # there would be more than that in all.
 _BLOCKS, _FEWEST_BLOCKS, _MOST_BLOCKS = 15, 5, 100_000
-# Kinds of alarms; thresholds are plain unless others warn for longer by so much.
+# Kinds of alarms; plain thresholds are taken unless others, as often false, warn for longer.
 _LEARNT, _PLAIN, _NO_KIND = range(3)
 _BETTER = 0.95
 # What a further limit has to add to the share of the horizon that is warned before; survived rows
@@ -57,7 +59,9 @@ _SHORT, _FEWEST, _HELD_ROWS, _MORE = 0.05, 10, 20_000, (1.1, 1.5)
 #: Columns of a limit: which rate it is for, the kind of alarm, the variable or form,
 #: which of `_AHEAD`, whether above (1) or below (-1), and the threshold.
 _RATE, _KIND, _OF, _WHEN, _SIGN, _AT = range(6)
-_DAY = 86400.0
+_DAY, _AS_GOOD = 86400.0, "plain thresholds do as well"
+# Limits by their places, each with that of its threshold.
+_Rule = tuple[tuple[int, int], ...]
 #: The file of such a judge.
 KIND = Kind(
     "foresight",
@@ -109,8 +113,8 @@ class Tally(NamedTuple):
     """What came of an alarm."""
 
     failures: int
-    foreseen: int  #: in alarm as the failure came
-    lead: float  #: mean time that the alarm was on by then, at most the horizon, 0 if not [s]
+    foreseen: int  #: with an alarm that began within the horizon before
+    lead: float  #: mean time from the first of them, at most the horizon, 0 if there is none [s]
     false: int
     days: float
 
@@ -126,8 +130,8 @@ class Foresight(LearningJudge):
     It learns from a whole log (`learn_log`), or with ``log``, the episodes so far, as it goes: of
     the latest 20,000 rows (half of them of episodes that failed), where enough has come since.
 
-    The risk is the share of such alarms that a failure followed, on episodes held out; 0 while none
-    is on. Which alarm it is, of those for several rates of false ones, says the tolerance: the one
+    The risk is the share of such alarms that a failure followed, cross-validated; 0 while none is
+    on. Which alarm it is, of those for several rates of false ones, says the tolerance: the one
     with most alarms of which more than that were right.
 
     Examples
@@ -163,7 +167,7 @@ class Foresight(LearningJudge):
         self.horizon, self.hold = horizon, hold  #: [rows]
         self.bridges = 0.0  #: longest hole in time that it goes on across, as in a log [s]
         self.forms, self.limits = forms, limits
-        #: (rates, 3) of each of `RATES` alarms, those that were right, and whether it is plain.
+        #: (rates, 3) of each of `RATES`, cross-validated, alarms, those that were right; its kind
         self.held_out = held_out
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=dt)
         self.log = log  #: what it learns from, if it does as it goes
@@ -235,14 +239,20 @@ class Foresight(LearningJudge):
                 continue
             judge, rest = fresh._fitted(log.part(number != k)), log.part(number == k)
             columns = judge._columns(rest.rows, rest.starts)
-            for plain, rate in np.ndindex(2, len(RATES)):
-                found, _ = judge.tally(rest, rate, plain=bool(plain), columns=columns)
-                tallies[plain, rate] += found.lead * found.failures, found.foreseen, found.false
+            for side, rate in np.ndindex(2, len(RATES)):
+                found, _ = judge.tally(rest, rate, plain=bool(side), columns=columns)
+                tallies[side, rate] += found.lead * found.failures, found.foreseen, found.false
         judge = fresh._fitted(log)
-        kind = (tallies[1, :, 0] >= _BETTER * tallies[0, :, 0]).astype(int)
-        _, right, false = tallies[kind, np.arange(len(RATES))].T
+        learnt, plain = tallies  # with as many false ones
+        as_many = np.minimum((plain[:, 2] + 1.0) / (learnt[:, 2] + 1.0), 1.0)
+        is_plain = plain[:, 0] >= _BETTER * as_many * learnt[:, 0]
+        rates = range(len(RATES))
+        limits = [[judge.of_rate(k, plain=x)[:, _OF:] for x in (False, True)] for k in rates]
+        kind = (is_plain | [np.array_equal(a, b) for a, b in limits]).astype(int)
+        _, right, false = tallies[kind, rates].T
+        right = right * [len(limits[k][kind[k]]) > 0 for k in rates]
         alarms, chance = right + false, log.failed.sum() * ahead / len(log.rows)
-        for k in range(len(RATES)):  # whether it is better than an alarm at any time
+        for k in rates:  # whether it is better than an alarm at any time
             if not (right[k] and wilson_bounds(right[k] / alarms[k], alarms[k])[0] > chance):
                 kind[k] = _NO_KIND
         told = np.column_stack([alarms, right, kind])
@@ -268,10 +278,11 @@ class Foresight(LearningJudge):
         above = product(range(1 if plain else len(_AHEAD)), range(m if plain else of), (1, -1))
         asked = [(v, when, sign) for when, v, sign in above if v < m or sign > 0]
         # Rows are looked at by blocks, in which it is enough that one of them is beyond.
+        # The last row, with which it may fail, is one by itself.
         coarse = min(len(log.rows) // _MOST_BLOCKS, self.horizon // _FEWEST_BLOCKS)
         size = max(self.horizon // _BLOCKS, coarse, 1)
-        since = np.arange(len(log.rows)) - np.repeat(log.starts, log.lengths)
-        blocks = np.flatnonzero(since % size == 0)
+        left = np.repeat(log.starts + log.lengths - 1, log.lengths) - np.arange(len(log.rows))
+        blocks = np.union1d(np.flatnonzero(left % size == 0), log.starts)
         shares = 1.0 - np.geomspace(0.3, max(3.0 / len(log.rows), 1e-5), _TRIED)
         signed = [sign * columns[v + of * when] for v, when, sign in asked]
         tried = [np.quantile(x, shares) for x in signed]
@@ -281,7 +292,7 @@ class Foresight(LearningJudge):
         most = spans[0] * log.failed.sum(), len(log.rows) * self.dt / _DAY
 
         @cache
-        def more(rule: tuple[tuple[int, int], ...]) -> Floats:
+        def more(rule: _Rule) -> Floats:
             """(limits, thresholds, 2) share that is warned, and false alarms a day, of one more."""
             above, found = np.zeros(len(blocks), np.bool_), np.zeros((len(asked), _TRIED, 2))
             for k, j in rule:
@@ -292,24 +303,38 @@ class Foresight(LearningJudge):
                 found[k, j] = leads.sum(), false
             return np.asarray(found / most)
 
-        rules: dict[tuple[tuple[int, int], ...], Floats] = {(): np.zeros(2)}
+        rules = [nothing := _Rule()]
         for price in _PRICES:
-            rule, worth = tuple[tuple[int, int], ...](), 0.0
+            rule, worth = nothing, 0.0
             while len(rule) < _MOST_LIMITS:
                 gain = more(rule) @ (1.0, -price)
                 best = divmod(int(gain.argmax()), _TRIED)
                 if gain[best] <= worth + _WORTH:
                     break
-                worth, told, rule = gain[best], more(rule)[best], (*rule, best)
-                rules[rule] = told
-        rows, alone = [], more(())
-        for rate, false in enumerate(RATES):
+                worth, rule = gain[best], (*rule, best)
+                rules.append(rule)
+        alone = more(nothing)
+        for false in RATES:
             fitting = np.where(alone[..., 1] <= false, alone[..., 0], -1.0)
-            best = divmod(int(fitting.argmax()), _TRIED)
-            rules[(best,)] = alone[best]
-            fit = [choice for choice in rules if rules[choice][1] <= false]
-            best_rule = max(fit, key=lambda choice: float(rules[choice][0]))
-            rows += [(rate, plain, *asked[k], asked[k][2] * tried[k][j]) for k, j in best_rule]
+            rules.append((divmod(int(fitting.argmax()), _TRIED),))
+
+        def beyond(rule: _Rule) -> Flags:
+            parts = [signed[k] > tried[k][j] for k, j in rule]
+            return np.asarray(np.logical_or.reduce([np.zeros(len(log.rows), np.bool_), *parts]))
+
+        counted, rows, chosen = dict[_Rule, tuple[float, int, float]](), [], nothing
+        for rule in rules:  # row by row
+            false = _tally(on := beyond(rule), log.starts, log.failed, self._spans, leads, on)
+            counted[rule] = leads.sum(), int((leads > 0.0).sum()), false / most[1]
+        for rate, false in enumerate(RATES):
+            fewest = counted[chosen][1]
+            fit = [rule for rule, (_, n, f) in counted.items() if f <= false and n >= fewest]
+            chosen = max(fit, key=lambda rule: (counted[rule][0], -counted[rule][2], -len(rule)))
+            kept = chosen
+            for part in chosen:  # what others imply is no part of it
+                rest = tuple(known for known in kept if known != part)
+                kept = kept if not rest or (beyond((part,)) & ~beyond(rest)).any() else rest
+            rows += [(rate, plain, *asked[k], asked[k][2] * tried[k][j]) for k, j in kept]
         return np.array(rows, np.float64).reshape(-1, 6)
 
     # -- Telling --------------------------------------------------------------------------------
@@ -335,7 +360,7 @@ class Foresight(LearningJudge):
         return np.asarray(sign[:, None] * x > (sign * limits[:, _AT])[:, None])
 
     def of_rate(self, rate: int, *, plain: bool | None = None) -> Floats:
-        """The limits of an alarm, by default of the kind that did better on what was held out."""
+        """The limits of an alarm, by default of the kind that did better, cross-validated."""
         kind = self.held_out[rate, 2] if plain is None else _PLAIN if plain else _LEARNT
         chosen = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
         return np.asarray(self.limits[chosen])
@@ -391,10 +416,22 @@ class Foresight(LearningJudge):
         alarms, right, _ = self.held_out[rate].tolist()
         limits, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
         if len(limits):
-            v, (name, there) = int(limits[0, _OF]), self._words(limits[0])
-            why = f"{name} {z[v]:.4g}: {there}" if v < len(z) else f"{name} {there}"
+            name, there = self._words(limits[0])
+            why = f"{name} {self._value(limits[0], z):.4g}: {there}"
+        came = f"after {right:.0f} of {alarms:.0f} such alarms it failed"
         within = span(self.horizon * self.dt)
-        return f"{why}; after {right:.0f} of {alarms:.0f} such alarms it failed within {within}"
+        return f"{why}; {came} within {within} (cross-validated on what it learnt from)"
+
+    def _value(self, limit: Floats, z: Floats) -> float:
+        """What is compared with a limit, at an observation (m,), as `_words` has it."""
+        if (v := int(limit[_OF])) < len(z):
+            return float(z[v])
+        row = self.forms[v - len(z)]
+        if row[failure.P : failure.HELD].any():
+            return float(failure.distances(row[None], z[None])[0, 0])
+        i, j = row[[failure.I, failure.J]].astype(int)
+        weights = row[[failure.B, failure.D]] * row[[failure.ONE, failure.OTHER]]
+        return float(z[i] if i == j else weights @ z[[i, j]] / np.hypot(*weights))
 
     @property
     def shares(self) -> Floats:
@@ -416,18 +453,30 @@ class Foresight(LearningJudge):
 
     @property
     def told_by_experience(self) -> str:
-        """What each alarm is, and how often it was right."""
-        alike = groupby(range(len(self.held_out)), self.of)
-        told = ((", ".join(f"{RATES[k]:g}" for k in rates), text) for text, rates in alike)
-        return "; ".join(f"for {rates} false alarms a day {text}" for rates, text in told)
+        """What each alarm is, with which tolerance it is taken, and how often it was right."""
+        told = []
+        for text, group in groupby(range(len(self.held_out)), self.of):
+            *_, last = rates = [*group]
+            at = f"{self.tolerance_of(RATES[last]):.3g}"
+            taken = f" (tolerance {at})" if self.rate_of(float(at)) == last else ""
+            stated = ", ".join(f"{RATES[k]:g}" for k in rates)
+            told.append(f"for {stated} false alarms a day{taken} {text}")
+        return "; ".join([_AS_GOOD] * self.is_plain + told)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether all its alarms are plain thresholds."""
+        kinds = self.held_out[:, 2]
+        return bool((kinds == _PLAIN).any() and (kinds != _LEARNT).all())
 
     def of(self, rate: int) -> str:
         """What the alarm for one of `RATES` is, and how often it was right, in words."""
         alarms, right, kind = self.held_out[rate].tolist()
         if kind == _NO_KIND:
             return "nothing was better than chance"
-        plain = "plain thresholds do as well: " if kind == _PLAIN else ""
-        return f"{plain}{self.words(rate)} ({right:.0f} of {alarms:.0f} were right, held out)"
+        plain = f"{_AS_GOOD}: " if kind == _PLAIN and not self.is_plain else ""
+        told = f"{right:.0f} of {alarms:.0f} were right, cross-validated"
+        return f"{plain}{self.words(rate)} ({told})"
 
     # -- Beside a machine -----------------------------------------------------------------------
 
@@ -601,6 +650,12 @@ def _look_ahead(
 
 
 @kernel
+def false_times(begun: int, over: int, fails: int, horizon: int) -> int:
+    """How often an alarm of such rows was false: as it began, and after each horizon of it."""
+    return min(max(fails - begun - 1, 0) // horizon, (over - begun + horizon - 1) // horizon)
+
+
+@kernel
 def _tally(above: Flags, starts: Ints, failed: Flags, spans: Ints, leads: Floats, on: Flags) -> int:
     """False alarms where ``above`` marks (T,) the rows beyond a limit; leads (E,), on (T,) are set.
 
@@ -609,22 +664,22 @@ def _tally(above: Flags, starts: Ints, failed: Flags, spans: Ints, leads: Floats
     false, horizon, hold, stays = 0, spans[0], spans[1], spans[2]
     for e in range(len(starts)):
         end = starts[e + 1] if e + 1 < len(starts) else len(above)
+        fails = end - 1 if failed[e] else end + horizon
         up, down, begun = 0, 0, -1
-        for t in range(starts[e], end):
-            if above[t]:
+        leads[e] = 0.0
+        for t in range(starts[e], end + 1):
+            if t < end and above[t]:
                 up, down = up + 1, 0
                 if begun < 0 and up >= hold:
                     begun = t
             else:
                 up, down = 0, down + 1
-                if begun >= 0 and down >= stays:
-                    false += (t - begun + horizon - 1) // horizon
-                    begun = -1
-            on[t] = begun >= 0
-        lasted = end - 1 - begun if begun >= 0 else 0
-        leads[e] = min(lasted, horizon) if failed[e] else 0.0
-        if failed[e]:
-            false += (max(lasted - horizon, 0) + horizon - 1) // horizon
-        elif begun >= 0:
-            false += lasted // horizon + 1
+            if begun >= 0 and (t == end or down >= stays):
+                wrong = false_times(begun, t, fails, horizon)
+                false += wrong
+                if failed[e] and wrong * horizon < t - begun:
+                    leads[e] = max(leads[e], min(fails - begun, horizon))
+                begun = -1
+            if t < end:
+                on[t] = begun >= 0
     return false

@@ -264,6 +264,19 @@ class Term(NamedTuple):
             )
         return np.asarray(values > 0)
 
+    def fault(self, value: Any) -> str:
+        """Why it cannot be told of one value, if that is so."""
+        if value is None or value == "":
+            return ""
+        if self.sign:
+            kind = "number" if self.of_number else "text"
+            is_right = isinstance(value, str) != self.of_number
+            needs = f"it is compared with the {kind} {self.value!r}"
+        else:
+            is_right = str(value).strip().lower() in _TRUTHS
+            needs = "it must be a truth value: true and false, 1 and 0, yes and no"
+        return "" if is_right else f"is {value!r}; {needs}"
+
     def holds_of(self, value: Any) -> bool:
         """Whether it holds of one value, a number, a text, a truth value or None."""
         value = value.strip() if isinstance(value, str) else value
@@ -889,8 +902,8 @@ class _Reader:
             **dict.fromkeys([*self._observed, *categories], "--observe"),
             **dict.fromkeys(self._episode, "--episode"),
             **dict.fromkeys(clock, "--time"),
-            columns.action: "--action",
         }
+        options.setdefault(columns.action, "--action")  # one that is observed, where nobody acts
         for name, option in options.items():
             if name not in table.columns:
                 shown = ", ".join(name[:40] for name in table.columns[:20])

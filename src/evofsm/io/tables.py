@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn, Self
 
@@ -465,7 +466,7 @@ class CsvTable(Table):
         self._first_row = rows[0] if rows else []
         commas = map(_DECIMAL_COMMA.fullmatch, [t for row in rows for t in row])
         self._has_commas = self._separator == ";" or (self._separator == "\t" and any(commas))
-        if all(is_number(name) for name in self.columns):
+        if any(map(is_date, self.columns)) or all(map(is_number, self.columns)):
             raise ValueError(
                 f"{path}, line {at + 1}: {header.strip()[:200]!r} is no header; a line above the "
                 "rows must name the columns"
@@ -741,6 +742,23 @@ def explained(text: str, hint: str = "") -> str:
 def is_date(text: str) -> bool:
     """Whether it is, or is meant to be, a time of ISO 8601, or one that begins with the day."""
     return (_DATE.match(text) or _DAY_FIRST.match(text.strip())) is not None
+
+
+def seconds_of_date(text: str, form: str = "") -> float:
+    """Since 1970, of one date as logs are read; a ValueError if it is none.
+
+    >>> seconds_of_date("01.01.1970 00:01:30,5"), seconds_of_date("1970-01-01T01:00:00+01:00")
+    (90.5, 0.0)
+    """
+    text = text.strip()
+    if form:
+        when = datetime.strptime(text, form)
+    else:
+        if found := re.fullmatch(r"(\d\d?)\.(\d\d?)\.(\d\d|\d{4}),?[T ]+(\d\d?)(:.*)", text):
+            day, month, year, hour, rest = found.groups()
+            text = f"{'20' * (len(year) == 2)}{year}-{month:0>2}-{day:0>2} {hour:0>2}{rest}"
+        when = datetime.fromisoformat(text)
+    return when.replace(tzinfo=when.tzinfo or UTC).timestamp()
 
 
 def is_number(text: str) -> bool:

@@ -191,7 +191,8 @@ def monitor(
             if alone:
                 reading = partial(reading, action="")
             asked = reading(observe=observe, episode=episode)
-            episodes = episodes_read(str(file), asked, dated=alone)
+            fewest = 1 if alone else 2  # a failure that comes at once counts as well
+            episodes = episodes_read(str(file), asked, dated=alone, fewest=fewest)
             if (first := next(episodes, None)) is None:
                 raise ValueError(f"{file}: no episode has two rows")
             chunks, interval = chain([first], episodes), first.dt

@@ -67,7 +67,7 @@ class Decider:
         self.episode = episode
         self.slots = slots or Slots()
         self.rate = rate  #: false alarms a day, where nobody acts, that the tolerance is set to
-        self.form = Form(guard, self.slots.keys)
+        self.form = Form(guard, self.slots.keys, *self.slots.clock)
         self.keep: Callable[[Taken], None] = lambda taken: None
         self.n = 0  #: decisions so far
         self.refused = 0  #: messages that were refused, since the process began
@@ -107,6 +107,8 @@ class Decider:
                 return self._recent[self._next][1]
             if isinstance(told, Row) and isinstance(self.latest, Row):
                 _refuse_stale(told, self.latest)
+            if isinstance(told, Row):
+                self.slots.refuse(told)
             if isinstance(told, Row) and self.slots.is_over(told):
                 fault = f"comes after its {self.slots.step:g} s were decided on, as nothing came"
                 raise MessageError("time", fault, told.time)
@@ -165,7 +167,10 @@ class Decider:
         """Take in what was accepted, and answer it."""
         if isinstance(told, Pause):
             return dict(self._waited(early=True).get("last", {}))
+        lacking = "" if self.rows or self.slots.waiting else self.slots.lacking(told)  # once
         answer = self._ended(told) if isinstance(told, End) else self._taken(told)
+        if lacking:
+            answer["note"] = "; ".join(filter(None, [answer.get("note"), lacking]))
         self._recent.append((told, answer))
         if self.rows >= self.episode and (not answer.get("alarm") or self.rows >= 2 * self.episode):
             self._end_unasked()
@@ -197,13 +202,15 @@ class Decider:
         if fails or not counts:
             is_new = fails and not slots.fails(before)
             last, was = self._waited(), bool(self.rows)
-            if was or (is_new and counts):
+            is_end = was or (is_new and counts)
+            if is_end:
                 self.end(is_new, _numbers(row.observation) if is_new and counts else None)
             columns = slots.columns
             why = f"--failed {columns.failed}" if fails else f"not --where {columns.where}"
             done = {} if self._is_alone else {"executed": plain(row.proposal)}
-            told = {"failed": is_new and (was or counts), **done, "reason": why, **last}
-            return self._of("end", time=row.time, **told)
+            told = {"failed": is_new} if is_end else {"alarm": False}
+            kind = "end" if is_end else "waiting"
+            return self._of(kind, time=row.time, **told, **done, reason=why, **last)
         if not slots.step:
             return self._decided(row)
         if (whole := slots.add(row)) is not None:

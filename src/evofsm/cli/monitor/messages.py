@@ -22,6 +22,7 @@ from evofsm.driving.naming import SPEEDS, VARIABLES
 from evofsm.driving.traffic import PLACES, RATES, SIZES
 from evofsm.fsm.naming import visible
 from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
+from evofsm.io.tables import TIMES, is_number, seconds_of_date
 from evofsm.store import LARGEST_OBSERVATION
 
 #: The version of the messages.
@@ -32,6 +33,9 @@ LONGEST = 1 << 16
 _MOST_OBJECTS = 64
 # So much of what is refused is shown, and so long may a name be [letters].
 _LETTERS = 40
+# What is later than this is in another unit [s]; what is said of lines of another kind.
+_LATEST = 1e11
+_NO_ROW = "rows are JSON, one per line; a log in a file: evofsm monitor FILE --summary"
 # Where a width is not given [m].
 _USUAL_WIDTH = 1.8
 
@@ -97,9 +101,14 @@ class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 
 
 class Form:
-    """Reads lines, for one guard; ``others`` are keys that rows may have beside its variables."""
+    """Reads lines, for one guard; ``others`` are keys that rows may have beside its variables.
 
-    def __init__(self, guard: Guard, others: Sequence[str] = ()) -> None:
+    The time may stand in the column of a log, ``clock``, in this unit, or in dates of this form.
+    """
+
+    def __init__(
+        self, guard: Guard, others: Sequence[str] = (), clock: str = "time", unit: str = "s"
+    ) -> None:
         reviser = guard.reviser
         #: Names of what is observed; empty where they have none, and come as a list.
         self.variables: tuple[str, ...] = guard.variables
@@ -113,25 +122,30 @@ class Form:
         # By keys of our own: a column may be called "Tank 1 [mm]", which no attribute can be.
         self._keys = {f"v{k}": name for k, name in enumerate(self.variables or ["observation"])}
         self._others = {f"w{k}": name for k, name in enumerate(others)}
+        clocks = dict.fromkeys([clock, *clock.split(",")])  # of date and time of day
+        taken = {"time", *self._keys.values(), *others}
+        self._clocks = {f"x{k}": name for k, name in enumerate(clocks) if name not in taken}
+        self._form, self._unit = unit if "%" in unit else "", TIMES.get(unit, 1.0)
         seen = [(key, _Seen if self.variables else several) for key in self._keys]
         action: Any = ("proposal", _action(guard))
         if isinstance(guard.actions, Choices) and guard.actions.n_actions == 1:  # nobody acts
             action = (*action, 0)
         version = ("schema", Literal[1], SCHEMA)
         also = [(key, float | bool | str | None, None) for key in self._others]
-        self._row = self._struct("Row", ("time", _Number), action, *seen, *also, version)
+        when = [(key, _Number | str | UnsetType, UNSET) for key in ("time", *self._clocks)]
+        self._row = self._struct("Row", *when, action, *seen, *also, version)
         placed = ("ego", _Vehicle), ("objects", list[_Vehicle])
         self._scene = self._struct("Scene", ("time", _Number), action, *placed, version)
         last = [(key, kind | UnsetType, UNSET) for key, kind in seen]
-        ended = ("end", bool), ("failed", bool, False), ("time", _Seen, None)
-        self._end = self._struct("End", *ended, *last, *also, version)
+        ended = ("end", bool), ("failed", bool, False), ("time", _Seen | str | UnsetType, UNSET)
+        self._end = self._struct("End", *ended, *when[1:], *last, *also, version)
         self._decoders = {kind: msgspec.json.Decoder(kind) for kind in (self._row, self._scene)}
 
     def _struct(self, name: str, *fields: Any) -> Any:
         strict: Any = {
             "forbid_unknown_fields": True,
             "kw_only": True,
-            "rename": self._keys | self._others,
+            "rename": self._keys | self._others | self._clocks,
         }
         return msgspec.defstruct(name, fields, **strict)
 
@@ -151,12 +165,32 @@ class Form:
             if kind is self._scene:
                 return self._of_scene(told)
             also = tuple(getattr(told, key) for key in self._others)
-            return Row(told.time, self._observed(told), _frozen(told.proposal), told=also)
+            if (time := self._when(told)) is None:
+                names = "".join(f", or {name!r}" for name in self._clocks.values())
+                raise MessageError("time", f"is missing{names}; every message of its kind has it")
+            return Row(time, self._observed(told), _frozen(told.proposal), told=also)
         except MessageError as error:
             error.time = _time(_parsed(line))
             raise
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             raise self._refused(line, kind, str(error)) from None
+
+    def _when(self, told: Any) -> float | None:
+        """The time of a message [s], as it or a log has it."""
+        keys = {"time": "time", **self._clocks}
+        found = {name: getattr(told, key) for key, name in keys.items()}
+        said = {name: value for name, value in found.items() if value not in (UNSET, None)}
+        name, time = next(iter(said.items()), ("time", None))
+        if isinstance(time, str):
+            try:
+                return seconds_of_date(" ".join(map(str, said.values())), self._form)
+            except ValueError:
+                fault = f"is {_shown(time)}; it must be float [s], or a date as logs have them"
+                raise MessageError(name, fault) from None
+        seconds = time if time is None or name == "time" else time * self._unit
+        if seconds is not None and seconds >= _LATEST:
+            raise MessageError(name, f"is {time:.15g}: milliseconds? It must be in seconds", time)
+        return seconds
 
     def _observed(self, told: Any) -> tuple[float | None, ...]:
         values = [getattr(told, key) for key in self._keys]
@@ -167,10 +201,10 @@ class Form:
             raise MessageError("end", "is false; it must be true")
         lacking = [name for key, name in self._keys.items() if getattr(told, key) is UNSET]
         if len(lacking) == len(self._keys):
-            return End(told.failed, time=told.time)
+            return End(told.failed, time=self._when(told))
         if lacking:
             raise MessageError(lacking[0], "is missing; a variable that was not seen is null")
-        return End(told.failed, self._observed(told), told.time)
+        return End(told.failed, self._observed(told), self._when(told))
 
     def _of_scene(self, told: Any) -> Row:
         if not (self.scenes or self.variables == VARIABLES):
@@ -222,6 +256,9 @@ class Form:
         else:
             expected = re.sub("^Expected |, got .*|`", "", text).replace(" | ", " or ")
             fault = f"is {value}; it must be {expected}"
+            if isinstance(sent := _at(told, place), str) and is_number(sent.replace(",", ".")):
+                cause = "a decimal comma" if "," in sent else "a number in quotes"
+                fault += f" ({cause}? send {sent.replace(',', '.')})"
         return MessageError(place or "line", fault, time)
 
 
@@ -299,7 +336,8 @@ def _parsed(line: bytes) -> dict[str, Any]:
             fault = f"holds {name}, which is no JSON; a number that was not seen is null"
             raise MessageError("line", fault) from None
         kind = "not UTF-8" if isinstance(error, UnicodeDecodeError) else "no JSON"
-        raise MessageError("line", f"is {kind}: {error}") from None
+        hint = "" if line.lstrip().startswith(b"{") else f"; {_NO_ROW}"
+        raise MessageError("line", f"is {kind}: {error}{hint}") from None
     if not isinstance(told, dict):
         raise MessageError("line", f"is {_shown(told)}; it must be a JSON object")
     return told

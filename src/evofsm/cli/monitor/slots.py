@@ -12,7 +12,7 @@ from operator import itemgetter
 from statistics import fmean
 from typing import Any
 
-from evofsm.cli.monitor.messages import Message, Row
+from evofsm.cli.monitor.messages import Message, MessageError, Row
 from evofsm.io import LogColumns
 from evofsm.io.logs import Condition
 
@@ -34,6 +34,8 @@ class Slots:
         terms = (term.column for c in self._conditions.values() for term in c.terms)
         #: Keys that rows may have beside the guard's variables, for the conditions.
         self.keys = tuple(dict.fromkeys({*terms} - {*self.names, columns.action}))
+        #: Of the log: what the column of its time is called, how dates are written, or its unit.
+        self.clock = columns.time, columns.units.get(columns.time, "s")
         self.waiting: list[Row] = []
         self._done = math.nan  # time of the slot that was decided on as nothing came
 
@@ -53,6 +55,20 @@ class Slots:
         if self.keys:
             said.append(f"rows may tell {', '.join(self.keys)}")
         return "; ".join(said)
+
+    def refuse(self, row: Row) -> None:
+        """Raise where a row tells of what a condition names what cannot be compared with it."""
+        told = dict(zip(self.keys, row.told, strict=False))
+        for option, condition in self._conditions.items():
+            for term in condition.terms:
+                if fault := term.fault(told.get(term.column)):
+                    raise MessageError(term.column, f"{fault} ({option})", row.time)
+
+    def lacking(self, row: Message) -> str:
+        """What a row does not tell of what conditions name, in words."""
+        told = zip(self.keys, row.told, strict=False) if isinstance(row, Row) else ()
+        names = ", ".join(name for name, value in told if value is None)
+        return f"no {names} in the row, which --failed or --where names" if names else ""
 
     def fails(self, row: Message | None) -> bool:
         """Whether a row meets what tells of failures."""
