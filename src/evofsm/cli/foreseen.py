@@ -216,13 +216,24 @@ def _draw(
     risk = np.max(on * judge.shares[:, None], axis=0)
     failed, ends = np.zeros(len(risk), np.bool_), runs.starts + runs.lengths - 1
     failed[ends[runs.failed]] = True
-    last = int(ends[runs.failed][-1] if runs.failed.any() else ends[-1])
-    near = max(int(runs.starts[runs.starts <= last][-1]), last - 4 * judge.horizon)
+    # Of those that lasted for a while, if there are any, the last one that failed, if one did.
+    number = int(np.lexsort([runs.starts, runs.failed, runs.lengths > judge.horizon])[-1])
+    last = int(ends[number])
+    near = max(int(runs.starts[number]), last - 4 * judge.horizon)
+    rows = [] if chosen is None else judge.of_rate(chosen).tolist()
+    limits = [(int(v), at) for *_, v, when, _, at in rows if v < runs.rows.shape[1] and not when]
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
     model = None if machine is None or not machine.n_states else machine.model()
     count = len(names) + 1 + (model is not None)
     with picture(out, 10.0, 1.3 * count) as figure:
         axes = figure.subplots(count, 2, sharex="col")
-        for column, part in zip(axes.T, (slice(None), slice(near, last + 1)), strict=True):
+        title = (
+            f"Episode {number + 1:,}, {'before it failed' if runs.failed[number] else 'its end'}"
+        )
+        title += f": {_date(times[last])}" * (times[last] >= _DATES)
+        parts = {f"{len(ends):,} episodes": slice(None), title: slice(near, last + 1)}
+        for column, (title, part) in zip(axes.T, parts.items(), strict=True):
             seen = times[part], runs.rows[part], names, risk[part], failed[part]
-            plot.history(column, *seen, tolerance, model=model)
+            plot.history(column, *seen, tolerance, model=model, limits=limits)
+            column[0].set_title(title, loc="left")
+        axes[-1, 1].get_legend().remove()

@@ -340,6 +340,18 @@ class Foresight(LearningJudge):
         chosen = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
         return np.asarray(self.limits[chosen])
 
+    def where(self, rate: int) -> tuple[Floats, Floats]:
+        """Forms (r, SIZE), and how near (r,) to each an alarm is on while nothing changes."""
+        limits, m = self.of_rate(rate), len(self.labels.names)
+        table, near = np.zeros((len(limits), failure.SIZE)), np.zeros(len(limits))
+        for k, (*_, v, _, sign, at) in enumerate(limits.tolist()):
+            if v < m:
+                sides = [FAILS, v, v, 0.0, 0.0, 1.0, 1.0, -sign * at, sign]
+                table[k, : failure.D] = sides
+            else:
+                table[k], near[k] = self.forms[int(v) - m], at
+        return table, near
+
     def tally(
         self,
         log: Runs,
