@@ -96,11 +96,9 @@ def test_a_few_spikes_do_not_set_the_axes_and_where_it_alarms_is_tinted():
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=[2.0, 20.0]))
     machine.learn_many(rows, [0] * len(rows), [0], [len(rows) - 1])
     judge = Foresight.learn_log([rows[:401, 1]] * 9, [True] * 9, dt=60.0, names=["heat"])
-    table, near = judge.where(0)
+    table = judge.where(0)
     table[:, [1, 2]] = 1  # the heat is the second one here
-    ax = plot.states(
-        machine.model(), new(), rows=rows, failed=failed, ways=True, alarm=(table, near)
-    )
+    ax = plot.states(machine.model(), new(), rows=rows, failed=failed, ways=True, alarm=table)
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
     assert -5.0 < left < 2.0 < 7.6 < right < 15.0
     assert 0.0 < low < 50.0 < 97.0 < high < 150.0

@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.driving import Episode
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel, Policy
+from evofsm.fsm.proportions import usual_range
 from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Trace
 from evofsm.guard import Guard, LearntRisk
-from evofsm.guard.learnt.failure import SAYS, I, J, distances, telling
+from evofsm.guard.learnt.failure import HELD, SAYS, SIZE, I, J, distances, telling
 from evofsm.guard.learnt.rollout import FAILS
 
 with needs("matplotlib", "plot", "plotting"):
@@ -54,9 +55,6 @@ _DISCS, _TICKS = 20, 12
 _DARK, _WIDEST = 2, 1.6
 # Points on each side of the grid on which it is asked where a guard fails.
 _GRID = 300
-# What is beyond this share of the rows by more than so much of their range is not in view; of
-# failures at least so many are, the nearest.
-_NEARLY_ALL, _FENCE, _SHARE_SEEN = (0.01, 0.99), 0.5, 0.25
 # Times from here on are dates [s].
 _DATES = 1e8
 
@@ -72,7 +70,7 @@ def states(
     rows: ArrayLike = (),
     failed: ArrayLike = (),
     ways: bool = False,
-    alarm: tuple[ArrayLike, ArrayLike] | None = None,
+    alarm: ArrayLike = (),
 ) -> Axes:
     """Centres of the states in the plane of two variables.
 
@@ -95,7 +93,7 @@ def states(
     ways : bool
         Whether to show how far each state of a `Novelty` reaches (an ellipse), the two likeliest
         ways out of each, as wide as they are likely, and a legend.
-    alarm : (forms, near), optional
+    alarm : (r, 14) array_like, optional
         Where a guard alarms, to tint, as `evofsm.guard.Foresight.where` has it.
 
     Raises
@@ -120,8 +118,8 @@ def states(
     centers, seen = model.centers[:, pair], np.reshape(rows, (-1, model.n_variables))[:, pair]
     fails = np.resize(np.asarray(failed, np.bool_), len(seen)) & bool(np.size(failed))
     times = np.ceil(_GRID**2 * model.visits / max(float(model.visits.sum()), 1.0)).astype(int)
-    looked_at = seen if len(seen) else centers.repeat(times, axis=0)
-    ends = np.transpose([usual(x, y) for x, y in zip(looked_at.T, seen[fails].T, strict=True)])
+    every = seen if len(seen) else centers.repeat(times, axis=0)
+    ends = np.transpose([usual_range(x, y) for x, y in zip(every.T, seen[fails].T, strict=True)])
     centers, in_view = np.clip(centers, *ends), ((centers >= ends[0]) & (centers <= ends[1])).all(1)
     look: Look = {"markersize": 1.5, "color": ink(0.3), "zorder": 1.2, "rasterized": True}
     if len(seen):
@@ -140,8 +138,8 @@ def states(
     ax.margins(0.1)
     ax.autoscale_view()
     limits = ax.axis()
-    if alarm is not None:
-        _tint(ax, pair, *alarm, label="where it alarms if nothing changes")
+    table = np.reshape(np.asarray(alarm, np.float64), (-1, SIZE))
+    _tint(ax, pair, table, table[:, HELD], label="where it alarms if nothing changes")
     if ways:
         leaves = model.changes * (1.0 - np.eye(model.n_states))
         shares = leaves / np.maximum(leaves.sum(1, keepdims=True), 1.0)
@@ -279,7 +277,7 @@ def experience(
     ax.update_datalim(centers)
     ax.autoscale_view()
     limits = ax.axis()
-    _tint(ax, pair, fails, np.zeros(len(fails)))
+    _tint(ax, pair, fails, 0.0 * fails[:, HELD])
     draw_centers(ax, centers, (), 10.0)
     ax.axis(limits)
     ring: Look = {"marker": "o", "fillstyle": "none"}
@@ -298,32 +296,19 @@ def experience(
     return ax
 
 
-def _tint(ax: Axes, pair: list[int], table: ArrayLike, near: ArrayLike, label: str = "") -> None:
-    """Tint where forms of a pair of variables are passed, with their edge."""
-    table, limits, red = np.asarray(table, np.float64), ax.axis(), COLORS["dead end"]
-    here = np.isin(table[:, [I, J]], pair).all(1)
+def _tint(ax: Axes, pair: list[int], table: Any, near: Any, label: str = "") -> None:
+    """Tint where forms (r, SIZE) of two variables are passed, or so nearly (r,), with an edge."""
+    limits, red, here = ax.axis(), COLORS["dead end"], np.isin(table[:, [I, J]], pair).all(1)
     if not here.any():
         return
     x, y = np.meshgrid(np.linspace(*limits[:2], _GRID), np.linspace(*limits[2:], _GRID))
     z = np.zeros((x.size, max(pair) + 1))
     z[:, pair] = np.column_stack([x.ravel(), y.ravel()])
-    beyond = -distances(table[here], z) - np.asarray(near, np.float64)[here, None]
-    form = beyond.max(0).reshape(x.shape)
+    form = (-distances(table[here], z) - near[here, None]).max(0).reshape(x.shape)
     ax.contourf(x, y, form, [0.0, np.inf], colors=[red], alpha=0.15, zorder=0.5)
     ax.contour(x, y, form, [0.0], colors=[red], linewidths=1.2, zorder=2.0)
     if label:
         ax.plot([], [], "s", markersize=8.0, color=red, alpha=0.3, label=label)
-
-
-def usual(values: NDArray[np.float64], failed: NDArray[np.float64]) -> tuple[float, float]:
-    """Ends of what is worth a look: of all values but a few far ones, and of failures so near."""
-    low, high = np.nanquantile(values, _NEARLY_ALL).tolist()
-    reach = _FENCE * (high - low) or math.inf
-    inside = values[(values >= low - reach) & (values <= high + reach)]
-    low, high = float(inside.min(initial=low)), float(inside.max(initial=high))
-    beyond = np.abs(failed - np.clip(failed, low, high))
-    near = failed[beyond <= np.quantile(beyond, _SHARE_SEEN)] if len(failed) else failed
-    return float(near.min(initial=low)), float(near.max(initial=high))
 
 
 # -- Of beliefs and drives ------------------------------------------------------------------------
@@ -469,9 +454,8 @@ def history(
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
     fails, lasts = np.asarray(failed, np.bool_), np.ptp(when)
     unit, size = ("hours", 3600.0) if lasts > 7200.0 else ("minutes", 60.0)
-    unit, size = ("days", 86400.0) if lasts > 2e5 else (unit, size)
     steps, dated = np.diff(when), bool(when[0] >= _DATES)
-    unit, size = ("days", 86400.0) if dated else (unit, size)
+    unit, size = ("days", 86400.0) if lasts > 2e5 or dated else (unit, size)
     step = float(np.median(steps)) if len(steps) else 0.0
     holes = np.flatnonzero(steps > 3.0 * step) + 1  # before each a row without numbers ends lines
     x, red, blue = (when - when[0] * (not dated)) / size, COLORS["dead end"], COLORS["follower"]
@@ -486,7 +470,8 @@ def history(
     for k, (ax, name, values) in enumerate(zip(axes, names, z.T, strict=False)):
         ax.plot(drawn, np.insert(values, holes, np.nan), color=ink(), linewidth=0.6)
         at = [value for variable, value in limits if variable == k]
-        low, high = usual(np.append(values, at), values[fails])
+        low, high = usual_range(values, values[fails])
+        low, high = min(low, *at, high), max(high, *at, low)
         pad = 0.06 * (high - low) or 1.0
         ax.set_ylim(low - pad, high + pad)
         for value in at:
@@ -510,8 +495,9 @@ def history(
     _explain(axes[-1])
     axes[-1].set(ylim=(-0.03, 1.03), ylabel="risk", xlabel=f"time [{unit}]")
     if dated:
-        ticks = AutoDateLocator(maxticks=8)
-        axes[-1].xaxis.set(major_locator=ticks, major_formatter=ConciseDateFormatter(ticks))
+        ticks = AutoDateLocator(maxticks=8)  # type: ignore[no-untyped-call]
+        written = ConciseDateFormatter(ticks)  # type: ignore[no-untyped-call]
+        axes[-1].xaxis.set(major_locator=ticks, major_formatter=written)
         axes[-1].set_xlabel("time")
 
 

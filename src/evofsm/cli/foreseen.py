@@ -25,8 +25,10 @@ if TYPE_CHECKING:
 RATE = 0.3
 #: The share of a log that is learnt from, where the rest is to judge it.
 LEARNT = 0.6
-# Alarms that are listed; times from here on are dates [s].
-_LISTED, _DATES = 12, 1e8
+# Alarms that are listed.
+_LISTED = 12
+#: Times from here on are dates [s].
+DATES = 1e8
 _CAME = ("ahead", "false/day")
 _HEADER = ("stated", "hold", "foreseen", *_CAME, "thresholds", *_CAME)
 
@@ -187,13 +189,14 @@ def _tables(found: dict[str, Any], judge: Foresight, title: str) -> Iterator[Ren
     rows = []
     for hit in found["listed"][-_LISTED:]:
         failed, why = "yes" if hit["failed"] else "no", hit["reason"].partition(";")[0]
-        rows.append([f"{hit['episode'] + 1}", _date(hit["time"]), span(hit["lasts"]), failed, why])
+        rows.append([f"{hit['episode'] + 1}", date(hit["time"]), span(hit["lasts"]), failed, why])
     title = f"\nThe last of {len(found['listed'])} alarms"
     yield table(title, ("episode", "time", "lasts", "failed", "why"), rows, left=(0, 4))
 
 
-def _date(time: float) -> str:
-    if time < _DATES:
+def date(time: float) -> str:
+    """A time [s], as people read it."""
+    if time < DATES:
         return f"{time:.10g}"
     return f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M}"
 
@@ -220,17 +223,14 @@ def _draw(
     number = int(np.lexsort([runs.starts, runs.failed, runs.lengths > judge.horizon])[-1])
     last = int(ends[number])
     near = max(int(runs.starts[number]), last - 4 * judge.horizon)
-    rows = [] if chosen is None else judge.of_rate(chosen).tolist()
-    limits = [(int(v), at) for *_, v, when, _, at in rows if v < runs.rows.shape[1] and not when]
+    limits = [] if chosen is None else judge.thresholds(chosen)
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
     model = None if machine is None or not machine.n_states else machine.model()
     count = len(names) + 1 + (model is not None)
     with picture(out, 10.0, 1.3 * count) as figure:
         axes = figure.subplots(count, 2, sharex="col")
-        title = (
-            f"Episode {number + 1:,}, {'before it failed' if runs.failed[number] else 'its end'}"
-        )
-        title += f": {_date(times[last])}" * (times[last] >= _DATES)
+        title = f"Episode {number + 1:,}{', before it failed' if runs.failed[number] else ''}"
+        title += f": {date(times[last])}" * (times[last] >= DATES)
         parts = {f"{len(ends):,} episodes": slice(None), title: slice(near, last + 1)}
         for column, (title, part) in zip(axes.T, parts.items(), strict=True):
             seen = times[part], runs.rows[part], names, risk[part], failed[part]

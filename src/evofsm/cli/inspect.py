@@ -51,8 +51,8 @@ def inspect(
     provenance = {} if header is None else header.provenance
     if plot is not None:
         title = f"States of {file.name}" + (f" over {Path(log).name}" if log else "")
-        logged = _logged(log, model, provenance.get("read with", {}))
-        _draw(model, guard, plot, axes, logged, title)
+        seen = _logged(log, model, provenance.get("read with", {}))
+        _draw(model, guard, plot, axes, seen, title)
     told = getattr(guard and guard.judge, "told_by_experience", None)
     known = [] if told is None else [("experience", str(told))]
     if as_json:
@@ -123,12 +123,7 @@ def _logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> d
 
 
 def _draw(
-    model: FSMModel,
-    guard: Guard | None,
-    out: Path,
-    axes: str | None,
-    logged: dict[str, Any],
-    title: str,
+    model: FSMModel, guard: Guard | None, out: Path, axes: str | None, logged: Any, title: str
 ) -> None:
     """States in the plane of two variables, and what a guard has learnt of failure."""
     from evofsm import plot
@@ -143,7 +138,7 @@ def _draw(
     judge = guard and guard.judge
     if isinstance(judge, Foresight):
         rate = judge.rate_of(getattr(guard and guard.reviser, "tolerance", 1.0))
-        logged["alarm"] = None if rate is None else judge.where(rate)
+        logged["alarm"] = () if rate is None else judge.where(rate)
     with picture(out, 7.2, 5.0) as figure:
         figure.suptitle(title, x=0.01, ha="left")
         if guard is not None and isinstance(judge, LearntRisk):
