@@ -2,13 +2,10 @@
 
 import asyncio
 import math
-from datetime import datetime, timedelta
 
 import pytest
 
 from evofsm.cli.driving import Setup, make_guard
-from evofsm.cli.foreseen import guard_where_nobody_acts
-from evofsm.cli.learning import episodes_of
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.options import reading_of
 from evofsm.cli.watch.logged import watched_log
@@ -24,7 +21,6 @@ from evofsm.cli.watch.session import (
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
 from evofsm.driving.assumed import guard_of_monitor
-from evofsm.fsm import Labels
 from evofsm.guard import Mode
 from evofsm.io import recording
 from monitor_rows import line, traffic
@@ -326,47 +322,6 @@ def test_a_log_is_watched_by_its_own_columns_and_units(tmp_path, capsys):
     assert second.time == pytest.approx(0.1)
     assert before.proposed_risk.risk > 0.9
     assert "the own car brakes with 4 m/s² (--brakes)" in capsys.readouterr().err
-
-
-def test_a_log_where_nobody_acts_opens_on_an_alarm_and_goes_by_the_clock(tmp_path):
-    path, minute = tmp_path / "heat.csv", datetime(2025, 3, 9, 23, 30)
-    lines = ["run,t,heat,trip"]
-    for run in range(9):
-        for k in range(60):
-            heat = -999.0 if run == k == 1 else 20.0 + k * (run % 2) + 0.1 * (k % 3)
-            lines.append(
-                f"{run},{minute + timedelta(minutes=100 * run + k)},{heat},{int(heat > 75)}"
-            )
-            if heat > 75:
-                break
-    path.write_text("\n".join(lines))
-    reading = reading_of("heat", "", "t", failed="trip>0")
-    shown = watched_log(str(path), reading)
-    start, known = shown.start, shown.known()
-    assert start.cases[:2] == (
-        "episode 1, 2025-03-09 23:30",
-        "episode 2, 2025-03-10 01:10 (alarm, failure)",
-    )
-    assert start.case == 1
-    assert 15.0 < start.ranges[0][0] < start.ranges[0][1] < 80.0  # without the spike
-    frames = drive(shown)
-    alarmed = next(f for f in frames if f.proposed_risk.risk > start.tolerance)
-    assert alarmed.observation[0] > known.limits[0][1]
-    told = tell(frames[-1], start)
-    assert told.when.startswith(
-        f"An alarm came at {minute + timedelta(seconds=6000 + alarmed.time):%H:%M}"
-    )
-    shown.restart(0)
-    *_, last = drive(shown)
-    told = tell(last, shown.start)
-    assert told.why == f"Nothing reached the alarm limit of {start.tolerance:.0%}."
-    assert told.outcome == "It ended at 03-10 00:29 without failure."
-    rows = [*episodes_of(reading.traces([str(path)]))]
-    known = Labels(names=("heat",)), None, 0.0, None, shown.machine
-    guard = guard_where_nobody_acts(rows, *known)
-    with pytest.raises(ValueError, match=r"read as trip every 60 s; this guard decides on heat"):
-        watched_log(str(path), reading_of("trip", "", "t"), guard=guard)
-    assert watched_log(str(path), reading, guard=guard).start.case == 1
 
 
 def test_what_was_before_is_shown_at_once():

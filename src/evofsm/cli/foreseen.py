@@ -230,7 +230,7 @@ def _draw(
     with picture(out, 10.0, 1.3 * count) as figure:
         axes = figure.subplots(count, 2, sharex="col")
         title = f"Episode {number + 1:,}{', before it failed' if runs.failed[number] else ''}"
-        title += f": {date(times[last])}" * (times[last] >= DATES)
+        title += f": {date(times[last])}" * bool(times[last] >= DATES)
         parts = {f"{len(ends):,} episodes": slice(None), title: slice(near, last + 1)}
         for column, (title, part) in zip(axes.T, parts.items(), strict=True):
             seen = times[part], runs.rows[part], names, risk[part], failed[part]

@@ -129,10 +129,9 @@ def _draw(
     from evofsm import plot
     from evofsm.guard import Foresight, LearntRisk
 
-    names = [model.labels.variable(k) for k in range(model.n_variables)]
-    short = [name.split(" [")[0] for name in names]
+    names = [model.labels.variable(k).split(" [")[0] for k in range(model.n_variables)]
     asked = [name.split(" [")[0] for name in split_names(axes or "")]
-    pair: Any = [short.index(name) for name in asked if name in short]
+    pair: Any = [names.index(name) for name in asked if name in names]
     if len(pair) != 2 * (axes is not None):
         raise ValueError(f"--axes is {axes}; name two of {', '.join(names)}")
     judge = guard and guard.judge

@@ -129,7 +129,8 @@ def _exposure(value: float) -> str:
 
 def usual_range(values: NDArray[np.float64], failed: NDArray[np.float64]) -> tuple[float, float]:
     """Ends of all values but a few far ones, and of the nearest quarter of those that failed."""
-    low, high = np.nanquantile(values, [0.01, 0.99]).tolist()
+    values, failed = values[np.isfinite(values)], failed[np.isfinite(failed)]
+    low, high = np.quantile(values, [0.01, 0.99]).tolist() if len(values) else (0.0, 1.0)
     reach = 0.5 * (high - low) or math.inf
     inside = values[(values >= low - reach) & (values <= high + reach)]
     low, high = float(inside.min(initial=low)), float(inside.max(initial=high))
