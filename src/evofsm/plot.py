@@ -138,16 +138,14 @@ def states(
     ax.margins(0.1)
     ax.autoscale_view()
     limits = ax.axis()
-    table = np.reshape(np.asarray(alarm, np.float64), (-1, SIZE))
-    _tint(ax, pair, table, table[:, HELD], label="where it alarms if nothing changes")
+    _tint(ax, pair, np.reshape(alarm, (-1, SIZE)))
     if ways:
         leaves = model.changes * (1.0 - np.eye(model.n_states))
         shares = leaves / np.maximum(leaves.sum(1, keepdims=True), 1.0)
         for i, j in np.argwhere(shares > 0.0):
             if (shares[i] > shares[i, j]).sum() < _DARK:
                 _arrow(ax, centers[i], centers[j], max(_WIDEST * shares[i, j], 0.4), ink(0.5))
-        if shares.any():
-            ax.plot([], [], color=ink(0.5), label="likeliest ways on")
+        ax.plot([], [], color=ink(0.5), label="likeliest ways on")
         inside = np.all((seen >= limits[::2]) & (seen <= limits[1::2]), axis=1)
         if outside := len(seen) - int(inside.sum()):
             beyond = f"not in view: {outside:,} observed, of which {fails[~inside].sum():,} failed"
@@ -277,7 +275,7 @@ def experience(
     ax.update_datalim(centers)
     ax.autoscale_view()
     limits = ax.axis()
-    _tint(ax, pair, fails, 0.0 * fails[:, HELD])
+    _tint(ax, pair, np.where(np.arange(SIZE) == HELD, 0.0, fails))
     draw_centers(ax, centers, (), 10.0)
     ax.axis(limits)
     ring: Look = {"marker": "o", "fillstyle": "none"}
@@ -296,19 +294,23 @@ def experience(
     return ax
 
 
-def _tint(ax: Axes, pair: list[int], table: Any, near: Any, label: str = "") -> None:
-    """Tint where forms (r, SIZE) of two variables are passed, or so nearly (r,), with an edge."""
-    limits, red, here = ax.axis(), COLORS["dead end"], np.isin(table[:, [I, J]], pair).all(1)
-    if not here.any():
+def _tint(ax: Axes, pair: list[int], table: NDArray[np.float64]) -> None:
+    """Tint where forms (r, SIZE) of two variables are passed, or by `HELD` nearly, with an edge."""
+    limits, red, table = (
+        ax.axis(),
+        COLORS["dead end"],
+        table[np.isin(table[:, [I, J]], pair).all(1)],
+    )
+    if not len(table):
         return
     x, y = np.meshgrid(np.linspace(*limits[:2], _GRID), np.linspace(*limits[2:], _GRID))
     z = np.zeros((x.size, max(pair) + 1))
     z[:, pair] = np.column_stack([x.ravel(), y.ravel()])
-    form = (-distances(table[here], z) - near[here, None]).max(0).reshape(x.shape)
+    form = (-distances(table, z) - table[:, HELD, None]).max(0).reshape(x.shape)
     ax.contourf(x, y, form, [0.0, np.inf], colors=[red], alpha=0.15, zorder=0.5)
     ax.contour(x, y, form, [0.0], colors=[red], linewidths=1.2, zorder=2.0)
-    if label:
-        ax.plot([], [], "s", markersize=8.0, color=red, alpha=0.3, label=label)
+    look: Look = {"markersize": 8.0, "color": red, "alpha": 0.3}
+    ax.plot([], [], "s", label="where it alarms if nothing changes", **look)
 
 
 # -- Of beliefs and drives ------------------------------------------------------------------------
@@ -497,8 +499,7 @@ def history(
     if dated:
         ticks = AutoDateLocator(maxticks=8)  # type: ignore[no-untyped-call]
         written = ConciseDateFormatter(ticks)  # type: ignore[no-untyped-call]
-        axes[-1].xaxis.set(major_locator=ticks, major_formatter=written)
-        axes[-1].set_xlabel("time")
+        axes[-1].xaxis.set(major_locator=ticks, major_formatter=written, label_text="time")
 
 
 def _explain(ax: Axes, handles: Sequence[Line2D] | None = None) -> None:

@@ -256,10 +256,10 @@ def known_of(judge: LearningJudge, tolerance: float) -> Known:
         known, rate = Known(told=judge.told_by_experience), judge.rate_of(tolerance)
         if rate is None:
             return known
-        table = judge.where(rate)
-        first, second, *_ = [*dict.fromkeys([*telling(table), *range(len(judge.labels.names))]), 0]
-        plane, limits = (first, second), judge.thresholds(rate)
-        return known._replace(plane=plane, forms=table.tolist(), limits=limits)
+        table, m = judge.where(rate), len(judge.labels.names)
+        first, second, *_ = [*dict.fromkeys([*telling(table), *range(m)]), 0]
+        known = known._replace(forms=table.tolist(), limits=judge.thresholds(rate))
+        return known._replace(plane=(first, second))
     if not isinstance(judge, LearntRisk) or not judge.n_variables:
         return Known()
     learnt, survived = judge.state, judge.state.survived
