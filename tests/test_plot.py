@@ -15,7 +15,7 @@ from studies.systems import Start, make_system
 
 from evofsm import EvolvingFSM, IntervalActions, Novelty, plot
 from evofsm.driving import drive, guard_for_family, load_family
-from evofsm.guard import Guard, LearntRisk, Mode
+from evofsm.guard import Foresight, Guard, LearntRisk, Mode
 
 OF_A_MODEL = (plot.states, plot.graph)
 
@@ -87,6 +87,27 @@ def test_states_over_rows_have_their_reach_and_their_ways_on_in_frame():
     assert len(arrows) == 3  # 1 to 2 and back, and on to 3
     only = plot.states(machine.model(), new(), ways=True)
     assert only.axis()[0] < -1.0  # so far the first one reaches
+
+
+def test_a_few_spikes_do_not_set_the_axes_and_where_it_alarms_is_tinted():
+    rows = np.column_stack([np.linspace(2.0, 7.0, 400), np.linspace(50.0, 90.0, 400)])
+    rows = np.vstack([rows, [[7.6, 97.0], [-999.0, 60.0], [5.0, 4000.0]]])
+    failed = np.arange(len(rows)) >= 400
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=[2.0, 20.0]))
+    machine.learn_many(rows, [0] * len(rows), [0], [len(rows) - 1])
+    judge = Foresight.learn_log([rows[:401, 1]] * 9, [True] * 9, dt=60.0, names=["heat"])
+    table = judge.where(0)
+    table[:, [1, 2]] = 1  # the heat is the second one here
+    ax = plot.states(machine.model(), new(), rows=rows, failed=failed, ways=True, alarm=table)
+    (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
+    assert -5.0 < left < 2.0 < 7.6 < right < 15.0
+    assert 0.0 < low < 50.0 < 97.0 < high < 150.0
+    said = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert said[-1] == "not in view: 2 observed, of which 2 failed"
+    tinted = ax.collections[0].get_paths()[0]
+    assert tinted.contains_points([[3.0, 99.0], [3.0, 60.0]]).tolist() == [True, False]
+    alone = plot.states(machine.model(), new())  # of a model by itself, too
+    assert -20.0 < alone.get_xlim()[0] < alone.get_xlim()[1] < 20.0
 
 
 def test_discs_that_would_meet_move_apart():
@@ -247,7 +268,21 @@ def test_a_history_marks_alarms_and_failures_and_leaves_holes_blank():
     assert [end.tolist() for end in ends] == [pytest.approx([2, 2]), pytest.approx([150, 152])]
     assert said.get_xlabel() == "time [hours]"
     labels = [text.get_text() for text in said.get_legend().get_texts()]
-    assert labels == ["alarm", "tolerance", "failure"]
+    assert labels == ["alarm", "limit of alarms", "failure"]
+
+
+def test_a_history_has_dates_limits_and_what_is_far_out_is_counted():
+    when, heat = 1.742e9 + 60.0 * np.arange(400), np.linspace(20.0, 60.0, 400)
+    heat[[50, 51]] = -999.0
+    axes = Figure().subplots(2)
+    risk, failed = (heat > 55.0).astype(float), np.arange(400) == 399
+    plot.history(axes, when, heat[:, None], ["heat"], risk, failed, 0.5, limits=[(0, 55.0)])
+    assert -10.0 < axes[0].get_ylim()[0] < 20.0
+    assert texts(axes[0]) == ["2 rows not in view"]
+    FigureCanvasAgg(axes[0].figure).draw()
+    assert axes[1].get_xlabel() == "time"
+    assert axes[1].xaxis.get_major_formatter().get_offset() == "2025-Mar-15"
+    assert [55.0, 55.0] in [list(line.get_ydata()) for line in axes[0].lines]
 
 
 @pytest.mark.parametrize("name", ["pressure behind the second stage of the pump [bar]", "p" * 60])

@@ -17,18 +17,21 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.driving import Episode
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel, Policy
+from evofsm.fsm.proportions import usual_range
 from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Trace
 from evofsm.guard import Guard, LearntRisk
-from evofsm.guard.learnt.failure import SAYS, I, J, forms, telling
+from evofsm.guard.learnt.failure import HELD, SAYS, SIZE, I, J, distances, telling
 from evofsm.guard.learnt.rollout import FAILS
 
 with needs("matplotlib", "plot", "plotting"):
     import matplotlib
     from matplotlib.colors import Normalize, to_hex, to_rgb
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
     from matplotlib.lines import Line2D
     from matplotlib.patches import Ellipse, FancyArrowPatch
     from matplotlib.patheffects import withStroke
+    from matplotlib.transforms import Bbox
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,6 +55,8 @@ _DISCS, _TICKS = 20, 12
 _DARK, _WIDEST = 2, 1.6
 # Points on each side of the grid on which it is asked where a guard fails.
 _GRID = 300
+# Times from here on are dates [s].
+_DATES = 1e8
 
 # -- Of a model -----------------------------------------------------------------------------------
 
@@ -65,10 +70,12 @@ def states(
     rows: ArrayLike = (),
     failed: ArrayLike = (),
     ways: bool = False,
+    alarm: ArrayLike = (),
 ) -> Axes:
     """Centres of the states in the plane of two variables.
 
-    Where discs would overlap they are moved apart. What is on the axes before stays in view.
+    Where discs would overlap they are moved apart. What is on the axes before stays in view. What
+    is far from nearly all else is not: such states are at the edge, such rows in the legend.
 
     Parameters
     ----------
@@ -86,6 +93,8 @@ def states(
     ways : bool
         Whether to show how far each state of a `Novelty` reaches (an ellipse), the two likeliest
         ways out of each, as wide as they are likely, and a legend.
+    alarm : (r, 14) array_like, optional
+        Where a guard alarms, to tint, as `evofsm.guard.Foresight.where` has it.
 
     Raises
     ------
@@ -105,10 +114,14 @@ def states(
     _refuse_unknown(model.n_states, dead_ends)
     _refuse_other(variables, model.n_variables)
     ax = _given_or_new(ax)
-    pair = list(variables)
+    pair, box = list(variables), [ax.dataLim.frozen()] if ax.has_data() else []
     centers, seen = model.centers[:, pair], np.reshape(rows, (-1, model.n_variables))[:, pair]
-    fails = np.resize(np.asarray(failed, np.bool_), len(seen)) if np.size(failed) else ()
-    look: Look = {"markersize": 1.5, "color": ink(0.3), "zorder": 0.5, "rasterized": True}
+    fails = np.resize(np.asarray(failed, np.bool_), len(seen)) & bool(np.size(failed))
+    times = np.ceil(_GRID**2 * model.visits / max(float(model.visits.sum()), 1.0)).astype(int)
+    every = seen if len(seen) else centers.repeat(times, axis=0)
+    ends = np.transpose([usual_range(x, y) for x, y in zip(every.T, seen[fails].T, strict=True)])
+    centers, in_view = np.clip(centers, *ends), ((centers >= ends[0]) & (centers <= ends[1])).all(1)
+    look: Look = {"markersize": 1.5, "color": ink(0.3), "zorder": 1.2, "rasterized": True}
     if len(seen):
         ax.plot(*seen.T, ".", label="observed", **look)
     if np.any(fails):
@@ -117,14 +130,15 @@ def states(
     if ways and isinstance(model.rule, Novelty):
         reach = np.sqrt(model.width) * np.resize(model.rule.scales, model.n_variables)[pair]
         look = {"color": COLORS["leader"], "alpha": 0.1, "linewidth": 0.0, "zorder": 0.4}
-        for k, center in enumerate(centers):
+        for k, center in enumerate(centers[in_view]):
             label = "" if k else "where a state reaches"
             ax.add_patch(Ellipse(center, *2.0 * reach, label=label, **look))
-        ax.update_datalim(np.vstack([centers - reach, centers + reach]))
-    ax.update_datalim(centers)
+        ends = np.vstack([ends, centers[in_view] - reach, centers[in_view] + reach])
+    ax.dataLim.set(Bbox.union([*box, Bbox([ends.min(0), ends.max(0)])]))
     ax.margins(0.1)
     ax.autoscale_view()
     limits = ax.axis()
+    _tint(ax, pair, np.reshape(alarm, (-1, SIZE)))
     if ways:
         leaves = model.changes * (1.0 - np.eye(model.n_states))
         shares = leaves / np.maximum(leaves.sum(1, keepdims=True), 1.0)
@@ -132,6 +146,10 @@ def states(
             if (shares[i] > shares[i, j]).sum() < _DARK:
                 _arrow(ax, centers[i], centers[j], max(_WIDEST * shares[i, j], 0.4), ink(0.5))
         ax.plot([], [], color=ink(0.5), label="likeliest ways on")
+        inside = np.all((seen >= limits[::2]) & (seen <= limits[1::2]), axis=1)
+        if outside := len(seen) - int(inside.sum()):
+            beyond = f"not in view: {outside:,} observed, of which {fails[~inside].sum():,} failed"
+            ax.plot([], [], " ", label=beyond)
         _explain(ax)
     draw_centers(ax, centers, dead_ends, size=13.0)
     ax.axis(limits)
@@ -257,14 +275,7 @@ def experience(
     ax.update_datalim(centers)
     ax.autoscale_view()
     limits = ax.axis()
-    x, y = np.meshgrid(np.linspace(*limits[:2], _GRID), np.linspace(*limits[2:], _GRID))
-    z = np.zeros((x.size, m))
-    z[:, pair] = np.column_stack([x.ravel(), y.ravel()])
-    here = fails[np.isin(fails[:, [I, J]], pair).all(1)]
-    if len(here):
-        form = forms(here, z)[0].max(0).reshape(x.shape)
-        ax.contourf(x, y, form, [0.0, np.inf], colors=[red], alpha=0.15, zorder=0.5)
-        ax.contour(x, y, form, [0.0], colors=[red], linewidths=1.2, zorder=2.0)
+    _tint(ax, pair, np.where(np.arange(SIZE) == HELD, 0.0, fails))
     draw_centers(ax, centers, (), 10.0)
     ax.axis(limits)
     ring: Look = {"marker": "o", "fillstyle": "none"}
@@ -281,6 +292,25 @@ def experience(
     _explain(ax, [Line2D([], [], label=name, **{**look, **s}) for name, s in looks.items()])
     ax.set(xlabel=called(pair[0]), ylabel=called(pair[1]))
     return ax
+
+
+def _tint(ax: Axes, pair: list[int], table: NDArray[np.float64]) -> None:
+    """Tint where forms (r, SIZE) of two variables are passed, or by `HELD` nearly, with an edge."""
+    limits, red, table = (
+        ax.axis(),
+        COLORS["dead end"],
+        table[np.isin(table[:, [I, J]], pair).all(1)],
+    )
+    if not len(table):
+        return
+    x, y = np.meshgrid(np.linspace(*limits[:2], _GRID), np.linspace(*limits[2:], _GRID))
+    z = np.zeros((x.size, max(pair) + 1))
+    z[:, pair] = np.column_stack([x.ravel(), y.ravel()])
+    form = (-distances(table, z) - table[:, HELD, None]).max(0).reshape(x.shape)
+    ax.contourf(x, y, form, [0.0, np.inf], colors=[red], alpha=0.15, zorder=0.5)
+    ax.contour(x, y, form, [0.0], colors=[red], linewidths=1.2, zorder=2.0)
+    look: Look = {"markersize": 8.0, "color": red, "alpha": 0.3}
+    ax.plot([], [], "s", label="where it alarms if nothing changes", **look)
 
 
 # -- Of beliefs and drives ------------------------------------------------------------------------
@@ -393,8 +423,11 @@ def history(
     tolerance: float,
     *,
     model: FSMModel | None = None,
+    limits: Sequence[tuple[int, float]] = (),
 ) -> None:
     """What was seen over time, above the risk; bands are alarms, crosses failures.
+
+    What is far from nearly all else of a variable is not in view, but counted.
 
     Parameters
     ----------
@@ -402,12 +435,14 @@ def history(
         One for each variable, then one for the states if there is a model, and one for the risk.
     time, risk, failed : (T,) array_like
         When each row was [s], the risk then, and whether a failure came with it. A step of more
-        than three usual ones is left blank.
+        than three usual ones is left blank. Times from 1e8 on are dates (UTC), since 1970.
     rows : (T, m) array_like
     names : sequence of m str
     tolerance : float
         There is an alarm where the risk is above it.
     model : FSMModel, optional
+    limits : sequence of (int, float)
+        Variables, by their index, and the values at which they alarm: lines.
 
     Examples
     --------
@@ -421,21 +456,31 @@ def history(
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
     fails, lasts = np.asarray(failed, np.bool_), np.ptp(when)
     unit, size = ("hours", 3600.0) if lasts > 7200.0 else ("minutes", 60.0)
-    unit, size = ("days", 86400.0) if lasts > 2e5 else (unit, size)
-    steps = np.diff(when)
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    holes = np.flatnonzero(steps > 3.0 * usual) + 1  # before each a row without numbers ends lines
-    x, red, orange = (when - when[0]) / size, COLORS["dead end"], COLORS["follower"]
-    drawn = np.insert(x, holes, x[holes - 1] + usual / size)
+    steps, dated = np.diff(when), bool(when[0] >= _DATES)
+    unit, size = ("days", 86400.0) if lasts > 2e5 or dated else (unit, size)
+    step = float(np.median(steps)) if len(steps) else 0.0
+    holes = np.flatnonzero(steps > 3.0 * step) + 1  # before each a row without numbers ends lines
+    x, red, blue = (when - when[0] * (not dated)) / size, COLORS["dead end"], COLORS["follower"]
+    drawn = np.insert(x, holes, x[holes - 1] + step / size)
     said = np.insert(np.asarray(risk, np.float64), holes, np.nan)
     for ax in axes:
-        look: Look = {"color": orange, "alpha": 0.25, "linewidth": 1.0, "label": "alarm"}
+        look: Look = {"color": blue, "alpha": 0.3, "linewidth": 2.5, "label": "alarm"}
         look["transform"] = ax.get_xaxis_transform()
         ax.fill_between(drawn, 0.0, 1.0, said > tolerance, **look)
         for cross in x[fails]:
             ax.axvline(cross, color=red, linewidth=0.8, linestyle="--")
-    for ax, name, values in zip(axes, names, z.T, strict=False):
+    for k, (ax, name, values) in enumerate(zip(axes, names, z.T, strict=False)):
         ax.plot(drawn, np.insert(values, holes, np.nan), color=ink(), linewidth=0.6)
+        at = [value for variable, value in limits if variable == k]
+        low, high = usual_range(values, values[fails])
+        low, high = min(low, *at, high), max(high, *at, low)
+        pad = 0.06 * (high - low) or 1.0
+        ax.set_ylim(low - pad, high + pad)
+        for value in at:
+            ax.axhline(value, color=red, linewidth=1.0)
+        if beyond := int(((values < low) | (values > high)).sum()):
+            look = {"ha": "right", "xycoords": "axes fraction"}
+            write(ax, f"{beyond:,} rows not in view", (1.0, 1.0), (0.0, 4.0), **look)
         height = 72.0 * ax.get_window_extent().height / ax.figure.dpi
         letters = int(height / (0.65 * float(ax.yaxis.label.get_fontsize())))
         ax.set_ylabel(textwrap.fill(name, max(letters, 8)))
@@ -445,12 +490,16 @@ def history(
         axes[-2].plot(x[sample], seen, ".", markersize=1.5, color=COLORS["leader"])
         label_states(axes[-2].yaxis, model.n_states)
         axes[-2].set_ylabel("state")
-    axes[-1].step(drawn, said, where="post", color=orange)
-    axes[-1].axhline(tolerance, color=ink(), linewidth=0.8, linestyle=":", label="tolerance")
+    axes[-1].step(drawn, said, where="post", color=blue)
+    axes[-1].axhline(tolerance, color=red, linewidth=1.0, label="limit of alarms")
     look = {"linestyle": "none", "marker": "X", "markersize": 4.5, "clip_on": False}
     axes[-1].plot(x[fails], np.ones(fails.sum()), color=red, label="failure", **look)
     _explain(axes[-1])
     axes[-1].set(ylim=(-0.03, 1.03), ylabel="risk", xlabel=f"time [{unit}]")
+    if dated:
+        ticks = AutoDateLocator(maxticks=8)  # type: ignore[no-untyped-call]
+        written = ConciseDateFormatter(ticks)  # type: ignore[no-untyped-call]
+        axes[-1].xaxis.set(major_locator=ticks, major_formatter=written, label_text="time")
 
 
 def _explain(ax: Axes, handles: Sequence[Line2D] | None = None) -> None:

@@ -75,4 +75,5 @@ def test_what_a_guard_has_learnt_is_said_and_drawn(evofsm, refused, tmp_path):
     said = evofsm("inspect", file, "--plot", drawn, "--axes", "variable 2,variable 1").stdout
     assert "experience    fails where variable 2 is above 0.3" in said
     assert "<svg" in drawn.read_text()
+    evofsm("inspect", file, "--plot", drawn, "--axes", "variable 2 [m],variable 1")  # with units
     assert "name two of variable 1" in refused("inspect", file, "--plot", drawn, "--axes", "x")

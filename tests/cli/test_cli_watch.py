@@ -49,6 +49,11 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c(tmp_path, arg
         (["CartPole"], "named with its version: CartPole-v1"),
         (["folder"], "folder is a folder; name the files in it"),
         (["learnt"], "learnt holds what was learnt, and is no log: evofsm inspect prints it"),
+        (
+            ["rows.csv"],
+            "no column 'gap'; it has t, heat (--observe names the right one). Is it no log",
+        ),
+        (["paper", "--guard", "learnt"], "--guard and options of columns are for a log"),
         (["empty.py"], "it defines neither environment() nor a Family called family"),
     ],
 )
@@ -56,5 +61,6 @@ def test_what_cannot_be_watched_is_said_in_a_line(refused, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder").mkdir()
     (tmp_path / "empty.py").touch()
+    (tmp_path / "rows.csv").write_text("t,heat\n0,1\n1,2\n")
     EvolvingFSM(n_actions=2).save("learnt")
     assert error in refused("watch", *arguments, "--no-browser", "--learn-first", "1")

@@ -250,6 +250,7 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
     from evofsm.cli.monitor.slots import Slots
     from evofsm.cli.monitor.summary import decided_on_log
     from evofsm.cli.options import reading_of
+    from evofsm.cli.watch.logged import watched_log
     from evofsm.io import LogColumns, episodes_of
 
     path, of = written("parquet"), f'"{VIBRATION}",{BEARING}'
@@ -276,6 +277,11 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
     assert sum(one["alarm"] for one in found) > 20
     drawn = evofsm("inspect", "guard.evofsm", "--plot", "states.png", "--log", path)
     assert (drawn.exit_code, Path("states.png").exists()) == (0, True)
+    guard = Guard.load("guard.evofsm")
+    shown = watched_log(path, reading_of(**told), guard=guard)
+    assert "(alarm, failure)" in shown.start.cases[shown.start.case]
+    with pytest.raises(ValueError, match=f"read as {BEARING} every 20 s; this guard decides on"):
+        watched_log(path, reading_of(**told | {"observe": BEARING, "resample": "20s"}), guard=guard)
     assert "as in a log: rows of 20 s become one" in live.stderr
 
 
@@ -341,22 +347,29 @@ def test_a_log_of_any_machine_is_watched(written):
     asked = {"time": "Zeit", "resample": "20s", "hole": "5min", "failed": "Status==Störung"}
     asked |= {"observe": f'"{VIBRATION}",{BEARING}', "where": "Drehzahl>100", "action": ""}
     with watched_log(written("parquet"), reading_of(**asked), None) as shown:
-        assert shown.start.cases[:2] == ("episode 1 (failure)", "episode 3 (failure)")
-        assert shown.start.cases[-1] == "episode 14"
+        first, second, *_, last = shown.start.cases
+        assert first == "episode 1, 2025-03-10 06:00 (alarm, failure)"
+        assert (second, last[:12]) == ("episode 2, 2025-03-10 06:28", "episode 14, ")
         assert "nobody acts" in introduce(shown.start)["intro"]
         assert shown.graph().states
         frames = [shown.step()]
         while not frames[-1].over:
             frames.append(shown.step())
+        (variable, at), *_ = shown.known().limits
+        for frame in frames[:-1]:  # by the alarm that was chosen, and by no other one
+            assert (frame.proposed_risk.risk > shown.start.tolerance) == (frame.reason[:2] != "no")
+        assert frames[-2].observation[variable] > at
         before = [tell(frame, shown.start).headline for frame in frames[:-1]]
         assert before == sorted(before, key="Alarm".__eq__)  # none, then it is on
         told = tell(frames[-1], shown.start)
         assert told.headline == "Failure"
-        assert told.when.startswith("An alarm came at ")
+        assert re.match(r"An alarm came at 06:\d\d:\d\d\.", told.when)
         assert f"{VIBRATION} above" in shown.known().told
         assert re.search(VIBRATION + r" \d\S+: above \S+; after \d+ of \d+ such alarms", told.why)
         shown.restart(len(shown.start.cases) - 1)  # one that went well
         while not (frame := shown.step()).over:
             assert tell(frame, shown.start).headline == "No alarm"
+        limit = f"{shown.start.tolerance:.0%}"
+        assert tell(frame, shown.start).why == f"Nothing reached the alarm limit of {limit}."
     with pytest.raises(ValueError, match="no episode failed, so"):
         watched_log(written("parquet"), reading_of(**asked | {"failed": None}), None)

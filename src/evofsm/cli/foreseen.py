@@ -25,8 +25,10 @@ if TYPE_CHECKING:
 RATE = 0.3
 #: The share of a log that is learnt from, where the rest is to judge it.
 LEARNT = 0.6
-# Alarms that are listed; times from here on are dates [s].
-_LISTED, _DATES = 12, 1e8
+# Alarms that are listed.
+_LISTED = 12
+#: Times from here on are dates [s].
+DATES = 1e8
 _CAME = ("ahead", "false/day")
 _HEADER = ("stated", "hold", "foreseen", *_CAME, "thresholds", *_CAME)
 
@@ -214,11 +216,11 @@ def _tables(
             ", then ".join([*false, *["yes"] * hit["failed"]]),
             hit["reason"].partition("; after")[0],
         )
-        rows.append([f"{hit['episode'] + 1}", _date(hit["time"]), span(hit["lasts"]), failed, why])
+        rows.append([f"{hit['episode'] + 1}", date(hit["time"]), span(hit["lasts"]), failed, why])
     title = _last(found["listed"], "Alarms")
     yield table(title, ("episode", "time", "lasts", "failed", "why"), rows, left=(0, 4))
     if missed := found["missed"]:
-        rows = [[f"{x['episode'] + 1}", _date(x["time"]), x["reason"]] for x in missed[-_LISTED:]]
+        rows = [[f"{x['episode'] + 1}", date(x["time"]), x["reason"]] for x in missed[-_LISTED:]]
         header = "episode", "time", "why"
         yield table(_last(missed, "Failures that were not foreseen"), header, rows, left=(0, 2))
 
@@ -228,8 +230,9 @@ def _last(hits: Sequence[Any], what: str) -> str:
     return f"\n{what}: {'all' if n <= _LISTED else f'the last {_LISTED} of'} {n:,}"
 
 
-def _date(time: float) -> str:
-    if time < _DATES:
+def date(time: float) -> str:
+    """A time [s], as people read it."""
+    if time < DATES:
         return f"{time:.10g}"
     return f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M}"
 
@@ -252,13 +255,21 @@ def _draw(
     risk = np.max(on * judge.shares[:, None], axis=0)
     failed, ends = np.zeros(len(risk), np.bool_), runs.starts + runs.lengths - 1
     failed[ends[runs.failed]] = True
-    last = int(ends[runs.failed][-1] if runs.failed.any() else ends[-1])
-    near = max(int(runs.starts[runs.starts <= last][-1]), last - 4 * judge.horizon)
+    # Of those that lasted for a while, if there are any, the last one that failed, if one did.
+    number = int(np.lexsort([runs.starts, runs.failed, runs.lengths > judge.horizon])[-1])
+    last = int(ends[number])
+    near = max(int(runs.starts[number]), last - 4 * judge.horizon)
+    limits = [] if chosen is None else judge.thresholds(chosen)
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
     model = None if machine is None or not machine.n_states else machine.model()
     count = len(names) + 1 + (model is not None)
     with picture(out, 10.0, 1.3 * count) as figure:
         axes = figure.subplots(count, 2, sharex="col")
-        for column, part in zip(axes.T, (slice(None), slice(near, last + 1)), strict=True):
+        title = f"Episode {number + 1:,}{', before it failed' if runs.failed[number] else ''}"
+        title += f": {date(times[last])}" * bool(times[last] >= DATES)
+        parts = {f"{len(ends):,} episodes": slice(None), title: slice(near, last + 1)}
+        for column, (title, part) in zip(axes.T, parts.items(), strict=True):
             seen = times[part], runs.rows[part], names, risk[part], failed[part]
-            plot.history(column, *seen, tolerance, model=model)
+            plot.history(column, *seen, tolerance, model=model, limits=limits)
+            column[0].set_title(title, loc="left")
+        axes[-1, 1].get_legend().remove()

@@ -50,7 +50,9 @@ def inspect(
     model, header, guard = load_model(file)
     provenance = {} if header is None else header.provenance
     if plot is not None:
-        _draw(model, guard, plot, axes, _logged(log, model, provenance.get("read with", {})))
+        title = f"States of {file.name}" + (f" over {Path(log).name}" if log else "")
+        seen = _logged(log, model, provenance.get("read with", {}))
+        _draw(model, guard, plot, axes, seen, title)
     told = getattr(guard and guard.judge, "told_by_experience", None)
     known = [] if told is None else [("experience", str(told))]
     if as_json:
@@ -121,18 +123,24 @@ def _logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> d
 
 
 def _draw(
-    model: FSMModel, guard: Guard | None, out: Path, axes: str | None, logged: dict[str, Any]
+    model: FSMModel, guard: Guard | None, out: Path, axes: str | None, logged: Any, title: str
 ) -> None:
     """States in the plane of two variables, and what a guard has learnt of failure."""
     from evofsm import plot
-    from evofsm.guard import LearntRisk
+    from evofsm.guard import Foresight, LearntRisk
 
     names = [model.labels.variable(k).split(" [")[0] for k in range(model.n_variables)]
-    pair: Any = [names.index(name) for name in split_names(axes or "") if name in names]
+    asked = [name.split(" [")[0] for name in split_names(axes or "")]
+    pair: Any = [names.index(name) for name in asked if name in names]
     if len(pair) != 2 * (axes is not None):
         raise ValueError(f"--axes is {axes}; name two of {', '.join(names)}")
+    judge = guard and guard.judge
+    if isinstance(judge, Foresight):
+        rate = judge.rate_of(getattr(guard and guard.reviser, "tolerance", 1.0))
+        logged["alarm"] = () if rate is None else judge.where(rate)
     with picture(out, 7.2, 5.0) as figure:
-        if guard is not None and isinstance(guard.judge, LearntRisk):
+        figure.suptitle(title, x=0.01, ha="left")
+        if guard is not None and isinstance(judge, LearntRisk):
             plot.experience(guard, figure.subplots(), variables=pair or None)
         elif model.n_variables == 1:
             plot.graph(model, figure.subplots())

@@ -176,12 +176,12 @@ _log = logging.getLogger("evofsm")
 
 
 class _Announcement(event.Listener):
-    """Says once that kernels are compiled."""
+    """Says once that kernels are compiled, of those to come not again while some are cached."""
 
     said = False
 
     def on_start(self, event: object) -> None:
-        if not self.said:
+        if not (self.said or any(Path(__file__).parents[1].rglob("__pycache__/*.nbi"))):
             _log.warning("compiling kernels, once; this takes some seconds ...")
         self.said = True
 

@@ -7,6 +7,9 @@ from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from evofsm.fsm.kernels import compiled
 from evofsm.fsm.validation import counted
 
@@ -122,3 +125,15 @@ def _two_digits(value: float, rounded: Callable[[float], int]) -> str:
 
 def _exposure(value: float) -> str:
     return f"{outward(math.floor, value, 2):g}" if value < 10.0 else f"{math.floor(value + 1e-6):,}"
+
+
+def usual_range(values: NDArray[np.float64], failed: NDArray[np.float64]) -> tuple[float, float]:
+    """Ends of all values but a few far ones, and of the nearest quarter of those that failed."""
+    values, failed = values[np.isfinite(values)], failed[np.isfinite(failed)]
+    low, high = np.quantile(values, [0.01, 0.99]).tolist() if len(values) else (0.0, 1.0)
+    reach = 0.5 * (high - low) or math.inf
+    inside = values[(values >= low - reach) & (values <= high + reach)]
+    low, high = float(inside.min(initial=low)), float(inside.max(initial=high))
+    beyond = np.abs(failed - np.clip(failed, low, high))
+    near = failed[beyond <= np.quantile(beyond, 0.25)] if len(failed) else failed
+    return float(near.min(initial=low)), float(near.max(initial=high))

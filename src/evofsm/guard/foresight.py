@@ -149,6 +149,7 @@ class Foresight(LearningJudge):
     fallback = Fallback(0.0, "nobody acts")
     rates = RATES  #: for each there is an alarm
     runs = Runs.of
+    _accepted = 0.0
 
     def __init__(
         self,
@@ -365,6 +366,19 @@ class Foresight(LearningJudge):
         chosen = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
         return np.asarray(self.limits[chosen])
 
+    def where(self, rate: int) -> Floats:
+        """(r, SIZE) forms beyond which an alarm is on while nothing changes; `HELD` is how near."""
+        m, found = len(self.labels.names), []
+        for *_, v, _, sign, at in self.of_rate(rate).tolist():
+            side = FAILS, v, v, 0.0, 0.0, 1.0, 1.0, -sign * at, sign, *np.zeros(5)
+            found.append(side if v < m else (*self.forms[int(v) - m, : failure.HELD], at))
+        return np.array(found).reshape(-1, failure.SIZE)
+
+    def thresholds(self, rate: int) -> list[tuple[int, float]]:
+        """The variables that alarm by themselves, and at which values."""
+        limits, m = self.of_rate(rate).tolist(), len(self.labels.names)
+        return [(int(v), at) for *_, v, when, _, at in limits if v < m and not when]
+
     def tally(
         self,
         log: Runs,
@@ -512,6 +526,7 @@ class Foresight(LearningJudge):
         mask: Any = None,
     ) -> Search:
         """Keep what is proposed, as nobody acts; the risk is that of the alarm that is on."""
+        self._accepted = tolerance
         passed, (*_, on) = self._next(situation.observation)
         rate, risk, reason = self.rate_of(tolerance), 0.0, "no alarm is on"
         evidence = 0.0 if rate is None else float(self.held_out[rate, 0])
@@ -524,8 +539,8 @@ class Foresight(LearningJudge):
         return Search(np.array([float(wanted)]), judged, 0, reason)
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
-        """The risk, whatever would be done."""
-        found = self.search(situation, 0.0, tolerance=0.0, revising=False).judged
+        """The risk, whatever would be done, with the tolerance that was asked for last."""
+        found = self.search(situation, 0.0, tolerance=self._accepted, revising=False).judged
         every = [np.repeat(values, np.size(actions)) for values in found[:4]]
         return Judgement(every[0], every[1], every[2], every[3], found.evidence)
 

@@ -8,6 +8,7 @@ import webbrowser
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.options import (
@@ -24,6 +25,7 @@ from evofsm.cli.options import (
     argument,
     given_of,
     option,
+    reading_of,
     reads_logs,
     require,
     require_world,
@@ -61,6 +63,13 @@ def watch(
     world: InWorld = "kinematic",
     judge: ByJudge = "kinematic",
     tolerance: Tolerance = TOLERANCE,
+    guard: Annotated[
+        Path | None,
+        option(
+            "Of a log: a guard that was saved, beside which it is played, and read as what that "
+            "learnt from. [default: one that learns from all of the log]"
+        ),
+    ] = None,
     seed: Seed = 0,
     learn_first: Annotated[int, option("Episodes to learn from before, at most.", min=0)] = 60,
     brakes: Brakes = BRAKES,
@@ -85,15 +94,27 @@ def watch(
     """
     require(websockets="watch")
     from evofsm.cli.watch.recorded import Recording
+    from evofsm.guard import Guard
+    from evofsm.store import read_header
 
     is_log = _is_log(what)
-    if not is_log and given_of(reading):
-        raise ValueError(f"options of columns are for a log, and {what} is none")
+    if not is_log and (given_of(reading) or guard):
+        raise ValueError(f"--guard and options of columns are for a log, and {what} is none")
+    if guard is not None:
+        kept = read_header(guard).provenance.get("read with", {})
+        reading = partial(reading_of, **{**reading.keywords, **kept, **given_of(reading)})
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         watched: Session | Recording
         if is_log:
             given = None if tolerance == TOLERANCE else tolerance
-            logged = _logged(what, reading(), given, case, judge=judge, brakes=brakes)
+            saved = None if guard is None else Guard.load(guard)
+            try:
+                logged = _logged(what, reading(), given, case, saved, judge=judge, brakes=brakes)
+            except ValueError as error:
+                if given_of(reading) or "has no column" not in str(error):
+                    raise
+                look = f"evofsm learn {quote(what)} says what it holds, and what to name"
+                raise ValueError(f"{error}. Is it no log of cars? {look}") from error
             watched = stack.enter_context(logged)
         elif what.endswith(".mcap"):
             watched = Recording(what)

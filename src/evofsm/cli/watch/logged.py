@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from evofsm.cli.foreseen import guard_where_nobody_acts
+from evofsm.cli.foreseen import DATES, date, guard_where_nobody_acts
 from evofsm.cli.learning import decided_on, episodes_read, guard_of_log, teach
 from evofsm.cli.options import BRAKES, TOLERANCE, Reading
 from evofsm.cli.show import progress, warn
@@ -18,11 +18,13 @@ from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.naming import Labels
-from evofsm.guard import Guard
+from evofsm.guard import Foresight, Guard
 from evofsm.io.logs import LONGEST_STEP, Chunk
 
 # Intervals of an action.
 _INTERVALS = 17
+# Share by which the step of a log may differ from that of a guard.
+_OTHER_STEP = 0.1
 # More rows of cars are not watched, and fewer of an episode; times that differ by less are one [s].
 _ROWS_OF_CARS, _FEWEST_ROWS, _TICK = 20_000, 10, 5e-4
 
@@ -32,12 +34,13 @@ def watched_log(
     reading: Reading,
     tolerance: float | None = None,
     case: int | None = None,
+    guard: Guard | None = None,
     *,
     judge: str = "kinematic",
     brakes: float = BRAKES,
     collisions: Mapping[str, Sequence[float]] = MappingProxyType({}),
 ) -> Session:
-    """The episodes of a log, with a guard that learnt from all of them.
+    """The episodes of a log, with a guard; without one with one that learnt from all of them.
 
     Of cars an episode is over with a contact; where they come apart again, another one begins. So
     it is with ``collisions`` that a simulation counted [s], by the name of who follows whom.
@@ -46,21 +49,29 @@ def watched_log(
     names = reading.columns.observe.names
     is_kinematic = reading.acts and judge == "kinematic" and len(names) == len(VARIABLES)
     of_cars = is_kinematic or (reading.acts and names == VARIABLES)
-    episodes = episodes_read(path, reading, most=_ROWS_OF_CARS + 2 if of_cars else None)
+    most = _ROWS_OF_CARS + 2 if of_cars else None
+    episodes = episodes_read(path, reading, dated=not of_cars, most=most)
     found = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
     if not found:
         why = f"nobody follows anybody for {_FEWEST_ROWS}" if of_cars else "no episode has two"
         raise ValueError(f"{path}: {why} rows")
     if case is not None and not 1 <= case <= len(found):
         raise ValueError(f"episode is {case}; there are 1 to {len(found)}")
-    if not (of_cars or any(played.fails for played in found)):
+    if guard is None and not (of_cars or any(played.fails for played in found)):
         raise ValueError(
             f"{path}: no episode failed, so there is nothing to foresee; --failed says what did"
         )
     labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
     rows = [played.rows for played in found]
     risk = TOLERANCE if tolerance is None else tolerance
-    if not reading.acts:
+    if guard is not None:
+        if tuple(names) != guard.variables or abs(rows[0].dt / guard.interval - 1.0) > _OTHER_STEP:
+            holds = f"{', '.join(names)} every {rows[0].dt:.4g} s"
+            wants = f"{', '.join(guard.variables)} every {guard.interval:.4g} s"
+            raise ValueError(f"{path} is read as {holds}; this guard decides on {wants}")
+        if tolerance is not None:
+            guard.reviser.tolerance = tolerance  # type: ignore[attr-defined]
+    elif not reading.acts:
         machine = system_machine(1, np.concatenate([chunk.observations for chunk in rows]))
         _learn_states(machine, rows, IntervalActions(0.0, 1.0, 1.0))
         guard = guard_where_nobody_acts(rows, labels, None, 0.0, tolerance, machine)
@@ -72,14 +83,27 @@ def watched_log(
     else:
         guard = _learnt_guard(rows, labels, risk)
     guard.learn = False
-    found = list(_judged(guard, found)) if of_cars else found
+    if of_cars:
+        found = list(_judged(guard, found))
+    if isinstance(guard.judge, Foresight):
+        limit = float(guard.reviser.tolerance)  # type: ignore[attr-defined]
+        found = list(_alarmed(guard.judge, guard.judge.rate_of(limit), found))
     system = Logged(path, found, labels, acts=reading.acts, of_cars=of_cars)
-    return Session(system, guard, case=system.places.get(case or 0, 0), on=False)
+    return Session(system, guard, case=system.places.get(case or 0, system.first), on=False)
+
+
+def _alarmed(judge: Foresight, rate: int | None, found: Sequence[Played]) -> Iterator[Played]:
+    """With whether alarms come before the last row, with which nothing is decided."""
+    runs = judge.runs([p.rows.observations for p in found], [bool(p.fails) for p in found])
+    on = np.zeros(len(runs.rows), np.bool_) if rate is None else judge.tally(runs, rate)[1]
+    for played, part in zip(found, np.split(on, runs.starts[1:]), strict=True):
+        yield played._replace(alarms=bool((part[1:-1] & ~part[:-2]).any()))
 
 
 def _whole(episodes: Iterable[Chunk]) -> Iterator[Played]:
     for number, episode in enumerate(episodes, 1):
-        yield Played(f"episode {number}", episode, "Failure (by the log)" * episode.failed)
+        began = f", {date(episode.times[0])}" if episode.times[0] >= DATES else ""
+        yield Played(f"episode {number}{began}", episode, "Failure (by the log)" * episode.failed)
 
 
 def _of_cars(

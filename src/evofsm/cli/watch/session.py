@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.cli.foreseen import DATES
 from evofsm.cli.watch.shown import (
     CALM,
     OF_CARS,
@@ -49,6 +50,7 @@ from evofsm.driving.world import GAP, GAP_BEHIND, LEADER_ACCELERATION, LEADER_SP
 from evofsm.extras import needs
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.naming import Labels
+from evofsm.fsm.proportions import usual_range
 from evofsm.fsm.rules import Novelty
 from evofsm.guard import (
     BELIEF_TOLERANCE,
@@ -89,6 +91,8 @@ _LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
 # So many rows of a long episode are played one by one, and so many in a second; of cars so much
 # before what is worst [s].
 _PLAYED, _A_SECOND, _BEFORE = 400, 10.0, 10.0
+# Rows of an episode that shows something.
+_SHOWS = 10
 # What a file may define besides its environment.
 _PARTS = ("controller", "failed", "variables")
 # Of more variables only those of the plane are named.
@@ -391,6 +395,7 @@ class Played(NamedTuple):
     rows: Chunk
     fails: str  #: who says that it failed; empty where it did not
     risks: Sequence[float] = ()  #: of what was done, where that was judged before
+    alarms: bool = False  #: whether one comes in it
 
     @property
     def highest(self) -> float:
@@ -402,11 +407,12 @@ class Played(NamedTuple):
         """Its name, with what is worst in it."""
         risk = f"risk {self.highest:.1%}" if self.risks else ""
         worst = self.fails.partition(" ")[0].lower() or risk
+        worst = ", ".join(filter(None, ["alarm" * self.alarms, worst]))
         return f"{self.name} ({worst})" if worst else self.name
 
 
 class Logged:
-    """What a log says happened, whoever asks: what failed first, then the riskiest."""
+    """What a log says happened, whoever asks; of cars what failed first, then the riskiest."""
 
     alone, terminated = math.nan, True
 
@@ -414,21 +420,26 @@ class Logged:
         self, path: str, played: Sequence[Played], labels: Labels, *, acts: bool, of_cars: bool
     ) -> None:
         self.name, self.interval = Path(path).name, float(played[0].rows.dt)
-        self.about = "each row as it was read."
+        self.about = "row by row."
         self.labels, self.of_cars = labels._replace(dt=self.interval), of_cars
         ranks = [(not part.fails, -part.highest) for part in played]
-        order = sorted(range(len(played)), key=ranks.__getitem__)
+        order = sorted(range(len(played)), key=ranks.__getitem__ if of_cars else None)
+        shows = [(len(p.rows.times) >= _SHOWS, p.alarms, bool(p.fails)) for p in played]
+        self.first = 0 if of_cars else shows.index(max(shows))  #: that is worth a look
         self._played = [played[number] for number in order]
         self.places = {number + 1: place for place, number in enumerate(order)}
         self.cases = tuple(part.called for part in self._played)
         self.told: dict[str, Any] = {"mode": "shadow", "acts": acts}
         if not of_cars:  # which move in real time
             pace = _A_SECOND * self.interval
+            every = np.concatenate([part.rows.observations for part in played])
+            fails = np.concatenate([part.rows.fails for part in played])
+            self.told["ranges"] = tuple(usual_range(x, x[fails]) for x in every.T)
             self.told["speeds"] = tuple(pace * by for by in (0.25, 0.5, 1.0, 2.0, 4.0))
 
     def begin(self, case: int) -> None:
         """Go to the first row of an episode."""
-        _, self._rows, fails, risks = self._played[case]
+        _, self._rows, fails, risks, _ = self._played[case]
         times = self._rows.times - self._rows.times[0]
         self._times, self._fails = times.tolist(), fails
         self._cars = list(cars_of(times, self._rows.observations)) if self.of_cars else None
@@ -436,7 +447,10 @@ class Logged:
         if self.of_cars:
             seen = not fails and np.isfinite(risks).any()
             begins = self._times[int(np.nanargmax(risks)) if seen else -1] - _BEFORE
-        self.told |= {"begins": begins, "fails": fails}
+        began = float(self._rows.times[0])
+        clock = math.nan if self.of_cars or self.interval < 1.0 else 0.0
+        clock = began if began >= DATES else clock
+        self.told |= {"begins": begins, "fails": fails, "began": clock}
         self._go_to(0)
 
     def _go_to(self, row: int) -> None:
@@ -541,7 +555,7 @@ class Session(AbstractContextManager["Session"]):
 
     def known(self) -> Known:
         """What is known of failure."""
-        return known_of(self.judge)
+        return known_of(self.judge, self._tolerance)
 
     def __exit__(self, *error: object) -> None:
         self.system.close()

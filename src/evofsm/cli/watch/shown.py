@@ -108,6 +108,8 @@ class Start(NamedTuple):
     ttc_threshold: float = _TTC.threshold  #: time to collision below which it warns [s]
     headway_threshold: float = _HEADWAY.threshold  #: the same of time headway [s]
     begins: float = 0.0  #: what was before is shown at once [s]
+    began: float = math.nan  #: the clock at time 0; NaN where times are told in seconds [s]
+    ranges: tuple[tuple[float, float], ...] = ()  #: of variables, without what is far from it all
     acts: bool = True  #: whether somebody acts; else risk is how often such alarms were right
     speeds: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  #: multiples of real time
 
@@ -240,17 +242,24 @@ class Known(NamedTuple):
     plane: tuple[int, int] = (0, 1)  #: the two that matter
     survived: Any = ()  #: (n, m) observations, a few of them
     failed: Any = ()  #: (k, m)
-    forms: Any = ()  #: (r, 14) where it fails, as in `evofsm.guard.learnt.failure`
+    forms: Any = ()  #: (r, 14) where it fails, as in `evofsm.guard.learnt.failure`, or alarms
     dead_ends: Any = ()  #: (d, m) centres
     radii: Any = ()  #: (d, m) in each variable
     told: str = ""  #: in words
     harm: str = ""  #: whether it does harm, in words; empty where it does not
+    limits: Any = ()  #: variables, and values at which they alarm
 
 
-def known_of(judge: LearningJudge) -> Known:
+def known_of(judge: LearningJudge, tolerance: float) -> Known:
     """What a judge knows that learns of failure; nothing of another."""
     if isinstance(judge, Foresight):
-        return Known(told=judge.told_by_experience)
+        known, rate = Known(told=judge.told_by_experience), judge.rate_of(tolerance)
+        if rate is None:
+            return known
+        table, m = judge.where(rate), len(judge.labels.names)
+        first, second, *_ = [*dict.fromkeys([*telling(table), *range(m)]), 0]
+        known = known._replace(forms=table.tolist(), limits=judge.thresholds(rate))
+        return known._replace(plane=(first, second))
     if not isinstance(judge, LearntRisk) or not judge.n_variables:
         return Known()
     learnt, survived = judge.state, judge.state.survived

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from typing import NamedTuple
 
 from evofsm.cli.watch.shown import LIVE, Danger, Frame, Start, Story
@@ -78,7 +79,7 @@ def tell(frame: Frame, start: Start) -> Told:
         when = "No danger was seen." if frame.over else "No danger so far."
         why, done = _no_danger(frame, start), _quiet(frame, start)
     else:
-        when, why = _when(story, danger, knows_leaders), _why(danger.began, start)
+        when, why = _when(start, story, danger, knows_leaders), _why(danger.began, start)
         done = _done(danger, frame, start)
     if not start.acts:
         when = when.replace("Danger began", "An alarm came").replace("No danger", "No alarm")
@@ -89,7 +90,7 @@ def tell(frame: Frame, start: Start) -> Told:
     if frame.novel:
         headline += ", the first of its kind"
         done += f" {_FIRST_FAILURE}: {frame.novel}."
-    told = status, headline, when, why, done, _outcome(frame, start), _alone(frame)
+    told = status, headline, when, why, done, _outcome(frame, start), _alone(frame, start)
     return Told(*(_UNIT.sub("\u00a0", text) for text in told))
 
 
@@ -108,7 +109,7 @@ def _status(frame: Frame, tolerance: float) -> str:
 
 def _no_danger(frame: Frame, start: Start) -> str:
     if not start.acts:
-        return "Nothing was near where it failed."
+        return f"Nothing reached the alarm limit of {start.tolerance:.0%}."
     if not frame.story.judged:
         return f"Nothing was judged, for {start.unjudged}."
     if math.isnan(frame.needed) or start.judge == "learnt":  # which recordings do not hold
@@ -138,11 +139,11 @@ def _quiet(frame: Frame, start: Start) -> str:
     return f"Nothing: {frame.idle}. It would have changed {would}{why}."
 
 
-def _when(story: Story, danger: Danger, knows_leaders: bool) -> str:
-    began, last = _seconds(danger.began.time), _seconds(danger.last)
+def _when(start: Start, story: Story, danger: Danger, knows_leaders: bool) -> str:
+    began, last = clock(danger.began.time, start), clock(danger.last, start)
     text = f"Danger began at {began}"
     if story.first < danger.began.time:
-        text += f" (for the first time at {_seconds(story.first)})"
+        text += f" (for the first time at {clock(story.first, start)})"
     if not story.in_danger:
         return f"{text}; it was over {'at once' if began == last else f'at {last}'}."
     if math.isnan(danger.dead_end):
@@ -150,7 +151,7 @@ def _when(story: Story, danger: Danger, knows_leaders: bool) -> str:
     reason = "nothing that it knows to do would most likely have been enough"
     if knows_leaders:
         reason = "if the leader braked hard, even braking in full at once would come too late"
-    return f"{text}. From {_seconds(danger.dead_end)} on it was a dead end: {reason}."
+    return f"{text}. From {clock(danger.dead_end, start)} on it was a dead end: {reason}."
 
 
 def _why(began: Frame, start: Start) -> str:
@@ -190,7 +191,7 @@ def _done(danger: Danger, frame: Frame, start: Start) -> str:
             hardest = f"; at its hardest it braked by {-danger.hardest:.1f} m/s²"
         now = f". Now {frame.idle}" if frame.idle else ""
         return (
-            f"The reviser stepped in at {_seconds(first.time)}, at first "
+            f"The reviser stepped in at {clock(first.time, start)}, at first "
             f"{_instead(first.executed, first.proposed, start)}. "
             f"It changed {danger.revised} {risky}{hardest}{now}."
         )
@@ -198,7 +199,7 @@ def _done(danger: Danger, frame: Frame, start: Start) -> str:
         idle = f"{frame.idle}, and it" if frame.idle else "the reviser"
         return f"Nothing: {idle} knew nothing better."
     return (
-        f"Nothing: {frame.idle}. From {_seconds(called.time)} on it would have changed "
+        f"Nothing: {frame.idle}. From {clock(called.time, start)} on it would have changed "
         f"{danger.advised} {risky}, at first {_instead(called.advised, called.proposed, start)}."
     )
 
@@ -232,12 +233,12 @@ def _action(action: Sequence[float], start: Start) -> str:
 
 
 def _outcome(frame: Frame, start: Start) -> str:
-    story, parts, when, cars = frame.story, [], _seconds(frame.time), frame.cars
+    story, parts, when, cars = frame.story, [], clock(frame.time, start), frame.cars
     if cars is None:
         ended = f"Failed at {when}." if frame.failed else f"It ended at {when} without failure."
         return ended if frame.over else ""
     if not math.isnan(story.leader_brakes):
-        since = _seconds(story.leader_brakes)
+        since = clock(story.leader_brakes, start)
         parts.append(f"The leader braked from {since} on, by up to {story.leader_decel:.1f} m/s².")
     if frame.failed:
         pace = f", {story.closing:.1f} m/s faster than the leader" if story.closing > 0.0 else ""
@@ -252,7 +253,7 @@ def _outcome(frame: Frame, start: Start) -> str:
     return " ".join(parts)
 
 
-def _alone(frame: Frame) -> str:
+def _alone(frame: Frame, start: Start) -> str:
     alone = frame.story.alone
     as_alone = frame.failed and math.isclose(alone, frame.time)
     if not math.isfinite(alone) or as_alone or frame.time == 0.0:
@@ -260,9 +261,13 @@ def _alone(frame: Frame) -> str:
     driver, fails, failed = "The controller alone", "would fail", "would have failed"
     if frame.cars:
         driver, fails, failed = "This driver", "would hit the leader", "would have hit the leader"
-    return f"{driver} {failed if frame.time >= alone else fails} at {_seconds(alone)}."
+    return f"{driver} {failed if frame.time >= alone else fails} at {clock(alone, start)}."
 
 
-def _seconds(time: float) -> str:
-    """A time, rounded as the page does it: 14.25 s becomes 14.3 s."""
+def clock(time: float, start: Start) -> str:
+    """A time as the page writes it: 14.25 s becomes 14.3 s, or 04:03 by the clock."""
+    if math.isfinite(start.began):
+        then, now = (datetime.fromtimestamp(start.began + t, UTC) for t in (0.0, time))
+        day = "%m-%d " if then.date() != now.date() else ""
+        return f"{now:{day}%H:%M{':%S' if start.interval < 60.0 else ''}}"
     return f"{time:.2g} s" if time < 1.0 else f"{math.floor(10.0 * time + 0.5) / 10.0:.1f} s"

@@ -1,6 +1,6 @@
 // The page: what comes from the run is shown, what is asked for is sent.
 
-import { readColours, seconds } from "./paint.js";
+import { clock, readColours } from "./paint.js";
 import { drawPlots, placeOf, span, timeAt } from "./plots.js";
 import { drawRoad } from "./road.js";
 import { Run } from "./run.js";
@@ -77,7 +77,7 @@ function learnt(start, known) {
   const signs = ["+ now, blue: its way", "○ state"];
   if (known.survived.length) signs.push("· survived");
   if (known.failed.length) signs.push("✕ failed");
-  if (known.forms.length) signs.push("shaded: expected to fail");
+  if (known.forms.length) signs.push(start.acts ? "shaded: expected to fail" : "shaded: it alarms");
   if (known.dead_ends.length) signs.push("dashed: dead end");
   signs.push(marksDeadEnds(start) ? "⬢ dead end" : "⬢ state in which it failed");
   return `${start.learning} ${signs.join(", ")}.`;
@@ -97,11 +97,11 @@ function showMode() {
   const recorded = run.start.mode === "act" ? "recorded" : run.start.mode;
   const mode = !run.isLive ? "past" : run.clock.over ? "ended" : run.clock.paused ? "paused" : recorded;
   if (socket.readyState === WebSocket.OPEN) at("mode").textContent = mode;
-  at("time").textContent = seconds(run.shown);
+  at("time").textContent = clock(run.shown, run.start);
   const scrub = at("scrub");
   scrub.max = span(run);
   scrub.value = run.shown;
-  scrub.setAttribute("aria-valuetext", `${run.shown.toFixed(1)} seconds`);
+  scrub.setAttribute("aria-valuetext", clock(run.shown, run.start));
 }
 
 let told = null;

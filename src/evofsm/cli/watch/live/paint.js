@@ -62,5 +62,19 @@ export function niceStep(about) {
 
 export const shown = (value) => `${Number(value.toPrecision(6))}`.replace("-", "−");
 
-/** A time in seconds, as the story tells it. */
-export const seconds = (time) => `${time > 0 && time < 1 ? Number(time.toPrecision(2)) : time.toFixed(1)} s`;
+/** A time as the story tells it. */
+export function clock(time, { began, interval }) {
+  if (began === null) return `${time > 0 && time < 1 ? Number(time.toPrecision(2)) : time.toFixed(1)} s`;
+  const [then, now] = [0, time].map((one) => new Date(1000 * (began + one)).toISOString());
+  return (then.slice(0, 10) === now.slice(0, 10) ? "" : `${now.slice(5, 10)} `) + now.slice(11, interval < 60 ? 19 : 16);
+}
+
+/** Values of a variable, without those that are far from all others. */
+export function nearOnes({ ranges }, variable, values) {
+  const [low, high] = ranges[variable] ?? [-Infinity, Infinity];
+  const known = values.filter((value) => value !== null && value !== undefined);
+  const near = known.filter((value) => value >= low && value <= high);
+  return near.length ? near : known;
+}
+
+export const limitsOf = ({ limits }, variable) => limits.filter(([one]) => one === variable).map(([, at]) => at);

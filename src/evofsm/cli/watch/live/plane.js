@@ -1,7 +1,7 @@
 // A plane of two variables: what was survived and what failed, where failure is expected, the states
 // that were found, and the way of the run. And how much each state is believed in, as bars.
 
-import { colour, fresh, hexagon, line, niceStep, shown, text } from "./paint.js";
+import { colour, fresh, hexagon, limitsOf, line, niceStep, nearOnes, shown, text } from "./paint.js";
 
 const MOST_BARS = 4;
 const APART = [20, 16]; // of two numbers, or of what a circle would cover of one [px]
@@ -44,10 +44,10 @@ function bar() {
 
 /** Of a variable: from an observation to a place on the canvas, back, and its ticks. */
 function axis(run, variable, from, to) {
-  const known = run.known, values = [known.survived, known.failed].flat().map((row) => row[variable])
+  const { known } = run, seen = [known.survived, known.failed].flat().map((row) => row[variable])
     .concat(run.graph.states.map((state) => state.center[variable]))
-    .concat(run.frames.map((frame) => frame.observation[variable]))
-    .filter((value) => value !== null && value !== undefined);
+    .concat(run.frames.map((frame) => frame.observation[variable]));
+  const values = nearOnes(run.start, variable, seen).concat(limitsOf(known, variable));
   const isGap = run.start.cars && variable === 0; // its root: where cars are close, it matters
   const [bend, back] = isGap ? [(value) => Math.sqrt(Math.max(0, value)), (value) => value * value] : [(value) => value, (value) => value];
   let low = values.reduce((a, b) => Math.min(a, b), Infinity), high = values.reduce((a, b) => Math.max(a, b), -Infinity);
@@ -56,12 +56,13 @@ function axis(run, variable, from, to) {
   else [low, high] = [low - pad, high + pad];
   const [first, last] = [bend(low), bend(high)];
   const place = (value) => from + ((bend(value) - first) / (last - first)) * (to - from);
+  const held = (value) => place(Math.max(low, Math.min(high, value))); // at the edge, where it is beyond
   const value = (at) => back(first + ((at - from) / (to - from)) * (last - first));
   const step = niceStep((high - low) / Math.max(2, Math.abs(to - from) / 70));
   const ticks = isGap ? [2, 5, 10, 20, 40, 80, 160, 320].filter((gap) => gap <= high) : [];
   for (let k = Math.ceil(low / step); !isGap && k * step <= high; k++) ticks.push(k * step);
   const apart = ticks.filter((tick, k) => k === 0 || Math.abs(place(tick) - place(ticks[k - 1])) > 18);
-  return { variable, place, value, ticks: apart, name: run.start.names[variable] };
+  return { variable, place, held, value, ticks: apart, name: run.start.names[variable] };
 }
 
 let axes = null; // of the plane as it was drawn
@@ -70,7 +71,7 @@ let axes = null; // of the plane as it was drawn
 export function placeHere(run) {
   const now = run.observation;
   const [a, b] = axes ? axes.map((one) => now[one.variable]) : [null, null];
-  return a === null || b === null ? null : [axes[0].place(a), axes[1].place(b)];
+  return a === null || b === null ? null : [axes[0].held(a), axes[1].held(b)];
 }
 
 export function drawPlane(canvas, run, [across, up]) {
@@ -88,16 +89,17 @@ export function drawPlane(canvas, run, [across, up]) {
   pen.rect(box.left, box.top, box.right - box.left, box.bottom - box.top);
   pen.clip();
   const { known } = run;
-  for (const form of known.forms) drawForm(pen, x, y, box, form);
+  for (const form of known.forms) drawForm(pen, x, y, box, form, run.start.acts ? 0 : form[13]);
   pen.fillStyle = colour.soft;
   pen.globalAlpha = 0.45;
   for (const row of known.survived) pen.fillRect(at(row)[0] - 1, at(row)[1] - 1, 2, 2);
   pen.globalAlpha = 1;
   for (const [k, row] of known.dead_ends.entries()) drawDeadEnd(pen, x, y, row, known.radii[k]);
   for (const row of known.failed) drawFailed(pen, ...at(row));
-  const places = graph.states.map((state) => at(state.center));
+  const places = graph.states.map(({ center }) => [x.held(center[across]), y.held(center[up])]);
+  const inView = graph.states.map(({ center }, k) => `${at(center)}` === `${places[k]}`);
   for (const [origin, target, share] of graph.transitions) {
-    if (places[origin] && places[target]) drawWay(pen, places[origin], places[target], share);
+    if (inView[origin] && inView[target]) drawWay(pen, places[origin], places[target], share);
   }
   drawTrail(pen, run, at);
   drawStates(pen, graph.states, places, decision.state);
@@ -122,13 +124,13 @@ function drawAxes(pen, x, y, box, width, height) {
 }
 
 /** Where it fails, if that is of no other variables: its inside, and its outline by marching squares. */
-function drawForm(pen, x, y, box, [, i, j, at, to, one, other, c, b, d, p, q, r]) {
+function drawForm(pen, x, y, box, [, i, j, at, to, one, other, c, b, d, p, q, r], near) {
   const shows = (variable) => variable === x.variable || variable === y.variable;
   if (!shows(i) || !shows(j)) return;
   const form = (px, py) => {
     const of = (variable) => (variable === x.variable ? x.value(px) : y.value(py));
     const u = (of(i) - at) * one, v = (of(j) - to) * other;
-    return c + u * (b + p * u + q * v) + v * (d + r * v);
+    return c + u * (b + p * u + q * v) + v * (d + r * v) - near * Math.hypot(b + 2 * p * u + q * v, d + 2 * r * v + q * u);
   };
   pen.fillStyle = colour.wash;
   pen.strokeStyle = colour.danger;
@@ -227,7 +229,7 @@ function drawState(pen, state, [x, y], radius, isNumbered, isPresent) {
   pen.lineWidth = isPresent ? 2 : 1.2;
   pen.fill();
   pen.stroke();
-  if (isNumbered && radius > 5) {
+  if (isNumbered && radius > 2 + 3 * `${state.state + 1}`.length) {
     const ink = state.is_dead_end || isPresent ? colour.panel : colour.ink;
     text(pen, `${state.state + 1}`, x, y + 0.5, { size: isPresent ? 11 : 9, bold: true, align: "center", ink });
   }

@@ -1,11 +1,12 @@
 // Risk, the classic warnings and accelerations, one above the other on one time axis.
 
-import { colour, fresh, line, niceStep, seconds, shown, text } from "./paint.js";
+import { clock, colour, fresh, limitsOf, line, nearOnes, niceStep, shown, text } from "./paint.js";
 
 const LEFT = 40, RIGHT = 12;
 const MOST_BAND = 0.3; // a wider interval says little, and would fill the panel
 const MOST_COMPONENTS = 4; // of an action
 const MOST_VARIABLES = 4; // of a log
+const STEPS = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 21600, 43200, 86400]; // of a clock [s]
 const LEAST_HEIGHT = 104; // of a panel [px]
 
 /** What is drawn in each panel; `value` answers a frame's value, null where there is none. */
@@ -65,13 +66,14 @@ function panels(run) {
 /** A variable over time. */
 function variable(run, title, k) {
   const value = (frame) => frame.observation[k] ?? null;
-  const all = run.frames.map(value).filter((one) => one !== null);
+  const at = limitsOf(run.known, k), all = nearOnes(run.start, k, run.frames.map(value)).concat(at);
   const low = Math.min(...all), high = Math.max(...all, low + 1e-9), step = niceStep((high - low) / 3);
   const ticks = [];
   for (let n = Math.ceil(low / step); n * step <= high; n++) ticks.push(n * step);
   return {
     title, about: "", low: low - 0.05 * (high - low), high: high + 0.05 * (high - low), ticks, show: shown,
-    lines: [{ label: "observed", ink: colour.ink, width: 1.4, dash: [], value }], bands: [], limits: [],
+    lines: [{ label: "observed", ink: colour.ink, width: 1.4, dash: [], value }], bands: [],
+    limits: at.map((one) => ({ at: one, ink: colour.danger })),
   };
 }
 
@@ -130,7 +132,7 @@ export function drawPlots(canvas, run) {
     }
   });
   canvas.setAttribute("aria-label", `${all.map((panel) => panel.title).join(", ")} over time`);
-  drawTimes(pen, x, most, bottom);
+  drawTimes(pen, x, run, bottom, width);
   drawMarks(pen, marks, x, top, bottom);
   // Words come last, on ground of their own, so that no mark strikes them through.
   all.forEach((panel, number) => {
@@ -148,7 +150,7 @@ function marksOf(frame, start) {
     { at: story.leader_brakes, label: "leader brakes", ink: colour.ink },
     { at: story.time_to_collision, label: "time to collision warns", ink: colour.leader },
     { at: story.failure, label: `✕ ${frame.told.headline.match(/\w+/)[0].toLowerCase()}`, ink: colour.danger },
-  ].filter((mark) => mark.at !== null).map((mark) => ({ ...mark, label: `${mark.label} ${seconds(mark.at)}` }));
+  ].filter((mark) => mark.at !== null).map((mark) => ({ ...mark, label: `${mark.label} ${clock(mark.at, start)}` }));
 }
 
 /** Give each mark a row in which its label meets no other; answers how many rows there are. */
@@ -287,11 +289,14 @@ function drawLine(pen, frames, one, x, y, steps) {
   pen.setLineDash([]);
 }
 
-function drawTimes(pen, x, most, bottom) {
-  const step = niceStep(most / 6);
-  for (let k = 0; k * step <= most * 1.001; k++) {
-    line(pen, x(k * step), bottom, x(k * step), bottom + 4, { ink: colour.soft });
-    text(pen, shown(k * step), x(k * step), bottom + 12, { size: 11, align: "center", ink: colour.soft });
+function drawTimes(pen, x, run, bottom, width) {
+  const { start } = run, most = span(run), isClock = start.began !== null, least = most * Math.max(80 / width, 1 / 6);
+  const step = isClock ? STEPS.find((one) => one >= least) ?? 86400 * Math.ceil(least / 86400) : niceStep(least);
+  for (let at = (step - ((start.began ?? 0) % step)) % step; at <= most * 1.001; at += step) {
+    line(pen, x(at), bottom, x(at), bottom + 4, { ink: colour.soft });
+    const words = isClock ? clock(at, start) : shown(at), half = pen.measureText(words).width / 2;
+    text(pen, words, Math.min(x(at), width - half - 2), bottom + 12, { size: 11, align: "center", ink: colour.soft });
   }
-  text(pen, "time [s]", x(most), bottom + 25, { size: 11, align: "right", ink: colour.soft });
+  const day = isClock ? new Date(1000 * start.began).toISOString().slice(0, 10) : "";
+  text(pen, start.began ? day : `time [${isClock ? "h:min" : "s"}]`, x(most), bottom + 25, { size: 11, align: "right", ink: colour.soft });
 }

@@ -6,7 +6,7 @@ export class Run {
     this.clock = { paused: false, speed: 1, revising: true, over: false };
     this.frames = [];
     this.graphs = [];
-    this.known = { plane: [0, 1], survived: [], failed: [], forms: [], dead_ends: [], radii: [], told: "", harm: "" };
+    this.known = { plane: [0, 1], survived: [], failed: [], forms: [], dead_ends: [], radii: [], told: "", harm: "", limits: [] };
     this.shown = 0; // the time that is shown [s]
     this.isLive = true; // or what is shown is the past
   }
