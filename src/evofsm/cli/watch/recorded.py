@@ -18,7 +18,6 @@ from evofsm.cli.watch.shown import (
     Start,
     cars_of,
     graph_of,
-    most_believed,
 )
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.fsm.naming import Labels
@@ -95,7 +94,7 @@ class Recording:
         model = self._run.model
         if model is None:
             return Graph(self._number)
-        return graph_of(model, _LABELS.place, number=self._number)
+        return graph_of(model, number=self._number)
 
     def known(self) -> Known:
         """Nothing: a log holds no judge."""
@@ -138,7 +137,6 @@ class Recording:
             advises=revised or abs(advised - executes) > _SAME_ACCEL,
             reason=str(row["reason"]),
             explanation=str(row["explanation"]),
-            belief=most_believed(row["belief"]),
             state=None if row["state"] == _NO_STATE else int(row["state"]),
             # The log has the interval of what was executed only.
             proposed_risk=executed if risk == executed.risk else Judged(risk),

@@ -32,7 +32,6 @@ from evofsm.cli.watch.shown import (
     first_of_its_kind,
     graph_of,
     known_of,
-    most_believed,
     numbers,
 )
 from evofsm.driving import (
@@ -551,7 +550,7 @@ class Session(AbstractContextManager["Session"]):
 
     def graph(self) -> Graph:
         """The states found so far."""
-        return graph_of(self.machine, self._place, self.judge, self._number)
+        return graph_of(self.machine, self.judge, self._number)
 
     def known(self) -> Known:
         """What is known of failure."""
@@ -598,7 +597,6 @@ class Session(AbstractContextManager["Session"]):
         numbered = zip(judged.risk, judged.low, judged.high, judged.critical, strict=True)
         wished, done, best = (Judged(*map(float, values)) for values in numbered)
         return frame._replace(
-            belief=most_believed(situation.belief),
             state=situation.state,
             proposed_risk=wished,
             executed_risk=done,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,8 +22,6 @@ from evofsm.guard.learnt.words import harm
 # The classic measures that are shown beside, with their thresholds.
 _TTC, _HEADWAY = TimeToCollision(), TimeHeadway()
 
-# So many states of a belief are shown, and none that is less probable.
-_MOST_BELIEVED, _LEAST_BELIEF = 12, 0.002
 # Of each state so many ways out are shown, and none that is rarer.
 _MOST_WAYS, _LEAST_SHARE = 3, 0.02
 
@@ -157,8 +155,6 @@ class Frame(NamedTuple):
     idle: str = ""  #: why the reviser does not act; empty where it does
     cars: Cars | None = None  #: where they are, if it is cars
     story: Story = Story()  #: what has happened so far
-    #: the most probable states, and how probable they are
-    belief: tuple[tuple[int, float], ...] = ()
     state: int | None = None  #: the most probable one
     proposed_risk: Judged = Judged()  #: of what the controller wants
     executed_risk: Judged = Judged()  #: of what is executed
@@ -184,7 +180,6 @@ class StateShown(NamedTuple):
     """A state, as it is drawn."""
 
     state: int
-    name: str
     center: tuple[float, ...]
     visits: float
     is_dead_end: bool  #: or where that is not known, whether a failure ended in it
@@ -200,32 +195,22 @@ class Graph(NamedTuple):
 
 
 def graph_of(
-    known: EvolvingFSM | FSMModel,
-    place: Callable[[NDArray[np.float64]], str],
-    judge: LearningJudge | None = None,
-    number: int = 0,
+    known: EvolvingFSM | FSMModel, judge: LearningJudge | None = None, number: int = 0
 ) -> Graph:
-    """The states, with their places in words, and their usual ways out, from a frame on.
+    """The states, and their usual ways out, from a frame on.
 
     Only a `LatentRisk` says which are dead ends; else those are marked in which a failure ended.
     """
     marked = [ended > 0.5 for ended in known.endings.tolist()]
     if isinstance(judge, LatentRisk):
         marked = [state.is_dead_end for state in assess_states(known, judge)]
-    centers = known.centers
-    where = map(place, centers), map(tuple, centers.tolist())
-    states = map(StateShown, range(known.n_states), *where, known.visits.tolist(), marked)
+    told = map(tuple, known.centers.tolist()), known.visits.tolist(), marked
+    states = map(StateShown, range(known.n_states), *told)
     changes = known.changes * ~np.eye(known.n_states, dtype=bool)
     shares = changes / np.maximum(changes.sum(axis=1, keepdims=True), 1.0)
     usual = np.argsort(-shares, axis=1, kind="stable")[:, :_MOST_WAYS]
     ways = ((i, j, float(shares[i, j])) for i, row in enumerate(usual.tolist()) for j in row)
     return Graph(number, tuple(states), tuple(way for way in ways if way[2] >= _LEAST_SHARE))
-
-
-def most_believed(belief: NDArray[np.float64]) -> tuple[tuple[int, float], ...]:
-    """The most probable states, and how probable they are."""
-    most = np.argsort(-belief, kind="stable")[:_MOST_BELIEVED].tolist()
-    return tuple((k, float(belief[k])) for k in most if belief[k] >= _LEAST_BELIEF)
 
 
 def numbers(action: Any) -> tuple[float, ...]:

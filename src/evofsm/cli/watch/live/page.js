@@ -4,7 +4,7 @@ import { clock, readColours } from "./paint.js";
 import { drawPlots, placeOf, span, timeAt } from "./plots.js";
 import { drawRoad } from "./road.js";
 import { Run } from "./run.js";
-import { drawBelief, drawPlane, marksDeadEnds, placeHere } from "./plane.js";
+import { drawPlane, marksDeadEnds, placeHere } from "./plane.js";
 
 const at = (id) => document.getElementById(id);
 const run = new Run();
@@ -216,7 +216,6 @@ function draw(now) {
   if (run.latest && (changed || run.shown !== time)) {
     if (changed || run.frame !== drawn) {
       at("playhead").style.top = `${drawPlots(plots, run)}px`;
-      drawBelief(at("belief"), run);
       drawPlane(at("map-canvas"), run, plane());
       showStory();
     }

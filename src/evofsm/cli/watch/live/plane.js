@@ -1,46 +1,14 @@
 // A plane of two variables: what was survived and what failed, where failure is expected, the states
-// that were found, and the way of the run. And how much each state is believed in, as bars.
+// that were found, and the way of the run.
 
 import { colour, fresh, hexagon, limitsOf, line, niceStep, nearOnes, shown, text } from "./paint.js";
 
-const MOST_BARS = 4;
 const APART = [20, 16]; // of two numbers, or of what a circle would cover of one [px]
 const EDGE = { left: 44, right: 14, top: 18, bottom: 34 };
 const CELL = 4; // of the grid on which forms are drawn [px]
 
 /** Whether states are marked that are dead ends; else those in which it failed. */
 export const marksDeadEnds = (start) => start.live && start.judge !== "learnt";
-
-export function drawBelief(list, run) {
-  const decision = run.decision, graph = run.graph;
-  if (!decision || !graph) return;
-  const likely = decision.belief.slice(0, MOST_BARS);
-  const marked = marksDeadEnds(run.start) ? "dead end" : "it failed here";
-  while (list.children.length < MOST_BARS) list.append(bar());
-  [...list.children].forEach((item, k) => {
-    const [state, share] = likely[k] ?? [null, 0];
-    const known = graph.states[state];
-    item.style.visibility = state === null ? "hidden" : "visible";
-    if (state === null) return;
-    item.className = known && known.is_dead_end ? "dead" : "";
-    item.querySelector(".bar").style.width = `${100 * share}%`;
-    item.querySelector(".share").textContent = `${Math.round(100 * share)} %`;
-    const name = known ? known.name : "new";
-    const words = `#${state + 1} ${known && known.is_dead_end ? `⬢ ${marked}: ` : ""}${name}`;
-    item.querySelector(".name").textContent = words;
-    item.title = words;
-  });
-}
-
-function bar() {
-  const item = document.createElement("li");
-  for (const part of ["bar", "name", "share"]) {
-    const span = document.createElement("span");
-    span.className = part;
-    item.append(span);
-  }
-  return item;
-}
 
 /** Of a variable: from an observation to a place on the canvas, back, and its ticks. */
 function axis(run, variable, from, to) {
@@ -106,7 +74,7 @@ export function drawPlane(canvas, run, [across, up]) {
   pen.restore();
   const present = graph.states[decision.state];
   canvas.setAttribute("aria-label", `${x.name} and ${y.name}. ` + (present
-    ? `${graph.states.length} states; now in number ${present.state + 1}: ${present.name}`
+    ? `${graph.states.length} states; now in number ${present.state + 1}: ${decision.here}`
     : `${graph.states.length} states`));
 }
 
