@@ -58,34 +58,22 @@ _UNASKED = {
 @reads_logs
 def learn(
     files: Annotated[
-        list[str],
-        argument(
-            "Logs or tables of objects (CSV, Parquet), FCD output of SUMO (XML, CSV, Parquet), "
-            "traces of ASAM OSI (.osi, MCAP), bags of ROS 2 (folder, MCAP, db3)."
-        ),
+        list[str], argument("Logs, recordings of traffic (FCD, ASAM OSI, objects), bags of ROS 2.")
     ],
     reading: partial[Reading],
     action_range: Annotated[
-        str,
-        option("Intervals of --action, LOW:HIGH:WIDTH; what lies beyond goes into the end ones."),
+        str, option("Intervals of --action, LOW:HIGH:WIDTH; the end ones take what lies beyond.")
     ] = "-2.5:2.5:0.3",
     rule: Annotated[
         str,
-        option(
-            "How states are made: paper; edges, with states at edges too; novelty, one wherever "
-            "nothing like it was seen, recommended for logs; or a rule of your own, as it is "
-            "registered or as module:Name."
-        ),
+        option("How states are made: paper, edges, novelty (for logs), or your own, module:Name."),
     ] = "paper",
     radius: Annotated[
         float | None, option("How far states lie apart. [default: 0.3; of novelty 1.0, in --scale]")
     ] = None,
     scale: Annotated[
         list[str] | None,
-        option(
-            "Novelty: the difference that counts as 1, by the column, such as gap=4. "
-            "May be repeated. [default: gap=4, v_follower=2, v_leader=2]"
-        ),
+        option("Novelty: the difference that counts as 1, by column: gap=4. May be repeated."),
     ] = None,
     spread: Annotated[
         float | None, option("Width of recognition. [default: 3.0; of novelty 1.0]")
@@ -95,17 +83,11 @@ def learn(
     ] = None,
     out: Annotated[Path | None, option("File to save the model to.")] = None,
     guard: Annotated[
-        Path | None,
-        option(
-            "File to save a guard to that decided on each row: evofsm monitor --guard takes it."
-        ),
+        Path | None, option("File to save a guard to that decided on each row, for evofsm monitor.")
     ] = None,
     judge: Annotated[
         Judge | None,
-        option(
-            "Of --guard: kinematic is given how cars follow each other, learnt nothing but what "
-            "failed. [default: kinematic for gap,v_follower,v_leader]"
-        ),
+        option("Of --guard: kinematic, of cars alone, or learnt, by nothing but what failed."),
     ] = None,
     brakes: Brakes = BRAKES,
     tolerance: Tolerance = TOLERANCE,
@@ -115,16 +97,9 @@ def learn(
 ) -> None:
     """Learn a state machine from logs of your own, of any size, row by row.
 
-    A log holds a row per time step. A step longer than 1.5 times the usual one (the median in the
-    first rows of a file) is a hole in time: it begins a new episode.
-
-    In FCD output of SUMO, a vehicle and the next one ahead of it on the same lane are a pair (a
-    leader beyond the end of the lane is not seen). A pair is observed by gap (bumper to bumper),
-    v_follower and v_leader; its action a_follower is what the follower did until the next time
-    step. SUMO rounds to 2 decimals unless given --precision 6. So are tables of objects (id, t, x,
-    y, vx, vy, length, lane) and traces of ASAM OSI read.
-
-    Without --failed nobody knows what failed, and evofsm explain says so.
+    A log holds a row per time step; after a hole in time an episode begins. Of recordings of
+    traffic, each vehicle and the next one ahead on its lane are a pair. Without --failed nobody
+    knows what failed.
 
     With --guard, a guard in shadow mode then goes through all rows and learns from them too. Where
     nobody acts (--action ''), it learns alarms, with 0.3 false ones a day unless --tolerance says

@@ -177,96 +177,56 @@ class Reading(NamedTuple):
 
 def reading_of(
     observe: Annotated[
-        str,
-        option(
-            "Columns to observe. A discrete one has its values: light=red/green. A name with a "
-            "comma stands in double quotes."
-        ),
+        str, option("Columns to observe; a discrete one with its values: light=red/green.")
     ] = "gap,v_follower,v_leader",
     action: Annotated[
         str, option("Column of the action taken from a row to the next; '': nobody acts.")
     ] = "a_follower",
     time: Annotated[
-        str,
-        option(
-            "Column of the time, in seconds or as dates: ISO 8601, or 14.03.2026 09:26:53. Of date "
-            "and time of day with a comma between."
-        ),
+        str, option("Column of the time: seconds or dates; of date and time of day: Datum,Uhrzeit.")
     ] = "time",
     episode: Annotated[
         str | None,
-        option(
-            "An episode begins where one of these columns changes, and in each file; none of them: "
-            "''. [default: those of run,pair,segment,episode there are]"
-        ),
+        option("Columns that tell episodes apart; '': none. [default: run,pair,segment,episode]"),
     ] = None,
     dt: Annotated[float | None, option("From a row to the next [s], without a clock.")] = None,
     failed: Annotated[
         str | None,
-        option(
-            "What failed: a column of truth values, or a comparison, in SI units, such as 'gap<=0' "
-            "or \"Status=='off'\", with 'and' or 'or' between several. The row with which it "
-            "becomes true ends the episode in failure."
-        ),
+        option("What failed: a column of truth values, 'gap<=0', \"Status=='off'\"; with and, or."),
     ] = None,
     unit: Annotated[
         list[str] | None,
-        option(
-            "Of a column, or of all that begin so: v=km/h, time=ms; of a date how it is written, "
-            "'time=%m/%d/%Y %H:%M'. May be repeated. [default: of a row of units below the names, "
-            "if there is one]"
-        ),
+        option("Of a column, or all that begin so: v=km/h; of dates 'time=%m/%d/%Y %H:%M'."),
     ] = None,
     topics: Annotated[
         Path | None, option("TOML: which field of which topic of a bag is which variable.")
     ] = None,
     no_leader: Annotated[
         str | None,
-        option(
-            "'end': a row in which a number is missing ends the episode, and is left out. A "
-            "condition, such as 'precedingId==0': so does a row in which it holds. [default: a "
-            "missing number is refused]"
-        ),
+        option("Rows left out, which end episodes: 'end', where a number is missing; 'leader==0'."),
     ] = None,
     hold: Annotated[
         float | None,
-        option(
-            "Signals of several clocks in one table: an empty field has the latest value, not "
-            "older than this [s]; rows are those with an action. [default: 0.5 where no row is "
-            "whole]",
-            min=0.0,
-        ),
+        option("Signals of several clocks: an empty field keeps its value so long [s].", min=0.0),
     ] = None,
     skip_bad: Annotated[
         int, option("Bad rows of a file that are left out, and said; more are refused.", min=0)
     ] = 10,  # as `evofsm.io.logs.SKIPPED`, without what that loads
     vehicle_length: Annotated[
         list[str] | None,
-        option(
-            "FCD: of vehicles [m], or of a type; where they drive side by side also their width: "
-            "truck=12, bike=1.6x0.65. May be repeated. [default: 5x1.8]"
-        ),
+        option("FCD: length [m] of vehicles or of a type, and width: truck=12, bike=1.6x0.65."),
     ] = None,
     where: Annotated[
         str | None,
-        option(
-            "A condition, as of --failed, for rows that count: 'Speed>100', or "
-            "\"Mode!='service'\". Others are left out, and end an episode, but not in failure."
-        ),
+        option("Rows that count, such as 'Speed>100'; others are left out, and end episodes."),
     ] = None,
     resample: Annotated[
         str | None,
-        option(
-            "Rows of so long a time become one, their mean, or of some columns another: 30s, or "
-            "30s,Speed=last,Vibration=max."
-        ),
+        option("Rows of so long become their mean, or another: 30s,Speed=last,Vibration=max."),
     ] = None,
     hole: Annotated[
         str | None,
-        option(
-            "So long a hole in time costs a transition, and no episode: 10min. [default: 1.5 usual "
-            "steps; 10 of --resample]"
-        ),
+        option("Up to so long a hole in time costs one transition, and no episode: 10min."),
     ] = None,
 ) -> Reading:
     """How a log is read, from the options of those names."""

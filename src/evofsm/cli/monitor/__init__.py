@@ -50,8 +50,7 @@ def monitor(
     ] = None,
     guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
     low: Annotated[
-        str | None,
-        option("Lowest action, to begin a guard of any system; with commas: of each component."),
+        str | None, option("Lowest action, of a guard that begins; with commas: of each component.")
     ] = None,
     high: Annotated[str | None, option("Highest action, as --low.")] = None,
     n_actions: Annotated[
@@ -78,11 +77,7 @@ def monitor(
     ] = None,
     audit: Annotated[Path | None, option("Write an audit log to this file.")] = None,
     episode: Annotated[
-        str | None,
-        option(
-            "Rows of an episode at most: it learns and saves after each. Of a log columns, as in "
-            "evofsm learn. [default: 6000]"
-        ),
+        str | None, option("Rows of an episode at most; of a log columns. [default: 6000]")
     ] = None,
     socket: Annotated[Path | None, option("Listen to a UNIX socket.")] = None,
     udp: Annotated[
@@ -96,10 +91,7 @@ def monitor(
     ] = None,
     warm: Annotated[bool, option("Compile before the first row comes.", "--warm")] = False,
     summary: Annotated[
-        bool,
-        option(
-            "Print alarms per hour, their share of the time, and the worst moments.", "--summary"
-        ),
+        bool, option("Print how often it would have alarmed, and the worst moments.", "--summary")
     ] = False,
     observe: Annotated[
         str | None,
@@ -115,22 +107,16 @@ def monitor(
     """Decide alongside a stack of your own: rows in, decisions out, a JSON line each.
 
     A row: {"time": 0.1, "gap": 32, "v_follower": 20, "v_leader": 18, "proposal": 0.5}, in s, m,
-    m/s and m/s²; or a scene of objects; or the variables of the guard. docs/monitor.md describes
-    all messages. What cannot be used is answered by a line that names it.
-
-    Rows come from standard input, a file, a socket, UDP or Zenoh. Nothing is learnt without
-    --learn, and nothing is changed without --mode act. Ctrl-C or SIGTERM ends it, with everything
-    saved. Rows are read as the log was that the guard learnt from, by --resample, --hole, --where
-    and --failed, or as these say.
+    m/s and m/s²; docs/monitor.md describes all messages. Nothing is learnt without --learn, and
+    nothing is changed without --mode act. Ctrl-C or SIGTERM ends it, with everything saved. Rows
+    are read as the log was that the guard learnt from, or as options from --observe to --hole say.
 
     To begin a guard of any system say what is observed (--observe), how often (--interval or
-    --resample), and who acts: --low and --high, --n-actions, or nobody (--action ''). It learns
-    from what comes, and from which episodes failed (--failed, or a message).
+    --resample), and who acts: --low and --high, --n-actions, or nobody (--action '').
 
-    With --summary it reads FILE, such lines or a log as evofsm learn reads it (by the options from
-    --observe to --hole), and prints how often it would have alarmed and how risky it was.
-    Where nobody acts (--action ''), alarms stand beside plain thresholds: failures foreseen, how
-    far ahead, false ones a day. Without --guard the first 60 % of the log are learnt from.
+    With --summary it reads FILE, such lines or a log, and prints how often it would have alarmed.
+    Where nobody acts, alarms stand beside plain thresholds; without --guard the first 60 % of the
+    log are learnt from.
     """
     if sum(source is not None for source in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")

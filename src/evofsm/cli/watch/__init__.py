@@ -45,30 +45,20 @@ def watch(
     what: Annotated[
         str,
         argument(
-            "Family of scenarios for cars: paper, emergency, ...; an environment of Gymnasium: "
-            "CartPole-v1, ...; or a Python file with one of your own. A run that drive --mcap "
-            "recorded; a log, as evofsm learn reads them, or what a SUMO configuration drives "
-            "(.sumocfg), watched in shadow mode.",
+            "Scenarios for cars (paper, emergency, ...), an environment (CartPole-v1, ...), a file "
+            "of Python with one of your own, a run of drive --mcap, a log, or a .sumocfg.",
             metavar="FAMILY|ENVIRONMENT|FILE",
         ),
     ] = "paper",
     case: Annotated[
-        int | None,
-        option(
-            "Which of its cases, draws or episodes. [default: the first; of a log the one with a "
-            "collision, or most in danger]",
-            min=1,
-        ),
+        int | None, option("Which case, draw or episode. [default: the first, or the worst]", min=1)
     ] = None,
     world: InWorld = "kinematic",
     judge: ByJudge = "kinematic",
     tolerance: Tolerance = TOLERANCE,
     guard: Annotated[
         Path | None,
-        option(
-            "Of a log: a guard that was saved, beside which it is played, and read as what that "
-            "learnt from. [default: one that learns from all of the log]"
-        ),
+        option("Of a log: a saved guard beside it. [default: one that learns from the log]"),
     ] = None,
     seed: Seed = 0,
     learn_first: Annotated[int, option("Episodes to learn from before, at most.", min=0)] = 60,
@@ -81,16 +71,11 @@ def watch(
     """Watch a run in the browser while it is driven, and act on it; or one that was recorded.
 
     A Python file defines a family of scenarios, called family, or a function environment(), which
-    returns an environment of Gymnasium, and if it likes controller(observation, random) (else
-    actions are random), failed(step) (else an episode that is terminated has failed), and
-    variables, their names. The guard of an environment is given nothing but which episodes failed.
+    returns an environment of Gymnasium, and if it likes controller, failed and variables
+    (docs/watch.md). A log is read with the options of evofsm learn, from --observe to --hole.
 
-    A log is read with the options of evofsm learn, from --observe to --hole; its gap,
-    own speed and leader's speed are named in this order.
-
-    The page shows what happens, what is known of failure, how risky each action is, and what was
-    done about it. It is served to this computer only, at the address that is printed, and the run
-    begins when the page is first opened. Ctrl-C ends it.
+    The page is served to this computer only, at the address that is printed, and the run begins
+    when it is first opened. Ctrl-C ends it.
     """
     require(websockets="watch")
     from evofsm.cli.watch.recorded import Recording
