@@ -506,49 +506,6 @@ def test_wherever_a_call_is_broken_off_nothing_is_done_and_it_works_again(kind, 
     assert not found
 
 
-@pytest.mark.parametrize(
-    "broken",
-    [
-        *("judge.judge", "judge.why", "judge.learn", "judge.start_episode", "judge.end"),
-        *("machine.observe", "machine.act", "machine.start_episode", "machine.fail"),
-        *("reviser.revise", "reviser.start_episode"),
-        *("audit.begin", "audit.seen", "audit.decided", "audit.ended"),
-    ],
-)
-def test_what_raises_in_a_part_of_it_is_done_again_by_the_same_call(broken, snapshot):
-    part, name = broken.split(".")
-    nothing = dict.fromkeys(("begin", "seen", "decided", "ended"), lambda *_, **__: None)
-    guard, twin = (continuous(audit=SimpleNamespace(**nothing)) for _ in range(2))
-    for one in (guard, twin):
-        balance(one, pushes(continuous, 10), gusts=[0.1])
-    calls = [
-        *(lambda one, k=k: one.decide([0.2, 0.1 * k], 2.0, DT * k) for k in range(3)),
-        lambda one: one.decide([0.3, 0.3], 2.0, 2.0),  # after a gap
-        lambda one: one.end(True),
-        lambda one: one.decide([0.1, 0.3], 2.0),
-    ]
-    times = 0
-
-    def fails(*_, **__):
-        raise RuntimeError("a bug of somebody's own")
-
-    for call in calls:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(getattr(guard, part), name, fails)
-            before = snapshot(guard.machine), guard.judge.gust, guard.n_episodes
-            try:
-                came = call(guard)
-            except RuntimeError:
-                times += 1
-                assert (snapshot(guard.machine), guard.judge.gust, guard.n_episodes) == before
-                patch.undo()
-                came = call(guard)
-        assert repr(came) == repr(call(twin))
-        assert snapshot(guard.machine) == snapshot(twin.machine)
-        assert (guard.judge.gust, guard.n_episodes) == (twin.judge.gust, twin.n_episodes)
-    assert times
-
-
 def test_a_child_forked_amid_an_end_in_another_thread_has_the_guard_of_before(
     in_a_child, monkeypatch
 ):
