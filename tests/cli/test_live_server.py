@@ -3,12 +3,9 @@
 import json
 import math
 import socket
-import socketserver
-import threading
 import time
 from contextlib import contextmanager, suppress
 from http.client import HTTPConnection
-from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import pytest
@@ -54,12 +51,12 @@ def get(page, path, host=None, **headers):
         connection.close()
 
 
-def looking_on(page, *, origin=None, token=None, sock=None, host=None, port=None):
+def looking_on(page, *, origin=None, token=None, sock=None, host=None):
     own = f"127.0.0.1:{page.port}"
     return connect(
         f"ws://{host or own}/{token or page.token}/socket",
         origin=origin or f"http://{own}",
-        sock=sock or socket.create_connection(("127.0.0.1", port or page.port)),
+        sock=sock or socket.create_connection(("127.0.0.1", page.port)),
         proxy=None,
         open_timeout=60,
     )
@@ -113,45 +110,20 @@ def test_other_names_are_refused(page, host):
     assert b"ssh -L 9000:127.0.0.1:%d" % page.port in said
 
 
-@contextmanager
-def tunnel(port):
-    """Another port of this computer that leads there, as one of ssh, an editor or a container."""
-
-    def pump(here, there):
-        with suppress(OSError):
-            while data := here.recv(4096):
-                there.sendall(data)
-        with suppress(OSError):
-            there.shutdown(socket.SHUT_WR)
-
-    class Both(socketserver.BaseRequestHandler):
-        def handle(self):
-            with socket.create_connection(("127.0.0.1", port)) as there:
-                back = threading.Thread(target=pump, args=(there, self.request))
-                back.start()
-                pump(self.request, there)
-                back.join()
-
-    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Both) as server:
-        threading.Thread(target=server.serve_forever).start()
-        yield server.server_address[1]
-        server.shutdown()
-
-
 @pytest.mark.parametrize("name", ["localhost", "127.0.0.1", "[::1]"])
 @pytest.mark.parametrize("rewrites", [False, True])
 def test_own_names_are_let_in_at_any_port(page, name, rewrites):
-    with tunnel(page.port) as port:
-        there = f"{name}:{port}"
-        host = f"127.0.0.1:{page.port}" if rewrites else there  # which some tunnels put there
-        status, headers, _ = get(SimpleNamespace(port=port), f"/{page.token}/page.js", host)
-        assert status == 200
-        assert "connect-src 'self'" in headers["Content-Security-Policy"]
-        with looking_on(page, origin=f"http://{there}", host=host, port=port) as client:
-            assert told(client, "start")["case"] == 0
-        for origin in FOREIGN:
-            with pytest.raises(InvalidStatus):
-                looking_on(page, origin=f"http://{origin}", host=host, port=port)
+    """As through a tunnel, of ssh, an editor or a container, to another port of this computer."""
+    there = f"{name}:9000"
+    host = f"127.0.0.1:{page.port}" if rewrites else there  # which some tunnels put there
+    status, headers, _ = get(page, f"/{page.token}/page.js", host)
+    assert status == 200
+    assert "connect-src 'self'" in headers["Content-Security-Policy"]
+    with looking_on(page, origin=f"http://{there}", host=host) as client:
+        assert told(client, "start")["case"] == 0
+    for origin in FOREIGN:
+        with pytest.raises(InvalidStatus):
+            looking_on(page, origin=f"http://{origin}", host=host)
 
 
 def test_a_socket_needs_the_token_and_an_origin_of_its_own(page):
