@@ -83,10 +83,6 @@ OPTIONS = {
         *(table(gap=lambda k: 30 - k), "--guard car.evofsm --judge learnt"),
         *(r"(--failed 'gap<=0') says it", ""),
     ),
-    "a blur": (
-        *(table("time,level,u", 400), LEVEL + " --spread 99"),
-        *(r"Try (--rule novelty --scale level=\S+), or a smaller (?=--spread)", "--spread 1"),
-    ),
     "beside": (beside(0.6, -0.6, 0), "", r"\? (--vehicle-length bike=5x0.8) says its length", ""),
     "a coarse clock": (table(time=lambda k: k // 20), "", r"and (--dt) stands in", "0.05"),
     "several episodes": (table("id," + CARS, **LAPS), "", r"\? (--episode) names", "id"),
@@ -108,7 +104,6 @@ def test_an_option_that_is_advised_mends_it(evofsm, log, how, where, value):
     asked = ["learn", "drive.log", *shlex.split(how)]
     told = re.search(where, said(evofsm(*asked)))
     added = shlex.split(f"{told[1]} {value}")
-    asked = asked[:-2] if "--spread" in added else asked
     mended = evofsm(*asked, *added)
     assert mended.exit_code == 0, mended.stderr
     assert re.search(where, said(mended)) is None

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from evofsm.cli.learning import Learning, Skill
     from evofsm.fsm.actions import IntervalActions
     from evofsm.fsm.machine import EvolvingFSM
-    from evofsm.fsm.model import FSMModel
     from evofsm.fsm.observations import ObservationEncoder
     from evofsm.guard import Guard
     from evofsm.io import Chunk, LogColumns
@@ -44,9 +43,6 @@ if TYPE_CHECKING:
 
 
 _MOST_ACTIONS = 1000
-# With a smaller share of what lies between a blind guess and certainty, the most probable state is
-# hardly told apart from the others.
-_UNCERTAIN = 0.45
 # What is said of an option that a log seems to need.
 _UNASKED = {
     "--resample": "some steps are longer or shorter, and begin an episode each",
@@ -176,9 +172,6 @@ def learn(
     if lengths.seen:
         told.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
     show(facts("What was read", told), *tables_of(learning.model))
-    blind = 1.0 / learning.model.n_states
-    if learning.certainty - blind < _UNCERTAIN * (1.0 - blind):
-        show(_hardly_told_apart(learning.model, learning.certainty, rule))
     show("", *_skills(learning.skills), "")
     if out is None and taught is None:
         say("Nothing was saved; --out MODEL saves the model.")
@@ -377,9 +370,8 @@ def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, An
     found = {name: getattr(learning.read, name) for name in names}
     if not learning.model.failures_told:
         found["failures"] = None
-    found |= {"transitions": learning.transitions, "certainty": learning.certainty}
     model = {**model_document(learning.model), "provenance": provenance}
-    return {**found, "skills": learning.skills, "model": model}
+    return {**found, "transitions": learning.transitions, "skills": learning.skills, "model": model}
 
 
 def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
@@ -404,26 +396,6 @@ def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     named = settings.pop("name")
     told = (f"{name} {value}" for name, value in settings.items())
     yield "rule", f"{named} (--rule), {', '.join(told)}"
-
-
-def _hardly_told_apart(model: FSMModel, certainty: float, rule: str) -> str:
-    """What to do about it."""
-    import numpy as np
-
-    from evofsm.driving.naming import VARIABLES
-
-    # A tenth of what the states cover is a difference that may count as 1.
-    tenths = zip(model.names, 0.1 * np.ptp(model.centers, axis=0), strict=True)
-    found = [
-        f"{name}={float(f'{max(x, 1e-3):.1g}'):g}" for name, x in tenths if name not in VARIABLES
-    ]
-    scales = [f"--scale {quote(text)}" for text in found]
-    advice = f"Try {' '.join(['--rule novelty', *scales])}, or a" if rule == "paper" else "A"
-    return (
-        f"\nStates are hardly told apart: the most probable one has {certainty:.0%} of the belief "
-        f"on average ({1 / model.n_states:.0%} is a blind guess). {advice} smaller --spread, which "
-        "sharpens recognition."
-    )
 
 
 def _read_otherwise(

@@ -80,9 +80,8 @@ class Read:
     blocks: int = 0
     dt: float = np.nan  #: usual time between two rows [s]
     last_time: float = np.nan  #: of the latest row [s]
-    #: number, divergence of persistence, that of forecasts, and the share that the most probable
-    #: state has: one step ahead, and `HORIZON`
-    sums: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 4)))
+    #: number, divergence of persistence, that of forecasts: one step ahead, and `HORIZON`
+    sums: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 3)))
 
     @property
     def steps_ahead(self) -> tuple[int, ...]:
@@ -98,7 +97,6 @@ class Learning(NamedTuple):
     model: FSMModel
     read: Read
     transitions: int
-    certainty: float  #: mean share of the belief that the most probable state has
     skills: tuple[Skill, ...]  #: of one step, then of `HORIZON`
 
 
@@ -121,8 +119,7 @@ def learn_traces(
             "no transition could be learnt: no row with an action is followed by another row of "
             "its episode (is every row an episode? are the rows sorted by episode and time?)"
         )
-    certainty = float(read.sums[0, 3] / (read.sums[0, 0] or np.nan))
-    return Learning(machine, model, read, transitions, certainty, tuple(_skills(read)))
+    return Learning(machine, model, read, transitions, tuple(_skills(read)))
 
 
 # -- What was noticed in reading ------------------------------------------------------------------
@@ -349,14 +346,13 @@ def _score(
             forecast = now.copy()  # of states created since nothing is known: they stay
             forecast[:, :n] = known @ np.linalg.matrix_power(marginal, steps - 1)
             divergence = jensen_shannon(forecast, came)
-        found = jensen_shannon(now, came), divergence, now.max(axis=1)
-        sums += len(then), *(values.sum() for values in found)
+        sums += len(then), jensen_shannon(now, came).sum(), divergence.sum()
 
 
 def _skills(read: Read) -> Iterator[Skill]:
     """The means, for each kind of forecast."""
     for sums, steps in zip(read.sums, read.steps_ahead, strict=False):
-        count, persistence, forecast, _ = sums.tolist()
+        count, persistence, forecast = sums.tolist()
         skill = 1.0 - forecast / persistence if persistence > 0.0 else np.nan
         rows = count or np.nan
         yield Skill(steps * read.dt, int(count), forecast / rows, persistence / rows, skill)
