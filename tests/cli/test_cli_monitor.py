@@ -1,6 +1,5 @@
 import json
 import os
-import re
 import shlex
 import shutil
 import signal
@@ -308,27 +307,19 @@ def test_the_client_in_c_gets_its_alarm(listening, tmp_path):
 VIBRATION = "Schwingung, mm/s"
 
 
-@pytest.fixture(scope="module")
-def tripped(pump, tmp_path_factory):
-    """A log of a pump that trips or is stopped; how it is read, and what is asked of it."""
-    pump(70).write_csv(log := tmp_path_factory.mktemp("pump") / "pump.csv")
-    read = ("--action", "", "--time", "Zeit", "--where", "Drehzahl>100", "--resample", "20s")
-    read += ("--hole", "300s", "--failed", "Status==Störung")
-    return log, read, ("--observe", f'"{VIBRATION}"', "--horizon", 1800)
-
-
-def test_where_nobody_acts_a_summary_judges_alarms_on_what_they_did_not_learn_from(
-    tripped, tmp_path
-):
-    log, read, asked = tripped
+def test_where_nobody_acts_a_summary_judges_alarms_on_what_they_did_not_learn_from(pump, tmp_path):
+    pump(70).write_csv(log := tmp_path / "pump.csv")
+    asked = ("--action", "", "--time", "Zeit", "--where", "Drehzahl>100", "--resample", "20s")
+    asked += ("--hole", "300s", "--failed", "Status==Störung")
+    asked += ("--observe", f'"{VIBRATION}"', "--horizon", 1800)
     picture = tmp_path / "pump.png"
-    result = evofsm(log, "--summary", *read, *asked, "--plot", picture)
+    result = evofsm(log, "--summary", *asked, "--plot", picture)
     assert result.exit_code == 0, result.stderr
     printed = " ".join(result.stdout.split())
     assert "learnt from its first 42 episodes, judged by the rest" in printed
     assert f"plain thresholds do as well 0.1 {VIBRATION} above" in printed
     assert picture.stat().st_size > 10_000
-    found = json.loads(evofsm(log, "--summary", *read, *asked, "--json").stdout)
+    found = json.loads(evofsm(log, "--summary", *asked, "--json").stdout)
     assert [*found["limits"][1]["thresholds"][0]] == ["variable", "above"]
     own = next(one["learnt"] for one in found["alarms"] if one["is_own"])
     assert own["failures"] == own["foreseen"] == found["failures"] == 14
@@ -336,22 +327,3 @@ def test_where_nobody_acts_a_summary_judges_alarms_on_what_they_did_not_learn_fr
     assert (len({*foreseen}), found["missed"]) == (14, [])
     assert f"14 of 14 failures foreseen, {own['lead'] / 60.0:.3g} min ahead" in printed
     assert "2025-03-11 " in printed
-
-
-def test_a_guard_where_nobody_acts_takes_rows_without_proposals_and_says_why(tripped, tmp_path):
-    log, read, asked = tripped
-    guard = tmp_path / "pump.evofsm"
-    arguments = ["learn", log, *read, *asked, "--guard", guard]
-    learnt = CliRunner().invoke(application(), [*map(str, arguments)])
-    assert learnt.exit_code == 0, learnt.stderr
-    assert "nobody acts" in learnt.stdout
-    assert f"{VIBRATION} above" in learnt.stdout
-    runs = {"Drehzahl": 1480, "Status": "Betrieb"}
-    rows = [line({"time": 20.0 * k, VIBRATION: z, **runs}) for k, z in enumerate([3.0, 6.9])]
-    waiting, calm, near = told(evofsm("--guard", guard, lines=rows))
-    assert (waiting["kind"], waiting["alarm"]) == ("waiting", False)  # the 20 s are not over
-    assert (calm["alarm"], near["alarm"]) == (False, True)
-    said = VIBRATION + r" 6.9: above \d.*; after \d+ of \d+ such alarms it failed within 30 min"
-    assert re.fullmatch(rf"{said} \(cross-validated.*", near["reason"])
-    judged = evofsm(log, "--summary", "--guard", guard, *read)
-    assert "35 of 35 failures foreseen" in judged.stdout
