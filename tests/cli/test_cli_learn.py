@@ -90,21 +90,6 @@ def test_json_is_one_document_with_counts_from_zero(evofsm, log, tmp_path):
     assert sum(action["uses"] for action in shown["actions"]) == learnt["transitions"] == 697
 
 
-def test_fcd_says_which_lengths_it_assumed(evofsm, tmp_path):
-    path = tmp_path / "fcd.xml"
-    steps = [
-        f'<timestep time="{k / 10}"><vehicle id="a" lane="e" pos="{60 + 2 * k}" speed="20" '
-        f'type="truck"/><vehicle id="b" lane="e" pos="{k}" speed="{20 + k / 9}"/></timestep>'
-        for k in range(30)
-    ]
-    path.write_text(f"<fcd-export>{''.join(steps)}</fcd-export>")
-    result = evofsm("learn", path, "--vehicle-length", "4.5", "--vehicle-length", "truck=12")
-    assert result.exit_code == 0
-    text = " ".join(result.stdout.split())
-    assert "vehicle lengths assumed, for FCD has none: truck 12 m, others 4.5 m" in text
-    assert "#1 48.0" in text
-
-
 OWN = ("--observe", "dist [m],ego_kmh,lead_kmh", "--action", "accel", "--unit", "ego_kmh=km/h")
 OWN += ("--unit", "lead_kmh=km/h", "--episode", "trip")
 
@@ -213,20 +198,6 @@ def test_files_that_are_none_end_with_one_line(evofsm, refused, log, tmp_path):
     assert refused("inspect", "nosuch") == "evofsm: nosuch: no such file or directory"
     assert "is a folder" in refused("learn", tmp_path)
     assert "another program" in refused("inspect", log)
-
-
-def test_a_bad_row_late_in_the_file_leaves_the_model_of_before(evofsm, refused, log, tmp_path):
-    path = tmp_path / "model.evofsm"
-    assert evofsm("learn", log, "--out", path).exit_code == 0
-    before = path.read_bytes()
-    bad = tmp_path / "bad.csv"
-    bad.write_text(log.read_text() + "r,v9,0,0.0,nan,1,1,1\n")
-    strict = "--skip-bad", 0
-    assert "bad.csv, line 702, column 'gap'" in refused("learn", log, bad, "--out", path, *strict)
-    assert path.read_bytes() == before
-    new = tmp_path / "new.evofsm"
-    refused("learn", bad, "--out", new, *strict)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.csv", "log.csv", "model.evofsm"]
 
 
 def test_out_never_overwrites_a_file_of_another_kind(evofsm, refused, log):
