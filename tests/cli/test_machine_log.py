@@ -8,6 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from evofsm import Guard
+from evofsm.cli.monitor.decider import Decider
+from evofsm.cli.monitor.slots import Slots
+from evofsm.cli.monitor.summary import decided_on_log
+from evofsm.cli.options import reading_of
+from evofsm.cli.watch.logged import watched_log
+from evofsm.cli.watch.words import introduce, tell
+from evofsm.io import LogColumns, episodes_of
+
 polars = pytest.importorskip("polars")
 pytest.importorskip("typer")
 
@@ -151,18 +160,8 @@ def test_failures_right_after_a_hole_are_counted_wherever_others_are(evofsm):
         rows.append(f"{time},{chance.gauss(9, 0.1):.2f},1")
         time += 7200
     Path("holes.csv").write_text("\n".join(["t,heat,trip", *rows]))
-    asked = (
-        "--observe",
-        "heat",
-        "--action",
-        "",
-        "--time",
-        "t",
-        "--failed",
-        "trip",
-        "--hole",
-        "10min",
-    )
+    asked = "--observe", "heat", "--action", "", "--time", "t", "--failed", "trip"
+    asked = *asked, "--hole", "10min"
     novelty = "--rule", "novelty", "--scale", "heat=1", "--guard", "holes.evofsm"
     learnt = evofsm("learn", "holes.csv", *asked, *novelty)
     assert "24 episodes ended with trip" in " ".join(learnt.stdout.split())
@@ -245,14 +244,6 @@ def sent(frame, path, began=None):
 
 @pytest.mark.parametrize("how", ["20s", f'20s,"{VIBRATION}"=max,{BEARING}=last'])
 def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, pump, how):
-    from evofsm import Guard
-    from evofsm.cli.monitor.decider import Decider
-    from evofsm.cli.monitor.slots import Slots
-    from evofsm.cli.monitor.summary import decided_on_log
-    from evofsm.cli.options import reading_of
-    from evofsm.cli.watch.logged import watched_log
-    from evofsm.io import LogColumns, episodes_of
-
     path, of = written("parquet"), f'"{VIBRATION}",{BEARING}'
     asked = "--observe", of, "--action", "", "--time", "Zeit", "--resample", how, "--hole", "5min"
     asked = *asked, "--where", "Drehzahl>100", "--failed", "Status==Störung", "--rule", "novelty"
@@ -340,10 +331,6 @@ def test_a_few_holes_in_an_even_log_are_said(evofsm):
 
 
 def test_a_log_of_any_machine_is_watched(written):
-    from evofsm.cli.options import reading_of
-    from evofsm.cli.watch.logged import watched_log
-    from evofsm.cli.watch.words import introduce, tell
-
     asked = {"time": "Zeit", "resample": "20s", "hole": "5min", "failed": "Status==Störung"}
     asked |= {"observe": f'"{VIBRATION}",{BEARING}', "where": "Drehzahl>100", "action": ""}
     with watched_log(written("parquet"), reading_of(**asked), None) as shown:
