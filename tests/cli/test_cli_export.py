@@ -25,23 +25,6 @@ def driven(evofsm, tmp_path_factory):
     return out, log
 
 
-def test_drive_logs_every_episode_and_what_was_learnt(driven):
-    polars = pytest.importorskip("polars")
-    out, log = driven
-    run = read_run(log)
-    assert (run.about["family"], run.about["mode"], run.about["world"]) == (
-        *("emergency", "shadow", "kinematic"),
-    )
-    summary = json.loads((out / "summary.json").read_text())
-    assert sum(episode.collided for episode in run.episodes) == summary["collisions"]
-    table = polars.read_parquet(out / "decisions.parquet")
-    for name in set(table.columns) - {"episode", "state"}:
-        logged = [value for episode in run.episodes for value in episode.columns[name].tolist()]
-        assert polars.Series(logged).equals(table[name].alias(""), null_equal=True), name
-    assert run.model.names == ("gap", "v_follower", "v_leader")
-    assert run.model.actions is not None
-
-
 @pytest.mark.parametrize(
     ("to", "begins"),
     [
