@@ -232,10 +232,13 @@ def episodes_read(
 
 
 def _first(chunks: Iterable[Chunk], most: int) -> Iterator[Chunk]:
+    left = most
     for chunk in chunks:
-        yield chunk.rows(0, most)
-        most -= len(chunk.times)
-        if most <= 0:
+        if left:
+            yield chunk.rows(0, left)
+        left -= len(chunk.times)
+        if left < 0:
+            warn(f"watched are the first {most:,} rows; there are more")
             return
 
 

@@ -49,7 +49,7 @@ def watched_log(
     names = reading.columns.observe.names
     is_kinematic = reading.acts and judge == "kinematic" and len(names) == len(VARIABLES)
     of_cars = is_kinematic or (reading.acts and names == VARIABLES)
-    most = _ROWS_OF_CARS + 2 if of_cars else None
+    most = _ROWS_OF_CARS if of_cars else None
     episodes = episodes_read(path, reading, dated=not of_cars, most=most)
     found = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
     if not found:
@@ -109,17 +109,12 @@ def _whole(episodes: Iterable[Chunk]) -> Iterator[Played]:
 def _of_cars(
     episodes: Iterable[Chunk], collisions: Mapping[str, Sequence[float]]
 ) -> Iterator[Played]:
-    """Their stretches, of the first rows."""
-    left = _ROWS_OF_CARS
+    """Their stretches."""
     for number, whole in enumerate(episodes, 1):
         name = "".join(whole.names) or f"episode {number}"
-        stretches = _stretches(whole.rows(0, left), collisions.get(name, ())) if left else ()
-        for rows, fails in stretches:
+        for rows, fails in _stretches(whole, collisions.get(name, ())):
             began = f", from {rows.times[0]:.1f} s" if whole.names else ""
             yield Played(name + began, rows, fails)
-        left -= len(whole.times)
-    if left < 0:
-        warn(f"watched are the first {_ROWS_OF_CARS:,} rows; there are more")
 
 
 def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Chunk, str]]:
