@@ -124,23 +124,23 @@ def test_what_is_repeated_or_missing_changes_no_alarm(surge):
 @pytest.mark.parametrize(
     ("heat", "failed", "hold", "told"),
     [
-        ([0, 0, 9, 9, 9], True, 0.0, (1, 2.0, 0)),
-        ([0, 0, 9, 9, 9], True, 120.0, (0, 0.0, 0)),  # it would have come with the failure
-        ([0, 0, 9, 9, 0, 0, 0, 0, 0, 0], False, 0.0, (0, 0.0, 1)),
-        ([9] * 41, False, 0.0, (0, 0.0, 3)),  # once for each horizon
-        ([9] * 41, True, 0.0, (1, 20.0, 1)),  # the horizon before the failure is right
-        ([9, 0, 9, 0, 9], True, 0.0, (1, 4.0, 0)),  # it stays on for a while
-        ([0, 0, 0, 0, 9], True, 0.0, (0, 0.0, 0)),  # no warning
-        ([0, 0, 9] + [0] * 12, True, 0.0, (1, 12.0, 0)),  # it is over long before, and right
-        ([9] + [0] * 30, True, 0.0, (0, 0.0, 1)),  # it came too early
-        ([9] + [0] * 14 + [9] + [0] * 14, True, 0.0, (1, 14.0, 1)),  # each by itself
-        ([9] * 25 + [0] * 9, True, 0.0, (1, 20.0, 1)),  # it said so again within the horizon
+        ([0, 0, 9, 9, 9], True, 1, (1, 2.0, 0)),
+        ([0, 0, 9, 9, 9], True, 3, (0, 0.0, 0)),  # it would have come with the failure
+        ([0, 0, 9, 9, 0, 0, 0, 0, 0, 0], False, 1, (0, 0.0, 1)),
+        ([9] * 41, False, 1, (0, 0.0, 3)),  # once for each horizon
+        ([9] * 41, True, 1, (1, 20.0, 1)),  # the horizon before the failure is right
+        ([9, 0, 9, 0, 9], True, 1, (1, 4.0, 0)),  # it stays on for a while
+        ([0, 0, 0, 0, 9], True, 1, (0, 0.0, 0)),  # no warning
+        ([0, 0, 9] + [0] * 12, True, 1, (1, 12.0, 0)),  # it is over long before, and right
+        ([9] + [0] * 30, True, 1, (0, 0.0, 1)),  # it came too early
+        ([9] + [0] * 14 + [9] + [0] * 14, True, 1, (1, 14.0, 1)),  # each by itself
+        ([9] * 25 + [0] * 9, True, 1, (1, 20.0, 1)),  # it said so again within the horizon
     ],
 )
 def test_what_counts_as_foreseen_and_as_false(heat, failed, hold, told):
     limits = np.array([[0, 1, 0, 0, 1, 5.0]])
-    judge = Foresight(DT, 20, 1, np.empty((0, 14)), limits, np.zeros((1, 3)), ("heat",))
-    found, _ = judge.tally(Runs.of([heat], [failed]), 0, plain=True, hold=hold)
+    judge = Foresight(DT, 20, hold, np.empty((0, 14)), limits, np.zeros((1, 3)), ("heat",))
+    found, _ = judge.tally(Runs.of([heat], [failed]), 0, plain=True)
     foreseen, minutes, false = told
     assert (found.foreseen, found.lead, found.false) == (foreseen, minutes * DT, false)
 

@@ -30,7 +30,7 @@ _LISTED = 12
 #: Times from here on are dates [s].
 DATES = 1e8
 _CAME = ("ahead", "false/day")
-_HEADER = ("stated", "hold", "foreseen", *_CAME, "thresholds", *_CAME)
+_HEADER = ("stated", "foreseen", *_CAME, "thresholds", *_CAME)
 
 
 def guard_where_nobody_acts(
@@ -128,13 +128,11 @@ def _document(
     """What came of all alarms in a log, beside plain thresholds; rows count from 0."""
     chosen, alarms, limits = judge.rate_of(tolerance), [], []
     for rate, stated in enumerate(RATES):
-        for held in sorted({judge.hold, max(judge.hold, judge.horizon // 10)}):
-            row: dict[str, Any] = {"stated": stated, "hold": (held - 1) * judge.dt}
-            row["is_own"] = rate == chosen and held == judge.hold
-            for kind, plain in (("learnt", None), ("plain", True)):
-                came, _ = judge.tally(runs, rate, plain=plain, hold=row["hold"])
-                row[kind] = {**came._asdict(), "false_a_day": came.rate}
-            alarms.append(row)
+        row: dict[str, Any] = {"stated": stated, "is_own": rate == chosen}
+        for kind, plain in (("learnt", None), ("plain", True)):
+            came, _ = judge.tally(runs, rate, plain=plain)
+            row[kind] = {**came._asdict(), "false_a_day": came.rate}
+        alarms.append(row)
         row = {"stated": stated, "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 2])]}
         row |= {"share_right": judge.shares[rate], "learnt": judge.words(rate) or "none"}
         row |= {"plain": judge.words(rate, plain=True) or "none"}
@@ -186,13 +184,13 @@ def _tables(
     soon = f"an alarm is right if one comes within {span(found['horizon'])}"
     text, rows, bold = "none: cross-validated, no alarm was better than chance", [], []
     for k, alarm in enumerate(found["alarms"]):
-        row = [f"{alarm['stated']:g}", span(alarm["hold"])]
+        row = [f"{alarm['stated']:g}"]
         for came in (alarm["learnt"], alarm["plain"]):
             share, ahead = f"{came['foreseen']} of {came['failures']}", span(came["lead"])
             row += [share, ahead, f"{came['false_a_day']:.2g}"]
         rows.append(row)
         if alarm["is_own"]:
-            text = f"{row[2]} failures foreseen, {row[3]} ahead (mean; not foreseen: 0)"
+            text = f"{row[1]} failures foreseen, {row[2]} ahead (mean; not foreseen: 0)"
             text += f", {alarm['learnt']['false']:,} false"
             bold = [k]
     pairs = [("rows", f"{found['rows']:,} in {found['episodes']:,} episodes, {days}{held_out}")]
@@ -212,10 +210,8 @@ def _tables(
     rows = []
     for hit in found["listed"][-_LISTED:]:
         false = {0: [], 1: ["no"]}.get(hit["false"], [f"{hit['false']} times no"])
-        failed, why = (
-            ", then ".join([*false, *["yes"] * hit["failed"]]),
-            hit["reason"].partition("; after")[0],
-        )
+        failed = ", then ".join([*false, *["yes"] * hit["failed"]])
+        why = hit["reason"].partition("; after")[0]
         rows.append([f"{hit['episode'] + 1}", date(hit["time"]), span(hit["lasts"]), failed, why])
     title = _last(found["listed"], "Alarms")
     yield table(title, ("episode", "time", "lasts", "failed", "why"), rows, left=(0, 4))

@@ -385,16 +385,14 @@ class Foresight(LearningJudge):
         rate: int,
         *,
         plain: bool | None = None,
-        hold: float | None = None,
         columns: Floats | None = None,
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,)."""
         limits = self.of_rate(rate, plain=plain)
         columns = self._columns(log.rows, log.starts) if columns is None else columns
         on = np.asarray(self._passed(columns, limits).any(axis=0))
-        spans, leads = self._spans, np.zeros(len(log.starts))
-        spans[1] = self.hold if hold is None else 1 + round(hold / self.dt)
-        false = _tally(on, log.starts, log.failed, spans, leads, on)
+        leads = np.zeros(len(log.starts))
+        false = _tally(on, log.starts, log.failed, self._spans, leads, on)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
         lead = float(leads.sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
