@@ -6,7 +6,6 @@ import shutil
 import signal
 import stat
 import tempfile
-import threading
 import time
 import tracemalloc
 
@@ -306,19 +305,6 @@ def test_what_a_killed_process_left_behind_is_swept_and_what_is_being_written_is
         assert sorted(tmp_path.iterdir()) == sorted([path, tmp_path / file.name, *others])
         file.write(b"whole")
     assert sorted(tmp_path.iterdir()) == sorted([path, *others])
-
-
-def test_threads_that_write_one_path_leave_it_whole_at_every_moment(tmp_path):
-    write(tmp_path / "file")
-    threads = [
-        threading.Thread(target=lambda: [write(tmp_path / "file") for _ in range(30)])
-        for _ in range(2)
-    ]
-    for thread in threads:
-        thread.start()
-    while any(thread.is_alive() for thread in threads):
-        store.read(tmp_path / "file", DRAWS)
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_any_other(tmp_path):
