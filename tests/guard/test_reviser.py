@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evofsm.driving.judge import LatentRisk
@@ -58,14 +58,6 @@ def risks(draw):
     )
 
 
-@st.composite
-def sets(draw):
-    low = draw(st.floats(-6.0, -0.2))
-    high = low + draw(st.floats(0.5, 8.0))
-    width = draw(st.floats(0.05, 2.0))
-    return IntervalActions(low=low, high=high, width=width)
-
-
 @given(risks(), PROPOSALS)
 def test_the_proposal_else_the_closest_that_is_tolerable_else_the_least_risky_is_executed(
     risk, wanted
@@ -81,18 +73,6 @@ def test_the_proposal_else_the_closest_that_is_tolerable_else_the_least_risky_is
     else:
         assert revision.risk_executed == danger.min()
     assert revision.risk_executed <= max(revision.risk_proposed, TOLERANCE)
-
-
-@settings(max_examples=25)
-@given(sets(), st.floats(0.0, 1.0))
-def test_a_revised_action_is_the_nearest_value_of_its_interval(actions, share):
-    wanted = actions.low + share * (actions.high - actions.low)
-    values = nearest_values(actions, wanted)
-    assert values[-2:] == [actions.low, actions.high]
-    for i, value in enumerate(values[:-2]):
-        assert actions.encode(value) == i
-        inside = np.linspace(*actions.interval(i), 9)[1:-1]
-        assert abs(value - wanted) <= np.abs(inside - wanted).min() + 1e-12
 
 
 def not_acting(judge):
