@@ -31,26 +31,14 @@ def rule(request):
     return request.param
 
 
-@pytest.fixture(scope="session")
-def walk():
-    """Observations of a random walk, actions with gaps, starts and failures of episodes."""
-
-    def make(rows, seed=0):
-        rng = np.random.default_rng(seed)
-        Z = np.cumsum(rng.normal(size=(rows, 2)), axis=0)
-        failures = np.flatnonzero(rng.random(rows) < 0.1)
-        return Z, rng.integers(-1, 3, rows), [rows // 3], failures
-
-    return make
-
-
 # -- All rules -------------------------------------------------------------------------------------
 
 
-def test_a_model_keeps_the_rule_and_recognises_by_it(rule, walk, tmp_path):
-    machine = EvolvingFSM(3, rule=rule)
-    Z, I, starts, failures = walk(300)
-    machine.learn_many(Z, I, starts, failures)
+def test_a_model_keeps_the_rule_and_recognises_by_it(rule, tmp_path):
+    machine, rng = EvolvingFSM(3, rule=rule), np.random.default_rng(0)
+    Z = np.cumsum(rng.normal(size=(300, 2)), axis=0)
+    failures = np.flatnonzero(rng.random(300) < 0.1)
+    machine.learn_many(Z, rng.integers(-1, 3, 300), [100], failures)
     machine.model().save(tmp_path / "model")
     model = FSMModel.load(tmp_path / "model")
     assert model.rule == rule
