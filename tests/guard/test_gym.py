@@ -850,23 +850,6 @@ def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
     assert (np.array(executed[4:]) <= 0.5).all()
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_with_one_environment_it_comes_to_the_same_bit_for_bit(mode, snapshot):
-    envs = SyncVectorEnv([CarFollowing], autoreset_mode=mode)
-    many = RevisedVectorActions(
-        envs, guard_for_cars(-2.5, 2.5), failed=lambda step: bool(step.info["failed"])
-    )
-    one = of_cars(CarFollowing())
-    alone = infos_of(drive(one, full_throttle, seed=1) + drive(one, full_throttle))
-    said = drive_all(many, len(alone) + (mode is NEXT_STEP), seed=1, wish=2.5)
-    told = [infos for _, infos in said if infos["_reviser/reason"][0]]
-    assert len(told) == len(alone)
-    for name in KEYS:
-        many_said = [np.asarray(infos[name][0]).tolist() for infos in told]
-        assert repr(many_said) == repr([np.asarray(info[name]).tolist() for info in alone]), name
-    assert snapshot(many.guard.machine) == snapshot(one.guard.machine)
-
-
 def test_a_guard_with_an_audit_log_is_not_shared():
     guard = guard_for(ONE, audit=object())
     with pytest.raises(ValueError, match="one episode at a time"):
