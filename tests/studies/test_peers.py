@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from studies import lib, peers
 from studies.peers import TASKS, WAYS, Job, Peers
+from studies.rivals import pendulum_shield
+from studies.systems import Box
 
 pl = pytest.importorskip("polars")
 
@@ -78,6 +80,16 @@ def test_the_page_says_where_the_filter_loses(tmp_path):
     assert line[1:3] == ("nothing but failures", "0.0 (0.0–0.0)")
     Peers().write({"rows": lib.frame_of(good)}, tmp_path)
     assert "| filter-1 | nothing but failures | 0.0 (" in (tmp_path / "peers.md").read_text()
+
+
+def test_who_is_told_of_a_pendulum_at_5_ms_holds_it():
+    shield = pendulum_shield(Box((-2.0,), (2.0,)), 0.5, False, 0.005)
+    angle, rate, chance = 0.0, 0.0, np.random.default_rng(0)
+    for _ in range(400):
+        torque = shield.action(np.array([angle, rate]), float(chance.uniform(0.0, 2.0)))
+        rate += 0.005 * (15.0 * np.sin(angle) + 3.0 * torque)
+        angle += 0.005 * rate
+        assert abs(angle) < 0.5
 
 
 # -- With Stable-Baselines3 -----------------------------------------------------------------------
