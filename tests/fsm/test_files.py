@@ -83,22 +83,16 @@ MACHINES = [
     ("n_states", 1e6, "n_states is 1000000"),
     ("action", 1e9, "action is 1000000000"),
     ("place", 7.0, "place of an action"),
-    ("belief", np.nan, "belief of nan"),
     ("belief", 0.5, "belief is no distribution"),
     ("matrices", 0.7, "a row of matrices is no distribution"),
-    ("centers", 1e308, r"centers of 1e\+308"),
-    ("visits", -1.0, "visits of -1"),
     ("failures", 1e9, "failures cannot be more than decisions"),
     ("clock", 0, "began is after the latest of 0"),
     ("latest_visit", 1e9, "latest_visit is after"),
-    ("radius", 1e308, r"radius of 1e\+308"),
     ("n_actions", 10**6, r"has shape \(3,\), not \(1000000,\)"),
-    ("gain", 2.0, "gain"),
     ("failures_told", 2, "failures_told of 2"),
     ("rule", {"name": "magic"}, "rule is .*magic.*; it must be one of paper, edges"),
     ("rule", None, "rule"),
     ("rule", {"name": "novelty", "gain": 1.0}, "gain"),
-    ("rule", {"name": "novelty", "scales": [1e308, 1.0]}, r"rule.scales of 1e\+308"),
     ("rule", {"name": "novelty", "scales": [1.0]}, "scales"),
 ]
 
@@ -116,10 +110,6 @@ def test_a_machine_that_no_learning_could_have_left_is_refused(
 
 MODELS = [
     ("visits", -1.0, "visits of -1"),
-    ("centers", -1e308, r"centers of -1e\+308"),
-    ("width", np.nan, "width of nan"),
-    ("dt", 1e308, r"dt of 1e\+308"),
-    ("settings", {"spread": 1e308}, r"settings.spread of 1e\+308"),
     ("actions", {"low": -1e308, "high": 0.0, "width": 1e308}, "actions.low of -1e"),
     ("actions", {"low": -0.5, "high": 1.0, "width": 1e-12}, "more than 3 intervals"),
     ("failures_told", {}, "failures_told is {}; it must be of type bool"),

@@ -236,7 +236,6 @@ def test_a_file_that_contradicts_itself_is_refused(taught, name, change, what):
     [
         ({"n_actions": 10**9}, "n_actions"),
         ({"own": np.inf}, "own of inf"),
-        ({"failures": []}, "failures"),
     ],
 )
 def test_a_forged_file_is_refused(taught, forge, tmp_path, change, why):

@@ -89,13 +89,10 @@ def within(of, name, value):
         ({"n_actions": 10**9}, "at most 1,000"),
         ({"given_horizon": 1e9}, "looks at most 10,000 ahead"),
         ({"seed": -1}, "seed of -1"),
-        ({"seed": None}, "lacks seed"),
         ({"names": None}, "names is None"),
         ({"state": []}, r"state is \[\]"),
-        (within("state", "horizon", 10**9), "horizon of 1e[+]09"),
         (within("state", "luck", 1), "luck"),
         (within("settings", "margin", "3"), "margin is '3'"),
-        (within("settings", "n_mutants", 10**9), "n_mutants of 1e[+]09"),
     ],
 )
 def test_a_forged_file_is_refused_before_it_asks_for_memory(
