@@ -128,11 +128,11 @@ def test_the_graph_says_how_likely_states_stay_and_dead_ends_have_another_shape(
 
 def test_what_a_model_does_not_have_is_named(model):
     for draw in OF_A_MODEL:
-        with pytest.raises(ValueError, match="dead_ends name state 3, but there are states 0 to 2"):
+        with pytest.raises(ValueError, match="state is 3; there are states 0 to 2"):
             draw(model, new(), dead_ends=[3])
         with pytest.raises(ValueError, match="no states: its machine had observed nothing"):
             draw(EvolvingFSM(n_actions=1).model(), new())
-    with pytest.raises(ValueError, match="no variable 2: there are 2"):
+    with pytest.raises(ValueError, match="variable is 2; there are variables 0 to 1"):
         plot.states(model, new(), variables=(0, 2))
 
 
@@ -227,7 +227,7 @@ def test_a_guard_that_has_not_learnt_where_it_fails_is_refused(guard):
     for one in (told, fresh):
         with pytest.raises(ValueError, match="has not learnt where it fails"):
             plot.experience(one, new())
-    with pytest.raises(ValueError, match="no variable 4: there are 4"):
+    with pytest.raises(ValueError, match="variable is 4; there are variables 0 to 3"):
         plot.experience(guard, new(), variables=(0, 4))
 
 

@@ -20,6 +20,7 @@ from evofsm.fsm.model import FSMModel, Policy
 from evofsm.fsm.proportions import usual_range
 from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Trace
+from evofsm.fsm.validation import check_index
 from evofsm.guard import Guard, LearntRisk
 from evofsm.guard.learnt.failure import HELD, SAYS, SIZE, I, J, distances, telling
 from evofsm.guard.learnt.rollout import FAILS
@@ -28,7 +29,6 @@ with needs("matplotlib", "plot", "plotting"):
     import matplotlib
     from matplotlib.colors import Normalize, to_hex, to_rgb
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Ellipse, FancyArrowPatch
     from matplotlib.patheffects import withStroke
     from matplotlib.transforms import Bbox
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.text import Annotation
 
-__all__ = ["COLORS", "belief", "experience", "graph", "history", "risk", "states"]
+__all__ = ["COLORS", "belief", "experience", "graph", "risk", "states"]
 
 Look = dict[str, Any]  # how something is drawn, as matplotlib is told
 States = Collection[int]  # indices
@@ -112,9 +112,9 @@ def states(
     'gap [m]'
     """
     _refuse_unknown(model.n_states, dead_ends)
-    _refuse_other(variables, model.n_variables)
+    pair = [check_index("variable", k, model.n_variables) for k in variables]
     ax = _given_or_new(ax)
-    pair, box = list(variables), [ax.dataLim.frozen()] if ax.has_data() else []
+    box = [ax.dataLim.frozen()] if ax.has_data() else []
     centers, seen = model.centers[:, pair], np.reshape(rows, (-1, model.n_variables))[:, pair]
     fails = np.resize(np.asarray(failed, np.bool_), len(seen)) & bool(np.size(failed))
     times = np.ceil(_GRID**2 * model.visits / max(float(model.visits.sum()), 1.0)).astype(int)
@@ -138,7 +138,7 @@ def states(
     ax.margins(0.1)
     ax.autoscale_view()
     limits = ax.axis()
-    _tint(ax, pair, np.reshape(alarm, (-1, SIZE)))
+    _tint(ax, pair, np.reshape(alarm, (-1, SIZE)), "where it alarms if nothing changes")
     if ways:
         leaves = model.changes * (1.0 - np.eye(model.n_states))
         shares = leaves / np.maximum(leaves.sum(1, keepdims=True), 1.0)
@@ -262,45 +262,39 @@ def experience(
     fails = known.forms[known.forms[:, SAYS] == FAILS]
     told = telling(fails)
     pair = list(variables or dict.fromkeys([*told, *range(max(m, 2))]))[:2]
-    _refuse_other(pair, m)
+    pair = [check_index("variable", k, m) for k in pair]
     ax, called, red = _given_or_new(ax), judge.labels.variable, COLORS["dead end"]
-    dots: Look = {"linestyle": "none", "marker": ".", "markersize": 1.5, "color": ink(0.4)}
-    crosses: Look = {"linestyle": "none", "marker": "x", "markersize": 5.0, "color": ink()}
-    ax.plot(*np.concatenate([known.survived, known.brinks])[:, pair].T, **dots)
-    ax.plot(*known.failures[:, pair].T, **crosses)
+    seen, label = (
+        np.concatenate([known.survived, known.brinks]),
+        "survived (blank: nothing was seen)",
+    )
+    ax.plot(*seen[:, pair].T, ".", markersize=1.5, color=ink(0.4), label=label)
+    ax.plot(*known.failures[:, pair].T, "x", markersize=5.0, color=ink(), label="failed")
     sizes = 2.0 * known.radii[:, None] * known.survived.std(0)[pair]
-    for centre, (wide, high) in zip(known.centres[:, pair], sizes, strict=True):
-        ax.add_patch(Ellipse(centre, wide, high, fill=False, edgecolor=red, zorder=3.0))
+    label = "dead end" + ", all else as in its centre" * (m > 2)
+    for k, (centre, (wide, high)) in enumerate(zip(known.centres[:, pair], sizes, strict=True)):
+        look: Look = {"fill": False, "edgecolor": red, "label": "" if k else label, "zorder": 3.0}
+        ax.add_patch(Ellipse(centre, wide, high, **look))
     centers = np.empty((0, 2)) if guard.machine is None else guard.machine.centers[:, pair]
     ax.update_datalim(centers)
     ax.autoscale_view()
     limits = ax.axis()
-    _tint(ax, pair, np.where(np.arange(SIZE) == HELD, 0.0, fails))
+    _tint(ax, pair, np.where(np.arange(SIZE) == HELD, 0.0, fails), "fails, as learnt")
     draw_centers(ax, centers, (), 10.0)
     ax.axis(limits)
-    ring: Look = {"marker": "o", "fillstyle": "none"}
-    looks: dict[str, Look] = {
-        "survived (blank: nothing was seen)": {**dots, "markersize": 5.0},
-        "failed": crosses,
-        "fails, as learnt": {"marker": "s", "markersize": 8.0, "color": red, "alpha": 0.3},
-        "dead end" + ", all else as in its centre" * (m > 2): {**ring, "color": red},
-        "state": {**ring, "color": ink()},
-    }
+    ax.plot([], [], "o", fillstyle="none", color=ink(), label="state")
     if elsewhere := sorted({*told} - {*pair}):
-        looks[f"not in view: fails by {', '.join(map(called, elsewhere))}"] = {"marker": ""}
-    look = {"linestyle": "none"}
-    _explain(ax, [Line2D([], [], label=name, **{**look, **s}) for name, s in looks.items()])
+        beyond = f"not in view: fails by {', '.join(map(called, elsewhere))}"
+        ax.plot([], [], " ", label=beyond)
+    _explain(ax, columns=2)
     ax.set(xlabel=called(pair[0]), ylabel=called(pair[1]))
     return ax
 
 
-def _tint(ax: Axes, pair: list[int], table: NDArray[np.float64]) -> None:
+def _tint(ax: Axes, pair: list[int], table: NDArray[np.float64], label: str) -> None:
     """Tint where forms (r, SIZE) of two variables are passed, or by `HELD` nearly, with an edge."""
-    limits, red, table = (
-        ax.axis(),
-        COLORS["dead end"],
-        table[np.isin(table[:, [I, J]], pair).all(1)],
-    )
+    limits, red = ax.axis(), COLORS["dead end"]
+    table = table[np.isin(table[:, [I, J]], pair).all(1)]
     if not len(table):
         return
     x, y = np.meshgrid(np.linspace(*limits[:2], _GRID), np.linspace(*limits[2:], _GRID))
@@ -310,7 +304,7 @@ def _tint(ax: Axes, pair: list[int], table: NDArray[np.float64]) -> None:
     ax.contourf(x, y, form, [0.0, np.inf], colors=[red], alpha=0.15, zorder=0.5)
     ax.contour(x, y, form, [0.0], colors=[red], linewidths=1.2, zorder=2.0)
     look: Look = {"markersize": 8.0, "color": red, "alpha": 0.3}
-    ax.plot([], [], "s", label="where it alarms if nothing changes", **look)
+    ax.plot([], [], "s", label=label, **look)
 
 
 # -- Of beliefs and drives ------------------------------------------------------------------------
@@ -425,33 +419,11 @@ def history(
     model: FSMModel | None = None,
     limits: Sequence[tuple[int, float]] = (),
 ) -> None:
-    """What was seen over time, above the risk; bands are alarms, crosses failures.
+    """What was seen over time [s], above the risk; bands are alarms, crosses failures.
 
-    What is far from nearly all else of a variable is not in view, but counted.
-
-    Parameters
-    ----------
-    axes : sequence of matplotlib.axes.Axes
-        One for each variable, then one for the states if there is a model, and one for the risk.
-    time, risk, failed : (T,) array_like
-        When each row was [s], the risk then, and whether a failure came with it. A step of more
-        than three usual ones is left blank. Times from 1e8 on are dates (UTC), since 1970.
-    rows : (T, m) array_like
-    names : sequence of m str
-    tolerance : float
-        There is an alarm where the risk is above it.
-    model : FSMModel, optional
-    limits : sequence of (int, float)
-        Variables, by their index, and the values at which they alarm: lines.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from evofsm import plot
-    >>> axes, seen = Figure().subplots(2), ([0, 1, 2], [[5], [6], [7]], ["heat"])
-    >>> plot.history(axes, *seen, [0, 0, 0.9], [False, False, True], 0.5)
-    >>> [ax.get_ylabel() for ax in axes]
-    ['heat', 'risk']
+    Axes are one for each variable, then one for the states if there is a model, and one for the
+    risk. What is far from nearly all else of a variable is not in view, but counted. Limits are
+    variables, by their index, and the values at which they alarm.
     """
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
     fails, lasts = np.asarray(failed, np.bool_), np.ptp(when)
@@ -502,11 +474,10 @@ def history(
         axes[-1].xaxis.set(major_locator=ticks, major_formatter=written, label_text="time")
 
 
-def _explain(ax: Axes, handles: Sequence[Line2D] | None = None) -> None:
+def _explain(ax: Axes, columns: int = 3) -> None:
     """Put the legend above, where it hides nothing."""
     look: Look = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2}
-    look |= {"fontsize": points(7.5), "frameon": False, "ncols": 2 if handles else 3}
-    ax.legend(handles=handles or ax.get_legend_handles_labels()[0], **look)
+    ax.legend(fontsize=points(7.5), frameon=False, ncols=columns, **look)
 
 
 def _given_or_new(ax: Axes | None) -> Axes:
@@ -517,17 +488,11 @@ def _given_or_new(ax: Axes | None) -> Axes:
     return pyplot.subplots(layout="constrained")[1]
 
 
-def _refuse_other(variables: Sequence[int], m: int) -> None:
-    if wrong := [index for index in variables if not 0 <= index < m]:
-        raise ValueError(f"there is no variable {wrong[0]}: there are {m}")
-
-
 def _refuse_unknown(n: int, dead_ends: States) -> None:
     if n == 0:
         raise ValueError("this model has no states: its machine had observed nothing")
     for state in dead_ends:
-        if not 0 <= state < n:
-            raise ValueError(f"dead_ends name state {state}, but there are states 0 to {n - 1}")
+        check_index("state", state, n)
 
 
 # -- Parts, in the paper's figures as well --------------------------------------------------------
