@@ -27,14 +27,6 @@ def drive(env, policy, **reset):
     return answers
 
 
-def own_driver(env):
-    return lambda observation, info: env.draw.controller.propose(observation, info["time"]).action
-
-
-def observations(answers):
-    return np.array([answer[0] for answer in answers])
-
-
 # Accelerations are in m/s² here; gymnasium.wrappers.RescaleAction gives the range that is advised.
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space:UserWarning")
 @pytest.mark.parametrize("family", ["emergency", "cut_in"])

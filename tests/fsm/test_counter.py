@@ -7,8 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
 # Run where the counter was added; prints nothing where all is well.
 SCRIPT = """
@@ -41,14 +39,9 @@ assert full.begun.tolist() == [2.0, 0.0], full.begun  # two were joined, and an 
 """
 
 
-@pytest.fixture(scope="module")
-def recipe():
-    """The diff in CONTRIBUTING.md."""
+def test_the_counter_of_the_recipe_counts_is_kept_joined_and_cleared(tmp_path):
     chapter = (ROOT / "CONTRIBUTING.md").read_text("utf-8").split("## Add a counter")[1]
-    return re.search(r"```diff\n(.*?)```", chapter, re.DOTALL)[1]
-
-
-def test_the_counter_of_the_recipe_counts_is_kept_joined_and_cleared(recipe, tmp_path):
+    recipe = re.search(r"```diff\n(.*?)```", chapter, re.DOTALL)[1]
     shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "diff").write_text(recipe, "utf-8")
     subprocess.run(["git", "apply", "diff"], cwd=tmp_path, check=True)

@@ -19,17 +19,10 @@ def machine_for(golden):
     return EvolvingFSM(int(q), radius, distance_weight, learning_rate, prior_frequency, spread)
 
 
-def run(golden):
-    machine = machine_for(golden)
-    trace = machine.learn_many(
-        golden["observations"], golden["actions"], golden["episode_starts"], belief=True
-    )
-    return machine, trace
-
-
 @pytest.fixture(scope="module")
 def outcome(golden):
-    return run(golden)
+    machine, names = machine_for(golden), ("observations", "actions", "episode_starts")
+    return machine, machine.learn_many(*(golden[name] for name in names), belief=True)
 
 
 @pytest.mark.parametrize("name", ["state", "n_states", "event"])

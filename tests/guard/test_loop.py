@@ -41,11 +41,8 @@ def script(*lines):
 
 
 def driven(controller=HASTY, reviser=None, *, on=None, **others):
-    return drive(make_guard(reviser, **others), on or scenario(), controller=controller)
-
-
-def make_guard(reviser=None, interval=0.25, **others):
-    return Guard.of(reviser or Unrevised(ACTIONS), interval=interval, **others)
+    guard = Guard.of(reviser or Unrevised(ACTIONS), interval=0.25, **others)
+    return drive(guard, on or scenario(), controller=controller)
 
 
 def test_decisions_are_those_of_the_record():
