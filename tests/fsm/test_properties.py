@@ -111,26 +111,6 @@ def test_shifting_all_observations_changes_no_belief(stream, offset):
     assert (shifted.centers == machine.centers + offset).all()
 
 
-@pytest.mark.parametrize("rare", [0, 1])
-def test_a_million_steps_leave_every_row_a_distribution(rare, spiral):
-    rows = 1_000_000
-    # First a spiral that founds states; then one corner for ever, so that the rows of all other
-    # states only decay. The rare action is taken at the beginning and at the very end.
-    Z = np.random.default_rng(rare).normal([8.0, 4.0], 0.01, size=(rows, 2))
-    Z[:60] = spiral(60)
-    I = np.full(rows, 1 - rare)
-    I[:60:5] = I[-3:] = rare
-    machine = EvolvingFSM(n_actions=2, radius=0.01, learning_rate=0.05, spread=0.01)
-    trace = machine.learn_many(Z, I)
-    assert machine.n_states > 8
-    assert machine.origin_frequency.min() < 1e-200  # what would be 0/0 with F and F_o kept apart
-    assert_distribution(machine.transition_matrices)
-    assert_distribution(machine.belief)
-    assert np.flatnonzero(np.isnan(trace.surprise)).tolist() == [0]
-    for i in (0, 1):
-        assert_distribution(machine.predict(i, 100))
-
-
 def test_a_row_forgotten_for_long_is_learnt_anew_from_one_visit():
     machine = EvolvingFSM(n_actions=1, radius=0.5, learning_rate=0.5, spread=1e-6)
     machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0] * 4)
