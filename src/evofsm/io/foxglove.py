@@ -83,9 +83,8 @@ class _Channels:
             self._send(topic, situation.time, message)
         changed = not same_action(revision.executed, revision.proposed)
         if changed or not same_action(revision.advised, revision.executed):
-            done, instead = (
-                ("executed", revision.executed) if changed else ("would advise", revision.advised)
-            )
+            done = "executed" if changed else "would advise"
+            instead = revision.executed if changed else revision.advised
             unit = " m/s²" if self.is_of_cars else ""
             text = f"proposed {_shown(revision.proposed)}, {done} {_shown(instead)}{unit}"
             level = LogLevel.Warning if changed else LogLevel.Info

@@ -347,29 +347,24 @@ class LogColumns:
         Time from a row to the next [s], for a log without a clock.
     failed : str, optional
         A column of truth values, or a comparison such as ``"gap<=0"``. The row with which it first
-        holds ends the episode in failure; those after it in which it still holds are left out.
-        Without it nothing tells of failures.
+        holds ends the episode in failure. Without it nothing tells of failures.
     units : mapping, optional
         Units by the column, or the beginning of columns, that are not those of the SI: ``"km/h"``.
     no_leader : str, optional
-        ``"end"``: a row in which an observed number is missing (an empty field, NaN, infinity) ends
-        the episode, and is left out; else it is a bad row. A condition, as ``failed`` takes one,
-        such as ``"precedingId==0"``: so does a row in which it holds, whatever stands there.
+        Rows that end the episode, and are left out: ``"end"``, in which an observed number is
+        missing; or a condition, as ``failed`` takes one.
     hold : float, optional
-        Signals of several clocks in one table: a field without a value has the latest one, if it is
-        not older than this [s]; rows are those with an action. Where no row has all values, 0.5 s.
+        A field without a value has the latest one, if it is not older than this [s]; rows are those
+        with an action. Where no row has all values, 0.5 s.
     skip_bad : int
         So many bad rows of a file are left out, and counted; with more it is refused.
     where : str, optional
-        A condition, as ``failed`` takes one: rows in which it does not hold are left out, and end
-        the episode. A failure that begins with the first of them is that of the row before.
+        A condition: rows in which it does not hold are left out, and end the episode.
     resample : Resample, optional
-        Rows of a step become one, with a clock as regular as that; the row that failed stays as it
-        is. A row in which a number is missing is left out, and ends no episode.
+        Rows of a step become one; the row that failed stays as it is.
     hole : float, optional
-        Longer than this [s] is a hole that begins an episode; what is shorter, but no usual step,
-        costs the transition across it alone. Without it each begins an episode; with ``resample``
-        it is ten of its steps.
+        A hole in time of up to this [s] costs one transition, a longer one begins an episode.
+        Without it each does; with ``resample`` it is ten of its steps.
     """
 
     observe: ObservationEncoder = field(default_factory=lambda: ObservationEncoder(*VARIABLES))
@@ -677,11 +672,9 @@ def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
     """What is read of a recording of many vehicles; what else was asked for is refused."""
     asked = [f"--observe {name}" for name in columns.observe.names if name not in VARIABLES]
     asked += [f"--action {columns.action}"] if columns.action != ACTION else []
-    given: dict[str, object] = {"--episode": columns.episode, "--dt": columns.dt}
-    given |= {"--unit": columns.units or None}
-    given |= {"--hold": columns.hold, "--where": columns.where, "--hole": columns.hole}
-    given |= {"--resample": columns.resample}
-    asked += [option for option, value in given.items() if value is not None]
+    names = "episode", "dt", "hold", "where", "hole", "resample"
+    asked += [f"--{name}" for name in names if getattr(columns, name) is not None]
+    asked += ["--unit"] * bool(columns.units)
     if columns.no_leader not in (None, "end"):  # who has none is no pair
         asked += [f"--no-leader {columns.no_leader}"]
     terms = [] if columns.failed is None else Condition.parse(columns.failed).terms
@@ -834,9 +827,8 @@ class _Reader:
                 continue
             if waiting is not None:
                 yield waiting
-            episodes = (
-                np.searchsorted(piece.starts or (), np.flatnonzero(starts & kept), "right") - 1
-            )
+            begun = np.flatnonzero(starts & kept)
+            episodes = np.searchsorted(piece.starts or (), begun, "right") - 1
             rows = slice(None) if kept.all() else kept  # a slice copies nothing
             waiting = Chunk(
                 source=self._table.path,

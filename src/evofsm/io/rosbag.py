@@ -235,12 +235,9 @@ class BagTable(Table):
         # Ticks while anything was heard of lately: clocks may jump by years.
         ends = np.append(np.flatnonzero(np.diff(stamps) > oldest + interval), len(stamps) - 1)
         begins = np.append(0, ends[:-1] + 1)
-        ticks = np.concatenate(
-            [
-                np.arange(-((stamps[0] - begin) // interval), (end - stamps[0]) // interval + 1)
-                for begin, end in zip(stamps[begins], stamps[ends] + oldest, strict=True)
-            ]
-        )
+        first = -((stamps[0] - stamps[begins]) // interval)
+        after = (stamps[ends] + oldest - stamps[0]) // interval + 1
+        ticks = np.concatenate([*map(np.arange, first, after)])
         at = stamps[0] + interval * ticks[ticks * interval <= stamps[-1] - stamps[0]]
         values: dict[str, NDArray[np.float64]] = {}
         known = np.ones(len(at), np.bool_)
@@ -264,10 +261,8 @@ class BagTable(Table):
         with needs("rosbags", "ros", f"{self.path}: a bag of ROS 2"):
             import zstandard  # of rosbags
             from rosbags.typesys.store import Typestore
-        fields = [
-            Field.parse(text)
-            for text in {text for v in self._topics.variables.values() for text in v.fields}
-        ]
+        texts = {text for variable in self._topics.variables.values() for text in variable.fields}
+        fields = [*map(Field.parse, texts)]
         topics = {field.topic for field in fields}
         values = {field.text: (array("q"), array("d"), dict[int, str]()) for field in fields}
         stores: dict[_Type, Typestore] = {}
@@ -330,9 +325,7 @@ class BagTable(Table):
         for schema, channel, message in messages(file, _MOST_BYTES, self.skips):
             there.add(channel.topic)
             if channel.topic in wanted:
-                told = ("", "", b"")
-                if schema is not None:
-                    told = schema.name, schema.encoding, schema.data
+                told = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
                 kind = _Type(told[0], channel.message_encoding, told[1], told[2].decode())
                 yield channel.topic, kind, message.log_time, message.data
 

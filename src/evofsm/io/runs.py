@@ -46,18 +46,13 @@ _LARGEST_CHUNK, _MOST_BELIEFS = 1 << 24, 1 << 27
 
 def columns_by_topic(names: Sequence[str] = VARIABLES) -> dict[str, tuple[str, ...]]:
     """The columns of decisions by channel; the channel of risks has them without ``risk_``."""
-    of_cars = tuple(names) == VARIABLES
+    of_cars, actions = tuple(names) == VARIABLES, ("proposed", "executed", "advised")
+    risks = "risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen"
     return {
         "/observation": ("time", *names, "intake"),
         "/belief": ("state", "belief", "surprise", "n_states"),
-        "/risk": (
-            *("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen"),
-            *(("time_to_collision", "time_headway") if of_cars else ()),
-        ),
-        "/decision": (
-            *("proposed", "executed", "advised", *(["realised"] if of_cars else [])),
-            *("reason", "explanation"),
-        ),
+        "/risk": (*risks, *(("time_to_collision", "time_headway") if of_cars else ())),
+        "/decision": (*actions, *(["realised"] if of_cars else []), "reason", "explanation"),
     }
 
 
@@ -184,9 +179,7 @@ def messages(
                 channels[record.id] = record
             elif isinstance(record, Message):
                 if (channel := channels.get(record.channel_id)) is None:
-                    raise RefusedError(
-                        f"a message is of channel {record.channel_id}; there is none"
-                    )
+                    raise RefusedError(f"there is no channel {record.channel_id} of a message")
                 yield schemas.get(channel.schema_id), channel, record
 
 

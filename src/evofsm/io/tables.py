@@ -517,10 +517,8 @@ class CsvTable(Table):
                     block = self._text(block, reached).encode()
                 while reached < self._above:
                     block, reached = block.partition(b"\n")[2], reached + 1
-                here, lines = (
-                    partial(self._odd, block, reached, columns, wanted),
-                    block.count(b"\n"),
-                )
+                here = partial(self._odd, block, reached, columns, wanted)
+                lines = block.count(b"\n")
                 if lines == len(block):
                     reached += lines
                     continue
@@ -577,12 +575,9 @@ class CsvTable(Table):
             if not any(frame[name].null_count() for name in numbers):
                 break
         found = {name: frame[f"column_{place + 1}"] for name, place in places.items()}
-        names_anew = (
-            found[name].str.strip_chars().is_in(wanted.all).any()
-            for name in wanted.numbers
-            if found[name].dtype == polars.String
-        )
-        return None if any(names_anew) else found
+        texts = (found[name] for name in wanted.numbers if found[name].dtype == polars.String)
+        names_anew = any(text.str.strip_chars().is_in(wanted.all).any() for text in texts)
+        return None if names_anew else found
 
     def _odd(self, block: bytes, reached: int, columns: Sequence[str], wanted: Wanted) -> _Odd:
         """The rows of some lines; those of another length are none."""
