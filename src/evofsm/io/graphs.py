@@ -12,7 +12,7 @@ import numpy as np
 
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import in_a_line
-from evofsm.fsm.validation import counted
+from evofsm.fsm.validation import check_index, counted
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.
 _DOT_MARK = ',\n      shape=hexagon, style=filled, fillcolor="#D55E00", fontcolor=white, penwidth=2'
@@ -76,9 +76,7 @@ def to_dot(
     """
     _refuse_no_probability(least)
     ended = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
-    marked = {int(state) for state in ended}
-    if beyond := sorted(state for state in marked if not 0 <= state < model.n_states):
-        raise ValueError(f"dead_ends names {beyond}; the model has {model.n_states} states, from 0")
+    marked = {check_index("state", state, model.n_states) for state in ended}
     lines = [_DOT_HEAD]
     most = model.visits.max(initial=0.0) or 1.0
     for state in range(model.n_states):
