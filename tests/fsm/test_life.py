@@ -97,15 +97,7 @@ class Life(RuleBasedStateMachine):
         I = np.array([i for _, i in rows], dtype=int)
         some = st.sets(st.integers(0, max(len(rows) - 1, 0)), max_size=2 if rows else 0)
         starts, failures = sorted(data.draw(some)), sorted(data.draw(some))
-        trace = self.machine.learn_many(Z, I, starts, failures, belief=True)
-        for row, (z, i) in enumerate(rows):  # the twin takes them one by one
-            if row in starts:
-                self.twin.start_episode()
-            step = self.twin.observe(z, failed=row in failures)
-            assert trace.state[row] == step.state
-            assert repr(float(trace.surprise[row])) == repr(float(step.surprise))
-            if i >= 0 and row not in failures:
-                self.twin.act(i)
+        self.both(lambda machine: machine.learn_many(Z, I, starts, failures, belief=True))
 
     @rule()
     def start_episode(self):
