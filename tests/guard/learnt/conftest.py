@@ -23,7 +23,6 @@ class Point:
 
     told: dict[str, Any] = field(default_factory=lambda: {"low": -1.0, "high": 1.0})
     places: int = 1
-    noise: float = 0.0  #: of the sensors
 
     def guard(self, **others):
         """One that knows nothing yet."""
@@ -43,21 +42,15 @@ class Point:
         rng = np.random.default_rng(episode)
         place, speed = rng.uniform(-0.3, 0.3, self.places), np.zeros(self.places)
         wind = 0.0
-
-        def seen():
-            z = np.concatenate([place, speed])
-            return z + self.noise * rng.normal(size=z.shape) if self.noise else z
-
         for _ in range(steps):
-            z = seen()
-            executed = yield z, self.propose(rng), False
+            executed = yield np.concatenate([place, speed]), self.propose(rng), False
             push = _PUSHES[executed] if "n_actions" in self.told else np.atleast_1d(executed)
             wind = 0.9 * wind + 0.01 * rng.normal()
             speed = 0.9 * speed + 0.02 * push + 0.01 * wind
             place = place + speed
             if place[0] >= _WALL:
                 break
-        yield seen(), None, bool(place[0] >= _WALL)
+        yield np.concatenate([place, speed]), None, bool(place[0] >= _WALL)
 
     def play(self, guard, episode, steps=60, seen=lambda k, z: z):
         """Revisions of an episode, and whether it failed."""
@@ -94,12 +87,6 @@ def point(request):
 def points():
     """All of them, by name."""
     return POINTS
-
-
-@pytest.fixture(scope="session")
-def noisy():
-    """One whose sensors are noisy, which takes some episodes to find out."""
-    return Point(noise=0.2)
 
 
 @pytest.fixture(scope="session")
