@@ -148,10 +148,7 @@ def drive(
 
 
 def _drive_in_turn(
-    results: Results,
-    episodes: int,
-    audit: Path | None,
-    mcap: Path | None,
+    results: Results, episodes: int, audit: Path | None, mcap: Path | None
 ) -> Driving:
     from evofsm.cli.driving import drive_in_turn
     from evofsm.driving import learners_of

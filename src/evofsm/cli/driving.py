@@ -283,10 +283,7 @@ def drive_in_turn(
 
 
 def drive_at_once(
-    results: Results,
-    episodes: int,
-    workers: int,
-    move: Advance = lambda *_, **__: None,
+    results: Results, episodes: int, workers: int, move: Advance = lambda *_, **__: None
 ) -> Driving:
     """Drive those held-out episodes that the results lack, by many workers.
 

@@ -54,11 +54,7 @@ def guard_where_nobody_acts(
 
 
 def guard_from_zero(
-    dt: float,
-    names: Sequence[str],
-    horizon: float | None,
-    hold: float,
-    tolerance: float | None,
+    dt: float, names: Sequence[str], horizon: float | None, hold: float, tolerance: float | None
 ) -> Guard:
     """The same, of one that has seen nothing, and learns as it goes."""
     judge = Foresight.from_zero(dt=dt, names=names, horizon=horizon, hold=hold)

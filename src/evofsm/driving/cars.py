@@ -22,10 +22,7 @@ from evofsm.guard import (
 )
 
 #: What each judge is told, by its name.
-TOLD: dict[str, str] = {
-    "kinematic": "how cars follow each other",
-    "learnt": "nothing but failures",
-}
+TOLD: dict[str, str] = {"kinematic": "how cars follow each other", "learnt": "nothing but failures"}
 
 #: The state rule for safety work: fine enough to steer by. The study compares the rules.
 SAFETY_RULE = Novelty(radius=1.0, scales=(4.0, 2.0, 2.0))

@@ -41,16 +41,7 @@ from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import Action, nearest_bounds
 from evofsm.guard.api import Trial
-from evofsm.store import (
-    COUNT,
-    FLAG,
-    LARGEST_OBSERVATION,
-    SIZE,
-    SMALLEST,
-    Kind,
-    Numbers,
-    Place,
-)
+from evofsm.store import COUNT, FLAG, LARGEST_OBSERVATION, SIZE, SMALLEST, Kind, Numbers, Place
 
 if TYPE_CHECKING:
     from evofsm.guard import ActionReviser
@@ -178,12 +169,7 @@ class LatentRisk(Retraced):
 
     @classmethod
     def given(
-        cls,
-        lowest: float,
-        decel: float,
-        leader_decel: float,
-        dt: float = 0.25,
-        **settings: Any,
+        cls, lowest: float, decel: float, leader_decel: float, dt: float = 0.25, **settings: Any
     ) -> Self:
         """Given the limits instead of learning them: the best that could be learnt.
 

@@ -18,14 +18,7 @@ from evofsm.driving.family import Draw, Family
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.scenarios import Scenario, steps_between
 from evofsm.driving.sumo import open_world
-from evofsm.driving.world import (
-    LEADER_ACCELERATION,
-    SPEED,
-    Drives,
-    Episode,
-    KinematicWorld,
-    World,
-)
+from evofsm.driving.world import LEADER_ACCELERATION, SPEED, Drives, Episode, KinematicWorld, World
 from evofsm.extras import needs
 from evofsm.fsm.proportions import FailureRecord
 from evofsm.guard import TOLERANCE, BoxActions, Guard, run_episode

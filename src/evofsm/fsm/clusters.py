@@ -178,12 +178,7 @@ def width_of(settings: Settings, variance: float) -> float:
 
 @inner_kernel
 def recognise(
-    squared_distances: Floats,
-    n: int,
-    nearest: int,
-    width: float,
-    tolerance: float,
-    belief: Floats,
+    squared_distances: Floats, n: int, nearest: int, width: float, tolerance: float, belief: Floats
 ) -> None:
     """Write the belief over the first ``n`` states, of which ``nearest`` is the nearest.
 

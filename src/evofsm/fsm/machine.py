@@ -23,15 +23,7 @@ from evofsm.fsm import arrays, rules
 from evofsm.fsm import step as stepping
 from evofsm.fsm import validation as valid
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.arrays import (
-    MACHINE,
-    NO_ACTION,
-    NOT_OPEN,
-    OF_ACTIONS,
-    OF_MODEL,
-    Learnt,
-    Settings,
-)
+from evofsm.fsm.arrays import MACHINE, NO_ACTION, NOT_OPEN, OF_ACTIONS, OF_MODEL, Learnt, Settings
 from evofsm.fsm.clusters import PAPER, width_of
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.explanation import Explanation, Nearest, explain

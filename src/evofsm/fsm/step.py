@@ -16,14 +16,7 @@ from numpy.typing import NDArray
 from evofsm.fsm.arrays import ENDINGS, EPISODES, FAILED_SOON, NO_ACTION, VISITS, Learnt, Settings
 from evofsm.fsm.clusters import CREATED, MERGED, MOVED, UNCHANGED, determine, recognise, width_of
 from evofsm.fsm.divergence import jensen_shannon_kernel
-from evofsm.fsm.kernels import (
-    inner_kernel,
-    kernel,
-    lanes,
-    rare_kernel,
-    spliced_kernel,
-    uncompiled,
-)
+from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced_kernel, uncompiled
 from evofsm.fsm.transitions import expand, forecast_and_identify, merge_closest, place_of, room_for
 from evofsm.fsm.validation import Floats
 

@@ -378,8 +378,7 @@ class Guard:
         #: What is done without a usable proposal where nothing is judged.
         self.fallback: Fallback = getattr(reviser, "fallback", NOTHING)
         self._labels = (Labels() if asked is None else asked.labels)._replace(
-            actions=self.actions if isinstance(self.actions, IntervalActions) else None,
-            dt=interval,
+            actions=self.actions if isinstance(self.actions, IntervalActions) else None, dt=interval
         )
         #: Episodes that it learnt from, and those of them that failed.
         self.n_episodes, self.n_failed = n_episodes, n_failed
@@ -858,8 +857,7 @@ class Guard:
         """
         machine = None if self.machine is None else self.machine.copy()
         reviser, judge = copy.deepcopy(
-            (self.reviser, self.judge),
-            {} if self.machine is None else {id(self.machine): machine},
+            (self.reviser, self.judge), {} if self.machine is None else {id(self.machine): machine}
         )
         names = (*_PLAIN_SETTINGS, "failed", "missing")
         settings = {name: getattr(self, name) for name in names}

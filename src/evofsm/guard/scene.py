@@ -138,12 +138,7 @@ class SceneRisk(ActionJudge):
     fallback = Fallback(0.0, "the first action")  #: without a usable proposal, revised like any
 
     def __init__(
-        self,
-        dt: float,
-        n_actions: int,
-        *,
-        columns: int = 5,
-        relative: bool = True,
+        self, dt: float, n_actions: int, *, columns: int = 5, relative: bool = True
     ) -> None:
         self.dt = positive("dt", dt)
         self.labels = Labels(dt=self.dt)

@@ -119,10 +119,7 @@ def watched_guard(family: Family, **settings: Any) -> Guard:
 
 
 def learn_first(
-    guard: Guard,
-    system: System,
-    episodes: int,
-    show: Callable[[int], None] = lambda done: None,
+    guard: Guard, system: System, episodes: int, show: Callable[[int], None] = lambda done: None
 ) -> None:
     """Drive a system for a while, in draws that are not watched, to learn.
 

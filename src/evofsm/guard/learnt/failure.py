@@ -336,8 +336,7 @@ def _most_telling(explained: Flags, perhaps: Flags, beyond: Floats) -> tuple[lis
     votes = explained.sum(0)
     tied = np.flatnonzero(votes == votes.max()).tolist()
     return tied, max(
-        tied,
-        key=lambda k: (perhaps[:, k].sum(), float(np.median(beyond[explained[:, k], k])), -k),
+        tied, key=lambda k: (perhaps[:, k].sum(), float(np.median(beyond[explained[:, k], k])), -k)
     )
 
 

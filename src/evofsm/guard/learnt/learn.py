@@ -13,13 +13,7 @@ import numpy as np
 from evofsm.guard.learnt import danger, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups, fitted
 from evofsm.guard.learnt.rollout import Flags, Floats, Model, value_of
-from evofsm.guard.learnt.state import (
-    Episode,
-    LearntSettings,
-    State,
-    model_of,
-    residuals_of,
-)
+from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
 
 # Actions of an episode that says how a system moves, at least; situations from which on
 # disturbances are looked for and backups evolve; those that are drawn to look for some;

@@ -12,14 +12,7 @@ from numpy.typing import NDArray
 from evofsm.guard.harm import OUTCOMES, SETTINGS
 from evofsm.guard.learnt import failure, model
 from evofsm.guard.learnt.failure import HELD, ONE, OTHER, SAYS, B, I, J, Survived
-from evofsm.guard.learnt.rollout import (
-    CRASHES,
-    FAILS,
-    Floats,
-    Model,
-    n_features,
-    refuse_too_many,
-)
+from evofsm.guard.learnt.rollout import CRASHES, FAILS, Floats, Model, n_features, refuse_too_many
 from evofsm.store import COUNT, FROM_1, SHARE, SIZE, SMALLEST, Kind, Numbers
 
 # What files hold of a field: observations, what is not negative, and ends that may be infinite.
