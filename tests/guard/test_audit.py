@@ -23,15 +23,7 @@ from evofsm.driving import (
     guard_for_cars,
     measures,
 )
-from evofsm.guard import (
-    ActionReviser,
-    AuditLog,
-    Guard,
-    Head,
-    Mode,
-    audit,
-    audit_log,
-)
+from evofsm.guard import ActionReviser, AuditLog, Guard, Head, Mode, audit, audit_log
 from evofsm.guard.audit_log import NOTHING, Chain, canonical, seal, unseal
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
@@ -393,9 +385,7 @@ def of_reviser(content):
 REPLAYED = {
     "executed": ("decision", 3, with_ulp("executed")),
     "observation": ("decision", 3, other("observation", [90.0, 15.0, 15.0])),
-    "risk": ("decision", 5, with_ulp("risk_proposed")),
     "reason": ("decision", 2, other("reason", "the driver wished it")),
-    "state": ("decision", 4, other("state", 99)),
     "explanation": ("decision", 4, other("explanation", "all was well here")),
     "learnt": ("end", 0, lambda content: content["learnt"].update(manoeuvres=99)),
     "a flag that is none": ("end", 0, other("failed", 0)),
