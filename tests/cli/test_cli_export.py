@@ -18,20 +18,13 @@ def driven(evofsm, tmp_path_factory):
     out = tmp_path_factory.mktemp("export") / "driven"
     log = out.with_suffix(".mcap")
     result = evofsm(
-        *("drive", "emergency", "--mode", "shadow", "--episodes", 2),
-        *("--out", out, "--mcap", log),
+        "drive", "emergency", "--mode", "shadow", "--episodes", 2, "--out", out, "--mcap", log
     )
     assert result.exit_code == 0, result.stderr
     return out, log
 
 
-@pytest.mark.parametrize(
-    ("to", "begins"),
-    [
-        ("dot", "digraph"),
-        ("prism", "// A machine of"),
-    ],
-)
+@pytest.mark.parametrize(("to", "begins"), [("dot", "digraph"), ("prism", "// A machine of")])
 def test_folder_machine_and_log_give_the_same_states(evofsm, driven, to, begins, tmp_path):
     out, log = driven
     printed = {}
@@ -53,9 +46,8 @@ def test_a_guard_is_written_in_c_and_for_cpp_to_a_folder(evofsm, refused, driven
     out, _ = driven
     for file in (out, out / "guard.evofsm"):
         assert evofsm("export", file, "--to", "c99", "--out", tmp_path / "c").exit_code == 0
-    assert {path.name for path in (tmp_path / "c").iterdir()} == {
-        *("evofsm.h", "evofsm.c", "evofsm.hpp"),
-    }
+    written = {path.name for path in (tmp_path / "c").iterdir()}
+    assert written == {"evofsm.h", "evofsm.c", "evofsm.hpp"}
     header = (tmp_path / "c" / "evofsm.h").read_text()
     assert "gap" in header
     assert "#define EVOFSM_VARIABLES 3\n" in header

@@ -16,13 +16,7 @@ from playwright import sync_api as playwright
 
 from evofsm.cli.options import reading_of
 from evofsm.cli.watch.logged import watched_log
-from evofsm.cli.watch.session import (
-    OnRoads,
-    Session,
-    learn_first,
-    read_simulated,
-    watched_guard,
-)
+from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_guard
 from evofsm.driving import KinematicWorld, load_family
 
 PAPER = load_family("paper")

@@ -11,13 +11,7 @@ from evofsm.cli.options import reading_of
 from evofsm.cli.watch.logged import watched_log
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.recorded import Recording
-from evofsm.cli.watch.session import (
-    OnRoads,
-    Session,
-    learn_first,
-    read_simulated,
-    watched_guard,
-)
+from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_guard
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
 from evofsm.driving.assumed import guard_of_monitor

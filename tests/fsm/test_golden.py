@@ -40,8 +40,7 @@ def test_beliefs_are_the_golden_ones(golden, outcome):
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["centers", "potentials", "transition_matrices", "joint_frequency", "origin_frequency"],
+    "name", ["centers", "potentials", "transition_matrices", "joint_frequency", "origin_frequency"]
 )
 def test_what_is_learnt_in_the_end_is_the_golden_one(name, golden, outcome):
     np.testing.assert_allclose(getattr(outcome[0], name), golden[name], rtol=0, atol=1e-9)

@@ -54,11 +54,7 @@ class Life(RuleBasedStateMachine):
     )
     def begin(self, state_rule, most, tolerance):
         self.machine = EvolvingFSM(
-            Q,
-            rule=state_rule,
-            learning_rate=0.3,
-            max_states=most,
-            belief_tolerance=tolerance,
+            Q, rule=state_rule, learning_rate=0.3, max_states=most, belief_tolerance=tolerance
         )
         self.twin = self.machine.copy()
         self.most = most

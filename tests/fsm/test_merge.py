@@ -9,11 +9,7 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.merging import merge
 from evofsm.fsm.rules import Edges, Novelty, Paper
 
-RULES = [
-    Novelty(1.0, (2.0, 1.0)),
-    Paper(),
-    Edges(),
-]
+RULES = [Novelty(1.0, (2.0, 1.0)), Paper(), Edges()]
 
 
 def taught(rule, seed, rows=150, q=3, **settings):

@@ -10,13 +10,7 @@ from hypothesis import strategies as st
 
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.rules import (
-    Edges,
-    Novelty,
-    Paper,
-    describe_rule,
-    register_rule,
-)
+from evofsm.fsm.rules import Edges, Novelty, Paper, describe_rule, register_rule
 from evofsm.fsm.step import Event
 
 RULES = {

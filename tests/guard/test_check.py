@@ -174,8 +174,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize(
-    ("name", "part"),
-    [(name, part) for name, of in BROKEN.items() for part in of],
+    ("name", "part"), [(name, part) for name, of in BROKEN.items() for part in of]
 )
 def test_what_breaks_a_contract_is_found_by_the_check_for_it(name, part):
     found = [one for one in check_results(part) if one.check == name and not one.passed]

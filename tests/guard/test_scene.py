@@ -232,11 +232,7 @@ def test_a_file_that_contradicts_itself_is_refused(taught, name, change, what):
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ({"n_actions": 10**9}, "n_actions"),
-        ({"own": np.inf}, "own of inf"),
-    ],
+    ("change", "why"), [({"n_actions": 10**9}, "n_actions"), ({"own": np.inf}, "own of inf")]
 )
 def test_a_forged_file_is_refused(taught, forge, tmp_path, change, why):
     taught.judge.save(tmp_path / "judge")

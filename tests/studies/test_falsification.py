@@ -7,16 +7,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from studies.falsification import (
-    Chosen,
-    Falsification,
-    Toy,
-    kept,
-    load,
-    plain,
-    row_of,
-    split,
-)
+from studies.falsification import Chosen, Falsification, Toy, kept, load, plain, row_of, split
 
 from evofsm.driving import FAMILIES, drive, guard_for_family, load_family, unrevised_guard
 from evofsm.paper import write_page

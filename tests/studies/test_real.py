@@ -6,16 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 from studies.drives import checksums_in, read_runs, runs_in
-from studies.real import (
-    HORIZONS,
-    TARGETS,
-    TOLD,
-    Leaders,
-    Question,
-    Real,
-    case_of,
-    coming,
-)
+from studies.real import HORIZONS, TARGETS, TOLD, Leaders, Question, Real, case_of, coming
 
 TTC_3, BRAKING = Question("ttc-3", 2.0), Question("braking-3", 2.0)
 

@@ -1,14 +1,7 @@
 from dataclasses import replace
 
 import pytest
-from studies.sensitivity import (
-    Remembering,
-    Sensitivity,
-    Trial,
-    evaluate,
-    recovered,
-    shares_of,
-)
+from studies.sensitivity import Remembering, Sensitivity, Trial, evaluate, recovered, shares_of
 
 from evofsm.driving import KinematicWorld
 from evofsm.paper import check_claims, run_paper
