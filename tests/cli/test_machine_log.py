@@ -273,7 +273,8 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
     assert "(alarm, failure)" in shown.start.cases[shown.start.case]
     with pytest.raises(ValueError, match=f"read as {BEARING} every 20 s; this guard decides on"):
         watched_log(path, reading_of(**told | {"observe": BEARING, "resample": "20s"}), guard=guard)
-    assert "as in a log: rows of 20 s become one" in live.stderr
+    assert "as in a log: --" in live.stderr
+    assert "--hole 5min" in live.stderr
 
 
 def test_a_guard_from_zero_where_nobody_acts_learns_as_it_goes(evofsm, pump):

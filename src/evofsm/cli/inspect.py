@@ -6,10 +6,9 @@ import math
 import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from evofsm.cli.options import Json, Saved, option, picture, quoted, reading_of, split_names
+from evofsm.cli.options import Json, Saved, option, picture, quoted, reading_of, split_names, typed
 from evofsm.cli.show import facts, print_json, say, show, table
 
 if TYPE_CHECKING:
@@ -179,27 +178,18 @@ def passages(model: FSMModel, most: int = 12) -> list[Passage]:
 
 def model_document(model: FSMModel) -> dict[str, Any]:
     """All that is printed of a model, for JSON; states and actions from 0."""
+    found = zip(model.centers, model.visits.tolist(), model.created.tolist(), strict=True)
+    intervals = [model.actions and model.actions.interval(r) for r in range(model.n_actions)]
+    uses = enumerate(zip(intervals, model.uses.tolist(), strict=True))
     return {
         **{name: getattr(model, name) for name in ("dt", "names", "units", "failures_told")},
         "settings": dict(model.settings),
         "states": [
-            {
-                "state": i,
-                "center": model.centers[i],
-                "visits": float(model.visits[i]),
-                "first_seen": int(model.created[i]),
-            }
-            for i in range(model.n_states)
+            {"state": i, "center": center, "visits": visits, "first_seen": int(created)}
+            for i, (center, visits, created) in enumerate(found)
         ],
         "transitions": passages(model),
-        "actions": [
-            {
-                "action": r,
-                "interval": model.actions.interval(r) if model.actions else None,
-                "uses": float(model.uses[r]),
-            }
-            for r in range(model.n_actions)
-        ],
+        "actions": [{"action": r, "interval": of, "uses": used} for r, (of, used) in uses],
     }
 
 
@@ -269,9 +259,7 @@ def _learnt_from(provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             more = f" and {len(value) - 3:,} more" if len(value) > 3 else ""
             text = ", ".join(file["name"] for file in value[:3]) + more
         if name == "read with":
-            several = ((k, v if isinstance(v, list) else [v]) for k, v in value.items())
-            options = (f"--{k.replace('_', '-')} {quote(str(v))}" for k, vs in several for v in vs)
-            text = " ".join(options)
+            text = typed(value)
         is_amount = name in ("files", "rows", "episodes", "transitions")
         yield f"learnt from {name}" if is_amount else name, text
 

@@ -135,9 +135,8 @@ def _of_steps(steps: NDArray[np.float64], facts: Pairs) -> Pairs:
     facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {usual:.2g} s"
     holes = steps > LONGEST_STEP * usual
     if len(late := steps[steps <= 0.0]):
-        told = (
-            f"{(late == 0.0).sum():,} at the time of the row before, {(late < 0.0).sum():,} earlier"
-        )
+        same, earlier = (late == 0.0).sum(), (late < 0.0).sum()
+        told = f"{same:,} at the time of the row before, {earlier:,} earlier"
         facts.append(("late rows", f"{told} (rows twice, unsorted, or --episode?)"))
     if odd.sum() < max(_MANY, _ODD * len(steps)):
         if holes.any():
@@ -210,9 +209,8 @@ def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str
                 times = int((here > np.append(False, here[:-1])).sum())
                 text = f"{kind:g}" if is_number else kind
                 value = text if is_number or re.fullmatch(r"[^\W\d]\w*", text) else f"'{text}'"
-                told = (
-                    f"({'once' if times == 1 else f'{times:,} times'}, {here.mean():.2%} of rows)"
-                )
+                often = "once" if times == 1 else f"{times:,} times"
+                told = f"({often}, {here.mean():.2%} of rows)"
                 yield name, f"{_named(name, _SIGNS)}=={value}", told
 
 

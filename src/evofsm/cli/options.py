@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial, wraps
 from importlib.util import find_spec
@@ -276,6 +276,12 @@ def given_of(reading: partial[Reading]) -> dict[str, Any]:
     """The options of `reading_of` that were typed, by the names of its parameters."""
     usual = signature(reading_of).parameters
     return {k: v for k, v in reading.keywords.items() if v not in (usual[k].default, [])}
+
+
+def typed(given: Mapping[str, Any]) -> str:
+    """The same, as they are typed."""
+    several = ((k, v if isinstance(v, list) else [v]) for k, v in given.items())
+    return " ".join(f"--{k.replace('_', '-')} {quote(str(v))}" for k, vs in several for v in vs)
 
 
 Horizon = Annotated[

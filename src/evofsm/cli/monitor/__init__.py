@@ -27,6 +27,7 @@ from evofsm.cli.options import (
     reading_of,
     reads_logs,
     split_names,
+    typed,
 )
 from evofsm.cli.show import show, warn
 
@@ -228,8 +229,8 @@ def monitor(
         server = Server(decider, heartbeat or math.inf, keeps=saved is not None)
         transport, where = _transport(file, socket, udp, zenoh, stack)
         warn(assumed)
-        if slots is not None and (words := slots.words()):
-            warn(f"as in a log: {words}")
+        if slots is not None and (as_typed := given_of(reading)):
+            warn(f"rows are read as in a log: {typed(as_typed)}")
         warn(f"ready: {where}")
         try:
             server.run(transport)

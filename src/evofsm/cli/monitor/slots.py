@@ -39,23 +39,6 @@ class Slots:
         self.waiting: list[Row] = []
         self._done = math.nan  # time of the slot that was decided on as nothing came
 
-    def words(self) -> str:
-        """What is done with rows, in a sentence; nothing where they stay as they are."""
-        columns, said = self.columns, list[str]()
-        if self.step:
-            ways = "".join(f", the {how} of {name}" for name, how in self._how.items())
-            said.append(
-                f"rows of {self.step:g} s become one, their mean{ways} (--resample), which is "
-                "decided on as a later one comes, or none for so long"
-            )
-        if columns.where:
-            said.append(f"rows count where {columns.where} (--where)")
-        if columns.failed:
-            said.append(f"an episode fails with {columns.failed} (--failed)")
-        if self.keys:
-            said.append(f"rows may tell {', '.join(self.keys)}")
-        return "; ".join(said)
-
     def refuse(self, row: Row) -> None:
         """Raise where a row tells of what a condition names what cannot be compared with it."""
         told = dict(zip(self.keys, row.told, strict=False))

@@ -97,20 +97,14 @@ _PARTS = ("controller", "failed", "variables")
 # Of more variables only those of the plane are named.
 _FEW_VARIABLES = 4
 # What Gymnasium's documentation calls the variables of its environments, with units.
-_LEG = "hip {0} angle [rad], hip {0} speed, knee {0} angle [rad], knee {0} speed, foot {0} contact"
-_LANDER = "x, y, speed x, speed y, angle [rad], angular velocity, left contact, right contact"
 _ENV_NAMES = {
     "CartPole": "cart position [m], cart velocity [m/s], pole angle [rad], "
     "pole angular velocity [rad/s]",
-    **dict.fromkeys(("MountainCar", "MountainCarContinuous"), "position [m], velocity"),
+    "MountainCar": "position [m], velocity",
     "Pendulum": "cosine of the angle, sine of the angle, angular velocity [rad/s]",
-    "Acrobot": "cosine of angle 1, sine of angle 1, cosine of angle 2, sine of angle 2, "
-    "angular velocity 1 [rad/s], angular velocity 2 [rad/s]",
-    **dict.fromkeys(("LunarLander", "LunarLanderContinuous"), _LANDER),
-    "BipedalWalker": "hull angle [rad], hull angular velocity, speed x, speed y, "
-    + ", ".join([_LEG.format(1), _LEG.format(2), *(f"lidar {k}" for k in range(1, 11))]),
+    "LunarLander": "x, y, speed x, speed y, angle [rad], angular velocity, left contact, "
+    "right contact",
 }
-_ENV_NAMES["BipedalWalkerHardcore"] = _ENV_NAMES["BipedalWalker"]
 
 
 def watched_guard(family: Family, **settings: Any) -> Guard:
@@ -336,7 +330,8 @@ class Simulated:
 
 def _names_of(env: Any) -> list[str]:
     """Of an environment's variables, with their units, where it is one that is known."""
-    known = _ENV_NAMES.get(env.spec.id.partition("-v")[0], "").split(", ") if env.spec else []
+    name = env.spec.id.partition("-v")[0].removesuffix("Continuous") if env.spec else ""
+    known = _ENV_NAMES.get(name, "").split(", ")
     return known if (len(known),) == env.observation_space.shape else []
 
 
