@@ -119,8 +119,8 @@ def test_discs_that_would_meet_move_apart():
 
 
 def test_the_graph_says_how_likely_states_stay_and_dead_ends_have_another_shape(model):
-    stays = np.diag(model.averaged_matrix("marginal"))
-    ax = plot.graph(model, new(), policy="marginal", dead_ends=[2])
+    stays = np.diag(model.averaged_matrix("observed"))
+    ax = plot.graph(model, new(), dead_ends=[2])
     assert f"stays {100 * stays[0]:.0f} %" in texts(ax)
     assert f"dead end\nstays {100 * stays[2]:.0f} %" in texts(ax)
     assert [line.get_marker() for line in ax.lines] == ["o", "o", "h"]

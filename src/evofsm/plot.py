@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm.driving import Episode
 from evofsm.extras import needs
-from evofsm.fsm.model import FSMModel, Policy
+from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import usual_range
 from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Trace
@@ -158,13 +158,11 @@ def states(
     return ax
 
 
-def graph(
-    model: FSMModel, ax: Axes | None = None, *, policy: Policy = "observed", dead_ends: States = ()
-) -> Axes:
+def graph(model: FSMModel, ax: Axes | None = None, *, dead_ends: States = ()) -> Axes:
     """The states on a circle, with arrows as wide as the next state is probable.
 
-    Staying is written beside the state; the two likeliest ways out of each are dark. Axes, dead
-    ends, result and errors are as in `states`; ``policy`` weighs actions as in ``averaged_matrix``.
+    Staying is written beside the state; the two likeliest ways out of each are dark; actions are
+    weighed by how often they were used. Axes, dead ends, result and errors are as in `states`.
 
     Examples
     --------
@@ -178,7 +176,7 @@ def graph(
     """
     _refuse_unknown(model.n_states, dead_ends)
     ax = _given_or_new(ax)
-    matrix, n = model.averaged_matrix(policy), model.n_states
+    matrix, n = model.averaged_matrix("observed"), model.n_states
     angle = 0.5 * np.pi - 2.0 * np.pi * np.arange(n) / n
     places = np.column_stack([np.cos(angle), np.sin(angle)])  # from the top, clockwise
     numbered = n <= _DISCS
@@ -203,22 +201,14 @@ def graph(
         color = ink(0.19) if pale else COLORS["dead end"] if j in dead_ends else ink(0.69)
         wide = max(_WIDEST * between[i, j] / heaviest, 0.4)
         bend = 0.28 / float(np.hypot(*(places[j] - places[i])))
-        _arrow(ax, places[i], places[j], wide, color, bend, 1.5 if pale else 2.0)
+        _arrow(ax, places[i], places[j], wide, color, bend)
     return ax
 
 
-def _arrow(
-    ax: Axes,
-    origin: Any,
-    target: Any,
-    width: float,
-    color: str,
-    bend: float = 0.2,
-    zorder: float = 2.0,
-) -> None:
-    look: Look = {"connectionstyle": f"arc3,rad={bend}", "arrowstyle": "-|>", "zorder": zorder}
+def _arrow(ax: Axes, origin: Any, target: Any, width: float, color: str, bend: float = 0.2) -> None:
+    look: Look = {"connectionstyle": f"arc3,rad={bend}", "arrowstyle": "-|>", "color": color}
     look |= {"mutation_scale": 6.5, "shrinkA": 7.5, "shrinkB": 8.5, "linewidth": width}
-    ax.add_patch(FancyArrowPatch(origin, target, color=color, **look))
+    ax.add_patch(FancyArrowPatch(origin, target, zorder=1.5 + 0.3 * width, **look))
 
 
 def experience(
@@ -264,10 +254,8 @@ def experience(
     pair = list(variables or dict.fromkeys([*told, *range(max(m, 2))]))[:2]
     pair = [check_index("variable", k, m) for k in pair]
     ax, called, red = _given_or_new(ax), judge.labels.variable, COLORS["dead end"]
-    seen, label = (
-        np.concatenate([known.survived, known.brinks]),
-        "survived (blank: nothing was seen)",
-    )
+    seen = np.concatenate([known.survived, known.brinks])
+    label = "survived (blank: nothing was seen)"
     ax.plot(*seen[:, pair].T, ".", markersize=1.5, color=ink(0.4), label=label)
     ax.plot(*known.failures[:, pair].T, "x", markersize=5.0, color=ink(), label="failed")
     sizes = 2.0 * known.radii[:, None] * known.survived.std(0)[pair]
@@ -284,8 +272,7 @@ def experience(
     ax.axis(limits)
     ax.plot([], [], "o", fillstyle="none", color=ink(), label="state")
     if elsewhere := sorted({*told} - {*pair}):
-        beyond = f"not in view: fails by {', '.join(map(called, elsewhere))}"
-        ax.plot([], [], " ", label=beyond)
+        ax.plot([], [], " ", label=f"not in view: fails by {', '.join(map(called, elsewhere))}")
     _explain(ax, columns=2)
     ax.set(xlabel=called(pair[0]), ylabel=called(pair[1]))
     return ax
@@ -435,10 +422,10 @@ def history(
     x, red, blue = (when - when[0] * (not dated)) / size, COLORS["dead end"], COLORS["follower"]
     drawn = np.insert(x, holes, x[holes - 1] + step / size)
     said = np.insert(np.asarray(risk, np.float64), holes, np.nan)
+    look: Look = {"color": blue, "alpha": 0.3, "linewidth": 2.5, "label": "alarm"}
     for ax in axes:
-        look: Look = {"color": blue, "alpha": 0.3, "linewidth": 2.5, "label": "alarm"}
-        look["transform"] = ax.get_xaxis_transform()
-        ax.fill_between(drawn, 0.0, 1.0, said > tolerance, **look)
+        over = ax.get_xaxis_transform()
+        ax.fill_between(drawn, 0.0, 1.0, said > tolerance, transform=over, **look)
         for cross in x[fails]:
             ax.axvline(cross, color=red, linewidth=0.8, linestyle="--")
     for k, (ax, name, values) in enumerate(zip(axes, names, z.T, strict=False)):
