@@ -70,3 +70,13 @@ def test_judges_of_little_and_many_judges_are_merged_within_what_they_may_keep(
     merged = merge_judges([guard.judge] * count)
     assert len(merged.state.situations) <= merged.settings.n_situations
     point.play(point.guard(judge=merged), 9)
+
+
+def test_doubts_and_what_is_left_out_outlast_merging(points):
+    judges = [points["box"].taught(4, seed=seed).judge for seed in (0, 1)]
+    for judge, held in zip(judges, (-30, -25), strict=True):
+        judge.without = frozenset({"backups"})
+        judge.state = judge.state._replace(misled=5.0, held=held)
+    merged = merge_judges(judges).state
+    assert (merged.misled, merged.held) == (5.0, -25)
+    np.testing.assert_array_equal(merged.policies, judges[0].state.policies)
