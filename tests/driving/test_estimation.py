@@ -105,25 +105,17 @@ def test_gentle_braking_does_not_water_down_what_hard_braking_may_be():
     assert manoeuvres.gentle == 400
 
 
-def watch_it(watch, speeds, gap=60.0, own=10.0):
-    """Manoeuvres of a leader with these speeds; the gap follows from them."""
-    told, last = [], speeds[0]
-    for speed in speeds:
-        gap += 0.5 * watch.dt * (last + speed - 2.0 * own)
-        told.append(watch.see(gap, own, speed))
-        last = speed
-    return [decel for decel in told if decel is not None]
-
-
 @pytest.mark.parametrize("dt", [0.1, 0.25, 0.5])
 @given(decel=st.floats(1.2, 12.0), speed=st.floats(8.0, 40.0))
 def test_constant_brakes_are_measured_as_they_are(dt, decel, speed):
     steps = int(speed / (decel * dt))
     assume(steps * dt >= 1.0 + 2 * dt)
     braking = speed - decel * dt * np.arange(steps + 1)
-    watch = BrakeWatch(dt)
-    told = watch_it(watch, np.concatenate([[speed] * 12, braking, [0.0] * 8]))
-    assert told == [pytest.approx(decel)]
+    watch, gap, told, last = BrakeWatch(dt), 60.0, [], speed
+    for now in np.concatenate([[speed] * 12, braking, [0.0] * 8]):
+        gap, last = gap + 0.5 * dt * (last + now - 20.0), now  # behind it at 10 m/s
+        told.append(watch.see(gap, 10.0, now))
+    assert [one for one in told if one is not None] == [pytest.approx(decel)]
 
 
 def test_a_manoeuvre_under_way_counts_when_the_episode_ends():
@@ -208,16 +200,6 @@ def estimates(perception, seen, done):
     return [perception.see(tuple(row), did) for row, did in zip(seen, before, strict=True)]
 
 
-def taught(decisions=600):
-    """A risk that has followed noisy traffic."""
-    risk = LatentRisk(lowest=-2.5)
-    risk.brakes.trust(2.5)
-    rows, done = traffic(decisions)
-    for row, did in zip(noisy(rows), done, strict=True):
-        risk.learn(row, did)
-    return risk, rows[-1]
-
-
 def situation(row):
     return Situation(np.asarray(row), np.ones(1), 0, np.nan, 0.0)
 
@@ -244,7 +226,10 @@ def test_a_cut_in_is_believed_at_once():
 
 
 def test_an_episode_begins_afresh_but_knows_its_sensors_and_keeps_more_distance():
-    risk, _ = taught()
+    risk, (rows, done) = LatentRisk(lowest=-2.5), traffic(600)
+    risk.brakes.trust(2.5)
+    for seen, did in zip(noisy(rows), done, strict=True):
+        risk.learn(seen, did)
     noise, row = risk.perception.noise, (30.0, 15.0, 15.0)
     assert min(noise) > 0.0
     risk.start_episode()

@@ -49,16 +49,12 @@ def test_a_newcomer_close_to_a_state_is_left_to_it():
     assert machine.centers.ravel().tolist() == [0.0, 9.0]
 
 
-def wander(rows, seed=0):
-    rng = np.random.default_rng(seed)
-    Z = np.abs(np.cumsum(rng.normal(scale=0.5, size=(rows, 2)), axis=0)) % 12.0
-    return Z, np.repeat(rng.integers(0, 3, rows // 10), 10)
-
-
 @pytest.mark.parametrize("rule", [Novelty(radius=1.0, spread=0.5), Paper()])
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
 def test_a_tolerant_belief_is_that_close_to_the_exact_one(rule, tolerance):
-    Z, I = wander(2000)
+    rng = np.random.default_rng(0)
+    Z = np.abs(np.cumsum(rng.normal(scale=0.5, size=(2000, 2)), axis=0)) % 12.0
+    I = np.repeat(rng.integers(0, 3, 200), 10)
     exact, tolerant = (EvolvingFSM(3, rule=rule, belief_tolerance=t) for t in (0.0, tolerance))
     a, b = (machine.learn_many(Z, I, belief=True) for machine in (exact, tolerant))
     assert a.n_states.tolist() == b.n_states.tolist()  # beliefs have no say in what is created

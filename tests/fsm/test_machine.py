@@ -18,17 +18,11 @@ def test_a_step_keeps_its_arrays_when_the_machine_goes_on(grown):
 # -- Failure -----------------------------------------------------------------------------------
 
 
-def sharp_machine():
-    """States at 0 and 1, recognised so sharply that a belief is exactly 0 or 1."""
-    machine = EvolvingFSM(n_actions=3, radius=0.5, spread=1e-6)
+def test_what_led_to_failure_is_counted_by_hand():
+    machine = EvolvingFSM(n_actions=3, radius=0.5, spread=1e-6)  # a belief is exactly 0 or 1
     machine.learn_many([[0.0], [0.0], [2.0], [1.0]], [-1, -1, -1, -1])
     assert machine.centers.tolist() == [[0.0], [1.0]]
     machine.start_episode()
-    return machine
-
-
-def test_what_led_to_failure_is_counted_by_hand():
-    machine = sharp_machine()
     machine.learn_one([0.0], 1)
     machine.learn_one([1.0], 2)
     machine.learn_one([1.0], 0)
