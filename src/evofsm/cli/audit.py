@@ -22,12 +22,10 @@ _FIELDS, _LETTERS = 5, 40
 
 def audit(
     file: Annotated[Path, argument("An audit log.")],
-    head: Annotated[
-        str | None, option("NUMBER:HASH of its last record at some time, kept elsewhere.")
-    ] = None,
+    head: Annotated[str | None, option("NUMBER:HASH of a record, kept elsewhere.")] = None,
     replay: Annotated[bool, option("Whether to drive again, and compare every decision.")] = True,
     failed: Annotated[
-        str | None, option("MODULE:FUNCTION that the guard was given as failed=, if it was.")
+        str | None, option("MODULE:FUNCTION, if the guard was given it as failed=.")
     ] = None,
     as_json: Json = False,
 ) -> int:

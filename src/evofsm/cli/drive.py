@@ -40,16 +40,12 @@ _EXCLUDE = {
 
 def drive(
     family: Annotated[
-        str,
-        argument(
-            "Family of scenarios: emergency, paper, shift, ..., a Python file with one of your "
-            "own, or a SUMO configuration (.sumocfg)."
-        ),
+        str, argument("Scenarios (emergency, paper, ...), a file with your own, or a .sumocfg.")
     ],
     episodes: Annotated[int, option("How many are driven.", min=1, max=2**32)] = 100,
     world: InWorld = "kinematic",
     reviser: Annotated[
-        str, option("Which filter: least-risk (ours), none, rss, aeb, or another measure.")
+        str, option("least-risk (ours), none, rss, aeb, or a measure.")
     ] = "least-risk",
     judge: ByJudge = "kinematic",
     mode: Annotated[ModeName, option("How far least-risk goes.")] = "act",
@@ -58,9 +54,7 @@ def drive(
         str, option("noise, delay, actuator, jerk, third_car; with commas.", "--with")
     ] = "",
     seed: Seed = 0,
-    learn: Annotated[
-        Path | None, option("Go on learning from this folder of an earlier --out.")
-    ] = None,
+    learn: Annotated[Path | None, option("Go on learning from a folder of --out.")] = None,
     frozen: Annotated[
         Path | None, option("Drive held-out draws with what this folder holds; learn nothing.")
     ] = None,

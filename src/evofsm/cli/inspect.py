@@ -37,9 +37,7 @@ def inspect(
     file: Saved,
     plot: Annotated[Path | None, option("File for a picture: PNG, PDF, SVG.")] = None,
     axes: Annotated[str | None, option("Two variables, of --plot.")] = None,
-    log: Annotated[
-        str | None, option("A log to show beneath, of --plot, read as the one it was learnt from.")
-    ] = None,
+    log: Annotated[str | None, option("A log to show beneath, of --plot.")] = None,
     as_json: Json = False,
 ) -> None:
     """Print what was learnt: states, the transitions that matter, where a guard's system fails.
@@ -277,7 +275,7 @@ def _aligned(values: NDArray[np.float64]) -> list[str]:
 def explain(
     file: Saved,
     observation: Annotated[
-        str | None, option("Its values, with commas between them: --observation=-9,14,14.")
+        str | None, option("Its values, with commas: --observation=-9,14,14.")
     ] = None,
     state: Annotated[str | None, option("A state by its number, from 1; or all.")] = None,
     action: Annotated[int | None, option("What came of this action there, from 1.")] = None,

@@ -61,8 +61,7 @@ def learn(
         str, option("Intervals of --action, LOW:HIGH:WIDTH; the end ones take what lies beyond.")
     ] = "-2.5:2.5:0.3",
     rule: Annotated[
-        str,
-        option("How states are made: paper, edges, novelty (for logs), or your own, module:Name."),
+        str, option("Rule of states: paper, edges, novelty (for logs), or module:Name.")
     ] = "paper",
     radius: Annotated[
         float | None, option("How far states lie apart. [default: 0.3; of novelty 1.0, in --scale]")
@@ -71,20 +70,13 @@ def learn(
         list[str] | None,
         option("Novelty: the difference that counts as 1, by column: gap=4. May be repeated."),
     ] = None,
-    spread: Annotated[
-        float | None, option("Width of recognition. [default: 3.0; of novelty 1.0]")
-    ] = None,
+    spread: Annotated[float | None, option("Width of recognition. [default: 3; novelty 1]")] = None,
     max_states: Annotated[
-        int | None, option("At so many, two are merged for each new one. [default: no limit]")
+        int | None, option("At so many, two are merged for each new one.")
     ] = None,
     out: Annotated[Path | None, option("File to save the model to.")] = None,
-    guard: Annotated[
-        Path | None, option("File to save a guard to that decided on each row, for evofsm monitor.")
-    ] = None,
-    judge: Annotated[
-        Judge | None,
-        option("Of --guard: kinematic, of cars alone, or learnt, by nothing but what failed."),
-    ] = None,
+    guard: Annotated[Path | None, option("File to save a guard to, for evofsm monitor.")] = None,
+    judge: Annotated[Judge | None, option("Of --guard: kinematic (of cars) or learnt.")] = None,
     brakes: Brakes = BRAKES,
     tolerance: Tolerance = TOLERANCE,
     horizon: Horizon = None,

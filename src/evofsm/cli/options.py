@@ -47,11 +47,7 @@ Json = Annotated[
     bool, option("Print one JSON document; states and actions count from 0.", "--json")
 ]
 Saved = Annotated[
-    Path,
-    argument(
-        "A machine, a model or a guard that was saved, a folder of drive --out, or a log of drive "
-        "--mcap."
-    ),
+    Path, argument("A saved machine, model or guard, or a folder or log that evofsm drive wrote.")
 ]
 Seed = Annotated[int, option("Seed of all random draws.", min=0)]
 InWorld = Annotated[World, option("SUMO itself, or the same motion in closed form.")]
@@ -286,11 +282,7 @@ def typed(given: Mapping[str, Any]) -> str:
 
 Horizon = Annotated[
     float | None,
-    option(
-        "Where nobody acts: an alarm is right if a failure comes within so long [s]. [default: a "
-        "twentieth of the median episode]",
-        min=0.0,
-    ),
+    option("Where nobody acts: an alarm is right if a failure comes within this [s].", min=0.0),
 ]
 Persist = Annotated[
     float, option("Where nobody acts: how long a limit is passed before it alarms [s].", min=0.0)

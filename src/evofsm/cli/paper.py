@@ -14,9 +14,7 @@ from evofsm.cli.show import print_json, progress
 def paper(
     world: InWorld = "sumo",
     rounds: Annotated[int, option("How often the four cases are driven.", min=1)] = 20,
-    out: Annotated[Path, option("Folder for the page, figures, traces and the model.")] = Path(
-        "evofsm-paper"
-    ),
+    out: Annotated[Path, option("Folder for the page and the model.")] = Path("evofsm-paper"),
     settings: Annotated[Path | None, option("TOML file in place of the paper's settings.")] = None,
     as_json: Json = False,
 ) -> int:

@@ -47,7 +47,7 @@ _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
 @reads_logs
 def monitor(
     file: Annotated[
-        Path | None, argument("JSON lines; with --summary a log too. [default: standard input]")
+        Path | None, argument("JSON lines; or a log. [default: standard input]")
     ] = None,
     guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
     low: Annotated[
@@ -63,19 +63,12 @@ def monitor(
     ] = None,
     brakes: Brakes = BRAKES,
     tolerance: Annotated[
-        float | None,
-        option(f"Highest risk that is accepted. [default: of --guard, or {TOLERANCE:g}]"),
+        float | None, option("Highest risk that is accepted. [default: of --guard, or 0.02]")
     ] = None,
-    traffic: Annotated[
-        bool, option("Judge all objects of scenes, who is behind included.", "--traffic")
-    ] = False,
-    mode: Annotated[
-        ModeName, option("How far it goes: shadow (what is proposed is executed) to act.")
-    ] = "shadow",
+    traffic: Annotated[bool, option("Judge all objects of scenes.", "--traffic")] = False,
+    mode: Annotated[ModeName, option("How far it goes: in shadow all passes.")] = "shadow",
     learn: Annotated[bool, option("Learn from what comes.", "--learn")] = False,
-    state: Annotated[
-        Path | None, option("Save all in this file, and go on from it; may be that of --guard.")
-    ] = None,
+    state: Annotated[Path | None, option("Save all in this file, and go on from it.")] = None,
     audit: Annotated[Path | None, option("Write an audit log to this file.")] = None,
     episode: Annotated[
         str | None, option("Rows of an episode at most; of a log columns. [default: 6000]")
@@ -84,9 +77,7 @@ def monitor(
     udp: Annotated[
         int | None, option("Listen to this port on 127.0.0.1; 0 for any.", min=0, max=65535)
     ] = None,
-    zenoh: Annotated[
-        str | None, option("Rows under KEY/row, decisions under KEY/decision.")
-    ] = None,
+    zenoh: Annotated[str | None, option("Rows at KEY/row, answers at KEY/decision.")] = None,
     heartbeat: Annotated[
         float | None, option("Send a heartbeat after so long without a row [s].", min=0.001)
     ] = None,
@@ -94,10 +85,7 @@ def monitor(
     summary: Annotated[
         bool, option("Print how often it would have alarmed, and the worst moments.", "--summary")
     ] = False,
-    observe: Annotated[
-        str | None,
-        option("Variables that are observed, in this order. [default: those of the guard]"),
-    ] = None,
+    observe: Annotated[str | None, option("Variables of rows. [default: the guard's]")] = None,
     *,
     reading: partial[Reading],
     horizon: Horizon = None,

@@ -50,15 +50,12 @@ def watch(
             metavar="FAMILY|ENVIRONMENT|FILE",
         ),
     ] = "paper",
-    case: Annotated[
-        int | None, option("Which case, draw or episode. [default: the first, or the worst]", min=1)
-    ] = None,
+    case: Annotated[int | None, option("Which case, draw or episode.", min=1)] = None,
     world: InWorld = "kinematic",
     judge: ByJudge = "kinematic",
     tolerance: Tolerance = TOLERANCE,
     guard: Annotated[
-        Path | None,
-        option("Of a log: a saved guard beside it. [default: one that learns from the log]"),
+        Path | None, option("Of a log: a saved guard. [default: one that learns from it]")
     ] = None,
     seed: Seed = 0,
     learn_first: Annotated[int, option("Episodes to learn from before, at most.", min=0)] = 60,

@@ -502,9 +502,8 @@ class Session(AbstractContextManager["Session"]):
     def _idle(self) -> str:
         """Why the reviser does not act; empty where it does."""
         if not self.revising:
-            return (
-                "the reviser only watched, in shadow mode" if self._is_log else "the reviser is off"
-            )
+            watched = "the reviser only watched, in shadow mode"
+            return watched if self._is_log else "the reviser is off"
         passing: str = self._reviser.passing  # type: ignore[attr-defined]
         why = "was not shown to help yet" if passing == "shadow" else passing
         return passing and f"the guard {why}, so what is proposed passes"
