@@ -198,7 +198,9 @@ def test_the_kind_is_told_by_the_methods():
     assert kind_of(lambda: CALM) == "controller"
     with pytest.raises(TypeError, match=r"has the methods of no kind: .*a controller has propose"):
         check_contract(3)
-    with pytest.raises(TypeError, match=r"IDM needs arguments \(accel, desired_speed.*--make"):
+    with pytest.raises(
+        TypeError, match=r"IDM needs arguments \(accel, desired_.*function that makes"
+    ):
         check_contract(IDM)
 
 

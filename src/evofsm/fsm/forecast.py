@@ -136,9 +136,6 @@ class Forecasts:
             predicted[of_it] = rows[of_it] @ self._matrix(self.steps.index(steps), action, n, n)
         return predicted if np.ndim(belief) == 2 else predicted[0]
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}(n_actions={self.n_actions}, steps={self.steps})"
-
     def _matrix(self, horizon: int, action: int, i: Any, j: Any) -> Floats:
         """Transition probabilities from states i to states j under an action.
 

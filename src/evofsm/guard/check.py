@@ -102,10 +102,8 @@ def _maker(part: Any) -> Make:
     parameters = inspect.signature(part).parameters.values()
     needed = [p.name for p in parameters if p.default is p.empty and p.kind in by_name]
     if needed:
-        raise TypeError(
-            f"{part.__name__} needs arguments ({', '.join(needed)}); give an instance, or a "
-            "function that makes one (--make on the command line)"
-        )
+        needs = f"{part.__name__} needs arguments ({', '.join(needed)})"
+        raise TypeError(f"{needs}; give an instance, or a function that makes one")
     make: Make = part
     return make
 
