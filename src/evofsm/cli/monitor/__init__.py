@@ -121,6 +121,7 @@ def monitor(
     from evofsm.driving.assumed import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
     from evofsm.guard import Foresight, Guard
+    from evofsm.store import read_header
 
     if guard is not None and brakes != BRAKES:
         raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
@@ -141,7 +142,9 @@ def monitor(
         if traffic:
             raise ValueError("--traffic is of cars, and goes with no --observe or --action")
         begun, learn = _begun({**told}, reading, interval, tolerance, horizon, persist), True
-    kept = _read_with(guard or state)
+    kept, learnt = dict[str, Any](), guard or state
+    if learnt is not None and learnt.is_file():
+        kept = dict(read_header(learnt).provenance.get("read with", {}))
     if is_log and episode is None:
         episode = kept.get("episode")
     given = {k: v for k, v in kept.items() if k not in ("observe", "episode")}
@@ -198,7 +201,11 @@ def monitor(
             slots = Slots(reading(observe=quoted(used.variables or VARIABLES), dt=None).columns)
         rate = RATE if begun and tolerance is None else None
         decider = Decider(used, episode=rows, slots=slots, rate=rate)
-        assumed = _of_saved(guard, used) if guard else assumptions(brakes, tolerated)
+        assumed = assumptions(brakes, tolerated)
+        if guard is not None:
+            risk = getattr(used.reviser, "tolerance", None)
+            accepts = "" if risk is None else f"; a risk of {risk:.3g} is accepted (--tolerance)"
+            assumed = f"assumed: what {guard} was given and has learnt{accepts}"
         if begun:
             assumed = f"a guard of {', '.join(used.variables)} begins, and learns from what comes"
         if summary and file is not None:
@@ -258,15 +265,6 @@ def _prepare(
         guard.audit = stack.enter_context(AuditLog(audit, sync="episode"))
 
 
-def _read_with(guard: Path | None) -> dict[str, Any]:
-    """The options by which evofsm learn read the log of a guard."""
-    from evofsm import store
-
-    if guard is None or not guard.is_file():
-        return {}
-    return dict(store.read_header(guard).provenance.get("read with", {}))
-
-
 def _begun(
     told: dict[str, Any],
     reading: partial[Reading],
@@ -313,13 +311,6 @@ def _begun(
         tolerance=TOLERANCE if tolerance is None else tolerance,
         mode=Mode.SHADOW,
     )
-
-
-def _of_saved(path: Path, guard: Guard) -> str:
-    """What a guard that was saved reckons with, in a line."""
-    tolerance = getattr(guard.reviser, "tolerance", None)
-    risk = "" if tolerance is None else f"; a risk of {tolerance:.3g} is accepted (--tolerance)"
-    return f"assumed: what {path} was given and has learnt{risk}"
 
 
 def _transport(

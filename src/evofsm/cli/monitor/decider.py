@@ -261,8 +261,7 @@ class Decider:
         known = {**revision._asdict(), "risk_low": low, "risk_high": high}
         said = {name: plain(known[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
         self._alarm = self._is_alarm(revision)
-        said |= {"reason": revision.reason, "alarm": self._alarm}
-        said |= {"mode": self.mode.value}
+        said |= {"reason": revision.reason, "alarm": self._alarm, "mode": self.mode.value}
         return self._of("decision", time=row.time, **leader, **self._worst(row), **said, **note)
 
     def _worst(self, row: Row) -> Answer:
