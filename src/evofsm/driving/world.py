@@ -315,9 +315,8 @@ class World(ABC):
                 wanted = propose(seen, time)
                 asked = float(wanted.action if isinstance(wanted, Proposal) else wanted)
                 if not math.isfinite(asked):
-                    raise ValueError(
-                        f"controller proposed {asked} at {time:g} s, gap {seen[0]:g} m"
-                    )
+                    where = f"at {time:g} s, gap {seen[0]:g} m"
+                    raise ValueError(f"controller proposed {asked} {where}")
                 road.advance(asked, steps)
             return road.episode()
 

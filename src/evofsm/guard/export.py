@@ -184,9 +184,8 @@ def _variables(names: Sequence[object], a: int, *, whole: bool) -> str:
     """Variables of an FMU for its description, in the order of ``fmi2.c``."""
     m, seen = len(names), [f"observation[{name}]" for name in names]
     acts = [f"{act}[{i}]" for act in ("proposal", "executed") for i in range(a)]
-    kinds = (
-        ["Real"] * m + ["Integer" if whole else "Real"] * (2 * a) + ["Real", "Integer", "Boolean"]
-    )
+    kinds = ["Real"] * m + ["Integer" if whole else "Real"] * (2 * a)
+    kinds += ["Real", "Integer", "Boolean"]
     how = ['"input"'] * (m + a) + ['"output" initial="exact"'] * (a + 3)
     every = zip([*seen, *acts, "risk", "reason", "revised"], kinds, how, strict=True)
     return "".join(

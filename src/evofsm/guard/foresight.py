@@ -534,8 +534,8 @@ class Foresight(LearningJudge):
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
         """The risk, whatever would be done, with the tolerance that was asked for last."""
         found = self.search(situation, 0.0, tolerance=self._accepted, revising=False).judged
-        every = [np.repeat(values, np.size(actions)) for values in found[:4]]
-        return Judgement(every[0], every[1], every[2], every[3], found.evidence)
+        risk, low, high, left = (np.repeat(values, np.size(actions)) for values in found[:4])
+        return Judgement(risk, low, high, left, found.evidence)
 
     def why(self, judged: Judgement, /) -> str:
         """Why it is dangerous."""
@@ -607,11 +607,7 @@ class Foresight(LearningJudge):
             if not (np.isin(arrays["forms"][:, [failure.I, failure.J]], range(count))).all():
                 raise ValueError("a form is of no variable")
             rows, starts, failed = (arrays.pop(name) for name in Runs._fields)
-            if (
-                (np.diff(starts) <= 0).any()
-                or (starts[:1] != 0).any()
-                or (starts >= len(rows)).any()
-            ):
+            if (np.diff(starts, append=len(rows)) <= 0).any() or (starts[:1] != 0).any():
                 raise ValueError("an episode begins beyond its rows")
             log = Runs(rows, starts.astype(np.int64), failed > 0.0)
             known: dict[str, Any] = {**settings, **arrays}

@@ -346,9 +346,8 @@ class Guard:
                 f"the judge has a method learn, but not all of a LearningJudge: it lacks {lacks}"
             )
         if judge and not math.isclose(judge.dt, self.interval):
-            raise ValueError(
-                f"interval is {interval} s, but the judge was made for decisions every {judge.dt} s"
-            )
+            made = f"the judge was made for decisions every {judge.dt} s"
+            raise ValueError(f"interval is {interval} s, but {made}")
         if machine is not None and machine.n_actions != self.actions.n_actions:
             raise ValueError(
                 f"the machine has {machine.n_actions} actions, but the set has "
@@ -813,11 +812,10 @@ class Guard:
     def __str__(self) -> str:
         """Its judge, what it learnt from, and what it knows of failure, a line each."""
         judge, actions = getattr(self.reviser, "risk", self.judge), self.actions
-        span = (
-            f"{actions.n_actions} actions"
-            if isinstance(actions, Choices)
-            else f"actions from {actions.low} to {actions.high}"
-        )
+        if isinstance(actions, Choices):
+            span = f"{actions.n_actions} actions"
+        else:
+            span = f"actions from {actions.low} to {actions.high}"
         how = type(self.reviser).__name__
         if isinstance(self.reviser, ActionReviser):
             how += f", tolerance {self.reviser.tolerance:g}, mode {self.reviser.mode.value}"

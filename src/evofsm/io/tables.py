@@ -507,9 +507,8 @@ class CsvTable(Table):
         import polars
 
         if twice := [name for name in wanted.all if self.columns.count(name) > 1]:
-            raise ValueError(
-                f"{self.path}, line {self._above}: two columns are called {twice[0]!r}"
-            )
+            called = f"two columns are called {twice[0]!r}"
+            raise ValueError(f"{self.path}, line {self._above}: {called}")
         columns, reached, behind = self.columns, 0, False
         with Source(self.path, self._on_read, self.skips) as source:
             while block := source.rows():
@@ -685,9 +684,8 @@ class ParquetTable(Table):
         """Read columns, in the order of rows."""
         for name in wanted.numbers:
             if not self._types[name].is_numeric():
-                raise ValueError(
-                    f"{self.path}: column {name!r} holds {self._types[name]}, not numbers"
-                )
+                holds = f"column {name!r} holds {self._types[name]}"
+                raise ValueError(f"{self.path}: {holds}, not numbers")
         part = self._scan.select(wanted.all)
         # Not collect_batches: it reads ahead of a slow consumer without bound (polars #28569).
         for first in range(0, self._rows, _PARQUET_ROWS):

@@ -212,7 +212,7 @@ class LearntRisk(ActionJudge):
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
         if self.choices > _MAX_CHOICES:
             raise ValueError(
-                f"n_actions is {n_actions}; a learnt judge takes at most {_MAX_CHOICES:,} actions"
+                f"n_actions is {n_actions}; a learnt judge takes at most {_MAX_CHOICES:,}"
             )
         self.low, self.high = _range(low, high, is_none=n_actions is not None)
         self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
@@ -534,9 +534,8 @@ class LearntRisk(ActionJudge):
             If it has another number of variables than before.
         """
         if (m := len(self._z[0]) if self._z else self.n_variables) not in (0, len(observation)):
-            raise ValueError(
-                f"observation has {len(observation)} variables, but the judge learnt of {m}"
-            )
+            has = f"observation has {len(observation)} variables"
+            raise ValueError(f"{has}, but the judge learnt of {m}")
         if len(self._z) > len(self._u):  # nothing was executed: it does not follow
             self._study(failed=False, terminated=False)
         self._z.append(observation.copy())

@@ -12,13 +12,9 @@ Examples
 'then always -2.5 survives all 10 disturbances remembered from 305 s, by 0.4 typical steps'
 >>> refused(2, ten, 0.4, 1.0)
 'no backup survives 2 of the 10 disturbances remembered from 305 s'
->>> refused(-1, ten, 0.4, 1.0)
-'no backup prevents failure, even if nothing disturbs it'
 >>> refused(0, Remembered(1, 12.3), 1.0, 1.3)
 'no backup survives the 1 disturbance remembered from 12 s by the margin of 1 typical step, \
 were they 1.3 times as hard'
->>> comes_near("always -2.5")
-'then always -2.5 would come near a dead end, from where episodes that had been certified failed'
 >>> dead_ends([1, 3])
 '; 2 dead ends: 3 and 1 episodes that had been certified failed from there'
 """
@@ -31,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evofsm.fsm.validation import counted
 from evofsm.guard.harm import Harm
 from evofsm.guard.learnt import failure
 from evofsm.guard.learnt.failure import HELD, SAYS, I
@@ -66,7 +63,7 @@ class Remembered(NamedTuple):
         time = f"{self.seconds:,.0f} s" if self.seconds >= 10.0 else f"{self.seconds:.1f} s"
         if not self.number:
             return f"what {time} brought"
-        return f"{self.number} disturbance{'s' * (self.number != 1)} remembered from {time}"
+        return f"{counted(self.number, 'disturbance')} remembered from {time}"
 
     def but(self, spared: int) -> str:
         """All of them, but those that need not be survived."""
@@ -97,11 +94,7 @@ def refused(
 
 
 def alone(why: str) -> str:
-    """Why it is dangerous where there is but one action, and so no backup.
-
-    >>> alone("no backup prevents failure, even if nothing disturbs it")
-    'it fails, even if nothing disturbs it'
-    """
+    """Why it is dangerous where there is but one action, and so no backup."""
     why = why.replace("no backup survives", "it does not survive")
     return why.replace("no backup prevents failure", "it fails")
 
@@ -118,8 +111,8 @@ def dead_ends(counts: Sequence[int]) -> str:
     """How many there are, those first from where most failed; empty without any."""
     if not counts:
         return ""
-    several, most_first = "s" * (len(counts) > 1), sorted(counts, reverse=True)
-    return f"; {len(counts)} dead end{several}: {failed(most_first)} from there"
+    most_first = failed(sorted(counts, reverse=True))
+    return f"; {counted(len(counts), 'dead end')}: {most_first} from there"
 
 
 def failed(counts: Sequence[int]) -> str:
@@ -151,7 +144,7 @@ def no_threshold(n_failed: int, *, is_given: bool) -> str:
         return "failed= is true nowhere around what was survived, so nothing is refused"
     if not n_failed:
         return NO_FAILURE
-    seen = "1 failure" if n_failed == 1 else f"{n_failed:,} failures"
+    seen = counted(n_failed, "failure")
     return f"{seen} seen, but beyond no value that was survived, so nothing is refused"
 
 
@@ -225,7 +218,7 @@ def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "
     >>> region(["x", "y"], [0, 1, 0.0, 0.0, 1.0, 1.0, -5.0, 3.0, 4.0, 0.0, 0.0, 0.0], 1)
     'where 0.6 x + 0.8 y is above 1 (1 failure)'
     """
-    seen = f"({count:,} {what}{'s' * (count != 1)})"
+    seen = f"({counted(count, what)})"
     i, j, at, to, sx, sy, c, b, d, p, q, r = row
     x, y = names[int(i)], names[int(j)]
     if i == j:
