@@ -414,9 +414,8 @@ def _read_otherwise(
     if jumps := learning.read.jumps:
         yield "time jumps", f"{jumps:,}; each begins an episode (a longer --hole bridges them)"
     if noted.leaderless:
-        why = "a number is missing" + f", or {columns.no_leader}" * (
-            columns.no_leader not in (None, "end")
-        )
+        nobody = columns.no_leader not in (None, "end")
+        why = "a number is missing" + f", or {columns.no_leader}" * nobody
         ends = "" if hole and not columns.no_leader else "; there an episode ends"
         yield "left out", f"{noted.leaderless:,} rows: {why}{ends}"
     if noted.elsewhere:

@@ -91,13 +91,7 @@ def require_world(world: World, **extras: str) -> None:
 
 
 def imported(name: str) -> Any:
-    """A class, function or instance by its name ``module:Name``, found in the present folder too.
-
-    >>> imported("math:pi"), imported("math.pi")
-    Traceback (most recent call last):
-        ...
-    ValueError: 'math.pi' names nothing; write module:Name
-    """
+    """A class, function or instance by its name ``module:Name``; found in this folder, too."""
     module, _, path = name.partition(":")
     if not (module and path):
         raise ValueError(f"{name!r} names nothing; write module:Name")
@@ -124,11 +118,7 @@ def in_quotes(text: str) -> str:
 
 
 def split_names(text: str) -> list[str]:
-    """Names that were given with commas between them; one with a comma stands in double quotes.
-
-    >>> split_names('gap, "v, in m/s"')
-    ['gap', 'v, in m/s']
-    """
+    """Names that were given with commas between them; one with a comma stands in double quotes."""
     return ["".join(parts) for parts in _named(text)]
 
 
@@ -290,11 +280,7 @@ Persist = Annotated[
 
 
 def seconds(name: str, text: str) -> float:
-    """How long a text says it is [s].
-
-    >>> seconds("--hole", "10min"), seconds("--hole", "0.5")
-    (600.0, 0.5)
-    """
+    """How long a text says it is [s]: ``10min``, or ``0.5``."""
     from evofsm.fsm.validation import positive
     from evofsm.io.tables import TIMES
 
