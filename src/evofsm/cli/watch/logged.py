@@ -58,7 +58,8 @@ def watched_log(
     if case is not None and not 1 <= case <= len(found):
         raise ValueError(f"episode is {case}; there are 1 to {len(found)}")
     if guard is None and not (of_cars or any(played.fails for played in found)):
-        raise ValueError(f"{path}: no episode failed: nothing to foresee; --failed says what did")
+        why = "no episode failed, so there is nothing to foresee; --failed says what did"
+        raise ValueError(f"{path}: {why}")
     labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
     rows = [played.rows for played in found]
     risk = TOLERANCE if tolerance is None else tolerance

@@ -50,7 +50,6 @@ class Danger(NamedTuple):
     advised: int = 0  #: of them, those that it changed, or would have
     stepped_in: Frame | None = None  #: in which it first changed one
     called: Frame | None = None  #: in which it first did, or would have
-    hardest: float = math.inf  #: lowest acceleration of a car that was put through [m/s²]
     dead_end: float = math.nan  #: since when nothing would have been enough [s]
 
 
@@ -357,8 +356,7 @@ def _went_on(danger: Danger, frame: Frame, is_tolerable: bool) -> Danger:
     if is_tolerable:
         return danger
     if frame.revised:
-        hardest = min(danger.hardest, frame.executed[0])
-        danger = danger._replace(stepped_in=danger.stepped_in or frame, hardest=hardest)
+        danger = danger._replace(stepped_in=danger.stepped_in or frame)
     return danger._replace(
         last=frame.time,
         wishes=danger.wishes + 1,

@@ -186,14 +186,11 @@ def _done(danger: Danger, frame: Frame, start: Start) -> str:
     n = danger.wishes
     risky = f"of {n} wishes that were too risky" if n > 1 else "wish that was too risky"
     if first is not None:
-        hardest = ""
-        if frame.cars and danger.hardest < -_HARDLY:
-            hardest = f"; at its hardest it braked by {-danger.hardest:.1f} m/s²"
         now = f". Now {frame.idle}" if frame.idle else ""
         return (
             f"The reviser stepped in at {clock(first.time, start)}, at first "
             f"{_instead(first.executed, first.proposed, start)}. "
-            f"It changed {danger.revised} {risky}{hardest}{now}."
+            f"It changed {danger.revised} {risky}{now}."
         )
     if called is None:
         idle = f"{frame.idle}, and it" if frame.idle else "the reviser"
