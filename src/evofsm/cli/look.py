@@ -135,8 +135,8 @@ def _of_steps(steps: NDArray[np.float64], facts: Pairs) -> Pairs:
     facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {usual:.2g} s"
     holes = steps > LONGEST_STEP * usual
     if len(late := steps[steps <= 0.0]):
-        same, earlier = (late == 0.0).sum(), (late < 0.0).sum()
-        told = f"{same:,} at the time of the row before, {earlier:,} earlier"
+        twice, earlier = (late == 0.0).sum(), (late < 0.0).sum()
+        told = f"{twice:,} at the time of the row before, {earlier:,} earlier"
         facts.append(("late rows", f"{told} (rows twice, unsorted, or --episode?)"))
     if odd.sum() < max(_MANY, _ODD * len(steps)):
         if holes.any():

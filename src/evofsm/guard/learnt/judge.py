@@ -211,9 +211,8 @@ class LearntRisk(ActionJudge):
         #: Number of actions; 0 where the action is a box.
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
         if self.choices > _MAX_CHOICES:
-            raise ValueError(
-                f"n_actions is {n_actions}; a learnt judge takes at most {_MAX_CHOICES:,}"
-            )
+            takes = f"a learnt judge takes at most {_MAX_CHOICES:,} actions"
+            raise ValueError(f"n_actions is {n_actions}; {takes}")
         self.low, self.high = _range(low, high, is_none=n_actions is not None)
         self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         #: How many numbers an action has.
