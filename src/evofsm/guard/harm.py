@@ -19,8 +19,14 @@ failed, where it does better by what is known, or every tenth time, as it may ha
 and in the first case three draws have to agree, unless the latest three guarded episodes failed, or
 less than three are known of the controller alone.
 
-Frozen, it acts unless its record says that it harms: that it loses more pairs than it wins. A
-guard, or a controller, that was never tried has no record, and then it acts.
+A guard of which the latest three episodes failed may stand before a controller that became good:
+then the controller drives until it fails, and after two guarded episodes at the latest. If its own
+latest three failed, too, there is little to lose, and the guard, which learns, drives the others,
+twelve at most.
+
+Frozen, it acts unless its record says that it harms, or does not help: it loses more pairs than it
+wins, or all its episodes failed, three at least, however late. A guard, or a controller, that was
+never tried has no record, and then it acts.
 """
 
 from __future__ import annotations
@@ -47,8 +53,11 @@ _SAME_SCORE = 0.05
 # The latest guarded episodes, if all failed, are reason enough for one draw to decide; else it
 # takes as many that agree.
 _CAREFUL = 3
-# Draws by which it is said how often the guard drives; below that it is said at all.
-_DRAWS, _SAID = 300, 0.9
+# A guard that always fails drives so many episodes in a row at most, and so many, where the
+# controller always fails as well, before draws decide.
+_TURN, _TRIES = 2, 12
+# Draws by which it is known how often the guard drives; below that share doubt is said.
+_DRAWS, _SAID = 300, 0.5
 # Decisions over which the share of proposals that are kept is counted, and at least for a word.
 _DECISIONS, _FEWEST_DECISIONS = 500, 100
 # Steps of who never fails.
@@ -103,8 +112,13 @@ class Harm(NamedTuple):
 
     @property
     def helps(self) -> bool:
-        """Whether guarded episodes end no worse than those alone, or of one kind none is known."""
+        """Whether guarded episodes end no worse than those alone, or of one kind none is known.
+
+        A guard of which all episodes failed, three at least, prevents nothing, however late.
+        """
         guarded, alone = self.guarded, self.alone
+        if _all_failed(guarded, max(_CAREFUL, len(guarded))):
+            return False
         won = self._weights(guarded) @ better(guarded, alone) @ self._weights(alone)
         return not guarded or not alone or bool(won >= 0.0)
 
@@ -129,6 +143,12 @@ class Harm(NamedTuple):
         """Why proposals pass in the episode to come; empty where they are revised."""
         if not learning:
             return "" if self.helps else "was not shown to help"
+        if _all_failed(self.guarded):
+            turn_is_over = all(outcome.guarded for outcome in self.outcomes[-_TURN:])
+            if turn_is_over or not _all_failed(self.alone[-1:], 1):
+                return "shadow"
+            if _all_failed(self.alone) and len(self.guarded) < _TRIES:
+                return ""
         fails = any(outcome.failed for outcome in self.outcomes[-1:])
         asked = self.refuses and (fails or self._long_ago or not self.helps)
         return "shadow" if asked and not self.drives(self._draws) else ""
@@ -136,13 +156,14 @@ class Harm(NamedTuple):
     @property
     def _long_ago(self) -> bool:
         """Whether it is long ago that the controller drove alone."""
-        return not (self.n_episodes - (self.alone[-1].episode if self.alone else 0)) % _RARELY
+        n = self.n_episodes - (self.alone[-1].episode if self.alone else 0)
+        return n > 0 and n % _RARELY == 0
 
     @property
     def _draws(self) -> int:
         """The guard drives if it does in one of so many draws."""
-        latest, is_new = self.guarded[-_CAREFUL:], len(self.alone) < _CAREFUL
-        is_bold = is_new or self._long_ago or all(outcome.failed for outcome in latest)
+        is_new = len(self.alone) < _CAREFUL
+        is_bold = is_new or self._long_ago or _all_failed(self.guarded)
         return 1 if is_bold else _CAREFUL
 
     def told(self, *, learning: bool) -> str:
@@ -150,12 +171,10 @@ class Harm(NamedTuple):
         guarded, alone = self.guarded, self.alone
         if not guarded or not alone:
             return ""
-        share = float(self.helps)
-        if learning:
-            share = 1.0 - (1.0 - self.drives(_DRAWS)) ** self._draws
-        if share >= _SAID:
+        doubted = learning and (1.0 - self.drives(_DRAWS)) ** self._draws > 1.0 - _SAID
+        if self.helps and not doubted:
             return ""
-        how = f"the guard drives some {share:.0%} of episodes" if learning else "proposals pass"
+        how = "both are tried" if learning else "proposals pass"
         found = f"guarded episodes {_ended(guarded)}, the controller alone {_ended(alone)}"
         return f"it was not shown to help: {found}; {how}"
 
@@ -242,6 +261,11 @@ def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.flo
     fails = (s_fails[:, None] > 0) | (o_fails > 0)
     failed = (s_fails[:, None] > 0) & (o_fails > 0)
     return np.where(fails, np.where(failed, _SOONER, 1.0) * (best.astype(float) - worse), neither)
+
+
+def _all_failed(outcomes: Sequence[Outcome], latest: int = _CAREFUL) -> bool:
+    """Whether there are so many, and the latest of them failed."""
+    return len(outcomes) >= latest and all(outcome.failed for outcome in outcomes[-latest:])
 
 
 def _ended(outcomes: Sequence[Outcome]) -> str:
