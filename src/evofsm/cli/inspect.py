@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from evofsm.cli.options import Json, Saved, option, picture, quoted, reading_of, typed
+from evofsm.cli.options import Json, Saved, option, picture, quoted, reading_of, split_names, typed
 from evofsm.cli.show import facts, print_json, say, show, table
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ _UNTOLD = (
 def inspect(
     file: Saved,
     plot: Annotated[Path | None, option("File for a picture: PNG, PDF, SVG.")] = None,
+    axes: Annotated[str | None, option("Two variables, of --plot.")] = None,
     log: Annotated[str | None, option("A log to show beneath, of --plot.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -48,7 +49,7 @@ def inspect(
     if plot is not None:
         title = f"States of {file.name}" + (f" over {Path(log).name}" if log else "")
         seen = _logged(log, model, provenance.get("read with", {}))
-        _draw(model, guard, plot, seen, title)
+        _draw(model, guard, plot, axes, seen, title)
     told = getattr(guard and guard.judge, "told_by_experience", None)
     known = [] if told is None else [("experience", str(told))]
     if as_json:
@@ -118,11 +119,18 @@ def _logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> d
     return {"rows": every[shown], "failed": ended[shown]}
 
 
-def _draw(model: FSMModel, guard: Guard | None, out: Path, logged: Any, title: str) -> None:
+def _draw(
+    model: FSMModel, guard: Guard | None, out: Path, axes: str | None, logged: Any, title: str
+) -> None:
     """States in the plane of two variables, and what a guard has learnt of failure."""
     from evofsm import plot
     from evofsm.guard import Foresight, LearntRisk
 
+    names = [model.labels.variable(k).split(" [")[0] for k in range(model.n_variables)]
+    asked = [name.split(" [")[0] for name in split_names(axes or "")]
+    pair: Any = [names.index(name) for name in asked if name in names]
+    if len(pair) != 2 * (axes is not None):
+        raise ValueError(f"--axes is {axes}; name two of {', '.join(names)}")
     judge = guard and guard.judge
     if isinstance(judge, Foresight):
         rate = judge.rate_of(getattr(guard and guard.reviser, "tolerance", 1.0))
@@ -130,11 +138,11 @@ def _draw(model: FSMModel, guard: Guard | None, out: Path, logged: Any, title: s
     with picture(out, 7.2, 5.0) as figure:
         figure.suptitle(title, x=0.01, ha="left")
         if guard is not None and isinstance(judge, LearntRisk):
-            plot.experience(guard, figure.subplots())
+            plot.experience(guard, figure.subplots(), variables=pair or None)
         elif model.n_variables == 1:
             plot.graph(model, figure.subplots())
         else:
-            plot.states(model, figure.subplots(), ways=True, **logged)
+            plot.states(model, figure.subplots(), variables=pair or (0, 1), ways=True, **logged)
 
 
 # -- As a whole -----------------------------------------------------------------------------------
