@@ -79,3 +79,25 @@ def test_however_variables_are_written_it_decides_the_same(wary, reloaded):
         np.testing.assert_allclose(*executed, atol=1e-5)
         reasons += [one.reason for one in rows[1]]
     assert any("dead end" in reason for reason in reasons)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_end_of_a_rail_is_no_disturbance_that_may_begin_anywhere(seed, reloaded):
+    """Whoever touches it shakes ever more: nothing survives that, and it begins nowhere else."""
+    guard, failed = Guard(low=-1.0, high=1.0, interval=0.1, seed=seed), []
+    for episode in range(14):
+        rng, place, shaken, shake = np.random.default_rng([seed, episode]), 0.0, 0.0, 0.0
+        for _ in range(80):
+            wanted = float(np.clip(0.6 + 0.4 * rng.normal(), -1.0, 1.0))
+            executed = float(guard.decide([place, shaken, shake], wanted).executed)
+            place, shaken = place + 0.05 * executed + 0.002 * rng.normal(), shaken + shake
+            if place > WALL:
+                place, shake = WALL + 0.001 * abs(rng.normal()), 0.2
+            if shaken >= 1.0:
+                break
+        failed.append(shaken >= 1.0)
+        guard.end(failed=failed[-1], observation=[place, shaken, shake])
+    assert failed[0]
+    assert sum(failed) <= 4
+    assert not any(failed[-6:])
+    assert reloaded(guard).judge.told_by_experience == guard.judge.told_by_experience

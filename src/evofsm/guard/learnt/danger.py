@@ -13,7 +13,7 @@ import numpy as np
 
 from evofsm.guard.learnt import failure, model
 from evofsm.guard.learnt.failure import HELD, SAYS, B, I, Survived
-from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, Floats, Model
+from evofsm.guard.learnt.rollout import CRASHES, DEAD, ENDS, FAILS, Floats, Model
 from evofsm.guard.learnt.state import Episode, LearntSettings, State, sizes
 
 # Episodes of which the end tells where there are any; observations so near the last one [typical
@@ -50,15 +50,20 @@ def fails(
         state = state._replace(ended=np.vstack([state.ended, rows[-1]])[-most:])
     if len(went_on):
         change = np.diff(went_on, axis=0)
-        between = went_on[:-1] + 0.5 * change
-        new = np.concatenate([went_on, between[~model.jumps(change, state.unit).any(1)]])
-        if given is not None:
-            new = new[[not given(row) for row in new]]
+        smooth = np.flatnonzero(~model.jumps(change, state.unit).any(1))
+        new = np.concatenate([went_on, (went_on[:-1] + 0.5 * change)[smooth]])
+        left = 0 if episode.terminated else _UNPROVEN
+        if episode.failed:
+            left = min(state.horizon, len(went_on) // 2)
+        at = np.append(np.arange(len(went_on)), smooth)
+        proven = np.append(state.proven, 1.0 * (at < len(went_on) - left))
         survived = np.concatenate([state.survived, new])
-        survived_in = np.append(state.survived_in, np.full(len(new), float(state.n_episodes)))
+        if given is not None:
+            fine = np.append(np.full(len(state.survived), True), [not given(row) for row in new])
+            survived, proven = survived[fine], proven[fine]
         while len(survived) > settings.max_survived:
-            survived, survived_in = survived[::2], survived_in[::2]
-        state = state._replace(survived=survived, survived_in=survived_in)
+            survived, proven = survived[::2], proven[::2]
+        state = state._replace(survived=survived, proven=proven)
     if failed:
         brinks = np.vstack([state.brinks, rows[-1:]])[-most:]
         state = state._replace(failures=np.vstack([state.failures, z[-1]])[-most:], brinks=brinks)
@@ -89,7 +94,7 @@ def explained(state: State, *, failed: bool, bends: bool = True) -> State:
     if bends and (failed or not is_told):
         rows = failure.explain(FAILS, failures, known, blur)
     rows[:, HELD] = failure.inside(rows, failures).sum(1)
-    forms = np.concatenate([ends, crashes, rows])
+    forms = np.concatenate([ends, crashes, rows, table[table[:, SAYS] == DEAD]])
     if state.held < 0 and failed and not _foreseen(state, table, known):
         return state._replace(forms=forms, held=0, wrong=state.wrong + 1)
     changed = state.held >= 0 and (failed or _shape(was) != _shape(rows))
@@ -119,7 +124,7 @@ def _endings(state: State, table: Floats, known: Survived) -> Floats:
     failed = state.failures[failure.inside(rows, state.failures).any(0)]
     crashes = failure.crashing(failed, ended, known, *set(rows[:, I].astype(int).tolist()))
     rows = failure.without(rows, failed[~failure.inside(crashes, failed, 0.0).any(0)])
-    return np.concatenate([rows, crashes, table[table[:, SAYS] == FAILS]])
+    return np.concatenate([rows, crashes, table[np.isin(table[:, SAYS], [FAILS, DEAD])]])
 
 
 def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> State:
@@ -169,8 +174,11 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
 # -- Dead ends ------------------------------------------------------------------------------------
 
 
-def dead_ends(state: State, known: Model, z: Floats, episode: Episode) -> State:
-    """Learn balls around what was observed between the last certificate and failure."""
+def dead_ends(state: State, known: Model, z: Floats, episode: Episode, before: Floats) -> State:
+    """Learn balls around what was observed between the last certificate and failure.
+
+    ``before`` is what was survived before the episode.
+    """
     inverse, centres, counts = known.inverse, state.centres, state.counts
     held = np.flatnonzero(episode.certified[: len(z) - 1]) if episode.failed else np.empty(0, int)
     rows = z[held[-1] + 1 :] if len(held) else z[:0]
@@ -186,16 +194,25 @@ def dead_ends(state: State, known: Model, z: Floats, episode: Episode) -> State:
     if not len(centres):
         return state
     radii = np.minimum(_LARGEST_RADIUS, _APART * 2.0 ** (np.minimum(counts, 9.0) - 1.0))
-    went_on = state.survived  # of the latest episode it is not known how it went on
-    if not episode.terminated:
-        latest = int((state.survived_in == state.n_episodes).sum())
-        went_on = went_on[: len(went_on) - (latest if episode.failed else min(latest, _UNPROVEN))]
+    went_on = before  # of a failed episode it is not known from where it went on
+    if not episode.failed:
+        went_on = state.survived[: None if episode.terminated else -_UNPROVEN]
     far = _between(centres, went_on[-_MAX_ROWS::_EACH], inverse)
     radii = np.minimum(radii, _WAY * far.min(1, initial=np.inf))
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2)))
     left = np.flatnonzero(radii > _SAME_PLACE * typical)
     left = np.sort(left[np.argsort(-counts[left], kind="stable")[:_MAX_ENDS]])
     return state._replace(centres=centres[left], radii=radii[left], counts=counts[left])
+
+
+def barred(state: State) -> State:
+    """Learn beyond which ends of what was survived began what nothing survives (`State.fatal`)."""
+    went_on, table = state.survived[state.proven > 0.0], state.forms
+    if not len(state.fatal) or not len(went_on):
+        return state
+    ends = failure.explain(DEAD, state.fatal, failure.boxed(sizes(state), went_on), bends=False)
+    ends = failure.nearer(ends, state.fatal, 1.0)
+    return state._replace(forms=np.concatenate([table[table[:, SAYS] != DEAD], ends]))
 
 
 def _between(a: Floats, b: Floats, inverse: Floats) -> Floats:

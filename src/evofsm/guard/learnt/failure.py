@@ -115,11 +115,11 @@ def without(table: Floats, z: Floats) -> Floats:
     return new
 
 
-def halfway(table: Floats, failures: Floats) -> Floats:
-    """Forms half as far from the innermost of the failures in each as they reached beyond."""
+def nearer(table: Floats, failures: Floats, share: float) -> Floats:
+    """Forms nearer by a share of the way to the innermost of the failures in each."""
     new, form = table.copy(), forms(table, failures)[0]
     within = np.where(form > 0.0, form, np.inf).min(1, initial=np.inf)
-    new[:, C] -= 0.5 * np.where(np.isfinite(within), within, 2.0 * GROWN)
+    new[:, C] -= share * np.where(np.isfinite(within), within, 2.0 * GROWN)
     return new
 
 
@@ -190,7 +190,7 @@ def _as_failed(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
     end, ended = row.copy(), survived.ended[inside(row[None], survived.ended)[0]]
     end[SAYS] = ENDS
     if len(ended):
-        crashes = halfway(crashing(held, ended, survived, int(row[I])), held)
+        crashes = nearer(crashing(held, ended, survived, int(row[I])), held, 0.5)
     else:
         crashes = _rare(held, survived, int(row[I]))
     return [end, *crashes] if len(crashes) else [row]

@@ -35,7 +35,8 @@ from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import words
 from evofsm.guard.learnt.backups import basis
 from evofsm.guard.learnt.failure import AT, SAYS, B, I, are_sides
-from evofsm.guard.learnt.learn import Given, disturbance_scale, ends_of, learn
+from evofsm.guard.learnt.learn import Given, disturbance_scale, learn
+from evofsm.guard.learnt.motion import used_at
 from evofsm.guard.learnt.rollout import (
     CUT_SHORT,
     FAILS,
@@ -548,7 +549,7 @@ class LearntRisk(ActionJudge):
         inner = self.encode(action)
         self._u = self._u[: len(self._z) - 1] if len(self._u) == len(self._z) else self._u
         self._u.append(inner)
-        self._used = self._used + ends_of(inner[None], self.choices)
+        self._used = self._used + used_at(inner[None], self.choices)[0]
 
     def learn(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
         """Take in what was executed, and whether the certificate of before still held."""

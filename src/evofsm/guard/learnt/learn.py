@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evofsm.guard.learnt import danger, model, motion
+from evofsm.guard.learnt import danger, failure, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups, fitted
-from evofsm.guard.learnt.rollout import Flags, Floats, Model, value_of
+from evofsm.guard.learnt.failure import SAYS
+from evofsm.guard.learnt.rollout import DEAD, Flags, Floats, Model, value_of
 from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
 
 # Actions of an episode that says how a system moves, at least; situations from which on
@@ -25,8 +26,8 @@ _AT_ONCE, _BY_FAR = 3, 100.0
 # Windows of which all that is known is their size; situations that are kept of a failure, and so
 # many steps before it at least.
 _MOST_WINDOWS, _BEFORE, _EARLIER = 3, 3, 2
-# An action is used at the end of its range from so far on.
-_LOW, _HIGH = -0.6, 0.6
+# Of the largest residual of a window, what is large enough to be where it began.
+_ONSET = 0.5
 
 
 class Given(NamedTuple):
@@ -83,7 +84,7 @@ def learn(
     state = state._replace(
         n_seen=state.n_seen + int(seen.sum()),
         margin=0.0 if "margin" in without else margin,
-        used=state.used + ends_of(u, state.choices),
+        used=state.used + motion.used_at(u, state.choices).sum(0),
     )
     # Model
     state = motion.steps(state, safe)
@@ -95,7 +96,8 @@ def learn(
     # Failure
     state = danger.fails(state, z, episode, settings, without, given.failed)
     if "dead-ends" not in without and len(state.forms):
-        state = danger.dead_ends(state, model_of(state, settings), safe, episode)
+        known = model_of(state, settings)
+        state = danger.dead_ends(state, known, safe, episode, before.survived)
     if not moves:
         return state._replace(n_episodes=state.n_episodes + 1)
     if not len(state.policies):
@@ -131,12 +133,6 @@ def learn(
         policies, linear = evolved(state.policies, state.linear, *asked)
         state = state._replace(policies=policies, linear=linear)
     return state._replace(n_episodes=state.n_episodes + 1)
-
-
-def ends_of(u: Floats, choices: int) -> Floats:
-    """(a, 2) how often each number of actions (T, a) was near an end of its range."""
-    lowest = -1.0 if choices else _LOW
-    return np.array([(u < lowest).sum(0), (u > _HIGH).sum(0)], np.float64).T
 
 
 def disturbance_scale(state: State, settings: LearntSettings) -> float:
@@ -233,9 +229,11 @@ def disturbances(
         lengths=np.array(lengths),
         seen_in=np.array(of),
     )
-    if len(windows) <= settings.n_disturbances:
-        return state
     found = residuals_of(state, known, H)
+    if looks and len(windows):
+        state, found = _fatal(state, known, found, settings)
+    if len(state.windows) <= settings.n_disturbances:
+        return state
     if looks:
         scale = disturbance_scale(state, settings)
         ends = worst(known, S, state.policies[:2], found, scale)
@@ -243,6 +241,28 @@ def disturbances(
     else:
         keep = _sizes(found[:, :, 1:], state)[: settings.n_disturbances]
     return kept(state, keep)
+
+
+def _fatal(
+    state: State, known: Model, found: Floats, settings: LearntSettings
+) -> tuple[State, Floats]:
+    """Take what nothing survives, in whatever situation, for a dead end where it began.
+
+    Such as the contact with the end of a rail: it is no disturbance that may begin anywhere. Where
+    the place cannot be told from others it is remembered as it was. ``found`` are residuals of all
+    that is remembered, (H, m, 1 + K), of which those of what is left are returned.
+    """
+    m = len(state.unit)
+    ends = worst(known, state.situations, state.policies[:2], found, 1.0)
+    fatal = np.flatnonzero(ends.max(0, initial=-np.inf) < 0.0) if len(ends) else np.empty(0, int)
+    size = np.abs(found[:, :m, 1 + fatal] / (state.unit[:, None] + 1e-300)).sum(1)
+    rows = state.windows[fatal, (size >= _ONSET * size.max(0)).argmax(0), :m]
+    is_new = ~(rows[:, None] == state.fatal).all(2).any(1)
+    seen = np.concatenate([state.fatal, rows[is_new]])[-settings.max_failures :]
+    state = danger.barred(state._replace(fatal=seen))
+    within = failure.inside(state.forms[state.forms[:, SAYS] == DEAD], rows).any(0)
+    keep = np.setdiff1d(np.arange(len(state.windows)), fatal[within])
+    return kept(state, keep.tolist()), found[:, :, np.append(0, 1 + keep)]
 
 
 def kept(state: State, keep: list[int]) -> State:
@@ -334,7 +354,17 @@ def coarser(state: State, settings: LearntSettings) -> State:
     learnt_anew = (
         *("squares", "products", "least", "most", "scale", "noise", "power"),
         *("recent_squares", "recent_products", "doubt", "since", "drifts", "misled"),
-        *("n_scanned", "n_moves", "centres", "radii", "counts", "windows", "lengths", "seen_in"),
+        *(
+            "n_scanned",
+            "n_moves",
+            "centres",
+            "radii",
+            "counts",
+            "fatal",
+            "windows",
+            "lengths",
+            "seen_in",
+        ),
         *("situations", "margin", "time_to_failure", "believed", "too_short", "horizon"),
     )
     return state._replace(

@@ -99,7 +99,6 @@ def merge(parts: Sequence[State], judge: LearntRisk) -> State:
     shared = np.isclose(ends, np.stack([lowest[0], highest[0]], 1), 1e-9, 0.0)
     after = n_episodes - of("n_episodes")  # the latest episode of each is the latest of all
     every = max(1, -(-len(rows("survived")) // settings.max_survived))
-    seen_in = np.concatenate([part.survived_in + k for part, k in zip(parts, after, strict=True)])
     drifts = [part.drifts + np.array([0, k, k]) for part, k in zip(parts, after, strict=True)]
     fields: dict[str, Any] = {
         **{name: int(of(name).sum()) for name in ("n_failed", "n_scanned", "n_seen", "n_moves")},
@@ -107,7 +106,10 @@ def merge(parts: Sequence[State], judge: LearntRisk) -> State:
         **{name: _average(of(name), moves) for name in ("unit", "power")},
         **{name: _average(of(name), moves * of("scale").any(1)) for name in ("scale", "noise")},
         **{name: rows(name, settings.max_failures) for name in ("failures", "brinks", "ended")},
-        **{name: rows(name) for name in ("centres", "radii", "counts", "windows", "lengths")},
+        **{
+            name: rows(name)
+            for name in ("centres", "radii", "counts", "fatal", "windows", "lengths")
+        },
         **{name: getattr(latest, name) for name in ("policies", "linear")},
         "n_episodes": n_episodes,
         "origin": first.origin,
@@ -122,7 +124,7 @@ def merge(parts: Sequence[State], judge: LearntRisk) -> State:
         "reached": np.where(shared, of("reached"), 0.0).sum(0),
         "seen_in": np.concatenate([part.seen_in + k for part, k in zip(parts, after, strict=True)]),
         "survived": rows("survived")[::every],
-        "survived_in": seen_in[::every],
+        "proven": rows("proven")[::every],
         "situations": rows("situations", settings.n_situations),
         "used": of("used").sum(0),
         **{name: int(of(name).max()) for name in ("horizon", "wrong", "stride")},
@@ -135,7 +137,7 @@ def merge(parts: Sequence[State], judge: LearntRisk) -> State:
     else:
         merged = fails(merged, no_rows, nothing, settings, judge.without, judge.failed)
     merged = merged._replace(held=int(min(0, of("held").max())))  # doubted is what all doubt
-    merged = dead_ends(merged, model_of(merged, settings), no_rows, nothing)
+    merged = dead_ends(merged, model_of(merged, settings), no_rows, nothing, no_rows)
     if not len(merged.situations):
         return merged
     known, scale = model_of(merged, settings), disturbance_scale(merged, settings)

@@ -19,6 +19,8 @@ from evofsm.guard.learnt.state import LearntSettings, State, model_of
 _MOST_CHANGES, _LARGEST_STEP = 5000.0, 6.0
 # Of what was seen, the share that is the same up to rounding.
 _SAME_SHARE = 1e-9
+# An action is used at the end of its range from so far on.
+_NEAR_END = 0.6
 # Changes of an episode that tell how large residuals are; how much the latest of them counts.
 _FEWEST_CHANGES, _LATEST = 5, 0.2
 # A variable that rests in more of the steps, such as a contact, is not held at an end as long as
@@ -78,8 +80,8 @@ def _extremes(known: Floats, new: Floats, close: Floats) -> tuple[Floats, Flags]
 def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntSettings) -> State:
     """Learn the model of observations (T + 1, m) and actions (T, a); NaN was not seen.
 
-    Outliers of the model ``known`` weigh less; jumps, and what is held at an end of a variable, are
-    left out.
+    Outliers of the model ``known`` weigh less, but for those that follow an action that was hardly
+    used; jumps, and what is held at an end of a variable, are left out.
     """
     phi, change, seen = model.rows_of(known, z, u)
     if not seen.any():
@@ -92,7 +94,9 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
     weight = np.where(jumped | held.any(1), 0.0, 1.0)
     if is_known:
         off = np.abs(rest) / np.maximum(state.scale, model.FLOOR * state.unit + 1e-300)
-        weight *= np.minimum(1.0, settings.outlier / np.maximum(off.max(1), 1e-12))
+        is_new = (used_at(u[1:], state.choices) & (state.used < settings.rare)).any((1, 2))
+        usual = np.minimum(1.0, settings.outlier / np.maximum(off.max(1), 1e-12))
+        weight *= np.where(is_new, 1.0, usual)
         free = ((after > known.lowest) & (after < known.highest)).all(1)
         ordinary = ((change >= state.least) & (change <= state.most)).all(1)
         rows = seen & free & ordinary
@@ -195,6 +199,12 @@ def told(
     return state._replace(
         squares=state.squares + phi.T @ (1.0 * phi), products=state.products + phi.T @ change
     )
+
+
+def used_at(u: Floats, choices: int) -> Flags:
+    """(T, a, 2) which numbers of actions (T, a) are near an end of their range."""
+    lowest = -1.0 if choices else -_NEAR_END
+    return np.stack([u < lowest, u > _NEAR_END], 2)
 
 
 def _held(state: State, to: Floats, after: Floats) -> Flags:

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from evofsm.guard.harm import OUTCOMES, SETTINGS
 from evofsm.guard.learnt import failure, model
 from evofsm.guard.learnt.failure import HELD, ONE, OTHER, SAYS, B, I, J, Survived
-from evofsm.guard.learnt.rollout import CRASHES, FAILS, Floats, Model, n_features, refuse_too_many
+from evofsm.guard.learnt.rollout import (
+    CRASHES,
+    DEAD,
+    FAILS,
+    Floats,
+    Model,
+    n_features,
+    refuse_too_many,
+)
 from evofsm.store import COUNT, FROM_1, SHARE, SIZE, SMALLEST, Kind, Numbers
 
 # What files hold of a field: observations, what is not negative, and ends that may be infinite.
@@ -67,6 +75,8 @@ class LearntSettings:
         missed more with them [ln(1 + square in typical steps)].
     outlier : float
         From so many scales on residuals weigh less (Huber 1964).
+    rare : int
+        But not of an action at an end of its range that was used less often.
     drift, drift_fade : float
         It moves otherwise from so much gained log likelihood on (Page 1954); of the latest episodes
         what is left an episode later.
@@ -112,6 +122,7 @@ class LearntSettings:
     lags: float = 10.0
     misled: float = 1.0
     outlier: float = 4.0
+    rare: int = 30
     drift: float = 30.0
     drift_fade: float = 0.95
     refused: float = 0.1
@@ -176,7 +187,7 @@ class State(NamedTuple):
     highest: Annotated[Floats, _BOUNDS.of(2, "m")]
     reached: Annotated[Floats, COUNT.of("m", 2)]  #: episodes that came to these ends by moving
     survived: Annotated[Floats, _SEEN.of("survived", "m")]
-    survived_in: Annotated[Floats, COUNT.of("survived")]  #: episode
+    proven: Annotated[Floats, COUNT.of("survived")]  #: 1 where it went on for long
     brinks: Annotated[Floats, _SEEN.of("brinks", "m")]  #: last observations before failure
     failures: Annotated[Floats, _SEEN.of("failures", "m")]
     ended: Annotated[Floats, _SEEN.of("ended", "m")]  #: where episodes ended without failing
@@ -190,6 +201,7 @@ class State(NamedTuple):
     centres: Annotated[Floats, _SEEN.of("dead_ends", "m")]
     radii: Annotated[Floats, _ABOVE_0.of("dead_ends")]
     counts: Annotated[Floats, _ABOVE_0.of("dead_ends")]
+    fatal: Annotated[Floats, _SEEN.of("fatal", "m")]  #: where what nothing survives began
     # disturbances
     windows: Annotated[Floats, _SEEN.of("windows", "steps", "seen")]  #: observations and actions
     lengths: Annotated[Floats, COUNT.of("windows")]
@@ -262,7 +274,7 @@ def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
     if daring:
         crash = table[:, SAYS] == CRASHES
         table = table.copy()
-        table[crash] = failure.halfway(table[crash], state.failures)
+        table[crash] = failure.nearer(table[crash], state.failures, 0.5)
     if state.held < (0 if daring else -settings.settled):
         table = failure.rivals(table, state.failures, sizes(state))
     return failure.prepared(table)
@@ -378,7 +390,7 @@ def unpacked(
             )
     forms, steps = state.forms, state.windows.shape[1]
     indices = forms[:, [SAYS, I, J]]
-    if ((indices != np.rint(indices)) | (indices < 0.0) | (indices >= [CRASHES + 1, m, m])).any():
+    if ((indices != np.rint(indices)) | (indices < 0.0) | (indices >= [DEAD + 1, m, m])).any():
         raise ValueError("forms are of variables that there are not")
     if (forms[:, [ONE, OTHER]] <= 0.0).any() or (forms[:, HELD] < 0.0).any():
         raise ValueError("forms have units that are not positive")

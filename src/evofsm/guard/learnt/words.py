@@ -31,7 +31,7 @@ from evofsm.fsm.validation import counted
 from evofsm.guard.harm import Harm
 from evofsm.guard.learnt import failure
 from evofsm.guard.learnt.failure import HELD, SAYS, I
-from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, Floats, Model
+from evofsm.guard.learnt.rollout import CRASHES, DEAD, ENDS, FAILS, Floats, Model
 from evofsm.guard.learnt.state import State, sizes
 
 #: Said as long as there is nothing to judge by.
@@ -50,7 +50,7 @@ _HARDER = 1.05
 # Of more dead ends, those from where most failed are counted.
 _ENDS_SHOWN = 3
 # What was seen in a form, by what it says.
-_WHAT = {FAILS: "failure", CRASHES: "failure", ENDS: "ending"}
+_WHAT = {FAILS: "failure", CRASHES: "failure", ENDS: "ending", DEAD: "time"}
 
 
 class Remembered(NamedTuple):
@@ -150,29 +150,31 @@ def no_threshold(n_failed: int, *, is_given: bool) -> str:
 
 def experience(state: State, remembered: Remembered, names: Sequence[str], nothing: str) -> str:
     """What was learnt so far; what is said of failure where that is not known is ``nothing``."""
-    there, ends = _where(state.forms, names)
+    there, ends, barred = _where(state.forms, names)
     latest = {int(j): int(since) + 1 for j, since, _ in state.drifts}
     more = "".join(f"; since episode {k} {names[j]} moves otherwise" for j, k in latest.items())
     if state.stride > 1:
         more += f"; it looks ahead in steps of {state.stride} decisions"
     if ends:
         more += f"; ends by itself {' or '.join(ends)}"
+    if barred:
+        more += f"; nothing survives what begins {' or '.join(barred)}"
     if not there:
         return nothing + more
     if state.differs:
         more += f"; failed= says otherwise in {state.differs:.1%} of the states around, where this "
         more += "decides"
     if state.held < 0:
-        tried, _ = _where(failure.rivals(state.forms, state.failures, sizes(state)), names)
+        tried, *_ = _where(failure.rivals(state.forms, state.failures, sizes(state)), names)
         more += "; much was refused without a failure: while it learns it tries whether it only "
         more += f"fails {' or '.join(tried)}"
     seen = f"{remembered}, to be survived by {changes(state.margin)}"
     return f"fails {' or '.join(there)}; {seen}{more}{dead_ends(state.counts.astype(int).tolist())}"
 
 
-def _where(table: Floats, names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Where it fails, and where it ends by itself, by a table of forms."""
-    said: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: []}
+def _where(table: Floats, names: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
+    """Where it fails, where it ends by itself, and where nothing survives what begins."""
+    said: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: [], DEAD: []}
     sides = []
     for row, is_side in zip(table, failure.are_sides(table), strict=True):
         told = region(names, row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])])
@@ -181,7 +183,8 @@ def _where(table: Floats, names: Sequence[str]) -> tuple[list[str], list[str]]:
         else:
             said[int(row[SAYS])].append(told)
     there = [f"where {' or '.join(sides)}"] if sides else []
-    return there + said[FAILS] + [f"if it ends {place}" for place in said[CRASHES]], said[ENDS]
+    there += said[FAILS] + [f"if it ends {place}" for place in said[CRASHES]]
+    return there, said[ENDS], said[DEAD]
 
 
 def here(
