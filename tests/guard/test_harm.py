@@ -190,3 +190,15 @@ def test_the_arm_that_is_better_is_drawn_ever_more_often():
                 harm = harm.after(driven, failed=after < 299.0)
                 guarded += drives
         assert least <= guarded / 800 <= most
+
+
+def test_a_controller_that_became_good_drives_on_alone_under_a_guard_that_always_fails():
+    harm, failed = Harm().after((30, 0, 29), failed=True), []
+    for episode in range(40):
+        drives = not harm.passing(learning=True)
+        driven = (30, 0, 0) if drives else (0, 5 if episode < 20 else 60, 0)
+        failed.append(drives or episode < 20)
+        harm = harm.after(driven, failed=failed[-1])
+    assert sum(failed[20:]) <= 3
+    assert not any(failed[24:])
+    assert not harm.helps

@@ -354,17 +354,8 @@ def coarser(state: State, settings: LearntSettings) -> State:
     learnt_anew = (
         *("squares", "products", "least", "most", "scale", "noise", "power"),
         *("recent_squares", "recent_products", "doubt", "since", "drifts", "misled"),
-        *(
-            "n_scanned",
-            "n_moves",
-            "centres",
-            "radii",
-            "counts",
-            "fatal",
-            "windows",
-            "lengths",
-            "seen_in",
-        ),
+        *("n_scanned", "n_moves", "centres", "radii", "counts", "fatal"),
+        *("windows", "lengths", "seen_in"),
         *("situations", "margin", "time_to_failure", "believed", "too_short", "horizon"),
     )
     return state._replace(

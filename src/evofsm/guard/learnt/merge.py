@@ -106,10 +106,8 @@ def merge(parts: Sequence[State], judge: LearntRisk) -> State:
         **{name: _average(of(name), moves) for name in ("unit", "power")},
         **{name: _average(of(name), moves * of("scale").any(1)) for name in ("scale", "noise")},
         **{name: rows(name, settings.max_failures) for name in ("failures", "brinks", "ended")},
-        **{
-            name: rows(name)
-            for name in ("centres", "radii", "counts", "fatal", "windows", "lengths")
-        },
+        **{name: rows(name) for name in ("centres", "radii", "counts", "fatal")},
+        **{name: rows(name) for name in ("windows", "lengths")},
         **{name: getattr(latest, name) for name in ("policies", "linear")},
         "n_episodes": n_episodes,
         "origin": first.origin,
