@@ -145,7 +145,7 @@ class Harm(NamedTuple):
             return "" if self.helps else "was not shown to help"
         if _all_failed(self.guarded):
             turn_is_over = all(outcome.guarded for outcome in self.outcomes[-_TURN:])
-            if turn_is_over or not _all_failed(self.alone[-1:], 1):
+            if turn_is_over or not _all_failed(self.alone, 1):
                 return "shadow"
             if _all_failed(self.alone) and len(self.guarded) < _TRIES:
                 return ""
