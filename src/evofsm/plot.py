@@ -22,6 +22,7 @@ from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Trace
 from evofsm.fsm.validation import check_index
 from evofsm.guard import Guard, LearntRisk
+from evofsm.guard.foresight import DATES
 from evofsm.guard.learnt.failure import HELD, SAYS, SIZE, I, J, distances, telling
 from evofsm.guard.learnt.rollout import FAILS
 
@@ -55,8 +56,6 @@ _DISCS, _TICKS = 20, 12
 _DARK, _WIDEST = 2, 1.6
 # Points on each side of the grid on which it is asked where a guard fails.
 _GRID = 300
-# Times from here on are dates [s].
-_DATES = 1e8
 
 # -- Of a model -----------------------------------------------------------------------------------
 
@@ -415,7 +414,7 @@ def history(
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
     fails, lasts = np.asarray(failed, np.bool_), np.ptp(when)
     unit, size = ("hours", 3600.0) if lasts > 7200.0 else ("minutes", 60.0)
-    steps, dated = np.diff(when), bool(when[0] >= _DATES)
+    steps, dated = np.diff(when), bool(when[0] >= DATES)
     unit, size = ("days", 86400.0) if lasts > 2e5 or dated else (unit, size)
     step = float(np.median(steps)) if len(steps) else 0.0
     holes = np.flatnonzero(steps > 3.0 * step) + 1  # before each a row without numbers ends lines

@@ -14,7 +14,7 @@ from evofsm.cli.options import picture
 from evofsm.cli.show import facts, print_json, show, table
 from evofsm.fsm import EvolvingFSM, Labels
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
-from evofsm.guard.foresight import RATES, Runs, false_times, span
+from evofsm.guard.foresight import DATES, RATES, Runs, false_times, span
 from evofsm.io import Chunk
 
 if TYPE_CHECKING:
@@ -27,8 +27,6 @@ RATE = 0.3
 LEARNT = 0.6
 # Alarms that are listed.
 _LISTED = 12
-#: Times from here on are dates [s].
-DATES = 1e8
 _CAME = ("ahead", "false/day")
 _HEADER = ("stated", "foreseen", *_CAME, "thresholds", *_CAME)
 

@@ -38,6 +38,8 @@ from evofsm.store import COUNT, FROM_1, SIZE, Kind, Numbers, Place
 
 #: False alarms a day that an alarm may be asked for, the fewest first.
 RATES = (0.1, 0.3, 1.0, 3.0)
+#: Times from here on are dates [s].
+DATES = 1e8
 # In horizons: how far ahead limits look, over what the rate is taken, how long an alarm stays on.
 _AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.125
 # Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts of a log.

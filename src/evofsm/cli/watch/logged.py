@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from evofsm.cli.foreseen import DATES, date, guard_where_nobody_acts
+from evofsm.cli.foreseen import date, guard_where_nobody_acts
 from evofsm.cli.learning import decided_on, episodes_read, guard_of_log, teach
 from evofsm.cli.options import BRAKES, TOLERANCE, Reading
 from evofsm.cli.show import progress, warn
@@ -19,6 +19,7 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.naming import Labels
 from evofsm.guard import Foresight, Guard
+from evofsm.guard.foresight import DATES
 from evofsm.io.logs import LONGEST_STEP, Chunk
 
 # Intervals of an action.

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli.foreseen import DATES
 from evofsm.cli.watch.shown import (
     CALM,
     OF_CARS,
@@ -64,6 +63,7 @@ from evofsm.guard import (
     Situation,
 )
 from evofsm.guard.actions import Action, Choices, change, is_usable, limits, put_into
+from evofsm.guard.foresight import DATES
 from evofsm.io import Chunk
 
 #: The state rule for looking on: coarse enough that each state can be told from the others.
