@@ -44,6 +44,8 @@ GROWN, SHRUNK = 1.0, 0.5
 _RESERVE = 0.01
 # What the distance to failure counts compared with the time survived.
 _DISTANCE, _FAR = 0.05, 0.05
+# Of a square, what rounding may add.
+_ROUNDED_UP = 1.0 + 1e-9
 # Halvings between a proposal and an action that passes.
 _HALVINGS = 4
 # Of two backups that last as long up to so much the first is taken.
@@ -277,9 +279,14 @@ def _measure(
     for s in range(len(model.dead_ends)):
         _from_centre(model, s, z, square)
         radius, worth = model.dead_ends[s, -2], model.dead_ends[s, -1]
-        for l in range(n):
-            left = (np.sqrt(square[l]) - radius) * worth + aside[s, l]
-            far[l] = left if left < far[l] else far[l]
+        nearer, typical = 0, 1.0 / worth
+        for l in range(n):  # most are farther away than what is nearest: a root less
+            within = max(far[l] * typical + radius, 0.0)
+            nearer += 1 if square[l] <= within * within * _ROUNDED_UP else 0
+        if nearer > 0:
+            for l in range(n):
+                left = (np.sqrt(square[l]) - radius) * worth + aside[s, l]
+                far[l] = left if left < far[l] else far[l]
 
 
 # -- A rollout ------------------------------------------------------------------------------------
