@@ -13,7 +13,7 @@ import numpy as np
 from evofsm.guard.learnt import danger, failure, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups, fitted
 from evofsm.guard.learnt.failure import SAYS
-from evofsm.guard.learnt.rollout import DEAD, Flags, Floats, Model, value_of
+from evofsm.guard.learnt.rollout import DEAD, FAILS, Flags, Floats, Model, value_of
 from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
 
 # Actions of an episode that says how a system moves, at least; situations from which on
@@ -106,7 +106,8 @@ def learn(
         state = state._replace(policies=policies, linear=linear)
     state = noted(state, safe, u, episode, settings, random)
     if "rivals" not in without and given.failed is None:
-        state = doubted(state, episode, settings)
+        tried = failure.inside(before.forms[before.forms[:, SAYS] == FAILS], safe, 0.0).any()
+        state = doubted(state, episode, settings, tried=bool(tried))
     refuted = 1 + np.flatnonzero(episode.lost[1 : max(1, len(safe) - state.horizon)])
     if len(refuted):
         state = motion.misled(state, safe, u, refuted, settings, failed=episode.failed)
@@ -141,10 +142,13 @@ def disturbance_scale(state: State, settings: LearntSettings) -> float:
     return 1.0 + min(most, settings.caution / max(1, state.n_scanned))
 
 
-def doubted(state: State, episode: Episode, settings: LearntSettings) -> State:
-    """Doubt forms that refused for long without a failure: rivals are tried (`failure.rivals`)."""
+def doubted(state: State, episode: Episode, settings: LearntSettings, *, tried: bool) -> State:
+    """Doubt forms that refused for long without a failure: rivals are tried (`failure.rivals`).
+
+    An episode speaks for rivals only if it was where they allow what forms refuse (``tried``).
+    """
     if state.held < 0:
-        return state._replace(held=state.held - (not episode.failed))
+        return state._replace(held=state.held - (tried and not episode.failed))
     much = episode.refused.sum() > settings.refused * len(episode.actions)
     held = state.held + bool(much and not episode.failed)
     patience = settings.patience * settings.again**state.wrong
