@@ -49,7 +49,7 @@ EXTREME = (-0.0, 5e-324, -1e-300, 1e-160, 1e-10, 150.0, -150.0, -1e3, 1e6, -1e18
 _FAR = 1e7
 # Numbers of a decision, in the order in which the program below writes them.
 NUMBERS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen", "left")
-CODES = (*("reason", "remark", "intake", "is_new", "state", "backup", "unsurvived", "backup_near"),)
+CODES = ("reason", "remark", "intake", "is_new", "state", "backup", "unsurvived")
 _MAIN = """#define _POSIX_C_SOURCE 199309L
 #include "evofsm.h"
 #include <stdio.h>
@@ -60,7 +60,7 @@ int main(void) {
   double row[ROW];
   evofsm_reset(&state);
   while (fread(row, sizeof row[0], ROW, stdin) == ROW) {
-    double numbers[17 + 2 * EVOFSM_ACTIONS] = {0.0};
+    double numbers[16 + 2 * EVOFSM_ACTIONS] = {0.0};
     evofsm_decision d = {0};
     struct timespec begin, end;
     int i;
@@ -75,10 +75,9 @@ int main(void) {
     numbers[5] = d.risk_high, numbers[6] = d.evidence, numbers[7] = d.seen, numbers[8] = d.left;
     numbers[9] = d.reason, numbers[10] = d.remark, numbers[11] = d.intake, numbers[12] = d.is_new;
     numbers[13] = d.state, numbers[14] = d.backup, numbers[15] = d.unsurvived;
-    numbers[16] = d.backup_near;
     for (i = 0; i < EVOFSM_ACTIONS; i++) {
-      numbers[17 + i] = d.executed[i];
-      numbers[17 + EVOFSM_ACTIONS + i] = d.advised[i];
+      numbers[16 + i] = d.executed[i];
+      numbers[16 + EVOFSM_ACTIONS + i] = d.advised[i];
     }
     fwrite(numbers, sizeof numbers[0], sizeof numbers / sizeof numbers[0], stdout);
   }
@@ -369,9 +368,9 @@ def compare(guard: Guard, program: Path, asked: Asked) -> Compared:
         found[:, 0],
         found[:, 1],
         found[:, 2:9],
-        found[:, 9:17].astype(int),
+        found[:, 9:16].astype(int),
     )
-    actions, taken = found[:, 17:], asked.codes[:, 0] == 0.0
+    actions, taken = found[:, 16:], asked.codes[:, 0] == 0.0
     # Squares are so large there that a last bit says which state is nearest.
     far = np.nan_to_num(np.abs(asked.rows), nan=0.0).max(1) > _FAR
     codes[far, 4], numbers[far, 5] = asked.codes[far, 2], asked.numbers[far, 5]
@@ -431,8 +430,6 @@ def _learnt(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str
     if kind == 0:
         return words.kept(backup, remembered, number["left"], allowed)
     why = words.refused(code["unsurvived"], remembered, judge.margin, judge.parts.scale, allowed)
-    if code["backup_near"] >= 0:
-        why = words.comes_near(judge.backup_text(code["backup_near"]))
     if kind == 1:
         return f"{why}; {words.changed(backup, remembered, judge.margin, allowed)}"
     if kind == 3 and code["passes"]:

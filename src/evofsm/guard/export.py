@@ -270,7 +270,6 @@ def _learnt(reviser: ActionReviser) -> Part:
         "half": risk.half,
     }
     most_rollouts = 2 * asked + max(few, rollout._HALVINGS) + 2 * few
-    most_rollouts += few * (len(model.dead_ends) > 0)
     about = (
         f"backups: {'; '.join(names)}\n"
         f"a decision: at most {most_rollouts} "

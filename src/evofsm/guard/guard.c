@@ -59,7 +59,6 @@ typedef struct {
   int state;                           /* from 0; -1: none is known */
   int backup;                          /* learnt: after which it passes, or lasts; -1: none */
   int unsurvived; /* learnt: disturbances not survived after the proposal; -1: not even none */
-  int backup_near; /* learnt: after which the proposal would pass but for a dead end; -1: none */
 } evofsm_decision;
 
 /* Of one stream of observations. Whoever calls owns it, and leaves what is in it alone; its size is
@@ -314,7 +313,7 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
   out->state = state->state;
   out->seen = state->seen;
   out->left = NAN;
-  out->backup = out->backup_near = -1;
+  out->backup = -1;
   out->unsurvived = 0;
   revise(state, out);
   out->is_new = out->seen < NEW;

@@ -69,10 +69,10 @@ def fails(
         state = state._replace(failures=np.vstack([state.failures, z[-1]])[-most:], brinks=brinks)
     if given is not None:
         return _asked(state, given, bends="regions" not in without)
-    return explained(state, failed=failed, bends="regions" not in without)
+    return explained(state, settings, failed=failed, bends="regions" not in without)
 
 
-def explained(state: State, *, failed: bool, bends: bool = True) -> State:
+def explained(state: State, settings: LearntSettings, *, failed: bool, bends: bool) -> State:
     """Explain all that failed or ended by forms, anew if it ``failed`` now."""
     known, table = sizes(state), state.forms
     if len(state.ended) >= _ENDED:
@@ -94,11 +94,24 @@ def explained(state: State, *, failed: bool, bends: bool = True) -> State:
     if bends and (failed or not is_told):
         rows = failure.explain(FAILS, failures, known, blur)
     rows[:, HELD] = failure.inside(rows, failures).sum(1)
+    state = state._replace(dropped=_dropped(state, was, rows, known, settings))
     forms = np.concatenate([ends, crashes, rows, table[table[:, SAYS] == DEAD]])
     if state.held < 0 and failed and not _foreseen(state, table, known):
         return state._replace(forms=forms, held=0, wrong=state.wrong + 1)
     changed = state.held >= 0 and (failed or _shape(was) != _shape(rows))
     return state._replace(forms=forms, held=0 if changed else state.held)
+
+
+def _dropped(
+    state: State, was: Floats, rows: Floats, known: Survived, settings: LearntSettings
+) -> Floats:
+    """(k, SIZE) thresholds that fewer forms took the place of, as long as nothing refutes them."""
+    sides, older = was[failure.are_sides(was)].copy(), state.dropped.copy()
+    sides[:, HELD] = settings.settled
+    older[:, HELD] -= 1.0
+    table = failure.without(np.concatenate([older[older[:, HELD] > 0.0], sides]), known.rows)
+    holds = failure.inside(table, state.failures).any(1)
+    return np.asarray(table[holds & ~(table[:, None, [I, B]] == rows[:, [I, B]]).all(2).any(1)])
 
 
 def _foreseen(state: State, table: Floats, known: Survived) -> bool:

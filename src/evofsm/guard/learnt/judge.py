@@ -48,7 +48,6 @@ from evofsm.guard.learnt.rollout import (
     pairs,
     rollout,
     search,
-    survives,
     value_of,
 )
 from evofsm.guard.learnt.state import (
@@ -223,15 +222,13 @@ class LearntRisk(ActionJudge):
         #: From an observation to whether it is a failure, if that was given.
         self.failed: Callable[[Floats], bool] | None = None
         self.harm = Harm()  #: how episodes ended, guarded and alone
-        self.n_violated = 0  #: certificates that were violated
         #: All that it has learnt, and what decides, made of it.
         stride = 1
         while steps is not None and steps > self.settings.horizon_max:
             steps, stride = -(-steps // 2), 2 * stride
-        blank = State.none(0, self.size, self.choices, self.settings, steps)
-        self.state = blank._replace(stride=stride)
-        if "margin" in self.without:
-            self.state = self.state._replace(margin=0.0)
+        self.state = State.none(0, self.size, self.choices, self.settings, steps)
+        margin = 0.0 if "margin" in self.without else self.state.margin
+        self.state = self.state._replace(stride=stride, margin=margin)
         self.parts: Parts | None = None
         self._forget()
 
@@ -353,13 +350,6 @@ class LearntRisk(ActionJudge):
         if not self._refused:
             return Search(options, judged, 0, words.kept(backup, remembered, left, allowed))
         why = words.refused(self._unsurvived, remembered, margin, scale, allowed)
-        if not cut and len(model.dead_ends):
-            free = model._replace(dead_ends=model.dead_ends[:0])
-            for q in ranks:
-                given = free, here, policies[q], parts.residuals, scale, proposal, margin, allowed
-                if survives(*given)[0]:
-                    why = words.comes_near(self.backup_text(q, policies))
-                    break
         if passes:
             instead = words.changed(backup, remembered, margin, allowed)
         elif tried is not None:
@@ -555,7 +545,6 @@ class LearntRisk(ActionJudge):
         """Take in what was executed, and whether the certificate of before still held."""
         if "margin" not in self.without and self.parts is not None:
             violated = self._certified and not self._holds
-            self.n_violated += violated
             s = self.settings
             margin = self.state.margin + s.margin_step * (violated - s.violation_rate)
             self.state = self.state._replace(margin=min(s.margin_max, max(s.margin_step, margin)))
@@ -696,7 +685,6 @@ class LearntRisk(ActionJudge):
         """A few sums that whatever is learnt changes."""
         return {
             "margin": self.margin,
-            "violated": float(self.n_violated),
             "backups": float(self.state.policies.sum()),
             "disturbances": float(self.state.windows.sum()),
             "harm": self.harm.kept + self.harm.n_episodes,
@@ -706,7 +694,7 @@ class LearntRisk(ActionJudge):
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
         numbers, arrays = packed(self.state)
         settings = {
-            **{name: getattr(self, name) for name in ("dt", "seed", "given_horizon", "n_violated")},
+            **{name: getattr(self, name) for name in ("dt", "seed", "given_horizon")},
             **{name: getattr(self, name).tolist() for name in ("low", "high")},
             **{name: list(getattr(self.labels, name)) for name in ("names", "units")},
             "n_actions": self.choices or None,
@@ -732,7 +720,6 @@ class LearntRisk(ActionJudge):
             of = judge.choices, judge.size, judge.settings
             judge.state = unpacked(settings["state"], arrays, *of)
             judge.harm = Harm.restored(settings["harm"], arrays["harm"])
-            judge.n_violated = settings["n_violated"]
             judge.remake()
         return judge
 

@@ -70,7 +70,6 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     merged.start_episode(learn=False)
     if len(told) > 1:
         merged.state = merge([judge.state for judge in told], merged)
-        merged.n_violated = sum(judge.n_violated for judge in told)
         merged.harm = Harm.merged([judge.harm for judge in told])
         merged.remake()
     return merged
@@ -131,7 +130,7 @@ def merge(parts: Sequence[State], judge: LearntRisk) -> State:
     no_rows = merged.survived[:0]
     nothing = Episode(no_rows, no_rows, False, False, no_rows, no_rows, no_rows, 0.0)
     if judge.failed is None:
-        merged = explained(merged, failed=True, bends="regions" not in judge.without)
+        merged = explained(merged, settings, failed=True, bends="regions" not in judge.without)
     else:
         merged = fails(merged, no_rows, nothing, settings, judge.without, judge.failed)
     merged = merged._replace(held=int(min(0, of("held").max())))  # doubted is what all doubt

@@ -10,7 +10,6 @@
   int n_past, is_placed;         /* how many there are; and whether one knows where one is now */
   int ranks[EVOFSM_BACKUPS];     /* backups, those first that passed last */
   int done;                      /* steps of rollouts in this search */
-  int ignores;                   /* whether dead ends do not count */
   /* Room of a rollout. */
   double z[EVOFSM_VARIABLES][EVOFSM_LANES], change[EVOFSM_VARIABLES][EVOFSM_LANES];
   double move[EVOFSM_VARIABLES][EVOFSM_LANES];
@@ -202,7 +201,7 @@ static void measure(evofsm_state *s) {
     }
   }
 #if EVOFSM_DEAD_ENDS > 0
-  for (f = 0; f < (s->ignores ? 0 : EVOFSM_DEAD_ENDS); f++) {
+  for (f = 0; f < EVOFSM_DEAD_ENDS; f++) {
     from_centre(s, f);
     for (l = 0; l < L; l++) {
       const double off = sqrt(s->square[l]) - dead_ends[f][M];
@@ -430,18 +429,6 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
   return EVOFSM_NOTHING_PASSES;
 }
 
-/* passes_without: the backup after which a proposal passes if dead ends do not count; -1: none. */
-static int passes_without(evofsm_state *s, const double proposal[A]) {
-  double left;
-  int r, after = -1;
-  s->ignores = 1;
-  for (r = 0; r < ASKED && after < 0; r++) {
-    after = passes(s, proposal, s->ranks[r], &left) ? s->ranks[r] : -1;
-  }
-  s->ignores = 0;
-  return after;
-}
-
 /* -- The judge: LearntRisk ---------------------------------------------------------------------- */
 
 /* _foresee: disturbances not survived after an action, under the best of some backups; -1: it fails
@@ -492,7 +479,6 @@ static void forget(evofsm_state *s) {
   for (i = 0; i < EVOFSM_BACKUPS; i++) {
     s->ranks[i] = i;
   }
-  s->ignores = 0;
 }
 
 static void start_revising(evofsm_state *s) { (void)s; }
@@ -511,9 +497,6 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   }
   encode(s->proposal, proposal);
   out->reason = search(s, proposal, action, &out->backup, &out->left);
-  if (EVOFSM_DEAD_ENDS > 0 && out->reason != EVOFSM_KEPT && out->reason != EVOFSM_CUT_SHORT) {
-    out->backup_near = passes_without(s, proposal);
-  }
   for (r = 0; s->ranks[r] != out->backup; r++) { /* at most EVOFSM_BACKUPS: it is one of them */
   }
   for (; r > 0; r--) { /* what passed now is asked first the next time */

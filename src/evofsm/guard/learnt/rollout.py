@@ -278,15 +278,13 @@ def _measure(
                 far[l] = square[l] if square[l] < far[l] else far[l]
     for s in range(len(model.dead_ends)):
         _from_centre(model, s, z, square)
-        radius, worth = model.dead_ends[s, -2], model.dead_ends[s, -1]
-        nearer, typical = 0, 1.0 / worth
+        radius, worth, nearer = model.dead_ends[s, -2], model.dead_ends[s, -1], 0
         for l in range(n):  # most are farther away than what is nearest: a root less
-            within = max(far[l] * typical + radius, 0.0)
+            within = max(far[l] / worth + radius, 0.0)
             nearer += 1 if square[l] <= within * within * _ROUNDED_UP else 0
-        if nearer > 0:
-            for l in range(n):
-                left = (np.sqrt(square[l]) - radius) * worth + aside[s, l]
-                far[l] = left if left < far[l] else far[l]
+        for l in range(n if nearer > 0 else 0):
+            left = (np.sqrt(square[l]) - radius) * worth + aside[s, l]
+            far[l] = left if left < far[l] else far[l]
 
 
 # -- A rollout ------------------------------------------------------------------------------------

@@ -83,7 +83,8 @@ class LearntSettings:
     refused, patience, again, settled : float
         What refuses more than this share of proposals, in so many episodes without failure, is
         doubted: while it learns its smallest rival is tried, ``again`` times as late each time that
-        was wrong. After so many episodes of it without failure it counts, also frozen.
+        was wrong. After so many episodes without failure in which it was tried it counts, also
+        frozen; so long thresholds count, frozen, that fewer forms took the place of.
     work, work_rate : float
         Products in the rollouts of a decision at most: altogether, and in a second of the interval.
 
@@ -192,6 +193,8 @@ class State(NamedTuple):
     failures: Annotated[Floats, _SEEN.of("failures", "m")]
     ended: Annotated[Floats, _SEEN.of("ended", "m")]  #: where episodes ended without failing
     forms: Annotated[Floats, Numbers(("forms", failure.SIZE))]  #: where it fails or ends
+    #: thresholds that fewer forms took the place of; `failure.HELD`: for so many episodes more
+    dropped: Annotated[Floats, Numbers(("dropped", failure.SIZE))]
     differs: Annotated[float, SHARE]  #: of what was asked, where a given function says otherwise
     #: episodes without failure in which much was refused; below 0 those of doubt
     held: Annotated[int, COUNT._replace(least=-COUNT.most)]
@@ -277,6 +280,8 @@ def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
         table[crash] = failure.nearer(table[crash], state.failures, 0.5)
     if state.held < (0 if daring else -settings.settled):
         table = failure.rivals(table, state.failures, sizes(state))
+    if not daring:
+        table = np.concatenate([table, state.dropped])
     return failure.prepared(table)
 
 
@@ -347,7 +352,7 @@ KIND = Kind(
         "given_horizon": SIZE._replace(optional=True),
         "n_actions": FROM_1._replace(optional=True),
         **dict.fromkeys(("low", "high"), Numbers(("ends",), -1e100, 1e100)),
-        **dict.fromkeys(("seed", "n_violated"), COUNT),
+        "seed": COUNT,
         **dict.fromkeys(("names", "units", "without"), list[str]),
         "harm": SETTINGS,
         "settings": {name: _SETTING[kind] for name, kind in get_type_hints(LearntSettings).items()},
@@ -388,7 +393,7 @@ def unpacked(
             raise ValueError(
                 f"{name} has shape {shape}, not one of {m} variables and actions of {a} numbers"
             )
-    forms, steps = state.forms, state.windows.shape[1]
+    forms, steps = np.concatenate([state.forms, state.dropped]), state.windows.shape[1]
     indices = forms[:, [SAYS, I, J]]
     if ((indices != np.rint(indices)) | (indices < 0.0) | (indices >= [DEAD + 1, m, m])).any():
         raise ValueError("forms are of variables that there are not")

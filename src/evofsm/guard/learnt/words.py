@@ -12,9 +12,6 @@ Examples
 'then always -2.5 survives all 10 disturbances remembered from 305 s, by 0.4 typical steps'
 >>> refused(2, ten, 0.4, 1.0)
 'no backup survives 2 of the 10 disturbances remembered from 305 s'
->>> refused(0, Remembered(1, 12.3), 1.0, 1.3)
-'no backup survives the 1 disturbance remembered from 12 s by the margin of 1 typical step, \
-were they 1.3 times as hard'
 >>> dead_ends([1, 3])
 '; 2 dead ends: 3 and 1 episodes that had been certified failed from there'
 """
@@ -99,14 +96,6 @@ def alone(why: str) -> str:
     return why.replace("no backup prevents failure", "it fails")
 
 
-def comes_near(backup: str) -> str:
-    """Why an action is dangerous that passes but for a dead end."""
-    return (
-        f"then {backup} would come near a dead end, from where episodes that had been certified "
-        "failed"
-    )
-
-
 def dead_ends(counts: Sequence[int]) -> str:
     """How many there are, those first from where most failed; empty without any."""
     if not counts:
@@ -168,6 +157,9 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
         tried, *_ = _where(failure.rivals(state.forms, state.failures, sizes(state)), names)
         more += "; much was refused without a failure: while it learns it tries whether it only "
         more += f"fails {' or '.join(tried)}"
+    if len(state.dropped):
+        until, *_ = _where(state.dropped, names)
+        more += f"; frozen it refuses, too, {until[0]}, as what took its place is new"
     seen = f"{remembered}, to be survived by {changes(state.margin)}"
     return f"fails {' or '.join(there)}; {seen}{more}{dead_ends(state.counts.astype(int).tolist())}"
 
