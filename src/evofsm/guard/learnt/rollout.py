@@ -39,7 +39,7 @@ FAILS, ENDS, CRASHES, DEAD = 0, 1, 2, 3
 FLAT = 1e-300
 #: Bent forms of failure reach so much farther than they were learnt, and where it ends by itself
 #: begins so much farther in [typical steps].
-GROWN, SHRUNK = 1.0, 0.5
+GROWN, SHRUNK = 2.0, 0.5
 # So much of half the range of actions a backup leaves unused for each typical step of margin.
 _RESERVE = 0.01
 # What the distance to failure counts compared with the time survived.
