@@ -193,7 +193,7 @@ class State(NamedTuple):
     failures: Annotated[Floats, _SEEN.of("failures", "m")]
     ended: Annotated[Floats, _SEEN.of("ended", "m")]  #: where episodes ended without failing
     forms: Annotated[Floats, Numbers(("forms", failure.SIZE))]  #: where it fails or ends
-    #: thresholds that fewer forms took the place of; `failure.HELD`: for so many episodes more
+    #: thresholds that fewer forms took the place of, for so many episodes more (``HELD``)
     dropped: Annotated[Floats, Numbers(("dropped", failure.SIZE))]
     differs: Annotated[float, SHARE]  #: of what was asked, where a given function says otherwise
     #: episodes without failure in which much was refused; below 0 those of doubt
