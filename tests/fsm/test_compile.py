@@ -98,5 +98,6 @@ def test_who_is_warm_compiles_no_more():
 
 @pytest.mark.slow
 def test_without_a_compiler_all_runs_in_python():
+    """As projects set it for their tests, to debug or to measure coverage."""
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     subprocess.run([sys.executable, "-W", "error", "-c", WARMED], env=environment, check=True)

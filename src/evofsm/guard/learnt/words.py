@@ -12,6 +12,9 @@ Examples
 'then always -2.5 survives all 10 disturbances remembered from 305 s, by 0.4 typical steps'
 >>> refused(2, ten, 0.4, 1.0)
 'no backup survives 2 of the 10 disturbances remembered from 305 s'
+>>> refused(0, Remembered(1, 12.3), 1.0, 1.3)
+'no backup survives the 1 disturbance remembered from 12 s by the margin of 1 typical step, \
+were they 1.3 times as hard'
 >>> dead_ends([1, 3])
 '; 2 dead ends: 3 and 1 episodes that had been certified failed from there'
 """
