@@ -96,6 +96,7 @@ def test_a_guard_that_saves_drives_nearly_always(wrong):
     rows = drive(guard, 40)
     assert sum(row == (60, "") for row in rows[1:]) >= 37
     assert "in shadow where in doubt" in str(guard)
+    assert "failures: 1 (0 of the latest 20 guarded), states" in str(guard)
     assert "it refuses nearly everything: 0% of proposals pass; that is no filter" in str(guard)
 
 
@@ -202,3 +203,18 @@ def test_a_controller_that_became_good_drives_on_alone_under_a_guard_that_always
     assert sum(failed[20:]) <= 3
     assert not any(failed[24:])
     assert not harm.helps
+
+
+@pytest.mark.parametrize(("how", "least", "most"), [("e", 20, 60), ("", 0, 8)])
+def test_a_good_controller_that_is_kept_from_its_goal_is_tried(how, least, most):
+    """It was careless for 40 episodes; under the guard it hovers. Nobody hopes for the unseen."""
+    for seed in range(5):
+        harm, alone = arms([(40, how, None)], [(30, "f", None)] * (3 + seed)), 0
+        for episode in range(100):
+            drives = not harm.passing(learning=True)
+            driven = (60, 0, 30) if drives else (0, 40, 0)
+            fails = not drives and episode < 40
+            ends = not drives and not fails and how == "e"
+            harm = harm.after(driven, failed=fails, ended=ends)
+            alone += not drives and episode >= 40
+        assert least <= alone <= most

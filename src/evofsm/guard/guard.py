@@ -821,10 +821,13 @@ class Guard:
             how += f", tolerance {self.reviser.tolerance:g}, mode {self.reviser.mode.value}"
             if self.reviser.risk is self._observing and (self._learn or not self.shadow):
                 how += ", in shadow where in doubt" if self.shadow else ", harm is not noticed"
+        latest = [] if self._observing is None else self._observing.harm.guarded
+        of_late = f" ({sum(o.failed for o in latest)} of the latest {len(latest)} guarded)"
         lines = [
             f"{type(self).__name__} of {span}, each {self.interval:g} s",
             f"judge: {'none' if judge is None else type(judge).__name__} ({how})",
-            f"episodes: {self.n_episodes}, failures: {self.n_failed}, states: "
+            f"episodes: {self.n_episodes}, failures: {self.n_failed}"
+            f"{of_late if latest else ''}, states: "
             f"{0 if self.machine is None else self.machine.n_states}, "
             f"frozen: {'no' if self._learn else 'yes'}",
         ]

@@ -13,11 +13,12 @@ episodes the better one is found by rank, which assumes nothing about how failur
 While it learns, who drives an episode is drawn by Thompson sampling with a Bayesian bootstrap
 (Eckles & Kaptein 2014): each episode of an arm gets a random weight, of the gamma distribution, and
 the guard drives if then it wins no fewer pairs than it loses. What is older weighs less, as guards
-and controllers change. Each arm begins with a part of an episode that ended well, so that it is
-tried. The controller drives alone, in *shadow*, only where that costs little: after an episode that
-failed, where it does better by what is known, or every tenth time, as it may have become better;
-and in the first case three draws have to agree, unless the latest three guarded episodes failed, or
-less than three are known of the controller alone.
+change, and of the controller alone much less, as it may be another one by now. Each arm begins with
+a part of an episode that did not fail, and ended by itself if any did, so that it is tried. The
+controller drives alone, in *shadow*, only where that costs little: after an episode that failed,
+where it does better by what is known, or every tenth time, as it may have become better; and in the
+first case three draws have to agree, unless the latest three guarded episodes failed, or less than
+three are known of the controller alone.
 
 A guard of which the latest three episodes failed may stand before a controller that became good:
 then the controller drives until it fails, and after two guarded episodes at the latest. If its own
@@ -41,9 +42,9 @@ from numpy.typing import NDArray
 from evofsm.store import COUNT, Numbers
 
 # Episodes of each arm that are kept, the latest; what is left of the weight of one an episode
-# later; and the weights of those that ended well, with which guarded and alone begin: who drives
-# alone until the first refusal is known already.
-_KEPT, _FADES, _HOPES = 20, 0.98, (0.5, 0.25)
+# later, alone and guarded; and the weights of those that ended well, with which guarded and alone
+# begin: who drives alone until the first refusal is known already.
+_KEPT, _FADES, _HOPES = 20, (0.9, 0.98), (0.5, 0.25)
 # So many episodes after the latest of the controller alone one is drawn, and then as often.
 _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
@@ -81,9 +82,9 @@ OUTCOMES = Numbers().of("h", 7)
 SETTINGS = {
     "n_episodes": COUNT,
     "refuses": bool,
+    "ends": bool,
     **dict.fromkeys(("decided", "kept"), Numbers(least=0.0, most=COUNT.most)),
 }
-_WELL = Outcome(0, _FOREVER, failed=False, guarded=False, ended=True)
 
 
 class Harm(NamedTuple):
@@ -92,6 +93,7 @@ class Harm(NamedTuple):
     outcomes: tuple[Outcome, ...] = ()
     n_episodes: int = 0
     refuses: bool = False  #: whether anything was refused yet: before, it is no guard
+    ends: bool = False  #: whether an episode ever ended by itself, without failing
     decided: float = 0.0  #: decisions of late in which it could refuse
     kept: float = 0.0  #: and of these proposals that were kept
 
@@ -127,7 +129,8 @@ class Harm(NamedTuple):
 
         The same for the same record.
         """
-        arms = [[*self.guarded, _WELL], [*self.alone, _WELL]]
+        well = Outcome(0, _FOREVER, failed=False, guarded=False, ended=self.ends)
+        arms = [[*self.guarded, well], [*self.alone, well]]
         random = np.random.default_rng([self.n_episodes, draws])
         guarded, alone = (
             random.gamma(np.append(self._weights(arm[:-1]), hope), size=(draws, len(arm)))
@@ -137,7 +140,8 @@ class Harm(NamedTuple):
         return float((won >= 0.0).mean())
 
     def _weights(self, outcomes: Sequence[Outcome]) -> NDArray[np.float64]:
-        return _FADES ** np.array([self.n_episodes - o.episode for o in outcomes], np.float64)
+        weights = [_FADES[o.guarded] ** (self.n_episodes - o.episode) for o in outcomes]
+        return np.array(weights, np.float64)
 
     def passing(self, *, learning: bool) -> str:
         """Why proposals pass in the episode to come; empty where they are revised."""
@@ -202,8 +206,8 @@ class Harm(NamedTuple):
             newest = part.alone[-kept:] + part.guarded[-kept:]
             outcomes += (o._replace(episode=o.episode + n_episodes) for o in newest)
             n_episodes += part.n_episodes
-        refuses = any(part.refuses for part in parts)
-        return cls(tuple(sorted(outcomes, key=lambda o: o.episode)), n_episodes, refuses)
+        known = any(part.refuses for part in parts), any(part.ends for part in parts)
+        return cls(tuple(sorted(outcomes, key=lambda o: o.episode)), n_episodes, *known)
 
     def after(
         self,
@@ -221,7 +225,9 @@ class Harm(NamedTuple):
         """
         acted, watched, kept = driven
         refuses, n = self.refuses or kept < acted, self.n_episodes + 1
-        now, fades = self._replace(n_episodes=n, refuses=refuses), math.exp(-acted / _DECISIONS)
+        ends = self.ends or (ended and not failed)
+        now = self._replace(n_episodes=n, refuses=refuses, ends=ends)
+        fades = math.exp(-acted / _DECISIONS)
         if refuses:
             now = now._replace(decided=fades * self.decided + acted, kept=fades * self.kept + kept)
         if bool(acted) == bool(watched):

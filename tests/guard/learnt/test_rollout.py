@@ -68,6 +68,9 @@ def random_model(draw, m, a, choices):
             [
                 [ENDS, 0.0, 2.0, -0.2, 0.3, 2.0, 0.5, 0.6, -0.9, 0.3, 0.1, 0.0, 0.0],
                 [CRASHES, 1.0, 1.0, 0.9, 0.0, 3.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
+                [ENDS, 0.0, 0.0, -0.7, 0.0, 2.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0],
+                [ENDS, 1.0, 1.0, 1.4, 0.0, 2.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
+                [CRASHES, 0.0, 0.0, 0.1, 0.0, 3.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0],
                 [FAILS, 1.0, m - 1.0, 1.5, -0.2, 2.0, 0.5, 1.0, 0.3, 0.1, -0.9, 0.4, -1.2],
                 side(0, 1.0, 0.7, 0.5),
                 side(m - 1, -1.0, -1.5, 2.0),
@@ -95,6 +98,18 @@ def nearest(form, z):
     return says, far - GROWN * (says == FAILS and any([p, q, r]))
 
 
+def crashes(said):
+    """How far it is to crash, each in the ends that stand before it."""
+    last, is_new = np.inf, True
+    for says, far in said:
+        if says == ENDS:
+            last, is_new = far if is_new else min(last, far), False
+        else:
+            is_new = True
+            if says == CRASHES:
+                yield max(last - GROWN, far)
+
+
 def from_dead_end(model, row, z):
     """How far an observation is from a dead end."""
     *centre, radius, worth = row
@@ -116,7 +131,7 @@ def plainly(model, situation, plan, policy, residuals, k, scale):
         said = [nearest(form, z) for form in model.forms]
         end = min((far for says, far in said if says == ENDS), default=np.inf)
         near = min([near, *(far for says, far in said if says == FAILS)])
-        near = min([near, *(max(end - GROWN, far) for says, far in said if says == CRASHES)])
+        near = min([near, *crashes(said)])
         near = min([near, *(from_dead_end(model, row, z) for row in dead_ends)])
         if near < 0.0:
             return t, near

@@ -1,8 +1,8 @@
 """Where a system fails, or ends by itself: the fewest forms that hold what failed and nothing else.
 
 A form is a row of a table. It says something of where it is above 0: that it fails there, that an
-episode ends by itself there, or that it fails if it ends (`FAILS`, `ENDS`, `CRASHES`). It is linear
-or quadratic in at most two variables.
+episode ends by itself there, or that it fails if it ends there (`FAILS`, `ENDS`, and `CRASHES` of
+the ends just before it). It is linear or quadratic in at most two variables.
 
 *Sides* of the box of what was survived are tried first, and what they leave is told by *bent*
 forms: ridge logistic regressions of what failed against what was survived, made so small that what
@@ -96,11 +96,11 @@ def telling(table: Floats) -> list[int]:
 
 
 def prepared(table: Floats) -> Floats:
-    """(r, 13) forms as kernels take them: what ends first, and linear ones with a gradient of 1.
+    """(r, 13) forms as kernels take them: linear ones with a gradient of 1.
 
     Those of two variables that say it fails are `GROWN` as bent ones are.
     """
-    rows = table[np.argsort(table[:, SAYS] == CRASHES, kind="stable"), :HELD].copy()
+    rows = table[:, :HELD].copy()
     flat = (rows[:, P:HELD] == 0.0).all(1)
     length = np.hypot(rows[:, B], rows[:, D])
     rows[flat, C : D + 1] /= np.where(length > 0.0, length, 1.0)[flat, None]

@@ -16,7 +16,7 @@
   double before[EVOFSM_NUMBERS][EVOFSM_LANES], now[EVOFSM_NUMBERS][EVOFSM_LANES];
   double found[EVOFSM_FEATURES][EVOFSM_LANES];
   double near[EVOFSM_LANES], far[EVOFSM_LANES], value[EVOFSM_LANES], worth[EVOFSM_LANES];
-  double over[EVOFSM_LANES], square[EVOFSM_LANES];
+  double over[EVOFSM_LANES], last[EVOFSM_LANES], square[EVOFSM_LANES];
   int survived[EVOFSM_LANES];
 #if EVOFSM_DEAD_ENDS > 0
   double aside[EVOFSM_DEAD_ENDS][EVOFSM_LANES];
@@ -170,7 +170,7 @@ static void from_centre(evofsm_state *s, int end) {
 static void measure(evofsm_state *s) {
   int f, l;
   for (l = 0; l < L; l++) {
-    s->far[l] = s->over[l] = INFINITY;
+    s->far[l] = s->over[l] = s->last[l] = INFINITY;
   }
   for (f = 0; f < FORMS; f++) {
     const double says = forms[f][0], *z = s->z[(int)forms[f][1]], *other_z = s->z[(int)forms[f][2]];
@@ -191,10 +191,12 @@ static void measure(evofsm_state *s) {
       }
     }
     for (l = 0; l < L; l++) {
-      if (says == ENDS) {
+      if (says == ENDS) { /* what crashes there follows it */
+        const int is_first = f == 0 || forms[f - 1][0] != ENDS;
+        s->last[l] = is_first || s->square[l] < s->last[l] ? s->square[l] : s->last[l];
         s->over[l] = s->square[l] < s->over[l] ? s->square[l] : s->over[l];
       } else {
-        const double crash = greater(s->over[l] - GROWN, s->square[l]);
+        const double crash = greater(s->last[l] - GROWN, s->square[l]);
         const double left = says == CRASHES ? crash : s->square[l];
         s->far[l] = left < s->far[l] ? left : s->far[l];
       }

@@ -241,18 +241,19 @@ def _from_centre(model: Model, s: int, z: Floats, square: Floats) -> None:
 
 @spliced_kernel
 def _measure(
-    model: Model, z: Floats, aside: Floats, square: Floats, far: Floats, over: Floats
+    model: Model, z: Floats, aside: Floats, square: Floats, last: Floats, far: Floats, over: Floats
 ) -> None:
     """The distance of each of n observations (m, n) to the nearest failure, into ``far`` (n,).
 
-    And to where it ends by itself, into ``over``: there it also fails if it crashes. Distances to
-    bent forms are of first order; their boundary touches what was survived in one place and lies
-    beyond the truth elsewhere, so they are `GROWN`. Dead ends of (k, n) that are set ``aside`` are
-    infinitely far. ``square`` (n,) is overwritten.
+    And to where it ends by itself, into ``over``: there it also fails if it crashes, as said by the
+    forms that follow those of the end. Distances to bent forms are of first order; their boundary
+    touches what was survived in one place and lies beyond the truth elsewhere, so they are `GROWN`.
+    Dead ends of (k, n) that are set ``aside`` are infinitely far. ``square`` and ``last`` (n,) are
+    overwritten.
     """
     n = len(far)
     for l in range(n):
-        far[l] = over[l] = np.inf
+        far[l] = over[l] = last[l] = np.inf
     for s in range(len(model.forms)):
         says, i, j = model.forms[s, 0], int(model.forms[s, 1]), int(model.forms[s, 2])
         at, to, inv_x, inv_y = model.forms[s, 3:7]
@@ -268,12 +269,14 @@ def _measure(
                 u, v = b + 2.0 * p * x + q * y, d + 2.0 * r * y + q * x
                 square[l] = -form / np.sqrt(u * u + v * v + FLAT) - grown
         if says == ENDS:
+            is_first = s == 0 or model.forms[s - 1, 0] != ENDS
             for l in range(n):
+                last[l] = square[l] if is_first or square[l] < last[l] else last[l]
                 over[l] = square[l] if square[l] < over[l] else over[l]
         else:
             if says == CRASHES:
                 for l in range(n):
-                    square[l] = max(over[l] - GROWN, square[l])
+                    square[l] = max(last[l] - GROWN, square[l])
             for l in range(n):
                 far[l] = square[l] if square[l] < far[l] else far[l]
     for s in range(len(model.dead_ends)):
@@ -318,7 +321,8 @@ def _rollout(
     z, change, move = np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
     before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
     column, survived = np.empty(n, np.int64), np.empty(n, np.int64)
-    near, far, square, over = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    near, far, square = np.empty(n), np.empty(n), np.empty(n)
+    over, last = np.empty(n), np.empty(n)
     aside = np.empty((len(model.dead_ends), n))
     for l in range(n):
         start = l // n_disturbances if l < count else 0
@@ -359,7 +363,7 @@ def _rollout(
         for i in range(a):
             for l in range(n):
                 before[i, l] = action[i, l]
-        _measure(model, z, aside, square, far, over)
+        _measure(model, z, aside, square, last, far, over)
         fails = 0
         for l in range(n):
             nearer = far[l] if far[l] < near[l] else near[l]
