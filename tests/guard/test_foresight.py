@@ -52,19 +52,22 @@ def test_where_one_limit_depends_on_another_it_foresees_more_than_thresholds(sur
     ours, thresholds = (surge.tally(then, rate, plain=plain)[0] for plain in (None, True))
     assert ours.foreseen == ours.failures > 10
     assert ours.lead > thresholds.lead + DT
-    assert ours.rate < 2.0
+    assert ours.rate < 3.0
     assert re.search(r"0\.\d+ flow above 0\.\d+", surge.told_by_experience)
 
 
-def test_an_alarm_for_more_false_ones_is_no_worse_where_it_learnt(surge):
+def test_as_few_are_false_as_stated_cross_validated_and_more_warn_no_later(surge):
     log = Runs.of(*log_of(surging, 0, 40))
-    for plain in (False, True):
-        came = [surge.tally(log, rate, plain=plain)[0] for rate in range(len(RATES))]
-        assert [x.foreseen for x in came] == sorted(x.foreseen for x in came)
-        assert [x.lead for x in came] == sorted(x.lead for x in came)
-        for rate in range(len(RATES)):
-            of = surge.of_rate(rate, plain=plain)[:, 2:5].tolist()
-            assert len({*map(tuple, of)}) == len(of) > 0  # no part of it implies another one
+    right, false, failures, _ = surge.held_out.T
+    days = len(log.rows) * DT / 86400.0
+    assert (false <= np.multiply(RATES, days) + 2.0 * np.sqrt(np.multiply(RATES, days)) + 1).all()
+    assert sorted(false) == list(false)
+    assert (failures == sum(log.failed)).all()
+    came = [surge.tally(log, rate)[0].foreseen for rate in range(len(RATES))]
+    assert right[-1] - 4 <= came[-1]  # the alarm that it tells of, not another
+    for rate in range(len(RATES)):
+        of = surge.of_rate(rate)[:, 2:5].tolist()
+        assert len({*map(tuple, of)}) == len(of)  # no part of it implies another one
 
 
 def test_a_warning_of_one_row_is_found_where_the_horizon_is_long():
@@ -74,7 +77,7 @@ def test_a_warning_of_one_row_is_found_where_the_horizon_is_long():
     told, _ = judge.tally(Runs.of(runs, [True] * 12), 0, plain=True)
     assert told.foreseen > 8
     assert told.false == 0
-    assert judge.told_by_experience.count("plain thresholds do as well") == 1  # said once
+    assert "plain thresholds do as well: variable 1 above 5.3" in judge.told_by_experience
 
 
 def test_one_failure_is_learnt_from_and_no_later_tolerance_silences_an_alarm(surge):
@@ -83,8 +86,8 @@ def test_one_failure_is_learnt_from_and_no_later_tolerance_silences_an_alarm(sur
         one = Foresight.learn_log(runs, [run.max() == 1.0 for run in runs], dt=DT)
         assert one.rate_of(0.01) is None  # cross-validated it was never right
     judge = copy.deepcopy(surge)
-    for right in ([4, 4, 4, 4], [4, 3, 3, 2], [2, 3, 3, 4]):
-        judge.held_out = np.column_stack([[4] * 4, right, [0] * 4])
+    for right in np.array([[4, 4, 4, 4], [4, 3, 3, 2], [2, 3, 3, 4]]):
+        judge.held_out = np.column_stack([right, 4 - right, [4] * 4, [0] * 4])
         for rate in RATES:
             assert judge.rate_of(judge.tolerance_of(rate)) is not None
 
@@ -92,7 +95,9 @@ def test_one_failure_is_learnt_from_and_no_later_tolerance_silences_an_alarm(sur
 def test_where_nothing_foresees_a_failure_there_is_no_alarm():
     judge = learnt(random, 40)
     assert judge.rate_of(0.01) is None
-    for_all = "for 0.1, 0.3, 1, 3 false alarms a day nothing was better than chance"
+    for_all = (
+        "for 0.1, 0.3, 1, 3 false alarms a day no alarm is false so seldom and better than chance"
+    )
     assert judge.told_by_experience == for_all
 
 
@@ -139,7 +144,7 @@ def test_what_is_repeated_or_missing_changes_no_alarm(surge):
 )
 def test_what_counts_as_foreseen_and_as_false(heat, failed, hold, told):
     limits = np.array([[0, 1, 0, 0, 1, 5.0]])
-    judge = Foresight(DT, 20, hold, np.empty((0, 14)), limits, np.zeros((1, 3)), ("heat",))
+    judge = Foresight(DT, 20, hold, np.empty((0, 14)), limits, np.zeros((1, 4)), ("heat",))
     found, _ = judge.tally(Runs.of([heat], [failed]), 0, plain=True)
     foreseen, minutes, false = told
     assert (found.foreseen, found.lead, found.false) == (foreseen, minutes * DT, false)

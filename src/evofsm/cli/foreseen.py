@@ -13,6 +13,7 @@ import numpy as np
 from evofsm.cli.options import picture
 from evofsm.cli.show import facts, print_json, show, table
 from evofsm.fsm import EvolvingFSM, Labels
+from evofsm.fsm.proportions import poisson_bounds
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
 from evofsm.guard.foresight import DATES, RATES, Runs, false_times, span
 from evofsm.io import Chunk
@@ -81,7 +82,7 @@ def show_foreseen(
 
     What is asked for are the horizon, the hold time and the tolerance.
     """
-    title, held_out = str(file), ""
+    title, held_out = str(file), "; not held out, if this guard learnt from them"
     if guard is None:
         rows = np.cumsum([len(e.times) for e in episodes])
         first = int((rows <= LEARNT * rows[-1]).sum())
@@ -127,7 +128,7 @@ def _document(
             came, _ = judge.tally(runs, rate, plain=plain)
             row[kind] = {**came._asdict(), "false_a_day": came.rate}
         alarms.append(row)
-        row = {"stated": stated, "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 2])]}
+        row = {"stated": stated, "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 3])]}
         row |= {"share_right": judge.shares[rate], "learnt": judge.words(rate) or "none"}
         row |= {"plain": judge.words(rate, plain=True) or "none"}
         row["thresholds"] = [
@@ -174,7 +175,7 @@ def _tables(
     found: dict[str, Any], judge: Foresight, title: str, held_out: str
 ) -> Iterator[RenderableType]:
     """The same for people."""
-    days = f"{found['seconds'] / 86400.0:.3g} days"
+    days = found["seconds"] / 86400.0
     soon = f"an alarm is right if one comes within {span(found['horizon'])}"
     text, rows, bold = "none: cross-validated, no alarm was better than chance", [], []
     for k, alarm in enumerate(found["alarms"]):
@@ -185,9 +186,13 @@ def _tables(
         rows.append(row)
         if alarm["is_own"]:
             text = f"{row[1]} failures foreseen, {row[2]} ahead (mean; not foreseen: 0)"
-            text += f", {alarm['learnt']['false']:,} false"
+            text += f", {(false := alarm['learnt']['false']):,} false"
+            if poisson_bounds(false)[0] > days * alarm["stated"]:
+                text += f": more than the {row[0]} a day that were stated, from too short a log"
+                text += ", or one that changed"
             bold = [k]
-    pairs = [("rows", f"{found['rows']:,} in {found['episodes']:,} episodes, {days}{held_out}")]
+    rows_read = f"{found['rows']:,} in {found['episodes']:,} episodes, {days:.3g} days of rows"
+    pairs = [("rows", rows_read + held_out)]
     at_once = f", and {found['failures_at_once']:,} right after a hole or standstill"
     failures = f"{found['failures']:,}{at_once * (found['failures_at_once'] > 0)}; {soon}"
     pairs += [("failures", failures), ("alarms", text)]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from evofsm.cli.options import in_quotes, quoted, seconds
 from evofsm.guard.foresight import span
-from evofsm.io.logs import LONGEST_STEP, USUAL_EPISODE
+from evofsm.io.logs import LONGEST_STEP, SKIPPED, USUAL_EPISODE
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
 
 Pairs = list[tuple[str, str]]
@@ -39,7 +39,7 @@ _NICE = [(seconds("", text), text) for text in _LONG.split()]
 
 def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     """What the first rows hold, by column and in all, and options that could be asked for."""
-    skipped, odd = dict[str, tuple[int, str]](), Pairs()
+    skipped, odd = dict[str, tuple[int, str]](), dict[str, int]()
     table.skips = Skips(1 << 60, skipped)
     frame, clock, form = _first_rows(table, odd)
     if not len(frame):
@@ -56,7 +56,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     facts = [*shown.items()][:_COLUMNS_SHOWN]
     if more := len(shown) - len(facts):
         facts.append(("...", f"and {more:,} more columns"))
-    facts += odd
+    facts += [("bad fields", f"{n:,} {told}") for told, n in odd.items()]
     facts += [
         (f"bad {kind}s", f"{n:,}, the first: {first}") for kind, (n, first) in skipped.items()
     ]
@@ -65,6 +65,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     options = [("--time", clock) if clock else ("--dt", "1"), *([("--unit", form)] if form else [])]
     groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
     group = next((name for name in groups if _is_in_blocks(frame[name])), "")
+    if (bad := sum(n for n, _ in skipped.values()) + sum(odd.values())) > SKIPPED:
+        options.append(("--skip-bad", f"{_round(2.0 * bad):.0f}"))
     if clock:
         within = ~np.diff(frame[group].rle_id().to_numpy()).astype(bool) if group else slice(None)
         options += _of_steps(np.diff(frame[clock].to_numpy())[within], facts)
@@ -88,7 +90,9 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     return facts, _of_numbers(moved, options)
 
 
-def _first_rows(table: CsvTable | ParquetTable, odd: Pairs) -> tuple[polars.DataFrame, str, str]:
+def _first_rows(
+    table: CsvTable | ParquetTable, odd: dict[str, int]
+) -> tuple[polars.DataFrame, str, str]:
     """Their columns, the clock in seconds, which one that is, and how it is written if oddly."""
     firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
     pairs = zip(firsts, [*firsts][1:], strict=False)
@@ -109,8 +113,8 @@ def _first_rows(table: CsvTable | ParquetTable, odd: Pairs) -> tuple[polars.Data
         bad = fields.filter(read.is_null() & fields.is_not_null())
         if read.n_unique() > _MOST_TEXTS and 2 * len(bad) < len(fields.drop_nulls()):
             frame = frame.with_columns(read.fill_null(math.nan).alias(name))
-            told = f"{len(bad):,} in column {name!r}, the first: {str(bad.first())!r}"
-            odd += [("bad fields", told)] * (len(bad) > 0)
+            if len(bad):
+                odd[f"in column {name!r}, the first: {str(bad.first())!r}"] = len(bad)
     texts = [name for name in texts if len(frame) and frame[name].dtype == polars.String]
     numbers = [name for name in firsts if name in frame.columns and frame[name].dtype.is_numeric()]
     if not clock and (form := next(filter(None, map(_form, map(frame.get_column, texts))), "")):

@@ -166,7 +166,7 @@ def _start(scenario: Scenario) -> float:
     return _FIRST_PLACE + (behind.gap + _VEHICLE_LENGTH if behind else 0.0)
 
 
-class _Road(Road):
+class _Road(Road, AbstractContextManager["_Road"]):
     """Cars of their own for one run, in a simulation that goes on from run to run."""
 
     def __init__(self, sumo: Any, run: int, scenario: Scenario) -> None:
@@ -222,9 +222,6 @@ class _Road(Road):
         if self.scenario.behind is not None:
             now[GAP_BEHIND] = position[0] - _VEHICLE_LENGTH - position[2]
             now[SPEED_BEHIND] = vehicle.getSpeed(self._cars[2])
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         for car in self._cars:

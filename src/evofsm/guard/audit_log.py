@@ -19,7 +19,7 @@ import platform
 import stat
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
 from hashlib import sha256
 from io import BytesIO
@@ -250,7 +250,7 @@ def _against(kept: Head, head: Head) -> Finding:
 # -- Logging --------------------------------------------------------------------------------------
 
 
-class AuditLog:
+class AuditLog(AbstractContextManager["AuditLog"]):
     """Logs what a guard decides, so that nobody can change it unnoticed: ``Guard(..., audit=log)``.
 
     Where the disk fails while driving, the log is broken off there, which is logged, and raised as
@@ -331,9 +331,6 @@ class AuditLog:
         finally:
             self._file.close()
         self._raise()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

@@ -7,11 +7,12 @@ eighth of the horizon after the last of them. It is right if a failure comes wit
 after it began, whether or not it is on by then. Where it stays on, it says so once in each horizon,
 and is false as often as no failure came. A failure is foreseen by the first of those before it.
 
-For each rate of false alarms that may be stated there is an alarm, of at most so many limits, and
-beside it one of plain thresholds. Both are searched for in the same way, for the longest warning on
-average (none counts as 0), with no fewer failures foreseen than by one with fewer false alarms.
-Which of them it is, and how often it was right, is told by cross-validation: of each third of the
-log, as it was learnt from the others. Alarms before the same failure count as one there.
+An alarm is of at most so many limits. Those are searched for that warn longest on average (none
+counts as 0), less a price for each false alarm, and beside them plain thresholds in the same way.
+For each rate of false alarms that may be stated the price is the one with the longest warning at no
+more false alarms than such a rate explains (the lower end of the 90 % interval of their count) by
+cross-validation: of each third of the log, as it was learnt from the others. So it is told how many
+failures it foresees, and how many alarms are false.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm import store
 from evofsm.fsm.kernels import kernel
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.proportions import wilson_bounds
+from evofsm.fsm.proportions import poisson_bounds, wilson_bounds
 from evofsm.fsm.validation import positive, refuse_unusable
 from evofsm.guard.actions import Action
 from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, Situation
@@ -43,7 +44,7 @@ DATES = 1e8
 # In horizons: how far ahead limits look, over what the rate is taken, how long an alarm stays on.
 _AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.125
 # Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts of a log.
-_MOST_LIMITS, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 4.0, 12), 3
+_MOST_LIMITS, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 50.0, 24), 3
 # Of a log of more rows some episodes are learnt from, if so many failures are left.
 _MOST_ROWS, _FAILURES = 500_000, 100
 # Blocks of rows in a horizon, as limits are searched for; of a long log fewer, but so many, where
@@ -70,7 +71,7 @@ KIND = Kind(
     {
         "forms": Numbers(("forms", failure.SIZE)),
         "limits": Numbers(("limits", 6)),
-        "held_out": COUNT.of("rates", 3),
+        "held_out": COUNT.of("rates", 4),
         "rows": Numbers(("rows", "variables")),
         "starts": COUNT.of("episodes"),
         "failed": COUNT.of("episodes"),
@@ -170,7 +171,8 @@ class Foresight(LearningJudge):
         self.horizon, self.hold = horizon, hold  #: [rows]
         self.bridges = 0.0  #: longest hole in time that it goes on across, as in a log [s]
         self.forms, self.limits = forms, limits
-        #: (rates, 3) of each of `RATES`, cross-validated, alarms, those that were right; its kind
+        #: (rates, 4) of each of `RATES`, cross-validated: failures foreseen, false alarms,
+        #: failures; and its kind
         self.held_out = held_out
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=dt)
         self.log = log  #: what it learns from, if it does as it goes
@@ -209,8 +211,8 @@ class Foresight(LearningJudge):
         cls, *, dt: float, names: Sequence[str], horizon: float | None = None, hold: float = 0.0
     ) -> Self:
         """One that has seen nothing, and learns as it goes; all as in `learn_log`."""
-        learnt = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((len(RATES), 3))
-        learnt[2][:, 2] = _NO_KIND
+        learnt = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((len(RATES), 4))
+        learnt[2][:, 3] = _NO_KIND
         given: dict[str, Any] = {"log": _nothing(len(names)), "asked": horizon}
         return cls(dt, _FEWEST, 1 + round(hold / dt), *learnt, names, **given)
 
@@ -233,33 +235,36 @@ class Foresight(LearningJudge):
             horizon = max(float(np.median(log.lengths)) * _SHORT, _FEWEST) * dt
         ahead = max(round(positive("horizon", horizon) / dt), 1)
         names = names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
-        nothing = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 3))
+        nothing = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 4))
         fresh = cls(dt, ahead, held, *nothing)
         number = np.arange(len(log.failed)) * _PARTS // len(log.failed)
-        tallies = np.zeros((2, len(RATES), 3))  # of both kinds: warned, foreseen, false
+        tallies, seen = np.zeros((2, len(_PRICES), 3)), 0  # warned, foreseen, false; rows
         for k in range(_PARTS):
             if not (number == k).any() or not log.failed[number != k].any():
                 continue
             judge, rest = fresh._fitted(log.part(number != k)), log.part(number == k)
-            columns = judge._columns(rest.rows, rest.starts)
-            for side, rate in np.ndindex(2, len(RATES)):
-                found, _ = judge.tally(rest, rate, plain=bool(side), columns=columns)
-                tallies[side, rate] += found.lead * found.failures, found.foreseen, found.false
-        judge = fresh._fitted(log)
-        learnt, plain = tallies  # with as many false ones
-        as_many = np.minimum((plain[:, 2] + 1.0) / (learnt[:, 2] + 1.0), 1.0)
-        is_plain = plain[:, 0] >= _BETTER * as_many * learnt[:, 0]
-        rates = range(len(RATES))
-        limits = [[judge.of_rate(k, plain=x)[:, _OF:] for x in (False, True)] for k in rates]
-        kind = (is_plain | [np.array_equal(a, b) for a, b in limits]).astype(int)
-        _, right, false = tallies[kind, rates].T
-        right = right * [len(limits[k][kind[k]]) > 0 for k in rates]
-        alarms, chance = right + false, log.failed.sum() * ahead / len(log.rows)
-        for k in rates:  # whether it is better than an alarm at any time
-            if not (right[k] and wilson_bounds(right[k] / alarms[k], alarms[k])[0] > chance):
-                kind[k] = _NO_KIND
-        told = np.column_stack([alarms, right, kind])
-        return cls(dt, ahead, held, judge.forms, judge.limits, told, names, units)
+            columns, seen = judge._columns(rest.rows, rest.starts), seen + len(rest.rows)
+            for side, price in np.ndindex(2, len(_PRICES)):
+                found, _ = judge.tally(rest, price, plain=bool(side), columns=columns)
+                tallies[side, price] += found.lead * found.failures, found.foreseen, found.false
+        judge, days = fresh._fitted(log), seen * dt / _DAY
+        fewest = np.array([[poisson_bounds(int(n))[0] for n in row] for row in tallies[..., 2]])
+        chance, limits, told = log.failed.sum() * ahead / len(log.rows), [np.empty((0, 6))], []
+        for rate, stated in enumerate(RATES):
+            fit = fewest <= stated * days
+            best = np.where(fit, tallies[..., 0], -1.0).argmax(1)
+            learnt, plain = tallies[[0, 1], best] * fit[[0, 1], best, None]
+            for side in np.flatnonzero(fit[[0, 1], best]).tolist():
+                part = judge.of_rate(int(best[side]), plain=bool(side))
+                limits.append(np.insert(part[:, 1:], 0, rate, 1))
+            as_many = min((plain[2] + 1.0) / (learnt[2] + 1.0), 1.0)
+            kind = int(plain[0] >= _BETTER * as_many * learnt[0])
+            _, right, false = (learnt, plain)[kind]
+            low = wilson_bounds(right / (right + false), right + false)[0] if right else 0.0
+            kind = kind if low > chance else _NO_KIND  # no better than an alarm at any time
+            told.append((right, false, log.failed.sum(), kind))
+        known = judge.forms, np.concatenate(limits), np.array(told, np.float64)
+        return cls(dt, ahead, held, *known, names, units)
 
     def _fitted(self, log: Runs) -> Self:
         """With forms and limits of both kinds, for all rates."""
@@ -306,38 +311,22 @@ class Foresight(LearningJudge):
                 found[k, j] = leads.sum(), false
             return np.asarray(found / most)
 
-        rules = [nothing := _Rule()]
-        for price in _PRICES:
-            rule, worth = nothing, 0.0
+        rows = []
+        for number, price in enumerate(_PRICES):
+            rule, worth = _Rule(), 0.0
             while len(rule) < _MOST_LIMITS:
                 gain = more(rule) @ (1.0, -price)
                 best = divmod(int(gain.argmax()), _TRIED)
                 if gain[best] <= worth + _WORTH:
                     break
                 worth, rule = gain[best], (*rule, best)
-                rules.append(rule)
-        alone = more(nothing)
-        for false in RATES:
-            fitting = np.where(alone[..., 1] <= false, alone[..., 0], -1.0)
-            rules.append((divmod(int(fitting.argmax()), _TRIED),))
-
-        def beyond(rule: _Rule) -> Flags:
             parts = [signed[k] > tried[k][j] for k, j in rule]
-            return np.asarray(np.logical_or.reduce([np.zeros(len(log.rows), np.bool_), *parts]))
-
-        counted, rows, chosen = dict[_Rule, tuple[float, int, float]](), [], nothing
-        for rule in rules:  # row by row
-            false = _tally(on := beyond(rule), log.starts, log.failed, self._spans, leads, on)
-            counted[rule] = leads.sum(), int((leads > 0.0).sum()), false / most[1]
-        for rate, false in enumerate(RATES):
-            fewest = counted[chosen][1]
-            fit = [rule for rule, (_, n, f) in counted.items() if f <= false and n >= fewest]
-            chosen = max(fit, key=lambda rule: (counted[rule][0], -counted[rule][2], -len(rule)))
-            kept = chosen
-            for part in chosen:  # what others imply is no part of it
-                rest = tuple(known for known in kept if known != part)
-                kept = kept if not rest or (beyond((part,)) & ~beyond(rest)).any() else rest
-            rows += [(rate, plain, *asked[k], asked[k][2] * tried[k][j]) for k, j in kept]
+            for n, (k, j) in enumerate(rule):  # what others imply is no part of it
+                rest = [part for m, part in enumerate(parts) if m != n]
+                if not rest or (parts[n] & ~np.logical_or.reduce(rest)).any():
+                    rows.append((number, plain, *asked[k], asked[k][2] * tried[k][j]))
+                else:
+                    parts[n] = np.zeros_like(parts[n])
         return np.array(rows, np.float64).reshape(-1, 6)
 
     # -- Telling --------------------------------------------------------------------------------
@@ -364,7 +353,7 @@ class Foresight(LearningJudge):
 
     def of_rate(self, rate: int, *, plain: bool | None = None) -> Floats:
         """The limits of an alarm, by default of the kind that did better, cross-validated."""
-        kind = self.held_out[rate, 2] if plain is None else _PLAIN if plain else _LEARNT
+        kind = self.held_out[rate, 3] if plain is None else _PLAIN if plain else _LEARNT
         chosen = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
         return np.asarray(self.limits[chosen])
 
@@ -422,12 +411,12 @@ class Foresight(LearningJudge):
 
     def reason(self, rate: int, z: Floats, passed: Floats) -> str:
         """Why an alarm is on at an observation (m,), with the limits (n, 6) that are passed."""
-        alarms, right, _ = self.held_out[rate].tolist()
+        right, false, *_ = self.held_out[rate].tolist()
         limits, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
         if len(limits):
             name, there = self._words(limits[0])
             why = f"{name} {self._value(limits[0], z):.4g}: {there}"
-        came = f"after {right:.0f} of {alarms:.0f} such alarms it failed"
+        came = f"after {right:.0f} of {right + false:.0f} such alarms it failed"
         within = span(self.horizon * self.dt)
         return f"{why}; {came} within {within} (cross-validated on what it learnt from)"
 
@@ -445,8 +434,8 @@ class Foresight(LearningJudge):
     @property
     def shares(self) -> Floats:
         """(rates,) of the alarms those that were right; 0 where nothing foresees a failure."""
-        share = self.held_out[:, 1] / np.maximum(self.held_out[:, 0], 1.0)
-        return np.where(self.held_out[:, 2] == _NO_KIND, 0.0, share)
+        right, false, _, kind = self.held_out.T
+        return np.where(kind == _NO_KIND, 0.0, right / np.maximum(right + false, 1.0))
 
     def rate_of(self, tolerance: float) -> int | None:
         """Which of `RATES` the alarm is for, more of which are right; None if there is none."""
@@ -454,8 +443,9 @@ class Foresight(LearningJudge):
         return int(fit[-1]) if len(fit) else None
 
     def tolerance_of(self, rate: float) -> float:
-        """The tolerance with which there are at most so many false alarms a day, if it can be."""
+        """The tolerance with which there are at most so many false alarms a day, or else few."""
         k = max(int(np.searchsorted(RATES, rate, "right")) - 1, 0)
+        k = next((n for n in range(k, len(RATES)) if self.shares[n] > 0.0), k)
         more = self.shares[k + 1 :]
         below = float(more[more < self.shares[k]].max(initial=0.0))
         return float(np.clip(0.5 * (self.shares[k] + below), 0.01, 0.99))
@@ -475,17 +465,17 @@ class Foresight(LearningJudge):
     @property
     def is_plain(self) -> bool:
         """Whether all its alarms are plain thresholds."""
-        kinds = self.held_out[:, 2]
+        kinds = self.held_out[:, 3]
         return bool((kinds == _PLAIN).any() and (kinds != _LEARNT).all())
 
     def of(self, rate: int) -> str:
         """What the alarm for one of `RATES` is, and how often it was right, in words."""
-        alarms, right, kind = self.held_out[rate].tolist()
+        right, false, failures, kind = self.held_out[rate].tolist()
         if kind == _NO_KIND:
-            return "nothing was better than chance"
+            return "no alarm is false so seldom and better than chance"
         plain = f"{_AS_GOOD}: " if kind == _PLAIN and not self.is_plain else ""
-        told = f"{right:.0f} of {alarms:.0f} were right, cross-validated"
-        return f"{plain}{self.words(rate)} ({told})"
+        told = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
+        return f"{plain}{self.words(rate)} ({told}, cross-validated)"
 
     # -- Beside a machine -----------------------------------------------------------------------
 
@@ -524,7 +514,7 @@ class Foresight(LearningJudge):
         self._accepted = tolerance
         passed, (*_, on) = self._next(situation.observation)
         rate, risk, reason = self.rate_of(tolerance), 0.0, "no alarm is on"
-        evidence = 0.0 if rate is None else float(self.held_out[rate, 0])
+        evidence = 0.0 if rate is None else float(self.held_out[rate, :2].sum())
         if rate is not None and on[rate]:
             risk = float(self.shares[rate])
             reason = self.reason(rate, situation.observation, self._limits[passed])

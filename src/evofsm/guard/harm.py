@@ -14,7 +14,8 @@ While it learns, who drives an episode is drawn by Thompson sampling with a Baye
 (Eckles & Kaptein 2014): each episode of an arm gets a random weight, of the gamma distribution, and
 the guard drives if then it wins no fewer pairs than it loses. What is older weighs less, as guards
 change, and of the controller alone much less, as it may be another one by now. Each arm begins with
-a part of an episode that did not fail, and ended by itself if any did, so that it is tried. The
+a part of an episode that did not fail, and ended by itself if any did, or the guard refuses nearly
+everything, so that it is tried. The
 controller drives alone, in *shadow*, only where that costs little: after an episode that failed,
 where it does better by what is known, or every tenth time, as it may have become better; and in the
 first case three draws have to agree, unless the latest three guarded episodes failed, or less than
@@ -129,7 +130,8 @@ class Harm(NamedTuple):
 
         The same for the same record.
         """
-        well = Outcome(0, _FOREVER, failed=False, guarded=False, ended=self.ends)
+        ends = self.ends or self.replaces  # who replaces the controller may hide how well it does
+        well = Outcome(0, _FOREVER, failed=False, guarded=False, ended=ends)
         arms = [[*self.guarded, well], [*self.alone, well]]
         random = np.random.default_rng([self.n_episodes, draws])
         guarded, alone = (

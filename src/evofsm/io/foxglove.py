@@ -11,10 +11,10 @@ import json
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,7 +247,7 @@ class RunWriter:
 # -- Live -----------------------------------------------------------------------------------------
 
 
-class FoxgloveSink:
+class FoxgloveSink(AbstractContextManager["FoxgloveSink"]):
     """Shows what a guard sees and decides: ``guard.audit = FoxgloveSink()``.
 
     Every decision is a message on ``/observation``, ``/belief``, ``/risk`` and ``/decision``; what
@@ -326,9 +326,6 @@ class FoxgloveSink:
     def close(self) -> None:
         """Stop serving, and end the file."""
         self._open.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

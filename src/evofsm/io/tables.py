@@ -9,7 +9,7 @@ import os
 import re
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -77,7 +77,7 @@ SI = {unit: base for base, group in _GROUPS.items() for unit in group}
 _SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": "m/s", "sec": "s"}
 _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
 # Names of columns are looked for in so many lines; what stands before the last line of a comment.
-_MOST_ABOVE, _COMMENT = 100, re.compile(r"\s*(#|%|//)+\s*")
+_MOST_ABOVE, _COMMENT = 100, re.compile(r"\A\s*(#|%|//)+\s*")
 # What stands in a field where there is no number.
 _MISSING = ("", "na", "n/a", "null", "none")
 # By which a comma is known to be a decimal one; groups of three digits it may separate as well.
@@ -177,7 +177,7 @@ class Skips:
         raise ValueError(next(iter(self._first.values()), otherwise))
 
 
-class Source:
+class Source(AbstractContextManager["Source"]):
     """A file that is read once, unpacked if it is gzipped; it may end early if ``skips`` allow."""
 
     def __init__(self, path: str, on_read: OnRead = silent, skips: Skips | None = None) -> None:
@@ -191,9 +191,6 @@ class Source:
         self._raw = io.BufferedReader(io.FileIO(path))
         self._packed = self._raw.peek(2).startswith(_GZIP)
         self._file = gzip.GzipFile(fileobj=self._raw) if self._packed else self._raw
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self._file.close()

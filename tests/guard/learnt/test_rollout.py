@@ -100,14 +100,13 @@ def nearest(form, z):
 
 def crashes(said):
     """How far it is to crash, each in the ends that stand before it."""
-    last, is_new = np.inf, True
+    last, before = np.inf, None
     for says, far in said:
         if says == ENDS:
-            last, is_new = far if is_new else min(last, far), False
-        else:
-            is_new = True
-            if says == CRASHES:
-                yield max(last - GROWN, far)
+            last = min(far, last) if before == ENDS else far
+        if says == CRASHES:
+            yield max(last - GROWN, far)
+        before = says
 
 
 def from_dead_end(model, row, z):
