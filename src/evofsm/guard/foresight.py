@@ -253,10 +253,10 @@ class Foresight(LearningJudge):
         for rate, stated in enumerate(RATES):
             fit = fewest <= stated * days
             best = np.where(fit, tallies[..., 0], -1.0).argmax(1)
-            learnt, plain = tallies[[0, 1], best] * fit[[0, 1], best, None]
-            for side in np.flatnonzero(fit[[0, 1], best]).tolist():
-                part = judge.of_rate(int(best[side]), plain=bool(side))
-                limits.append(np.insert(part[:, 1:], 0, rate, 1))
+            parts = [judge.of_rate(k, plain=x) for x, k in enumerate(best.tolist())]
+            usable = fit[[0, 1], best] & [len(part) > 0 for part in parts]
+            learnt, plain = tallies[[0, 1], best] * usable[:, None]
+            limits += [np.insert(parts[k][:, 1:], 0, rate, 1) for k in np.flatnonzero(usable)]
             as_many = min((plain[2] + 1.0) / (learnt[2] + 1.0), 1.0)
             kind = int(plain[0] >= _BETTER * as_many * learnt[0])
             _, right, false = (learnt, plain)[kind]
