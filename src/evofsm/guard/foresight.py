@@ -253,7 +253,8 @@ class Foresight(LearningJudge):
         for rate, stated in enumerate(RATES):
             fit = fewest <= stated * days
             best = np.where(fit, tallies[..., 0], -1.0).argmax(1)
-            parts = [judge.of_rate(k, plain=x) for x, k in enumerate(best.tolist())]
+            kinds = zip((False, True), best.tolist(), strict=True)
+            parts = [judge.of_rate(k, plain=is_plain) for is_plain, k in kinds]
             usable = fit[[0, 1], best] & [len(part) > 0 for part in parts]
             learnt, plain = tallies[[0, 1], best] * usable[:, None]
             limits += [np.insert(parts[k][:, 1:], 0, rate, 1) for k in np.flatnonzero(usable)]
