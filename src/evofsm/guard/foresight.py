@@ -253,8 +253,7 @@ class Foresight(LearningJudge):
         for rate, stated in enumerate(RATES):
             fit = fewest <= stated * days
             best = np.where(fit, tallies[..., 0], -1.0).argmax(1)
-            kinds = zip((False, True), best.tolist(), strict=True)
-            parts = [judge.of_rate(k, plain=is_plain) for is_plain, k in kinds]
+            parts = [judge.of_rate(int(best[k]), plain=k > 0) for k in range(2)]
             usable = fit[[0, 1], best] & [len(part) > 0 for part in parts]
             learnt, plain = tallies[[0, 1], best] * usable[:, None]
             limits += [np.insert(parts[k][:, 1:], 0, rate, 1) for k in np.flatnonzero(usable)]
