@@ -235,7 +235,8 @@ def test_a_guard_that_has_not_learnt_where_it_fails_is_refused(guard):
 def test_in_the_example_another_controller_is_kept_out(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "examples")
     tried = importlib.import_module("disc").main(tmp_path / "disc.png")
-    assert (tried[0].failed > 20, tried[40].failed, tried[40].arrived >= 40) == (True, 0, True)
+    assert tried[0].failed > 20 > tried[40].failed == 0
+    assert tried[40].arrived > tried[0].arrived + 10
 
 
 @pytest.mark.slow

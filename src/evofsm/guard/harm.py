@@ -13,13 +13,13 @@ episodes the better one is found by rank, which assumes nothing about how failur
 While it learns, who drives an episode is drawn by Thompson sampling with a Bayesian bootstrap
 (Eckles & Kaptein 2014): each episode of an arm gets a random weight, of the gamma distribution, and
 the guard drives if then it wins no fewer pairs than it loses. What is older weighs less, as guards
-change, and of the controller alone much less, as it may be another one by now. Each arm begins with
-a part of an episode that did not fail, and ended by itself if any did, or the guard refuses nearly
-everything, so that it is tried. The
-controller drives alone, in *shadow*, only where that costs little: after an episode that failed,
-where it does better by what is known, or every tenth time, as it may have become better; and in the
-first case three draws have to agree, unless the latest three guarded episodes failed, or less than
-three are known of the controller alone.
+change, and of the controller alone much less where episodes may end by themselves without failing:
+it may be another one by now, and be kept from an end. Each arm begins with a part of an episode
+that did not fail, and ended by itself if any did, so that it is tried. The controller drives alone,
+in *shadow*, only where that costs little: after an episode that failed, where it does better by
+what is known, or every tenth time, as it may have become better; and in the first case three draws
+have to agree, unless the latest three guarded episodes failed, or less than three are known of the
+controller alone.
 
 A guard of which the latest three episodes failed may stand before a controller that became good:
 then the controller drives until it fails, and after two guarded episodes at the latest. If its own
@@ -130,8 +130,7 @@ class Harm(NamedTuple):
 
         The same for the same record.
         """
-        ends = self.ends or self.replaces  # who replaces the controller may hide how well it does
-        well = Outcome(0, _FOREVER, failed=False, guarded=False, ended=ends)
+        well = Outcome(0, _FOREVER, failed=False, guarded=False, ended=self.ends)
         arms = [[*self.guarded, well], [*self.alone, well]]
         random = np.random.default_rng([self.n_episodes, draws])
         guarded, alone = (
@@ -142,8 +141,8 @@ class Harm(NamedTuple):
         return float((won >= 0.0).mean())
 
     def _weights(self, outcomes: Sequence[Outcome]) -> NDArray[np.float64]:
-        weights = [_FADES[o.guarded] ** (self.n_episodes - o.episode) for o in outcomes]
-        return np.array(weights, np.float64)
+        fades = [_FADES[o.guarded or not self.ends] for o in outcomes]
+        return np.power(fades, [self.n_episodes - o.episode for o in outcomes])
 
     def passing(self, *, learning: bool) -> str:
         """Why proposals pass in the episode to come; empty where they are revised."""
