@@ -177,6 +177,13 @@ def test_frozen_it_acts_where_episodes_ended_better(guarded, alone, helps):
     assert arms([guarded] * 3, [alone] * 3).helps == helps
 
 
+@pytest.mark.parametrize(("failed", "helps"), [(18, False), (4, True)])
+def test_frozen_it_acts_where_it_prevents_most_failures(failed, helps):
+    """A lander's guard: later crashes count for little; episodes of both arms failed."""
+    guarded = [(150, "f", None)] * failed + [(300, "", None)] * (20 - failed)
+    assert arms(guarded, [(110, "f", None)] * 6).helps == helps
+
+
 def test_the_arm_that_is_better_is_drawn_ever_more_often():
     """By simulation: failure after times that differ by a factor, cut off at 300 steps."""
     for better_by, least, most in ((3.0, 0.7, 1.0), (1.0, 0.2, 0.8), (1 / 3, 0.0, 0.4)):

@@ -27,8 +27,8 @@ latest three failed, too, there is little to lose, and the guard, which learns, 
 twelve at most.
 
 Frozen, it acts unless its record says that it harms, or does not help: it loses more pairs than it
-wins, or all its episodes failed, three at least, however late. A guard, or a controller, that was
-never tried has no record, and then it acts.
+wins, prevents less than half of the failures per step, or all its episodes failed, three at least,
+however late. A guard, or a controller, that was never tried has no record, and then it acts.
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ _KEPT, _FADES, _HOPES = 20, (0.9, 0.98), (0.5, 0.25)
 _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
 _SOONER = 0.3
+# Of the failures per step of the controller alone, a guard that helps leaves no larger share.
+_LEFT = 0.5
 # Scores that differ by less than this share are equal.
 _SAME_SCORE = 0.05
 # The latest guarded episodes, if all failed, are reason enough for one draw to decide; else it
@@ -117,13 +119,16 @@ class Harm(NamedTuple):
     def helps(self) -> bool:
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
 
-        A guard of which all episodes failed, three at least, prevents nothing, however late.
+        A guard of which all episodes failed, three at least, prevents nothing, however late; nor
+        does one that fails more than half as often per step as the controller alone.
         """
         guarded, alone = self.guarded, self.alone
         if _all_failed(guarded, max(_CAREFUL, len(guarded))):
             return False
+        if not guarded or not alone:
+            return True
         won = self._weights(guarded) @ better(guarded, alone) @ self._weights(alone)
-        return not guarded or not alone or bool(won >= 0.0)
+        return bool(won >= 0.0 and self._rate(guarded) <= _LEFT * self._rate(alone))
 
     def drives(self, draws: int) -> float:
         """In how many of some draws the guard would drive the next episode, as a share.
@@ -143,6 +148,12 @@ class Harm(NamedTuple):
     def _weights(self, outcomes: Sequence[Outcome]) -> NDArray[np.float64]:
         fades = [_FADES[o.guarded or not self.ends] for o in outcomes]
         return np.power(fades, [self.n_episodes - o.episode for o in outcomes])
+
+    def _rate(self, outcomes: Sequence[Outcome]) -> float:
+        """Failures per step."""
+        weights = self._weights(outcomes)
+        fails, steps = weights @ [(o.failed, o.steps) for o in outcomes]
+        return float(fails / steps)
 
     def passing(self, *, learning: bool) -> str:
         """Why proposals pass in the episode to come; empty where they are revised."""

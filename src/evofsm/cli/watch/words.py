@@ -30,7 +30,7 @@ _COMPONENTS = 3
 _UNIT = re.compile(r"(?<=\d) (?=(?:s|m|m/s|m/s²)\b)")
 _HEADLINES = {
     "unjudged": "Nothing is judged",
-    "safe": "Safe",
+    "safe": "No danger known",
     "danger": "Danger",
     "averted": "Danger, held off",
     "dead end": "Dead end, as far as it has learnt",
