@@ -56,7 +56,6 @@ def audit(
 
 
 def _facts(found: Audit) -> Iterator[tuple[str, str]]:
-    """What was found, line by line."""
     from evofsm.fsm.validation import counted
 
     finding, contents = found.finding, found.contents

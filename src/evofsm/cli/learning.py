@@ -353,7 +353,6 @@ def _score(
 
 
 def _skills(read: Read) -> Iterator[Skill]:
-    """The means, for each kind of forecast."""
     for sums, steps in zip(read.sums, read.steps_ahead, strict=False):
         count, persistence, forecast = sums.tolist()
         skill = 1.0 - forecast / persistence if persistence > 0.0 else np.nan

@@ -97,8 +97,6 @@ class Neighbour(NamedTuple):
 
 
 class _Facts(NamedTuple):
-    """What does not change about a car."""
-
     length: float  #: [m]
     min_gap: float  #: [m]
     decel: float  #: [m/s²]
@@ -533,7 +531,6 @@ class _Ride:
     _latest: dict[str, tuple[float, float]] = field(default_factory=dict)  # speed, acceleration
 
     def see(self, car: str, speed: float, free: float) -> None:
-        """Take in the speed of a car after a step, and that on a free road [m/s]."""
         dt = self.dt
         self.seconds += dt
         self.metres += speed * dt
@@ -545,12 +542,10 @@ class _Ride:
         self._latest[car] = speed, acceleration
 
     def forget(self, cars: Iterable[str]) -> None:
-        """These have left."""
         for car in cars:
             self._latest.pop(car, None)
 
     def told(self) -> dict[str, float]:
-        """What it came to, by name."""
         seconds = self.seconds or math.nan
         return {
             "car_seconds": self.seconds,

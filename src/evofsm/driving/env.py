@@ -144,7 +144,6 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self._open.close()
 
     def _info(self, step: Episode) -> dict[str, Any]:
-        """What is known after a step, given its rows."""
         return {
             "time": float(step.time[-1]),
             "gap": float(step.observations[-1, 0]),

@@ -275,7 +275,6 @@ class _Player:
     def _again(
         guard: Guard, time: Any, observation: Any, action: Any, mask: Any = None
     ) -> tuple[str, dict[str, Any], bool]:
-        """Which decision it is, what is told of it, and whether it is one to speak of."""
         proposal = Proposal(_action(action), checked_mask(guard.actions, mask))
         situation = guard.recognise(_floats(observation), _number(time))
         revision = guard.revise(situation, proposal)
@@ -312,7 +311,6 @@ def _action(action: Any) -> Action:
 
 
 def _differing(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> tuple[Field, ...]:
-    """What is not the same to the last bit."""
     fields = {
         name: tuple(canonical(entry[name]) if name in entry else "" for entry in (recorded, again))
         for name in sorted(recorded.keys() | again.keys())

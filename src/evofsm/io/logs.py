@@ -703,7 +703,6 @@ class _Clock:
         self._first_path = ""
 
     def open(self, path: str) -> None:
-        """Begin a file."""
         self._path = path
         self._last = self._usual = np.nan
 
@@ -796,7 +795,6 @@ class _Reader:
         self._unknown: Callable[[], str] | None = None  # says where that row has no action
 
     def chunks(self) -> Iterator[Chunk]:
-        """The rows that are learnt, piece by piece."""
         action, clock = self._columns.action, self._clock
         wanted, factors = self._wanted()
         waiting: Chunk | None = None  # until it is known whether its last row failed
@@ -1078,7 +1076,6 @@ class _Reader:
 
 
 def _encoded(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
-    """Columns of the observation for one variable."""
     if isinstance(variable, str):
         return piece.numbers[variable]
     encoder = ObservationEncoder(variable)

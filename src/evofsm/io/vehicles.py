@@ -484,7 +484,6 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
 
 
 def _pointing(obj: Object, pointed: dict[str, float]) -> Object:
-    """The same object with a heading, if it is known from now or before."""
     heading = obj.heading if math.isfinite(obj.heading) else math.nan
     if math.isnan(heading) and math.hypot(obj.vx, obj.vy) >= _TURNS_ABOVE:
         heading = math.atan2(obj.vy, obj.vx)
@@ -594,7 +593,6 @@ def _is_view(osi: Any, data: bytes) -> bool:
 
 
 def _scene(osi: Any, place: str, data: bytes, is_view: bool) -> Scene:
-    """The moving objects on lanes, but pedestrians and animals."""
     try:
         message = (osi.SensorView if is_view else osi.GroundTruth).from_binary(data)
     except ValueError as error:

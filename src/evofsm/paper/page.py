@@ -260,7 +260,6 @@ def _drawn(page: Page, folder: Path) -> dict[str, str]:
 
 
 def _summary(pages: Sequence[Page]) -> Table:
-    """What each page asks and what came out, in a line each."""
     lost = [sum(len(table.frame) for table in page.losses) for page in pages]
     rows = {
         "question": [page.title for page in pages],
@@ -273,7 +272,6 @@ def _summary(pages: Sequence[Page]) -> Table:
 
 
 def _versions(more: Sequence[str]) -> dict[str, str]:
-    """What the numbers were computed with."""
     found = {"evofsm": evofsm.__version__, "Python": platform.python_version()}
     names = {"libsumo": "SUMO (libsumo)"}
     found |= {names.get(name, name): version(name) for name in (*_PACKAGES, *more)}
