@@ -449,10 +449,7 @@ def _sha256(header: bytes, numbers: Iterable[Any]) -> str:
 def _refuse_unfit(
     kind: Kind, settings: Mapping[str, Any], entries: Mapping[str, _Entry]
 ) -> dict[int | str, int]:
-    """Raise for settings out of their range, or arrays whose names, types or shapes are others.
-
-    Returns the number that each name in a shape stands for.
-    """
+    """Raise for what does not fit; returns the number that each name in a shape stands for."""
     sizes: dict[int | str, int] = {}
     _refuse_settings(settings, kind.settings, sizes)
     if lacking := set(kind.arrays) - set(entries):

@@ -351,10 +351,7 @@ def fcd_of_table(table: Table) -> Iterator[_Timestep] | None:
 
 
 def _by_time(table: Table, wanted: Wanted) -> Iterator[tuple[float, list[tuple[Any, ...]]]]:
-    """Place, numbers behind the time, and texts of all rows of a time.
-
-    Where a row is left out, so are those of its time: others would be taken for pairs.
-    """
+    """Place, numbers and texts of all rows of a time, unless one is left out."""
     now, rows, is_whole = math.nan, list[tuple[Any, ...]](), True
     for piece in table.pieces(wanted):
         piece.leave_out_unusable(wanted.numbers[0])

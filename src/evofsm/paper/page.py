@@ -38,10 +38,7 @@ _WIDEST = 200
 
 
 class _Cell(Formatter):
-    """``str.format`` for cells: `NONE` for missing numbers, shares in percent, true minus signs.
-
-    What is small, but not 0, is not shown as 0.
-    """
+    """``str.format`` for cells, in which what is small, but not 0, is not shown as 0."""
 
     def get_field(self, name: str, args: Any, row: Any) -> Any:
         return row[name], name  # names may hold dots and brackets
