@@ -281,7 +281,6 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def _write_over(target: Path, whole: BinaryIO) -> None:
-    """Write a whole file over another one, for which there is room."""
     whole.seek(0)
     with open(target, "r+b") as file:
         free = shutil.disk_usage(target).free + os.fstat(file.fileno()).st_size
@@ -382,7 +381,6 @@ class _Entry(NamedTuple):
 
 
 def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
-    """Read the header of an open file, as it was written too, and its checksum."""
     size = file.seek(0, os.SEEK_END)
     if size > _LARGEST_FILE + _LARGEST_HEADER:
         raise ValueError(f"it has {size:,} bytes; no file holds more than {_LARGEST_FILE:,}")
@@ -451,10 +449,7 @@ def _sha256(header: bytes, numbers: Iterable[Any]) -> str:
 def _refuse_unfit(
     kind: Kind, settings: Mapping[str, Any], entries: Mapping[str, _Entry]
 ) -> dict[int | str, int]:
-    """Raise for settings out of their range, or arrays whose names, types or shapes are others.
-
-    Returns the number that each name in a shape stands for.
-    """
+    """Raise for what does not fit; returns the number that each name in a shape stands for."""
     sizes: dict[int | str, int] = {}
     _refuse_settings(settings, kind.settings, sizes)
     if lacking := set(kind.arrays) - set(entries):

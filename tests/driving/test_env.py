@@ -43,7 +43,6 @@ def test_an_episode_is_chosen_exactly():
     assert (info["index"], info["split"]) == (7, "test")
     assert env.draw == load_family("emergency").draw(5, 7, "test")
     assert env.reset(options={"index": 7})[1]["split"] == "train"
-    assert CarFollowing(split="test").reset()[1]["split"] == "test"
 
 
 @pytest.mark.parametrize(

@@ -129,3 +129,16 @@ def test_an_onset_is_counted_in_the_state_before_the_latest_observations():
         machine.observe(z)
     machine.onset()
     assert machine.onsets.sum() == 3.0
+
+
+def test_a_question_changes_nothing_and_its_answer_is_the_askers_own(grown, snapshot):
+    before = snapshot(grown)
+    for name in ("belief", "centers", "visits", "state_ids", "decisions", "transition_matrices"):
+        getattr(grown, name)[...] = 7
+    for policy in ("marginal", "hold", "observed"):
+        grown.predict(0, 50, policy)[...] = 7
+    model = grown.model()
+    model.recognise([0.1, 0.2])
+    model.propagate(grown.belief, 0, 3)
+    grown.copy().learn_many(np.ones((4, 2)), [0] * 4)
+    assert snapshot(grown) == before

@@ -57,24 +57,3 @@ def test_a_copy_goes_its_own_way_and_has_a_lock_of_its_own(grown, snapshot, twin
         assert snapshot(another) == before
         assert elsewhere(lambda: another.learn_one([0.1, 0.2], 0))
     assert snapshot(another) != before == snapshot(grown)
-
-
-def test_a_forked_process_is_not_kept_waiting_by_a_thread_that_it_lacks(in_a_child, grown):
-    held, over = threading.Event(), threading.Event()
-
-    def hold():
-        with grown._lock:
-            held.set()
-            over.wait()
-
-    thread = threading.Thread(target=hold)
-    thread.start()
-    held.wait()
-
-    def goes_on():
-        assert elsewhere(lambda: grown.observe([0.1, 0.2]))
-
-    went_on = in_a_child(goes_on)
-    over.set()
-    thread.join()
-    assert went_on

@@ -19,7 +19,6 @@ from evofsm.driving.judge import LatentRisk
 from evofsm.guard.actions import BoxActions, Choices, put_into, same_action
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Search
 from evofsm.guard.guard import KIND
-from evofsm.guard.learnt import judge as judging
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.loop import run_episode
 from evofsm.guard.reviser import Mode
@@ -504,36 +503,6 @@ def test_wherever_a_call_is_broken_off_nothing_is_done_and_it_works_again(kind, 
     found = Counter(one_guard.harms(kind, 257, error))
     assert found.pop("") > 20
     assert not found
-
-
-def test_a_child_forked_amid_an_end_in_another_thread_has_the_guard_of_before(
-    in_a_child, monkeypatch
-):
-    guard, twin = one_guard.learnt(), one_guard.learnt()
-    amid, over, learn = threading.Event(), threading.Event(), judging.learn
-
-    def waits(*given, **how):
-        state = learn(*given, **how)
-        if threading.current_thread() is thread:
-            amid.set()
-            over.wait()
-        return state
-
-    monkeypatch.setattr(judging, "learn", waits)
-    thread = threading.Thread(target=guard.end, args=(True, [1.2, 0.1]))
-    thread.start()
-    amid.wait()
-
-    def end():
-        assert one_guard.held(guard) == one_guard.held(twin)
-        for one in (guard, twin):
-            one.end(True, [1.2, 0.1])
-        assert one_guard.gone_on(guard) == one_guard.gone_on(twin)
-
-    is_as_before = in_a_child(end)
-    over.set()
-    thread.join()
-    assert is_as_before
 
 
 # -- Who feeds it -------------------------------------------------------------------------------

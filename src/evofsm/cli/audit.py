@@ -23,7 +23,6 @@ _FIELDS, _LETTERS = 5, 40
 def audit(
     file: Annotated[Path, argument("An audit log.")],
     head: Annotated[str | None, option("NUMBER:HASH of a record, kept elsewhere.")] = None,
-    replay: Annotated[bool, option("Whether to drive again, and compare every decision.")] = True,
     failed: Annotated[
         str | None, option("MODULE:FUNCTION, if the guard was given it as failed=.")
     ] = None,
@@ -33,8 +32,8 @@ def audit(
 
     Finds the first record that was altered, removed, repeated or inserted; then gives the guard
     that the log began with what was observed and proposed, and compares each decision to the last
-    bit. Ends with 0 if all is well, 1 if the log was tampered with or a
-    decision comes out otherwise, and 2 if it cannot be read.
+    bit. Ends with 0 if all is well, 1 if the log was tampered with or a decision comes out
+    otherwise, and 2 if it cannot be read.
     """
     from evofsm.guard import Head
     from evofsm.guard import audit as examine
@@ -42,7 +41,6 @@ def audit(
     found = examine(
         file,
         None if head is None else Head.parse(head),
-        replay=replay,
         failed=None if failed is None else imported(failed),
     )
     if as_json:
@@ -56,7 +54,6 @@ def audit(
 
 
 def _facts(found: Audit) -> Iterator[tuple[str, str]]:
-    """What was found, line by line."""
     from evofsm.fsm.validation import counted
 
     finding, contents = found.finding, found.contents
@@ -73,18 +70,16 @@ def _facts(found: Audit) -> Iterator[tuple[str, str]]:
     if contents.settings:
         held += f", {counted(contents.settings, 'setting change')}"
     yield "holds", held + ("" if finding is None else ", so far")
-    if found.replayed is None:
-        yield "replay", "not done"
-    else:
-        yield from _of_replay(found, found.replayed)
+    yield from _of_replay(found)
     if finding is None:
         yield "head", str(found.head)
 
 
-def _of_replay(found: Audit, replayed: int) -> Iterator[tuple[str, str]]:
+def _of_replay(found: Audit) -> Iterator[tuple[str, str]]:
     from evofsm.fsm.validation import counted
 
-    difference, decisions = found.difference, found.contents.decisions
+    difference, replayed = found.difference, found.replayed
+    decisions = found.contents.decisions
     good = f"{counted(replayed, 'decision')} as recorded, to the last bit"
     if difference is None:
         yield "replay", good

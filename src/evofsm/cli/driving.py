@@ -154,7 +154,6 @@ class Results:
         self._collisions = sum(row["collided"] for row in self.rows.values())
 
     def _begin(self, folder: Path) -> None:
-        """Go on from what is in the folder."""
         setup = self.setup
         folder.mkdir(parents=True, exist_ok=True)
         self._journal = Journal(folder / _JOURNAL, setup.settings)
@@ -232,7 +231,6 @@ class Results:
 
 
 def _write_decisions(path: Path, rows: Sequence[Outcomes]) -> None:
-    """Every decision, as a table."""
     with needs("polars", "tables", "writing decisions as Parquet"):
         import polars
     kinds = {name: polars.List(DECISION_COLUMNS[name].kind) for name in DECISION_TABLE}
@@ -244,7 +242,6 @@ def _write_decisions(path: Path, rows: Sequence[Outcomes]) -> None:
 
 
 def _decided(driven: Episode) -> dict[str, list[Any]]:
-    """The columns of an episode's decisions."""
     columns = {name: DECISION_COLUMNS[name].read for name in DECISION_TABLE}
     return {name: [read(d) for d in driven.decisions] for name, read in columns.items()}
 

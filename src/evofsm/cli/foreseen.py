@@ -120,7 +120,6 @@ def _runs(episodes: Sequence[Chunk]) -> Runs:
 def _document(
     judge: Foresight, tolerance: float, runs: Runs, times: NDArray[np.float64]
 ) -> dict[str, Any]:
-    """What came of all alarms in a log, beside plain thresholds; rows count from 0."""
     chosen, alarms, limits = judge.rate_of(tolerance), [], []
     for rate, stated in enumerate(RATES):
         row: dict[str, Any] = {"stated": stated, "is_own": rate == chosen}
@@ -174,7 +173,6 @@ def _listed(
 def _tables(
     found: dict[str, Any], judge: Foresight, title: str, held_out: str
 ) -> Iterator[RenderableType]:
-    """The same for people."""
     days = found["seconds"] / 86400.0
     soon = f"an alarm is right if one comes within {span(found['horizon'])}"
     text, rows, bold = "none: cross-validated, no alarm was better than chance", [], []

@@ -325,10 +325,7 @@ def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: R
 def _score(
     model: FSMModel, trace: Trace, block: Chunk, taken: NDArray[np.int64], read: Read
 ) -> None:
-    """Add the divergences of forecasts of rows: of one step as it was learnt, of more by a model.
-
-    The first step is made under its own action, the others under all alike, as in the paper.
-    """
+    """Add divergences of forecasts: the first step under its action, others under all alike."""
     episode = np.zeros(len(taken), np.int64)
     episode[block.starts] = 1
     episode = episode.cumsum()
@@ -353,7 +350,6 @@ def _score(
 
 
 def _skills(read: Read) -> Iterator[Skill]:
-    """The means, for each kind of forecast."""
     for sums, steps in zip(read.sums, read.steps_ahead, strict=False):
         count, persistence, forecast = sums.tolist()
         skill = 1.0 - forecast / persistence if persistence > 0.0 else np.nan

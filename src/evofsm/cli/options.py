@@ -293,7 +293,6 @@ def seconds(name: str, text: str) -> float:
 
 
 def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
-    """How rows of a step become one."""
     from evofsm.io.logs import BECOME, Resample
 
     step, *told = _named(text) or [("", "")]

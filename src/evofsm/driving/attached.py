@@ -97,8 +97,6 @@ class Neighbour(NamedTuple):
 
 
 class _Facts(NamedTuple):
-    """What does not change about a car."""
-
     length: float  #: [m]
     min_gap: float  #: [m]
     decel: float  #: [m/s²]
@@ -258,12 +256,11 @@ class Guarding:
         guard: Guard | None,
         acts: bool,
         settings: Mapping[str, float],
-        learn: bool,
         report: Callable[[GuardedStep], None] | None,
     ) -> None:
         self._sumo, self._vehicle, self._seeing = sumo, sumo.vehicle, seeing
         self._acts, self._report = acts, report
-        self._template, self._settings, self._learn = guard, settings, learn
+        self._template, self._settings = guard, settings
         self.cars: dict[str, _Car] = {}  #: by id
         self._watches: dict[str, BrakeWatch] = {}
         #: How hard they were seen to brake.
@@ -313,7 +310,7 @@ class Guarding:
             car.speed, car.time = speed, time
             if self._acts:
                 self._act(car, speed)
-        if decides and self._learn:
+        if decides:
             self._watch(seen_leaders)
 
     # -- A step ---------------------------------------------------------------------------------
@@ -533,7 +530,6 @@ class _Ride:
     _latest: dict[str, tuple[float, float]] = field(default_factory=dict)  # speed, acceleration
 
     def see(self, car: str, speed: float, free: float) -> None:
-        """Take in the speed of a car after a step, and that on a free road [m/s]."""
         dt = self.dt
         self.seconds += dt
         self.metres += speed * dt
@@ -545,12 +541,10 @@ class _Ride:
         self._latest[car] = speed, acceleration
 
     def forget(self, cars: Iterable[str]) -> None:
-        """These have left."""
         for car in cars:
             self._latest.pop(car, None)
 
     def told(self) -> dict[str, float]:
-        """What it came to, by name."""
         seconds = self.seconds or math.nan
         return {
             "car_seconds": self.seconds,
@@ -734,15 +728,15 @@ def attach(
     tolerance: float = TOLERANCE,
     leader_decel: float = _LEADER_DECEL,
     regain: float = REGAIN,
-    learn: bool = True,
     seed: int = 0,
     report: Callable[[GuardedStep], None] | None = None,
 ) -> Attachment:
     """Guard, or watch, cars of a SUMO simulation that runs.
 
     From then on each ``simulationStep`` does the rest. SUMO drives a guarded car as before, but no
-    faster than its guard allows. The guard minds who is ahead and behind in its lane; right of way,
-    red lights and lane changes stay SUMO's.
+    faster than its guard allows, and all guards learn how hard leaders brake from what each sees.
+    The guard minds who is ahead and behind in its lane; right of way, red lights and lane changes
+    stay SUMO's.
 
     Parameters
     ----------
@@ -766,8 +760,6 @@ def attach(
     regain : float
         Within this time a gap that is not safe, such as after a lane change, is to be safe again
         [s], by no more braking than that takes; see `LatentRisk`.
-    learn : bool
-        Whether the guards learn how hard leaders brake, all of them from what each sees.
     seed : int
         Of the share.
     report : callable, optional
@@ -806,7 +798,7 @@ def attach(
     cars: Guarding | Watching = Watching(seeing)
     if mode != "watch":
         settings = {"tolerance": tolerance, "leader_decel": leader_decel, "regain": regain}
-        cars = Guarding(sumo, seeing, guard, mode == "act", settings, learn, report)
+        cars = Guarding(sumo, seeing, guard, mode == "act", settings, report)
     attachment = Attachment(sumo, chosen, seeing, cars)
     attachment.listen()
     return attachment

@@ -60,8 +60,6 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         "kinematic" or "sumo".
     seed : int
         Of the family's draws. The seed of `reset` picks among them.
-    split : str
-        Which scenarios to pick from, unless `reset` is told.
     collision_cost : float
         Taken from the reward of the step that ends in a collision [m].
 
@@ -82,14 +80,12 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         world: str = "kinematic",
         *,
         seed: int = 0,
-        split: str = "train",
         collision_cost: float = 1000.0,
     ) -> None:
         if not 0.0 <= collision_cost < math.inf:
             raise ValueError(f"collision_cost is {collision_cost}; it must be finite, 0 or more")
         self.family = family if isinstance(family, Family) else load_family(family)
         self.seed = seed
-        self.split = split
         self.collision_cost = collision_cost
         self.draw: Draw | None = None  #: what is driven: its scenario, and its own controller
         self.observation_space = Box(np.array(LOW), np.array(HIGH), dtype=np.float64)
@@ -106,7 +102,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         """Begin a scenario, drawn by ``seed`` or with ``split`` and ``index`` of ``options``."""
         super().reset(seed=seed)
         asked = dict(options or {})
-        split = asked.pop("split", self.split)
+        split = asked.pop("split", "train")
         drawn = int(self.np_random.integers(_INDICES))
         index = int(asked.pop("index", drawn))
         if asked:
@@ -144,7 +140,6 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self._open.close()
 
     def _info(self, step: Episode) -> dict[str, Any]:
-        """What is known after a step, given its rows."""
         return {
             "time": float(step.time[-1]),
             "gap": float(step.observations[-1, 0]),

@@ -43,8 +43,7 @@ def _paper(numbers: Numbers) -> tuple[Scenario, IDM | ChangingIDM]:
 
     Section 3 of Han, Filev, Ozguner (arXiv:1908.10823), run on to 60 s, in which not all stand. The
     settings are those of `evofsm paper`, but for the set of actions, which begins at -2.5 m/s²
-    in the study: there no one could command what its drivers brake by. Unrevised, cases 1 and 4
-    collide; 28 % of the time is a dead end.
+    in the study: there no one could command what its drivers brake by.
     """
     leader = Leader(_LEADER_MODEL, brake_decel=9.0, brake_speed=24.2)
     hasty, calm = _aggressive(-4.0), _normal(-4.0)

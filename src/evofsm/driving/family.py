@@ -79,7 +79,6 @@ class Numbers:
         return choices[self.below(f"{place}.one_of", len(choices))]
 
     def _stream(self, place: str) -> np.random.Generator:
-        """The random numbers that belong to a place."""
         return np.random.default_rng([*self._key, crc32(place.encode())])
 
 
@@ -248,7 +247,6 @@ def _with(part: str, **values: float) -> Callable[[Scenario, Numbers], Scenario]
 
 
 def _third_car(scenario: Scenario, numbers: Numbers) -> Scenario:
-    """A car behind, with the ordinary brakes that UN R157 counts on."""
     gap = numbers.between("behind.gap", 10.0, 40.0)
     driver = IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=-6.0, highest=2.5)
     return replace(scenario, behind=Behind(driver, gap))

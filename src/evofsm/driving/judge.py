@@ -221,7 +221,6 @@ class LatentRisk(Retraced):
 
     @step
     def _keep_up(self, seen: Three, command: float, learn: bool, watched: bool) -> None:
-        """Keep up with what was seen, and learn from it."""
         estimate = self.perception.see(seen, self._expected, sure=self.brakes.known, learn=learn)
         self._commands = (self._commands[1], command)
         ended = None
@@ -361,7 +360,6 @@ class LatentRisk(Retraced):
         return found
 
     def _leader_braking(self, situation: Situation) -> float:
-        """How hard the leader brakes since the observation before [m/s²]."""
         now, before = self._estimate(situation.observation).mean, self.perception.latest
         if before is None or is_another(before.mean, now, self.dt):
             return 0.0
@@ -623,7 +621,6 @@ def _judge(
     evidence: float,
     judged: NDArray[np.float64],
 ) -> None:
-    """Write risk, its interval and the critical deceleration."""
     critical_decelerations(observation, accelerations, before, body, dt, judged[3])
     for k in range(len(accelerations)):
         judged[0, k] = _interpolated(judged[3, k], table)

@@ -25,7 +25,6 @@ _GRAVITY = 9.81
 
 
 def _columns(observations: Floats) -> Floats:
-    """Gap and both speeds, one after the other."""
     return np.moveaxis(np.asarray(observations, dtype=np.float64), -1, 0)
 
 

@@ -145,7 +145,6 @@ def is_whole(observation: Three) -> bool:
 
 @compiled
 def _diagonal(deviations: Three) -> Matrix:
-    """Covariance of what is not correlated."""
     gap, speed, leader = deviations
     return (gap * gap, 0.0, 0.0), (0.0, speed * speed, 0.0), (0.0, 0.0, leader * leader)
 

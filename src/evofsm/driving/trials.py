@@ -137,7 +137,6 @@ def outcome_of(episode: Episode, unrevised: Reference, interval: float) -> Outco
 
 
 def _distance(episode: Episode, until: int) -> float:
-    """Driven up to a row [m]."""
     dt = episode.time[1] - episode.time[0]
     return float(episode.record[: until + 1, SPEED].sum() * dt)
 

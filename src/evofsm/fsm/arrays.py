@@ -204,7 +204,6 @@ _SUM = COUNT._replace(whole=False)
 
 
 def _optional(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The same settings, each of which may be missing."""
     return {
         name: told._replace(optional=True) if isinstance(told, Numbers) else told
         for name, told in settings.items()

@@ -129,10 +129,7 @@ def potential_of(now: Any, variables: Records, weights: Floats, z: Floats) -> fl
 
 @inner_kernel
 def _update_potentials(learnt: Learnt, settings: Settings, n: int) -> float:
-    """Recursion of the centres' potentials; returns the highest.
-
-    It needs the distances to z_{t-1}, which are still at hand from the step before.
-    """
+    """Recursion of the centres' potentials, by the distances to z_{t-1}; returns the highest."""
     potentials, squared_distances = learnt.potentials, learnt.squared_distances
     t = learnt.now[0].n_observations + 1.0
     for i in range(lanes(n)):

@@ -49,7 +49,6 @@ def jensen_shannon_kernel(p: Floats, q: Floats, n: int, terms: Floats) -> float:
 
 @inner_kernel
 def _series(x: float) -> float:
-    """Of ``x = d^2``, seven terms."""
     x2 = x * x
     last = 1 / 45 + x * (1 / 66) + x2 * (1 / 91)
     return x * (1.0 + x * (1 / 6) + x2 * (1 / 15 + x * (1 / 28) + x2 * last))

@@ -137,10 +137,7 @@ class Forecasts:
         return predicted if np.ndim(belief) == 2 else predicted[0]
 
     def _matrix(self, horizon: int, action: int, i: Any, j: Any) -> Floats:
-        """Transition probabilities from states i to states j under an action.
-
-        It is presumed to lead where all lead together.
-        """
+        """Transition probabilities from states i to j; presumed are those of all actions."""
         block, stays = np.ix_(i, j), i[:, None] == j
         share = self._moving[horizon][1] / self._moving[horizon].sum()
         presumed = share * self._elsewhere[block] + (1.0 - share) * stays

@@ -198,10 +198,7 @@ def announce_compiling() -> None:
 
 
 def _drop_stale_caches(package: Path) -> None:
-    """Delete cached code where a file of kernels has changed.
-
-    Numba compares a cached kernel with its own file only, not with those of the kernels it calls.
-    """
+    """Delete cached code where a file of kernels has changed; Numba looks at its own file only."""
     noted = package / "__pycache__" / "kernels.json"
     files = [(path, path.stat()) for path in sorted(package.rglob("*.py"))]
     times = [[str(path), stat.st_size, stat.st_mtime_ns] for path, stat in files]

@@ -629,7 +629,6 @@ class EvolvingFSM(Retraced):
             )
 
     def _fit(self, m: int) -> None:
-        """Settle the number of variables with the first observation."""
         if self.n_states == 0:
             self._settings = self._settings._replace(weights=rules.weights_of(self._rule, m))
             learnt = arrays.blank(m, self.n_actions, LINE, 0)
@@ -643,7 +642,6 @@ class EvolvingFSM(Retraced):
             self._learnt = arrays.resized(self._learnt, *room)
 
     def _nearest(self, state: int) -> Nearest | None:
-        """How far the latest observation is from its state, if it was seen whole."""
         learnt = self._learnt
         if learnt.states["latest_visit"][state] != learnt.now["clock"][0]:
             return None

@@ -291,7 +291,6 @@ class FSMModel:
 
     @property
     def _content(self) -> dict[str, Any]:
-        """All but the arrays, for JSON."""
         return {name: getattr(self, name) for name in ("width", "dt", "failures_told")} | {
             **{name: list(getattr(self, name)) for name in ("names", "units")},
             "actions": None if self.actions is None else asdict(self.actions),
@@ -319,7 +318,6 @@ class FSMModel:
         return given, rows
 
     def _belief(self, belief: Any) -> Floats:
-        """Refuse what is no distribution over the states."""
         given = np.asarray(belief, dtype=np.float64)
         if given.shape != (self.n_states,):
             raise ValueError(

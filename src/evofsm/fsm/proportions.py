@@ -110,7 +110,6 @@ class FailureRecord(NamedTuple):
 
 
 def _rate(failures: int, exposure: float, words: str) -> str:
-    """A rate and its bounds, rounded outward."""
     low, high = (bound / exposure for bound in poisson_bounds(failures))
     if failures == 0:
         return f"{_two_digits(high, math.ceil)} {words}"

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from copy import deepcopy
 from functools import wraps
-from threading import RLock, get_ident
+from threading import RLock
 from typing import Any, TypeAlias, TypeVar, cast
-from weakref import WeakSet
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 #: Takes back what was done since it was made; twice is as good as once.
@@ -16,15 +14,12 @@ Rollback: TypeAlias = Callable[[], None]
 
 # So many steps are gone through again at most.
 _MOST_STEPS = 512
-# All that threads share, for a process that is forked.
-_SHARED: WeakSet[Any] = WeakSet()
 
 
 def share(shared: Any) -> None:
     """Give an object a lock, so that threads may share it: its ``_lock``."""
     shared._lock = RLock()
-    shared._call = None  # of a transaction under way the thread, and what takes it back
-    _SHARED.add(shared)
+    shared._call = None  # what takes back a transaction under way
 
 
 def alone(method: Method) -> Method:
@@ -50,10 +45,10 @@ def transaction(method: Method) -> Method:
             return method(self, *args, **kwargs)
         with self._lock:
             if self._call is not None:  # an interrupt broke off the taking back, too
-                self._call[1]()
+                self._call()
             rollback: Rollback = self._savepoint()
             try:
-                self._call = get_ident(), rollback
+                self._call = rollback
                 result = method(self, *args, **kwargs)
                 self._call = None
                 return result
@@ -106,20 +101,3 @@ def step(method: Method) -> Method:
         return result
 
     return cast(Method, noted)
-
-
-def _begin_alone() -> None:
-    """In a process just forked: it lacks the threads that held locks and would go on.
-
-    What they were amid is taken back.
-    """
-    for shared in (every := list(_SHARED)):
-        shared._lock = RLock()
-    for shared in every:
-        if shared._call is not None and shared._call[0] != get_ident():
-            shared._call[1]()
-            shared._call = None
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_begin_alone)

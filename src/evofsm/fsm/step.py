@@ -142,10 +142,7 @@ def believe(learnt: Learnt, belief: Floats) -> None:
 def _create(
     learnt: Learnt, settings: Settings, limit: Limit, nearest: int, potential: float
 ) -> tuple[int, int]:
-    """Create a state on the latest observation; returns what happened and the nearest state.
-
-    Where there are as many states as allowed, two, or the newcomer and one, are merged.
-    """
+    """Create a state, at the limit by merging two; returns what happened and the nearest."""
     now, n = learnt.now[0], learnt.now[0].n_states
     new, event = n, CREATED
     if limit is None or n < limit:  # None is known as this is compiled: the rest is left out then
@@ -170,7 +167,6 @@ def _create(
 
 @inner_kernel
 def _tick(now: Any) -> None:
-    """Count an observation, with which an episode may begin."""
     now.clock += 1
     now.before = now.state if now.chained else -1
     now.began = now.began if now.chained else now.clock
@@ -200,10 +196,7 @@ def _count_decision(learnt: Learnt, place: int, n: int, failed: bool) -> None:
 
 @rare_kernel
 def _end(learnt: Learnt, settings: Settings) -> None:
-    """Count the failure where the episode was last and what it did before; clear the chain.
-
-    So failed all that the episode did within the horizon before.
-    """
+    """Count the failure, and all that the episode did within the horizon; clear the chain."""
     now = learnt.now[0]
     learnt.sums[ENDINGS, now.state] += 1.0
     since = max(float(now.began), now.clock - settings.failure_horizon)

@@ -168,7 +168,6 @@ def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> No
 
 @spliced_kernel
 def _forget(learnt: Learnt, given: int, n: int) -> None:
-    """Make an index as good as new."""
     learnt.states[given].joined = learnt.states[given].latest_visit = 0.0
     for k in range(len(learnt.sums)):
         learnt.sums[k, given] = 0.0

@@ -508,7 +508,6 @@ def made_by() -> dict[str, str]:
 
 
 def _start(guard: Guard) -> dict[str, Any]:
-    """Who decides, as it is before the episode."""
     file = BytesIO()
     if known := can_be_made_again(guard):
         guard.save(file)

@@ -196,13 +196,11 @@ def _variables(names: Sequence[object], a: int, *, whole: bool) -> str:
 
 
 def _sections(template: Path) -> dict[str, str]:
-    """The parts of a template by their names."""
     _, *parts = re.split(r"^/\* ==== (\S+) ==== \*/\n", template.read_text("utf-8"), flags=re.M)
     return dict(zip(parts[::2], parts[1::2], strict=True))
 
 
 def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Sizes and constants of the loop: states, input, actions."""
     actions, model = guard.actions, guard._frozen
     low, high = (np.atleast_1d(end) for end in limits(actions))
     seen_from, seen_to = looping.ends_of(reviser.risk, m)
@@ -234,7 +232,6 @@ def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any
 
 
 def _learnt(reviser: ActionReviser) -> Part:
-    """What a learnt judge decides by."""
     risk: Any = reviser.risk
     state, parts = risk.state, risk.parts
     if parts is None or not len(state.forms):
@@ -291,7 +288,6 @@ _OF_MODEL = (
 
 
 def _written(constants: Mapping[str, Any]) -> str:
-    """Numbers as macros, arrays as constants."""
     numbers, arrays = "", ""
     for name, value in constants.items():
         if np.ndim(value) == 0:

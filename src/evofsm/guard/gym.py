@@ -291,7 +291,6 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     def _learn(
         self, observations: Any, rewards: Any, terminated: Any, truncated: Any, infos: Any
     ) -> None:
-        """Tell each environment's lane what followed."""
         rows = iterate(self.env.observation_space, observations)
         for k, (lane, observation) in enumerate(zip(self._lanes, rows, strict=True)):
             ends, info = (bool(terminated[k]), bool(truncated[k])), _of_one(infos, k, self.num_envs)
@@ -299,7 +298,6 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 def _of_one(infos: Mapping[str, Any], k: int, count: int) -> dict[str, Any]:
-    """The part of ``infos`` that belongs to one environment of so many."""
     found = {}
     for name, value in infos.items():
         if (name[:1] == "_" and name[1:] in infos) or (
@@ -529,7 +527,6 @@ class Terms:
 
 
 def _flat(space: Space[Any]) -> Observe:
-    """From an observation to a vector."""
     if isinstance(space, Box):
         return lambda observation: np.reshape(observation, -1)
     if isinstance(space, Dict) and space.keys() == {"observation", "action_mask"}:

@@ -105,13 +105,11 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
         return observations, rewards, terminated, truncated, infos
 
     def _begin(self, observations: _Each, infos: _Each) -> None:
-        """Begin the episodes of agents that are new."""
         for agent, observation in observations.items():
             if not (lane := self._enter(agent)).is_open:
                 lane.begin(observation, infos.get(agent, {}))
 
     def _enter(self, agent: Any) -> Lane:
-        """The lane of an agent, which may be new."""
         if agent not in self._lanes:
             spaces = self.env.observation_space(agent), self.env.action_space(agent)
             self._lanes[agent] = Lane(self._terms(*spaces), shared=True)

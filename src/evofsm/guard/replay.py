@@ -71,7 +71,7 @@ class Audit(NamedTuple):
     half_written: int  #: what a last line without an end holds, as after a crash [byte]
     finding: Finding | None  #: None where nothing was tampered with
     contents: Contents  #: of the records up to there
-    replayed: int | None  #: decisions that came out as they were recorded; None if not asked for
+    replayed: int  #: decisions that came out as they were recorded
     difference: Finding | None  #: the first record that does not come out again
     not_replayed: tuple[str, ...]  #: why not, of each session that could not be
     other_makers: tuple[Field, ...]  #: what computed then and what does now, where that differs
@@ -82,9 +82,7 @@ class Audit(NamedTuple):
         return self.finding is None and self.difference is None
 
 
-def audit(
-    path: Path, kept: Head | None = None, *, replay: bool = True, failed: _Failed | None = None
-) -> Audit:
+def audit(path: Path, kept: Head | None = None, *, failed: _Failed | None = None) -> Audit:
     """Verify the chain of a log and the form of its records, and decide again.
 
     Parameters
@@ -93,7 +91,6 @@ def audit(
         A log that is being written is audited up to where it is now.
     kept : Head, optional
         A head that was kept elsewhere.
-    replay : bool
     failed : callable, optional
         As the guard had it. No log holds code: without it episodes of a guard that was told by a
         function where it fails are not replayed, which is said.
@@ -133,7 +130,7 @@ fields=())
             break
         counts[record.content["kind"]] += 1
         counts["quiet rows"] += len(record.content.get("before", ()))
-        if replay and difference is None:
+        if difference is None:
             difference = player.play(record)
     finding = finding or chain.finding
     if chain.head == NOTHING and finding is None:
@@ -147,7 +144,7 @@ fields=())
         half_written=chain.half_written,
         finding=finding,
         contents=contents,
-        replayed=player.decisions if replay else None,
+        replayed=player.decisions,
         difference=difference,
         not_replayed=tuple(player.not_replayed),
         other_makers=tuple(player.other_makers.values()),
@@ -275,7 +272,6 @@ class _Player:
     def _again(
         guard: Guard, time: Any, observation: Any, action: Any, mask: Any = None
     ) -> tuple[str, dict[str, Any], bool]:
-        """Which decision it is, what is told of it, and whether it is one to speak of."""
         proposal = Proposal(_action(action), checked_mask(guard.actions, mask))
         situation = guard.recognise(_floats(observation), _number(time))
         revision = guard.revise(situation, proposal)
@@ -312,7 +308,6 @@ def _action(action: Any) -> Action:
 
 
 def _differing(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> tuple[Field, ...]:
-    """What is not the same to the last bit."""
     fields = {
         name: tuple(canonical(entry[name]) if name in entry else "" for entry in (recorded, again))
         for name in sorted(recorded.keys() | again.keys())

@@ -222,7 +222,6 @@ class SceneRisk(ActionJudge):
         return f"how close is too close was learnt of {self.memory.failures} failures"
 
     def _foreseen(self, situation: Situation) -> Foreseen | str:
-        """What each action brings, or why nothing can be said."""
         seen = self._read(situation.observation)
         if self.memory.contact is None:
             return self.told_by_experience
@@ -237,7 +236,6 @@ class SceneRisk(ActionJudge):
         return Judgement(risks, low, high, np.full(len(risks), math.nan), evidence)
 
     def _read(self, observation: _Floats) -> Seen:
-        """What an observation shows."""
         if not observation.size or observation.size % self.columns:
             raise ValueError(f"{observation.size} numbers are no rows of {self.columns}")
         rows = observation.reshape(-1, self.columns)
@@ -673,7 +671,6 @@ class Memory:
         self._paths, self._others = paths[rows], past.other[rows]
 
     def _features(self, own: _Floats, away: _Floats, other: _Floats) -> _Floats:
-        """(k, f) what two objects are compared by."""
         far, rest, ego = self._spreads
         near = _NEAR_TO * away / far, _NEAR_TO * other / rest
         return np.hstack([*near, (away + own[:, :_P]) / far, own[:, _P:] / ego[_P:]])

@@ -68,7 +68,6 @@ class _Channels:
         self._log = LogChannel("/log", context=self.context)
 
     def event(self, kind: str, at: float, observation: NDArray[np.float64]) -> None:
-        """Something happened, so long after the episode began [s]."""
         where = dict(zip(self.names, observation.tolist(), strict=False))
         self._send("/event", at, {"kind": kind, "episode": self.episode, "time": at, **where})
 
@@ -91,7 +90,6 @@ class _Channels:
             self.note(level, situation.time, f"{text}: {revision.reason}")
 
     def note(self, level: LogLevel, at: float, text: str) -> None:
-        """A line for the log panel."""
         now = self.begin + round(at * _SECOND)
         stamp = Timestamp(*divmod(now, _SECOND))
         self._log.log(Log(timestamp=stamp, level=level, message=text, name="evofsm"), log_time=now)
@@ -144,7 +142,6 @@ class _File:
             raise self.error or error from None
 
     def write(self, data: bytes | bytearray) -> int:
-        """Write, or remember why not."""
         try:
             return self._file.write(data)
         except OSError as error:
@@ -155,7 +152,6 @@ class _File:
         return getattr(self._file, name)
 
     def close(self) -> None:
-        """Write the index, which ends the log."""
         with self.explained():
             self.mcap.close()
 

@@ -107,7 +107,6 @@ def _refuse_no_probability(least: float) -> None:
 
 
 def _where(model: FSMModel, state: int) -> list[str]:
-    """Name, value and unit of each variable at the centre of a state."""
     nothing = ("",) * model.n_variables
     variables = zip(model.names or nothing, model.units or nothing, strict=True)
     return [
@@ -196,7 +195,6 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
 
 
 def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> Iterator[str]:
-    """What the process is, what its actions are, and what it lacks."""
     tried = model.decisions > 0.0
     few = tried & (model.decisions < evidence)
     lost = model.decisions[few].sum() / model.decisions.sum()
@@ -216,7 +214,6 @@ def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> Ite
 
 
 def _command(model: FSMModel, state: int, action: int, least: float) -> Iterator[str]:
-    """What an action does in a state, with what it rests on."""
     decided, failed = model.decisions[action, state], model.failures[action, state]
     row = model.transition_matrices[action, state]
     row = np.where(row >= min(least, row.max()), row, 0.0)

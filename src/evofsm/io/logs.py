@@ -690,10 +690,7 @@ def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
 
 
 class _Clock:
-    """Sees that time runs forward, and finds the holes in it, in one file after the other.
-
-    The usual step of a file is the median of the steps in the first rows read of it.
-    """
+    """Finds holes in time, by the median step of the first rows; time must run forward."""
 
     def __init__(self, columns: LogColumns) -> None:
         self.ticks = columns.dt is None
@@ -703,7 +700,6 @@ class _Clock:
         self._first_path = ""
 
     def open(self, path: str) -> None:
-        """Begin a file."""
         self._path = path
         self._last = self._usual = np.nan
 
@@ -796,7 +792,6 @@ class _Reader:
         self._unknown: Callable[[], str] | None = None  # says where that row has no action
 
     def chunks(self) -> Iterator[Chunk]:
-        """The rows that are learnt, piece by piece."""
         action, clock = self._columns.action, self._clock
         wanted, factors = self._wanted()
         waiting: Chunk | None = None  # until it is known whether its last row failed
@@ -958,11 +953,7 @@ class _Reader:
             )
 
     def _starts(self, piece: Piece) -> NDArray[np.bool_]:
-        """The rows that begin another episode.
-
-        The rows of an episode have to stand together: one that comes back after another one would
-        be cut there, and what leads from one of its rows to the next be lost without a word.
-        """
+        """The rows that begin another episode, of which all rows have to stand together."""
         starts = np.zeros(piece.rows, np.bool_)
         if piece.starts is not None:
             starts[piece.starts] = True
@@ -1078,7 +1069,6 @@ class _Reader:
 
 
 def _encoded(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
-    """Columns of the observation for one variable."""
     if isinstance(variable, str):
         return piece.numbers[variable]
     encoder = ObservationEncoder(variable)

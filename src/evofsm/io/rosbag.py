@@ -343,7 +343,6 @@ class _Type(NamedTuple):
     definition: str
 
     def store(self, topic: str) -> Any:
-        """What unpacks such messages."""
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
         if self.packed != "cdr":

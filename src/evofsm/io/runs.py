@@ -300,7 +300,6 @@ def _episode(
 
 
 def _column(name: str, field: str, messages: list[dict[str, Any]]) -> NDArray[Any]:
-    """A field of all messages, in their order."""
     if name == "belief":
         rows = [message[field] for message in messages]
         longest = max(map(len, rows), default=0)

@@ -351,10 +351,7 @@ def fcd_of_table(table: Table) -> Iterator[_Timestep] | None:
 
 
 def _by_time(table: Table, wanted: Wanted) -> Iterator[tuple[float, list[tuple[Any, ...]]]]:
-    """Place, numbers behind the time, and texts of all rows of a time.
-
-    Where a row is left out, so are those of its time: others would be taken for pairs.
-    """
+    """Place, numbers and texts of all rows of a time, unless one is left out."""
     now, rows, is_whole = math.nan, list[tuple[Any, ...]](), True
     for piece in table.pieces(wanted):
         piece.leave_out_unusable(wanted.numbers[0])
@@ -484,7 +481,6 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
 
 
 def _pointing(obj: Object, pointed: dict[str, float]) -> Object:
-    """The same object with a heading, if it is known from now or before."""
     heading = obj.heading if math.isfinite(obj.heading) else math.nan
     if math.isnan(heading) and math.hypot(obj.vx, obj.vy) >= _TURNS_ABOVE:
         heading = math.atan2(obj.vy, obj.vx)
@@ -594,7 +590,6 @@ def _is_view(osi: Any, data: bytes) -> bool:
 
 
 def _scene(osi: Any, place: str, data: bytes, is_view: bool) -> Scene:
-    """The moving objects on lanes, but pedestrians and animals."""
     try:
         message = (osi.SensorView if is_view else osi.GroundTruth).from_binary(data)
     except ValueError as error:

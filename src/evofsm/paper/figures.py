@@ -135,7 +135,6 @@ def draw_case(study: PaperStudy, run: Run) -> Drawn:
 
 
 def _title_of(study: PaperStudy, run: Run) -> str:
-    """The name of a run and how its follower drives."""
     manners = ("aggressive", "normal") if run.case in (1, 3) else ("normal", "aggressive")
     change = study.settings.switch_at.get(run.case)
     later = "" if change is None else f", {manners[1]} from {change:g} s"
@@ -143,7 +142,6 @@ def _title_of(study: PaperStudy, run: Run) -> str:
 
 
 def _tint(figure: Drawn, panels: Sequence[Axes], study: PaperStudy, run: Run) -> None:
-    """Tint the time in which a full brake of the leader could not be survived."""
     time, settings = run.episode.time, study.settings
     hopeless = study.in_dead_end(run)
     for axes in panels:

@@ -38,10 +38,7 @@ _WIDEST = 200
 
 
 class _Cell(Formatter):
-    """``str.format`` for cells: `NONE` for missing numbers, shares in percent, true minus signs.
-
-    What is small, but not 0, is not shown as 0.
-    """
+    """``str.format`` for cells, in which what is small, but not 0, is not shown as 0."""
 
     def get_field(self, name: str, args: Any, row: Any) -> Any:
         return row[name], name  # names may hold dots and brackets
@@ -260,7 +257,6 @@ def _drawn(page: Page, folder: Path) -> dict[str, str]:
 
 
 def _summary(pages: Sequence[Page]) -> Table:
-    """What each page asks and what came out, in a line each."""
     lost = [sum(len(table.frame) for table in page.losses) for page in pages]
     rows = {
         "question": [page.title for page in pages],
@@ -273,7 +269,6 @@ def _summary(pages: Sequence[Page]) -> Table:
 
 
 def _versions(more: Sequence[str]) -> dict[str, str]:
-    """What the numbers were computed with."""
     found = {"evofsm": evofsm.__version__, "Python": platform.python_version()}
     names = {"libsumo": "SUMO (libsumo)"}
     found |= {names.get(name, name): version(name) for name in (*_PACKAGES, *more)}

@@ -132,7 +132,6 @@ def _trace(number: int, run: Run) -> pl.DataFrame:
 
 
 def _tables(study: PaperStudy) -> Iterator[Table]:
-    """Forecasts against simple ones, states against an oracle, and how early they warn."""
     forecasts = divergences(study)
     yield Table(
         "Largest divergence of one-step forecasts [bit], by case, and the mean",
@@ -181,7 +180,6 @@ def divergences(study: PaperStudy) -> pl.DataFrame:
 
 
 def _table_of_losses(study: PaperStudy) -> Table:
-    """Every simple forecast that comes closer than the machine's."""
     found = divergences(study).unpivot(index="forecast", variable_name="where")
     machine = found.filter(forecast=_OURS).select("where", ours="value")
     better = found.filter(~pl.col("forecast").str.starts_with(_OURS)).join(machine, on="where")
@@ -199,7 +197,6 @@ def _table_of_losses(study: PaperStudy) -> Table:
 
 
 def _table_of_states(study: PaperStudy) -> Table:
-    """Where the states lie, and for how much of their time an oracle sees a dead end."""
     recognised = np.concatenate([run.state for run in study.runs])
     hopeless = np.concatenate([study.in_dead_end(run) for run in study.runs])
     ends = [run.state[-1] for run in study.runs if run.episode.collided]

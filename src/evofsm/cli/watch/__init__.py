@@ -109,7 +109,6 @@ def watch(
 
 
 async def _serve(watched: Session | Recording, port: int, *, browse: bool) -> None:
-    """Play to whoever opens the page."""
     from evofsm.cli.watch.player import Player
     from evofsm.cli.watch.server import LivePage
 

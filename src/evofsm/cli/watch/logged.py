@@ -109,7 +109,6 @@ def _whole(episodes: Iterable[Chunk]) -> Iterator[Played]:
 def _of_cars(
     episodes: Iterable[Chunk], collisions: Mapping[str, Sequence[float]]
 ) -> Iterator[Played]:
-    """Their stretches."""
     for number, whole in enumerate(episodes, 1):
         name = "".join(whole.names) or f"episode {number}"
         for rows, fails in _stretches(whole, collisions.get(name, ())):
@@ -139,7 +138,6 @@ def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Ch
 
 
 def _judged(guard: Guard, found: Sequence[Played]) -> Iterator[Played]:
-    """With the risk of each row, as the guard finds it."""
     with progress("Judging", len(found)) as move:
         for number, played in enumerate(found, 1):
             risks = [said.risk_proposed for said in decided_on(guard, played.rows)]

@@ -123,7 +123,6 @@ class Recording:
         )
 
     def _decided(self, frame: Frame, number: int) -> Frame:
-        """What was recognised, judged and decided."""
         row = {name: values[number] for name, values in self._episode.columns.items()}
         executed = Judged(*map(float, (row["risk_executed"], row["risk_low"], row["risk_high"])))
         risk = float(row["risk_proposed"])

@@ -73,7 +73,6 @@ def message(kind: str, what: Any, start: Start | None = None) -> str:
 
 
 def _rounded(value: Any) -> Any:
-    """With five decimals, and names of what has some."""
     if isinstance(value, float):
         return round(value, 5)
     value = value._asdict() if hasattr(value, "_asdict") else value
@@ -203,8 +202,6 @@ class LivePage:
 
 
 class _Command(msgspec.Struct, forbid_unknown_fields=True):
-    """What a page asks for."""
-
     do: str
     value: bool | float | None = None
 

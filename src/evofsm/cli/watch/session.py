@@ -279,7 +279,6 @@ class Simulated:
         self.time += self.interval
 
     def _wish(self) -> Any:
-        """What the controller wants, as the environment takes it."""
         if self._controller is None:
             return self._env.action_space.sample()
         return self._controller(self._seen, self._random)
@@ -500,7 +499,6 @@ class Session(AbstractContextManager["Session"]):
         self._reviser.mode = Mode.ACT if on else Mode.SHADOW  # type: ignore[attr-defined]
 
     def _idle(self) -> str:
-        """Why the reviser does not act; empty where it does."""
         if not self.revising:
             watched = "the reviser only watched, in shadow mode"
             return watched if self._is_log else "the reviser is off"
@@ -612,7 +610,6 @@ class Session(AbstractContextManager["Session"]):
         self._judged = self.judge.judge(situation, asked)
 
     def _needed(self, judged: Judgement) -> dict[str, Any]:
-        """What has to be survived, and why that is not."""
         judge = self.judge
         if isinstance(judge, LatentRisk):
             expected = judge.manoeuvres.exceeded_by

@@ -221,7 +221,6 @@ def _instead(better: Sequence[float], wished: Sequence[float], start: Start) -> 
 
 
 def _action(action: Sequence[float], start: Start) -> str:
-    """An action of any system, as people read it."""
     if start.discrete:
         return action_name(int(action[0])) if math.isfinite(action[0]) else "nothing"
     shown = [float(f"{value:.2g}") for value in action[:_COMPONENTS]]
