@@ -10,7 +10,7 @@ import copy
 import math
 import os
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from io import BytesIO
 from operator import attrgetter
@@ -178,6 +178,8 @@ class Guard:
     backup : callable, optional
         From an observation to an action that is thought to save. A learnt judge fits linear
         feedback to it, and tries that as one backup of several.
+    names : sequence of str
+        Of the variables of an observation, as a learnt judge says them.
     horizon : float, optional
         How far ahead a learnt judge looks, and what the machine's explanations call soon [s].
         Without it a learnt judge looks as far as it finds that it has to.
@@ -246,6 +248,7 @@ class Guard:
         failed: Callable[[NDArray[np.float64]], bool] | None = None,
         model: Callable[[NDArray[np.float64], Any], ArrayLike] | None = None,
         backup: Callable[[NDArray[np.float64]], ArrayLike] | None = None,
+        names: Sequence[str] = (),
         horizon: float | None = None,
         tolerance: float = TOLERANCE,
         mode: Mode = Mode.ACT,
@@ -259,12 +262,13 @@ class Guard:
         actions = _actions(low, high, n_actions)
         interval = positive("interval", interval)
         soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
-        given: dict[str, Any] = {"model": model, "backup": backup}
+        given: dict[str, Any] = {"model": model, "backup": backup, "names": names}
         if judge is None:
             known = {"n_actions": n_actions, "horizon": horizon, "seed": seed, **given}
             judge = LearntRisk(interval, low, high, **known)
         elif any(given.values()):
-            raise ValueError(f"{type(judge).__name__} asks no model and no backup: leave them out")
+            asks = "asks no model, no backup and no names: leave them out"
+            raise ValueError(f"{type(judge).__name__} {asks}")
         if machine is None:
             machine = EvolvingFSM(
                 actions.n_actions,

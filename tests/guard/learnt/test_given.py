@@ -53,7 +53,7 @@ def test_what_is_wrong_with_a_given_function_is_said_and_nothing_is_learnt():
     assert str(guard) == before
     with pytest.raises(TypeError, match="backup is 3; it must be a function, such as"):
         Guard(-1.0, 1.0, interval=0.1, backup=3)
-    with pytest.raises(ValueError, match="LearntRisk asks no model and no backup"):
+    with pytest.raises(ValueError, match="LearntRisk asks no model, no backup"):
         Guard(-1.0, 1.0, interval=0.1, judge=guard.judge, model=move)
 
 
@@ -80,3 +80,13 @@ def test_a_given_backup_is_fitted_for_choices_and_for_many_numbers(n_actions):
         assert np.sign(does[0] - 0.5 if n_actions else does[0]) == np.sign(
             z[0] if n_actions else -z[0]
         )
+
+
+def test_a_guard_says_variables_by_their_names():
+    guard = Guard(low=-1.0, high=1.0, interval=0.1, names=["angle", "speed"])
+    for k in range(4):
+        guard.decide([0.1 * k, 1.0], 0.5)
+    guard.end(failed=True, observation=[0.4, 1.0])
+    assert "fails where angle is above 0.3" in str(guard)
+    with pytest.raises(ValueError, match=r"it must have 2 \(angle, speed\)"):
+        guard.decide([0.0], 0.5)
