@@ -204,8 +204,7 @@ def _tables(
         is_other = limit["kind"] != "plain" and limit["plain"] != "none"
         beside = f"; plain thresholds would be {limit['plain']}" if is_other else ""
         said.append((f"{limit['stated']:g}", f"{judge.of(k)}{beside}"))
-    alike = "; plain thresholds do as well" * judge.is_plain
-    yield facts(f"\nWhere they alarm, by false alarms a day{alike}", said)
+    yield facts("\nWhere they alarm, by false alarms a day", said)
     rows = []
     for hit in found["listed"][-_LISTED:]:
         false = {0: [], 1: ["no"]}.get(hit["false"], [f"{hit['false']} times no"])
