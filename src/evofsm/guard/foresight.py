@@ -2,11 +2,10 @@
 
 A *limit* is a threshold of a variable, or of the nearness to a form of failure as `failure.explain`
 learns them: now, or as it will be at the present rate in half the horizon, or in all of it. An
-alarm is on while one of its limits is passed; it comes after a hold time, and stays on while one
-would be passed within the horizon at the present rate, and for a quarter of it after. It is right
-if a failure comes within the horizon after it began, whether or not it is on by then. Where it
-stays on, it says so once in each horizon, and is false as often as no failure came. A failure is
-foreseen by the first of those before it.
+alarm is on while one of its limits is passed; it comes after a hold time, and stays while one will
+be within the horizon at its rate, and for a quarter of it more. It is right if a failure comes
+within the horizon after it began, on by then or not. Where it stays on, it says so once in each
+horizon, and is false as often as no failure came. A failure is foreseen by the first before it.
 
 An alarm is of at most so many limits. Those are searched for that warn longest on average (none
 counts as 0), less a price for each false alarm, and beside them plain thresholds in the same way.
@@ -250,20 +249,23 @@ class Foresight(LearningJudge):
                 tallies[side, price] += found.lead * found.failures, found.foreseen, found.false
         judge, days = fresh._fitted(log), seen * dt / _DAY
         fewest = np.array([[poisson_bounds(int(n))[0] for n in row] for row in tallies[..., 2]])
-        chance, limits, told = log.failed.sum() * ahead / len(log.rows), [np.empty((0, 6))], []
+        chance, limits = log.failed.sum() * ahead / len(log.rows), [np.empty((0, 6))]
+        before, told = limits[0], list[Any]()  # limits of the rate before
         for rate, stated in enumerate(RATES):
             fit = fewest <= stated * days
             best = np.where(fit, tallies[..., 0], -1.0).argmax(1)
-            parts = [judge.of_rate(int(best[k]), plain=k > 0) for k in range(2)]
+            parts = [judge.of_rate(int(best[k]), plain=k > 0)[:, 1:] for k in range(2)]
             usable = fit[[0, 1], best] & [len(part) > 0 for part in parts]
             learnt, plain = tallies[[0, 1], best] * usable[:, None]
-            limits += [np.insert(parts[k][:, 1:], 0, rate, 1) for k in np.flatnonzero(usable)]
+            limits += [np.insert(parts[k], 0, rate, 1) for k in np.flatnonzero(usable)]
             as_many = min((plain[2] + 1.0) / (learnt[2] + 1.0), 1.0)
             kind = int(plain[0] >= _BETTER * as_many * learnt[0])
             _, right, false = (learnt, plain)[kind]
             low = wilson_bounds(right / (right + false), right + false)[0] if right else 0.0
             kind = kind if low > chance else _NO_KIND  # no better than an alarm at any time
-            told.append((right, false, log.failed.sum(), kind))
+            is_same = bool(told) and told[-1][3] == kind and np.array_equal(parts[kind % 2], before)
+            told.append(told[-1] if is_same else (right, false, float(log.failed.sum()), kind))
+            before = parts[kind % 2]
         known = judge.forms, np.concatenate(limits), np.array(told, np.float64)
         return cls(dt, ahead, held, *known, names, units)
 
@@ -277,8 +279,7 @@ class Foresight(LearningJudge):
         forms = failure.explain(FAILS, failed, survived)
         judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
         columns = judge._columns(log.rows, log.starts)
-        limits = [judge._searched(columns, log, plain=plain) for plain in (False, True)]
-        judge.limits = np.concatenate(limits)
+        judge.limits = np.vstack([judge._searched(columns, log, plain=k) for k in (False, True)])
         return judge
 
     def _searched(self, columns: Floats, log: Runs, *, plain: bool) -> Floats:
@@ -457,13 +458,17 @@ class Foresight(LearningJudge):
     def told_by_experience(self) -> str:
         """What each alarm is, with which tolerance it is taken, and how often it was right."""
         told = []
-        for text, group in groupby(range(len(self.held_out)), self.of):
-            *_, last = rates = [*group]
+        for stated, last in self.alarms.items():
             at = f"{self.tolerance_of(RATES[last]):.3g}"
             taken = f" (tolerance {at})" if self.rate_of(float(at)) == last else ""
-            stated = ", ".join(f"{RATES[k]:g}" for k in rates)
-            told.append(f"for {stated} false alarms a day{taken} {text}")
+            told.append(f"for {stated} false alarms a day{taken} {self.of(last)}")
         return "; ".join(told)
+
+    @property
+    def alarms(self) -> dict[str, int]:
+        """Those that differ: by all rates that one is for, in words, the last of these."""
+        groups = (list(group) for _, group in groupby(range(len(self.held_out)), self.of))
+        return {", ".join(f"{RATES[k]:g}" for k in rates): rates[-1] for rates in groups}
 
     def of(self, rate: int) -> str:
         """What the alarm for one of `RATES` is, and how often it was right, in words."""
@@ -651,10 +656,7 @@ def false_times(begun: int, over: int, fails: int, horizon: int) -> int:
 
 @kernel
 def _tally(above: Flags, on: Flags, starts: Ints, failed: Flags, spans: Ints, leads: Floats) -> int:
-    """False alarms where ``above`` marks (T,) the rows beyond a limit; leads (E,) are set.
-
-    ``on`` (T,) marks rows at which one stays on, and then all at which one is.
-    """
+    """False alarms of rows (T,) above limits; on (T,) is where one stays, then is; leads (E,)."""
     false, horizon, hold, stays = 0, spans[0], spans[1], spans[2]
     for e in range(len(starts)):
         end = starts[e + 1] if e + 1 < len(starts) else len(above)
