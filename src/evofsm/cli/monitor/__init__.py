@@ -155,9 +155,7 @@ def monitor(
         episode = kept.get("episode")
     given = {k: v for k, v in kept.items() if k not in ("observe", "episode")}
     reading = partial(reading_of, **{**reading.keywords, **given, **given_of(reading)})
-    if is_log and not summary:
-        warn(f"warning: {file} is read as live rows; of a log, --summary says where it alarms")
-    elif episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
+    if episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
         raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns of a log")
     rows = EPISODE if episode is None or is_log else int(episode)
     with ExitStack() as stack:
