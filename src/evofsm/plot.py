@@ -404,13 +404,12 @@ def history(
     *,
     model: FSMModel | None = None,
     limits: Sequence[tuple[int, float]] = (),
-    alarm: str = "alarm",
 ) -> None:
     """What was seen over time [s], above the risk; bands are alarms, crosses failures.
 
     Axes are one for each variable, then one for the states if there is a model, and one for the
     risk. What is far from nearly all else of a variable is not in view, but counted. Limits are
-    variables, by their index, and the values at which they alarm. The legend says ``alarm``.
+    variables, by their index, and the values at which they alarm.
     """
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
     fails, lasts = np.asarray(failed, np.bool_), np.ptp(when)
@@ -422,7 +421,7 @@ def history(
     x, red, blue = (when - when[0] * (not dated)) / size, COLORS["dead end"], COLORS["follower"]
     drawn = np.insert(x, holes, x[holes - 1] + step / size)
     said = np.insert(np.asarray(risk, np.float64), holes, np.nan)
-    look: Look = {"color": blue, "alpha": 0.3, "linewidth": 2.5, "label": alarm}
+    look: Look = {"color": blue, "alpha": 0.3, "linewidth": 2.5, "label": "alarm"}
     for ax in axes:
         over = ax.get_xaxis_transform()
         ax.fill_between(drawn, 0.0, 1.0, said > tolerance, transform=over, **look)

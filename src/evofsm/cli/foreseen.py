@@ -254,7 +254,7 @@ def _draw(
     near = max(int(runs.starts[number]), last - 4 * judge.horizon)
     limits = [] if chosen is None else judge.thresholds(chosen)
     stated = next((rates for rates, last in judge.alarms.items() if chosen == last), "")
-    alarm = f"alarm (for {stated} false a day)" if stated else "no alarm"
+    alarm = f", alarm for {stated} false a day" if stated else ", no alarm"
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
     model = None if machine is None or not machine.n_states else machine.model()
     count = len(names) + 1 + (model is not None)
@@ -262,9 +262,9 @@ def _draw(
         axes = figure.subplots(count, 2, sharex="col")
         title = f"Episode {number + 1:,}{', before it failed' if runs.failed[number] else ''}"
         title += f": {date(times[last])}" * bool(times[last] >= DATES)
-        parts = {f"{len(ends):,} episodes": slice(None), title: slice(near, last + 1)}
+        parts = {f"{len(ends):,} episodes{alarm}": slice(None), title: slice(near, last + 1)}
         for column, (title, part) in zip(axes.T, parts.items(), strict=True):
             seen = times[part], runs.rows[part], names, risk[part], failed[part]
-            plot.history(column, *seen, tolerance, model=model, limits=limits, alarm=alarm)
+            plot.history(column, *seen, tolerance, model=model, limits=limits)
             column[0].set_title(title, loc="left")
         axes[-1, 1].get_legend().remove()
