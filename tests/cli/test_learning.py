@@ -1,4 +1,4 @@
-"""Learning from chunks: the same in any size, scored as the definitions say."""
+"""Learning from chunks: the same in any size."""
 
 import math
 
@@ -47,22 +47,6 @@ def test_chunks_of_any_size_learn_what_one_does(trace, snapshot, size):
     assert snapshot(learnt.machine) == snapshot(whole.machine)
 
 
-def test_where_the_action_tells_what_comes_forecasts_beat_persistence():
-    # A switch: the action says where to go, so the belief never stays and is always foreseen.
-    places = np.random.default_rng(3).integers(0, 2, 4000)
-    Z = 10.0 * places[:-1, None].astype(float)
-    learnt = learn_traces(
-        chunks(Z, np.where(places[1:], 0.9, -0.9), [0]), machine(spread=0.01), ACTIONS
-    )
-    first, second = learnt.skills
-    assert learnt.model.n_states == 2
-    assert (first.seconds, second.seconds) == (0.1, 1.0)
-    assert first.forecasts > second.forecasts > 1000
-    assert first.skill == pytest.approx(1 - first.divergence / first.persistence)
-    assert first.skill > 0.9
-    assert 0.2 < second.skill < 0.6  # of what comes after it nothing is known
-
-
 def test_a_transition_goes_from_where_one_was_to_where_one_came():
     Z = np.tile([[0.0], [10.0], [30.0]], (40, 1))
     fsm = EvolvingFSM(ACTIONS.n_actions, rule=Novelty(1.0, [2.0]))
@@ -72,10 +56,9 @@ def test_a_transition_goes_from_where_one_was_to_where_one_came():
     assert len(passages(learnt.model, 2)) == 2  # the most frequent ones, not their mirror images
 
 
-def test_one_state_has_no_skill():
+def test_one_state_has_no_transitions():
     learnt = learn_traces(chunks(np.zeros((200, 2)), np.zeros(200), [0]), machine(), ACTIONS)
     assert learnt.model.n_states == 1
-    assert all(math.isnan(skill.skill) for skill in learnt.skills)
     assert passages(learnt.model) == []
 
 

@@ -199,6 +199,16 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     kinds = ["decision"] * 3 + ["end"] + ["waiting"] * 6  # one end of each failure
     assert [one["kind"] for one in came] == kinds
     assert came[3]["failed"]
+    trips = ";1;6,0;yes", *[";1;6,0;yes"] * 5, ";0;6,0;0"
+    times = [f"2025-03-10 06:{k:02}:00" for k in range(3, 10)]
+    lines = *(f"{date};0; 6,0;yes" for date in dates), *map("".join, zip(times, trips, strict=True))
+    odd = "10.03.2025 06:10:00;0;Bad;1", "10.03.2025 06:10:00;0", "10.03.2025 06:11:00;0;;yes"
+    title, header, *in_csv = answers("Mühle;;;", "Zeit;trip;heat;runs", *lines, *odd)
+    assert (title["kind"], header["kind"], in_csv[:10]) == ("error", "waiting", came)
+    bad, short, unseen = in_csv[10:]
+    assert (bad["about"], bad["error"][:27]) == ("heat", "line 13: 'Bad' is no number")
+    assert "line 14: 2 fields, but the header names 4" in short["error"]
+    assert "not seen: heat" in unseen["reason"]
     faults = {
         "'1'; it is compared with the number 1.0 (--failed)": {"trip": "1"},
         "'TRIP'; it must be a truth value": {"runs": "TRIP"},
@@ -275,6 +285,8 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
         watched_log(path, reading_of(**told | {"observe": BEARING, "resample": "20s"}), guard=guard)
     assert "as in a log: --" in live.stderr
     assert "--hole 5min" in live.stderr
+    beside = evofsm("monitor", "guard.evofsm")
+    assert (beside.exit_code, "ready: reads standard input" in beside.stderr) == (0, True)
 
 
 def test_a_guard_from_zero_where_nobody_acts_learns_as_it_goes(evofsm, pump):

@@ -198,12 +198,12 @@ def _tables(
     title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
     yield table(title, _HEADER, rows, bold=bold)
     said = []
-    for k, limit in enumerate(found["limits"]):
+    for stated, k in judge.alarms.items():
+        limit = found["limits"][k]
         is_other = limit["kind"] != "plain" and limit["plain"] != "none"
         beside = f"; plain thresholds would be {limit['plain']}" if is_other else ""
-        said.append((f"{limit['stated']:g}", f"{judge.of(k)}{beside}"))
-    alike = "; plain thresholds do as well" * judge.is_plain
-    yield facts(f"\nWhere they alarm, by false alarms a day{alike}", said)
+        said.append((stated, f"{judge.of(k)}{beside}"))
+    yield facts("\nWhere they alarm, by false alarms a day", said)
     rows = []
     for hit in found["listed"][-_LISTED:]:
         false = {0: [], 1: ["no"]}.get(hit["false"], [f"{hit['false']} times no"])
@@ -242,10 +242,8 @@ def _draw(
     from evofsm import plot
 
     chosen = judge.rate_of(tolerance)
-    on = np.array([judge.tally(runs, rate)[1] for rate in range(len(RATES))])
-    if chosen is not None:
-        on[judge.shares > tolerance] &= on[chosen]
-    risk = np.max(on * judge.shares[:, None], axis=0)
+    on = judge.tally(runs, chosen or 0)[1]
+    risk = on * (0.0 if chosen is None else judge.shares[chosen])  # as a live row tells it
     failed, ends = np.zeros(len(risk), np.bool_), runs.starts + runs.lengths - 1
     failed[ends[runs.failed]] = True
     # Of those that lasted for a while, if there are any, the last one that failed, if one did.
@@ -253,6 +251,8 @@ def _draw(
     last = int(ends[number])
     near = max(int(runs.starts[number]), last - 4 * judge.horizon)
     limits = [] if chosen is None else judge.thresholds(chosen)
+    stated = next((rates for rates, last in judge.alarms.items() if chosen == last), "")
+    alarm = f", alarm for {stated} false a day" if stated else ", no alarm"
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
     model = None if machine is None or not machine.n_states else machine.model()
     count = len(names) + 1 + (model is not None)
@@ -260,7 +260,7 @@ def _draw(
         axes = figure.subplots(count, 2, sharex="col")
         title = f"Episode {number + 1:,}{', before it failed' if runs.failed[number] else ''}"
         title += f": {date(times[last])}" * bool(times[last] >= DATES)
-        parts = {f"{len(ends):,} episodes": slice(None), title: slice(near, last + 1)}
+        parts = {f"{len(ends):,} episodes{alarm}": slice(None), title: slice(near, last + 1)}
         for column, (title, part) in zip(axes.T, parts.items(), strict=True):
             seen = times[part], runs.rows[part], names, risk[part], failed[part]
             plot.history(column, *seen, tolerance, model=model, limits=limits)

@@ -123,18 +123,24 @@ def _draw(
     model: FSMModel, guard: Guard | None, out: Path, axes: str | None, logged: Any, title: str
 ) -> None:
     """States in the plane of two variables, and what a guard has learnt of failure."""
+    import numpy as np
+
     from evofsm import plot
     from evofsm.guard import Foresight, LearntRisk
+    from evofsm.guard.learnt.failure import telling
 
     names = [model.labels.variable(k).split(" [")[0] for k in range(model.n_variables)]
     asked = [name.split(" [")[0] for name in split_names(axes or "")]
     pair: Any = [names.index(name) for name in asked if name in names]
     if len(pair) != 2 * (axes is not None):
         raise ValueError(f"--axes is {axes}; name two of {', '.join(names)}")
-    judge = guard and guard.judge
+    judge, told = guard and guard.judge, list[int]()
     if isinstance(judge, Foresight):
         rate = judge.rate_of(getattr(guard and guard.reviser, "tolerance", 1.0))
         logged["alarm"] = () if rate is None else judge.where(rate)
+        told = [] if rate is None else telling(judge.where(rate))
+    away = (model.centers - np.median(model.centers, axis=0)) ** 2  # then what differs at failures
+    told += np.argsort(-(model.endings @ away) / (away.sum(0) + 1e-12), kind="stable").tolist()
     with picture(out, 7.2, 5.0) as figure:
         figure.suptitle(title, x=0.01, ha="left")
         if guard is not None and isinstance(judge, LearntRisk):
@@ -142,7 +148,8 @@ def _draw(
         elif model.n_variables == 1:
             plot.graph(model, figure.subplots())
         else:
-            plot.states(model, figure.subplots(), variables=pair or (0, 1), ways=True, **logged)
+            pair = pair or [*dict.fromkeys(told)][:2]
+            plot.states(model, figure.subplots(), variables=pair, ways=True, **logged)
 
 
 # -- As a whole -----------------------------------------------------------------------------------

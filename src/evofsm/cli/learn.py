@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from shlex import quote
@@ -28,12 +27,10 @@ from evofsm.cli.options import (
     option,
     reads_logs,
 )
-from evofsm.cli.show import facts, print_json, progress, say, show, table, warn
+from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
-    from evofsm.cli.learning import Learning, Skill
+    from evofsm.cli.learning import Learning
     from evofsm.fsm.actions import IntervalActions
     from evofsm.fsm.machine import EvolvingFSM
     from evofsm.fsm.observations import ObservationEncoder
@@ -164,7 +161,7 @@ def learn(
     if lengths.seen:
         told.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
     show(facts("What was read", told), *tables_of(learning.model))
-    show("", *_skills(learning.skills), "")
+    say("")
     if out is None and taught is None:
         say("Nothing was saved; --out MODEL saves the model.")
     elif out is not None:
@@ -363,7 +360,7 @@ def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, An
     if not learning.model.failures_told:
         found["failures"] = None
     model = {**model_document(learning.model), "provenance": provenance}
-    return {**found, "transitions": learning.transitions, "skills": learning.skills, "model": model}
+    return {**found, "transitions": learning.transitions, "model": model}
 
 
 def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
@@ -425,20 +422,3 @@ def _read_otherwise(
     if told:
         given = (f"{name} from {unit}" for name, unit in told.items())
         yield "converted", f"{', '.join(given)} to units of the SI"
-
-
-def _skills(skills: Sequence[Skill]) -> Iterator[RenderableType]:
-    rows = []
-    for result in skills:
-        digits = "+.2f" if abs(result.skill) < 10.0 else "+,.0f"
-        skill = "none" if math.isnan(result.skill) else f"{result.skill:{digits}}"
-        divergences = f"{result.divergence:.2g}", f"{result.persistence:.2g}"
-        rows.append((f"{result.seconds:g} s", *divergences, skill))
-    header = ("ahead", "forecast [bit]", "persistence [bit]", "skill")
-    yield table("Forecasts compared with persistence", header, rows)
-    yield (
-        "\nThe first step under its own action, others under all alike, as in the paper; mean "
-        "Jensen-Shannon divergence from the belief that came, of rows that were not learnt yet. "
-        "Persistence: the belief stays as it is. Skill: 1 is perfect, 0 as good as persistence, "
-        "below 0 worse."
-    )

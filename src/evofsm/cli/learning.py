@@ -1,41 +1,27 @@
-"""Learn a machine from a stream of traces, and score its forecasts before it learns from them.
-
-Rows are learnt in blocks, of which so many rows are scored. The forecast of one step is the one
-that the machine made as it learnt; those further ahead are made by the machine as it was before the
-block. The rival is persistence: the belief stays as it is. A forecast's distance from the belief
-that came is measured by the Jensen-Shannon divergence.
-"""
+"""Learn a machine from a stream of traces, say what was odd in them, and teach a guard."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from shlex import quote
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.cli.options import Reading
 from evofsm.cli.show import warn
 from evofsm.driving.assumed import guard_of_monitor
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.step import Trace
 from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode, Revision
 from evofsm.io import Chunk, episodes_of
 from evofsm.io.logs import LogColumns, Noted
 from evofsm.io.tables import SI, TIMES, UNITS
 
-#: How far ahead the longer forecast looks [s].
-HORIZON = 1.0
-
-# Blocks grow from so many rows to so many; of each so many are scored at most.
-_FIRST_BLOCK, _LARGEST_BLOCK, _SCORED = 64, 8192, 256
 # A unit at the end of a column's name, behind another letter or as a word of its own.
 _WORD = "(?:^|[^A-Za-z]|(?<=[a-z])(?=[A-Z]))"
 _CALLED = re.compile(_WORD + "((?i:km[/_ ]?p?h|kph|mph|knots|feet|ft|cm|mm|km))[^A-Za-z]*$")
@@ -56,19 +42,9 @@ _NO_SPEED = 500.0
 _NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
 
 
-class Skill(NamedTuple):
-    """How well one kind of forecast did against persistence."""
-
-    seconds: float  #: looked ahead [s]
-    forecasts: int  #: number scored
-    divergence: float  #: mean, from the belief that came [bit]
-    persistence: float  #: the same mean for the belief that stays as it is [bit]
-    skill: float  #: 1 perfect, 0 as good as persistence, negative worse; NaN: nothing ever moved
-
-
 @dataclass
 class Read:
-    """What was read, and sums over the forecasts of it."""
+    """What was read."""
 
     rows: int = 0  #: observations
     episodes: int = 0
@@ -77,17 +53,8 @@ class Read:
     clipped_above: int = 0  #: actions above the range, put into its last interval
     jumps: int = 0  #: episodes that began because of a hole in time
     failures: int = 0  #: episodes that ended in failure
-    blocks: int = 0
     dt: float = np.nan  #: usual time between two rows [s]
     last_time: float = np.nan  #: of the latest row [s]
-    #: number, divergence of persistence, that of forecasts: one step ahead, and `HORIZON`
-    sums: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 3)))
-
-    @property
-    def steps_ahead(self) -> tuple[int, ...]:
-        """Steps of the forecasts; of one alone where one is about as long as `HORIZON`, or more."""
-        steps = 0 if np.isnan(self.dt) else round(HORIZON / self.dt)
-        return (1, steps) if 1 < steps < _LARGEST_BLOCK // 2 else (1,)
 
 
 class Learning(NamedTuple):
@@ -97,7 +64,6 @@ class Learning(NamedTuple):
     model: FSMModel
     read: Read
     transitions: int
-    skills: tuple[Skill, ...]  #: of one step, then of `HORIZON`
 
 
 def learn_traces(
@@ -119,7 +85,7 @@ def learn_traces(
             "no transition could be learnt: no row with an action is followed by another row of "
             "its episode (is every row an episode? are the rows sorted by episode and time?)"
         )
-    return Learning(machine, model, read, transitions, tuple(_skills(read)))
+    return Learning(machine, model, read, transitions)
 
 
 # -- What was noticed in reading ------------------------------------------------------------------
@@ -289,24 +255,14 @@ def refusing(share: float) -> str:
 
 
 def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: Read) -> None:
-    """Learn a chunk block by block, and score the forecasts of each before."""
+    """Learn a chunk."""
     read.dt = chunk.dt
     indices = np.full(len(chunk.times), -1)
     known = ~np.isnan(chunk.actions)
     indices[known] = actions.encode(chunk.actions[known])
     if chunk.failures is not None:
         machine.tell_of_failures()
-    first = 0
-    while first < len(indices):
-        end = first + min(_FIRST_BLOCK << min(read.blocks, 20), _LARGEST_BLOCK)
-        block, taken = chunk.rows(first, end), indices[first:end]
-        before = machine.model() if machine.n_states else None
-        trace = machine.learn_many(
-            block.observations, taken, block.starts, block.failures, belief=True
-        )
-        if before is not None:
-            _score(before, trace, block, taken, read)
-        first, read.blocks = end, read.blocks + 1
+    machine.learn_many(chunk.observations, indices, chunk.starts, chunk.failures)
     steps = np.diff(chunk.times, prepend=read.last_time)
     steps[chunk.starts] = 0.0
     read.last_time = float(chunk.times[-1])
@@ -317,41 +273,3 @@ def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: R
     read.failures += 0 if chunk.failures is None else len(chunk.failures)
     read.clipped_below += int((chunk.actions < actions.low).sum())
     read.clipped_above += int((chunk.actions > actions.high).sum())
-
-
-# -- Scores ---------------------------------------------------------------------------------------
-
-
-def _score(
-    model: FSMModel, trace: Trace, block: Chunk, taken: NDArray[np.int64], read: Read
-) -> None:
-    """Add divergences of forecasts: the first step under its action, others under all alike."""
-    episode = np.zeros(len(taken), np.int64)
-    episode[block.starts] = 1
-    episode = episode.cumsum()
-    beliefs, n = trace.belief, model.n_states
-    assert beliefs is not None
-    for sums, steps in zip(read.sums, read.steps_ahead, strict=False):
-        # Rows with an action that so many others of their episode follow; some from all over.
-        then = np.flatnonzero((episode[:-steps] == episode[steps:]) & (taken[:-steps] >= 0))
-        if steps == 1:
-            then = then[np.isfinite(trace.surprise[then + 1])]
-        then = then[:: max(1, -(-len(then) // _SCORED))]
-        now, came = beliefs[then], beliefs[then + steps]
-        if steps == 1:
-            divergence = trace.surprise[then + 1]
-        else:
-            known = np.einsum("ti,tij->tj", now[:, :n], model.transition_matrices[taken[then]])
-            marginal = model.averaged_matrix("marginal")
-            forecast = now.copy()  # of states created since nothing is known: they stay
-            forecast[:, :n] = known @ np.linalg.matrix_power(marginal, steps - 1)
-            divergence = jensen_shannon(forecast, came)
-        sums += len(then), jensen_shannon(now, came).sum(), divergence.sum()
-
-
-def _skills(read: Read) -> Iterator[Skill]:
-    for sums, steps in zip(read.sums, read.steps_ahead, strict=False):
-        count, persistence, forecast = sums.tolist()
-        skill = 1.0 - forecast / persistence if persistence > 0.0 else np.nan
-        rows = count or np.nan
-        yield Skill(steps * read.dt, int(count), forecast / rows, persistence / rows, skill)

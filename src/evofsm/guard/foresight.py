@@ -2,10 +2,10 @@
 
 A *limit* is a threshold of a variable, or of the nearness to a form of failure as `failure.explain`
 learns them: now, or as it will be at the present rate in half the horizon, or in all of it. An
-alarm is on while one of its limits is passed; it comes after a hold time, and stays on for an
-eighth of the horizon after the last of them. It is right if a failure comes within the horizon
-after it began, whether or not it is on by then. Where it stays on, it says so once in each horizon,
-and is false as often as no failure came. A failure is foreseen by the first of those before it.
+alarm is on while one of its limits is passed; it comes after a hold time, and stays while one will
+be within the horizon at its rate, and for a quarter of it more. It is right if a failure comes
+within the horizon after it began, on by then or not. Where it stays on, it says so once in each
+horizon, and is false as often as no failure came. A failure is foreseen by the first before it.
 
 An alarm is of at most so many limits. Those are searched for that warn longest on average (none
 counts as 0), less a price for each false alarm, and beside them plain thresholds in the same way.
@@ -42,7 +42,7 @@ RATES = (0.1, 0.3, 1.0, 3.0)
 #: Times from here on are dates [s].
 DATES = 1e8
 # In horizons: how far ahead limits look, over what the rate is taken, how long an alarm stays on.
-_AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.125
+_AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.25
 # Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts of a log.
 _MOST_LIMITS, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 50.0, 24), 3
 # Of a log of more rows some episodes are learnt from, if so many failures are left.
@@ -62,7 +62,7 @@ _SHORT, _FEWEST, _HELD_ROWS, _MORE = 0.05, 10, 20_000, (1.1, 1.5)
 #: Columns of a limit: which rate it is for, the kind of alarm, the variable or form,
 #: which of `_AHEAD`, whether above (1) or below (-1), and the threshold.
 _RATE, _KIND, _OF, _WHEN, _SIGN, _AT = range(6)
-_DAY, _AS_GOOD = 86400.0, "plain thresholds do as well"
+_DAY = 86400.0
 # Limits by their places, each with that of its threshold.
 _Rule = tuple[tuple[int, int], ...]
 #: The file of such a judge.
@@ -249,20 +249,23 @@ class Foresight(LearningJudge):
                 tallies[side, price] += found.lead * found.failures, found.foreseen, found.false
         judge, days = fresh._fitted(log), seen * dt / _DAY
         fewest = np.array([[poisson_bounds(int(n))[0] for n in row] for row in tallies[..., 2]])
-        chance, limits, told = log.failed.sum() * ahead / len(log.rows), [np.empty((0, 6))], []
+        chance, limits = log.failed.sum() * ahead / len(log.rows), [np.empty((0, 6))]
+        before, told = limits[0], list[Any]()  # limits of the rate before
         for rate, stated in enumerate(RATES):
             fit = fewest <= stated * days
             best = np.where(fit, tallies[..., 0], -1.0).argmax(1)
-            parts = [judge.of_rate(int(best[k]), plain=k > 0) for k in range(2)]
+            parts = [judge.of_rate(int(best[k]), plain=k > 0)[:, 1:] for k in range(2)]
             usable = fit[[0, 1], best] & [len(part) > 0 for part in parts]
             learnt, plain = tallies[[0, 1], best] * usable[:, None]
-            limits += [np.insert(parts[k][:, 1:], 0, rate, 1) for k in np.flatnonzero(usable)]
+            limits += [np.insert(parts[k], 0, rate, 1) for k in np.flatnonzero(usable)]
             as_many = min((plain[2] + 1.0) / (learnt[2] + 1.0), 1.0)
             kind = int(plain[0] >= _BETTER * as_many * learnt[0])
             _, right, false = (learnt, plain)[kind]
             low = wilson_bounds(right / (right + false), right + false)[0] if right else 0.0
             kind = kind if low > chance else _NO_KIND  # no better than an alarm at any time
-            told.append((right, false, log.failed.sum(), kind))
+            is_same = bool(told) and told[-1][3] == kind and np.array_equal(parts[kind % 2], before)
+            told.append(told[-1] if is_same else (right, false, float(log.failed.sum()), kind))
+            before = parts[kind % 2]
         known = judge.forms, np.concatenate(limits), np.array(told, np.float64)
         return cls(dt, ahead, held, *known, names, units)
 
@@ -276,8 +279,7 @@ class Foresight(LearningJudge):
         forms = failure.explain(FAILS, failed, survived)
         judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
         columns = judge._columns(log.rows, log.starts)
-        limits = [judge._searched(columns, log, plain=plain) for plain in (False, True)]
-        judge.limits = np.concatenate(limits)
+        judge.limits = np.vstack([judge._searched(columns, log, plain=k) for k in (False, True)])
         return judge
 
     def _searched(self, columns: Floats, log: Runs, *, plain: bool) -> Floats:
@@ -307,7 +309,7 @@ class Foresight(LearningJudge):
                 above |= x[k] > tried[k][j]
             for k, j in np.ndindex(len(asked), _TRIED):
                 beyond = above | (x[k] > tried[k][j])
-                false = _tally(beyond, starts, log.failed, spans, leads, beyond)
+                false = _tally(beyond, beyond, starts, log.failed, spans, leads)
                 found[k, j] = leads.sum(), false
             return np.asarray(found / most)
 
@@ -345,11 +347,13 @@ class Foresight(LearningJudge):
         columns: Floats = found.reshape(-1, len(rows))
         return columns
 
-    def _passed(self, columns: Floats, limits: Floats) -> Flags:
-        """(n, T) which limits are passed."""
+    def _passed(self, columns: Floats, limits: Floats, *, soon: bool = False) -> Flags:
+        """(n, T) which limits are passed; or ``soon``, within the horizon at the present rate."""
         of, when, sign = limits[:, [_OF, _WHEN, _SIGN]].T.astype(int)
-        x = columns[of + when * (len(columns) // len(_AHEAD))]
-        return np.asarray(sign[:, None] * x > (sign * limits[:, _AT])[:, None])
+        ahead = columns.reshape(len(_AHEAD), -1, columns.shape[1])
+        later = (np.maximum(when, least) for least in range(len(_AHEAD) if soon else 1))
+        x = np.fmax.reduce([sign[:, None] * ahead[then, of] for then in later])
+        return np.asarray(x > (sign * limits[:, _AT])[:, None])
 
     def of_rate(self, rate: int, *, plain: bool | None = None) -> Floats:
         """The limits of an alarm, by default of the kind that did better, cross-validated."""
@@ -376,9 +380,9 @@ class Foresight(LearningJudge):
         """What came of the alarm for one of `RATES`, and when it was on (T,)."""
         limits = self.of_rate(rate, plain=plain)
         columns = self._columns(log.rows, log.starts) if columns is None else columns
-        on = np.asarray(self._passed(columns, limits).any(axis=0))
+        above, on = (np.any(self._passed(columns, limits, soon=k), axis=0) for k in (False, True))
         leads = np.zeros(len(log.starts))
-        false = _tally(on, log.starts, log.failed, self._spans, leads, on)
+        false = _tally(above, on, log.starts, log.failed, self._spans, leads)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
         lead = float(leads.sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
@@ -454,26 +458,24 @@ class Foresight(LearningJudge):
     def told_by_experience(self) -> str:
         """What each alarm is, with which tolerance it is taken, and how often it was right."""
         told = []
-        for text, group in groupby(range(len(self.held_out)), self.of):
-            *_, last = rates = [*group]
+        for stated, last in self.alarms.items():
             at = f"{self.tolerance_of(RATES[last]):.3g}"
             taken = f" (tolerance {at})" if self.rate_of(float(at)) == last else ""
-            stated = ", ".join(f"{RATES[k]:g}" for k in rates)
-            told.append(f"for {stated} false alarms a day{taken} {text}")
-        return "; ".join([_AS_GOOD] * self.is_plain + told)
+            told.append(f"for {stated} false alarms a day{taken} {self.of(last)}")
+        return "; ".join(told)
 
     @property
-    def is_plain(self) -> bool:
-        """Whether all its alarms are plain thresholds."""
-        kinds = self.held_out[:, 3]
-        return bool((kinds == _PLAIN).any() and (kinds != _LEARNT).all())
+    def alarms(self) -> dict[str, int]:
+        """Those that differ: by all rates that one is for, in words, the last of these."""
+        groups = (list(group) for _, group in groupby(range(len(self.held_out)), self.of))
+        return {", ".join(f"{RATES[k]:g}" for k in rates): rates[-1] for rates in groups}
 
     def of(self, rate: int) -> str:
         """What the alarm for one of `RATES` is, and how often it was right, in words."""
         right, false, failures, kind = self.held_out[rate].tolist()
         if kind == _NO_KIND:
             return "no alarm is false so seldom and better than chance"
-        plain = f"{_AS_GOOD}: " if kind == _PLAIN and not self.is_plain else ""
+        plain = "plain thresholds do as well: " * (kind == _PLAIN)
         told = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
         return f"{plain}{self.words(rate)} ({told}, cross-validated)"
 
@@ -484,19 +486,20 @@ class Foresight(LearningJudge):
         if self._seen and self.log is not None:
             seen, self._seen = self._seen, []
             self._learn_from(seen, self.log, failed=False)
-        kept = [self.of_rate(rate) for rate in range(len(self.held_out))]
-        self._limits = np.concatenate([np.empty((0, 6)), *kept])
+        kinds = self.held_out[self.limits[:, _RATE].astype(int), 3]
+        self._limits: Floats = self.limits[self.limits[:, _KIND] == kinds]
         # Variables smoothed once and twice; rows since limits were passed, and not; what is on.
-        self._now: tuple[Any, ...] = None, *np.zeros((3, len(kept)), int)
+        self._now: tuple[Any, ...] = None, *np.zeros((3, len(self.held_out)), int)
 
     def _next(self, z: Floats) -> tuple[Flags, tuple[Any, ...]]:
         """Which limits are passed, and the state after an observation (m,)."""
         memory, up, down, on = self._now
         memory = np.full((2, len(z) + len(self.forms)), np.nan) if memory is None else memory.copy()
         columns = self._columns(z[None], np.empty(0, np.int64), memory)
-        passed = self._passed(columns, self._limits)[:, 0]
-        above = np.bincount(self._limits[passed, _RATE].astype(int), minlength=len(up)) > 0
-        up, down = np.where(above, up + 1, 0), np.where(above, 0, down + 1)
+        passed, soon = (self._passed(columns, self._limits, soon=k)[:, 0] for k in (False, True))
+        rates = (self._limits[flags, _RATE].astype(int) for flags in (passed, soon))
+        above, near = (np.bincount(rate, minlength=len(up)) > 0 for rate in rates)
+        up, down = np.where(above, up + 1, 0), np.where(above | (near & (on > 0)), 0, down + 1)
         on = (up >= self.hold) | ((on > 0) & (down < self._spans[2]))
         return passed, (memory, up, down, on)
 
@@ -652,11 +655,8 @@ def false_times(begun: int, over: int, fails: int, horizon: int) -> int:
 
 
 @kernel
-def _tally(above: Flags, starts: Ints, failed: Flags, spans: Ints, leads: Floats, on: Flags) -> int:
-    """False alarms where ``above`` marks (T,) the rows beyond a limit; leads (E,), on (T,) are set.
-
-    ``on`` may be the same as ``above``.
-    """
+def _tally(above: Flags, on: Flags, starts: Ints, failed: Flags, spans: Ints, leads: Floats) -> int:
+    """False alarms of rows (T,) above limits; on (T,) is where one stays, then is; leads (E,)."""
     false, horizon, hold, stays = 0, spans[0], spans[1], spans[2]
     for e in range(len(starts)):
         end = starts[e + 1] if e + 1 < len(starts) else len(above)
@@ -668,6 +668,8 @@ def _tally(above: Flags, starts: Ints, failed: Flags, spans: Ints, leads: Floats
                 up, down = up + 1, 0
                 if begun < 0 and up >= hold:
                     begun = t
+            elif t < end and begun >= 0 and on[t]:
+                up, down = 0, 0
             else:
                 up, down = 0, down + 1
             if begun >= 0 and (t == end or down >= stays):

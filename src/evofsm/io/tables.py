@@ -78,8 +78,8 @@ _SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": 
 _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
 # Names of columns are looked for in so many lines; what stands before the last line of a comment.
 _MOST_ABOVE, _COMMENT = 100, re.compile(r"\A\s*(#|%|//)+\s*")
-# What stands in a field where there is no number.
-_MISSING = ("", "na", "n/a", "null", "none")
+#: What stands in a field where there is no number.
+MISSING = ("", "na", "n/a", "null", "none")
 # By which a comma is known to be a decimal one; groups of three digits it may separate as well.
 _DECIMAL_COMMA = re.compile(r"\s*-?\d+,(\d\d?|\d{4,})\s*")
 # What no text holds.
@@ -374,7 +374,7 @@ class Wanted(NamedTuple):
             if values.dtype == polars.String:
                 fields = values.str.strip_chars()
                 values = fields.cast(polars.Float64, strict=False)
-                wrong = values.is_null() & ~fields.fill_null("").str.to_lowercase().is_in(_MISSING)
+                wrong = values.is_null() & ~fields.fill_null("").str.to_lowercase().is_in(MISSING)
                 if wrong.any():
                     piece.leave_out(name, wrong.to_numpy())
             piece.numbers[name] = values.cast(polars.Float64).to_numpy()
@@ -420,6 +420,28 @@ class _Odd(NamedTuple):
     left_out: list[tuple[int, str]]  #: lines that are no rows, and why; of a comment nothing
 
 
+class Dialect:
+    """How fields stand in the lines of a table: by the line that names columns, and some below."""
+
+    def __init__(self, header: str, below: Sequence[str]) -> None:
+        header = _COMMENT.sub("", header, count=1)
+        self.separator = _separator(header)
+        self.columns = _fields(header, self.separator)
+        self.units: Mapping[str, str] = {}  #: as a row below the names says
+        rows = [_fields(row, self.separator) for row in below]
+        told = [unit_of(text) for text in rows[0]] if rows else []
+        if any(u in UNITS for u in told) and not any(map(is_number, told)):
+            self.units, rows = dict(zip(self.columns, told, strict=False)), rows[1:]
+        self.first_row = rows[0] if rows else []
+        commas = map(_DECIMAL_COMMA.fullmatch, [t for row in rows for t in row])
+        self.has_commas = self.separator == ";" or (self.separator == "\t" and any(commas))
+
+    def miscounted(self, count: int, named: int) -> str:
+        """What is wrong with a line of so many fields."""
+        why = f"(cut off, a quote not closed, or does a field hold {self.separator!r}?)"
+        return f"{count} fields, but the header names {named} {why}"
+
+
 class CsvTable(Table):
     """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
 
@@ -445,24 +467,15 @@ class CsvTable(Table):
         # A field may be long that nobody asks for; lines are bounded.
         csv.field_size_limit(max(csv.field_size_limit(), _CSV_BYTES + 2 * _LONGEST_LINE))
         with Source(path, skips=Skips(1)) as source:  # said where the rows are read
-            text = self._text(source.rows(), 0).removeprefix("\ufeff")
+            text = decoded(source.rows(), path).removeprefix("\ufeff")
         lines = [line.rstrip("\r") for line in text.split("\n", _MOST_ABOVE)[:_MOST_ABOVE]]
         at = self._header(lines, set(names))
-        self._above = at + 1  # lines before the first row
-        header, first = _COMMENT.sub("", lines[at], count=1), lines[at + 1 : at + 4]
-        self._separator = _separator(header)
-        self.columns = _fields(header, self._separator)
+        self._dialect = dialect = Dialect(lines[at], lines[at + 1 : at + 4])
+        self.columns, self.units, header = dialect.columns, dialect.units, lines[at]
+        self._above = at + 1 + bool(dialect.units)  # lines before the first row
         # With nothing in it that has a meaning; polars is not to be left alone with others.
-        quoted = f'"[^"{self._separator}\\r\\n]*"(?=[{self._separator}\\r\\n])'
+        quoted = f'"[^"{dialect.separator}\\r\\n]*"(?=[{dialect.separator}\\r\\n])'
         self._quoted = re.compile(quoted.encode())
-        rows = [_fields(row, self._separator) for row in first]
-        told = [unit_of(text) for text in rows[0]] if rows else []
-        if any(u in UNITS for u in told) and not any(map(is_number, told)):
-            self.units = dict(zip(self.columns, told, strict=False))
-            self._above, rows = self._above + 1, rows[1:]
-        self._first_row = rows[0] if rows else []
-        commas = map(_DECIMAL_COMMA.fullmatch, [t for row in rows for t in row])
-        self._has_commas = self._separator == ";" or (self._separator == "\t" and any(commas))
         if any(map(is_date, self.columns)) or all(map(is_number, self.columns)):
             raise ValueError(
                 f"{path}, line {at + 1}: {header.strip()[:200]!r} is no header; a line above the "
@@ -471,17 +484,12 @@ class CsvTable(Table):
 
     def _header(self, lines: Sequence[str], names: set[str]) -> int:
         """Which line names the columns: the one with most names, or the last before the rows."""
-        best, most = 0, 0
-        for at, line in enumerate(lines):
-            text = _COMMENT.sub("", line, count=1)
-            if (there := len(names.intersection(_fields(text, _separator(text))))) > most:
-                best, most = at, there
-        if most:
-            return best
+        there = [len(names.intersection(Dialect(line, ()).columns)) for line in lines]
+        if any(there):
+            return there.index(max(there))
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
-        fields = (_fields(lines[at], _separator(lines[at])) for at in rows)
-        counts = [sum(map(bool, map(str.strip, found))) for found in fields]
+        counts = [sum(map(bool, Dialect(lines[at], ()).columns)) for at in rows]
         usual = max(counts, key=counts.count, default=0)  # titles above fill fewer fields
         first = next((at for at, n in zip(rows, counts, strict=True) if n >= usual), 0)
         separator = _separator(lines[first])
@@ -490,14 +498,14 @@ class CsvTable(Table):
 
     def first(self, name: str) -> str:
         """What the first row has in a column."""
-        return dict(zip(self.columns, self._first_row, strict=False)).get(name, "")
+        return dict(zip(self.columns, self._dialect.first_row, strict=False)).get(name, "")
 
     def holds(self, name: str) -> Literal["number", "text", ""]:
         """What a column holds, by its first row; nothing of one without a name of its own."""
         if not name or self.columns.count(name) > 1:
             return ""
         text = self.first(name)
-        return "number" if is_number(text.replace(",", ".", self._has_commas)) else "text"
+        return "number" if is_number(text.replace(",", ".", self._dialect.has_commas)) else "text"
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """Read columns, in the order of rows."""
@@ -510,7 +518,7 @@ class CsvTable(Table):
         with Source(self.path, self._on_read, self.skips) as source:
             while block := source.rows():
                 if not block.isascii():
-                    block = self._text(block, reached).encode()
+                    block = decoded(block, self.path, reached).encode()
                 while reached < self._above:
                     block, reached = block.partition(b"\n")[2], reached + 1
                 here = partial(self._odd, block, reached, columns, wanted)
@@ -531,7 +539,7 @@ class CsvTable(Table):
                         name: polars.Series(name, texts, polars.String)
                         for name, texts in zip(wanted.all, fields, strict=True)
                     }
-                if self._has_commas:
+                if self._dialect.has_commas:
                     for name in wanted.numbers:
                         if found[name].dtype == polars.String:
                             found[name] = found[name].str.replace(",", ".", literal=True)
@@ -550,11 +558,11 @@ class CsvTable(Table):
         if b'"' in block and 2 * len(self._quoted.findall(block)) != block.count(b'"'):
             return None
         places = {name: columns.index(name) for name in wanted.all}
-        separators = block.count(self._separator.encode())
         # As polars calls columns, for there may be two of one name.
         kinds: dict[str, Any] = {f"column_{k + 1}": polars.String for k in range(len(columns))}
         numbers = {f"column_{places[name] + 1}": polars.Float64 for name in wanted.numbers}
-        dialect: Any = {"separator": self._separator, "decimal_comma": self._has_commas}
+        separator, has_commas = self._dialect.separator, self._dialect.has_commas
+        dialect: Any = {"separator": separator, "decimal_comma": has_commas}
         for schema in (kinds | numbers, kinds):
             try:
                 frame = polars.read_csv(
@@ -566,7 +574,7 @@ class CsvTable(Table):
                 )
             except (polars.exceptions.PolarsError, polars.exceptions.PanicException):
                 return None
-            if separators != len(frame) * (len(columns) - 1):
+            if block.count(separator.encode()) != len(frame) * (len(columns) - 1):
                 return None
             if not any(frame[name].null_count() for name in numbers):
                 break
@@ -578,7 +586,7 @@ class CsvTable(Table):
     def _odd(self, block: bytes, reached: int, columns: Sequence[str], wanted: Wanted) -> _Odd:
         """The rows of some lines; those of another length are none."""
         text = io.StringIO(block.decode(), newline="")
-        reader = csv.reader(text, delimiter=self._separator, strict=True)
+        reader = csv.reader(text, delimiter=self._dialect.separator, strict=True)
         lines, rows, anew = list[int](), list[list[str]](), list[int]()
         left_out = list[tuple[int, str]]()
         places = [columns.index(name) for name in wanted.all]
@@ -599,9 +607,7 @@ class CsvTable(Table):
                         left_out.append((line, ""))
                     else:
                         anew.append(len(lines))
-                        why = f"{len(fields)} fields, but the header names {len(columns)}"
-                        mark = f"does a field hold {self._separator!r}?"
-                        left_out.append((line, f"{why} (cut off, a quote not closed, or {mark})"))
+                        left_out.append((line, self._dialect.miscounted(len(fields), len(columns))))
                     begun = reader.line_num
                 return _Odd(columns, lines, rows, anew, left_out)
             except csv.Error as error:
@@ -628,19 +634,6 @@ class CsvTable(Table):
         odd = here()
         text = "" if name is None else odd.rows[row][wanted.all.index(name)]
         return f"{self.path}, line {odd.lines[row]}", text
-
-    def _text(self, block: bytes, reached: int) -> str:
-        """Lines in UTF-8 or, where they are none, in the encoding of Western Europe."""
-        try:
-            return block.decode()
-        except UnicodeDecodeError as error:
-            if not _CONTROL.search(block):
-                return block.decode("cp1252", errors="replace")
-            line = reached + block.count(b"\n", 0, error.start)
-            raise ValueError(
-                f"{self.path}, after line {line}: this is not text in UTF-8 (a file of another "
-                "kind, or saved in another encoding?)"
-            ) from error
 
 
 _AS_PARQUET = "Parquet (was a copy or a download interrupted?)"
@@ -700,6 +693,20 @@ class ParquetTable(Table):
 
 
 # -- Fields ---------------------------------------------------------------------------------------
+
+
+def decoded(block: bytes, path: str, reached: int = 0) -> str:
+    """Lines in UTF-8 or, where they are none, in the encoding of Western Europe."""
+    try:
+        return block.decode()
+    except UnicodeDecodeError as error:
+        if not _CONTROL.search(block):
+            return block.decode("cp1252", errors="replace")
+        line = reached + block.count(b"\n", 0, error.start)
+        raise ValueError(
+            f"{path}, after line {line}: this is not text in UTF-8 (a file of another "
+            "kind, or saved in another encoding?)"
+        ) from error
 
 
 def _separator(line: str) -> str:

@@ -40,14 +40,16 @@ if TYPE_CHECKING:
 _SAME_STEP = 0.05
 # Of rows of cars, where nobody said another one [s].
 _INTERVAL = 0.1
-# What other files end with is read as JSON lines.
+# What other files end with holds live rows; so does CSV without --summary.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
+# In the beginning of what was saved.
+_SAVED = b'{"__metadata__"'
 
 
 @reads_logs
 def monitor(
     file: Annotated[
-        Path | None, argument("JSON lines; or a log. [default: standard input]")
+        Path | None, argument("Rows in JSON or CSV; a log; or a guard. [default: standard input]")
     ] = None,
     guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
     low: Annotated[
@@ -107,6 +109,10 @@ def monitor(
     Where nobody acts, alarms stand beside plain thresholds; without --guard the first 60 % of the
     log are learnt from.
     """
+    if file is not None and file.is_file() and guard is None:
+        with file.open("rb") as beginning:
+            if _SAVED in beginning.read(64):  # rows then come from elsewhere
+                file, guard = None, file
     if sum(source is not None for source in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
     if traffic and (guard or state or learn):
@@ -135,7 +141,7 @@ def monitor(
         made = guard_of_traffic if traffic else guard_of_monitor
         return made(interval or _INTERVAL, brakes, tolerated)
 
-    is_log = file is not None and (file.suffix in _LOGS or file.is_dir())
+    is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
     parts = {"low": low, "high": high, "n_actions": n_actions, "observe": observe}
     told, begun = {name: part for name, part in parts.items() if part is not None}, None
     if guard is None and not is_log and (told or "action" in given_of(reading)):
@@ -149,9 +155,7 @@ def monitor(
         episode = kept.get("episode")
     given = {k: v for k, v in kept.items() if k not in ("observe", "episode")}
     reading = partial(reading_of, **{**reading.keywords, **given, **given_of(reading)})
-    if is_log and not summary:
-        warn(f"warning: {file} is read as JSON lines; of a log, --summary says where it alarms")
-    elif episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
+    if episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
         raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns of a log")
     rows = EPISODE if episode is None or is_log else int(episode)
     with ExitStack() as stack:

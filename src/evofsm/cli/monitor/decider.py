@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Pause, Row, Taken
-from evofsm.cli.monitor.slots import Slots
+from evofsm.cli.monitor.slots import CsvRows, Slots
 from evofsm.cli.show import plain
 from evofsm.driving.judge import SLIGHT, LatentRisk
 from evofsm.driving.traffic import COLUMNS, TrafficRisk
@@ -81,6 +81,7 @@ class Decider:
         self._units = () if judge is None else judge.labels.units
         self._drives = isinstance(judge, LatentRisk | TrafficRisk)
         self._is_alone = isinstance(judge, Foresight)  # nobody acts
+        self._csv = CsvRows(self.slots, self.form.variables, acts=not self._is_alone)
         if isinstance(judge, Foresight):
             judge.bridges = self.slots.hole or 0.0
 
@@ -98,7 +99,9 @@ class Decider:
         Messages that are sent again, as after a connection was lost, get the answers of before.
         """
         try:
-            told = self.form.read(line)
+            if (message := self._csv.read(line)) is None:
+                return self._of("waiting", alarm=self._alarm, reason="names the columns")
+            told = self.form.read(message)
             beyond = self.guard.beyond(np.array(told.observation or (), np.float64))
             if beyond is not None:
                 raise MessageError(*beyond, told.time)
@@ -117,7 +120,7 @@ class Decider:
             if isinstance(told, Row) and not told.time < told.time + self.guard.interval:
                 raise MessageError("time", "is too large to tell rows apart", told.time)
         except MessageError as refused:
-            return self.error(refused.about, str(refused), refused.time)
+            return self.error(refused.about, f"{self._csv.place}{refused}", refused.time)
         try:
             answer = self.act(told)
         except Exception as error:  # an end that the guard cannot take

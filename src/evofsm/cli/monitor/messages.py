@@ -35,7 +35,7 @@ _MOST_OBJECTS = 64
 _LETTERS = 40
 # What is later than this is in another unit [s]; what is said of lines of another kind.
 _LATEST = 1e11
-_NO_ROW = "rows are JSON, one per line; a log in a file: evofsm monitor FILE --summary"
+_NO_ROW = "rows are JSON, one per line, or CSV below a line that names columns (tail -n +1 -f LOG)"
 # Where a width is not given [m].
 _USUAL_WIDTH = 1.8
 

@@ -1,20 +1,24 @@
-"""Live rows, read as a log is: which count, what failed, and those of a step as one.
+"""Live rows, read as a log is: in CSV too, which count, what failed, those of a step as one.
 
 The options are those of ``evofsm learn``, `evofsm.io.LogColumns`; what comes is the same.
 """
 
 from __future__ import annotations
 
+import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 from operator import itemgetter
 from statistics import fmean
 from typing import Any
 
+import msgspec
+
 from evofsm.cli.monitor.messages import Message, MessageError, Row
 from evofsm.io import LogColumns
-from evofsm.io.logs import Condition
+from evofsm.io.logs import Condition, units_of
+from evofsm.io.tables import MISSING, UNITS, Dialect, decoded, explained, is_date, is_number
 
 _BECOME: dict[str, Any] = {"mean": fmean, "last": itemgetter(-1), "max": max, "min": min}
 
@@ -31,9 +35,10 @@ class Slots:
         self._how = {} if made is None else made.how
         told = {"--where": columns.where, "--failed": columns.failed}
         self._conditions = {o: Condition.parse(t, o) for o, t in told.items() if t is not None}
-        terms = (term.column for c in self._conditions.values() for term in c.terms)
+        every = [term for c in self._conditions.values() for term in c.terms]
+        self.compared = [term.column for term in every if term.of_number]  #: with a number
         #: Keys that rows may have beside the guard's variables, for the conditions.
-        self.keys = tuple(dict.fromkeys({*terms} - {*self.names, columns.action}))
+        self.keys = tuple({t.column for t in every} - {*self.names, columns.action})
         #: Of the log: what the column of its time is called, how dates are written, or its unit.
         self.clock = columns.time, columns.units.get(columns.time, "s")
         self.waiting: list[Row] = []
@@ -99,6 +104,90 @@ class Slots:
 
     def _time(self, row: Row) -> float:
         return self.step * math.floor(row.time / self.step + 1e-9)
+
+
+class CsvRows:
+    """Lines of CSV as messages, below one that names the columns; others stay as they are."""
+
+    def __init__(self, slots: Slots, variables: Sequence[str], *, acts: bool) -> None:
+        self._columns = columns = slots.columns
+        self._variables, action = variables, [columns.action] if acts else []
+        self._numbers = {*variables, *action, *slots.compared}
+        if "%" not in columns.units.get(columns.time, ""):
+            self._numbers.add(columns.time)
+        kept = *variables, *slots.keys, *columns.time.split(","), "proposal"
+        #: What messages call the columns that are read.
+        self._called = dict(zip(kept, kept, strict=True)) | dict.fromkeys(action, "proposal")
+        self._called[columns.time] = "time"
+        self._header, self._count, self._factors = "", 0, dict[str, float]()
+        self._dialect: Dialect | None = None
+        self.place = ""  #: of a line of CSV, as what is said of it begins
+
+    def read(self, line: bytes) -> bytes | None:
+        """The message on a line; None where it names the columns, or their units."""
+        self.place, self._count = "", self._count + 1
+        if line.lstrip(b"\xef\xbb\xbf \t")[:1] in (b"{", b""):
+            return line
+        try:
+            text = decoded(line, "").removeprefix("\ufeff")
+        except ValueError:
+            return line
+        if is_header := self._names_columns(text):
+            self._header, self._dialect = text, None
+        if not self._header:
+            return line
+        self.place = f"line {self._count}: "
+        try:
+            if is_header or self._has_units(text):
+                return None
+            assert self._dialect is not None
+            return msgspec.json.encode(dict(self._told(self._dialect, text)))
+        except MessageError:
+            raise
+        except csv.Error as error:
+            raise MessageError("line", f"{error} (an unclosed quote?)") from None
+
+    def _names_columns(self, text: str) -> bool:
+        """Whether it names those of all variables; of some alone is an error."""
+        if not any(name in text for name in self._variables):
+            return False
+        named = Dialect(text, ()).columns
+        lacking = [name for name in self._variables if name not in named]
+        if 0 < len(lacking) < len(self._variables):
+            raise MessageError(lacking[0], f"is no column; there are {', '.join(named)}")
+        return not lacking
+
+    def _has_units(self, text: str) -> bool:
+        """Whether the first line below the names tells units; it tells the dialect as well."""
+        if self._dialect is not None:
+            return False
+        dialect, given = Dialect(self._header, [text]), self._columns.units
+        numbers = [name for name in dialect.columns if name in self._numbers]
+        units = {name: unit for name, unit in given.items() if "%" not in unit}
+        units = {**dialect.units, **units_of(units, numbers)}
+        self._factors = {name: UNITS.get(units.get(name, ""), 1.0) for name in numbers}
+        self._dialect = dialect
+        return bool(dialect.units)
+
+    def _told(self, dialect: Dialect, text: str) -> Iterator[tuple[str, Any]]:
+        """What a row tells, by the keys of messages."""
+        fields = next(csv.reader([text], delimiter=dialect.separator, strict=True))
+        if len(fields) != (named := len(dialect.columns)):
+            raise MessageError("line", dialect.miscounted(len(fields), named))
+        for name, told in zip(dialect.columns, map(str.strip, fields), strict=True):
+            if name in self._numbers and not is_date(told):
+                yield self._called[name], self._number(name, told, dialect)
+            elif name in self._called:
+                yield self._called[name], told or None
+
+    def _number(self, name: str, text: str, dialect: Dialect) -> float | None:
+        """What stands in a field, in units of the SI; None where nothing does."""
+        if text.lower() in MISSING:
+            return None
+        if not is_number(plain := text.replace(",", ".") if dialect.has_commas else text):
+            raise MessageError(name, explained(text))
+        number = float(plain) * self._factors[name]
+        return int(number) if self._called[name] == "proposal" and number.is_integer() else number
 
 
 def _joined(how: str | None, values: Sequence[Any]) -> Any:
