@@ -325,5 +325,9 @@ def test_where_nobody_acts_a_summary_judges_alarms_on_what_they_did_not_learn_fr
     assert own["failures"] == own["foreseen"] == found["failures"] == 14
     foreseen = [one["episode"] for one in found["listed"] if one["failed"]]
     assert (len({*foreseen}), found["missed"]) == (14, [])
+    (there,) = found["fails"]
+    assert there["where"].startswith(f"{VIBRATION} is above ")
+    assert (there["came"], there["failed"]) == (14, 14)
+    assert f"{there['where']} 14 14" in printed
     assert f"14 of 14 failures foreseen, {own['lead'] / 60.0:.3g} min ahead" in printed
     assert "2025-03-11 " in printed

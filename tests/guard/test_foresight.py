@@ -98,7 +98,7 @@ def test_where_nothing_foresees_a_failure_there_is_no_alarm():
     for_all = (
         "for 0.1, 0.3, 1, 3 false alarms a day no alarm is false so seldom and better than chance"
     )
-    assert judge.told_by_experience == for_all
+    assert judge.told_by_experience.endswith(for_all)
 
 
 def test_a_guard_alarms_row_by_row_as_the_log_was_judged_also_from_its_file(surge, reloaded):

@@ -141,7 +141,9 @@ def _document(
     listed = [] if chosen is None else list(_listed(judge, chosen, runs, times))
     missed = [row for row in listed if "lasts" not in row]
     listed = [row for row in listed if "lasts" in row]
-    return {**head, "alarms": alarms, "limits": limits, "listed": listed, "missed": missed}
+    fails = [dict(zip(("where", "came", "failed"), row, strict=True)) for row in judge.fails(runs)]
+    told = {"alarms": alarms, "limits": limits, "fails": fails}
+    return {**head, **told, "listed": listed, "missed": missed}
 
 
 def _listed(
@@ -204,6 +206,9 @@ def _tables(
         beside = f"; plain thresholds would be {limit['plain']}" if is_other else ""
         said.append((stated, f"{judge.of(k)}{beside}"))
     yield facts("\nWhere they alarm, by false alarms a day", said)
+    rows = [[x["where"], f"{x['came']:,}", f"{x['failed']:,}"] for x in found["fails"]]
+    header = "it fails where", "episodes that came there", "of them failed"
+    yield table("\nWhere it fails, as it was learnt", header, rows)
     rows = []
     for hit in found["listed"][-_LISTED:]:
         false = {0: [], 1: ["no"]}.get(hit["false"], [f"{hit['false']} times no"])

@@ -401,9 +401,9 @@ class Foresight(LearningJudge):
         is_flat = not row[failure.P : failure.HELD].any()
         if is_flat:  # then a limit of nearness is one of the form
             row[failure.C] -= at * np.hypot(row[failure.B], row[failure.D])
-        there = region(names, row[failure.I : failure.HELD].tolist(), 0).rpartition(" (")[0]
+        there = self._region(row)
         if is_flat:
-            variable, _, beyond = there.removeprefix("where ").partition(" is ")
+            variable, _, beyond = there.partition(" is ")
             return variable, f"{beyond}{soon}"
         how = "beyond" if at > 0.0 else "within"
         return "it", f"{how} {abs(at):.2g} typical steps of where it fails{soon}: {there}"
@@ -454,10 +454,23 @@ class Foresight(LearningJudge):
         below = float(more[more < self.shares[k]].max(initial=0.0))
         return float(np.clip(0.5 * (self.shares[k] + below), 0.01, 0.99))
 
+    def fails(self, log: Runs) -> list[tuple[str, int, int]]:
+        """Where it fails, in words; how many episodes came there, and how many of them failed."""
+        there = failure.distances(self.forms, log.rows) <= 0.0
+        came = np.logical_or.reduceat(there, log.starts, axis=1)
+        counts = came.sum(1).tolist(), (came & log.failed).sum(1).tolist()
+        return list(zip(map(self._region, self.forms), *counts, strict=True))
+
+    def _region(self, form: Floats) -> str:
+        """Where a form is, in words."""
+        row = form[failure.I : failure.HELD].tolist()
+        return region(self.labels.names, row, 0).rpartition(" (")[0].removeprefix("where ")
+
     @property
     def told_by_experience(self) -> str:
-        """What each alarm is, with which tolerance it is taken, and how often it was right."""
-        told = []
+        """Where it fails; what each alarm is, how often it was right, and with which tolerance."""
+        there = " or ".join(map(self._region, self.forms))
+        told = [f"it fails where {there}"] if there else []
         for stated, last in self.alarms.items():
             at = f"{self.tolerance_of(RATES[last]):.3g}"
             taken = f" (tolerance {at})" if self.rate_of(float(at)) == last else ""
