@@ -165,7 +165,8 @@ def test_settings_of_a_guard_are_those_in_c(name, change, tmp_path):
 
 @pytest.mark.slow
 def test_a_search_that_is_cut_short_is_so_in_c(wall, monkeypatch, tmp_path):
-    monkeypatch.setattr(LearntRisk, "effort", property(lambda self: (3, 1.0)))
+    risk = wall.guard.judge
+    monkeypatch.setattr(risk, "parts", risk.parts._replace(n_asked=3, n_judged=1, most=1.0))
     asked = c99.ask(wall, 1500)
     assert sum("the search was cut short" in reason for reason, _ in asked.said) > 20
     assert c99.compare(wall.guard, c99.build(wall.guard, tmp_path), asked).agrees

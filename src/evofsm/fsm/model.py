@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any, Literal, Self, SupportsIndex, get_args
 
 import numpy as np
@@ -152,8 +153,7 @@ class FSMModel:
     def recognise(self, z: ArrayLike) -> Floats:
         """(n,) belief of an observation (m,), or (N, n) of many: the paper's Section 2.2.2."""
         given, rows = self._observations(z)
-        weights = weights_of(self.rule, self.n_variables)
-        belief = believed(self.centers.T, weights, rows, self.width)
+        belief = believed(*self._places, rows, self.width)
         return belief if given.ndim == 2 else belief[0]
 
     def nearest(self, z: ArrayLike) -> Nearest:
@@ -300,6 +300,11 @@ class FSMModel:
 
     # -- Inside ---------------------------------------------------------------------------------
 
+    @cached_property
+    def _places(self) -> tuple[Floats, Floats]:
+        """Centres (m, n), as kernels take them, and 1 / scale of each variable."""
+        return np.array(self.centers.T, order="C"), weights_of(self.rule, self.n_variables)
+
     def _matrix(self, action: SupportsIndex | None, policy: Policy = "observed") -> Floats:
         """Of an action; without one, of all as a policy weighs them."""
         if action is None:
@@ -312,7 +317,7 @@ class FSMModel:
         rows = np.atleast_2d(given)
         if rows.ndim != 2 or rows.shape[1] != self.n_variables:
             raise ValueError(f"z has shape {given.shape}; a row needs {self.n_variables} variables")
-        refuse_unusable("z", rows)
+        refuse_unusable("z", given)
         if self.n_states == 0:
             raise ValueError("this model has no states: its machine had observed nothing")
         return given, rows
@@ -332,8 +337,8 @@ def believed(centers: Floats, weights: Floats, rows: Floats, width: float) -> Fl
     """(N, n) beliefs of rows (N, m), given centres (m, n) and 1 / scale of each variable."""
     n = centers.shape[1]
     belief = np.empty((len(rows), lanes(n)))
-    given = np.array(centers, order="C"), weights, np.array(rows, order="C"), float(width), n
-    recognise_rows(*given, belief)
+    given = np.ascontiguousarray(centers), weights, np.ascontiguousarray(rows)
+    recognise_rows(*given, float(width), n, belief)
     return belief[:, :n].copy()
 
 

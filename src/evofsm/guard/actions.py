@@ -159,7 +159,7 @@ class BoxActions:
 
     def clip(self, action: ArrayLike) -> NDArray[np.float64]:
         """(..., d) ndarray: the actions of the set that are closest; NaN stays."""
-        return np.asarray(np.clip(np.asarray(action, dtype=np.float64), *self.bounds))
+        return np.asarray(np.minimum(np.maximum(action, self.bounds[0]), self.bounds[1]))
 
     def encode(self, action: ArrayLike) -> int:
         """Index of the cell in which an action (d,) lies; beyond the box, of the cell at its edge.
@@ -199,7 +199,7 @@ def fixed(action: Action) -> Action:
 def same_action(one: Action, other: Action) -> bool:
     """Whether two actions are the same; NaN is no action, and the same as none."""
     equal = one == other
-    return bool(equal.all()) if isinstance(equal, np.ndarray) else bool(equal)
+    return all(equal.tolist()) if isinstance(equal, np.ndarray) else bool(equal)
 
 
 def no_action(actions: ActionSet) -> Action:
@@ -210,14 +210,14 @@ def no_action(actions: ActionSet) -> Action:
 def put_into(actions: ActionSet, action: Action) -> Action:
     """The action of a set that is closest to one; a number stands for every component of a box."""
     if isinstance(actions, BoxActions):
-        return actions.clip(np.broadcast_to(action, actions.half.shape))
+        return actions.clip(action)
     return min(max(float(action), actions.low), actions.high)
 
 
 def is_usable(actions: ActionSet, action: Action) -> bool:
     """Whether an action is finite, and one of a few where there are only those."""
     if isinstance(actions, BoxActions):
-        return np.shape(action) == actions.half.shape and bool(np.isfinite(action).all())
+        return np.shape(action) == actions.half.shape and all(np.isfinite(action).tolist())
     return math.isfinite(action) and not (isinstance(actions, Choices) and action not in actions)
 
 

@@ -242,9 +242,8 @@ def _learnt(reviser: ActionReviser) -> Part:
         raise ValueError(f"at most {_MOST_DISTURBANCES} disturbances are exported, not {count}")
     lanes = -(-count // _LANES) * _LANES
     remembered, soon = risk.remembered, risk._soon(risk.remembered.seconds)
-    few, most = risk.effort
     names = [f"{q}: {risk.backup_text(q)}" for q in range(len(state.policies))]
-    asked = min(few, len(names))
+    asked = min(parts.n_asked, len(names))
     constants: dict[str, Any] = {
         "DISTURBANCES": count,
         "STEPS": steps,
@@ -255,8 +254,8 @@ def _learnt(reviser: ActionReviser) -> Part:
         "MARGIN": risk.margin,
         "ALLOWED": risk._allowed(reviser.tolerance, remembered),
         "ASKED": asked,
-        "JUDGED": 1 if most < 2 * few * state.horizon else asked,
-        "MOST_DONE": math.ceil(most),
+        "JUDGED": min(parts.n_judged, asked),
+        "MOST_DONE": math.ceil(parts.most),
         "EVIDENCE": float(remembered.number),
         **{name.strip("_"): getattr(rollout, name) for name in _OF_ROLLOUTS},
         **{name: getattr(model, name) for name in _OF_MODEL},
@@ -266,7 +265,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "middle": risk.middle,
         "half": risk.half,
     }
-    most_rollouts = 2 * asked + max(few, rollout._HALVINGS) + 2 * few
+    most_rollouts = 2 * asked + max(parts.n_asked, rollout._HALVINGS) + 2 * parts.n_asked
     about = (
         f"backups: {'; '.join(names)}\n"
         f"a decision: at most {most_rollouts} "

@@ -598,9 +598,9 @@ class Guard:
     def beyond(self, z: NDArray[np.float64]) -> tuple[str, str] | None:
         """The first variable of an observation (m,) that cannot be so, and why; NaN can."""
         least, most = ends_of(getattr(self.reviser, "risk", self.judge), len(z))
-        if not (wrong := (z < least) | (z > most)).any():
+        if True not in (wrong := ((z < least) | (z > most)).tolist()):
             return None
-        k = int(wrong.argmax())
+        k = wrong.index(True)
         name = self.variables[k] if self.variables else f"observation[{k}]"
         return name, (
             f"is {z[k]:g}; it must lie between {least[k]:g} and {most[k]:g} (in another unit, or "

@@ -189,30 +189,29 @@ class ActionReviser:
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """What to execute instead of the proposal, which is first made usable (`make_usable`)."""
-        acts, names = self.acts, self.risk.labels.names
+        acts = self.acts
         wanted, remark = make_usable(proposal, self.actions, self.risk.fallback)
         if not acts:
             self._trial = 0
         if self.mode is Mode.OFF:
             return unjudged_revision(wanted, proposal, remark or "reviser is off")
         options, judged, best, reason = self._search(situation, wanted, acts, proposal.mask)
-        executed = best if acts else 0
-        is_number = options.ndim == 1
+        executed, advised = best if acts else 0, fixed(options[best])
         if not acts and best != 0:
             reason = f"{self.passing or self.mode.value}: {reason}"
-        unseen = unseen_text(situation, names) if situation.intake else ""
+        unseen = unseen_text(situation, self.risk.labels.names) if situation.intake else ""
         # Of a situation that is new: whether it is dangerous is another question.
         new = "never seen before" if judged.seen < _NEW else ""
         return Revision(
-            executed=float(options[executed]) if is_number else fixed(options[executed]),
-            proposed=float(proposal.action) if is_number else fixed(proposal.action),
+            executed=advised if acts else fixed(options[0]),
+            proposed=fixed(proposal.action),
             risk_proposed=float(judged.risk[0]),
             risk_executed=float(judged.risk[executed]),
             interval=(float(judged.low[executed]), float(judged.high[executed])),
             reason="; ".join(filter(None, (remark, unseen, new, reason))),
             evidence=judged.evidence,
             seen=judged.seen,
-            advised=float(options[best]) if is_number else fixed(options[best]),
+            advised=advised,
         )
 
     def _search(
@@ -221,12 +220,12 @@ class ActionReviser:
         """Which option should be executed: the judge's own, or the best of those it is given."""
         if self._searches:
             how: dict[str, Any] = {} if mask is None else {"mask": mask}
-            found: Search = self.risk.search(  # type: ignore[attr-defined]
+            options, judged, best, reason = self.risk.search(  # type: ignore[attr-defined]
                 situation, wanted, tolerance=self.tolerance, revising=self._revising, **how
             )
-            self._revising = found.best != 0
-            within = np.minimum(np.maximum(found.options, self._low), self._high)
-            return found._replace(options=within)
+            self._revising = best != 0
+            within = np.minimum(np.maximum(options, self._low), self._high)
+            return Search(within, judged, best, reason)
         options = np.minimum(np.maximum(wanted, self._lowest), self._highest)
         if mask is not None:
             options = options[np.append(True, mask)]

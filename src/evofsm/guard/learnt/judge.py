@@ -81,16 +81,23 @@ class Parts(NamedTuple):
     daring: Model  #: while it learns
     residuals: Floats  #: (H, m, 1 + K) of disturbances; number 0 is none
     scale: float  #: how much harder than they were disturbances are taken to be
+    n_asked: int  #: backups that a search asks
+    n_judged: int  #: and those by which a risk is found
+    most: float  #: steps of rollouts after which a search is cut short
 
     @classmethod
-    def of(cls, state: State, settings: LearntSettings) -> Parts | None:
+    def of(cls, state: State, settings: LearntSettings, dt: float) -> Parts | None:
         """Make them; None as long as there are no backups."""
         if not len(state.policies):
             return None
         model = model_of(state, settings)
         daring = model._replace(forms=forms_of(state, settings, daring=True))
-        rest = residuals_of(state, model, state.horizon)
-        return cls(model, daring, rest, disturbance_scale(state, settings))
+        rest, s = residuals_of(state, model, state.horizon), settings
+        few = s.n_asked if len(pairs(len(state.origin))[0]) else 2
+        cost = (model.weights.size + model.dead_ends.size) * rest.shape[2]
+        most = max(min(s.work, s.work_rate * dt) / cost, few * state.horizon)
+        judged, scale = 1 if most < 2 * few * state.horizon else few, disturbance_scale(state, s)
+        return cls(model, daring, rest, scale, few, judged, most)
 
 
 class LearntRisk(ActionJudge):
@@ -160,9 +167,8 @@ class LearntRisk(ActionJudge):
     PARTS = ("margin", "backups", "dead-ends", "stretches", "regions", "rivals")
 
     # Of the present episode.
-    _at: Floats | None  # the situation in which one was last, by all that was seen
-    _past: list[Floats]  # observations of the last step, unseen ones as they were taken to be
-    _done: list[Floats]  # and actions after them
+    _past: list[Floats]  # latest observations, a step and one, unseen ones as they were taken to be
+    _done: list[Floats]  # actions of the last step
     _z: list[Floats]  # observations that are to be learnt from
     _u: list[Floats]  # and actions after them
     # Of each decision: a proposal was refused, nothing helped even undisturbed, some backup held.
@@ -283,15 +289,6 @@ class LearntRisk(ActionJudge):
         """Disturbances that it counts on, and the time in which they were seen."""
         return Remembered(len(self.state.windows), self.state.n_seen * self.state.stride * self.dt)
 
-    @property
-    def effort(self) -> tuple[int, float]:
-        """Backups that a search asks, and steps of rollouts after which it is cut short."""
-        assert self.parts is not None
-        s, model = self.settings, self.parts.model
-        few = s.n_asked if len(pairs(self.n_variables)[0]) else 2
-        cost = (model.weights.size + model.dead_ends.size) * self.parts.residuals.shape[2]
-        return few, max(min(s.work, s.work_rate * self.dt) / cost, few * self.state.horizon)
-
     def search(
         self,
         situation: Situation,
@@ -315,8 +312,7 @@ class LearntRisk(ActionJudge):
             return Search(options, _unjudged(1), 0, why)
         model = parts.daring if self.learning else parts.model
         proposal, scale, margin = self.encode(wanted), parts.scale, self.state.margin
-        few, most = self.effort
-        remembered, ranks = self.remembered, self._ranks[:few]
+        remembered, ranks, most = self.remembered, self._ranks[: parts.n_asked], parts.most
         allowed = self._allowed(tolerance, remembered)
         policies = self.state.policies
         if mask is not None:
@@ -342,7 +338,7 @@ class LearntRisk(ActionJudge):
             situation,
             here,
             policies,
-            np.array((proposal, action) if self._refused else (proposal,)),
+            [proposal, action] if self._refused else [proposal],
             left if passes and not allowed else None,
         )
         self._fails_after = max(self._fails_after, fails_after)
@@ -368,7 +364,7 @@ class LearntRisk(ActionJudge):
         given, here = np.asarray(actions, np.float64), self._here(situation.observation)
         if here is None or self.parts is None or not len(self.state.forms):
             return _unjudged(len(given))
-        inner = np.array([self.encode(action) for action in given])
+        inner = [self.encode(action) for action in given]
         return self._judged(situation, here, self.state.policies, inner)[0]
 
     def why(self, judged: Judgement) -> str:
@@ -382,7 +378,7 @@ class LearntRisk(ActionJudge):
         situation: Situation,
         here: Floats,
         policies: Floats,
-        actions: Floats,
+        actions: Sequence[Floats],
         passes: float | None = None,
     ) -> tuple[Judgement, bool, float]:
         """Of some actions; ``passes`` is what is left after the last, if that is known to pass.
@@ -390,12 +386,11 @@ class LearntRisk(ActionJudge):
         And whether the last is lost for good, and after how many steps any of them fails at the
         latest.
         """
-        asked = actions if passes is None else actions[:-1]
-        few, most = self.effort
-        best = policies[self._ranks[: 1 if most < 2 * few * self.state.horizon else few]]
-        foreseen = [self._foresee(here, action[None], best) for action in asked]
-        if passes is not None:
-            foreseen.append((0.0, passes, 0.0))
+        assert self.parts is not None
+        foreseen = [] if passes is None else [(0.0, passes, 0.0)]
+        if asked := actions[: len(actions) - len(foreseen)]:
+            best = policies[self._ranks[: self.parts.n_judged]]
+            foreseen = [self._foresee(here, action[None], best) for action in asked] + foreseen
         unsurvived, left, after = zip(*foreseen, strict=True)
         self._unsurvived = -1 if math.isinf(unsurvived[0]) else int(unsurvived[0])
         remembered = self.remembered
@@ -462,14 +457,21 @@ class LearntRisk(ActionJudge):
 
     def _here(self, z: Floats) -> Floats | None:
         """The situation, if that is seen; what was not is taken to have gone on as before."""
-        at, past, m, has_gaps = self._at, self._past, len(z), math.isnan(z.dot(z))
-        if at is None:
-            return None if has_gaps else np.append(z, np.zeros(m + self.size))
-        stride = self.state.stride
-        if has_gaps:
-            z = np.where(np.isnan(z), at[:m] + at[m : 2 * m] / stride, z)
-        change = (z - past[0]) * (stride / len(past))
-        return np.concatenate([z, change, sum(self._done) / len(past)])
+        seen, stride, n = self._filled(z), self.state.stride, len(self._done)
+        if not n or seen is None:
+            return None if seen is None else np.append(seen, np.zeros(len(z) + self.size))
+        change = (seen - self._past[-n]) * (stride / n)
+        return np.concatenate([seen, change, sum(self._done) / n])
+
+    def _filled(self, z: Floats) -> Floats | None:
+        """An observation, in which what was not seen has gone on as before; None at first."""
+        past, n, stride = self._past, len(self._past) - 1, self.state.stride
+        if not math.isnan(z.dot(z)):
+            return z
+        if n < 0:
+            return None
+        change = (past[-1] - past[0]) * (stride / n) if n else np.zeros(len(z))
+        return np.where(np.isnan(z), past[-1] + change / stride, z)
 
     def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
@@ -567,12 +569,10 @@ class LearntRisk(ActionJudge):
 
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
-        here = self._here(np.array(observation, np.float64))
-        if here is not None:
-            latest = slice(-self.state.stride, None)
-            self._at, z = here, here[: (len(here) - self.size) // 2]
-            self._past = [*self._past, z][latest]
-            self._done = [*self._done, self.encode(action)][latest]
+        z, stride = self._filled(np.array(observation, np.float64)), self.state.stride
+        if z is not None:
+            self._past = [*self._past, z][-stride - 1 :]
+            self._done = [*self._done, self.encode(action)][-stride:]
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; the episode before is learnt from."""
@@ -637,17 +637,17 @@ class LearntRisk(ActionJudge):
             has_horizon=self.given_horizon is not None,
             given=self._given,
         )
-        self.parts = Parts.of(self.state, self.settings)
+        self.parts = Parts.of(self.state, self.settings, self.dt)
         self._used, self._ranks = np.zeros((self.size, 2)), np.arange(len(self.state.policies))
 
     def remake(self) -> None:
         """Decide by `state`, between two episodes."""
-        self.parts = Parts.of(self.state, self.settings)
+        self.parts = Parts.of(self.state, self.settings, self.dt)
         self._forget()
 
     def _forget(self) -> None:
         """Begin an episode."""
-        self._at, self._past, self._done = None, [], []
+        self._past, self._done = [], []
         self._z, self._u, self._notes = [], [], []
         self._certified = self._holds = self._refused = self._lost = False
         self._unsurvived, self._fails_after = 0, 0.0
