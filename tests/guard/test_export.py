@@ -12,7 +12,7 @@ import pytest
 import c99
 from evofsm import Guard, Missing
 from evofsm.driving import LatentRisk, guard_for_cars
-from evofsm.guard import LearntRisk, Mode
+from evofsm.guard import Mode
 from evofsm.guard.export import write_c99, write_fmu
 
 PAGE = Path(__file__).parents[2] / "docs" / "on-your-target.md"
