@@ -233,7 +233,7 @@ def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]
     if lacking := [column for column in single if column not in given]:
         raise ValueError(
             f"--rule novelty has to know the difference that counts as 1 in {lacking[0]!r}: "
-            f"--scale {quote(lacking[0])}=2 (4 m of a gap and 2 m/s of a speed are usual)"
+            f"--scale {quote(lacking[0])}=2 (a fifth of what it spans, or so)"
         )
     return [given.get(name, 1.0) for name in encoder.names]
 
@@ -329,6 +329,7 @@ def _saying(chunks: Iterable[Chunk], lines: list[str], kept: list[Chunk] | None)
 def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
     """Where it is, what it takes, and what it reckons with."""
     from evofsm.guard import Foresight, LearntRisk
+    from evofsm.guard.foresight import span
 
     assert guard.judge is not None
     names = map(guard.judge.labels.variable, range(len(guard.variables)))
@@ -338,10 +339,12 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     yield f"The guard was saved to {path}. {takes}"
     if isinstance(guard.judge, Foresight):
         tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
+        soon = f"up to {span(guard.judge.horizon * guard.judge.dt)} (--horizon)"
         if (rate := guard.judge.rate_of(tolerance)) is None:
-            yield "It never alarms: cross-validated, no alarm was better than chance."
+            why = "cross-validated, no alarm was better than chance"
+            yield f"It never alarms: {why} (fewer columns, or a longer --horizon?)."
         else:
-            yield f"It alarms where {guard.judge.of(rate)}."
+            yield f"It alarms {soon} before a failure, where {guard.judge.of(rate)}."
         yield f"All that it learnt (--tolerance takes one): {guard.judge.told_by_experience}."
         return
     if not isinstance(guard.judge, LearntRisk):

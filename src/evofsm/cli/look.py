@@ -56,6 +56,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     facts = [*shown.items()][:_COLUMNS_SHOWN]
     if more := len(shown) - len(facts):
         facts.append(("...", f"and {more:,} more columns"))
+    lacking = int(np.isnan([*values.values()]).any(0).sum())
+    facts += [("incomplete", f"{lacking:,} rows, in which a number is missing")] * (lacking > 0)
     facts += [("bad fields", f"{n:,} {told}") for told, n in odd.items()]
     facts += [
         (f"bad {kind}s", f"{n:,}, the first: {first}") for kind, (n, first) in skipped.items()
@@ -65,11 +67,11 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     options = [("--time", clock) if clock else ("--dt", "1"), *([("--unit", form)] if form else [])]
     groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
     group = next((name for name in groups if _is_in_blocks(frame[name])), "")
-    if (bad := sum(n for n, _ in skipped.values()) + sum(odd.values())) > SKIPPED:
+    if (bad := max(lacking, sum(n for n, _ in skipped.values()) + sum(odd.values()))) > SKIPPED:
         options.append(("--skip-bad", f"{_round(2.0 * bad):.0f}"))
     if clock:
         within = ~np.diff(frame[group].rle_id().to_numpy()).astype(bool) if group else slice(None)
-        options += _of_steps(np.diff(frame[clock].to_numpy())[within], facts)
+        options += _of_steps(np.diff(frame[clock].to_numpy())[within], facts, lacking)
     if still:
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
@@ -131,8 +133,8 @@ def _first_rows(
     return frame, clock, form
 
 
-def _of_steps(steps: NDArray[np.float64], facts: Pairs) -> Pairs:
-    """What makes one clock of such steps within episodes."""
+def _of_steps(steps: NDArray[np.float64], facts: Pairs, lacking: int) -> Pairs:
+    """What makes one clock of such steps within episodes, if so many rows are left out."""
     later = steps[steps > 0.0]
     usual = float(np.median(later)) if len(later) else math.nan
     odd = (steps == 0.0) | (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
@@ -142,7 +144,7 @@ def _of_steps(steps: NDArray[np.float64], facts: Pairs) -> Pairs:
         twice, earlier = (late == 0.0).sum(), (late < 0.0).sum()
         told = f"{twice:,} at the time of the row before, {earlier:,} earlier"
         facts.append(("late rows", f"{told} (rows twice, unsorted, or --episode?)"))
-    if odd.sum() < max(_MANY, _ODD * len(steps)):
+    if odd.sum() + lacking < max(_MANY, _ODD * len(steps)):
         if holes.any():
             told = f"{holes.sum():,}, the longest {span(later.max())}, together"
             told += f" {span(float((steps[holes] - usual).sum()))}; each begins an episode (--hole)"
