@@ -464,27 +464,6 @@ def value_of(
 KEPT, CHANGED, CUT_SHORT, NOTHING_PASSES = 0, 1, 2, 3
 
 
-def survives(
-    model: Model,
-    situation: Floats,
-    policy: Floats,
-    residuals: Floats,
-    scale: float,
-    action: Floats,
-    margin: float,
-    allowed: int,
-) -> tuple[bool, float, int]:
-    """Whether a backup survives after an action by the margin, what is left, and steps of rollouts.
-
-    All disturbances have to be survived but ``allowed``, and that none begins.
-    """
-    count = residuals.shape[2]
-    ends = Ends(np.empty(count), np.empty(count))
-    given = residuals, scale, margin, allowed, ends
-    lost, left, took = _enter.call(model, situation[None], action[None], policy, *given)
-    return lost <= allowed and left >= margin, left, took
-
-
 def search(
     model: Model,
     situation: Floats,
@@ -514,14 +493,16 @@ def search(
     as long.
     """
     m, choices, done = len(model.origin), model.choices, 0
+    begin, count = situation[None], residuals.shape[2]
+    ends = Ends(np.empty(count), np.empty(count))
 
     def after(action: Floats, backup: int) -> tuple[bool, float]:
         """Whether the backup survives after the action, and by how much."""
         nonlocal done
-        amid = residuals, scale, action, margin, allowed
-        passes, left, took = survives(model, situation, policies[backup], *amid)
+        amid = residuals, scale, margin, allowed, ends
+        lost, left, took = _enter.call(model, begin, action[None], policies[backup], *amid)
         done += took
-        return passes, left
+        return lost <= allowed and left >= margin, left
 
     for q in ranks:
         if done >= most:
@@ -553,7 +534,7 @@ def search(
         return NOTHING_PASSES, proposal, ranks[0], math.inf
     best, longest, shortest, wanted = ranks[0], -np.inf, np.inf, -np.inf
     for q in ranks:
-        asked = model, situation[None], policies[q], residuals, scale
+        asked = model, begin, policies[q], residuals, scale
         lasts = float(rollout(*asked).worth.mean())
         shortest = min(shortest, lasts)
         if lasts > longest + _EQUAL:
