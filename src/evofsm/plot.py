@@ -441,7 +441,7 @@ def history(
             write(ax, f"{beyond:,} rows not in view", (1.0, 1.0), (0.0, 4.0), **look)
         height = 72.0 * ax.get_window_extent().height / ax.figure.dpi
         letters = int(height / (0.65 * float(ax.yaxis.label.get_fontsize())))
-        ax.set_ylabel(textwrap.fill(name, max(letters, 8), break_long_words=False))
+        ax.set_ylabel(textwrap.fill(name, max(letters, 8)))
     if model is not None:
         sample = np.arange(0, len(z), max(len(z) // 2000, 1))
         seen = [model.nearest(row).state for row in z[sample]]

@@ -27,7 +27,7 @@ latest three failed, too, there is little to lose, and the guard, which learns, 
 twelve at most.
 
 Frozen, it acts unless its record says that it harms, or does not help: it loses more pairs than it
-wins, prevents less than three of four failures per step, or all its episodes failed, three at
+wins, prevents less than half of the failures per step, or all its episodes failed, three at
 least, however late. A guard, or a controller, that was never tried has no record: then it acts.
 """
 
@@ -51,7 +51,7 @@ _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
 _SOONER = 0.3
 # Of the failures per step of the controller alone, a guard that helps leaves no larger share.
-_LEFT = 0.25
+_LEFT = 0.5
 # Scores that differ by less than this share are equal.
 _SAME_SCORE = 0.05
 # The latest guarded episodes, if all failed, are reason enough for one draw to decide; else it
@@ -120,7 +120,7 @@ class Harm(NamedTuple):
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
 
         A guard of which all episodes failed, three at least, prevents nothing, however late; nor
-        does one that fails more than a quarter as often per step as the controller alone.
+        does one that fails more than half as often per step as the controller alone.
         """
         guarded, alone = self.guarded, self.alone
         if _all_failed(guarded, max(_CAREFUL, len(guarded))):
