@@ -27,8 +27,8 @@ latest three failed, too, there is little to lose, and the guard, which learns, 
 twelve at most.
 
 Frozen, it acts unless its record says that it harms, or does not help: it loses more pairs than it
-wins, prevents less than half of the failures per step, or all its episodes failed, three at
-least, however late. A guard, or a controller, that was never tried has no record: then it acts.
+wins or, of three episodes at least, all failed, however late, or it prevents less than half of the
+failures per step. A guard, or a controller, that was never tried has no record: then it acts.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class Harm(NamedTuple):
     def helps(self) -> bool:
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
 
-        A guard of which all episodes failed, three at least, prevents nothing, however late; nor
+        Of three episodes at least, a guard that failed in all prevents nothing, however late; nor
         does one that fails more than half as often per step as the controller alone.
         """
         guarded, alone = self.guarded, self.alone
@@ -127,8 +127,9 @@ class Harm(NamedTuple):
             return False
         if not guarded or not alone:
             return True
-        won = self._weights(guarded) @ better(guarded, alone) @ self._weights(alone)
-        return bool(won >= 0.0 and self._rate(guarded) <= _LEFT * self._rate(alone))
+        if len(guarded) >= _CAREFUL and self._rate(guarded) > _LEFT * self._rate(alone):
+            return False
+        return bool(self._weights(guarded) @ better(guarded, alone) @ self._weights(alone) >= 0.0)
 
     def drives(self, draws: int) -> float:
         """In how many of some draws the guard would drive the next episode, as a share.
@@ -151,8 +152,7 @@ class Harm(NamedTuple):
 
     def _rate(self, outcomes: Sequence[Outcome]) -> float:
         """Failures per step."""
-        weights = self._weights(outcomes)
-        fails, steps = weights @ [(o.failed, o.steps) for o in outcomes]
+        fails, steps = self._weights(outcomes) @ [(o.failed, o.steps) for o in outcomes]
         return float(fails / steps)
 
     def passing(self, *, learning: bool) -> str:
