@@ -142,8 +142,6 @@ class CsvRows:
                 return None
             assert self._dialect is not None
             return msgspec.json.encode(dict(self._told(self._dialect, text)))
-        except MessageError:
-            raise
         except csv.Error as error:
             raise MessageError("line", f"{error} (an unclosed quote?)") from None
 

@@ -92,12 +92,12 @@ class Parts(NamedTuple):
             return None
         model = model_of(state, settings)
         daring = model._replace(forms=forms_of(state, settings, daring=True))
-        rest, s = residuals_of(state, model, state.horizon), settings
-        few = s.n_asked if len(pairs(len(state.origin))[0]) else 2
+        rest, scale = residuals_of(state, model, state.horizon), disturbance_scale(state, settings)
+        few = settings.n_asked if len(pairs(len(state.origin))[0]) else 2
         cost = (model.weights.size + model.dead_ends.size) * rest.shape[2]
-        most = max(min(s.work, s.work_rate * dt) / cost, few * state.horizon)
-        judged, scale = 1 if most < 2 * few * state.horizon else few, disturbance_scale(state, s)
-        return cls(model, daring, rest, scale, few, judged, most)
+        most = max(min(settings.work, settings.work_rate * dt) / cost, few * state.horizon)
+        n_judged = 1 if most < 2 * few * state.horizon else few
+        return cls(model, daring, rest, scale, few, n_judged, most)
 
 
 class LearntRisk(ActionJudge):
@@ -387,10 +387,11 @@ class LearntRisk(ActionJudge):
         latest.
         """
         assert self.parts is not None
-        foreseen = [] if passes is None else [(0.0, passes, 0.0)]
-        if asked := actions[: len(actions) - len(foreseen)]:
-            best = policies[self._ranks[: self.parts.n_judged]]
-            foreseen = [self._foresee(here, action[None], best) for action in asked] + foreseen
+        asked = actions if passes is None else actions[:-1]
+        best = policies[self._ranks[: self.parts.n_judged]]
+        foreseen = [self._foresee(here, action[None], best) for action in asked]
+        if passes is not None:
+            foreseen.append((0.0, passes, 0.0))
         unsurvived, left, after = zip(*foreseen, strict=True)
         self._unsurvived = -1 if math.isinf(unsurvived[0]) else int(unsurvived[0])
         remembered = self.remembered
