@@ -42,6 +42,8 @@ _REFITS, _UNLIKELY, _WORST = 3, 2.0, 100
 # Variables of which all pairs are tried; pairs of which two forms are, and rounds of dealing
 # failures out between two.
 _SCREENED, _IN_TWO, _ROUNDS = 6, 3, 3
+# What is left of a variance given another variable, at least, as a share.
+_ALIKE = 1e-6
 # An ellipse may be moved inwards by so much [standard deviations].
 _INWARDS = 0.1 * 1.5 ** np.arange(8)
 # A rival of a threshold holds less than so much of what was survived.
@@ -397,18 +399,34 @@ def _in_two(F: Floats, asked: Ints, score: Floats, survived: Survived) -> tuple[
 def _asked(failures: Floats, survived: Survived) -> Ints:
     """(c, 3) variables and kinds of forms that are tried: of many variables those that tell most.
 
-    A variable tells failed observations from survived ones where they have another mean or spread.
+    A variable tells failed observations from survived ones where they have another mean or spread,
+    by itself or given another variable.
     """
-    spread, moving = survived.spread, np.flatnonzero(survived.spread > 0.0)
+    moving = np.flatnonzero(survived.spread > 0.0)
     if len(moving) > _SCREENED:
-        seen = survived.rows[:, moving]
-        square = ((failures[:, moving] - seen.mean(0)) ** 2).mean(0) / spread[moving] ** 2
-        ratio = np.maximum(square, 1e-12) / (seen.var(0) / spread[moving] ** 2 + 1e-12)
-        tells = 0.5 * (ratio - 1.0 - np.log(ratio))
+        x, y = (z[:, moving] / survived.spread[moving] for z in (failures, survived.rows))
+        tells = _tells(x, y)
         moving = np.sort(moving[np.argsort(-tells, kind="stable")[:_SCREENED]])
     alone = [(j, j, 0) for j in moving]
     bent = [(i, j, kind) for i, j in combinations(moving, 2) for kind in (1, 2)]
     return np.array(alone + bent, np.int64).reshape(-1, 3)
+
+
+def _tells(failures: Floats, survived: Floats) -> Floats:
+    """(m,) what each variable tells at best, alone or beyond another one: divergences of normals.
+
+    The scatter of failures (k, m) is about the mean of what was survived, which counts as one more.
+    """
+    x, y = (z - survived.mean(0) for z in (failures, survived))
+    S = y.T @ y / len(y) + 1e-12 * np.eye(y.shape[1])
+    M = (x.T @ x + S) / (len(x) + 1.0)
+    (s, t), (u, v) = (np.broadcast_arrays(A.diagonal()[:, None], A.diagonal()) for A in (S, M))
+    alone = 0.5 * (u / s - 1.0 - np.log(u / s))[:, 0]
+    det = np.maximum(s * t - S**2, _ALIKE * s * t)
+    trace = (t * u - 2.0 * S * M + s * v) / det
+    pairs = 0.5 * (trace - 2.0 - np.log(np.maximum(u * v - M**2, _ALIKE * u * v) / det))
+    np.fill_diagonal(pairs, 0.0)
+    return np.asarray(np.maximum(alone, (pairs - alone).max(1)))
 
 
 def _split(x: Floats) -> Flags:
