@@ -52,6 +52,10 @@ def written(pump):
             text = text.write_csv(None, float_precision=3, **dialect)
             text = text.replace("Zeit", "Datum;Uhrzeit") if form == "two columns" else text
             text = f"Pumpe 4;;;;\nvom 5.12.;;;;\n{text}" if form == "titles" else text
+            if form == "units":  # and how values were made, as loggers write both
+                names, _, rows = text.partition("\n")
+                told = (";".join(["", *[how] * (names.count(";") - 1), "\n"]) for how in UNITS)
+                text = f"TOA5;CR6;CR6;33;std.09;CPU:pump;1;rows\n{names}\n{''.join(told)}{rows}"
             Path(path).write_bytes(text.encode("cp1252"))
         return path
 
@@ -59,7 +63,8 @@ def written(pump):
 
 
 @pytest.mark.parametrize(
-    "form", ["german", "titles", "two columns", "english", "american", "parquet", "codes"]
+    "form",
+    ["german", "titles", "units", "two columns", "english", "american", "parquet", "codes"],
 )
 def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, written, form):
     path = written(form)
@@ -91,6 +96,7 @@ def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, wri
     assert "warning" not in summed.stderr
 
 
+UNITS = "mm/s", "Avg"
 READ = "--action", "--time", "--unit", "--where", "--failed", "--resample", "--hole"
 
 

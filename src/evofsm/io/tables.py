@@ -429,9 +429,15 @@ class Dialect:
         self.columns = _fields(header, self.separator)
         self.units: Mapping[str, str] = {}  #: as a row below the names says
         rows = [_fields(row, self.separator) for row in below]
-        told = [unit_of(text) for text in rows[0]] if rows else []
-        if any(u in UNITS for u in told) and not any(map(is_number, told)):
-            self.units, rows = dict(zip(self.columns, told, strict=False)), rows[1:]
+        values = next((row for row in rows if any(map(_is_value, row))), [])
+        above = rows[: rows.index(values)] if values else rows[:1]
+        told = [unit_of(text) for row in above[:1] for text in row]
+        pairs = zip(told, values, strict=False)
+        over = any(_is_value(value) and text.lower() not in MISSING for text, value in pairs)
+        #: How many rows below the names say what numbers are, such as their units.
+        self.n_told = len(above) if over or any(unit in UNITS for unit in told) else 0
+        if self.n_told:
+            self.units, rows = dict(zip(self.columns, told, strict=False)), rows[self.n_told :]
         self.first_row = rows[0] if rows else []
         commas = map(_DECIMAL_COMMA.fullmatch, [t for row in rows for t in row])
         self.has_commas = self.separator == ";" or (self.separator == "\t" and any(commas))
@@ -470,9 +476,9 @@ class CsvTable(Table):
             text = decoded(source.rows(), path).removeprefix("\ufeff")
         lines = [line.rstrip("\r") for line in text.split("\n", _MOST_ABOVE)[:_MOST_ABOVE]]
         at = self._header(lines, set(names))
-        self._dialect = dialect = Dialect(lines[at], lines[at + 1 : at + 4])
+        self._dialect = dialect = Dialect(lines[at], lines[at + 1 : at + 5])
         self.columns, self.units, header = dialect.columns, dialect.units, lines[at]
-        self._above = at + 1 + bool(dialect.units)  # lines before the first row
+        self._above = at + 1 + dialect.n_told  # lines before the first row
         # With nothing in it that has a meaning; polars is not to be left alone with others.
         quoted = f'"[^"{dialect.separator}\\r\\n]*"(?=[{dialect.separator}\\r\\n])'
         self._quoted = re.compile(quoted.encode())
@@ -489,9 +495,12 @@ class CsvTable(Table):
             return there.index(max(there))
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
-        counts = [sum(map(bool, Dialect(lines[at], ()).columns)) for at in rows]
-        usual = max(counts, key=counts.count, default=0)  # titles above fill fewer fields
-        first = next((at for at, n in zip(rows, counts, strict=True) if n >= usual), 0)
+        named = [Dialect(lines[at], ()).columns for at in rows]
+        sizes, counts = [*map(len, named)], [sum(map(bool, names)) for names in named]
+        # Titles above fill fewer fields, or have another number of them.
+        usual, size = (max(n, key=n.count, default=0) for n in (counts, sizes))
+        found = zip(rows, counts, sizes, strict=True)
+        first = next((at for at, n, of in found if n >= usual and of == size), 0)
         separator = _separator(lines[first])
         above, row = (_fields(lines[at], separator) for at in (max(first - 1, 0), first))
         return first - 1 if first and is_number(row[0]) and len(above) == len(row) else first
@@ -765,6 +774,10 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _is_value(text: str) -> bool:
+    return is_number(text.replace(",", ".")) or is_date(text)
 
 
 def _microseconds(

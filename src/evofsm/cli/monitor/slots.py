@@ -165,7 +165,7 @@ class CsvRows:
         units = {**dialect.units, **units_of(units, numbers)}
         self._factors = {name: UNITS.get(units.get(name, ""), 1.0) for name in numbers}
         self._dialect = dialect
-        return bool(dialect.units)
+        return dialect.n_told > 0
 
     def _told(self, dialect: Dialect, text: str) -> Iterator[tuple[str, Any]]:
         """What a row tells, by the keys of messages."""
