@@ -56,6 +56,15 @@ def test_where_one_limit_depends_on_another_it_foresees_more_than_thresholds(sur
     assert re.search(r"0\.\d+ flow above 0\.\d+", surge.told_by_experience)
 
 
+def test_it_finds_which_two_of_many_variables_limit_each_other(surge):
+    rng, (runs, failed) = np.random.default_rng(5), log_of(surging, 0, 40)
+    wide = [np.column_stack([rng.normal(size=(len(z), 7)).cumsum(0), z]) for z in runs]
+    names = *map(str, range(7)), *NAMES
+    judge = Foresight.learn_log(wide, failed, dt=DT, horizon=HORIZON, names=names)
+    assert {*re.findall("[a-z]+", judge.words(2))} == {*NAMES, "above"}
+    assert judge.held_out[2, 0] >= 0.95 * sum(failed)
+
+
 def test_as_few_are_false_as_stated_cross_validated_and_more_warn_no_later(surge):
     log = Runs.of(*log_of(surging, 0, 40))
     right, false, failures, _ = surge.held_out.T
@@ -98,7 +107,7 @@ def test_where_nothing_foresees_a_failure_there_is_no_alarm():
     for_all = (
         "for 0.1, 0.3, 1, 3 false alarms a day no alarm is false so seldom and better than chance"
     )
-    assert judge.told_by_experience.endswith(for_all)
+    assert judge.told_by_experience == for_all  # nor does anything hold where it fails
 
 
 def test_a_guard_alarms_row_by_row_as_the_log_was_judged_also_from_its_file(surge, reloaded):

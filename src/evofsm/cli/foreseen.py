@@ -121,10 +121,11 @@ def _document(
     judge: Foresight, tolerance: float, runs: Runs, times: NDArray[np.float64]
 ) -> dict[str, Any]:
     chosen, alarms, limits = judge.rate_of(tolerance), [], []
+    columns = judge.columns(runs.rows, runs.starts)
     for rate, stated in enumerate(RATES):
         row: dict[str, Any] = {"stated": stated, "is_own": rate == chosen}
         for kind, plain in (("learnt", None), ("plain", True)):
-            came, _ = judge.tally(runs, rate, plain=plain)
+            came, _ = judge.tally(runs, rate, plain=plain, columns=columns)
             row[kind] = {**came._asdict(), "false_a_day": came.rate}
         alarms.append(row)
         row = {"stated": stated, "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 3])]}
@@ -138,7 +139,7 @@ def _document(
     head: dict[str, Any] = {"rows": len(times), "episodes": len(runs.starts)}
     head |= {"failures": int(runs.failed.sum()), "seconds": len(times) * judge.dt}
     head |= {"horizon": judge.horizon * judge.dt, "tolerance": tolerance}
-    listed = [] if chosen is None else list(_listed(judge, chosen, runs, times))
+    listed = [] if chosen is None else list(_listed(judge, chosen, runs, times, columns))
     missed = [row for row in listed if "lasts" not in row]
     listed = [row for row in listed if "lasts" in row]
     fails = [dict(zip(("where", "came", "failed"), row, strict=True)) for row in judge.fails(runs)]
@@ -147,10 +148,14 @@ def _document(
 
 
 def _listed(
-    judge: Foresight, rate: int, runs: Runs, times: NDArray[np.float64]
+    judge: Foresight,
+    rate: int,
+    runs: Runs,
+    times: NDArray[np.float64],
+    columns: NDArray[np.float64],
 ) -> Iterator[dict[str, Any]]:
     """Each alarm, and each failure that none was before, which lasts for no time."""
-    _, on = judge.tally(runs, rate)
+    _, on = judge.tally(runs, rate, columns=columns)
     horizon = judge.horizon
     for k, (first, end) in enumerate(pairwise([*runs.starts.tolist(), len(times)])):
         edges = np.flatnonzero(np.diff(on[first:end], prepend=False, append=False)) + first
@@ -163,7 +168,7 @@ def _listed(
             false = false_times(begun, over, fails, horizon)
             right = bool(runs.failed[k]) and false * horizon < over - begun
             foreseen |= right
-            passed = judge.passed(runs.rows[first : begun + 1])
+            passed = judge.passed(columns[:, begun])
             row = {"episode": k, "row": begun, "time": times[begun], "failed": right}
             row |= {"lasts": (over - begun) * judge.dt, "false": int(false)}
             yield {**row, "reason": judge.reason(rate, runs.rows[begun], passed)}
@@ -249,7 +254,7 @@ def _draw(
     chosen = judge.rate_of(tolerance)
     on = judge.tally(runs, chosen or 0)[1]
     risk = on * (0.0 if chosen is None else judge.shares[chosen])  # as a live row tells it
-    failed, ends = np.zeros(len(risk), np.bool_), runs.starts + runs.lengths - 1
+    failed, ends = np.zeros(len(risk), np.bool_), runs.last
     failed[ends[runs.failed]] = True
     # Of those that lasted for a while, if there are any, the last one that failed, if one did.
     number = int(np.lexsort([runs.starts, runs.failed, runs.lengths > judge.horizon])[-1])

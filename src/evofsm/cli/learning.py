@@ -127,7 +127,8 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
                 goes.append(told + SI.get(noted.units.get(name, ""), ""))
         told = ": ".join([f"no row meets --failed {quote(columns.failed)}", *goes])
         found.append(told.rstrip())
-    if (step := noted.longest_step) > 0.0 and time in noted.untold and time not in called:
+    is_untold = time in noted.untold and time not in called and not noted.resampled
+    if (step := noted.longest_step) > 0.0 and is_untold:
         unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
         cause = f"is the time in {unit}? --unit {time}={unit} converts it"
         found.append(f"there is a row every {step:,.6g} s: {cause}")

@@ -21,9 +21,9 @@ _BISECTIONS = 60
 
 
 @compiled
-def wilson_bounds(share: float, count: float) -> tuple[float, float]:
+def wilson_bounds(share: float, count: float, quantile: float = _QUANTILE) -> tuple[float, float]:
     """90 % interval, lower and upper, of a share of ``count`` cases (Wilson 1927)."""
-    spread = _QUANTILE * _QUANTILE / count
+    spread = quantile * quantile / count
     centre = (share + 0.5 * spread) / (1.0 + spread)
     reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
     return max(centre - reach, 0.0), min(centre + reach, 1.0)

@@ -53,9 +53,13 @@ _BLOCKS, _FEWEST_BLOCKS, _MOST_BLOCKS = 15, 5, 100_000
 # Kinds of alarms; plain thresholds are taken unless others, as often false, warn for longer.
 _LEARNT, _PLAIN, _NO_KIND = range(3)
 _BETTER = 0.95
-# What a further limit has to add to the share of the horizon that is warned before; survived rows
-# that forms of failure are learnt from.
+# What a limit has to add to the share of the horizon that is warned before; survived rows of which
+# forms of failure are learnt.
 _WORTH, _ROWS = 2e-3, 4000
+# An alarm is better than one at any time if it is by so many standard errors: of many the best was
+# taken. A form is said if it holds such a share of the failures; and all, if they hold a share of
+# those that they were not learnt from that is by so much larger than that of all rows.
+_NO_CHANCE, _SAID, _KNOWN = 2.9, 0.1, 0.5
 # Without a horizon: the share of the median episode, and the fewest rows. Rows that one that learns
 # as it goes keeps; it learns anew where failures, or rows, are so many times as many.
 _SHORT, _FEWEST, _HELD_ROWS, _MORE = 0.05, 10, 20_000, (1.1, 1.5)
@@ -94,6 +98,16 @@ class Runs(NamedTuple):
     def lengths(self) -> Ints:
         """(E,) rows of each."""
         return np.diff(self.starts, append=len(self.rows))
+
+    @property
+    def last(self) -> Ints:
+        """(E,) the last row of each."""
+        return self.starts + self.lengths - 1
+
+    @property
+    def failures(self) -> Floats:
+        """(F, m) rows in which they failed."""
+        return self.rows[self.last[self.failed]]
 
     @classmethod
     def of(cls, episodes: Sequence[ArrayLike], failed: ArrayLike) -> Runs:
@@ -238,16 +252,22 @@ class Foresight(LearningJudge):
         nothing = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 4))
         fresh = cls(dt, ahead, held, *nothing)
         number = np.arange(len(log.failed)) * _PARTS // len(log.failed)
-        tallies, seen = np.zeros((2, len(_PRICES), 3)), 0  # warned, foreseen, false; rows
+        tallies = np.zeros((2, len(_PRICES), 3))  # warned, foreseen, false
+        there = np.zeros((2, 2))  # of failures, and rows: how many are where others failed, and all
         for k in range(_PARTS):
             if not (number == k).any() or not log.failed[number != k].any():
                 continue
             judge, rest = fresh._fitted(log.part(number != k)), log.part(number == k)
-            columns, seen = judge._columns(rest.rows, rest.starts), seen + len(rest.rows)
+            columns = judge.columns(rest.rows, rest.starts)
+            for n, z in enumerate((rest.failures, rest.rows)):
+                there[n] += failure.inside(judge.forms, z).any(0).sum(), len(z)
             for side, price in np.ndindex(2, len(_PRICES)):
                 found, _ = judge.tally(rest, price, plain=bool(side), columns=columns)
                 tallies[side, price] += found.lead * found.failures, found.foreseen, found.false
-        judge, days = fresh._fitted(log), seen * dt / _DAY
+        judge, days = fresh._fitted(log), there[1, 1] * dt / _DAY
+        holds, shares = judge.forms[:, failure.HELD], there[:, 0] / np.maximum(there[:, 1], 1.0)
+        is_known = not there[0, 1] or shares[0] - shares[1] >= _KNOWN
+        holds[holds < (_SAID * log.failed.sum() if is_known else np.inf)] = 0.0
         fewest = np.array([[poisson_bounds(int(n))[0] for n in row] for row in tallies[..., 2]])
         chance, limits = log.failed.sum() * ahead / len(log.rows), [np.empty((0, 6))]
         before, told = limits[0], list[Any]()  # limits of the rate before
@@ -261,7 +281,8 @@ class Foresight(LearningJudge):
             as_many = min((plain[2] + 1.0) / (learnt[2] + 1.0), 1.0)
             kind = int(plain[0] >= _BETTER * as_many * learnt[0])
             _, right, false = (learnt, plain)[kind]
-            low = wilson_bounds(right / (right + false), right + false)[0] if right else 0.0
+            n = right + false
+            low = wilson_bounds(right / n, n, _NO_CHANCE)[0] if right else 0.0
             kind = kind if low > chance else _NO_KIND  # no better than an alarm at any time
             is_same = bool(told) and told[-1][3] == kind and np.array_equal(parts[kind % 2], before)
             told.append(told[-1] if is_same else (right, false, float(log.failed.sum()), kind))
@@ -271,14 +292,13 @@ class Foresight(LearningJudge):
 
     def _fitted(self, log: Runs) -> Self:
         """With forms and limits of both kinds, for all rates."""
-        last = np.append(log.starts[1:], len(log.rows)) - 1
-        rows, failed = np.delete(log.rows, last[log.failed], 0), log.rows[last[log.failed]]
+        rows, failed = np.delete(log.rows, log.last[log.failed], 0), log.failures
         unit = np.median(np.abs(np.diff(log.rows, axis=0)), axis=0) + 1e-12
         box, sample = np.sort(rows, axis=0), rows[:: max(len(rows) // _ROWS, 1)]
         survived = failure.Survived(sample, box[:2], box[:-3:-1], unit, rows.std(0), rows[:0])
         forms = failure.explain(FAILS, failed, survived)
         judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
-        columns = judge._columns(log.rows, log.starts)
+        columns = judge.columns(log.rows, log.starts)
         judge.limits = np.vstack([judge._searched(columns, log, plain=k) for k in (False, True)])
         return judge
 
@@ -313,13 +333,14 @@ class Foresight(LearningJudge):
                 found[k, j] = leads.sum(), false
             return np.asarray(found / most)
 
-        rows = []
+        # What one failure alone speaks for is no further limit.
+        rows, alone = [], max(_WORTH, 1.0 / log.failed.sum())
         for number, price in enumerate(_PRICES):
             rule, worth = _Rule(), 0.0
             while len(rule) < _MOST_LIMITS:
                 gain = more(rule) @ (1.0, -price)
                 best = divmod(int(gain.argmax()), _TRIED)
-                if gain[best] <= worth + _WORTH:
+                if gain[best] <= worth + (alone if rule else _WORTH):
                     break
                 worth, rule = gain[best], (*rule, best)
             parts = [signed[k] > tried[k][j] for k, j in rule]
@@ -338,7 +359,7 @@ class Foresight(LearningJudge):
         """The horizon, how long a limit has to be passed, and how long an alarm stays on [rows]."""
         return np.array([self.horizon, self.hold, max(round(_STAYS * self.horizon), 1)])
 
-    def _columns(self, rows: Floats, starts: Ints, memory: Floats | None = None) -> Floats:
+    def columns(self, rows: Floats, starts: Ints, memory: Floats | None = None) -> Floats:
         """(3 v, T) variables and nearness to forms: now, and as far ahead as `_AHEAD` says."""
         x = np.vstack([rows.T, -failure.distances(self.forms, rows)])
         memory = np.full((2, len(x)), np.nan) if memory is None else memory
@@ -377,9 +398,12 @@ class Foresight(LearningJudge):
     def tally(
         self, log: Runs, rate: int, *, plain: bool | None = None, columns: Floats | None = None
     ) -> tuple[Tally, Flags]:
-        """What came of the alarm for one of `RATES`, and when it was on (T,)."""
+        """What came of the alarm for one of `RATES`, and when it was on (T,).
+
+        With the `columns` of the log, if they are known.
+        """
         limits = self.of_rate(rate, plain=plain)
-        columns = self._columns(log.rows, log.starts) if columns is None else columns
+        columns = self.columns(log.rows, log.starts) if columns is None else columns
         above, on = (np.any(self._passed(columns, limits, soon=k), axis=0) for k in (False, True))
         leads = np.zeros(len(log.starts))
         false = _tally(above, on, log.starts, log.failed, self._spans, leads)
@@ -408,10 +432,9 @@ class Foresight(LearningJudge):
         how = "beyond" if at > 0.0 else "within"
         return "it", f"{how} {abs(at):.2g} typical steps of where it fails{soon}: {there}"
 
-    def passed(self, rows: Floats) -> Floats:
-        """(n, 6) the limits that the last row of an episode so far, (T, m), passes."""
-        columns = self._columns(rows, np.zeros(1, np.int64))
-        return self._limits[self._passed(columns[:, -1:], self._limits)[:, 0]]
+    def passed(self, column: Floats) -> Floats:
+        """(n, 6) the limits that a row passes, of which this is the one of `columns`."""
+        return self._limits[self._passed(column[:, None], self._limits)[:, 0]]
 
     def reason(self, rate: int, z: Floats, passed: Floats) -> str:
         """Why an alarm is on at an observation (m,), with the limits (n, 6) that are passed."""
@@ -456,10 +479,15 @@ class Foresight(LearningJudge):
 
     def fails(self, log: Runs) -> list[tuple[str, int, int]]:
         """Where it fails, in words; how many episodes came there, and how many of them failed."""
-        there = failure.distances(self.forms, log.rows) <= 0.0
+        there = failure.distances(self._said, log.rows) <= 0.0
         came = np.logical_or.reduceat(there, log.starts, axis=1)
         counts = came.sum(1).tolist(), (came & log.failed).sum(1).tolist()
-        return list(zip(map(self._region, self.forms), *counts, strict=True))
+        return list(zip(map(self._region, self._said), *counts, strict=True))
+
+    @property
+    def _said(self) -> Floats:
+        """Those of the forms that are known well enough to be said."""
+        return np.asarray(self.forms[self.forms[:, failure.HELD] > 0.0])
 
     def _region(self, form: Floats) -> str:
         """Where a form is, in words."""
@@ -469,7 +497,7 @@ class Foresight(LearningJudge):
     @property
     def told_by_experience(self) -> str:
         """Where it fails; what each alarm is, how often it was right, and with which tolerance."""
-        there = " or ".join(map(self._region, self.forms))
+        there = " or ".join(map(self._region, self._said))
         told = [f"it fails where {there}"] if there else []
         for stated, last in self.alarms.items():
             at = f"{self.tolerance_of(RATES[last]):.3g}"
@@ -508,7 +536,7 @@ class Foresight(LearningJudge):
         """Which limits are passed, and the state after an observation (m,)."""
         memory, up, down, on = self._now
         memory = np.full((2, len(z) + len(self.forms)), np.nan) if memory is None else memory.copy()
-        columns = self._columns(z[None], np.empty(0, np.int64), memory)
+        columns = self.columns(z[None], np.empty(0, np.int64), memory)
         passed, soon = (self._passed(columns, self._limits, soon=k)[:, 0] for k in (False, True))
         rates = (self._limits[flags, _RATE].astype(int) for flags in (passed, soon))
         above, near = (np.bincount(rate, minlength=len(up)) > 0 for rate in rates)
