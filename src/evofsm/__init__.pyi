@@ -11,7 +11,6 @@ from .fsm import Novelty as Novelty
 from .fsm import ObservationEncoder as ObservationEncoder
 from .fsm import Paper as Paper
 from .fsm import jensen_shannon as jensen_shannon
-from .fsm import merge as merge
 from .fsm import register_rule as register_rule
 from .guard import Guard as Guard
 from .guard import warm as warm

@@ -16,7 +16,6 @@ import sys
 import numpy as np
 from pathlib import Path
 from evofsm import EvolvingFSM, FSMModel, Novelty
-from evofsm import merge
 
 folder = Path(sys.argv[1])
 
@@ -33,7 +32,6 @@ one.save(folder / "machine")
 one.model().save(folder / "model")
 assert EvolvingFSM.load(folder / "machine").begun.tolist() == [1.0, 1.0]
 assert FSMModel.load(folder / "model").begun.tolist() == [1.0, 1.0]
-assert merge([one, one]).begun.tolist() == [2.0, 2.0]
 
 full = machine(max_states=2)
 full.learn_many([[0.0], [1.5], [9.0]], [0] * 3, episode_starts=[0, 1])

@@ -11,7 +11,6 @@ from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.explanation import Tally
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.merging import merge
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.rules import Novelty
@@ -79,11 +78,6 @@ def test_where_states_were_joined_there_is_no_interval():
     text = model.explain(int(joined)).text
     assert "States were joined here, so an episode may count twice." in text
     assert "%" not in text
-    one, other = EvolvingFSM(1, rule=Novelty(radius=1.0)), EvolvingFSM(1, rule=Novelty(radius=1.0))
-    one.learn_many([[0.0], [1.5]], [0, 0])
-    other.learn_many([[0.7]], [0])
-    assert merge([one, other], radius=2.0).joined.tolist() == [1.0]
-    assert not merge([one, other.copy()], radius=0.1).joined.any()
 
 
 # -- What is said ----------------------------------------------------------------------------------
@@ -173,8 +167,6 @@ def test_failures_that_were_told_and_never_happened_are_counted_as_none(tell, tm
     assert EvolvingFSM.load(tmp_path / "machine").failures_told
     assert FSMModel.load(tmp_path / "model").failures_told
     assert machine.copy().failures_told
-    assert not merge([machine, untold()]).failures_told
-    assert merge([machine, machine.copy()]).failures_told
 
 
 # -- What was never seen ---------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from evofsm.guard import AuditLog, Guard, LearntRisk, Mode, audit, merge_judges
+from evofsm.guard import AuditLog, Guard, LearntRisk, Mode, audit
 from evofsm.guard.api import Search
 from evofsm.guard.export import write_c99
 from evofsm.guard.harm import Harm
@@ -124,15 +124,6 @@ def test_where_someone_else_acts_the_controller_is_alone(wrong):
     guard.freeze()  # it was never tried
     guard.reviser.mode = Mode.ACT
     assert drive(guard, 2) == [(1, "")] * 2
-
-
-def test_merged_it_is_said_of_all_episodes(wrong):
-    guards = make(), make(seed=1)
-    for guard in guards:
-        drive(guard, 7)
-    merged = merge_judges([guard.judge for guard in guards]).harm
-    assert len(merged.outcomes) == merged.n_episodes == 14
-    assert not merged.helps
 
 
 def test_a_score_that_is_no_number_is_refused_and_nothing_ends():

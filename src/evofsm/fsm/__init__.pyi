@@ -2,7 +2,6 @@ from .actions import IntervalActions as IntervalActions
 from .divergence import jensen_shannon as jensen_shannon
 from .forecast import Forecasts as Forecasts
 from .machine import EvolvingFSM as EvolvingFSM
-from .merging import merge as merge
 from .model import FSMModel as FSMModel
 from .model import Policy as Policy
 from .naming import Labels as Labels

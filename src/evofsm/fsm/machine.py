@@ -503,17 +503,12 @@ class EvolvingFSM(Retraced):
         content, learnt = store.read(path, MACHINE)
         with store.explained(path):
             machine = cls(**{**content, "rule": rules.restore_rule(content["rule"])})
-            return machine._with_arrays(learnt)
-
-    def _with_arrays(self, learnt: Mapping[str, NDArray[Any]]) -> Self:
-        """A machine of the same settings that has learnt these arrays, by their names in a file."""
-        machine = self.copy()
-        if m := len(learnt["first"]):
-            machine._fit(m)
-            machine._learnt = arrays.from_names(learnt, m, self.n_actions)
-        else:
-            machine._learnt.now["failures_told"] = learnt["failures_told"]
-        return machine
+            if m := len(learnt["first"]):
+                machine._fit(m)
+                machine._learnt = arrays.from_names(learnt, m, machine.n_actions)
+            else:
+                machine._learnt.now["failures_told"] = learnt["failures_told"]
+            return machine
 
     @property
     def _content(self) -> dict[str, Any]:

@@ -23,7 +23,6 @@ from .guard import Guard as Guard
 from .gym import RevisedActions as RevisedActions
 from .gym import RevisedVectorActions as RevisedVectorActions
 from .learnt.judge import LearntRisk as LearntRisk
-from .learnt.merge import merge_judges as merge_judges
 from .learnt.state import LearntSettings as LearntSettings
 from .loop import Decision as Decision
 from .loop import run_episode as run_episode

@@ -209,18 +209,6 @@ class Harm(NamedTuple):
         rows = np.array(self.outcomes, np.float64).reshape(-1, 6)
         return np.nan_to_num(np.insert(rows, 5, np.isfinite(rows[:, 5]), axis=1))
 
-    @classmethod
-    def merged(cls, parts: Sequence[Harm]) -> Harm:
-        """Of guards that learnt apart: the newest outcomes of each."""
-        outcomes, n_episodes = list[Outcome](), 0
-        kept = max(1, _KEPT // len(parts))
-        for part in parts:
-            newest = part.alone[-kept:] + part.guarded[-kept:]
-            outcomes += (o._replace(episode=o.episode + n_episodes) for o in newest)
-            n_episodes += part.n_episodes
-        known = any(part.refuses for part in parts), any(part.ends for part in parts)
-        return cls(tuple(sorted(outcomes, key=lambda o: o.episode)), n_episodes, *known)
-
     def after(
         self,
         driven: tuple[int, int, int],

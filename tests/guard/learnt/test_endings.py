@@ -6,7 +6,7 @@ import pytest
 gymnasium = pytest.importorskip("gymnasium")
 
 from evofsm import Guard  # noqa: E402
-from evofsm.guard import LearntRisk, RevisedActions, merge_judges  # noqa: E402
+from evofsm.guard import LearntRisk, RevisedActions  # noqa: E402
 from evofsm.guard.learnt.failure import SAYS, are_sides, distances  # noqa: E402
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS  # noqa: E402
 
@@ -62,12 +62,9 @@ def test_who_lands_is_let_land_and_what_lands_too_fast_is_not(lander):
     assert failed == 0 < 4 < alone[0] < 16 <= landed
 
 
-def test_a_file_holds_them_and_a_merged_judge_knows_those_of_both(lander, reloaded):
+def test_a_file_holds_them(lander, reloaded):
     again = reloaded(lander.judge)
     assert again.told_by_experience == lander.judge.told_by_experience
-    merged = merge_judges([lander.judge, again])
-    assert len(merged.state.ended) == 2 * len(again.state.ended)
-    assert "ends by itself" in merged.told_by_experience
 
 
 def walk(judge, place, **how):

@@ -69,10 +69,10 @@ def fails(
         state = state._replace(failures=np.vstack([state.failures, z[-1]])[-most:], brinks=brinks)
     if given is not None:
         return _asked(state, given, bends="regions" not in without)
-    return explained(state, settings, failed=failed, bends="regions" not in without)
+    return _explained(state, settings, failed=failed, bends="regions" not in without)
 
 
-def explained(state: State, settings: LearntSettings, *, failed: bool, bends: bool) -> State:
+def _explained(state: State, settings: LearntSettings, *, failed: bool, bends: bool) -> State:
     """Explain all that failed or ended by forms, anew if it ``failed`` now."""
     known, table = sizes(state), state.forms
     if len(state.ended) >= _ENDED:

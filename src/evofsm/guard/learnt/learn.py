@@ -214,7 +214,7 @@ def disturbances(
         calm = model.undisturbed(H, m, 1)[:, : new.shape[1]]
         with_none = np.concatenate([calm, new], 2)
         picked = S[random.permutation(len(S))[:_TRIED_IN]]
-        ends = worst(known, picked, state.policies[:1], with_none, 1.0)
+        ends = _worst(known, picked, state.policies[:1], with_none, 1.0)
     harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_MOST_WINDOWS]
     starts = starts[harmful]
     longest = settings.horizon_max + 2
@@ -240,11 +240,11 @@ def disturbances(
         return state
     if looks:
         scale = disturbance_scale(state, settings)
-        ends = worst(known, S, state.policies[:2], found, scale)
-        keep = chosen(ends, settings.n_disturbances)
+        ends = _worst(known, S, state.policies[:2], found, scale)
+        keep = _chosen(ends, settings.n_disturbances)
     else:
         keep = _sizes(found[:, :, 1:], state)[: settings.n_disturbances]
-    return kept(state, keep)
+    return _kept(state, keep)
 
 
 def _fatal(
@@ -257,7 +257,7 @@ def _fatal(
     that is remembered, (H, m, 1 + K), of which those of what is left are returned.
     """
     m = len(state.unit)
-    ends = worst(known, state.situations, state.policies[:2], found, 1.0)
+    ends = _worst(known, state.situations, state.policies[:2], found, 1.0)
     fatal = np.flatnonzero(ends.max(0, initial=-np.inf) < 0.0) if len(ends) else np.empty(0, int)
     size = np.abs(found[:, :m, 1 + fatal] / (state.unit[:, None] + 1e-300)).sum(1)
     rows = state.windows[fatal, (size >= _ONSET * size.max(0)).argmax(0), :m]
@@ -266,10 +266,10 @@ def _fatal(
     state = danger.barred(state._replace(fatal=seen))
     within = failure.inside(state.forms[state.forms[:, SAYS] == DEAD], rows).any(0)
     keep = np.setdiff1d(np.arange(len(state.windows)), fatal[within])
-    return kept(state, keep.tolist()), found[:, :, np.append(0, 1 + keep)]
+    return _kept(state, keep.tolist()), found[:, :, np.append(0, 1 + keep)]
 
 
-def kept(state: State, keep: list[int]) -> State:
+def _kept(state: State, keep: list[int]) -> State:
     """Forget all disturbances but these, by their numbers from 0."""
     of = {name: getattr(state, name)[keep] for name in ("windows", "lengths", "seen_in")}
     return state._replace(**of)
@@ -283,7 +283,7 @@ def _sizes(rest: Floats, state: State) -> list[int]:
     return [int(k) for k in np.argsort(-size, kind="stable")]
 
 
-def worst(
+def _worst(
     known: Model, situations: Floats, policies: Floats, residuals: Floats, scale: float
 ) -> Floats:
     """(S, K) how disturbances end in situations in which nothing else is lost."""
@@ -293,7 +293,7 @@ def worst(
     return np.asarray(np.minimum(ends, _BY_FAR))
 
 
-def chosen(ends: Floats, most: int) -> list[int]:
+def _chosen(ends: Floats, most: int) -> list[int]:
     """Which are worst in some situation (S, K), and of others those that are worst in the mean."""
     if not len(ends):
         return list(range(ends.shape[1]))[-most:]
