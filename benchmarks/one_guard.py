@@ -124,7 +124,8 @@ def harms(make: str, every: int = 1, error: type[BaseException] = BrokenError) -
 
     Of the lines it takes one in ``every``; of those of an end, which has many, one in 20 times it.
     """
-    guard, other = MAKES[make](), MAKES[make]()
+    guard = MAKES[make]()
+    other = copy.deepcopy(guard)
     for name, call in calls(other).items():
         before = held(other)
         for line in itertools.count(1, every * (20 if name.startswith("end") else 1)):

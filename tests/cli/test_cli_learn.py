@@ -160,7 +160,7 @@ def test_a_guard_that_refuses_most_of_the_time_is_said_to(evofsm, tmp_path):
     """A tank whose inlet, which nobody sees, opens and closes now and then."""
     path, guard, chance = tmp_path / "tank.csv", tmp_path / "tank.evofsm", random.Random(3)
     rows = ["run,time,level,pump"]
-    for run in range(30):
+    for run in range(12):
         level, inlet = chance.uniform(0.2, 0.6), False
         for k in range(200):
             pump, inlet = chance.random(), inlet != (chance.random() < 0.1)

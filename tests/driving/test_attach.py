@@ -148,7 +148,7 @@ def test_shadow_changes_nothing(road):
 def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step):
     usual = (
         '<vType id="usual" decel="4.5" speedDev="0.1"/><flow id="car" type="usual" route="along" '
-        'begin="1" end="60" period="2" departSpeed="max" departPos="0"/>'
+        'begin="1" end="40" period="2" departSpeed="max" departPos="0"/>'
     )
     found = []
     for mode in ("watch", "act"):
@@ -157,9 +157,9 @@ def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step):
         sumo.simulationStep()
         sumo.vehicle.setType("ego", "usual")  # nobody is hasty
         cars = attach(sumo, "type:usual", mode=mode)
-        drive(sumo, 60.0, brakes_at=np.inf)
+        drive(sumo, 40.0, brakes_at=np.inf)
         sumo.vehicle.setMaxSpeed("lead", 3.0)
-        drive(sumo, 60.0, brakes_at=np.inf)
+        drive(sumo, 40.0, brakes_at=np.inf)
         found.append(cars.summary())
         cars.detach()
     alone, guarded = found

@@ -496,8 +496,10 @@ def test_where_nothing_moves_before_it_fails_it_learns_all_the_same():
 # -- What is broken off -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", one_guard.MAKES)
-@pytest.mark.parametrize("error", [one_guard.BrokenError, KeyboardInterrupt])
+@pytest.mark.parametrize(
+    ("kind", "error"),
+    [*((kind, KeyboardInterrupt) for kind in one_guard.MAKES), ("learnt", one_guard.BrokenError)],
+)
 def test_wherever_a_call_is_broken_off_nothing_is_done_and_it_works_again(kind, error):
     """At lines of all of the package, in each of its calls; ``make torture`` tries every line."""
     found = Counter(one_guard.harms(kind, 257, error))

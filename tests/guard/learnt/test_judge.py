@@ -162,11 +162,11 @@ def test_failures_that_no_threshold_explains_are_not_denied():
     assert guard.judge.told_by_experience.startswith("17 failures seen")
 
 
-@pytest.mark.parametrize("places", [7, 20, 32])
+@pytest.mark.parametrize("places", [7, 32])
 def test_many_variables_are_learnt_of_in_a_few_episodes_too(points, places, reloaded):
     many = replace(points["box"], places=places)
     guard = many.guard(shadow=False)
-    assert sum(many.play(guard, k)[1] for k in range(6)) <= 2
+    assert sum(many.play(guard, k)[1] for k in range(4)) <= 2
     assert reloaded(guard).judge.n_variables == 2 * places
 
 
@@ -199,9 +199,13 @@ def test_a_copy_goes_on_the_same_by_itself_until_it_is_frozen(points, exactly, c
     assert content(guard.judge) == content(twin.judge)
 
 
-@pytest.mark.parametrize("most", [math.inf, 2])  # as it is, or cut short after so many steps
-def test_a_log_is_replayed_learning_and_frozen(point, tmp_path, monkeypatch, most):
+@pytest.mark.parametrize(
+    ("name", "most"),  # as it is, or cut short after so many steps
+    [("box", math.inf), ("plane", math.inf), ("choices", math.inf), ("box", 2)],
+)
+def test_a_log_is_replayed_learning_and_frozen(points, tmp_path, monkeypatch, name, most):
     monkeypatch.setattr(judging, "search", lambda *given, **told: search(*given[:9], most, **told))
+    point = points[name]
     with AuditLog(tmp_path / "log") as log:
         guard = point.guard(audit=log)
         for episode in range(4):
