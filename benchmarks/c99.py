@@ -10,11 +10,13 @@ part is not seen, infinite, late or anywhere; some proposals are no numbers, or 
 from __future__ import annotations
 
 import argparse
+import copy
 import math
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from time import perf_counter
 from typing import Any, ClassVar, NamedTuple
@@ -209,23 +211,30 @@ class Learnt(NamedTuple):
 
 def learnt(name: str, episodes: int | None = None) -> Learnt:
     """A guard that learnt so many episodes of a system by its name."""
-    (kind, most), parts = SYSTEMS[name], name.endswith("+parts")
-    system: Any = kind()
+    kind, most = SYSTEMS[name]
+    told = _taught(name.removesuffix("+parts"), most if episodes is None else episodes)
+    system, guard = kind(), copy.deepcopy(told)
+    if name.endswith("+parts"):
+        _add_parts(guard.judge)
+    return Learnt(system, guard)
+
+
+@cache
+def _taught(name: str, episodes: int) -> Guard:
+    system: Any = SYSTEMS[name][0]()
     if isinstance(system, Emergency):
         judge = "kinematic" if name.endswith("cars") else "learnt"
         guard = guard_for_family(system.env.family, judge=judge)
     else:
         guard = Guard(**system.actions)
     guard.shadow = False  # it decides, even if it did harm
-    for seed in range(most if episodes is None else episodes):
+    for seed in range(episodes):
         seen, failed, over = system.reset(seed), False, False
         while not over:
             seen, failed, over = system.step(guard.decide(seen, system.propose()).executed)
         guard.end(failed, seen)
     guard.freeze()
-    if parts:
-        _add_parts(guard.judge)
-    return Learnt(system, guard)
+    return guard
 
 
 def _add_parts(judge: Any) -> None:

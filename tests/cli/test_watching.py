@@ -373,11 +373,16 @@ EMERGENCY = load_family("emergency")
 LEADERS = ("leader brake", "leaders", "latent risk", "braking in full")
 
 
-def told_over(episodes, *, on=True):
-    """Frames of a run under a learnt judge, each with its story in words."""
+@cache
+def told_nothing(episodes):
     guard = watched_guard(EMERGENCY, judge="learnt")
     learn_first(guard, OnRoads(EMERGENCY, KinematicWorld()), episodes)
-    with opened(EMERGENCY, guard, case=1, on=on) as session:
+    return guard
+
+
+def told_over(episodes, *, on=True):
+    """Frames of a run under a learnt judge, each with its story in words."""
+    with opened(EMERGENCY, told_nothing(episodes).copy(), case=1, on=on) as session:
         return [(frame, tell(frame, session.start)) for frame in drive(session)]
 
 

@@ -45,5 +45,6 @@ def test_the_counter_of_the_recipe_counts_is_kept_joined_and_cleared(tmp_path):
     recipe = re.search(r"```diff\n(.*?)```", chapter, re.DOTALL)[1]
     shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
     subprocess.run(["git", "apply"], input=recipe, text=True, cwd=tmp_path, check=True)
-    there = os.environ | {"PYTHONPATH": str(tmp_path / "src")}
+    # Without a compiler, which would compile all kernels anew.
+    there = os.environ | {"PYTHONPATH": str(tmp_path / "src"), "NUMBA_DISABLE_JIT": "1"}
     subprocess.run([sys.executable, "-Wignore", "-c", SCRIPT, tmp_path], env=there, check=True)

@@ -28,11 +28,12 @@ def wall():
     return c99.learnt("wall")
 
 
-def agrees(learnt, folder, *flags, decisions=1500, seed=1):
-    """How both decide; the same, or it fails."""
+def agrees(learnt, folder, *flags, decisions=600, seed=1):
+    """How both decide, compiled with each of the flags; the same, or it fails."""
     asked = c99.ask(learnt, decisions, seed)
-    found = c99.compare(learnt.guard, c99.build(learnt.guard, folder, *flags), asked)
-    assert found.agrees, found[:6]
+    for each in flags:
+        found = c99.compare(learnt.guard, c99.build(learnt.guard, folder, *each), asked)
+        assert found.agrees, found[:6]
     return found
 
 
@@ -53,7 +54,7 @@ def run_cpp(folder, source, *prefixes, told=""):
 
 
 def test_a_guard_in_c_decides_as_in_python(wall, tmp_path):
-    found = agrees(wall, tmp_path, "-O1", decisions=800)
+    found = agrees(wall, tmp_path, ["-O1"])
     assert found.changed > 100
     assert found.refused > 5
     assert "-0.0," not in (tmp_path / "evofsm.c").read_text()  # no risk prints as -0
@@ -140,10 +141,8 @@ def test_what_cannot_be_exported_is_refused_and_nothing_is_written(guard, why, t
 @pytest.mark.slow
 @pytest.mark.parametrize("name", c99.SYSTEMS)
 def test_decisions_are_the_same_and_sanitizers_silent(name, tmp_path):
-    learnt = c99.learnt(name)
-    for flags in (("-O2",), c99.SANITIZERS):
-        found = agrees(learnt, tmp_path / flags[0], *flags)
-        assert found.changed > 20
+    found = agrees(c99.learnt(name, episodes=15), tmp_path, ["-O2"], c99.SANITIZERS, decisions=1000)
+    assert found.changed > 20
 
 
 SETTINGS = {
@@ -160,7 +159,7 @@ SETTINGS = {
 def test_settings_of_a_guard_are_those_in_c(name, change, tmp_path):
     learnt = c99.learnt(name)
     SETTINGS[change](learnt.guard)
-    agrees(learnt, tmp_path, "-O1")
+    agrees(learnt, tmp_path, ["-O1"])
 
 
 @pytest.mark.slow
@@ -175,7 +174,7 @@ def test_a_search_that_is_cut_short_is_so_in_c(wall, monkeypatch, tmp_path):
 @pytest.mark.slow
 def test_brakes_that_are_not_known_are_tried_in_c_too(tmp_path):
     learnt = c99.learnt("cars", episodes=0)
-    found = agrees(learnt, tmp_path, "-O1")
+    found = agrees(learnt, tmp_path, ["-O1"])
     assert constant(tmp_path, "KNOWN") == 0
     assert found.changed > 50
 
@@ -183,7 +182,7 @@ def test_brakes_that_are_not_known_are_tried_in_c_too(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["disc", "cars"])
 def test_it_asks_for_no_memory_and_little_of_the_stack(name, tmp_path):
-    write_c99(c99.learnt(name).guard, tmp_path)
+    write_c99(c99.learnt(name, episodes=15).guard, tmp_path)
     for optimised in ("-O0", "-O2"):
         command = ["cc", *c99.FLAGS, optimised, "-fstack-usage", "-c", "evofsm.c"]
         subprocess.run(command, cwd=tmp_path, check=True)
@@ -248,15 +247,15 @@ def test_tools_load_an_fmu_and_step_it(wall, monkeypatch, tmp_path, caplog, caps
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "episodes"), [("cars", 100), ("cartpole", 2), ("disc", 5)])
+@pytest.mark.parametrize(("name", "episodes"), [("cars", 20), ("cartpole", 1), ("disc", 2)])
 def test_an_fmu_drives_as_python_does(name, episodes, tmp_path):
-    driven = c99.drive_fmu(c99.learnt(name), tmp_path, episodes)
+    driven = c99.drive_fmu(c99.learnt(name, episodes=15), tmp_path, episodes)
     assert driven.decisions > 100 * episodes
     assert driven.others == 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["wall", "exit", "main", "ACC", "my_evofsm_2", "EVOFSM", "K"])
+@pytest.mark.parametrize("name", ["exit", "ACC", "my_evofsm_2", "K"])
 def test_two_guards_are_linked_into_one_program_whatever_is_called_so_in_c(wall, name, tmp_path):
     write_c99(wall.guard, tmp_path, name)
     write_c99(c99.learnt("cars", episodes=0).guard, tmp_path, "cars")
