@@ -6,7 +6,7 @@ from studies.closed_loop import MACHINE, OURS, ClosedLoop
 
 TINY = ClosedLoop(
     train=10,
-    test=20,
+    test=10,
     seeds=2,
     rule_seeds=1,
     rule_test=3,
@@ -14,12 +14,19 @@ TINY = ClosedLoop(
     world_test=2,
     machine_check=4,
     machine_train=10,
+    rule_train=4,
+    check_test=10,
+    before=10,
+    after=4,
+    shift_test=4,
+    machine_shift_seeds=1,
+    machine_shift_test=2,
 )
 
 
 @pytest.fixture(scope="module")
 def found():
-    return TINY.run(workers=2)
+    return TINY.run(workers=1)
 
 
 def rows_of(found, policy):
@@ -43,7 +50,7 @@ def test_the_unrevised_driver_collides_and_ours_does_not(found):
 def test_the_machine_is_told_nothing_but_failures_and_learns_from_the_same_draws(found):
     machine = rows_of(found, MACHINE)
     assert {row["told"] for row in machine} == {"nothing but failures"}
-    assert {(row["train_episodes"], row["episodes"]) for row in machine} == {(10, 20)}
+    assert {(row["train_episodes"], row["episodes"]) for row in machine} == {(10, 10)}
     # It knows of no collision before the first, and the driver alone has hardly an episode without.
     assert all(1 <= row["train_collisions"] <= 7 for row in machine)
     assert all(row["collisions"] <= 2 and row["mobility"] > 0.5 for row in machine)

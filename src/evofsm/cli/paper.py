@@ -23,6 +23,7 @@ def paper(
     Ends with 0 if all claims hold, with 1 if any does not.
     """
     require_world(world, polars="tables", matplotlib="plot", jinja2="plot")
+    out.mkdir(parents=True, exist_ok=True)  # where that fails nothing is driven first
     from evofsm.paper import print_page
     from evofsm.paper.reproduction import reproduce
 
