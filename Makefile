@@ -3,6 +3,8 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# Tests start Python often: what it compiles is kept, whatever the environment says.
+export PYTHONDONTWRITEBYTECODE =
 INSTALL = $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check install --quiet
 
 .PHONY: paper watch closed-loop evidence docs test test-all check house \

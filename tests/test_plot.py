@@ -198,7 +198,7 @@ def guard():
     told = {"names": system.variables, "units": ["m", "m", "m/s", "m/s"]}
     judge = LearntRisk(system.interval, **system.actions.settings, **told)
     guard = Guard(**system.actions.settings, interval=system.interval, judge=judge)
-    for episode in range(20):
+    for episode in range(10):
         run(system, guard, Start.training(0, 0, episode))
     return guard
 

@@ -138,5 +138,5 @@ def test_there_is_no_step_without_an_episode():
 def test_in_a_platoon_the_example_prevents_collisions(monkeypatch):
     pytest.importorskip("pettingzoo")
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "examples")
-    unguarded, guarded = importlib.import_module("platoon").main(["--episodes", "3"])
-    assert (unguarded, guarded) == (3, 0)
+    unguarded, guarded = importlib.import_module("platoon").main(["--episodes", "1"])
+    assert (unguarded, guarded) == (1, 0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evofsm.fsm.machine import EvolvingFSM
@@ -84,11 +84,13 @@ def assert_sound(machine, trace):
     assert model.decisions.sum() == pytest.approx(len(surprise))
 
 
+@settings(max_examples=60)
 @given(streams())
 def test_a_batch_and_a_loop_are_the_same_and_what_is_learnt_is_sound(learn, stream):
     learn(*stream)
 
 
+@settings(max_examples=60)
 @given(streams(numbers=st.floats(-1e100, 1e100)))
 def test_that_holds_for_numbers_of_every_size(learn, stream):
     learn(*stream)
@@ -100,6 +102,7 @@ def test_that_holds_in_every_unit(learn, scale):
     learn(EvolvingFSM(n_actions=2, radius=0.3 * scale), Z, np.arange(200) % 2)
 
 
+@settings(max_examples=60)
 @given(streams(), st.sampled_from([1.0, -64.0, 2.0**20, -(2.0**40)]))
 def test_shifting_all_observations_changes_no_belief(stream, offset):
     machine, Z, I, starts, _ = stream

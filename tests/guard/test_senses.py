@@ -149,7 +149,7 @@ def odd(kind):
 
 
 @pytest.mark.parametrize("kind", ["cars", "traffic", "learnt", "scene"])
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_whatever_is_seen_is_decided_in_time_or_refused_by_name(kind, data, ends_in_time):
     taught, usual = odd(kind)

@@ -122,7 +122,7 @@ def test_the_study_of_the_readme_runs(tmp_path):
 def test_results_keep_the_order_of_the_tasks_whatever_the_number_of_workers():
     tasks = [partial(divmod, number, 3) for number in range(6)]
     assert lib.parallel(tasks, 1) == lib.parallel(tasks, 2) == [divmod(n, 3) for n in range(6)]
-    slow_first = [partial(time.sleep, 1.0), partial(int, 7)]
+    slow_first = [partial(time.sleep, 0.3), partial(int, 7)]
     assert lib.parallel(slow_first, 2) == [None, 7]
     with pytest.raises(ZeroDivisionError):
         lib.parallel([*tasks, partial(divmod, 1, 0)], 2)

@@ -29,8 +29,7 @@ def paper(
 
     with progress(f"Driving and learning ({world})") as done:
         found = reproduce(world, rounds, settings, done)
-    command = shlex.join(["evofsm", *sys.argv[1:]])
-    page = found.write(out, command)
+    page = found.write(out, command := shlex.join(["evofsm", *sys.argv[1:]]))
     if as_json:
         print_json([claim._asdict() for claim in found.claims])
     else:

@@ -26,7 +26,7 @@ def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(
     assert exactly(point.play(again, 50)[0]) == exactly(point.play(guard, 50)[0])
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def judge(points):
     """Settings and arrays of a file."""
     points["box"].taught(3).judge.save(file := BytesIO())

@@ -313,7 +313,7 @@ def test_a_question_changes_nothing_of_what_is_learnt(point, content):
         asked.judge.judge(there, [asked.judge.fallback.action])
         return z
 
-    for episode in range(8):
+    for episode in range(4):
         point.play(asked, episode, seen=ask)
         point.play(unasked, episode)
     assert content(asked) == content(unasked)
