@@ -156,6 +156,7 @@ def test_columns_that_are_named_in_another_order_are_what_they_are_called(evofsm
     assert turned == usual
 
 
+@pytest.mark.slow
 def test_a_guard_that_refuses_most_of_the_time_is_said_to(evofsm, tmp_path):
     """A tank whose inlet, which nobody sees, opens and closes now and then."""
     path, guard, chance = tmp_path / "tank.csv", tmp_path / "tank.evofsm", random.Random(3)

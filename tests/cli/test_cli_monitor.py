@@ -107,6 +107,7 @@ def numbers_of(text):
     return [one for one in cells if one and one[0].replace(".", "").isdecimal()]
 
 
+@pytest.mark.slow
 def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(tmp_path):
     decider = Decider(guard_of_monitor(0.1, 5.0, 0.05))
     decider.guard.learn = False

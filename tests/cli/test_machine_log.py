@@ -258,6 +258,7 @@ def sent(frame, path, began=None):
     return path
 
 
+@pytest.mark.slow
 def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, pump):
     path, of, how = written("parquet"), f'"{VIBRATION}",{BEARING}', f"20s,{BEARING}=last"
     asked = "--observe", of, "--action", "", "--time", "Zeit", "--resample", how, "--hole", "5min"
@@ -294,6 +295,7 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
     assert (beside.exit_code, "ready: reads standard input" in beside.stderr) == (0, True)
 
 
+@pytest.mark.slow
 def test_a_guard_from_zero_where_nobody_acts_learns_as_it_goes(evofsm, pump):
     log, of = pump(18), f'"{VIBRATION}",{BEARING}'
     asked = "--observe", of, "--action", "", "--resample", "20s", "--hole", "5min"

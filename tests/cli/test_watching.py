@@ -79,6 +79,7 @@ def test_the_same_run_is_shown_the_same_and_restarting_begins_anew():
         session.restart(4)
 
 
+@pytest.mark.slow
 def test_any_environment_is_watched_by_a_guard_that_is_given_nothing_but_which_episodes_failed():
     system = read_simulated("CartPole-v1")
     learn_first(system.guard, system, 12)

@@ -144,7 +144,10 @@ def test_shadow_changes_nothing(road):
     np.testing.assert_allclose([one.wish for one in told], [one.deed for one in told], atol=1e-9)
 
 
-@pytest.mark.parametrize("step", [0.1, 1.0])  # where it lasts as long as they keep, at the edge
+@pytest.mark.parametrize(
+    "step",  # where it lasts as long as they keep, at the edge
+    [pytest.param(0.1, marks=pytest.mark.slow), 1.0],
+)
 def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step):
     usual = (
         '<vType id="usual" decel="4.5" speedDev="0.1"/><flow id="car" type="usual" route="along" '

@@ -496,6 +496,7 @@ def test_where_nothing_moves_before_it_fails_it_learns_all_the_same():
 # -- What is broken off -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "error"),
     [*((kind, KeyboardInterrupt) for kind in one_guard.MAKES), ("learnt", one_guard.BrokenError)],

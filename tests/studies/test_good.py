@@ -24,6 +24,7 @@ def test_a_good_controller_does_not_fail_alone_and_the_careless_one_does(name, c
     assert any(failed(system, k) for k in range(4))
 
 
+@pytest.mark.slow
 def test_a_guard_that_learnt_of_a_careless_controller_leaves_a_good_one_alone():
     rows = driven("pendulum", "random", seed=0, train=12, episodes=3)
     assert [row["way"] for row in rows] == [ALONE, FROZEN, LEARNING]

@@ -14,6 +14,7 @@ def test_a_log_has_trips_and_planned_stops_and_comes_again(name):
     assert all(np.array_equal(a.values, b.values) for a, b in zip(runs, again, strict=True))
 
 
+@pytest.mark.slow
 def test_where_the_limit_depends_on_the_load_learnt_alarms_foresee_more():
     rows = pooled_over_seeds(pl.DataFrame(judged("compressor", 40.0, 0)))
     ours, thresholds = (

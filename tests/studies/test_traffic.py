@@ -8,6 +8,7 @@ from studies.traffic import ALONE, OURS, Traffic, beside_alone, simulate
 pytest.importorskip("libsumo")
 
 
+@pytest.mark.slow
 def test_late_drivers_are_simulated_beside_themselves_without_guards():
     alone, guarded = (
         simulate("road", "late", policy, 0, seconds=70.0)[0] for policy in (ALONE, OURS)

@@ -77,9 +77,11 @@ POINTS = {
 }
 
 
-@pytest.fixture(params=POINTS)
+@pytest.fixture(
+    params=["box", *(pytest.param(name, marks=pytest.mark.slow) for name in ("plane", "choices"))]
+)
 def point(request):
-    """Each of them."""
+    """Each of them; of the quick tests one is enough."""
     return POINTS[request.param]
 
 

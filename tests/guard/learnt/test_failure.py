@@ -188,6 +188,7 @@ def test_a_rival_of_a_threshold_asks_each_variable_in_which_failures_are_rare():
     assert crashes(np.vstack([touched[0], failures]), ended=touched[0]) == [False, True, True, True]
 
 
+@pytest.mark.slow
 def test_what_refused_for_long_without_a_failure_is_tried_by_its_smallest_rival():
     """A craft that sinks fails if it touches fast, and ends if slowly, which it did never yet."""
     guard = Guard(0.0, 1.0, interval=0.1)

@@ -35,6 +35,7 @@ def taught(**given):
     return guard
 
 
+@pytest.mark.slow
 def test_a_given_model_knows_of_brakes_that_were_never_tried():
     without, told = (
         sum(drive(guard, 100 + k) for k in range(8)) for guard in (taught(), taught(model=move))

@@ -161,7 +161,7 @@ def test_failures_that_no_threshold_explains_are_not_denied():
     assert guard.judge.told_by_experience.startswith("17 failures seen")
 
 
-@pytest.mark.parametrize("places", [7, 32])
+@pytest.mark.parametrize("places", [7, pytest.param(32, marks=pytest.mark.slow)])
 def test_many_variables_are_learnt_of_in_a_few_episodes_too(points, places, reloaded):
     many = replace(points["box"], places=places)
     guard = many.guard(shadow=False)
