@@ -61,6 +61,16 @@ def test_forms_explain_failures_and_nothing_that_was_survived_is_inside(shape):
     assert (said != SHAPES[shape](elsewhere)).mean() < 0.06
 
 
+def test_the_walls_of_a_room_stay_thresholds_of_which_each_explains_a_few():
+    rng = np.random.default_rng(0)
+    survived, failures = rng.uniform(-1.0, 1.0, (3000, 9)), rng.uniform(-0.9, 0.9, (33, 9))
+    walls = np.arange(32) % 8
+    failures[:32][np.arange(32), walls // 2] = np.where(walls % 2, 1.01, -1.01)  # one has none
+    forms = explain(FAILS, failures, survived_as(survived, np.full(9, 0.02)))
+    held = {(int(row[I]), row[B]) for row in forms[are_sides(forms)]}
+    assert held >= {(k, sign) for k in range(4) for sign in (-1.0, 1.0)}
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_order_unit_direction_and_origin_of_variables_make_no_difference(shape):
     failures, survived = seen(shape)

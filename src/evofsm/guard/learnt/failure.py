@@ -28,8 +28,9 @@ SAYS, I, J, AT, TO, ONE, OTHER, C, B, D, P, Q, R, HELD = range(SIZE)
 
 # Bent forms at most; a failure so near one [typical steps] is in it, as it is known no better.
 _MAX_FORMS, BLUR = 8, 0.5
-# A side that explains fewer failures, or a smaller share of them, may be challenged.
-_FEW_FAILURES, _SHARE = 3, 0.25
+# A side that explains fewer failures, or a smaller share of them, may be challenged; of more sides
+# than so many, one with less than half of an even share.
+_FEW_FAILURES, _SHARE, _FEW_SIDES = 3, 0.25, 4
 # So many failures may leave two sides undecided.
 _MOST_UNDECIDED = 2
 # Beyond an end is what is so many typical steps beyond; blurred ends are so wide [scales].
@@ -39,9 +40,9 @@ _FIT_ROWS, _NEWTON, _RIDGE = 400, 40, 1e-9
 # Fits of what explains failures with more likelihood than this each; how many survived ones that
 # are wrongly inside are added.
 _REFITS, _UNLIKELY, _WORST = 3, 2.0, 100
-# Variables of which all pairs are tried; pairs of which two forms are, and rounds of dealing
-# failures out between two.
-_SCREENED, _IN_TWO, _ROUNDS = 6, 3, 3
+# Variables of which all pairs are tried, and how many of others; pairs of which two forms are, and
+# rounds of dealing failures out between two.
+_SCREENED, _COUPLED, _IN_TWO, _ROUNDS = 6, 3, 3, 3
 # What is left of a variance given another variable, at least, as a share.
 _ALIKE = 1e-6
 # An ellipse may be moved inwards by so much [standard deviations].
@@ -277,7 +278,8 @@ def explain(
     by, k = inside(stay, failures), len(failures)
     if not bends or by.any(0).all() or not len(survived.rows) or not k:
         return _counted(stay, failures)
-    strong = by.sum(1) >= max(_FEW_FAILURES, _SHARE * k)
+    share = _SHARE if len(stay) <= _FEW_SIDES else 0.5 / len(stay)
+    strong = by.sum(1) >= max(_FEW_FAILURES, share * k)
     bent, _ = _bent(says, failures[by[strong].sum(0) == 0], survived)
     if strong.any():
         alone, whole = _bent(says, failures, survived, len(bent) + int(strong.sum()))
@@ -399,34 +401,36 @@ def _in_two(F: Floats, asked: Ints, score: Floats, survived: Survived) -> tuple[
 def _asked(failures: Floats, survived: Survived) -> Ints:
     """(c, 3) variables and kinds of forms that are tried: of many variables those that tell most.
 
-    A variable tells failed observations from survived ones where they have another mean or spread,
-    by itself or given another variable.
+    A variable tells failed observations from survived ones where they have another mean or spread;
+    of pairs those are tried, too, that tell most beyond what their variables do.
     """
     moving = np.flatnonzero(survived.spread > 0.0)
+    pairs = [*combinations(moving.tolist(), 2)]
     if len(moving) > _SCREENED:
         x, y = (z[:, moving] / survived.spread[moving] for z in (failures, survived.rows))
-        tells = _tells(x, y)
-        moving = np.sort(moving[np.argsort(-tells, kind="stable")[:_SCREENED]])
-    alone = [(j, j, 0) for j in moving]
-    bent = [(i, j, kind) for i, j in combinations(moving, 2) for kind in (1, 2)]
-    return np.array(alone + bent, np.int64).reshape(-1, 3)
+        alone, more = _tells(x, y)
+        coupled = [pairs[n] for n in np.argsort(-more, kind="stable")[:_COUPLED]]
+        moving = np.sort(moving[np.argsort(-alone, kind="stable")[:_SCREENED]])
+        pairs = [*dict.fromkeys([*combinations(moving.tolist(), 2), *coupled])]
+    bent = [(i, j, kind) for i, j in pairs for kind in (1, 2)]
+    return np.array([*((j, j, 0) for j in moving), *bent], np.int64).reshape(-1, 3)
 
 
-def _tells(failures: Floats, survived: Floats) -> Floats:
-    """(m,) what each variable tells at best, alone or beyond another one: divergences of normals.
+def _tells(failures: Floats, survived: Floats) -> tuple[Floats, Floats]:
+    """(m,) what each variable tells, and what each pair of them does beyond that.
 
-    The scatter of failures (k, m) is about the mean of what was survived, which counts as one more.
+    Twice the divergences of normal distributions of failures (k, m), about the mean of what was
+    survived, from those of that; for pairs it counts as one failure more.
     """
-    x, y = (z - survived.mean(0) for z in (failures, survived))
-    S = y.T @ y / len(y) + 1e-12 * np.eye(y.shape[1])
-    M = (x.T @ x + S) / (len(x) + 1.0)
-    (s, t), (u, v) = (np.broadcast_arrays(A.diagonal()[:, None], A.diagonal()) for A in (S, M))
-    alone = 0.5 * (u / s - 1.0 - np.log(u / s))[:, 0]
-    det = np.maximum(s * t - S**2, _ALIKE * s * t)
-    trace = (t * u - 2.0 * S * M + s * v) / det
-    pairs = 0.5 * (trace - 2.0 - np.log(np.maximum(u * v - M**2, _ALIKE * u * v) / det))
-    np.fill_diagonal(pairs, 0.0)
-    return np.asarray(np.maximum(alone, (pairs - alone).max(1)))
+    scale = np.sqrt(survived.var(0) + 1e-12)
+    x, y = ((z - survived.mean(0)) / scale for z in (failures, survived))
+    square, R = np.maximum((x * x).mean(0), 1e-12), y.T @ y / len(y)
+    S = (x.T @ x + R) / (len(x) + 1.0)
+    i, j = np.triu_indices(len(scale), 1)
+    joint, free = S[i, i] + S[j, j], np.maximum(1.0 - R[i, j] ** 2, _ALIKE)
+    left = np.maximum(1.0 - S[i, j] ** 2 / (S[i, i] * S[j, j]), _ALIKE)
+    more = (joint - 2.0 * R[i, j] * S[i, j]) / free - joint - np.log(left / free)
+    return square - 1.0 - np.log(square), more
 
 
 def _split(x: Floats) -> Flags:
