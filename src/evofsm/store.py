@@ -387,8 +387,7 @@ def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
     file.seek(0)
     length = int.from_bytes(file.read(8), "little")
     if not 2 <= length <= min(size - 8, _LARGEST_HEADER):
-        how = "of a log, evofsm learn FILE says what is in it"
-        raise ValueError(f"it is another program's file, or was cut off ({how})")
+        raise ValueError("it is another program's file, or cut off (a log? evofsm learn reads it)")
     encoded = file.read(length)
     try:
         index = json.loads(encoded)

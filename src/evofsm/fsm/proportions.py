@@ -22,7 +22,7 @@ _BISECTIONS = 60
 
 @compiled
 def wilson_bounds(share: float, count: float, quantile: float = _QUANTILE) -> tuple[float, float]:
-    """90 % interval, lower and upper, of a share of ``count`` cases (Wilson 1927)."""
+    """Interval, by default of 90 %, of a share of ``count`` cases (Wilson 1927)."""
     spread = quantile * quantile / count
     centre = (share + 0.5 * spread) / (1.0 + spread)
     reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
