@@ -496,11 +496,14 @@ class CsvTable(Table):
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
         named = [Dialect(lines[at], ()).columns for at in rows]
-        sizes, counts = [*map(len, named)], [sum(map(bool, names)) for names in named]
-        # Titles above fill fewer fields, or have another number of them.
-        usual, size = (max(n, key=n.count, default=0) for n in (counts, sizes))
-        found = zip(rows, counts, sizes, strict=True)
-        first = next((at for at, n, of in found if n >= usual and of == size), 0)
+        counts = [sum(map(bool, fields)) for fields in named], [*map(len, named)]
+        usual, size = (max(n, key=n.count, default=0) for n in counts)
+
+        def is_title(fields: Sequence[str]) -> bool:  # of fewer fields, or of others and numbers
+            is_odd = len(fields) != size and any(map(is_number, fields))
+            return is_odd or sum(map(bool, fields)) < usual
+
+        first = next((at for at, n in zip(rows, named, strict=True) if not is_title(n)), 0)
         separator = _separator(lines[first])
         above, row = (_fields(lines[at], separator) for at in (max(first - 1, 0), first))
         return first - 1 if first and is_number(row[0]) and len(above) == len(row) else first
