@@ -168,11 +168,15 @@ def test_frozen_it_acts_where_episodes_ended_better(guarded, alone, helps):
     assert arms([guarded] * 3, [alone] * 3).helps == helps
 
 
-@pytest.mark.parametrize(("failed", "helps"), [(18, False), (4, True)])
-def test_frozen_it_acts_where_it_prevents_most_failures(failed, helps):
-    """A lander's guard: later crashes count for little; episodes of both arms failed."""
+@pytest.mark.parametrize(
+    ("failed", "kept", "helps"),
+    [(18, 400.0, False), (8, 400.0, True), (8, 0.0, False), (4, 0.0, True)],
+)
+def test_frozen_it_acts_where_it_prevents_most_failures(failed, kept, helps):
+    """A lander's guard: later crashes count for little; one that flies by itself has to do more."""
     guarded = [(150, "f", None)] * failed + [(300, "", None)] * (20 - failed)
-    assert arms(guarded, [(110, "f", None)] * 6).helps == helps
+    harm = arms(guarded, [(110, "f", None)] * 6)._replace(decided=500.0, kept=kept)
+    assert harm.helps == helps
 
 
 def test_the_arm_that_is_better_is_drawn_ever_more_often():

@@ -28,7 +28,8 @@ twelve at most.
 
 Frozen, it acts unless its record says that it harms, or does not help: it loses more pairs than it
 wins or, of three episodes at least, all failed, however late, or it prevents less than half of the
-failures per step. A guard, or a controller, that was never tried has no record: then it acts.
+failures per step, nine of ten if it replaces nearly every proposal. A guard, or a controller,
+that was never tried has no record: then it acts.
 """
 
 from __future__ import annotations
@@ -50,8 +51,9 @@ _KEPT, _FADES, _HOPES = 20, (0.9, 0.98), (0.5, 0.25)
 _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
 _SOONER = 0.3
-# Of the failures per step of the controller alone, a guard that helps leaves no larger share.
-_LEFT = 0.5
+# Of the failures per step of the controller alone, a guard that helps leaves no larger share; nor
+# does, of the second, one that replaces nearly every proposal.
+_LEFT, _LEFT_BY_ITSELF = 0.5, 0.1
 # Scores that differ by less than this share are equal.
 _SAME_SCORE = 0.05
 # The latest guarded episodes, if all failed, are reason enough for one draw to decide; else it
@@ -120,14 +122,16 @@ class Harm(NamedTuple):
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
 
         Of three episodes at least, a guard that failed in all prevents nothing, however late; nor
-        does one that fails more than half as often per step as the controller alone.
+        does one that fails more than half as often per step as the controller alone; more than a
+        tenth, if it replaces nearly every proposal: then it would fly any controller's craft so.
         """
         guarded, alone = self.guarded, self.alone
         if _all_failed(guarded, max(_CAREFUL, len(guarded))):
             return False
         if not guarded or not alone:
             return True
-        if len(guarded) >= _CAREFUL and self._rate(guarded) > _LEFT * self._rate(alone):
+        left = _LEFT_BY_ITSELF if self.replaces else _LEFT
+        if len(guarded) >= _CAREFUL and self._rate(guarded) > left * self._rate(alone):
             return False
         return bool(self._weights(guarded) @ better(guarded, alone) @ self._weights(alone) >= 0.0)
 
