@@ -10,7 +10,6 @@ part is not seen, infinite, late or anywhere; some proposals are no numbers, or 
 from __future__ import annotations
 
 import argparse
-import copy
 import math
 import subprocess
 import sys
@@ -213,7 +212,7 @@ def learnt(name: str, episodes: int | None = None) -> Learnt:
     """A guard that learnt so many episodes of a system by its name."""
     kind, most = SYSTEMS[name]
     told = _taught(name.removesuffix("+parts"), most if episodes is None else episodes)
-    system, guard = kind(), copy.deepcopy(told)
+    system, guard = kind(), told.copy()
     if name.endswith("+parts"):
         _add_parts(guard.judge)
     return Learnt(system, guard)

@@ -293,9 +293,8 @@ def risks_of(values: list[Floats], failed: list[bool], first: int) -> list[Float
         max_states=_MOST_STATES,
         failure_horizon=round(HORIZON / STEP),
     )
-    last = np.append(log.starts[1:], len(log.rows)) - 1
     none = np.zeros(len(log.rows), np.int64)
-    machine.learn_many(log.rows, none, log.starts, last[log.failed])
+    machine.learn_many(log.rows, none, log.starts, log.last[log.failed])
     model = machine.model()
     share = model.failed_soon / (model.episodes + 2.0)
     centers = model.centers / scales

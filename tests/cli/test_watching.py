@@ -411,7 +411,7 @@ def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
 def test_the_same_rows_get_the_same_risks_as_from_the_monitor(tmp_path):
     path = tmp_path / "drive.csv"
     told = ["time,gap,v_follower,v_leader,a_follower"]
-    for k, row in enumerate(traffic(600)):  # leaders brake hard now and then: it could learn
+    for k, row in enumerate(traffic(2500)):  # leaders brake hard now and then: it could learn
         values = (row[name] for name in ("gap", "v_follower", "v_leader", "proposal"))
         told.append(",".join(map(str, (k / 10, *values))))
     path.write_text("\n".join([*told, ""]))
@@ -420,6 +420,6 @@ def test_the_same_rows_get_the_same_risks_as_from_the_monitor(tmp_path):
     guard = guard_of_monitor(0.1, 6.0)
     guard.learn = False
     decider = Decider(guard)
-    said = [decider.answer(line(row))["risk_proposed"] for row in traffic(600)][: len(watched)]
+    said = [decider.answer(line(row))["risk_proposed"] for row in traffic(2500)][: len(watched)]
     assert said == pytest.approx(watched, abs=1e-6)
-    assert max(said) > 0.01
+    assert max(said) > 0.02

@@ -102,7 +102,7 @@ def test_one_failure_is_learnt_from_and_no_later_tolerance_silences_an_alarm(sur
 
 
 def test_where_nothing_foresees_a_failure_there_is_no_alarm():
-    judge = learnt(random, 20)
+    judge = learnt(random, 40)
     assert judge.rate_of(0.01) is None
     for_all = (
         "for 0.1, 0.3, 1, 3 false alarms a day no alarm is false so seldom and better than chance"

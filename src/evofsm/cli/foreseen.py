@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rich.console import RenderableType
 
+    Floats = NDArray[np.float64]
+
 #: False alarms a day that are accepted, where nobody says how risky it may be.
 RATE = 0.3
 #: The share of a log that is learnt from, where the rest is to judge it.
@@ -99,9 +101,10 @@ def show_foreseen(
     assert isinstance(judge, Foresight)
     tolerance = reviser.tolerance if asked[-1] is None else asked[-1]
     runs, times = _runs(episodes), np.concatenate([e.times for e in episodes])
+    columns = judge.columns(runs.rows, runs.starts)
     if plot is not None:
-        _draw(judge, tolerance, guard.machine, runs, times, plot)
-    found = {**_document(judge, tolerance, runs, times), "failures_at_once": at_once}
+        _draw(judge, tolerance, guard.machine, runs, times, columns, plot)
+    found = {**_document(judge, tolerance, runs, times, columns), "failures_at_once": at_once}
     if as_json:
         print_json({"file": file, **found})
     else:
@@ -118,10 +121,9 @@ def _runs(episodes: Sequence[Chunk]) -> Runs:
 
 
 def _document(
-    judge: Foresight, tolerance: float, runs: Runs, times: NDArray[np.float64]
+    judge: Foresight, tolerance: float, runs: Runs, times: Floats, columns: Floats
 ) -> dict[str, Any]:
     chosen, alarms, limits = judge.rate_of(tolerance), [], []
-    columns = judge.columns(runs.rows, runs.starts)
     for rate, stated in enumerate(RATES):
         row: dict[str, Any] = {"stated": stated, "is_own": rate == chosen}
         for kind, plain in (("learnt", None), ("plain", True)):
@@ -148,11 +150,7 @@ def _document(
 
 
 def _listed(
-    judge: Foresight,
-    rate: int,
-    runs: Runs,
-    times: NDArray[np.float64],
-    columns: NDArray[np.float64],
+    judge: Foresight, rate: int, runs: Runs, times: Floats, columns: Floats
 ) -> Iterator[dict[str, Any]]:
     """Each alarm, and each failure that none was before, which lasts for no time."""
     _, on = judge.tally(runs, rate, columns=columns)
@@ -245,14 +243,15 @@ def _draw(
     tolerance: float,
     machine: EvolvingFSM | None,
     runs: Runs,
-    times: NDArray[np.float64],
+    times: Floats,
+    columns: Floats,
     out: Path,
 ) -> None:
     """Variables, states, risk, alarms and failures over time: all of it, and the last failure."""
     from evofsm import plot
 
     chosen = judge.rate_of(tolerance)
-    on = judge.tally(runs, chosen or 0)[1]
+    on = judge.tally(runs, chosen or 0, columns=columns)[1]
     risk = on * (0.0 if chosen is None else judge.shares[chosen])  # as a live row tells it
     failed, ends = np.zeros(len(risk), np.bool_), runs.last
     failed[ends[runs.failed]] = True

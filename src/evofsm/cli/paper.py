@@ -29,7 +29,8 @@ def paper(
 
     with progress(f"Driving and learning ({world})") as done:
         found = reproduce(world, rounds, settings, done)
-    page = found.write(out, command := shlex.join(["evofsm", *sys.argv[1:]]))
+    command = shlex.join(["evofsm", *sys.argv[1:]])
+    page = found.write(out, command)
     if as_json:
         print_json([claim._asdict() for claim in found.claims])
     else:

@@ -311,7 +311,7 @@ class Foresight(LearningJudge):
         # The last row, with which it may fail, is one by itself.
         coarse = min(len(log.rows) // _MOST_BLOCKS, self.horizon // _FEWEST_BLOCKS)
         size = max(self.horizon // _BLOCKS, coarse, 1)
-        left = np.repeat(log.starts + log.lengths - 1, log.lengths) - np.arange(len(log.rows))
+        left = np.repeat(log.last, log.lengths) - np.arange(len(log.rows))
         blocks = np.union1d(np.flatnonzero(left % size == 0), log.starts)
         shares = 1.0 - np.geomspace(0.3, max(3.0 / len(log.rows), 1e-5), _TRIED)
         signed = [sign * columns[v + of * when] for v, when, sign in asked]

@@ -51,8 +51,8 @@ _KEPT, _FADES, _HOPES = 20, (0.9, 0.98), (0.5, 0.25)
 _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
 _SOONER = 0.3
-# Of the failures per step of the controller alone, a guard that helps leaves no larger share; nor
-# does, of the second, one that replaces nearly every proposal.
+# The largest share of the controller's failures per step that a guard leaves which helps, and one
+# which replaces nearly every proposal.
 _LEFT, _LEFT_BY_ITSELF = 0.5, 0.1
 # Scores that differ by less than this share are equal.
 _SAME_SCORE = 0.05

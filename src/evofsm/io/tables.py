@@ -490,20 +490,20 @@ class CsvTable(Table):
 
     def _header(self, lines: Sequence[str], names: set[str]) -> int:
         """Which line names the columns: the one with most names, or the last before the rows."""
-        there = [len(names.intersection(Dialect(line, ()).columns)) for line in lines]
+        named = [Dialect(line, ()).columns for line in lines]
+        there = [len(names.intersection(fields)) for fields in named]
         if any(there):
             return there.index(max(there))
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
-        named = [Dialect(lines[at], ()).columns for at in rows]
-        counts = [sum(map(bool, fields)) for fields in named], [*map(len, named)]
+        counts = [sum(map(bool, named[at])) for at in rows], [len(named[at]) for at in rows]
         usual, size = (max(n, key=n.count, default=0) for n in counts)
 
         def is_title(fields: Sequence[str]) -> bool:  # of fewer fields, or of others and numbers
             is_odd = len(fields) != size and any(map(is_number, fields))
             return is_odd or sum(map(bool, fields)) < usual
 
-        first = next((at for at, n in zip(rows, named, strict=True) if not is_title(n)), 0)
+        first = next((at for at in rows if not is_title(named[at])), 0)
         separator = _separator(lines[first])
         above, row = (_fields(lines[at], separator) for at in (max(first - 1, 0), first))
         return first - 1 if first and is_number(row[0]) and len(above) == len(row) else first
