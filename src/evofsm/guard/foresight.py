@@ -705,7 +705,9 @@ def _tally(above: Flags, on: Flags, starts: Ints, failed: Flags, spans: Ints, le
         up, down, begun = 0, 0, -1
         leads[e] = 0.0
         for t in range(starts[e], end + 1):
-            if t < end and above[t]:
+            if begun < 0 and t < end and not above[t]:  # most rows
+                up, on[t] = 0, False
+            elif t < end and above[t]:
                 up, down = up + 1, 0
                 if begun < 0 and up >= hold:
                     begun = t

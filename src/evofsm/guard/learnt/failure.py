@@ -514,22 +514,23 @@ def _logistic(phi: Floats, y: Floats) -> tuple[Floats, Floats]:
     hold[:, :p][~(phi != 0.0).any(1)] = 1.0  # features that it has not
     w, to = np.zeros((count, p + 1)), np.where(y > 0.0, -1.0, 1.0)
 
-    def cost(index: Ints, w: Floats) -> Floats:
-        t = np.einsum("cnp,cp->cn", X[index], w) * to
-        lost = np.maximum(t, 0.0) + np.log1p(np.exp(-np.abs(t)))
-        return np.asarray(lost.sum(1) + 0.5 * (hold[index] * w**2).sum(1))
+    def tried(index: Ints, A: Floats, w: Floats) -> tuple[Floats, Floats]:
+        """What weights cost, and what each row adds up to."""
+        t = np.einsum("cnp,cp->cn", A, w)
+        lost = np.maximum(t * to, 0.0) + np.log1p(np.exp(-np.abs(t)))
+        return np.asarray(lost.sum(1) + 0.5 * (hold[index] * w**2).sum(1)), t
 
-    going, now = np.arange(count), cost(np.arange(count), w)
+    going, A = np.arange(count), X
+    now, t = tried(going, A, w)
     for _ in range(_NEWTON):
-        A = X[going]
-        q = 0.5 * (1.0 + np.tanh(0.5 * np.einsum("cnp,cp->cn", A, w[going])))
+        q = 0.5 * (1.0 + np.tanh(0.5 * t))
         down = np.einsum("cnp,cn->cp", A, q - y) + hold[going] * w[going]
         curved = (A * np.maximum(q * (1.0 - q), 1e-12)[..., None]).transpose(0, 2, 1) @ A
         curved += hold[going][:, :, None] * np.eye(p + 1)
         step = np.linalg.solve(curved, down[..., None])[..., 0]
         rate = np.ones(len(going))
         for _ in range(10):
-            new = cost(going, w[going] - rate[:, None] * step)
+            new, t = tried(going, A, w[going] - rate[:, None] * step)
             worse = new > now[going] - 1e-12
             if not worse.any():
                 break
@@ -537,7 +538,8 @@ def _logistic(phi: Floats, y: Floats) -> tuple[Floats, Floats]:
         w[going] -= np.where(worse, 0.0, rate)[:, None] * step
         was = now[going]
         now[going] = np.where(worse, was, new)
-        going = going[~worse & (was - new >= 1e-4 * new + 1e-9)]
+        on = ~worse & (was - new >= 1e-4 * new + 1e-9)
+        going, A, t = going[on], A[on], t[on]
         if not len(going):
             break
     likelihood = -(now - 0.5 * (hold * w**2).sum(1))
