@@ -4,6 +4,8 @@ import json
 import random
 import re
 import shlex
+from datetime import UTC
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -248,14 +250,16 @@ def test_what_cannot_be_done_with_rows_is_refused(refused, written, options, mes
     assert message in refused("learn", path, *asked, "--failed", "Status==Störung", *options)
 
 
-def sent(frame, path, began=None):
+def sent(frame, path):
     """Rows of a log as a machine sends them, in the order in which they came."""
-    began = began or frame["Zeit"][0]
     with Path(path).open("w") as file:
         for row in frame.iter_rows(named=True):
-            time = (row.pop("Zeit") - began).total_seconds()
-            file.write(json.dumps({"time": time, **row}) + "\n")
+            file.write(json.dumps({"time": seconds(row.pop("Zeit")), **row}) + "\n")
     return path
+
+
+def seconds(date):
+    return date.replace(tzinfo=UTC).timestamp()
 
 
 @pytest.mark.slow
@@ -269,7 +273,7 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
     live = evofsm("monitor", sent(log, "rows.jsonl"), "--guard", "guard.evofsm")
     answers = [json.loads(line) for line in live.stdout.splitlines()]
     assert len(answers) == len(log)  # of which the last stands still
-    ends = [answer for answer in answers if answer["kind"] == "end" and "last" in answer]
+    ends = [answer for answer in answers if answer["kind"] == "end"]
     assert [end["failed"] for end in ends].count(True) == 7
     # An episode that did not fail ends live only as the next row comes, after its last decision.
     found = [a.get("last", a) if a.get("failed", True) else a for a in answers]
@@ -279,7 +283,9 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
     chunks = reading_of(**told).traces([path])
     decider = Decider(Guard.load("guard.evofsm"), slots=Slots(LogColumns(hole=300.0)))
     expected = [a for a, row in decided_on_log(decider, episodes_of(chunks)) if row is not None]
-    for name in ("time", "alarm", "risk_proposed", "reason"):
+    began = seconds(log["Zeit"][0])
+    assert [one["time"] - began for one in found] == [one["time"] for one in expected]
+    for name in ("alarm", "risk_proposed", "reason"):
         assert [one[name] for one in found] == [one[name] for one in expected]
     assert sum(one["alarm"] for one in found) > 20
     drawn = evofsm("inspect", "guard.evofsm", "--plot", "states.png", "--log", path)
@@ -302,13 +308,15 @@ def test_a_guard_from_zero_where_nobody_acts_learns_as_it_goes(evofsm, pump):
     asked = *asked, "--where", "Drehzahl>100", "--failed", "Status==Störung"
     alarmed = []
     for part in (log[: len(log) // 2], log[len(log) // 2 :]):  # the second one goes on
-        rows = sent(part, "rows.jsonl", began=log["Zeit"][0])
+        rows = sent(part, "rows.jsonl")
         done = evofsm("monitor", rows, *asked, "--state", "pump.evofsm")
         assert done.exit_code == 0, done.stderr
         for said in (f"a guard of {VIBRATION}, {BEARING} begins", "ready: reads rows.jsonl"):
             assert said in done.stderr
         answers = [json.loads(line) for line in done.stdout.splitlines()]
-        alarmed += [a["last"]["alarm"] for a in answers if a["kind"] == "end" and a["failed"]]
+        for before, end in pairwise(answers):
+            if end["kind"] == "end" and end["failed"]:
+                alarmed.append(end.get("last", before)["alarm"])
     assert len(alarmed) == 9
     assert not any(alarmed[:2])
     assert all(alarmed[-5:])
@@ -356,23 +364,21 @@ def test_a_log_of_any_machine_is_watched(written):
     with watched_log(written("parquet"), reading_of(**asked), None) as shown:
         first, second, *_, last = shown.start.cases
         assert first == "episode 1, 2025-03-10 06:00 (alarm, failure)"
-        assert (second, last[:12]) == ("episode 2, 2025-03-10 06:28", "episode 14, ")
+        assert (second, last[:12]) == ("episode 2, 2025-03-10 06:29", "episode 14, ")
         assert "nobody acts" in introduce(shown.start)["intro"]
         assert shown.graph().states
         frames = [shown.step()]
         while not frames[-1].over:
             frames.append(shown.step())
-        (variable, at), *_ = shown.known().limits
         for frame in frames[:-1]:  # by the alarm that was chosen, and by no other one
             assert (frame.proposed_risk.risk > shown.start.tolerance) == (frame.reason[:2] != "no")
-        assert frames[-2].observation[variable] > at
         before = [tell(frame, shown.start).headline for frame in frames[:-1]]
         assert before == sorted(before, key="Alarm".__eq__)  # none, then it is on
         told = tell(frames[-1], shown.start)
         assert told.headline == "Failure"
         assert re.match(r"An alarm came at 06:\d\d:\d\d\.", told.when)
         assert f"{VIBRATION} above" in shown.known().told
-        assert re.search(VIBRATION + r" \d\S+: above \S+; after \d+ of \d+ such alarms", told.why)
+        assert re.search(VIBRATION + r" \d\S+: above .+; after \d+ of \d+ such alarms", told.why)
         shown.restart(len(shown.start.cases) - 1)  # one that went well
         while not (frame := shown.step()).over:
             assert tell(frame, shown.start).headline == "No alarm"

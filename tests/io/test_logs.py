@@ -599,25 +599,27 @@ JITTERED = (
 @pytest.mark.parametrize(
     ("how", "seen", "did"),
     [
-        ({}, [1.5, 5.0, 7.0, 9.0], [1.0, 1.0, 1.0, 1.0]),
-        ({"x": "last", "u": "max"}, [2.0, 6.0, 7.0, 9.0], [2.0, 1.0, 1.0, 1.0]),
-        ({"x": "min", "u": "min"}, [1.0, 4.0, 7.0, 9.0], [0.0, 1.0, 1.0, 1.0]),
+        ({}, [1.5, 5.0, 9.0], [1.0, 1.0, 1.0]),
+        ({"x": "last", "u": "max"}, [2.0, 6.0, 9.0], [2.0, 1.0, 1.0]),
+        ({"x": "min", "u": "min"}, [1.0, 4.0, 9.0], [0.0, 1.0, 1.0]),
     ],
 )
-def test_rows_of_a_step_become_one_and_the_row_that_failed_stays(tmp_path, pieces, how, seen, did):
+def test_rows_of_a_whole_step_become_one_at_its_end_and_what_failed_stays(
+    tmp_path, pieces, how, seen, did
+):
     noted = Noted()
     rows = *JITTERED, "41 3 1 off"  # still so
     step = Resample(10.0, how)
     ((*found, failed),) = taken(tmp_path, rows, noted, resample=step, failed="Status==off")
     did[1] = pytest.approx(np.nan, nan_ok=True)  # before a hole
-    assert (found, failed) == ([[0.0, 10.0, 30.0, 40.0], seen, did], [3])
+    assert (found, failed) == ([[10.0, 20.0, 38.0], seen, did], [2])
     assert (noted.resampled, noted.crossed) == (6, 1)
 
 
 def test_of_equal_times_and_rows_that_lack_a_number_nothing_is_lost_but_them(tmp_path, pieces):
     rows = "0 1 0 on", "0 3 0 on", "7  0 on", "11 4 0 on", "x 9 0 on", "12 ? 0 on", "19 6 0 on"
     noted = Noted()
-    assert taken(tmp_path, rows, noted, resample=Resample(10.0)) == [([0, 10], [2, 5], [0, 0], [])]
+    assert taken(tmp_path, rows, noted, resample=Resample(10.0)) == [([10, 20], [2, 5], [0, 0], [])]
     assert (noted.leaderless, noted.skipped["field"][0]) == (2, 2)
 
 

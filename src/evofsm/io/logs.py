@@ -561,57 +561,62 @@ def _joined(parts: Sequence[Chunk]) -> Chunk:
 
 
 def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) -> Iterator[Chunk]:
-    """The rows of a step as one; before a hole within an episode the action is unknown.
+    """The rows of a step as one, at its end; before a hole within an episode the action is unknown.
 
-    Its last row may belong to a step that goes on, or have a hole behind it: a chunk leaves it to
-    the next one.
+    Of a step in which it failed only the row that did is left: what was before was never a whole
+    step. The last row may belong to a step that goes on, or have a hole behind it: a chunk leaves
+    it to the next one.
     """
     import polars
 
     step = columns.resample and columns.resample.step
-    said = columns.resample.how if columns.resample else {}
+    ways = columns.resample.how if columns.resample else {}
     variables, names = columns.observe.variables, columns.observe.names
-    hows = [said.get(name, "mean") if name in variables else "last" for name in names]
-    hows.append(said.get(columns.action, "mean"))
-    rest: Chunk | None = None
+    hows = [ways.get(name, "mean") if name in variables else "last" for name in names]
+    hows.append(ways.get(columns.action, "mean"))
+    remainder: Chunk | None = None
     for chunk in chain(chunks, [None]):
-        parts = [part for part in (rest, chunk) if part is not None]
+        parts = [part for part in (remainder, chunk) if part is not None]
         if not parts:
             return
         noted.resampled += 0 if chunk is None else len(chunk.times)
         whole = _joined(parts)
         times, fails = whole.times, whole.fails
-        begins = fails | (not step)  # the row that failed stays as it is
+        begins, places, usual = fails | (not step), times, whole.dt
         begins[whole.starts] = begins[0] = True
         if step:
-            ticks = np.floor(times / step + 1e-9)
-            begins[1:] |= ticks[1:] != ticks[:-1]
-            later = np.append(False, fails[1:] & (ticks[1:] == ticks[:-1]))
-            later[whole.starts] = False
-            times = step * (ticks + later)
+            offset = noted.began % step  # steps are those of the clock
+            places, usual = np.floor((times + offset) / step + 1e-9), 1.0
+            begins[1:] |= places[1:] != places[:-1]
+            times = np.where(fails, times, step * (places + 1.0) - offset)
         first = np.flatnonzero(begins)
-        steps = np.diff(times[first])
-        lost = (steps > LONGEST_STEP * whole.dt) | (steps < whole.dt / LONGEST_STEP)
-        starts = np.searchsorted(first, whole.starts)
-        lost[starts[starts > 0] - 1] = False
         rows = polars.DataFrame(np.column_stack([whole.observations, whole.actions]))
         rows = rows.fill_nan(None).with_columns(step=np.cumsum(begins))  # what lacks does not count
         become = (getattr(polars.nth(k), how)() for k, how in enumerate(hows))
         rows = rows.group_by("step", maintain_order=True).agg(become).drop("step")
-        *seen, actions = rows.to_numpy().T.copy()
+        starts, is_whole = np.searchsorted(first, whole.starts), np.ones(len(first), np.bool_)
+        if step:
+            is_whole[:-1] = ~fails[first[1:]] | (np.diff(places[first]) > 0.0)
+            is_whole[starts[starts > 0] - 1] = True
+        *seen, actions = rows.to_numpy()[is_whole].T.copy()
+        keeps = int(is_whole.sum()) - (chunk is not None and not fails[-1])
+        last, first = first[-1], first[is_whole]
+        starts = np.searchsorted(first, whole.starts)
+        steps = np.diff(places[first])
+        lost = (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
+        lost[starts[starts > 0] - 1] = False
         actions[:-1][lost] = np.nan
         made = whole._replace(
             observations=np.column_stack(seen),
             actions=actions,
             times=times[first],
             starts=starts,
-            failures=None if whole.failures is None else np.searchsorted(first, whole.failures),
+            failures=None if whole.failures is None else np.flatnonzero(fails[first]),
         )
-        keeps = len(first) - (chunk is not None and not fails[-1])
         noted.crossed += int(lost[:keeps].sum())
-        rest = None
+        remainder = None
         if keeps < len(first):
-            rest = whole.rows(int(first[-1]), len(fails))._replace(jumps=0)
+            remainder = whole.rows(int(last), len(fails))._replace(jumps=0)
         if keeps:
             yield made.rows(0, keeps)
 

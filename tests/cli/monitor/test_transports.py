@@ -113,7 +113,7 @@ def test_what_waits_for_its_slot_is_decided_on_where_nothing_comes_and_rows_afte
         kinds = [json.loads(answers.readline())["kind"] for _ in range(4)]
         assert kinds == ["waiting", "waiting", "waiting", "decision"]
         late = json.loads(answers.readline())  # nobody asked for it
-        assert (late["kind"], late["n"], late["time"]) == ("decision", 2, pytest.approx(0.3))
+        assert (late["kind"], late["n"], late["time"]) == ("decision", 2, pytest.approx(0.6))
         os.write(feed, ROWS[4] + ROWS[6])
         refused, waiting = (json.loads(answers.readline()) for _ in range(2))
         assert "comes after its 0.3 s were decided on" in refused["error"]

@@ -204,6 +204,8 @@ class Decider:
         counts, fails = slots.counts(row), slots.fails(row)
         if fails or not counts:
             is_new = fails and not slots.fails(before)
+            if is_new:
+                slots.leave_out(row)
             last, was = self._waited(), bool(self.rows)
             is_end = was or (is_new and counts)
             if is_end:

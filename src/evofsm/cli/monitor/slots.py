@@ -93,14 +93,19 @@ class Slots:
         if not self.waiting:
             return None
         rows, self.waiting = self.waiting, []
-        time = self._time(rows[0])
-        self._done = time if early else math.nan
+        begin = self._time(rows[0])
+        self._done = begin if early else math.nan
         seen = zip_longest(self.names, zip(*(row.observation or () for row in rows), strict=True))
         observation = tuple(_joined(self._how.get(name), column) for name, column in seen if column)
         proposals = [row.proposal for row in rows]
         is_number = all(isinstance(wanted, float | None) for wanted in proposals)
         how = self._how.get(self.columns.action) if is_number else "last"
-        return Row(time, observation, _joined(how, proposals))
+        return Row(begin + self.step, observation, _joined(how, proposals))  # at its end
+
+    def leave_out(self, row: Row) -> None:
+        """Leave out what waits of the step of a row with which it failed: it is no whole one."""
+        if self.waiting and self._time(row) == self._time(self.waiting[0]):
+            self.waiting.clear()
 
     def _time(self, row: Row) -> float:
         return self.step * math.floor(row.time / self.step + 1e-9)
