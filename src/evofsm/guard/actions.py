@@ -225,13 +225,13 @@ def checked_mask(actions: ActionSet, mask: ArrayLike | None) -> Mask | None:
     """Which of a few actions are allowed; None where all are, or none, which tells nothing."""
     if mask is None:
         return None
-    allowed = np.asarray(mask).astype(np.bool_)
-    if not isinstance(actions, Choices) or allowed.shape != (actions.n_actions,):
+    flags = np.asarray(mask).astype(np.bool_)
+    if not isinstance(actions, Choices) or flags.shape != (actions.n_actions,):
         raise ValueError(
-            f"the mask of allowed actions has shape {allowed.shape}, but the guard has {actions}; "
+            f"the mask of allowed actions has shape {flags.shape}, but the guard has {actions}; "
             "it must have an entry for each of Choices"
         )
-    return allowed if 0 < allowed.sum() < len(allowed) else None
+    return flags if 0 < flags.sum() < len(flags) else None
 
 
 def limits(actions: ActionSet) -> tuple[Action, Action]:
@@ -303,5 +303,5 @@ def _levels(dimensions: int) -> tuple[int, ...]:
     if dimensions == 1:
         return (_LEVELS,)
     count = max(2, int(_CELLS ** (1.0 / dimensions) + 1e-9))
-    divided = min(dimensions, int(math.log2(_CELLS)))
-    return (count,) * divided + (1,) * (dimensions - divided)
+    n_components = min(dimensions, int(math.log2(_CELLS)))
+    return (count,) * n_components + (1,) * (dimensions - n_components)

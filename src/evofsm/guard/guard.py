@@ -88,18 +88,18 @@ class InputMonitor(NamedTuple):
         """What is wrong with an observation at ``time`` [s], and itself, unless it was too late."""
         if time <= self.time:
             return Intake.REPEATED if time == self.time else Intake.LATE, self
-        found, held = Intake.WHOLE, observation
+        intake, latest_row = Intake.WHOLE, observation
         if math.isnan(observation.dot(observation)):  # the quickest way to ask for NaN
             absent = np.isnan(observation)
             if self.missing is Missing.REJECT:
-                gone = np.flatnonzero(absent).tolist()
-                raise ValueError(f"variables {gone} of the observation at {time:g} s are missing")
+                holes = np.flatnonzero(absent).tolist()
+                raise ValueError(f"variables {holes} of the observation at {time:g} s are missing")
             if len(self.held) == len(observation):  # what was seen of them before is still held
-                held = np.where(absent, self.held, observation)
-            found = _LACKING[self.missing]
+                latest_row = np.where(absent, self.held, observation)
+            intake = _LACKING[self.missing]
         if time - self.time > _GAP * self.interval:
-            found |= Intake.GAP
-        return found, InputMonitor(self.missing, self.interval, held.copy(), time)
+            intake |= Intake.GAP
+        return intake, InputMonitor(self.missing, self.interval, latest_row.copy(), time)
 
 
 class DecisionLogger(Protocol):
@@ -262,11 +262,11 @@ class Guard:
         actions = _actions(low, high, n_actions)
         interval = positive("interval", interval)
         soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
-        given: dict[str, Any] = {"model": model, "backup": backup, "names": names}
+        arguments: dict[str, Any] = {"model": model, "backup": backup, "names": names}
         if judge is None:
-            known = {"n_actions": n_actions, "horizon": horizon, "seed": seed, **given}
-            judge = LearntRisk(interval, low, high, **known)
-        elif any(given.values()):
+            settings = {"n_actions": n_actions, "horizon": horizon, "seed": seed, **arguments}
+            judge = LearntRisk(interval, low, high, **settings)
+        elif any(arguments.values()):
             asks = "asks no model, no backup and no names: leave them out"
             raise ValueError(f"{type(judge).__name__} {asks}")
         if machine is None:
@@ -341,29 +341,29 @@ class Guard:
         self.process = os.getpid()  #: in which it was made; a copy elsewhere learns for itself
         self.actions = reviser.actions
         self.interval = positive("interval", interval)
-        asked = reviser.risk if isinstance(reviser, ActionReviser) else judge
-        if judge is None and isinstance(asked, LearningJudge):
-            judge = asked
-        elif judge is None and hasattr(asked, "learn"):
-            lacks = [name for name in _LEARNS if getattr(asked, name, None) is None]
+        action_judge = reviser.risk if isinstance(reviser, ActionReviser) else judge
+        if judge is None and isinstance(action_judge, LearningJudge):
+            judge = action_judge
+        elif judge is None and hasattr(action_judge, "learn"):
+            lacks = [name for name in _LEARNS if getattr(action_judge, name, None) is None]
             raise ValueError(
                 f"the judge has a method learn, but not all of a LearningJudge: it lacks {lacks}"
             )
         if judge and not math.isclose(judge.dt, self.interval):
-            made = f"the judge was made for decisions every {judge.dt} s"
-            raise ValueError(f"interval is {interval} s, but {made}")
+            text = f"the judge was made for decisions every {judge.dt} s"
+            raise ValueError(f"interval is {interval} s, but {text}")
         if machine is not None and machine.n_actions != self.actions.n_actions:
             raise ValueError(
                 f"the machine has {machine.n_actions} actions, but the set has "
                 f"{self.actions.n_actions}"
             )
-        if isinstance(asked, LearntRisk):
-            if bool(asked.choices) != isinstance(self.actions, Choices):
+        if isinstance(action_judge, LearntRisk):
+            if bool(action_judge.choices) != isinstance(self.actions, Choices):
                 raise ValueError(
                     "the judge was made for a range of actions, but the guard has n_actions, or "
                     "the other way round"
                 )
-            asked.failed = failed
+            action_judge.failed = failed
             warm_judge()
         if machine is not None:
             warm_machine(limited=machine.max_states is not None)
@@ -377,10 +377,10 @@ class Guard:
         self.explaining = explaining
         self.missing = missing
         #: What the judge calls the variables of an observation; empty where it does not say.
-        self.variables: tuple[str, ...] = () if asked is None else asked.labels.names
+        self.variables: tuple[str, ...] = () if action_judge is None else action_judge.labels.names
         #: What is done without a usable proposal where nothing is judged.
         self.fallback: Fallback = getattr(reviser, "fallback", NOTHING)
-        self._labels = (Labels() if asked is None else asked.labels)._replace(
+        self._labels = (Labels() if action_judge is None else action_judge.labels)._replace(
             actions=self.actions if isinstance(self.actions, IntervalActions) else None, dt=interval
         )
         #: Episodes that it learnt from, and those of them that failed.
@@ -440,12 +440,12 @@ class Guard:
 
     def _savepoint(self) -> Rollback:
         """What takes back all that is done from now on."""
-        kept = _CHANGES(self)
+        attributes = _CHANGES(self)
         parts: Any = self.machine, self.judge, self.reviser, self.audit
         rollbacks = [part.savepoint() for part in parts if hasattr(part, "savepoint")]
 
         def rollback() -> None:
-            for name, value in zip(_CHANGING, kept, strict=True):
+            for name, value in zip(_CHANGING, attributes, strict=True):
                 setattr(self, name, value)
             for take_back in rollbacks:
                 take_back()
@@ -525,12 +525,12 @@ class Guard:
                 "environments with one guard?); run them all under RevisedVectorActions or "
                 "RevisedAgents, or give each a guard of its own, such as guard.copy(); then reset"
             )
-        wanted, mask = proposal if isinstance(proposal, Proposal) else (proposal, None)
-        wanted = no_action(self.actions) if wanted is None else self._proposed(wanted)
+        action, mask = proposal if isinstance(proposal, Proposal) else (proposal, None)
+        action = no_action(self.actions) if action is None else self._proposed(action)
         mask = checked_mask(self.actions, mask)
         if time is None:
             time = self._decisions * self.interval if self._under_way else 0.0
-        return self.revise(self.recognise(observation, time), Proposal(wanted, mask))
+        return self.revise(self.recognise(observation, time), Proposal(action, mask))
 
     def _proposed(self, action: ArrayLike) -> Action:
         """An action of the right type, whatever its values."""
@@ -584,12 +584,12 @@ class Guard:
     def _checked(self, observation: ArrayLike) -> NDArray[np.float64]:
         """An observation that judge and machine can take in; NaN stays."""
         z = real_array("observation", observation, 1)
-        known = len(self.variables) or (0 if self.machine is None else self.machine.n_variables)
-        if known and len(z) != known:
-            named = f" ({', '.join(self.variables)})" if self.variables else ""
-            raise ValueError(f"observation has {len(z)} variables; it must have {known}{named}")
-        if told := self.beyond(z):
-            raise ValueError(" ".join(told))
+        count = len(self.variables) or (0 if self.machine is None else self.machine.n_variables)
+        if count and len(z) != count:
+            names = f" ({', '.join(self.variables)})" if self.variables else ""
+            raise ValueError(f"observation has {len(z)} variables; it must have {count}{names}")
+        if fault := self.beyond(z):
+            raise ValueError(" ".join(fault))
         if (judge := self._observing) and len(z) != judge.n_variables:
             refuse_too_many(len(z), judge.size, box=not judge.choices)
         self._count_missing(z)
@@ -616,38 +616,38 @@ class Guard:
             self._lacking = np.zeros(1 + len(z), np.int64)
         self._lacking = self._lacking + np.append(1, np.isnan(z))  # the first counts them all
         if self._lacking[0] == _MANY:
-            gone = enumerate(self._lacking[1:].tolist())
-            told = ", ".join(f"{self._labels.variable(k)} in {count}" for k, count in gone if count)
+            sums = enumerate(self._lacking[1:].tolist())
+            text = ", ".join(f"{self._labels.variable(k)} in {count}" for k, count in sums if count)
             warnings.warn(
                 f"none of {_MANY} observations on end was whole, and nothing is learnt from such: "
-                f"missing (NaN) was {told}. Leave it out of what is observed, or see to the sensor",
+                f"missing (NaN) was {text}. Leave it out of what is observed, or see to the sensor",
                 stacklevel=4,
             )
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:
         """Where it is; machine and judge learn the transition to it."""
-        machine, known, held = self.machine, self._frozen, self._monitor.held
-        belief, surprise, seen = np.ones(1), math.nan, math.nan
+        machine, model, latest_row = self.machine, self._frozen, self._monitor.held
+        belief, surprise, state_time = np.ones(1), math.nan, math.nan
         state: int | None = None
-        incomplete = bool(intake) and bool(intake & INCOMPLETE)
-        if known is not None:
-            if known.n_states and not math.isnan(held.dot(held)):
-                belief = known.recognise(held)
+        is_incomplete = bool(intake) and bool(intake & INCOMPLETE)
+        if model is not None:
+            if model.n_states and not math.isnan(latest_row.dot(latest_row)):
+                belief = model.recognise(latest_row)
                 state = int(belief.argmax())
-        elif machine is not None and not (incomplete and machine.n_states == 0):
+        elif machine is not None and not (is_incomplete and machine.n_states == 0):
             policy = Missing.REJECT
-            if incomplete:
+            if is_incomplete:
                 policy = self.missing if machine.state is not None else Missing.PARTIAL
             step = machine.observe(z, missing=policy)
             belief, state, surprise = step.belief, step.state, step.surprise
         if self._observing is not None and self._learn:
-            began = self._observing.observe(z)
-            if began and machine is not None:
+            is_onset = self._observing.observe(z)
+            if is_onset and machine is not None:
                 machine.onset()
         if machine is not None and state is not None:
-            visits = opened(machine)[0].sums[VISITS] if known is None else known.visits
-            seen = float(visits[state]) * self.interval
-        return Situation(z, belief, state, surprise, time, intake, seen)
+            visits = opened(machine)[0].sums[VISITS] if model is None else model.visits
+            state_time = float(visits[state]) * self.interval
+        return Situation(z, belief, state, surprise, time, intake, state_time)
 
     @transaction
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
@@ -665,8 +665,8 @@ class Guard:
             self.audit.decided(situation, proposal, revision)
         self._take_in(situation, revision.executed)
         if isinstance(self.actions, Choices):
-            executed, advised = int(revision.executed), int(revision.advised)
-            revision = revision._replace(executed=executed, advised=advised)
+            executed, advice = int(revision.executed), int(revision.advised)
+            revision = revision._replace(executed=executed, advised=advice)
         return revision
 
     @transaction
@@ -718,19 +718,19 @@ class Guard:
         else:
             nearest = self._frozen.nearest(self._monitor.held)
             text = explain(self._frozen, situation.belief, action, self._labels, nearest).text
-        if told := self.told_here(situation.observation):
-            text = f"{text} {told}"
+        if words := self.told_here(situation.observation):
+            text = f"{text} {words}"
         return revision._replace(explanation=text)
 
     def told_here(self, z: ArrayLike) -> str:
         """What the judge knows of failures and dead ends near an observation (m,), in words."""
         if self._observing is None or self.machine is None:
             return ""
-        told, centre = self._observing.told_here(np.asarray(z, np.float64))
+        words, centre = self._observing.told_here(np.asarray(z, np.float64))
         if centre is None:
-            return told
+            return words
         state = (self._frozen or self.machine.model()).nearest(centre).state
-        return f"{told} Its centre is in #{state + 1}."
+        return f"{words} Its centre is in #{state + 1}."
 
     @transaction
     def end(
@@ -791,22 +791,22 @@ class Guard:
                 machine.fail()
             machine.tell_of_failures()
         if z is not None and self._observing is not None and self._learn:
-            began = self._observing.observe(z)
-            if began and machine is not None and not failed:  # of what failed it counts nothing
+            is_onset = self._observing.observe(z)
+            if is_onset and machine is not None and not failed:  # of what failed it counts nothing
                 machine.onset()
         if machine is not None and not failed:
             machine.start_episode()
         if self.judge is not None:
             if self._learn:
-                also = {"terminated": terminated} if self._observing is not None else {}
-                self.judge.end(z, failed=failed, **also)
+                options = {"terminated": terminated} if self._observing is not None else {}
+                self.judge.end(z, failed=failed, **options)
             else:
                 self.judge.start_episode(learn=False)
         self._under_way = False
         if self._learn:
             if (judge := self._observing) is not None:
-                driven = self._acted, self._watched, self._kept
-                judge.harm = judge.harm.after(driven, failed=failed, ended=terminated, score=score)
+                counts = self._acted, self._watched, self._kept
+                judge.harm = judge.harm.after(counts, failed=failed, ended=terminated, score=score)
             self.n_episodes += 1
             self.n_failed += failed
         if self.audit is not None:
@@ -835,8 +835,8 @@ class Guard:
             f"{0 if self.machine is None else self.machine.n_states}, "
             f"frozen: {'no' if self._learn else 'yes'}",
         ]
-        if known := getattr(judge, "told_by_experience", ""):
-            lines.append(f"failure: {known}")
+        if words := getattr(judge, "told_by_experience", ""):
+            lines.append(f"failure: {words}")
         return "\n".join(lines)
 
     # What another process gets has a lock of its own.
@@ -888,17 +888,17 @@ class Guard:
         ValueError
             If the reviser is of someone's own class, so that no file can say what it is.
         """
-        described = outline(self)
-        if described["reviser"] is None:
+        parts = outline(self)
+        if parts["reviser"] is None:
             raise ValueError(f"a {type(self.reviser).__name__} is no reviser that a file can hold")
-        kept = {
-            **described,
+        settings = {
+            **parts,
             "missing": self.missing.value,
             "failed": self.failed is not None,
             **{name: getattr(self, name) for name in _PLAIN_SETTINGS},
         }
         files = {"machine": _bytes(self.machine), "judge": _bytes(self.judge)}
-        store.write(path, KIND, kept, files, provenance)
+        store.write(path, KIND, settings, files, provenance)
 
     @classmethod
     def load(
@@ -937,17 +937,17 @@ class Guard:
         >>> Guard.load(BytesIO(file.getvalue())).interval
         0.25
         """
-        kept, files = store.read(path, KIND)
+        settings, files = store.read(path, KIND)
         with store.explained(path):
-            if kept["failed"] and failed is None:
+            if settings["failed"] and failed is None:
                 raise ValueError("this guard knew failures by a function; give it again: failed=")
-            given = None if isinstance(judge, type) else judge
+            instance = None if isinstance(judge, type) else judge
             return cls.of(
-                **rebuild(kept, *_loaded(kept, files, judge), given),
+                **rebuild(settings, *_loaded(settings, files, judge), instance),
                 failed=failed,
                 audit=audit,
-                missing=Missing(kept["missing"]),
-                **{name: kept[name] for name in _PLAIN_SETTINGS},
+                missing=Missing(settings["missing"]),
+                **{name: settings[name] for name in _PLAIN_SETTINGS},
             )
 
 

@@ -87,27 +87,27 @@ def run_episode(
     """
     propose = getattr(controller, "propose", None) or (lambda seen, time: controller(seen))  # type: ignore[operator]
     observation, info = environment.reset(seed=seed, options=options)
-    number, allowed = guard.begin(), action_masks(environment)
+    number, mask_of = guard.begin(), action_masks(environment)
     # Who else has a guard's methods may not count episodes.
-    feeding: Any = {} if number is None else {"episode": number}
-    held, count, score, over, failed = _whole(observation, None), 0, 0.0, False, False
-    while not over:
+    arguments: Any = {} if number is None else {"episode": number}
+    latest_row, count, score, is_over, failed = _whole(observation, None), 0, 0.0, False, False
+    while not is_over:
         time = info.get("time", count * guard.interval)
-        proposal = _asked(propose, held, time) or Proposal(no_action(guard.actions))
+        proposal = _asked(propose, latest_row, time) or Proposal(no_action(guard.actions))
         if isinstance(guard.actions, Choices) and proposal.mask is None:
-            proposal = proposal._replace(mask=allowed(observation, info))
+            proposal = proposal._replace(mask=mask_of(observation, info))
         begin = perf_counter()
-        revision = guard.decide(np.ravel(observation), proposal, time, **feeding)
+        revision = guard.decide(np.ravel(observation), proposal, time, **arguments)
         seconds, situation = perf_counter() - begin, guard.situation
         observation, reward, terminated, truncated, info = environment.step(revision.executed)
-        held, count, score = _whole(observation, held), count + 1, score + float(reward)
-        over, failed = bool(terminated or truncated), bool(info.get("failed", terminated))
-        if over:
-            if feeding:
-                feeding["score"] = score if math.isfinite(score) else None
-            guard.end(failed, np.ravel(observation), terminated=bool(terminated), **feeding)
-        realised = float(info.get("realised", math.nan))
-        yield Decision(situation, revision, realised, float(reward), failed, seconds)
+        latest_row, count, score = _whole(observation, latest_row), count + 1, score + float(reward)
+        is_over, failed = bool(terminated or truncated), bool(info.get("failed", terminated))
+        if is_over:
+            if arguments:
+                arguments["score"] = score if math.isfinite(score) else None
+            guard.end(failed, np.ravel(observation), terminated=bool(terminated), **arguments)
+        effect = float(info.get("realised", math.nan))
+        yield Decision(situation, revision, effect, float(reward), failed, seconds)
 
 
 def action_masks(environment: Any) -> Callable[[Any, Mapping[str, Any]], Any]:
@@ -123,9 +123,9 @@ def action_masks(environment: Any) -> Callable[[Any, Mapping[str, Any]], Any]:
         ask = None
 
     def now(observation: Any, info: Mapping[str, Any]) -> Any:
-        for told in (observation, info):
-            if isinstance(told, Mapping) and told.get("action_mask") is not None:
-                return told["action_mask"]
+        for source in (observation, info):
+            if isinstance(source, Mapping) and source.get("action_mask") is not None:
+                return source["action_mask"]
         return ask() if ask else None
 
     return now
@@ -145,8 +145,8 @@ def _asked(
 ) -> Proposal | None:
     """What the controller proposes; None where it fails to: someone has to go on driving."""
     try:
-        wanted = propose(seen.copy(), time)
-        proposal = wanted if isinstance(wanted, Proposal) else Proposal(wanted)
+        reply = propose(seen.copy(), time)
+        proposal = reply if isinstance(reply, Proposal) else Proposal(reply)
         numbers = np.asarray(proposal.action, dtype=np.float64)
     except Exception as error:
         _log.warning("controller failed at %g s: %r", time, error)

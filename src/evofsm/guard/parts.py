@@ -64,8 +64,8 @@ def _reviser(guard: _Guard) -> dict[str, Any] | None:
         judge = _judge(reviser.risk, guard)
         return {"class": "ActionReviser", "judge": judge, "settings": settings_of(reviser)}
     name = part_name(reviser)
-    told = reviser.described() if name else None
-    return None if told is None else {"class": name, **told}
+    description = reviser.described() if name else None
+    return None if description is None else {"class": name, **description}
 
 
 def _judge(judge: ActionJudge, guard: _Guard) -> dict[str, Any] | None:
@@ -75,9 +75,9 @@ def _judge(judge: ActionJudge, guard: _Guard) -> dict[str, Any] | None:
         return None
     if judge is guard.judge:
         return {"class": name}
-    asked = getattr(judge, "risk", None), getattr(judge, "machine", None)
-    known = asked[0] is guard.judge and asked[1] is guard.machine and guard.machine is not None
-    return {"class": name, **judge.described()} if known else None  # type: ignore[attr-defined]
+    parts = getattr(judge, "risk", None), getattr(judge, "machine", None)
+    is_known = parts[0] is guard.judge and parts[1] is guard.machine and guard.machine is not None
+    return {"class": name, **judge.described()} if is_known else None  # type: ignore[attr-defined]
 
 
 def rebuild(
@@ -96,15 +96,15 @@ def rebuild(
     parts = {"machine": machine, "judge": risk}
     if reviser["class"] != "ActionReviser":
         return parts | {"reviser": part_class(reviser["class"]).restored(reviser, actions)}
-    named = reviser["judge"]
-    asked = judge if risk is None else risk
-    if named is not None and (of := part_class(named["class"])) is not type(risk):
+    description = reviser["judge"]
+    action_judge = judge if risk is None else risk
+    if description is not None and (of := part_class(description["class"])) is not type(risk):
         if not hasattr(of, "restored"):
-            raise ValueError(f"what its {named['class']} has learnt is missing")
-        asked = of.restored(named, machine, risk)
-    if asked is None:
+            raise ValueError(f"what its {description['class']} has learnt is missing")
+        action_judge = of.restored(description, machine, risk)
+    if action_judge is None:
         raise ValueError("no installed package declares its judge; give the judge as it is")
-    again = ActionReviser(asked, actions)
+    again = ActionReviser(action_judge, actions)
     set_again(again, reviser["settings"])
     return parts | {"reviser": again}
 

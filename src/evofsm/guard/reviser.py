@@ -88,22 +88,22 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
     >>> make_usable(Proposal(float("nan")), actions)
     Usable(action=0.0, remark='no usable proposal (nan): doing nothing')
     """
-    wanted, mask = proposal.action, proposal.mask
-    if not isinstance(actions, BoxActions) and actions.low <= wanted <= actions.high:
+    request, mask = proposal.action, proposal.mask
+    if not isinstance(actions, BoxActions) and actions.low <= request <= actions.high:
         is_choice = isinstance(actions, Choices)
-        if not is_choice or (wanted == int(wanted) and (mask is None or mask[int(wanted)])):
-            return Usable(float(wanted), "")  # the usual case, at once
-    if mask is not None or not is_usable(actions, wanted):
-        action, doing = put_into(actions, fallback.action), fallback.doing
+        if not is_choice or (request == int(request) and (mask is None or mask[int(request)])):
+            return Usable(float(request), "")  # the usual case, at once
+    if mask is not None or not is_usable(actions, request):
+        action, words = put_into(actions, fallback.action), fallback.doing
         if mask is not None and not mask[int(action)]:
-            action, doing = float(mask.argmax()), "the first that is allowed"
-        barred = ", not allowed here" if is_usable(actions, wanted) else ""
-        return Usable(action, f"no usable proposal ({action_text(wanted)}{barred}): {doing}")
-    action = put_into(actions, wanted)
-    if same_action(action, wanted):
+            action, words = float(mask.argmax()), "the first that is allowed"
+        note = ", not allowed here" if is_usable(actions, request) else ""
+        return Usable(action, f"no usable proposal ({action_text(request)}{note}): {words}")
+    action = put_into(actions, request)
+    if same_action(action, request):
         return Usable(action, "")
     low, high = (action_text(limit) for limit in limits(actions))
-    return Usable(action, f"proposal {action_text(wanted)} is outside [{low}, {high}]")
+    return Usable(action, f"proposal {action_text(request)} is outside [{low}, {high}]")
 
 
 class ActionReviser:
@@ -190,28 +190,28 @@ class ActionReviser:
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """What to execute instead of the proposal, which is first made usable (`make_usable`)."""
         acts = self.acts
-        wanted, remark = make_usable(proposal, self.actions, self.risk.fallback)
+        action, remark = make_usable(proposal, self.actions, self.risk.fallback)
         if not acts:
             self._trial = 0
         if self.mode is Mode.OFF:
-            return unjudged_revision(wanted, proposal, remark or "reviser is off")
-        options, judged, best, reason = self._search(situation, wanted, acts, proposal.mask)
-        executed, advised = best if acts else 0, fixed(options[best])
+            return unjudged_revision(action, proposal, remark or "reviser is off")
+        options, judgement, best, reason = self._search(situation, action, acts, proposal.mask)
+        index, advice = best if acts else 0, fixed(options[best])
         if not acts and best != 0:
             reason = f"{self.passing or self.mode.value}: {reason}"
         unseen = unseen_text(situation, self.risk.labels.names) if situation.intake else ""
         # Of a situation that is new: whether it is dangerous is another question.
-        new = "never seen before" if judged.seen < _NEW else ""
+        new = "never seen before" if judgement.seen < _NEW else ""
         return Revision(
-            executed=advised if acts else fixed(options[0]),
+            executed=advice if acts else fixed(options[0]),
             proposed=fixed(proposal.action),
-            risk_proposed=float(judged.risk[0]),
-            risk_executed=float(judged.risk[executed]),
-            interval=(float(judged.low[executed]), float(judged.high[executed])),
+            risk_proposed=float(judgement.risk[0]),
+            risk_executed=float(judgement.risk[index]),
+            interval=(float(judgement.low[index]), float(judgement.high[index])),
             reason="; ".join(filter(None, (remark, unseen, new, reason))),
-            evidence=judged.evidence,
-            seen=judged.seen,
-            advised=advised,
+            evidence=judgement.evidence,
+            seen=judgement.seen,
+            advised=advice,
         )
 
     def _search(
@@ -220,24 +220,24 @@ class ActionReviser:
         """Which option should be executed: the judge's own, or the best of those it is given."""
         if self._searches:
             how: dict[str, Any] = {} if mask is None else {"mask": mask}
-            options, judged, best, reason = self.risk.search(  # type: ignore[attr-defined]
+            options, judgement, best, reason = self.risk.search(  # type: ignore[attr-defined]
                 situation, wanted, tolerance=self.tolerance, revising=self._revising, **how
             )
             self._revising = best != 0
             within = np.minimum(np.maximum(options, self._low), self._high)
-            return Search(within, judged, best, reason)
+            return Search(within, judgement, best, reason)
         options = np.minimum(np.maximum(wanted, self._lowest), self._highest)
         if mask is not None:
             options = options[np.append(True, mask)]
         if not acts:
             options = self.risk.effective(situation, options)
         if self.risk.trial() is None:  # most proposals are kept: this one is looked at first
-            judged = self.risk.judge(situation, options[:1])
-            if judged.risk[0] <= self.tolerance * (_RELEASE if self._revising else 1.0):
+            judgement = self.risk.judge(situation, options[:1])
+            if judgement.risk[0] <= self.tolerance * (_RELEASE if self._revising else 1.0):
                 self._revising = False
-                return Search(options[:1], judged, 0, _KEPT)
-        judged = self.risk.judge(situation, options)
-        return Search(options, judged, *self._decide(situation, options, judged, acts))
+                return Search(options[:1], judgement, 0, _KEPT)
+        judgement = self.risk.judge(situation, options)
+        return Search(options, judgement, *self._decide(situation, options, judgement, acts))
 
     def _decide(
         self, situation: Situation, options: NDArray[np.float64], judged: Judgement, acts: bool
@@ -250,29 +250,29 @@ class ActionReviser:
             return self._closest_to(trial.action, options), f"{trial.unknown}: {trial.doing}"
         if not judged.risk[0] > limit:
             self._revising = False
-            known = judged.risk[0] <= limit
-            return 0, _KEPT if known else "its risk is not known yet"
+            is_known = judged.risk[0] <= limit
+            return 0, _KEPT if is_known else "its risk is not known yet"
         self._revising = True
         why = self.risk.why(judged)
         if trial is not None:
             if acts:
                 self._trial = _TRIAL
-                tried = self._closest_to(trial.action, options)
-                return tried, f"{why}; {trial.unknown}, so {trial.how}"
+                index = self._closest_to(trial.action, options)
+                return index, f"{why}; {trial.unknown}, so {trial.how}"
             why = f"{why}; {trial.unknown}, {trial.assumed}"
         # Once revising, what is safe by the margin; else whatever is tolerable.
-        chosen = self.risk.choose(situation, options, judged, (limit, self.tolerance))
-        if chosen is not None:
-            self._revising = chosen[0] != 0
-            return chosen[0], f"{why}; {chosen[1]}"
+        choice = self.risk.choose(situation, options, judged, (limit, self.tolerance))
+        if choice is not None:
+            self._revising = choice[0] != 0
+            return choice[0], f"{why}; {choice[1]}"
         change = distances(self.actions, options, options[0])
         # Of several that are least risky the lowest, in a box that of the least change.
         rank = change if isinstance(self.actions, BoxActions) else options
         least = int(np.lexsort((rank, judged.risk))[0])
         if isinstance(self.actions, Choices) and judged.risk[least] <= self.tolerance:
             return least, f"{why}; the least risky that can"
-        for tolerated in (limit, self.tolerance):
-            if (tolerable := np.flatnonzero(judged.risk <= tolerated)).size:
+        for bound in (limit, self.tolerance):
+            if (tolerable := np.flatnonzero(judged.risk <= bound)).size:
                 return int(tolerable[change[tolerable].argmin()]), f"{why}; the closest that can"
         return least, f"{why}; nothing can, the least risky"
 
@@ -283,8 +283,8 @@ class ActionReviser:
 def unseen_text(situation: Situation, variables: Sequence[str]) -> str:
     """What is said of a situation that was not seen whole, or not in time."""
     values = zip(variables, situation.observation, strict=False)
-    if missing := [name for name, value in values if math.isnan(value)]:
-        return f"not seen: {', '.join(missing)}"
+    if names := [name for name, value in values if math.isnan(value)]:
+        return f"not seen: {', '.join(names)}"
     return "nothing new was seen" if situation.intake & STALE else ""
 
 

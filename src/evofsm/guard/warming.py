@@ -22,8 +22,8 @@ def warm() -> None:
     >>> from evofsm import warm
     >>> warm()
     """
-    for limited in (False, True):
-        warm_machine(limited=limited)
+    for is_limited in (False, True):
+        warm_machine(limited=is_limited)
     warm_judge()
 
 
