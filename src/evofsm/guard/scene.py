@@ -178,36 +178,36 @@ class SceneRisk(ActionJudge):
 
         Else one of the least risky after which it lasts longest; ``wanted``, if it is among them.
         """
-        found = self._foreseen(situation)
-        if isinstance(found, str):
-            return Search(np.array([wanted]), self._judged(np.full(1, math.nan)), 0, found)
-        risks, proposed = found.risks.min(1), int(wanted)
-        judged = self._judged(risks[[proposed]])
+        forecast = self._foreseen(situation)
+        if isinstance(forecast, str):
+            return Search(np.array([wanted]), self._judged(np.full(1, math.nan)), 0, forecast)
+        risks, proposed = forecast.risks.min(1), int(wanted)
+        judgement = self._judged(risks[[proposed]])
         if risks[proposed] <= tolerance:
-            said = f"risk within {_STEPS_AHEAD * self.dt:g} s is within the tolerance"
-            return Search(np.array([wanted]), judged, 0, said)
-        why, after = self.why(judged), found.after
+            text = f"risk within {_STEPS_AHEAD * self.dt:g} s is within the tolerance"
+            return Search(np.array([wanted]), judgement, 0, text)
+        why, after = self.why(judgement), forecast.after
         can = risks if mask is None else np.where(mask, risks, math.inf)
         good, reason = np.flatnonzero(can <= tolerance), "the closest in effect that can"
         if not len(good):
             good = np.flatnonzero(can <= can.min() + tolerance)
-            lasting = found.lasting[good].max(1)
-            good = good[lasting >= lasting.max() - tolerance]
+            shares = forecast.lasting[good].max(1)
+            good = good[shares >= shares.max() - tolerance]
             reason = "nothing can, the one that lasts longest"
         if proposed in good:
             best, reason = proposed, "nothing can, nor does anything last longer"
         else:
             best = int(good[self.memory.apart(after[good], after[proposed]).argmin()])
-        judged = self._judged(risks[[proposed, best]])
+        judgement = self._judged(risks[[proposed, best]])
         options = np.array([wanted, float(best)])
-        return Search(options, judged, int(best != proposed), f"{why}; {reason}")
+        return Search(options, judgement, int(best != proposed), f"{why}; {reason}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each action; NaN as long as nothing can be said."""
-        given, found = np.asarray(actions, np.float64), self._foreseen(situation)
-        if isinstance(found, str):
-            return self._judged(np.full(len(given), math.nan))
-        return self._judged(found.risks.min(1)[given.astype(int)])
+        choices, forecast = np.asarray(actions, np.float64), self._foreseen(situation)
+        if isinstance(forecast, str):
+            return self._judged(np.full(len(choices), math.nan))
+        return self._judged(forecast.risks.min(1)[choices.astype(int)])
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
@@ -222,12 +222,12 @@ class SceneRisk(ActionJudge):
         return f"how close is too close was learnt of {self.memory.failures} failures"
 
     def _foreseen(self, situation: Situation) -> Foreseen | str:
-        seen = self._read(situation.observation)
+        scene = self._read(situation.observation)
         if self.memory.contact is None:
             return self.told_by_experience
-        if not np.isfinite(seen.own).all():
+        if not np.isfinite(scene.own).all():
             return "own row is not seen"
-        return self.memory.foresee(seen)
+        return self.memory.foresee(scene)
 
     def _judged(self, risks: _Floats) -> Judgement:
         bounds = [wilson_bounds(float(risk), _ANALOGS) for risk in risks]
@@ -250,11 +250,11 @@ class SceneRisk(ActionJudge):
 
     def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike) -> None:
         """Take in an observation and the action after it."""
-        seen = self._read(np.asarray(observation, np.float64))
-        if not np.isfinite(seen.own).all():  # what follows begins anew
+        scene = self._read(np.asarray(observation, np.float64))
+        if not np.isfinite(scene.own).all():  # what follows begins anew
             self._remember(failed=False)
             return
-        self._seen.append(seen)
+        self._seen.append(scene)
         self._actions.append(int(action))
 
     watch = learn
@@ -278,11 +278,11 @@ class SceneRisk(ActionJudge):
 
     def savepoint(self) -> Rollback:
         """What takes back all that it learns from now on."""
-        seen, actions, learnt = [*self._seen], [*self._actions], {**vars(self.memory)}
+        scenes, actions, memory = [*self._seen], [*self._actions], {**vars(self.memory)}
 
         def rollback() -> None:
-            self._seen, self._actions = [*seen], [*actions]
-            vars(self.memory).update(learnt)
+            self._seen, self._actions = [*scenes], [*actions]
+            vars(self.memory).update(memory)
 
         return rollback
 
@@ -295,12 +295,12 @@ class SceneRisk(ActionJudge):
 
     def sums(self, n_states: int) -> dict[str, float]:
         """A few sums that change with whatever is learnt."""
-        past = self.memory.past
+        history = self.memory.past
         return {
-            "episodes": float(len(past.ends) - 1),
+            "episodes": float(len(history.ends) - 1),
             "failures": float(self.memory.failures),
-            "moments": float(len(past.own)),
-            "places": float(past.away.sum()),
+            "moments": float(len(history.own)),
+            "places": float(history.away.sum()),
         }
 
     # -- Files ----------------------------------------------------------------------------------
@@ -319,13 +319,13 @@ class SceneRisk(ActionJudge):
         """Read what `save` wrote; a ValueError if it is something else or damaged."""
         settings, arrays = store.read(path, _KIND)
         with store.explained(path):
-            counted = {name: int(settings.pop(name)) for name in ("failures", "fitted")}
+            counts = {name: int(settings.pop(name)) for name in ("failures", "fitted")}
             judge = cls(settings.pop("dt"), settings.pop("n_actions"), **settings)
             whole_numbers = ("actions", "counts", "links")
             arrays |= {name: arrays[name].astype(np.int64) for name in whole_numbers}
-            past = Past(**arrays | {"lost": arrays["lost"].astype(bool)})
-            past.refuse_damaged(judge.memory.past, judge.memory.n_actions)
-            judge.memory.restore(past, **counted)
+            history = Past(**arrays | {"lost": arrays["lost"].astype(bool)})
+            history.refuse_damaged(judge.memory.past, judge.memory.n_actions)
+            judge.memory.restore(history, **counts)
         return judge
 
 
@@ -356,17 +356,17 @@ class Past(NamedTuple):
         cls, seen: Sequence[Seen], q: int, actions: Sequence[int] = (), failed: bool = False
     ) -> Past:
         """An episode, from what was seen at each moment; actions are one fewer."""
-        lost = np.zeros(len(seen), bool)
-        lost[-2:-1] = failed
+        losses = np.zeros(len(seen), bool)
+        losses[-2:-1] = failed
         # In the order in which a file holds them: sums are then the same to the last bit.
         ego = np.array([s.own for s in seen]).reshape(-1, _P + q)
         away, rest = (
             np.ascontiguousarray(np.concatenate([np.zeros((0, width)), *rows]))
             for width, rows in ((_P, [s.away for s in seen]), (q, [s.other for s in seen]))
         )
-        acted = np.array([*actions, -1][: len(seen)], np.int64)
+        choices = np.array([*actions, -1][: len(seen)], np.int64)
         counts = np.array([len(s.away) for s in seen], np.int64)
-        return cls(ego, acted, counts, lost, away, rest, np.full(len(away), -1))
+        return cls(ego, choices, counts, losses, away, rest, np.full(len(away), -1))
 
     @property
     def ends(self) -> _Ints:
@@ -403,12 +403,12 @@ class Past(NamedTuple):
 
     def refuse_damaged(self, none: Past, n_actions: int) -> None:
         """Raise a ValueError where arrays contradict each other, or are of other rows than none."""
-        linked, last = self.links >= 0, self.actions < 0
+        has_link, last = self.links >= 0, self.actions < 0
         if [array.shape[1:] for array in self] != [array.shape[1:] for array in none]:
             raise ValueError("its rows are of other columns than it says")
         if self.counts.sum() != len(self.links) or (self.links >= len(self.links)).any():
             raise ValueError("moments and objects are not as many as counted")
-        if (self.moment[self.links[linked]] != self.moment[linked] + 1).any():
+        if (self.moment[self.links[has_link]] != self.moment[has_link] + 1).any():
             raise ValueError("an object is linked to another moment than the next one")
         if (self.actions >= n_actions).any() or not np.append(True, last)[-1]:
             raise ValueError("an action is none, or the last episode has no end")
@@ -444,13 +444,13 @@ class Contact(NamedTuple):
         The closest object in a failure was met. Of the shapes of a box of this ``spread``, that is
         taken by which the fewest survived steps came closer than the failed ones.
         """
-        tried = []
+        candidates = []
         for power in _SHAPES:
             sides = spread * np.exp(0.5 * power * np.array([1.0, -1.0]))
             near = np.sort(_closest(*survived, sides))
             met = np.sort([_closest(*steps, sides).min() for steps in failed])
-            tried.append((np.log1p(np.searchsorted(near, met)).sum(), sides, near, met))
-        _, sides, near, met = min(tried, key=operator.itemgetter(0))
+            candidates.append((np.log1p(np.searchsorted(near, met)).sum(), sides, near, met))
+        _, sides, near, met = min(candidates, key=operator.itemgetter(0))
         at = np.unique(np.concatenate([met, near[:_CLOSEST]]))
         failures = 1 + len(met) - np.searchsorted(met, at, "left")
         risk = failures / (failures + np.searchsorted(near, at, "right"))
@@ -513,41 +513,41 @@ class Memory:
 
     def add(self, episode: Past) -> None:
         """Remember an episode; learn from it at once if it failed, else now and then."""
-        failed, past = bool(episode.lost.any()), self.past.and_then(episode)
-        starts = past.objects[past.ends]  # of each episode, as objects
-        forgotten = min(int((len(past.away) - starts > _MOST_REMEMBERED).sum()), len(starts) - 2)
-        past = past.between(forgotten, len(starts) - 1)
-        self.fitted = max(0, self.fitted - forgotten)
+        failed, history = bool(episode.lost.any()), self.past.and_then(episode)
+        starts = history.objects[history.ends]  # of each episode, as objects
+        surplus = min(int((len(history.away) - starts > _MOST_REMEMBERED).sum()), len(starts) - 2)
+        history = history.between(surplus, len(starts) - 1)
+        self.fitted = max(0, self.fitted - surplus)
         self.failures += failed
-        count = len(past.ends) - 1
-        fits = failed or forgotten > 0 or count - self.fitted >= max(1, count // 10)
-        self.past = self._fit(past) if fits else past
+        count = len(history.ends) - 1
+        fits = failed or surplus > 0 or count - self.fitted >= max(1, count // 10)
+        self.past = self._fit(history) if fits else history
 
     def restore(self, past: Past, failures: int, fitted: int) -> None:
         """Remember these, of which the first ``fitted`` were learnt from, as they were linked."""
         self.past, self.failures, self.fitted = past, failures, fitted
         if fitted:
-            known = past.between(0, fitted)
-            self._fit_spreads(known)
-            self._fit_motion(known)
+            episodes = past.between(0, fitted)
+            self._fit_spreads(episodes)
+            self._fit_motion(episodes)
             if self._motion is None:
                 raise ValueError(f"{fitted} episodes were learnt from, but no object is seen twice")
-            self._conclude(known)
+            self._conclude(episodes)
 
     def _fit(self, past: Past) -> Past:
         """Link objects, and learn from all that is remembered."""
         count = len(past.ends) - 1
         again = self._motion is None or count & (count - 1) == 0
-        first = 0 if again else int(past.ends[self.fitted])
-        self._fit_spreads(past)
+        history, first = past, 0 if again else int(past.ends[self.fitted])
+        self._fit_spreads(history)
         for _ in range(3 if self._motion is None else 1):
-            past = self._linked(past, first)
-            self._fit_motion(past)
+            history = self._linked(history, first)
+            self._fit_motion(history)
             if self._motion is None:
-                return past
+                return history
         self.fitted = count
-        self._conclude(past)
-        return past
+        self._conclude(history)
+        return history
 
     def _conclude(self, past: Past) -> None:
         self._fit_oneself(past)
@@ -570,8 +570,8 @@ class Memory:
             if past.actions[t] < 0 or not (past.counts[t] and past.counts[t + 1]):
                 continue
             now, then = slice(ends[t], ends[t + 1]), slice(ends[t + 1], ends[t + 2])
-            expected = past.away[now] + self._moved(past.own[t : t + 2], past.other[now])
-            off = (expected[:, None] - past.away[then]) / away
+            places = past.away[now] + self._moved(past.own[t : t + 2], past.other[now])
+            off = (places[:, None] - past.away[then]) / away
             change = (past.other[now][:, None] - past.other[then]) / rest
             apart = (off**2).sum(2)
             unlike = apart + _OF_REST * (change**2).sum(2)
@@ -597,8 +597,8 @@ class Memory:
         spread = np.maximum(x.var(0), _CONSTANT * (x**2).mean(0)) + 1e-12
         ridge = _RIDGE * len(rows) * np.diag(spread)
         for _ in range(_REWEIGHTINGS):
-            weighed = x * weights[:, None]
-            motion = np.linalg.solve(weighed.T @ x + ridge, weighed.T @ y + ridge @ prior)
+            weighted_x = x * weights[:, None]
+            motion = np.linalg.solve(weighted_x.T @ x + ridge, weighted_x.T @ y + ridge @ prior)
             off = (((y - x @ motion) / self._spreads[0]) ** 2).sum(1)
             middle = max(float(np.median(off)), _LEAST_SQUARE)
             weights = 1.0 / (1.0 + off / (_HALF * middle))
@@ -619,50 +619,50 @@ class Memory:
 
     def _fit_oneself(self, past: Past) -> None:
         """What each action brought oneself, from states in units of their spreads."""
-        known = np.flatnonzero((past.actions >= 0) & ~past.lost)
+        moments = np.flatnonzero((past.actions >= 0) & ~past.lost)
         self._own = []
         for action in range(self.n_actions):
-            rows = known[past.actions[known] == action]
+            rows = moments[past.actions[moments] == action]
             before = past.own[rows]
             self._own.append((before / self._spreads[2], past.own[rows + 1] - before))
 
     def _fit_contact(self, past: Past) -> None:
         """How close is too close."""
         safe = np.flatnonzero((past.links >= 0) & ~past.lost[past.moment])
-        failed, ends = [], past.objects
+        failures, ends = [], past.objects
         for t in np.flatnonzero(past.lost):
             rows = slice(ends[t], ends[t + 1])
             last = past.away[ends[t + 1] : ends[t + 2]]
-            start, linked = past.away[rows], past.links[rows]
-            expected = start + self._moved(past.own[t : t + 2], past.other[rows])
-            end = np.where((linked >= 0)[:, None], past.away[linked], expected)
+            start, links = past.away[rows], past.links[rows]
+            places = start + self._moved(past.own[t : t + 2], past.other[rows])
+            end = np.where((links >= 0)[:, None], past.away[links], places)
             if len(start) or len(last):
-                failed.append((np.concatenate([start, last]), np.concatenate([end, last])))
-        if failed and len(safe):
+                failures.append((np.concatenate([start, last]), np.concatenate([end, last])))
+        if failures and len(safe):
             steps = past.away[safe], past.away[past.links[safe]]
-            self.contact = Contact.learn(steps, failed, self._spreads[0])
+            self.contact = Contact.learn(steps, failures, self._spreads[0])
 
     def _fit_objects(self, past: Past) -> None:
         """Where each object went from then on, oneself left out."""
         rows, moment = np.flatnonzero(past.links >= 0), past.moment
         now, then = moment[rows], past.links[rows]
-        moved = self._mine(past.own[now], past.own[now + 1])
-        went = np.full_like(past.away, np.nan)
-        went[rows] = past.away[then] - past.away[rows] - moved
-        known = np.hstack([past.other, np.ones((len(past.other), 1))])
-        steady = np.linalg.lstsq(known[rows], went[rows], rcond=None)[0]
+        own_moves = self._mine(past.own[now], past.own[now + 1])
+        moves = np.full_like(past.away, np.nan)
+        moves[rows] = past.away[then] - past.away[rows] - own_moves
+        terms = np.hstack([past.other, np.ones((len(past.other), 1))])
+        steady = np.linalg.lstsq(terms[rows], moves[rows], rcond=None)[0]
         self._steady = steady[:-1]
-        step, links = known @ steady, past.links.copy()
+        step, links = terms @ steady, past.links.copy()
         if self.contact is not None:
-            off = np.abs((went[rows] - step[rows]) / self.contact.sides).max(1)
+            off = np.abs((moves[rows] - step[rows]) / self.contact.sides).max(1)
             astray = rows[off > _ASTRAY * self.contact.met]
             if 2 * len(astray) < len(rows):  # else what failed met in one point, as in cells
-                links[astray], went[astray] = -1, np.nan
+                links[astray], moves[astray] = -1, np.nan
                 rows = np.flatnonzero(links >= 0)
         total, at = np.zeros_like(past.away), np.arange(len(past.away))
         paths = np.empty((len(past.away), _STEPS_AHEAD, _P))
         for h in range(_STEPS_AHEAD):
-            here = np.where((at >= 0)[:, None], went[at], np.nan)
+            here = np.where((at >= 0)[:, None], moves[at], np.nan)
             step = np.where(np.isnan(here), step, here)
             total = total + step
             paths[:, h] = total
@@ -685,18 +685,18 @@ class Memory:
         """What comes of each action."""
         assert self.contact is not None
         n = self.n_actions
-        gone, weights, after = self._own_courses(seen.own)
-        safe = np.ones(gone.shape[:3])
+        moves, weights, after = self._own_courses(seen.own)
+        safe = np.ones(moves.shape[:3])
         ego = np.repeat(seen.own[None], len(seen.away), axis=0)
         analogs = _nearest(self._objects, self._features(ego, seen.away, seen.other), _ANALOGS)
         for i, (like, share) in enumerate(zip(*analogs, strict=True)):
             faster = (seen.other[i] - self._others[like]) @ self._steady
             path = self._paths[like] + faster[:, None] * np.arange(1, _STEPS_AHEAD + 1)[:, None]
-            to = seen.away[i] + path + gone[:, :, None]
+            to = seen.away[i] + path + moves[:, :, None]
             start = np.broadcast_to(seen.away[i], (*to.shape[:3], 1, _P))
             safe *= share @ (1.0 - self.contact.of(np.concatenate([start, to], axis=-2)))
-        lost = ((1.0 - safe) * weights[:, :, None]).sum(0).reshape(n, n, _STEPS_AHEAD)
-        return Foreseen(lost[:, :, -1], 1.0 - lost.mean(-1), after)
+        losses = ((1.0 - safe) * weights[:, :, None]).sum(0).reshape(n, n, _STEPS_AHEAD)
+        return Foreseen(losses[:, :, -1], 1.0 - losses.mean(-1), after)
 
     def _own_courses(self, own: _Floats) -> tuple[_Floats, _Floats, _Floats]:
         """How r courses move relative places, by action and by that which follows for good.
@@ -706,7 +706,7 @@ class Memory:
         n, r = self.n_actions, _OWN_ANALOGS
         first, then = np.repeat(np.arange(n), n), np.tile(np.arange(n), n)
         at = np.broadcast_to(own, (r, n * n, len(own)))
-        gone = np.zeros((r, n * n, _STEPS_AHEAD, _P))
+        moves = np.zeros((r, n * n, _STEPS_AHEAD, _P))
         shares = np.full((r, n * n), 1.0 / r)
         total = np.zeros((r * n * n, _P))
         course = np.arange(r)[:, None, None]
@@ -723,11 +723,11 @@ class Memory:
                 if h == 0:
                     shares[:, rows] = np.take_along_axis(share, index, -1)[..., 0]
             total = total + self._mine(at.reshape(-1, len(own)), to.reshape(-1, len(own)))
-            gone[:, :, h] = total.reshape(r, n * n, _P)
+            moves[:, :, h] = total.reshape(r, n * n, _P)
             if h == 0:
                 after = to[0, ::n]
             at = to
-        return gone, shares / shares.sum(0), after
+        return moves, shares / shares.sum(0), after
 
 
 def _terms(before: _Floats, after: _Floats) -> _Floats:
