@@ -184,20 +184,20 @@ class Chain:
 
     def records(self) -> Iterator[Record]:
         """The records, after which `finding` is known; a ValueError if there is none."""
-        known = self._kept in (None, NOTHING)
-        reading = lines(self.path, _LONGEST_LINE)
-        for line in reading:
+        has_head = self._kept in (None, NOTHING)
+        file_lines = lines(self.path, _LONGEST_LINE)
+        for line in file_lines:
             if not line.endswith(b"\n"):
                 self.half_written = len(line)
                 break
             record = unseal(line)
             if record is None or (record.number - 1, record.previous) != self.head:
-                self.finding = self._broken(record, unseal(next(reading, b"")), reading)
+                self.finding = self._broken(record, unseal(next(file_lines, b"")), file_lines)
                 return
             self.head, self.size = Head(record.number, record.digest), self.size + len(line)
-            known = known or self._kept == self.head
+            has_head = has_head or self._kept == self.head
             yield record
-        if not known and self._kept is not None:
+        if not has_head and self._kept is not None:
             self.finding = _against(self._kept, self.head)
 
     def _broken(self, here: Record | None, after: Record | None, rest: Iterator[bytes]) -> Finding:
@@ -228,23 +228,23 @@ def lines(path: Path, longest: int) -> Iterator[bytes]:
     """
     with open(path, "rb") as file:
         status = os.fstat(file.fileno())
-        left = status.st_size if stat.S_ISREG(status.st_mode) else sys.maxsize
-        while line := file.readline(min(longest + 1, left)):
+        remainder = status.st_size if stat.S_ISREG(status.st_mode) else sys.maxsize
+        while line := file.readline(min(longest + 1, remainder)):
             if len(line) > longest:
                 text = f"{path} has a line of more than {longest >> 20} MiB"
                 raise ValueError(f"{text}: is it another kind of file?")
-            left -= len(line)
+            remainder -= len(line)
             yield line
 
 
 def _against(kept: Head, head: Head) -> Finding:
     """Why a whole chain has not the head that was kept."""
-    last, known = head.number, kept.number
-    if known > last:
-        why = f"the head was record {known}, but the log ends with {last}: its end was cut off"
+    last, number = head.number, kept.number
+    if number > last:
+        why = f"the head was record {number}, but the log ends with {last}: its end was cut off"
         return Finding(last + 1, why)
-    why = f"record {known} is not the one that the head is of: records up to it were written anew"
-    return Finding(known, why)
+    why = f"record {number} is not the one that the head is of: records up to it were written anew"
+    return Finding(number, why)
 
 
 # -- Logging --------------------------------------------------------------------------------------
@@ -373,8 +373,8 @@ class AuditLog(AbstractContextManager["AuditLog"]):
             before = self._take_before()
             self._write("decision", before=before, time=time, observation=observation, **decision)
         else:
-            masked = [] if proposal.mask is None else [proposal.mask.tolist()]
-            self._before.append([time, observation, written(proposal.action), *masked])
+            masks = [] if proposal.mask is None else [proposal.mask.tolist()]
+            self._before.append([time, observation, written(proposal.action), *masks])
             if len(self._before) >= _MOST_QUIET:
                 self._flush()
 
@@ -396,10 +396,10 @@ class AuditLog(AbstractContextManager["AuditLog"]):
 
     def savepoint(self) -> Rollback:
         """What takes back all that is logged from now on, in the file, too."""
-        kept = {**self.__dict__, "_before": [*self._before]}
+        attributes = {**self.__dict__, "_before": [*self._before]}
 
         def rollback() -> None:
-            self.__dict__.update(kept)
+            self.__dict__.update(attributes)
             with suppress(OSError):  # else before more is written
                 self._cut()
 
@@ -509,13 +509,13 @@ def made_by() -> dict[str, str]:
 
 def _start(guard: Guard) -> dict[str, Any]:
     file = BytesIO()
-    if known := can_be_made_again(guard):
+    if is_replayable := can_be_made_again(guard):
         guard.save(file)
-        if not (known := file.tell() < _LONGEST_LINE // 2):
+        if not (is_replayable := file.tell() < _LONGEST_LINE // 2):
             _log.warning("the guard is too large for an audit log: it will not be replayed")
     return {
         "about": _ABOUT,
-        "guard": base64.b64encode(file.getvalue()).decode() if known else None,
+        "guard": base64.b64encode(file.getvalue()).decode() if is_replayable else None,
         "made_by": made_by(),
         "reviser": type(guard.reviser).__name__,
         "told_failures": guard.failed is not None,
@@ -553,9 +553,9 @@ def sums_of(guard: Guard) -> dict[str, float]:
 def decision_of(situation: Situation, proposal: Proposal, revision: Revision) -> dict[str, Any]:
     """A decision, as it is written, but for what came in."""
     likely = np.argsort(-situation.belief, kind="stable")[:_STATES].tolist()
-    decided = Decision(situation, revision._replace(proposed=proposal.action))
+    decision = Decision(situation, revision._replace(proposed=proposal.action))
     return {
-        **{name: _plain(RECORD[name].kind, RECORD[name].read(decided)) for name in _TOLD},
+        **{name: _plain(RECORD[name].kind, RECORD[name].read(decision)) for name in _TOLD},
         "belief": [[state, float(situation.belief[state])] for state in likely],
         "interval": [float(bound) for bound in revision.interval],
         "mask": None if proposal.mask is None else proposal.mask.tolist(),

@@ -73,9 +73,9 @@ def check_contract(part: object) -> None:
         ...
     AssertionError: proposes_numbers: it proposes inf at gap inf m, 20.0 and 0.0 m/s ...
     """
-    broken = [f"{r.check}: {r.message}" for r in check_results(part) if not r.passed]
-    if broken:
-        raise AssertionError("\n".join(broken))
+    failures = [f"{r.check}: {r.message}" for r in check_results(part) if not r.passed]
+    if failures:
+        raise AssertionError("\n".join(failures))
 
 
 def check_results(part: object) -> list[Result]:
@@ -86,12 +86,12 @@ def check_results(part: object) -> list[Result]:
 
 def kind_of(part: object) -> str:
     """Of which kind a class, an instance, or a function that makes one is."""
-    made = part if inspect.isclass(part) else _maker(part)()
+    instance = part if inspect.isclass(part) else _maker(part)()
     for kind, names in _METHODS.items():
-        if all(hasattr(made, name) for name in names):
+        if all(hasattr(instance, name) for name in names):
             return kind
-    known = "; ".join(f"a {kind} has {', '.join(names)}" for kind, names in _METHODS.items())
-    raise TypeError(f"{part!r} has the methods of no kind: {known}")
+    kinds = "; ".join(f"a {kind} has {', '.join(names)}" for kind, names in _METHODS.items())
+    raise TypeError(f"{part!r} has the methods of no kind: {kinds}")
 
 
 def _maker(part: Any) -> Make:
@@ -112,8 +112,8 @@ def _result(clause: Clause, make: Make) -> Result:
     name = clause.__name__
     try:
         clause(make)
-    except AssertionError as broken:
-        return Result(name, False, str(broken))
+    except AssertionError as failure:
+        return Result(name, False, str(failure))
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{place.filename}, line {place.lineno}"
@@ -150,16 +150,16 @@ def _common(answers: Callable[[Any, Rows], Answers]) -> Clause:
 
     def answers_hang_on_inputs_alone(make: Make) -> None:
         """It changes no input, keeps no array of its caller, and draws no random numbers."""
-        part, twin, buffer, found = make(), make(), np.empty(3), []
+        part, twin, buffer, outputs = make(), make(), np.empty(3), []
         for row in _drive():
             buffer[:] = row
-            found += answers(part, [buffer])
-            changed = "it changed an observation that it was given (work in place? copy it first)"
-            _insist(_same(buffer, row), changed)
+            outputs += answers(part, [buffer])
+            message = "it changed an observation that it was given (work in place? copy it first)"
+            _insist(_same(buffer, row), message)
             buffer[:] = 1e6
-        expected = [answer for row in _drive() for answer in answers(twin, [row])]
+        reference = [answer for row in _drive() for answer in answers(twin, [row])]
         _insist(
-            _same(found, expected),
+            _same(outputs, reference),
             "two that saw the same answer otherwise (an array that is kept instead of copied, a "
             "random number without a seed, or something shared by all of the class?)",
         )
@@ -198,16 +198,16 @@ def _situation(row: NDArray[np.float64], k: int) -> Situation:
 def _revisions(reviser: Any, rows: Rows) -> Answers:
     actions = np.resize(_ACTIONS, len(rows)).tolist()
     pairs = enumerate(zip(rows, actions, strict=True))
-    made = [reviser.revise(_situation(row, k), Proposal(action)) for k, (row, action) in pairs]
-    return [(r.executed, r.risk_executed, r.reason, r.advised) for r in made]
+    revisions = [reviser.revise(_situation(row, k), Proposal(action)) for k, (row, action) in pairs]
+    return [(r.executed, r.risk_executed, r.reason, r.advised) for r in revisions]
 
 
 def revises_what_is_proposed(make: Make) -> None:
     """It executes a finite number within its actions, even where no number was proposed."""
     reviser = make()
-    wanted = (*_ACTIONS.tolist(), 5.0, -9.0, math.nan, math.inf, -math.inf, 1e9)
+    proposals = (*_ACTIONS.tolist(), 5.0, -9.0, math.nan, math.inf, -math.inf, 1e9)
     for k, row in enumerate(_drive(40)):
-        proposed = wanted[k % len(wanted)]
+        proposed = proposals[k % len(proposals)]
         of = f"for a proposal of {proposed}"
         try:
             answer = reviser.revise(_situation(row, k), Proposal(proposed))
@@ -228,17 +228,17 @@ def revises_what_is_proposed(make: Make) -> None:
 
 def an_episode_starts_anew(make: Make) -> None:
     """After `start_episode` it decides as one that has just been made."""
-    used, fresh = make(), make()
-    _revisions(used, [np.array([2.0, 25.0, 5.0])] * 3)
-    used.start_episode()
-    fresh.start_episode()
-    found, expected = (_revisions(part, list(_drive(seed=1))) for part in (used, fresh))
-    _insist(_same(found, expected), "after start_episode it still depends on the episode before")
+    reviser, twin = make(), make()
+    _revisions(reviser, [np.array([2.0, 25.0, 5.0])] * 3)
+    reviser.start_episode()
+    twin.start_episode()
+    outputs, reference = (_revisions(part, list(_drive(seed=1))) for part in (reviser, twin))
+    _insist(_same(outputs, reference), "after start_episode it still depends on the episode before")
 
 
 def _judgements(judge: Any, rows: Rows) -> Answers:
-    made = (judge.judge(_situation(row, 1), _ACTIONS.copy()) for row in rows)
-    return [(judged.risk, judged.low, judged.high) for judged in made]
+    judgements = (judge.judge(_situation(row, 1), _ACTIONS.copy()) for row in rows)
+    return [(judgement.risk, judgement.low, judgement.high) for judgement in judgements]
 
 
 def _taught(make: Make, *, ask: bool = False) -> tuple[Guard, Any]:
@@ -266,11 +266,11 @@ def _asked(judge: Any) -> list[Judgement]:
 
 def judges_each_action(make: Make) -> None:
     """It returns a probability for each action, within its interval, or NaN where it knows none."""
-    for judged in _asked(_taught(make)[1]):
-        shapes = {np.shape(getattr(judged, name)) for name in ("risk", "low", "high")}
+    for judgement in _asked(_taught(make)[1]):
+        shapes = {np.shape(getattr(judgement, name)) for name in ("risk", "low", "high")}
         _insist(shapes == {_ACTIONS.shape}, f"of {len(_ACTIONS)} actions it returns {shapes}")
-        known = ~np.isnan(judged.risk)
-        low, risk, high = judged.low[known], judged.risk[known], judged.high[known]
+        is_risk = ~np.isnan(judgement.risk)
+        low, risk, high = judgement.low[is_risk], judgement.risk[is_risk], judgement.high[is_risk]
         sound = ((low >= 0.0) & (low <= risk) & (risk <= high) & (high <= 1.0)).all()
         why = "probabilities lie in [0, 1], and in their interval"
         _insist(sound, f"its risks are {risk} within {low} to {high}; {why}")

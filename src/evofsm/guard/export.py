@@ -89,9 +89,9 @@ def write_c99(guard: Guard, folder: Path, prefix: str = "evofsm") -> None:
         )
     texts = _texts(guard)
     folder.mkdir(parents=True, exist_ok=True)
-    for ending in ("h", "hpp", "c"):
-        text = texts[f"evofsm.{ending}"].replace("EVOFSM", prefix.upper())
-        with store.replacing(folder / f"{prefix}.{ending}") as place:
+    for suffix in ("h", "hpp", "c"):
+        text = texts[f"evofsm.{suffix}"].replace("EVOFSM", prefix.upper())
+        with store.replacing(folder / f"{prefix}.{suffix}") as place:
             place.write(re.sub(r"evofsm(?! \d)", prefix, text).encode())
 
 
@@ -102,14 +102,14 @@ def write_fmu(guard: Guard, file: Path) -> None:
     """
     name = re.sub(r"^(?=\d)|\W", "_", file.stem, flags=re.ASCII)
     texts, library = _texts(guard, name), f"{name}.{_LIBRARIES.get(sys.platform, 'so')}"
-    with tempfile.TemporaryDirectory() as place, store.replacing(file) as written:
+    with tempfile.TemporaryDirectory() as place, store.replacing(file) as output:
         folder = Path(place)
         for file_name, text in texts.items():
             (folder / file_name).write_text(text, "utf-8")
         with suppress(OSError):  # there is no compiler
             command = (os.environ.get("CC") or "cc", *_FLAGS, "-o", library)
             subprocess.run([*command, "evofsm.c", "fmi2.c", "-lm"], cwd=place, check=False)
-        with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as unit:
+        with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as unit:
             unit.write(folder / "modelDescription.xml", "modelDescription.xml")
             for file_name in ("evofsm.h", "evofsm.c", "fmi2.c"):
                 unit.write(folder / file_name, f"sources/{file_name}")
@@ -118,15 +118,15 @@ def write_fmu(guard: Guard, file: Path) -> None:
                     folder / library, f"binaries/{sys.platform.removesuffix('32')}64/{library}"
                 )
             else:
-                said = "%s holds sources alone: no C compiler built it here (cc, CC)"
-                logging.getLogger(__name__).warning(said, file)
+                note = "%s holds sources alone: no C compiler built it here (cc, CC)"
+                logging.getLogger(__name__).warning(note, file)
 
 
 def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
     """All files by their names; and of an FMU by its own."""
     frozen = guard.copy()
     frozen.freeze()
-    reviser, asked = frozen.reviser, type(getattr(frozen.reviser, "risk", None))
+    reviser, judge_class = frozen.reviser, type(getattr(frozen.reviser, "risk", None))
     if type(reviser) is not ActionReviser or reviser.mode is Mode.OFF:
         raise ValueError(
             "only a guard with an ActionReviser whose mode is not off is exported, not one of "
@@ -142,22 +142,22 @@ def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
             "on, or set guard.shadow = False"
         )
     if not reviser.acts:
-        said = "exported in mode %s it watches: executed is always the proposal; --mode act filters"
-        logging.getLogger(__name__).warning(said, reviser.mode.value)
-    if asked is not LearntRisk and "in_c99" not in vars(asked):
-        raise ValueError(f"a LearntRisk or a LatentRisk is exported, but no {asked.__name__}")
-    part: Part = _learnt(reviser) if asked is LearntRisk else reviser.risk.in_c99(reviser)  # type: ignore[attr-defined]
+        note = "exported in mode %s it watches: executed is always the proposal; --mode act filters"
+        logging.getLogger(__name__).warning(note, reviser.mode.value)
+    if judge_class is not LearntRisk and "in_c99" not in vars(judge_class):
+        raise ValueError(f"a LearntRisk or a LatentRisk is exported, but no {judge_class.__name__}")
+    part: Part = _learnt(reviser) if judge_class is LearntRisk else reviser.risk.in_c99(reviser)  # type: ignore[attr-defined]
     common, judge = _sections(Path(__file__).with_name("guard.c")), _sections(part.template)
     sizes, constants = _common(frozen, reviser, part.variables)
     sizes |= part.sizes
     sizes["STACK"] = _STACK + 64 * sizes.get("NUMBERS", 0) + 32 * sizes.get("LANES", 0)
     m, a = sizes["VARIABLES"], sizes["ACTIONS"]
-    seen = ", ".join(names) or "variables in their order"
-    told = visible(f"{frozen}\nan observation: {seen}\n{part.about}").replace("\n", "\n   ")
+    variables = ", ".join(names) or "variables in their order"
+    about = visible(f"{frozen}\nan observation: {variables}\n{part.about}").replace("\n", "\n   ")
     learnt = _written({**constants, **part.constants})
     texts = {
         "TOOL": f"evofsm {__version__}",
-        "ABOUT": re.sub("(?<=[*/?])(?=[*/?])", " ", told),  # neither a comment nor a trigraph
+        "ABOUT": re.sub("(?<=[*/?])(?=[*/?])", " ", about),  # neither a comment nor a trigraph
         "SIZES": _written({f"EVOFSM_{name}": value for name, value in sizes.items()}),
         "STATE": judge["state"],
         "CONSTANTS": learnt,
@@ -182,12 +182,12 @@ def _told(names: Sequence[str]) -> tuple[str, ...]:
 
 def _variables(names: Sequence[object], a: int, *, whole: bool) -> str:
     """Variables of an FMU for its description, in the order of ``fmi2.c``."""
-    m, seen = len(names), [f"observation[{name}]" for name in names]
+    m, columns = len(names), [f"observation[{name}]" for name in names]
     acts = [f"{act}[{i}]" for act in ("proposal", "executed") for i in range(a)]
     kinds = ["Real"] * m + ["Integer" if whole else "Real"] * (2 * a)
     kinds += ["Real", "Integer", "Boolean"]
     how = ['"input"'] * (m + a) + ['"output" initial="exact"'] * (a + 3)
-    every = zip([*seen, *acts, "risk", "reason", "revised"], kinds, how, strict=True)
+    every = zip([*columns, *acts, "risk", "reason", "revised"], kinds, how, strict=True)
     return "".join(
         f'    <ScalarVariable name={quoteattr(name)} valueReference="{k}" '
         f'causality={causality} variability="discrete"><{kind} start="0"/></ScalarVariable>\n'
@@ -241,9 +241,9 @@ def _learnt(reviser: ActionReviser) -> Part:
     if count > _MOST_DISTURBANCES:
         raise ValueError(f"at most {_MOST_DISTURBANCES} disturbances are exported, not {count}")
     lanes = -(-count // _LANES) * _LANES
-    remembered, soon = risk.remembered, risk._soon(risk.remembered.seconds)
+    memory, soon = risk.remembered, risk._soon(risk.remembered.seconds)
     names = [f"{q}: {risk.backup_text(q)}" for q in range(len(state.policies))]
-    asked = min(parts.n_asked, len(names))
+    n_queries = min(parts.n_asked, len(names))
     constants: dict[str, Any] = {
         "DISTURBANCES": count,
         "STEPS": steps,
@@ -252,11 +252,11 @@ def _learnt(reviser: ActionReviser) -> Part:
         "FORMS": len(model.forms),
         "SCALE": parts.scale,
         "MARGIN": risk.margin,
-        "ALLOWED": risk._allowed(reviser.tolerance, remembered),
-        "ASKED": asked,
-        "JUDGED": min(parts.n_judged, asked),
+        "ALLOWED": risk._allowed(reviser.tolerance, memory),
+        "ASKED": n_queries,
+        "JUDGED": min(parts.n_judged, n_queries),
         "MOST_DONE": math.ceil(parts.most),
-        "EVIDENCE": float(remembered.number),
+        "EVIDENCE": float(memory.number),
         **{name.strip("_"): getattr(rollout, name) for name in _OF_ROLLOUTS},
         **{name: getattr(model, name) for name in _OF_MODEL},
         "residuals": rest[:, :, [*range(count), *[0] * (lanes - count)]],  # others are undisturbed
@@ -265,7 +265,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "middle": risk.middle,
         "half": risk.half,
     }
-    most_rollouts = 2 * asked + max(parts.n_asked, rollout._HALVINGS) + 2 * parts.n_asked
+    most_rollouts = 2 * n_queries + max(parts.n_asked, rollout._HALVINGS) + 2 * parts.n_asked
     about = (
         f"backups: {'; '.join(names)}\n"
         f"a decision: at most {most_rollouts} "
@@ -304,5 +304,5 @@ def _number(value: Any) -> str:
         return "{" + (", " if np.ndim(value) == 1 else ",\n ").join(map(_number, value)) + "}"
     if isinstance(value, bool | int | np.integer):
         return str(int(value))
-    named = {math.inf: "INFINITY", -math.inf: "(-INFINITY)"}
-    return named.get(float(value), f"({float(value)!r})" if value < 0.0 else repr(float(value)))
+    names = {math.inf: "INFINITY", -math.inf: "(-INFINITY)"}
+    return names.get(float(value), f"({float(value)!r})" if value < 0.0 else repr(float(value)))

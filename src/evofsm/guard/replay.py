@@ -123,17 +123,17 @@ def audit(path: Path, kept: Head | None = None, *, failed: _Failed | None = None
 fields=())
     """
     chain, counts, player = Chain(path, kept), Counter[str](), _Player(failed)
-    finding = difference = None
+    fault = difference = None
     for record in chain.records():
-        finding = _misfit(record, started=counts["start"] > 0)
-        if finding is not None:
+        fault = _misfit(record, started=counts["start"] > 0)
+        if fault is not None:
             break
         counts[record.content["kind"]] += 1
         counts["quiet rows"] += len(record.content.get("before", ()))
         if difference is None:
             difference = player.play(record)
-    finding = finding or chain.finding
-    if chain.head == NOTHING and finding is None:
+    fault = fault or chain.finding
+    if chain.head == NOTHING and fault is None:
         raise ValueError(f"{path} is no audit log, or no record of it was finished")
     spoke = counts["decision"]
     contents = Contents(
@@ -142,7 +142,7 @@ fields=())
     return Audit(
         head=chain.head,
         half_written=chain.half_written,
-        finding=finding,
+        finding=fault,
         contents=contents,
         replayed=player.decisions,
         difference=difference,
@@ -162,9 +162,9 @@ def _misfit(record: Record, *, started: bool) -> Finding | None:
         why = f"its version is {version!r}, not {LOG_VERSION} (did a newer evofsm write it?)"
     elif kind != "start" and not started:
         why = "it comes before the guard that decides"
-    elif differing := sorted((FIELDS[kind] | {"kind", "clock"}) ^ content.keys()):
-        has = "has" if differing[0] in content else "lacks"
-        why = f"a record of kind {kind!r} {has} {differing[0][:40]!r}"
+    elif names := sorted((FIELDS[kind] | {"kind", "clock"}) ^ content.keys()):
+        has = "has" if names[0] in content else "lacks"
+        why = f"a record of kind {kind!r} {has} {names[0][:40]!r}"
     elif not isinstance(content.get("before", []), list):
         why = "what it holds before it is no list"
     return Finding(record.number, f"record {record.number} was forged: {why}") if why else None
@@ -192,8 +192,8 @@ class _Player:
         except _DiffersError as differs:
             return Finding(record.number, *differs.args)
         except _NONSENSE as error:
-            said = f"there is no {error}" if isinstance(error, KeyError) else str(error)
-            return Finding(record.number, f"it cannot be replayed: {said}")
+            text = f"there is no {error}" if isinstance(error, KeyError) else str(error)
+            return Finding(record.number, f"it cannot be replayed: {text}")
         return None
 
     def _play(self, content: Mapping[str, Any]) -> None:
@@ -223,17 +223,17 @@ class _Player:
             if then != now.get(name):
                 self.other_makers[name] = Field(name, str(then), now.get(name, ""))
         self._guard, self._is_under_way = None, False
-        told = content["told_failures"]
+        needs_code = content["told_failures"]
         if content["guard"] is None:
             self.not_replayed.append(
                 f"{content['reviser']} is no reviser that is known here, or asks a judge that is "
                 "not, or that was not told what happened, or the guard was too large"
             )
-        elif told and self._failed is None:
+        elif needs_code and self._failed is None:
             self.not_replayed.append(_NO_FUNCTION)
         else:
             file = BytesIO(base64.b64decode(content["guard"], validate=True))
-            self._guard = Guard.load(file, failed=self._failed if told else None, audit=_DEAF)
+            self._guard = Guard.load(file, failed=self._failed if needs_code else None, audit=_DEAF)
 
     @staticmethod
     def _set(guard: Guard, settings: Mapping[str, Any]) -> None:
@@ -251,18 +251,18 @@ class _Player:
         if not proposed:
             guard.recognise(_floats(observation), _number(time))
             return
-        when, told, speaks = self._again(guard, time, observation, *proposed)
+        when, entry, speaks = self._again(guard, time, observation, *proposed)
         if speaks:
             raise _DiffersError(
-                f"{when} was recorded as nothing to speak of, but {told['reason']}",
-                (Field("executed", canonical(told["proposed"]), canonical(told["executed"])),),
+                f"{when} was recorded as nothing to speak of, but {entry['reason']}",
+                (Field("executed", canonical(entry["proposed"]), canonical(entry["executed"])),),
             )
         self.decisions += 1
 
     def _decision(self, guard: Guard, content: Mapping[str, Any]) -> None:
-        given = (content[name] for name in ("time", "observation", "proposed", "mask"))
-        when, told, speaks = self._again(guard, *given)
-        if fields := _differing({name: content[name] for name in told}, told):
+        row = (content[name] for name in ("time", "observation", "proposed", "mask"))
+        when, entry, speaks = self._again(guard, *row)
+        if fields := _differing({name: content[name] for name in entry}, entry):
             raise _DiffersError(f"{when} comes out otherwise", fields)
         if not speaks:
             raise _DiffersError(f"{when} changed nothing")
@@ -275,15 +275,15 @@ class _Player:
         proposal = Proposal(_action(action), checked_mask(guard.actions, mask))
         situation = guard.recognise(_floats(observation), _number(time))
         revision = guard.revise(situation, proposal)
-        told = decision_of(situation, proposal, revision)
-        return f"the decision at {situation.time:g} s", told, is_spoken(guard.reviser, revision)
+        entry = decision_of(situation, proposal, revision)
+        return f"the decision at {situation.time:g} s", entry, is_spoken(guard.reviser, revision)
 
     def _end(self, guard: Guard, content: Mapping[str, Any]) -> None:
         last = content["observation"]
         how = {name: content[name] for name in ("failed", "terminated")}
-        for name, said in how.items():
-            if not isinstance(said, bool):
-                raise ValueError(f"{name} is {said!r}")
+        for name, flag in how.items():
+            if not isinstance(flag, bool):
+                raise ValueError(f"{name} is {flag!r}")
         score = None if content["score"] is None else _number(content["score"])
         guard.end(observation=None if last is None else _floats(last), score=score, **how)
         self._is_under_way = False
