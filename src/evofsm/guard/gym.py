@@ -148,8 +148,8 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         penalty: float = 0.0,
     ) -> None:
         refuse_unless(isinstance(env, gymnasium.Env), env)
-        given = {"guard": guard, "observe": observe, "failed": failed, "penalty": penalty}
-        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **given)  # for `spec`
+        arguments = {"guard": guard, "observe": observe, "failed": failed, "penalty": penalty}
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **arguments)  # for `spec`
         gymnasium.Wrapper.__init__(self, env)
         self.guard, self.failed = guard, failed
         terms = Terms(guard, *_spaces(env), observe, failed, penalty)
@@ -173,14 +173,14 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Execute the guard's revision of ``action``."""
-        was_open, decided = self._lane.is_open, self._lane.decide(action)
-        observation, reward, terminated, truncated, info = self.env.step(decided.executed)
+        was_open, decision = self._lane.is_open, self._lane.decide(action)
+        observation, reward, terminated, truncated, info = self.env.step(decision.executed)
         ends = bool(terminated), bool(truncated)
         self._lane.follow(StepResult(observation, reward, *ends, info))
         if self._lane.is_open and not was_open and not self._resets_itself:
             self._resets_itself = True
             warnings.warn(_BY_ITSELF, stacklevel=2)
-        return observation, decided.paid(reward), terminated, truncated, {**info, **decided.info}
+        return observation, decision.paid(reward), terminated, truncated, {**info, **decision.info}
 
 
 class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
@@ -268,20 +268,20 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Execute the guard's revision of each environment's action."""
-        proposed = iterate(self.action_space, actions)
+        rows = iterate(self.action_space, actions)
         were_open = [lane.is_open for lane in self._lanes]
-        decided = [lane.decide(action) for lane, action in zip(self._lanes, proposed, strict=True)]
+        decisions = [lane.decide(action) for lane, action in zip(self._lanes, rows, strict=True)]
         space = self.single_action_space
-        into: Any = create_empty_array(space, self.num_envs)
-        executed = concatenate(space, [decision.executed for decision in decided], into)
+        buffer: Any = create_empty_array(space, self.num_envs)
+        executed = concatenate(space, [decision.executed for decision in decisions], buffer)
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         self._learn(observations, rewards, terminated, truncated, infos)
-        if any(decision.cost for decision in decided):
+        if any(decision.cost for decision in decisions):
             shape = (-1,) + (1,) * (np.ndim(rewards) - 1)
-            rewards = rewards - np.reshape([decision.cost for decision in decided], shape)
+            rewards = rewards - np.reshape([decision.cost for decision in decisions], shape)
         for name in _RISK_INFOS:
             infos |= {name: np.zeros(self.num_envs), f"_{name}": np.zeros(self.num_envs, bool)}
-        for k, (decision, was_open) in enumerate(zip(decided, were_open, strict=True)):
+        for k, (decision, was_open) in enumerate(zip(decisions, were_open, strict=True)):
             infos = self._add_info(infos, decision.info, k)
             if not was_open:
                 for name in decision.info:
@@ -298,18 +298,18 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 def _of_one(infos: Mapping[str, Any], k: int, count: int) -> dict[str, Any]:
-    found = {}
+    info = {}
     for name, value in infos.items():
         if (name[:1] == "_" and name[1:] in infos) or (
             f"_{name}" in infos and not infos[f"_{name}"][k]
         ):
             continue
         if isinstance(value, dict):
-            found[name] = _of_one(value, k, count)
+            info[name] = _of_one(value, k, count)
         else:
             many = len(value) if isinstance(value, list | tuple) else (*np.shape(value), 0)[0]
-            found[name] = value[k] if many == count else value
-    return found
+            info[name] = value[k] if many == count else value
+    return info
 
 
 # -- One environment's episodes under a guard ---------------------------------------------------
@@ -360,8 +360,8 @@ class Lane:
         terms, proposal = self.terms, Proposal(self.terms.to_guard(action), self._mask)
         if not self.is_open:
             terms.say_if_silent("no episode was under way: call reset()")
-            unjudged = terms.decided(action, terms.unjudged(proposal))
-            return unjudged._replace(executed=action, cost=0.0)
+            decision = terms.decided(action, terms.unjudged(proposal))
+            return decision._replace(executed=action, cost=0.0)
         if self._seen is None:
             terms.say_if_silent("observe returned None: there was nothing to judge", ever=False)
             self.revision = terms.unjudged(proposal)
@@ -389,30 +389,30 @@ class Lane:
                     )
                 lane._guard = None if lane._guard is guard else lane._guard
                 _SHARED.add(guard)
-        shared = guard.audit is None and (self._shared or guard in _SHARED)
-        decider = guard.copy() if shared else guard
+        is_shared = guard.audit is None and (self._shared or guard in _SHARED)
+        decider = guard.copy() if is_shared else guard
         self._episode = decider.begin()
         return decider
 
     def follow(self, step: StepResult, *, resets: bool = False) -> None:
         """What followed in the environment; ``resets`` says that what ends begins anew with it."""
-        over, now = step.terminated or step.truncated, step
+        is_over, now = step.terminated or step.truncated, step
         if not self.is_open:
-            if not over:  # it began the next episode by itself
+            if not is_over:  # it began the next episode by itself
                 self.begin(now.observation, now.info)
             return
         last = [step.info[name] for name in _LAST if name in step.info]
-        resets = over and (resets or bool(last))
+        resets = is_over and (resets or bool(last))
         if resets:
             info = step.info.get("final_info", step.info)
             step = replace(step, observation=last[0] if last else None, info=info)
         failed = self.terms.failed(step)
         self._score += np.sum(step.reward)
         self._look(step.observation, step.info)
-        if failed or over or self._seen is None:
-            score = float(self._score) if over and np.isfinite(self._score) else None
+        if failed or is_over or self._seen is None:
+            score = float(self._score) if is_over and np.isfinite(self._score) else None
             self.end(failed=failed, terminated=step.terminated, score=score)
-        self.is_open = not over
+        self.is_open = not is_over
         if resets:
             self.begin(now.observation, now.info)
 
@@ -421,8 +421,8 @@ class Lane:
         decider, guard = self._guard, self.terms.guard
         if decider is not None and decider is not guard and guard.learn:
             self._episode = guard.begin(decider)
-            for step, (seen, proposal, executed) in enumerate(self._past):
-                situation = guard.recognise(seen, step * guard.interval)
+            for step, (observation, proposal, executed) in enumerate(self._past):
+                situation = guard.recognise(observation, step * guard.interval)
                 guard.take_in(situation, proposal, executed)
         if decider is guard or (decider is not None and guard.learn):
             episode = self._episode
@@ -456,9 +456,9 @@ class Terms:
     ) -> None:
         if not 0.0 <= penalty < math.inf:
             raise ValueError(f"penalty is {penalty}; it must be 0 or above, and finite")
-        for name, given in (("observe", observe), ("failed", failed)):
-            if not (given is None or callable(given) or (name, given) == ("failed", "terminated")):
-                raise TypeError(f"{name} is {given!r}; it must be a function of a{_SUCH_AS[name]}")
+        for name, term in (("observe", observe), ("failed", failed)):
+            if not (term is None or callable(term) or (name, term) == ("failed", "terminated")):
+                raise TypeError(f"{name} is {term!r}; it must be a function of a{_SUCH_AS[name]}")
         self.guard = guard
         self.penalty = penalty
         self._silent, self._has_decided = 0, False
@@ -471,20 +471,20 @@ class Terms:
         With ``ever`` false only as long as nothing was ever decided.
         """
         self._has_decided |= not why
-        told = why and (ever or not self._has_decided)
-        self._silent = self._silent + 1 if told else 0
+        is_silent = why and (ever or not self._has_decided)
+        self._silent = self._silent + 1 if is_silent else 0
         if self._silent == _SILENT:
             warnings.warn(f"nothing was decided in {_SILENT} steps on end: {why}", stacklevel=4)
 
     def unjudged(self, proposal: Proposal) -> Revision:
         """The proposal, made usable, where there is nothing to judge."""
-        wanted, remark = make_usable(proposal, self.guard.actions, self.guard.fallback)
-        return unjudged_revision(wanted, proposal, f"nothing is ahead; {remark or 'not revised'}")
+        action, remark = make_usable(proposal, self.guard.actions, self.guard.fallback)
+        return unjudged_revision(action, proposal, f"nothing is ahead; {remark or 'not revised'}")
 
     def decided(self, action: Any, revision: Revision) -> Decided:
         """What is executed, as the environment takes it: the very action where it is kept."""
-        kept = same_action(revision.executed, revision.proposed)
-        executed = action if kept else self._to_env(revision.executed)
+        is_kept = same_action(revision.executed, revision.proposed)
+        executed = action if is_kept else self._to_env(revision.executed)
         actions, size = self.guard.actions, 1.0
         if is_usable(actions, revision.proposed):
             size = change(actions, put_into(actions, revision.proposed), revision.executed)
@@ -503,27 +503,27 @@ class Terms:
         if self._failed is None or isinstance(self._failed, str):
             return step.terminated and (self._failed is not None or self.guard.failed is None)
         try:
-            found = self._failed(step)
+            reply = self._failed(step)
         except (AttributeError, KeyError, TypeError) as error:
             error.add_note(f"failed was called with a{_SUCH_AS['failed']}")
             raise
-        if np.size(found) != 1 or np.asarray(found).dtype.kind not in "biu":
-            raise TypeError(f"failed returned {found!r}; it must be True or False")
-        return bool(found)
+        if np.size(reply) != 1 or np.asarray(reply).dtype.kind not in "biu":
+            raise TypeError(f"failed returned {reply!r}; it must be True or False")
+        return bool(reply)
 
     def look(self, observation: Any) -> _Seen:
         """What the guard observes; None where there is nothing to judge."""
-        given = None if observation is None else self._observe(observation)
-        if given is None:
+        reply = None if observation is None else self._observe(observation)
+        if reply is None:
             return None
-        seen, names = np.array(given, dtype=np.float64), self.guard.variables
-        if seen.ndim != 1 or len(seen) != (len(names) or len(seen)) or np.isinf(seen).any():
+        vector, names = np.array(reply, dtype=np.float64), self.guard.variables
+        if vector.ndim != 1 or len(vector) != (len(names) or len(vector)) or np.isinf(vector).any():
             form = f"{' and '.join(names)}, {len(names)} finite numbers" if names else "finite"
             raise ValueError(
-                f"observe returned {given}; it must be {form}, with NaN for what was not observed, "
+                f"observe returned {reply}; it must be {form}, with NaN for what was not observed, "
                 "or None where there is nothing to judge"
             )
-        return seen
+        return vector
 
 
 def _flat(space: Space[Any]) -> Observe:
@@ -553,8 +553,8 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
         first = int(space.start)
         return lambda action: float(action) - first, lambda action: first + int(action)
     shape = actions.half.shape if isinstance(actions, BoxActions) else ()
-    numbers = not isinstance(actions, Choices)
-    if not (isinstance(space, Box) and numbers and math.prod(space.shape) == math.prod(shape)):
+    is_range = not isinstance(actions, Choices)
+    if not (isinstance(space, Box) and is_range and math.prod(space.shape) == math.prod(shape)):
         raise ValueError(
             f"the environment's actions are {space}, but the guard's are {actions}: make a guard "
             "of such actions, n_actions of Discrete and arrays low and high of Box, or wrap the "
@@ -571,12 +571,12 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
         )
 
     def to_guard(action: Any) -> Action:
-        wanted = np.array(action, dtype=np.float64).reshape(shape)
-        return wanted if shape else float(wanted)
+        array = np.array(action, dtype=np.float64).reshape(shape)
+        return array if shape else float(array)
 
     def to_env(action: Action) -> NDArray[Any]:
-        again = np.asarray(action).reshape(space.shape).astype(space.dtype)
-        return np.asarray(np.clip(again, space.low, space.high))
+        array = np.asarray(action).reshape(space.shape).astype(space.dtype)
+        return np.asarray(np.clip(array, space.low, space.high))
 
     return to_guard, to_env
 

@@ -80,27 +80,27 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
 
     def step(self, actions: _Each) -> tuple[_Each, _Each, _Each, _Each, _Each]:
         """Execute the guard's revision of each agent's action."""
-        decided = {agent: self._enter(agent).decide(action) for agent, action in actions.items()}
-        executed = {agent: decision.executed for agent, decision in decided.items()}
+        decisions = {agent: self._enter(agent).decide(action) for agent, action in actions.items()}
+        executed = {agent: decision.executed for agent, decision in decisions.items()}
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         infos, rewards = dict(infos), dict(rewards)
         alive = {*self.env.agents}
         for agent, lane in self._lanes.items():
             if not lane.is_open:
                 continue
-            over, left = bool(terminated.get(agent)), agent not in alive
-            ends = over, bool(truncated.get(agent)) or (left and not over)
+            is_over, has_left = bool(terminated.get(agent)), agent not in alive
+            ends = is_over, bool(truncated.get(agent)) or (has_left and not is_over)
             info = infos.get(agent, {})
-            seen, reward = observations.get(agent), rewards.get(agent, math.nan)
-            lane.follow(StepResult(seen, reward, *ends, info))
-            if agent not in decided:  # what it does now follows from no action of before
+            row, reward = observations.get(agent), rewards.get(agent, math.nan)
+            lane.follow(StepResult(row, reward, *ends, info))
+            if agent not in decisions:  # what it does now follows from no action of before
                 lane.end(failed=False)
-        for agent, decision in decided.items():
+        for agent, decision in decisions.items():
             if agent in rewards:
                 rewards[agent] = decision.paid(rewards[agent])
             if agent in infos or agent in terminated:
                 infos[agent] = {**infos.get(agent, {}), **decision.info}
-        here = {agent: seen for agent, seen in observations.items() if agent in self.env.agents}
+        here = {agent: row for agent, row in observations.items() if agent in self.env.agents}
         self._begin(here, infos)
         return observations, rewards, terminated, truncated, infos
 
