@@ -80,13 +80,13 @@ class _Channels:
             message = {field_of(topic, name): get(decision) for name, get in read.items()}
             message |= {"belief": belief} if topic == "/belief" else {}
             self._send(topic, situation.time, message)
-        changed = not same_action(revision.executed, revision.proposed)
-        if changed or not same_action(revision.advised, revision.executed):
-            done = "executed" if changed else "would advise"
-            instead = revision.executed if changed else revision.advised
+        is_changed = not same_action(revision.executed, revision.proposed)
+        if is_changed or not same_action(revision.advised, revision.executed):
+            verb = "executed" if is_changed else "would advise"
+            instead = revision.executed if is_changed else revision.advised
             unit = " m/s²" if self.is_of_cars else ""
-            text = f"proposed {_shown(revision.proposed)}, {done} {_shown(instead)}{unit}"
-            level = LogLevel.Warning if changed else LogLevel.Info
+            text = f"proposed {_shown(revision.proposed)}, {verb} {_shown(instead)}{unit}"
+            level = LogLevel.Warning if is_changed else LogLevel.Info
             self.note(level, situation.time, f"{text}: {revision.reason}")
 
     def note(self, level: LogLevel, at: float, text: str) -> None:
@@ -104,8 +104,8 @@ class _Channels:
         self.episode += 1
 
     def _send(self, topic: str, at: float, message: Mapping[str, Any]) -> None:
-        known = {name: value for name, value in message.items() if _is_known(value)}
-        data = json.dumps(known, ensure_ascii=False, allow_nan=False).encode()
+        fields = {name: value for name, value in message.items() if _is_known(value)}
+        data = json.dumps(fields, ensure_ascii=False, allow_nan=False).encode()
         self._channels[topic].log(data, log_time=self.begin + round(at * _SECOND))
         if self.file is not None and self.file.error is not None:
             raise self.file.error
@@ -210,20 +210,20 @@ class RunWriter:
     def __init__(self, file: BinaryIO, about: Mapping[str, Any]) -> None:
         self._channels = _Channels(VARIABLES, ())
         self._file = _File(file, self._channels, PROFILE)
-        told = {"library": f"evofsm {__version__}", **about, "format": FORMAT}
-        texts = {name: x if isinstance(x, str) else json.dumps(x) for name, x in told.items()}
+        facts = {"library": f"evofsm {__version__}", **about, "format": FORMAT}
+        texts = {name: x if isinstance(x, str) else json.dumps(x) for name, x in facts.items()}
         with self._file.explained():
             self._file.mcap.write_metadata(PROFILE, texts)
 
     def add(self, episode: Episode) -> None:
         """Write the next episode, with its decisions."""
-        channels, seen = self._channels, episode.observations
-        channels.event("episode started", float(episode.time[0]), seen[0])
+        channels, observations = self._channels, episode.observations
+        channels.event("episode started", float(episode.time[0]), observations[0])
         for decision in episode.decisions:
             channels.decision(decision)
-        told = {"collision": episode.collided, "rear-end collision": episode.rear_ended}
-        happened = [kind for kind, it_did in told.items() if it_did]
-        channels.end(float(episode.time[-1]), seen[-1], happened)
+        outcomes = {"collision": episode.collided, "rear-end collision": episode.rear_ended}
+        kinds = [kind for kind, it_did in outcomes.items() if it_did]
+        channels.end(float(episode.time[-1]), observations[-1], kinds)
 
     def attach(self, model: FSMModel) -> None:
         """Attach what was learnt."""
@@ -302,10 +302,10 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"]):
         self._open = ExitStack()
         if file is not None:
             try:
-                opened = self._open.enter_context(io.BufferedWriter(io.FileIO(file, "x")))
+                writer = self._open.enter_context(io.BufferedWriter(io.FileIO(file, "x")))
             except FileExistsError:
                 raise FileExistsError(f"{fspath(file)} exists; it was left alone") from None
-            self._open.callback(_File(opened, self._channels).close)
+            self._open.callback(_File(writer, self._channels).close)
         #: Where it is served; None without a port.
         self.address: str | None = None
         if port is not None:

@@ -75,8 +75,8 @@ def to_dot(
     <BLANKLINE>
     """
     _refuse_no_probability(least)
-    ended = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
-    marked = {check_index("state", state, model.n_states) for state in ended}
+    end_states = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
+    marked_states = {check_index("state", state, model.n_states) for state in end_states}
     lines = [_DOT_HEAD]
     most = model.visits.max(initial=0.0) or 1.0
     for state in range(model.n_states):
@@ -85,18 +85,18 @@ def to_dot(
         if ends := model.endings[state]:
             share = ends / model.endings.sum()
             texts.append(f"{counted(round(ends), 'failure')}, {share:.0%} of all")
-        if dead_ends is not None and state in marked:
+        if dead_ends is not None and state in marked_states:
             texts.append("dead end")
         label = r"\n".join(text.replace("\\", r"\\").replace('"', r"\"") for text in texts)
         width = 0.75 + _LARGEST_NODE * (model.visits[state] / most) ** 0.5
-        mark = _DOT_MARK if state in marked else ""
+        mark = _DOT_MARK if state in marked_states else ""
         lines.append(f'  s{state + 1} [label="{label}", width={width:.2f}{mark}];')
     matrix = model.averaged_matrix("observed")
-    drawn = (matrix >= least) & (model.changes >= evidence) & (matrix > 0.0)
-    for i, j in np.argwhere(drawn).tolist():
-        chance, seen = matrix[i, j], model.changes[i, j]
-        width, dashes = max(_WIDEST_LINE * chance, 0.3), "" if seen else ", style=dashed"
-        label = f'label="{chance:.3f} ({seen:,.0f})", penwidth={width:.2f}'
+    is_drawn = (matrix >= least) & (model.changes >= evidence) & (matrix > 0.0)
+    for i, j in np.argwhere(is_drawn).tolist():
+        chance, count = matrix[i, j], model.changes[i, j]
+        width, dashes = max(_WIDEST_LINE * chance, 0.3), "" if count else ", style=dashed"
+        label = f'label="{chance:.3f} ({count:,.0f})", penwidth={width:.2f}'
         lines.append(f"  s{i + 1} -> s{j + 1} [{label}{dashes}];")
     return "\n".join([*lines, "}", ""])
 
@@ -107,8 +107,8 @@ def _refuse_no_probability(least: float) -> None:
 
 
 def _where(model: FSMModel, state: int) -> list[str]:
-    nothing = ("",) * model.n_variables
-    variables = zip(model.names or nothing, model.units or nothing, strict=True)
+    blanks = ("",) * model.n_variables
+    variables = zip(model.names or blanks, model.units or blanks, strict=True)
     return [
         " ".join(part for part in (in_a_line(name), f"{value:.4g}", in_a_line(unit)) if part)
         for (name, unit), value in zip(variables, model.centers[state], strict=True)
@@ -195,13 +195,13 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
 
 
 def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> Iterator[str]:
-    tried = model.decisions > 0.0
-    few = tried & (model.decisions < evidence)
-    lost = model.decisions[few].sum() / model.decisions.sum()
+    is_tried = model.decisions > 0.0
+    few = is_tried & (model.decisions < evidence)
+    share = model.decisions[few].sum() / model.decisions.sum()
     yield f"// A machine of {model.n_states} states and {model.n_actions} actions, by evofsm."
     yield "// s=0 is failure, s=i the state #i. 'seen 0' is the prior alone, or what states share."
-    yield f"// Left out: {(~tried).sum():,} pairs of state and action that were never tried, and"
-    yield f"// {few.sum():,} that rest on fewer than {evidence:g} decisions ({lost:.2%} of all);"
+    yield f"// Left out: {(~is_tried).sum():,} pairs of state and action that were never tried, and"
+    yield f"// {few.sum():,} that rest on fewer than {evidence:g} decisions ({share:.2%} of all);"
     yield f"// transitions below {least:g}. States without any action, labelled unknown: {unknown}."
     if not model.failures.any():
         yield "// NO DECISION FAILED, or which did is not known: a probability of failure that is"
@@ -214,19 +214,19 @@ def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> Ite
 
 
 def _command(model: FSMModel, state: int, action: int, least: float) -> Iterator[str]:
-    decided, failed = model.decisions[action, state], model.failures[action, state]
+    decisions, failures = model.decisions[action, state], model.failures[action, state]
     row = model.transition_matrices[action, state]
     row = np.where(row >= min(least, row.max()), row, 0.0)
-    share = failed / decided
+    share = failures / decisions
     chances = np.concatenate([[share], (1.0 - share) * row / row.sum()])
     parts: list[int] = np.rint(chances * 10**_DECIMALS).astype(np.int64).tolist()
     parts[int(np.argmax(parts))] += 10**_DECIMALS - sum(parts)  # to the last digit
-    seen = [f"failed {failed:.4g}", *(f"seen {count:g}" for count in model.changes[state])]
-    used = f"a{action + 1} was used {model.uses[action]:,.0f} times"
-    yield f"  [a{action + 1}] s={state + 1} -> // {decided:.4g} decisions; {used}"
+    comments = [f"failed {failures:.4g}", *(f"seen {count:g}" for count in model.changes[state])]
+    usage = f"a{action + 1} was used {model.uses[action]:,.0f} times"
+    yield f"  [a{action + 1}] s={state + 1} -> // {decisions:.4g} decisions; {usage}"
     targets = np.flatnonzero(parts).tolist()
     for target in targets:
         part = parts[target]
         chance = "1" if part == 10**_DECIMALS else f"0.{part:0{_DECIMALS}d}"
         end = ";" if target == targets[-1] else " +"
-        yield f"    {chance}:(s'={target}){end} // {seen[target]}"
+        yield f"    {chance}:(s'={target}){end} // {comments[target]}"

@@ -174,23 +174,23 @@ class Noted:
             self.failed += len(chunk.failures)
             for row in np.intersect1d(chunk.failures, chunk.starts):
                 here = dict(zip(names, chunk.observations[row].tolist(), strict=True))
-                shared = self.at_once.items() & here.items() if self.failed_at_once else here
-                self.at_once, self.failed_at_once = dict(shared), self.failed_at_once + 1
+                constants = self.at_once.items() & here.items() if self.failed_at_once else here
+                self.at_once, self.failed_at_once = dict(constants), self.failed_at_once + 1
 
     def _compare_rates(self, chunk: Chunk, gap: int, follower: int, leader: int) -> None:
         """The gap changes as speeds differ, and the own speed as the action says."""
         within = np.diff(chunk.times) > 0.0
         within[chunk.starts[1:] - 1] = False
         steps = np.diff(chunk.times)[within]
-        seen, changed = chunk.observations, np.diff(chunk.observations, axis=0)[within]
-        closing = seen[:, leader] - seen[:, follower]
-        told = {
-            "gap": (changed[:, gap] / steps, 0.5 * (closing[1:] + closing[:-1])[within]),
-            "action": (changed[:, follower] / steps, chunk.actions[:-1][within]),
+        observations, changes = chunk.observations, np.diff(chunk.observations, axis=0)[within]
+        gap_rates = observations[:, leader] - observations[:, follower]
+        witnesses = {
+            "gap": (changes[:, gap] / steps, 0.5 * (gap_rates[1:] + gap_rates[:-1])[within]),
+            "action": (changes[:, follower] / steps, chunk.actions[:-1][within]),
         }
-        for kind, (shown, said) in told.items():
-            known = np.isfinite(said)
-            x, y = said[known], shown[known]
+        for kind, (slopes, reports) in witnesses.items():
+            is_known = np.isfinite(reports)
+            x, y = reports[is_known], slopes[is_known]
             if len(x) > _COMPARED and x.std() > 0.0 < y.std():
                 alike = float(np.corrcoef(x, y)[0, 1])
                 rate = alike * float(y.std() / x.std())
@@ -206,7 +206,7 @@ def units_of(units: Mapping[str, str], used: Sequence[str]) -> dict[str, str]:
 
     A name that is no column's is the beginning of all that it fits; the longest one counts.
     """
-    found: dict[str, str] = {}
+    column_units: dict[str, str] = {}
     for name in sorted(units, key=lambda name: (name in used, len(name))):
         fit = [name] if name in used else [column for column in used if column.startswith(name)]
         if not fit:
@@ -214,8 +214,8 @@ def units_of(units: Mapping[str, str], used: Sequence[str]) -> dict[str, str]:
                 f"--unit {name}={units[name]}: no column that is read is called so, or begins so; "
                 f"read are {', '.join(used)}"
             )
-        found |= dict.fromkeys(fit, units[name])
-    return found
+        column_units |= dict.fromkeys(fit, units[name])
+    return column_units
 
 
 class Term(NamedTuple):
@@ -230,16 +230,16 @@ class Term(NamedTuple):
         """From ``collided``, ``gap<=0`` or ``Status=='off'``; a ValueError if it is none."""
         name, rest = quoted_name(text)
         column, sign, value, *_ = *re.split("([<>]=?|[=!]=|=)", rest, maxsplit=1), "", ""
-        column, value, text_given = name + column.strip(), value.strip(), _IN_QUOTES.match(value)
+        column, value, quotation = name + column.strip(), value.strip(), _IN_QUOTES.match(value)
         sign = "==" if sign == "=" else sign
         if not column or bool(sign) != bool(value) or (not sign and _IN_QUOTES.match(column)):
             raise ValueError(text)
-        if sign and not text_given and is_number(value) and np.isfinite(float(value)):
+        if sign and not quotation and is_number(value) and np.isfinite(float(value)):
             return cls(column, sign, float(value))
-        is_odd = not text_given and (is_number(value) or re.search("[<>=]", value))
+        is_odd = not quotation and (is_number(value) or re.search("[<>=]", value))
         if sign[:1] in ("<", ">") or is_odd:
             raise ValueError(text)
-        return cls(column, sign, text_given[2] if text_given else value)
+        return cls(column, sign, quotation[2] if quotation else value)
 
     @property
     def of_number(self) -> bool:
@@ -444,22 +444,22 @@ def read_traces(
     """
     columns = columns or LogColumns()
     lengths = lengths or VehicleLengths()
-    noted = noted or Noted()
+    notes = noted or Noted()
     clock = _Clock(columns)
     for path in paths:
         clock.open(path)
-        rows, left_out = 0, noted.leaderless + noted.elsewhere
-        skips = Skips(columns.skip_bad, noted.skipped)
-        table = open_table(path, columns, lengths, on_read, topics, skips, noted.told)
-        used = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
-        chunks = _Reader(table, used, clock, noted).chunks()
-        if used.longest_hole:
-            chunks = _on_one_clock(chunks, used, noted)
+        rows, left_out = 0, notes.leaderless + notes.elsewhere
+        skips = Skips(columns.skip_bad, notes.skipped)
+        table = open_table(path, columns, lengths, on_read, topics, skips, notes.told)
+        file_columns = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
+        chunks = _Reader(table, file_columns, clock, notes).chunks()
+        if file_columns.longest_hole:
+            chunks = _on_one_clock(chunks, file_columns, notes)
         for chunk in chunks:
             rows += len(chunk.times)
-            noted.see(chunk, columns.observe.names, first=rows == len(chunk.times))
+            notes.see(chunk, columns.observe.names, first=rows == len(chunk.times))
             yield chunk
-        if rows == 0 and noted.leaderless + noted.elsewhere > left_out:
+        if rows == 0 and notes.leaderless + notes.elsewhere > left_out:
             meets = f", and --where {columns.where} must hold" if columns.where else ""
             names = ", ".join(columns.observe.names)
             raise ValueError(f"{path}: no row is left; {names} must all be there{meets}")
@@ -468,7 +468,7 @@ def read_traces(
     lengths.refuse_unknown()
     for kind, times in lengths.overlaps.most_common(1):
         length, width = lengths.size_of(kind)
-        noted.told.append(
+        notes.told.append(
             f"{times:,} times a vehicle overlaps another one that is not in line with it (type "
             f"{kind!r}): is it narrower than {width:g} m? --vehicle-length "
             f"{quote(f'{kind}={length:g}x0.8')} says its length and width"
@@ -546,8 +546,8 @@ def _joined(parts: Sequence[Chunk]) -> Chunk:
     before = np.cumsum([0, *(len(part.times) for part in parts[:-1])])
 
     def joined(name: str, rows: int = 0) -> NDArray[Any]:
-        found = zip(parts, rows * before, strict=True)
-        return np.concatenate([getattr(part, name) + first for part, first in found])
+        pairs = zip(parts, rows * before, strict=True)
+        return np.concatenate([getattr(part, name) + first for part, first in pairs])
 
     return parts[-1]._replace(
         source=parts[0].source,
@@ -570,10 +570,10 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
     import polars
 
     step = columns.resample and columns.resample.step
-    ways = columns.resample.how if columns.resample else {}
+    methods = columns.resample.how if columns.resample else {}
     variables, names = columns.observe.variables, columns.observe.names
-    hows = [ways.get(name, "mean") if name in variables else "last" for name in names]
-    hows.append(ways.get(columns.action, "mean"))
+    hows = [methods.get(name, "mean") if name in variables else "last" for name in names]
+    hows.append(methods.get(columns.action, "mean"))
     remainder: Chunk | None = None
     for chunk in chain(chunks, [None]):
         parts = [part for part in (remainder, chunk) if part is not None]
@@ -598,27 +598,27 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
         if step:
             is_whole[:-1] = ~fails[first[1:]] | (np.diff(places[first]) > 0.0)
             is_whole[starts[starts > 0] - 1] = True
-        *seen, actions = rows.to_numpy()[is_whole].T.copy()
+        *observations, actions = rows.to_numpy()[is_whole].T.copy()
         keeps = int(is_whole.sum()) - (chunk is not None and not fails[-1])
         last, first = first[-1], first[is_whole]
         starts = np.searchsorted(first, whole.starts)
         steps = np.diff(places[first])
-        lost = (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
-        lost[starts[starts > 0] - 1] = False
-        actions[:-1][lost] = np.nan
-        made = whole._replace(
-            observations=np.column_stack(seen),
+        holes = (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
+        holes[starts[starts > 0] - 1] = False
+        actions[:-1][holes] = np.nan
+        step_rows = whole._replace(
+            observations=np.column_stack(observations),
             actions=actions,
             times=times[first],
             starts=starts,
             failures=None if whole.failures is None else np.flatnonzero(fails[first]),
         )
-        noted.crossed += int(lost[:keeps].sum())
+        noted.crossed += int(holes[:keeps].sum())
         remainder = None
         if keeps < len(first):
             remainder = whole.rows(int(last), len(fails))._replace(jumps=0)
         if keeps:
-            yield made.rows(0, keeps)
+            yield step_rows.rows(0, keeps)
 
 
 def open_table(
@@ -655,8 +655,8 @@ def open_table(
         moments = vehicles.pairs_of_fcd(path, steps, lengths, skips)
     if moments is not None:
         return PairTable(path, moments, skips)
-    asked = {*columns.observe.names, columns.action, columns.time}
-    names = asked.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
+    log_names = {*columns.observe.names, columns.action, columns.time}
+    names = log_names.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
     table: Table = (
         CsvTable(path, on_read, names, skips)
         if kind == "csv"
@@ -675,21 +675,21 @@ def open_table(
 
 def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
     """What is read of a recording of many vehicles; what else was asked for is refused."""
-    asked = [f"--observe {name}" for name in columns.observe.names if name not in VARIABLES]
-    asked += [f"--action {columns.action}"] if columns.action != ACTION else []
+    options = [f"--observe {name}" for name in columns.observe.names if name not in VARIABLES]
+    options += [f"--action {columns.action}"] if columns.action != ACTION else []
     names = "episode", "dt", "hold", "where", "hole", "resample"
-    asked += [f"--{name}" for name in names if getattr(columns, name) is not None]
-    asked += ["--unit"] * bool(columns.units)
+    options += [f"--{name}" for name in names if getattr(columns, name) is not None]
+    options += ["--unit"] * bool(columns.units)
     if columns.no_leader not in (None, "end"):  # who has none is no pair
-        asked += [f"--no-leader {columns.no_leader}"]
+        options += [f"--no-leader {columns.no_leader}"]
     terms = [] if columns.failed is None else Condition.parse(columns.failed).terms
     if not all(term.of_number and term.column in (*VARIABLES, ACTION) for term in terms):
-        asked += [f"--failed {columns.failed} (but with 'gap<=0')"]
-    if asked:
+        options += [f"--failed {columns.failed} (but with 'gap<=0')"]
+    if options:
         raise ValueError(
             f"{path} holds many vehicles (FCD of SUMO, objects, OSI), with a clock and episodes of "
             f"their own; it gives {', '.join(VARIABLES)} and the action {ACTION}, and cannot be "
-            f"read with {', '.join(asked)}"
+            f"read with {', '.join(options)}"
         )
     return replace(columns, time="time", no_leader=None)
 
@@ -778,9 +778,9 @@ class _Reader:
         self._observed = [v for v in self._variables if isinstance(v, str)]
         usual = [name for name in USUAL_EPISODE if name in table.columns]
         self._episode = usual if columns.episode is None else list(columns.episode)
-        told = {"--failed": columns.failed, "--where": columns.where}
-        told |= {} if columns.no_leader == "end" else {"--no-leader": columns.no_leader}
-        self._conditions = {o: Condition.parse(t, o) for o, t in told.items() if t is not None}
+        texts = {"--failed": columns.failed, "--where": columns.where}
+        texts |= {} if columns.no_leader == "end" else {"--no-leader": columns.no_leader}
+        self._conditions = {o: Condition.parse(t, o) for o, t in texts.items() if t is not None}
         self._failed = self._conditions.get("--failed")
         self._before = 0  # rows
         self._first_date = np.nan
@@ -798,16 +798,16 @@ class _Reader:
 
     def chunks(self) -> Iterator[Chunk]:
         action, clock = self._columns.action, self._clock
-        wanted, factors = self._wanted()
-        waiting: Chunk | None = None  # until it is known whether its last row failed
-        for piece in filter(attrgetter("rows"), self._table.pieces(wanted)):
+        request, factors = self._wanted()
+        last_chunk: Chunk | None = None  # until it is known whether its last row failed
+        for piece in filter(attrgetter("rows"), self._table.pieces(request)):
             for name, factor in factors.items():
                 piece.numbers[name] = piece.numbers[name] * factor
-            if clock.ticks and not wanted.dates:
+            if clock.ticks and not request.dates:
                 piece.leave_out_unusable(self._columns.time)
-            times = self._times(piece, is_date=bool(wanted.dates))
-            if clock.ticks and (filled := self._fill(piece, times)) is not None:
-                piece, times = piece.take(filled), times[filled]
+            times = self._times(piece, is_date=bool(request.dates))
+            if clock.ticks and (action_rows := self._fill(piece, times)) is not None:
+                piece, times = piece.take(action_rows), times[action_rows]
             if not piece.rows:
                 continue
             starts = self._starts(piece)
@@ -819,18 +819,18 @@ class _Reader:
             starts |= holes
             self._before += piece.rows
             observations = np.column_stack([_encoded(piece, v) for v in self._variables])
-            kept, fails = self._sift(piece, anew, starts, late)
-            if self._failed_before and waiting is not None and waiting.failures is not None:
-                last = len(waiting.times) - 1
-                waiting = waiting._replace(failures=np.append(waiting.failures, last))
-            if not kept.any():
+            is_kept, fails = self._sift(piece, anew, starts, late)
+            if self._failed_before and last_chunk is not None and last_chunk.failures is not None:
+                last = len(last_chunk.times) - 1
+                last_chunk = last_chunk._replace(failures=np.append(last_chunk.failures, last))
+            if not is_kept.any():
                 continue
-            if waiting is not None:
-                yield waiting
-            begun = np.flatnonzero(starts & kept)
-            episodes = np.searchsorted(piece.starts or (), begun, "right") - 1
-            rows = slice(None) if kept.all() else kept  # a slice copies nothing
-            waiting = Chunk(
+            if last_chunk is not None:
+                yield last_chunk
+            first_rows = np.flatnonzero(starts & is_kept)
+            episodes = np.searchsorted(piece.starts or (), first_rows, "right") - 1
+            rows = slice(None) if is_kept.all() else is_kept  # a slice copies nothing
+            last_chunk = Chunk(
                 source=self._table.path,
                 observations=observations[rows],
                 actions=piece.numbers[action][rows],
@@ -841,8 +841,8 @@ class _Reader:
                 failures=None if self._failed is None else np.flatnonzero(fails[rows]),
                 names=[piece.names[k] for k in episodes] if piece.names else (),
             )
-        if waiting is not None:
-            yield waiting
+        if last_chunk is not None:
+            yield last_chunk
 
     def _fill(self, piece: Piece, times: NDArray[np.float64]) -> NDArray[np.int64] | None:
         """Fill in the latest values of each signal, and say which rows count: those with an action.
@@ -852,7 +852,7 @@ class _Reader:
         there = {name: np.isfinite(values) for name, values in piece.numbers.items()}
         if self._hold is None:
             is_whole = np.logical_and.reduce(list(there.values())).any()
-            is_joined = not is_whole and all(seen.sum() > _FEWEST_VALUES for seen in there.values())
+            is_joined = not is_whole and all(mask.sum() > _FEWEST_VALUES for mask in there.values())
             self._hold = OLDEST if is_joined else 0.0
             if self._hold:
                 self._noted.told.append(
@@ -872,8 +872,8 @@ class _Reader:
             too_old = age > self._hold * (1.0 + 1e-9)
             piece.numbers[name] = np.where(too_old, np.nan, values[latest[1:]])
         for name, texts in piece.texts.items():
-            filled = texts.replace("", None).forward_fill()
-            piece.texts[name] = filled.fill_null(self._held_texts.get(name, ""))
+            series = texts.replace("", None).forward_fill()
+            piece.texts[name] = series.fill_null(self._held_texts.get(name, ""))
             self._held_texts[name] = piece.texts[name][-1]
         return np.flatnonzero(there[self._columns.action])
 
@@ -886,8 +886,8 @@ class _Reader:
             is_one = columns.time in table.columns
             clock = [columns.time] if is_one else columns.time.split(",")
         terms = [term for condition in self._conditions.values() for term in condition.terms]
-        compared = [term.column for term in terms if term.of_number]
-        told = [term.column for term in terms if not term.of_number]
+        term_numbers = [term.column for term in terms if term.of_number]
+        term_texts = [term.column for term in terms if not term.of_number]
         categories = [v.name for v in self._variables if isinstance(v, Category)]
         options = {
             **{t.column: option for option, c in self._conditions.items() for t in c.terms},
@@ -898,24 +898,24 @@ class _Reader:
         options.setdefault(columns.action, "--action")  # one that is observed, where nobody acts
         for name, option in options.items():
             if name not in table.columns:
-                shown = ", ".join(name[:40] for name in table.columns[:20])
+                names = ", ".join(name[:40] for name in table.columns[:20])
                 more = f" and {len(table.columns) - 20:,} more" if len(table.columns) > 20 else ""
                 how = ", and --dt stands in for a clock" if option == "--time" else ""
                 if commas := [title for title in table.columns if "," in title and name in title]:
                     how = f"; a name with a comma stands in double quotes: '\"{commas[0]}\"'"
                 raise ValueError(
-                    f"{table.path} has no column {name!r}; it has {shown}{more} ({option} names "
+                    f"{table.path} has no column {name!r}; it has {names}{more} ({option} names "
                     f"the right one{how})"
                 )
         form = columns.units.get(columns.time, "")
         form = form if "%" in form else ""
         is_dated = clock and (form or is_date(" ".join(map(table.first, clock))))
-        numbers = [*learnt, *compared, *([] if is_dated else clock)]
+        numbers = [*learnt, *term_numbers, *([] if is_dated else clock)]
         try:
-            given = {name: unit for name in numbers if (unit := table.units.get(name))}
+            column_units = {name: unit for name in numbers if (unit := table.units.get(name))}
             units = {name: unit for name, unit in columns.units.items() if unit != form}
-            given |= units_of(units, numbers)
-            for name, unit in given.items():
+            column_units |= units_of(units, numbers)
+            for name, unit in column_units.items():
                 if unit in UNITS and (unit in TIMES) != (name == columns.time):
                     raise ValueError(
                         f"column {name!r} has the unit {unit}; the column of the time needs a unit "
@@ -923,13 +923,13 @@ class _Reader:
                     )
         except ValueError as error:
             raise ValueError(f"{table.path}: {error}") from None
-        self._noted.units |= given
-        self._noted.untold += [name for name in numbers if name not in given]
+        self._noted.units |= column_units
+        self._noted.untold += [name for name in numbers if name not in column_units]
         if not clock and is_number(table.first(columns.time)):
             numbers.append(columns.time)  # to be compared with --dt
-        texts = [*self._episode, *categories, *told]
-        wanted = Wanted(numbers, texts, clock if is_dated else (), form)
-        return wanted, {name: UNITS[unit] for name, unit in given.items() if unit in UNITS}
+        texts = [*self._episode, *categories, *term_texts]
+        request = Wanted(numbers, texts, clock if is_dated else (), form)
+        return request, {name: UNITS[unit] for name, unit in column_units.items() if unit in UNITS}
 
     def _times(self, piece: Piece, *, is_date: bool) -> NDArray[np.float64]:
         if not self._clock.ticks:
@@ -994,32 +994,32 @@ class _Reader:
         """
         columns, failed = self._columns, self._failed
         action = columns.action
-        lacking, nobody, elsewhere, still = np.zeros((4, piece.rows), np.bool_)
+        is_incomplete, nobody, elsewhere, still = np.zeros((4, piece.rows), np.bool_)
         if columns.no_leader or columns.resample or self._hold:
             for name in self._observed:
-                lacking |= ~np.isfinite(piece.numbers[name])
+                is_incomplete |= ~np.isfinite(piece.numbers[name])
         if "--no-leader" in self._conditions:
             nobody = self._conditions["--no-leader"].holds(piece)
         if "--where" in self._conditions:
             elsewhere = ~self._conditions["--where"].holds(piece)
-        lacking |= nobody
-        gone = lacking | elsewhere
+        is_incomplete |= nobody
+        is_left_out = is_incomplete | elsewhere
         cars = VARIABLES if self._observed == [*VARIABLES] else ()
         for name in self._observed:
-            piece.leave_out_unusable(name, ~gone, _NO_LEADER)
+            piece.leave_out_unusable(name, ~is_left_out, _NO_LEADER)
         for name, span in zip(cars, RANGES, strict=False):
             why = f"{_NO_CAR}it lies between {span[0]:g} and {span[1]:g}"
-            piece.leave_out_unusable(name, ~gone, "", span, why)
+            piece.leave_out_unusable(name, ~is_left_out, "", span, why)
         unknown = np.isnan(piece.numbers[action])
-        piece.leave_out_unusable(action, ~gone & ~unknown)
+        piece.leave_out_unusable(action, ~is_left_out & ~unknown)
         if not (self._table.derives or columns.resample):
-            self._count_unknown(piece, unknown & ~gone, starts)
+            self._count_unknown(piece, unknown & ~is_left_out, starts)
         for term in failed.terms if failed else ():
             if term.of_number and term.column not in self._observed:
-                piece.leave_out(term.column, np.isnan(piece.numbers[term.column]) & ~gone)
+                piece.leave_out(term.column, np.isnan(piece.numbers[term.column]) & ~is_left_out)
         fails = np.zeros(piece.rows, np.bool_)
         holds = fails if failed is None else failed.holds(piece) & ~nobody
-        kept = ~(gone | piece.bad | late)
+        is_kept = ~(is_left_out | piece.bad | late)
         self._failed_before = False
         if failed:
             for row in np.flatnonzero(late)[::-1]:  # whose time the row before has
@@ -1032,34 +1032,34 @@ class _Reader:
             self._held = bool(holds[-1])
             fails, still = holds & ~before, holds & before
             # What fails as it is left out is the end of the episode before.
-            ended = fails & ~kept & ~starts & np.append(self._kept, kept[:-1])
-            still |= ended  # it is over
-            self._noted.unplaced += int((fails & ~kept & ~ended).sum())
-            self._noted.after_failure += int((still & kept).sum())
-            self._failed_before = bool(ended[0])
-            fails = (fails & kept) | np.append(ended[1:], False)
-            kept &= ~still
-        self._noted.elsewhere += int((elsewhere & ~lacking).sum())
-        self._noted.leaderless += int(lacking.sum())
+            prior_ends = fails & ~is_kept & ~starts & np.append(self._kept, is_kept[:-1])
+            still |= prior_ends  # it is over
+            self._noted.unplaced += int((fails & ~is_kept & ~prior_ends).sum())
+            self._noted.after_failure += int((still & is_kept).sum())
+            self._failed_before = bool(prior_ends[0])
+            fails = (fails & is_kept) | np.append(prior_ends[1:], False)
+            is_kept &= ~still
+        self._noted.elsewhere += int((elsewhere & ~is_incomplete).sum())
+        self._noted.leaderless += int(is_incomplete.sum())
         if columns.no_leader or not columns.longest_hole:
-            elsewhere |= lacking
+            elsewhere |= is_incomplete
         if not columns.longest_hole:
             elsewhere |= piece.bad
         ends = (fails | still | elsewhere) & ~late
         starts |= np.append(self._ended, ends[:-1])
-        self._ended, self._kept = bool(ends[-1]), bool(kept[-1])
-        return kept, fails
+        self._ended, self._kept = bool(ends[-1]), bool(is_kept[-1])
+        return is_kept, fails
 
     def _note_compared(self, piece: Piece, failed: Condition) -> None:
         """What stands in the columns that tell of failures, should no row meet what is asked."""
         for term in failed.terms:
-            seen: list[Any] = self._noted.compared.setdefault(term.column, [])
+            entries: list[Any] = self._noted.compared.setdefault(term.column, [])
             if term.of_number:
                 values = piece.numbers[term.column]
-                values = np.append(seen, values[np.isfinite(values)])
-                seen[:] = [values.min(), values.max()] if len(values) else []
+                values = np.append(entries, values[np.isfinite(values)])
+                entries[:] = [values.min(), values.max()] if len(values) else []
             elif term.sign:
-                seen[:] = sorted({*seen, *piece.texts[term.column].unique()})[:_MANY_TEXTS]
+                entries[:] = sorted({*entries, *piece.texts[term.column].unique()})[:_MANY_TEXTS]
 
     def _count_unknown(
         self, piece: Piece, unknown: NDArray[np.bool_], starts: NDArray[np.bool_]
@@ -1067,10 +1067,10 @@ class _Reader:
         """Count rows without an action, but the last ones of episodes, which need none."""
         if self._unknown is not None and not starts[0]:
             piece.skips.leave_out("action", self._unknown)
-        told = partial(piece.told, name=self._columns.action, hint=_NO_ACTION)
+        message = partial(piece.told, name=self._columns.action, hint=_NO_ACTION)
         for row in np.flatnonzero(unknown[:-1] & ~starts[1:]).tolist():
-            piece.skips.leave_out("action", partial(told, row))
-        self._unknown = partial(told, piece.rows - 1) if unknown[-1] else None
+            piece.skips.leave_out("action", partial(message, row))
+        self._unknown = partial(message, piece.rows - 1) if unknown[-1] else None
 
 
 def _encoded(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
@@ -1079,8 +1079,8 @@ def _encoded(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
     encoder = ObservationEncoder(variable)
     codes = np.array([encoder.encode({variable.name: value}) for value in variable.values])
     places = {value: place for place, value in enumerate(variable.values)}
-    found = piece.texts[variable.name].replace_strict(places, default=-1).to_numpy()
-    if (found < 0).any():
+    indices = piece.texts[variable.name].replace_strict(places, default=-1).to_numpy()
+    if (indices < 0).any():
         why = "{!r} is none of the values that --observe names: " + ", ".join(variable.values)
-        piece.leave_out(variable.name, found < 0, why)
-    return np.asarray(codes[found], np.float64)
+        piece.leave_out(variable.name, indices < 0, why)
+    return np.asarray(codes[indices], np.float64)

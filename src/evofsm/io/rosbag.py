@@ -181,16 +181,16 @@ class Topics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         >>> topics.variables["v"].field, topics.interval
         ('/odom.speed', 0.1)
         """
-        named, where = given.get("variables"), ""
+        contents, entries, where = given, given.get("variables"), ""
         try:
-            if isinstance(named, Mapping):
-                parsed: dict[str, Variable] = {}
-                for name, value in named.items():
+            if isinstance(entries, Mapping):
+                variables: dict[str, Variable] = {}
+                for name, value in entries.items():
                     where = f"variable {name}: "
-                    told = {"field": value} if isinstance(value, str) else value
-                    parsed[name] = msgspec.convert(told, Variable)
-                given, where = {**given, "variables": parsed}, ""
-            return msgspec.convert(given, cls)
+                    attributes = {"field": value} if isinstance(value, str) else value
+                    variables[name] = msgspec.convert(attributes, Variable)
+                contents, where = {**given, "variables": variables}, ""
+            return msgspec.convert(contents, cls)
         except msgspec.ValidationError as error:
             raise ValueError(f"{where}{error}") from None
 
@@ -240,19 +240,19 @@ class BagTable(Table):
         ticks = np.concatenate([*map(np.arange, first, after)])
         at = stamps[0] + interval * ticks[ticks * interval <= stamps[-1] - stamps[0]]
         values: dict[str, NDArray[np.float64]] = {}
-        known = np.ones(len(at), np.bool_)
+        is_known = np.ones(len(at), np.bool_)
         for field, (of_field, numbers) in found.items():
             latest = np.searchsorted(of_field, at, side="right") - 1
-            known &= (latest >= 0) & (at - of_field[latest] <= oldest)
+            is_known &= (latest >= 0) & (at - of_field[latest] <= oldest)
             values[field] = numbers[latest]
-        rows = {"time": (at - stamps[0])[known] / _NANOSECONDS}
+        rows = {"time": (at - stamps[0])[is_known] / _NANOSECONDS}
         for name, variable in topics.variables.items():
             value = values[variable.field] - (values[variable.minus] if variable.minus else 0.0)
             factor = 1.0 if variable.unit is None else UNITS[variable.unit]
-            rows[name] = (factor * value + variable.offset)[known]
+            rows[name] = (factor * value + variable.offset)[is_known]
         if self.derives:
             action = np.diff(rows["v_follower"], append=np.nan) / topics.interval
-            follows = np.diff(at[known], append=0) == interval
+            follows = np.diff(at[is_known], append=0) == interval
             rows[ACTION] = np.where(follows, action, np.nan)
         return rows
 
@@ -290,33 +290,33 @@ class BagTable(Table):
                 )
             for field in fields:
                 if field.topic == topic:
-                    stamps, numbers, called = values[field.text]
-                    number = field.read(message, called, counts[topic])
+                    stamps, numbers, names = values[field.text]
+                    number = field.read(message, names, counts[topic])
                     if number is not None:
                         stamps.append(stamp)
                         numbers.append(number)
-        if lacking := sorted(topics - there):
-            raise RefusedError(f"it has no topic {lacking[0]!r}; it has {', '.join(sorted(there))}")
+        if lack := sorted(topics - there):
+            raise RefusedError(f"it has no topic {lack[0]!r}; it has {', '.join(sorted(there))}")
         if self._topics.stamp == "received":
             self._compare(spans)
-        found: dict[str, _Values] = {}
+        series: dict[str, _Values] = {}
         for text, (stamps, numbers, _) in values.items():
             if not len(stamps):
                 topic = text.partition(".")[0]
                 lacks = f"messages with {text}" if counts[topic] else "messages"
                 raise RefusedError(f"its topic {topic!r} has no {lacks}")
             order = np.argsort(np.array(stamps), kind="stable")
-            found[text] = np.array(stamps)[order], np.array(numbers)[order]
-        return found
+            series[text] = np.array(stamps)[order], np.array(numbers)[order]
+        return series
 
     def _compare(self, spans: Mapping[str, Sequence[int]]) -> None:
         """Say where messages are recorded at another rate than the one of their headers."""
         for topic, (first, last, begin, end) in spans.items():
-            recorded, stamped = (last - first) / _NANOSECONDS, (end - begin) / _NANOSECONDS
-            if stamped and abs(stamped - recorded) > max(_SPAN, _SHARE * recorded):
+            bag_span, own_span = (last - first) / _NANOSECONDS, (end - begin) / _NANOSECONDS
+            if own_span and abs(own_span - bag_span) > max(_SPAN, _SHARE * bag_span):
                 self._told.append(
-                    f"{self.path}: messages of {topic} span {stamped:.3g} s by their headers, and "
-                    f"{recorded:.3g} s as recorded, by which times are (played, or simulated, at "
+                    f"{self.path}: messages of {topic} span {own_span:.3g} s by their headers, and "
+                    f"{bag_span:.3g} s as recorded, by which times are (played, or simulated, at "
                     'another speed?): stamp = "header" in the file of --topics goes by the headers'
                 )
                 return
@@ -325,8 +325,8 @@ class BagTable(Table):
         for schema, channel, message in messages(file, _MOST_BYTES, self.skips):
             there.add(channel.topic)
             if channel.topic in wanted:
-                told = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
-                kind = _Type(told[0], channel.message_encoding, told[1], told[2].decode())
+                parts = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
+                kind = _Type(parts[0], channel.message_encoding, parts[1], parts[2].decode())
                 yield channel.topic, kind, message.log_time, message.data
 
 
@@ -375,25 +375,25 @@ def _files(path: Path) -> Iterator[tuple[Path, bool]]:
             if file.suffix == ".zstd":
                 import zstandard
 
-                unpacked = Path(folder) / file.stem
-                with file.open("rb") as packed, unpacked.open("wb") as out:
-                    zstandard.ZstdDecompressor().copy_stream(packed, out)
-                file = unpacked
-            with file.open("rb") as opened:
-                yield file, opened.read(len(_MCAP)) == _MCAP
+                target = Path(folder) / file.stem
+                with file.open("rb") as source, target.open("wb") as out:
+                    zstandard.ZstdDecompressor().copy_stream(source, out)
+                file = target
+            with file.open("rb") as stream:
+                yield file, stream.read(len(_MCAP)) == _MCAP
 
 
 def _of_sqlite(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
     with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as bag:
-        named = bag.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-        there |= {topic for _, topic, *_ in named}
-        defined: dict[str, list[str]] = {}
+        rows = bag.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+        there |= {topic for _, topic, *_ in rows}
+        definitions: dict[str, list[str]] = {}
         if bag.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
             columns = "topic_type, encoding, encoded_message_definition FROM message_definitions"
-            defined = {name: told for name, *told in bag.execute(f"SELECT {columns}")}
-        for number, topic, name, packed in named:
+            definitions = {name: fields for name, *fields in bag.execute(f"SELECT {columns}")}
+        for number, topic, name, encoding in rows:
             if topic in wanted:
-                kind = _Type(name, packed, *defined.get(name, ("", "")))
+                kind = _Type(name, encoding, *definitions.get(name, ("", "")))
                 query = "SELECT timestamp, data FROM messages WHERE topic_id = ? ORDER BY timestamp"
                 for stamp, data in bag.execute(query, (number,)):
                     yield topic, kind, stamp, data

@@ -65,10 +65,10 @@ def columns_of(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[str, 
     """The columns of decisions by name, for cars or for variables of these names and units."""
     if tuple(names) == VARIABLES:
         return DECISION_COLUMNS
-    told = [f" [{unit}]" if unit else "" for unit in units] + [""] * len(names)
+    suffixes = [f" [{unit}]" if unit else "" for unit in units] + [""] * len(names)
     return dict(RECORD) | {
         name: Column(float, f"as observed{unit}; left out where missing", partial(_observed, k))
-        for k, (name, unit) in enumerate(zip(names, told, strict=False))
+        for k, (name, unit) in enumerate(zip(names, suffixes, strict=False))
     }
 
 
@@ -284,9 +284,9 @@ def _episode(
         for name in names
     }
     # Times that were left out are infinite where all that they follow from is known.
-    seen = np.isfinite([columns[name] for name in VARIABLES]).all(axis=0)
+    is_known = np.isfinite([columns[name] for name in VARIABLES]).all(axis=0)
     for name in ("time_to_collision", "time_headway"):
-        columns[name][np.isnan(columns[name]) & seen] = math.inf
+        columns[name][np.isnan(columns[name]) & is_known] = math.inf
     where = np.array([end[name] for name in VARIABLES], np.float64)
     for array in (where, *columns.values()):
         array.setflags(write=False)

@@ -110,8 +110,8 @@ def quoted_name(text: str) -> tuple[str, str]:
     >>> quoted_name('"gap, in m"<=0'), quoted_name("gap<=0")
     (('gap, in m', '<=0'), ('', 'gap<=0'))
     """
-    found = re.match(r'\s*"((?:[^"]|"")+)"\s*', text)
-    return (found[1].replace('""', '"'), text[found.end() :]) if found else ("", text)
+    quotation = re.match(r'\s*"((?:[^"]|"")+)"\s*', text)
+    return (quotation[1].replace('""', '"'), text[quotation.end() :]) if quotation else ("", text)
 
 
 def silent(count: int) -> None:
@@ -130,19 +130,19 @@ def file_kind(path: str) -> Kind:
     if path.removesuffix(".gz").endswith(".osi"):
         return "osi"
     with Source(path) as source:
-        beginning = source.read(64).removeprefix(_BYTE_ORDER_MARK).lstrip()
-    if not beginning:
+        head = source.read(64).removeprefix(_BYTE_ORDER_MARK).lstrip()
+    if not head:
         raise ValueError(f"{path} is empty")
-    if b'{"__metadata__"' in beginning:
+    if b'{"__metadata__"' in head:
         raise ValueError(f"{path} holds what was learnt, and is no log: evofsm inspect prints it")
-    if foreign := next((says for mark, says in _FOREIGN.items() if beginning.startswith(mark)), ""):
+    if foreign := next((says for mark, says in _FOREIGN.items() if head.startswith(mark)), ""):
         raise ValueError(f"{path} {foreign.replace('FILE', path)}")
-    if beginning.startswith(_MCAP):
-        profile = beginning[_PROFILE:]
+    if head.startswith(_MCAP):
+        profile = head[_PROFILE:]
         kinds: dict[bytes, Kind] = {b"ros2": "bag", b"evofsm": "run"}
         return next((kind for mark, kind in kinds.items() if profile.startswith(mark)), "mcap")
     marks: dict[bytes, Kind] = {_PARQUET: "parquet", _SQLITE: "bag", b"<": "xml"}
-    return next((kind for mark, kind in marks.items() if beginning.startswith(mark)), "csv")
+    return next((kind for mark, kind in marks.items() if head.startswith(mark)), "csv")
 
 
 class Skips:
@@ -231,13 +231,13 @@ class Source(AbstractContextManager["Source"]):
         try:
             data: bytes = self._file.readline(most) if to_line_end else self._file.read1(most)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            told = (
+            message = (
                 f"{self.path}, after line {self.lines}: the gzip data ends early or is damaged "
                 f"(was a copy or a download interrupted, or is it still being written?): {error}"
             )
             if self._skips is None or not isinstance(error, EOFError):
-                raise ValueError(told) from error
-            self._skips.leave_out("cut", told)
+                raise ValueError(message) from error
+            self._skips.leave_out("cut", message)
             self._ended, data = True, b""
         if self._packed:
             self.lines += data.count(b"\n")
@@ -337,7 +337,7 @@ class Piece:
 
     def take(self, rows: NDArray[np.int64]) -> Piece:
         """Some of its rows."""
-        taken = replace(
+        piece = replace(
             self,
             rows=len(rows),
             numbers={name: values[rows] for name, values in self.numbers.items()},
@@ -345,8 +345,8 @@ class Piece:
             find=lambda row, name: self.find(int(rows[row]), name),
             anew=np.searchsorted(rows, self.anew).tolist(),
         )
-        taken.bad[:] = self.bad[rows]
-        return taken
+        piece.bad[:] = self.bad[rows]
+        return piece
 
 
 class Wanted(NamedTuple):
@@ -431,13 +431,13 @@ class Dialect:
         rows = [_fields(row, self.separator) for row in below]
         values = next((row for row in rows if any(map(_is_value, row))), [])
         above = rows[: rows.index(values)] if values else rows[:1]
-        told = [unit_of(text) for row in above[:1] for text in row]
-        pairs = zip(told, values, strict=False)
+        units = [unit_of(text) for row in above[:1] for text in row]
+        pairs = zip(units, values, strict=False)
         over = any(_is_value(value) and text.lower() not in MISSING for text, value in pairs)
         #: How many rows below the names say what numbers are, such as their units.
-        self.n_told = len(above) if over or any(unit in UNITS for unit in told) else 0
+        self.n_told = len(above) if over or any(unit in UNITS for unit in units) else 0
         if self.n_told:
-            self.units, rows = dict(zip(self.columns, told, strict=False)), rows[self.n_told :]
+            self.units, rows = dict(zip(self.columns, units, strict=False)), rows[self.n_told :]
         self.first_row = rows[0] if rows else []
         commas = map(_DECIMAL_COMMA.fullmatch, [t for row in rows for t in row])
         self.has_commas = self.separator == ";" or (self.separator == "\t" and any(commas))
@@ -480,8 +480,8 @@ class CsvTable(Table):
         self.columns, self.units, header = dialect.columns, dialect.units, lines[at]
         self._above = at + 1 + dialect.n_told  # lines before the first row
         # With nothing in it that has a meaning; polars is not to be left alone with others.
-        quoted = f'"[^"{dialect.separator}\\r\\n]*"(?=[{dialect.separator}\\r\\n])'
-        self._quoted = re.compile(quoted.encode())
+        pattern = f'"[^"{dialect.separator}\\r\\n]*"(?=[{dialect.separator}\\r\\n])'
+        self._quoted = re.compile(pattern.encode())
         if any(map(is_date, self.columns)) or all(map(is_number, self.columns)):
             raise ValueError(
                 f"{path}, line {at + 1}: {header.strip()[:200]!r} is no header; a line above the "
@@ -490,20 +490,20 @@ class CsvTable(Table):
 
     def _header(self, lines: Sequence[str], names: set[str]) -> int:
         """Which line names the columns: the one with most names, or the last before the rows."""
-        named = [Dialect(line, ()).columns for line in lines]
-        there = [len(names.intersection(fields)) for fields in named]
+        headers = [Dialect(line, ()).columns for line in lines]
+        there = [len(names.intersection(fields)) for fields in headers]
         if any(there):
             return there.index(max(there))
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
-        counts = [sum(map(bool, named[at])) for at in rows], [len(named[at]) for at in rows]
+        counts = [sum(map(bool, headers[at])) for at in rows], [len(headers[at]) for at in rows]
         usual, size = (max(n, key=n.count, default=0) for n in counts)
 
         def is_title(fields: Sequence[str]) -> bool:  # of fewer fields, or of others and numbers
             is_odd = len(fields) != size and any(map(is_number, fields))
             return is_odd or sum(map(bool, fields)) < usual
 
-        first = next((at for at in rows if not is_title(named[at])), 0)
+        first = next((at for at in rows if not is_title(headers[at])), 0)
         separator = _separator(lines[first])
         above, row = (_fields(lines[at], separator) for at in (max(first - 1, 0), first))
         return first - 1 if first and is_number(row[0]) and len(above) == len(row) else first
@@ -524,42 +524,42 @@ class CsvTable(Table):
         import polars
 
         if twice := [name for name in wanted.all if self.columns.count(name) > 1]:
-            called = f"two columns are called {twice[0]!r}"
-            raise ValueError(f"{self.path}, line {self._above}: {called}")
-        columns, reached, behind = self.columns, 0, False
+            fault = f"two columns are called {twice[0]!r}"
+            raise ValueError(f"{self.path}, line {self._above}: {fault}")
+        columns, lines_before, behind = self.columns, 0, False
         with Source(self.path, self._on_read, self.skips) as source:
             while block := source.rows():
                 if not block.isascii():
-                    block = decoded(block, self.path, reached).encode()
-                while reached < self._above:
-                    block, reached = block.partition(b"\n")[2], reached + 1
-                here = partial(self._odd, block, reached, columns, wanted)
+                    block = decoded(block, self.path, lines_before).encode()
+                while lines_before < self._above:
+                    block, lines_before = block.partition(b"\n")[2], lines_before + 1
+                here = partial(self._odd, block, lines_before, columns, wanted)
                 lines = block.count(b"\n")
                 if lines == len(block):
-                    reached += lines
+                    lines_before += lines
                     continue
-                found = self._plain(block, columns, wanted)
+                series = self._plain(block, columns, wanted)
                 anew = [0] if behind else []
-                if found is None:
+                if series is None:
                     odd = here()
                     columns, anew = odd.columns, anew + odd.anew
                     for line, why in odd.left_out:
                         place = f"{self.path}, line {line}: {why or 'a comment'}"
                         self.skips.leave_out("row" if why else "comment", place, bool(why))
                     fields = zip(*odd.rows, strict=True) if odd.rows else [()] * len(wanted.all)
-                    found = {
+                    series = {
                         name: polars.Series(name, texts, polars.String)
                         for name, texts in zip(wanted.all, fields, strict=True)
                     }
                 if self._dialect.has_commas:
                     for name in wanted.numbers:
-                        if found[name].dtype == polars.String:
-                            found[name] = found[name].str.replace(",", ".", literal=True)
-                n_rows = len(found[wanted.all[0]])
+                        if series[name].dtype == polars.String:
+                            series[name] = series[name].str.replace(",", ".", literal=True)
+                n_rows = len(series[wanted.all[0]])
                 behind = n_rows in anew
                 if n_rows or anew:
-                    yield wanted.piece(found, partial(self._find, here, wanted), self.skips, anew)
-                reached += lines
+                    yield wanted.piece(series, partial(self._find, here, wanted), self.skips, anew)
+                lines_before += lines
 
     def _plain(
         self, block: bytes, columns: Sequence[str], wanted: Wanted
@@ -590,10 +590,10 @@ class CsvTable(Table):
                 return None
             if not any(frame[name].null_count() for name in numbers):
                 break
-        found = {name: frame[f"column_{place + 1}"] for name, place in places.items()}
-        texts = (found[name] for name in wanted.numbers if found[name].dtype == polars.String)
+        series = {name: frame[f"column_{place + 1}"] for name, place in places.items()}
+        texts = (series[name] for name in wanted.numbers if series[name].dtype == polars.String)
         names_anew = any(text.str.strip_chars().is_in(wanted.all).any() for text in texts)
-        return None if names_anew else found
+        return None if names_anew else series
 
     def _odd(self, block: bytes, reached: int, columns: Sequence[str], wanted: Wanted) -> _Odd:
         """The rows of some lines; those of another length are none."""
@@ -603,7 +603,7 @@ class CsvTable(Table):
         left_out = list[tuple[int, str]]()
         places = [columns.index(name) for name in wanted.all]
         may_name = any(name.encode() in block for name in wanted.all)
-        begun = 0
+        last_line = 0
         while True:
             try:
                 for fields in filter(None, reader):
@@ -620,25 +620,25 @@ class CsvTable(Table):
                     else:
                         anew.append(len(lines))
                         left_out.append((line, self._dialect.miscounted(len(fields), len(columns))))
-                    begun = reader.line_num
+                    last_line = reader.line_num
                 return _Odd(columns, lines, rows, anew, left_out)
             except csv.Error as error:
                 line, why = reached + reader.line_num, f"{error} (an unclosed quote?)"
-                if reader.line_num > begun + 1:
+                if reader.line_num > last_line + 1:
                     raise ValueError(f"{self.path}, line {line}: {why}") from error
                 anew.append(len(lines))
                 left_out.append((line, why))
-                begun = reader.line_num
+                last_line = reader.line_num
 
     def _named_anew(self, fields: Sequence[str], wanted: Wanted, line: int) -> bool:
         """Whether a row is no row but names the columns once more."""
-        lacking = set(wanted.all).difference(_names(fields))
-        if lacking and len(wanted.all) - len(lacking) > 1:
+        omissions = set(wanted.all).difference(_names(fields))
+        if omissions and len(wanted.all) - len(omissions) > 1:
             raise ValueError(
-                f"{self.path}, line {line}: it names the columns anew, without {min(lacking)!r} "
+                f"{self.path}, line {line}: it names the columns anew, without {min(omissions)!r} "
                 "(two logs in one file? learn them apart)"
             )
-        return not lacking
+        return not omissions
 
     def _find(
         self, here: Callable[[], _Odd], wanted: Wanted, row: int, name: str | None
@@ -671,8 +671,8 @@ class ParquetTable(Table):
         if name not in self.columns:
             return ""
         with readable(self.path, _AS_PARQUET):
-            found = self._scan.select(name).drop_nulls().head(1).collect()
-        return str(found.item()) if len(found) else ""
+            frame = self._scan.select(name).drop_nulls().head(1).collect()
+        return str(frame.item()) if len(frame) else ""
 
     def holds(self, name: str) -> Literal["number", "text", ""]:
         """What a column holds, by its type, as far as that is known."""
@@ -693,8 +693,8 @@ class ParquetTable(Table):
         for first in range(0, self._rows, _PARQUET_ROWS):
             with readable(self.path, _AS_PARQUET):
                 frame = part.slice(first, _PARQUET_ROWS).collect()
-            found = {name: frame[name] for name in wanted.all}
-            yield wanted.piece(found, partial(self._find, frame, first), self.skips)
+            series = {name: frame[name] for name in wanted.all}
+            yield wanted.piece(series, partial(self._find, frame, first), self.skips)
             self._on_read(os.path.getsize(self.path) * len(frame) // self._rows)
 
     def _find(
@@ -763,8 +763,8 @@ def seconds_of_date(text: str, form: str = "") -> float:
     if form:
         when = datetime.strptime(text, form)
     else:
-        if found := re.fullmatch(r"(\d\d?)\.(\d\d?)\.(\d\d|\d{4}),?[T ]+(\d\d?)(:.*)", text):
-            day, month, year, hour, rest = found.groups()
+        if match := re.fullmatch(r"(\d\d?)\.(\d\d?)\.(\d\d|\d{4}),?[T ]+(\d\d?)(:.*)", text):
+            day, month, year, hour, rest = match.groups()
             text = f"{'20' * (len(year) == 2)}{year}-{month:0>2}-{day:0>2} {hour:0>2}{rest}"
         when = datetime.fromisoformat(text)
     return when.replace(tzinfo=when.tzinfo or UTC).timestamp()
@@ -792,9 +792,9 @@ def _microseconds(
     why = f"{{!r}} is not read as a date; all must be {_ISO}, and all have a zone, or none"
     if dates.dtype == polars.String:
         texts, parts = dates.str.strip_chars(), ""
-        if not form and (found := _DAY_FIRST.match(str(texts.first()))):
-            form = f"%d.%m.%{'Y' if found[1] else 'y'} %H:%M{':%S' if found[2] else ''}"
-            parts = "%.f" if found[2] else ""
+        if not form and (match := _DAY_FIRST.match(str(texts.first()))):
+            form = f"%d.%m.%{'Y' if match[1] else 'y'} %H:%M{':%S' if match[2] else ''}"
+            parts = "%.f" if match[2] else ""
         if "," not in form and texts.str.contains(",", literal=True).any():
             texts = texts.str.replace(r",\s+", " ").str.replace(",", ".", literal=True)
         try:

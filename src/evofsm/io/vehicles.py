@@ -71,17 +71,17 @@ class PairTable(Table):
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """All columns, whichever are wanted."""
-        before, starts, waiting, names = 0, [0], list[NDArray[np.float64]](), list[str]()
+        before, starts, blocks, names = 0, [0], list[NDArray[np.float64]](), list[str]()
         for (_, follower, leader), rows in chain(self._episodes(), [(("", "", ""), None)]):
             if rows is not None:
-                waiting.append(rows)
+                blocks.append(rows)
                 names.append(f"{follower} behind {leader}")
                 starts.append(starts[-1] + len(rows))
-            if waiting and (rows is None or starts[-1] >= _ROWS_AT_ONCE):
-                numbers = dict(zip(COLUMNS, np.concatenate(waiting).T, strict=True))
-                known = starts[:-1], names
-                yield Piece.of_numbers(self.path, before, numbers, *known, self.skips)
-                before, starts, waiting, names = before + starts[-1], [0], [], []
+            if blocks and (rows is None or starts[-1] >= _ROWS_AT_ONCE):
+                numbers = dict(zip(COLUMNS, np.concatenate(blocks).T, strict=True))
+                episodes = starts[:-1], names
+                yield Piece.of_numbers(self.path, before, numbers, *episodes, self.skips)
+                before, starts, blocks, names = before + starts[-1], [0], [], []
         if before == 0:
             self.skips.refuse_nothing(
                 f"{self.path}: no vehicle ever follows another one on the same lane"
@@ -90,7 +90,7 @@ class PairTable(Table):
     def _episodes(self) -> Iterator[tuple[tuple[str, str, str], NDArray[np.float64] | None]]:
         """Rows of a pair for as long as it stays one, or until too many wait."""
         open_pairs: dict[tuple[str, str, str], array[float]] = {}
-        waiting, before = 0, -math.inf
+        n_rows, before = 0, -math.inf
         for moment in self._moments:
             if not moment.time > before:
                 self.skips.leave_out(
@@ -105,14 +105,14 @@ class PairTable(Table):
                 rows = open_pairs.pop(pair.who, None) or array("d")
                 rows.extend((moment.time, pair.gap, pair.v_follower, pair.v_leader))
                 present[pair.who] = rows
-            waiting += len(moment.pairs)
+            n_rows += len(moment.pairs)
             for names, rows in open_pairs.items():
-                waiting -= len(rows) // 4
+                n_rows -= len(rows) // 4
                 yield names, _with_actions(rows)
             open_pairs = present
-            if waiting > _MOST_WAITING:
+            if n_rows > _MOST_WAITING:
                 yield from ((names, _with_actions(rows)) for names, rows in open_pairs.items())
-                open_pairs, waiting = {}, 0
+                open_pairs, n_rows = {}, 0
         yield from ((names, _with_actions(rows)) for names, rows in open_pairs.items())
 
 
@@ -178,8 +178,8 @@ class VehicleLengths:
                 )
 
     def __str__(self) -> str:
-        named = [f"{kind} {length:g} m" for kind, length in self.by_type.items()]
-        return ", ".join([*named, f"{'others ' if named else ''}{self.default:g} m"])
+        texts = [f"{kind} {length:g} m" for kind, length in self.by_type.items()]
+        return ", ".join([*texts, f"{'others ' if texts else ''}{self.default:g} m"])
 
 
 class _Car(NamedTuple):
@@ -205,12 +205,12 @@ def pairs_of_fcd(
 ) -> Iterator[Moment]:
     """At each time, the vehicles of which one follows the other."""
     has_vehicles = False
-    for time, place, seen in steps:
+    for time, place, entries in steps:
         cars = dict[str, _Car]()
         with skips.leaving_out("timestep"):  # without one of them, others would be taken for pairs
-            for where, told in seen:
-                if told.get("lane"):  # persons, and vehicles off the road, have none
-                    car = _car(where, told, lengths)
+            for where, attributes in entries:
+                if attributes.get("lane"):  # persons, and vehicles off the road, have none
+                    car = _car(where, attributes, lengths)
                     if car.name in cars:
                         skips.leave_out("twice", f"{where()}: {car.name[:40]!r} is there twice")
                     cars.setdefault(car.name, car)
@@ -232,8 +232,8 @@ def _car(place: Place, told: Mapping[str, str], lengths: VehicleLengths) -> _Car
     if "id" not in told:
         _refuse_lack(place(), "id")
     kind, heading = told.get("type", ""), cmath.rect(1.0, math.radians(90.0 - angle))
-    seen = told["lane"], along, told["id"], speed, kind, *lengths.size_of(kind)
-    return _Car(*seen, lateral, complex(x, y), heading)
+    fields = told["lane"], along, told["id"], speed, kind, *lengths.size_of(kind)
+    return _Car(*fields, lateral, complex(x, y), heading)
 
 
 def _queues(cars: Sequence[_Car], lengths: VehicleLengths) -> Iterator[Following]:
@@ -301,7 +301,7 @@ def fcd_of_xml(path: str, on_read: OnRead, skips: Skips) -> Iterator[_Timestep]:
     parser.StartDoctypeDeclHandler = lambda name, *_: refuse(
         f"there is a <!DOCTYPE {name[:40]}>, and entities are not read"
     )
-    fed, data = 0, b" "
+    n_bytes, data = 0, b" "
     with Source(path, on_read, skips) as source:
         while data:
             data = source.read(_BYTES_AT_ONCE)
@@ -309,13 +309,13 @@ def fcd_of_xml(path: str, on_read: OnRead, skips: Skips) -> Iterator[_Timestep]:
                 parser.Parse(data, not data)
             except expat.ExpatError as error:
                 why = expat.ErrorString(error.code)
-                told = f"{path}, line {error.lineno}: this XML is cut off or damaged: {why}"
-                told += " (was SUMO or a copy interrupted?)"
-                if data or not fed or why not in _CUT:
-                    raise ValueError(told) from error
-                skips.leave_out("cut", told)
-            fed += len(data)
-            if fed - parser.CurrentByteIndex > _LONGEST_TAG:
+                message = f"{path}, line {error.lineno}: this XML is cut off or damaged: {why}"
+                message += " (was SUMO or a copy interrupted?)"
+                if data or not n_bytes or why not in _CUT:
+                    raise ValueError(message) from error
+                skips.leave_out("cut", message)
+            n_bytes += len(data)
+            if n_bytes - parser.CurrentByteIndex > _LONGEST_TAG:
                 refuse(f"a tag or comment of more than {_LONGEST_TAG:,} bytes begins here")
             yield from whole
             whole.clear()
@@ -358,17 +358,17 @@ def _by_time(table: Table, wanted: Wanted) -> Iterator[tuple[float, list[tuple[A
         columns = [piece.numbers[name].tolist() for name in wanted.numbers]
         columns += [piece.texts[name].to_list() for name in wanted.texts]
         bad = set(np.flatnonzero(piece.bad).tolist())
-        lost = {row for row in bad if math.isnan(columns[0][row])}  # of this time or of that
-        broken = {*piece.anew, *lost, *(row + 1 for row in lost)}
+        lost_rows = {row for row in bad if math.isnan(columns[0][row])}  # of this time or of that
+        breaks = {*piece.anew, *lost_rows, *(row + 1 for row in lost_rows)}
         for row, (time, *values) in enumerate(zip(*columns, strict=True)):
-            is_whole = is_whole and row not in broken
+            is_whole = is_whole and row not in breaks
             if time != now:
                 if rows and is_whole:
                     yield now, rows
-                now, rows, is_whole = time, [], row not in broken
+                now, rows, is_whole = time, [], row not in breaks
             is_whole = is_whole and row not in bad
             rows.append((partial(piece.at, row), *values))
-        is_whole = is_whole and piece.rows not in broken
+        is_whole = is_whole and piece.rows not in breaks
     if rows and is_whole:
         yield now, rows
 
@@ -437,15 +437,15 @@ def scenes_of_table(table: Table) -> Iterator[Scene]:
             for place, *values, name, lane in rows:
                 if not lane:  # whoever follows nobody may lack anything
                     continue
-                given = dict(zip([*numbers, *optional], values, strict=True))
+                fields = dict(zip([*numbers, *optional], values, strict=True))
                 for column in numbers:
-                    if not abs(given[column]) <= LARGEST_OBSERVATION:
-                        said = explained(f"{given[column]:g}")
-                        raise ValueError(f"{place()}, column {column!r}: {said}")
-                if not given["length"] > 0.0:
-                    length = f"{given['length']:g}"
+                    if not abs(fields[column]) <= LARGEST_OBSERVATION:
+                        reason = explained(f"{fields[column]:g}")
+                        raise ValueError(f"{place()}, column {column!r}: {reason}")
+                if not fields["length"] > 0.0:
+                    length = f"{fields['length']:g}"
                     raise ValueError(f"{place()}: the length is {length}; it must be positive")
-                objects.append(Object(name, lane, **given))
+                objects.append(Object(name, lane, **fields))
             yield Scene(time, rows[0][0], objects)
 
 
@@ -455,7 +455,7 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
     The gap is the distance between the middles, in a straight line, less half of both lengths:
     where a lane bends, it is a little too small.
     """
-    pointed: dict[str, float] = {}
+    headings: dict[str, float] = {}
     has_lanes = False
     for scene in scenes:
         lanes: defaultdict[str, list[Object]] = defaultdict(list)
@@ -469,7 +469,7 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
                 )
                 continue
             names.add(obj.id)
-            lanes[obj.lane].append(_pointing(obj, pointed))
+            lanes[obj.lane].append(_pointing(obj, headings))
         has_lanes = has_lanes or bool(lanes)
         pairs = [pair for lane in lanes.values() for pair in _following(scene, lane)]
         yield Moment(scene.time, scene.place, pairs)
@@ -504,8 +504,8 @@ def _following(scene: Scene, lane: Sequence[Object]) -> Iterator[Following]:
     along = dx * np.cos(headings)[:, None] + dy * np.sin(headings)[:, None]
     widths = np.array([obj.width for obj in lane])
     widths[~(widths > 0.0)] = _USUAL_WIDTH
-    filled = np.where(np.isnan(headings), headings[:, None], headings)
-    mean = np.exp(1j * headings[:, None]) + np.exp(1j * filled)
+    leader_headings = np.where(np.isnan(headings), headings[:, None], headings)
+    mean = np.exp(1j * headings[:, None]) + np.exp(1j * leader_headings)
     beside = _across(dx + 1j * dy, mean) >= 0.5 * (widths[:, None] + widths)
     ahead = (along > 0.0) & ~(beside & (along < _BESIDE_WITHIN))
     apart = np.where(ahead, np.hypot(dx, dy), np.inf)
@@ -555,18 +555,18 @@ def scenes_of_mcap(path: str, on_read: OnRead, skips: Skips) -> Iterator[Scene]:
     from evofsm.io.runs import messages
 
     osi = _osi(path)
-    chosen, number, kinds = None, 0, set[str]()
+    channel_id, number, kinds = None, 0, set[str]()
     for schema, channel, message in messages(path, _MOST_BYTES, skips):
         kind = "" if schema is None else schema.name.rpartition(".")[2]
         kinds.add(kind)
-        if chosen is None and kind in ("GroundTruth", "SensorView"):
-            chosen = channel.id
-        if channel.id == chosen:
+        if channel_id is None and kind in ("GroundTruth", "SensorView"):
+            channel_id = channel.id
+        if channel.id == channel_id:
             number += 1
             on_read(len(message.data))
             with skips.leaving_out("message"):
                 yield _scene(osi, f"{path}, message {number}", message.data, kind == "SensorView")
-    if chosen is None:
+    if channel_id is None:
         names = ", ".join(sorted(kinds - {""})) or "none"
         skips.refuse_nothing(
             f"{path}: no channel of it holds GroundTruth or SensorView of OSI; its schemas are "
@@ -601,20 +601,20 @@ def _scene(osi: Any, place: str, data: bytes, is_view: bool) -> Scene:
     stamp = (truth and truth.timestamp) or message.timestamp or osi.Timestamp()
     on_foot = (osi.MovingObject.Type.PEDESTRIAN, osi.MovingObject.Type.ANIMAL)
     objects = [
-        _object(place, moving, lane)
-        for moving in (truth.moving_object if truth else ())
-        if moving.base and moving.type not in on_foot and (lane := _lane(moving))
+        _object(place, vehicle, lane)
+        for vehicle in (truth.moving_object if truth else ())
+        if vehicle.base and vehicle.type not in on_foot and (lane := _lane(vehicle))
     ]
     return Scene(stamp.seconds + 1e-9 * stamp.nanos, lambda: place, objects)
 
 
 def _lane(moving: Any) -> str:
     """Where it is; empty where that is not known: it follows nobody, and nobody follows it."""
-    classified = moving.moving_object_classification
-    lanes = (classified and classified.assigned_lane_id) or moving.assigned_lane_id
-    if lanes or not (classified and classified.logical_lane_assignment):
+    classification = moving.moving_object_classification
+    lanes = (classification and classification.assigned_lane_id) or moving.assigned_lane_id
+    if lanes or not (classification and classification.logical_lane_assignment):
         return str(lanes[0].value) if lanes else ""
-    return f"logical {classified.logical_lane_assignment[0].assigned_lane_id.value}"
+    return f"logical {classification.logical_lane_assignment[0].assigned_lane_id.value}"
 
 
 def _object(place: str, moving: Any, lane: str) -> Object:
