@@ -53,13 +53,13 @@ def _of_collisions(study: PaperStudy) -> Iterator[Claim]:
         braking = np.flatnonzero(run.episode.leader_accelerations == -decel)
         at_brake = int(run.state[braking[0]]) if len(braking) else None
         end = f"collision at {run.episode.time[-1]:.1f} s, in {_name(run.state[-1])}"
-        came = end if run.episode.collided else "no collision"
-        braked = at_brake is not None
+        fate = end if run.episode.collided else "no collision"
+        has_braked = at_brake is not None
         yield Claim(
             f"brake_at_{time:g}",
             f"Leader brakes at {time:g} s, in the dead end: collision",
             "collision",
-            f"{_name(at_brake)} at the brake; {came}" if braked else "the leader did not brake",
+            f"{_name(at_brake)} at the brake; {fate}" if has_braked else "the leader did not brake",
             run.episode.collided and at_brake == study.dead_end,
         )
 
@@ -123,11 +123,11 @@ def _change(study: PaperStudy, case: int, *, leaves: bool) -> tuple[str, bool]:
     for run in runs:
         inside = run.state == study.dead_end
         row = min(int(np.searchsorted(run.episode.time, switch)), len(inside) - 1)
-        changed = row + int(np.argmax(inside[row:] != inside[row]))  # `row` where it never does
-        as_in_paper += bool(inside[row] == leaves and inside[changed] != leaves != inside[-1])
+        change_row = row + int(np.argmax(inside[row:] != inside[row]))  # `row` where it never does
+        as_in_paper += bool(inside[row] == leaves and inside[change_row] != leaves != inside[-1])
     text = f"{_name(run.state[row])} at {switch:g} s"
-    if changed > row:
-        text += f", {_name(run.state[changed])} from {run.episode.time[changed]:.1f} s"
+    if change_row > row:
+        text += f", {_name(run.state[change_row])} from {run.episode.time[change_row]:.1f} s"
     return f"{text}; so in {as_in_paper} of {len(runs)} rounds", as_in_paper == len(runs)
 
 

@@ -74,8 +74,8 @@ def figures(study: PaperStudy) -> Iterator[Figure]:
 
 def _panels(rows: int, columns: int, height: float, **others: bool) -> tuple[Drawn, Any]:
     figure = Drawn(figsize=(WIDTH, height), layout="constrained")
-    shared: Look = {"sharex": True, "squeeze": False, **others}
-    return figure, figure.subplots(rows, columns, **shared)
+    look: Look = {"sharex": True, "squeeze": False, **others}
+    return figure, figure.subplots(rows, columns, **look)
 
 
 def _letter(panels: Iterable[Axes], offset: plot.Point = (-14.0, 9.0)) -> None:
@@ -197,9 +197,9 @@ def draw_divergence(study: PaperStudy) -> Drawn:
     highest = [float(np.nanmax(run.surprise)) for run in study.last_round]
     grid[0, 0].set_ylim(0.0, 1.12 * max(LARGEST_DIVERGENCE, *highest))
     grid[0, 0].set_xlim(0.0, study.settings.scenario.duration)
-    for left, below in zip(grid[:, 0], grid[1], strict=True):
-        left.set_ylabel("divergence [bit]")
-        below.set_xlabel("time [s]")
+    for left_axes, lower_axes in zip(grid[:, 0], grid[1], strict=True):
+        left_axes.set_ylabel("divergence [bit]")
+        lower_axes.set_xlabel("time [s]")
     _letter(grid.flat)
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return figure
@@ -238,8 +238,8 @@ def draw_space(study: PaperStudy) -> Drawn:
             gap = np.maximum(run.episode.observations[:, 0], 0.0)
             speed = run.episode.observations[:, variable]
             axes.plot(gap, speed, **look)
-            veiled = np.where(run.state == study.dead_end, gap, np.nan)
-            axes.plot(veiled, speed, zorder=1.8, solid_capstyle="butt", **_VEIL)
+            dead_end_gap = np.where(run.state == study.dead_end, gap, np.nan)
+            axes.plot(dead_end_gap, speed, zorder=1.8, solid_capstyle="butt", **_VEIL)
             if run.episode.collided:
                 plot.draw_collision(axes, float(gap[-1]), float(speed[-1]))
             else:

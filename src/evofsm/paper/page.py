@@ -128,8 +128,8 @@ class Table:
     def numeric(self) -> list[bool]:
         """Whether a column, never the first, holds numbers."""
         columns = list(zip(*self.cells, strict=True))[1:]
-        held = [all(re.match(r"[−–∞≤≥<>+\d]", text) for text in column) for column in columns]
-        return [False, *(held or [False] * (len(self.header) - 1))]
+        is_numeric = [all(re.match(r"[−–∞≤≥<>+\d]", text) for text in column) for column in columns]
+        return [False, *(is_numeric or [False] * (len(self.header) - 1))]
 
     @property
     def is_wordy(self) -> bool:
@@ -191,8 +191,8 @@ class Page:
         """All tables but those of what is lost, the targets first."""
         mark = pl.when(pl.nth(-1)).then(pl.lit("holds")).otherwise(pl.lit("fails"))
         name = "" if self.targets.is_empty() else f"{self.targets.columns[0].capitalize()}s"
-        asked = [Table(name, self.targets, mark=mark)] if name else []
-        return [*asked, *(part for part in self.parts if isinstance(part, Table))]
+        targets = [Table(name, self.targets, mark=mark)] if name else []
+        return [*targets, *(part for part in self.parts if isinstance(part, Table))]
 
     @property
     def losses(self) -> list[Table]:
@@ -257,11 +257,11 @@ def _drawn(page: Page, folder: Path) -> dict[str, str]:
 
 
 def _summary(pages: Sequence[Page]) -> Table:
-    lost = [sum(len(table.frame) for table in page.losses) for page in pages]
+    loss_counts = [sum(len(table.frame) for table in page.losses) for page in pages]
     rows = {
         "question": [page.title for page in pages],
         "answer": [page.answer for page in pages],
-        "rows lost": lost,
+        "rows lost": loss_counts,
     }
     holds = pl.Series([page.holds for page in pages], dtype=pl.Boolean)
     mark = pl.when(holds).then(pl.lit("holds")).when(~holds).then(pl.lit("fails"))
@@ -269,10 +269,10 @@ def _summary(pages: Sequence[Page]) -> Table:
 
 
 def _versions(more: Sequence[str]) -> dict[str, str]:
-    found = {"evofsm": evofsm.__version__, "Python": platform.python_version()}
+    versions = {"evofsm": evofsm.__version__, "Python": platform.python_version()}
     names = {"libsumo": "SUMO (libsumo)"}
-    found |= {names.get(name, name): version(name) for name in (*_PACKAGES, *more)}
-    return {**found, "system": f"{platform.system()} on {platform.machine()}"}
+    versions |= {names.get(name, name): version(name) for name in (*_PACKAGES, *more)}
+    return {**versions, "system": f"{platform.system()} on {platform.machine()}"}
 
 
 # -- The terminal ---------------------------------------------------------------------------------
@@ -310,8 +310,8 @@ def print_table(table: Table, out: Console) -> None:
     for k, (name, is_number) in enumerate(zip(table.header, table.numeric, strict=True)):
         column = [name, *(row[k] for row in table.cells)]
         longest = max(map(len, column if is_number else " ".join(column).split()), default=0)
-        given: Any = {"justify": "right" if is_number else "left", "vertical": "bottom"}
-        grid.add_column(name, min_width=longest, **given)
+        alignment: Any = {"justify": "right" if is_number else "left", "vertical": "bottom"}
+        grid.add_column(name, min_width=longest, **alignment)
         least += longest + 2
     for row, mark in zip(table.cells, table.marks, strict=True):
         grid.add_row(signs.get(mark or "", "") + row[0], *row[1:], style=styles.get(mark or ""))

@@ -57,7 +57,7 @@ class Reproduction:
         """Every claim beside what was measured, and what an expert would ask next."""
         study = self.study
         world = _WORLDS.get(study.world, study.world)
-        held = sum(claim.holds for claim in self.claims)
+        n_holds = sum(claim.holds for claim in self.claims)
         first, *rest = figures(study)
         targets = pl.DataFrame(self.claims).select("claim", "paper", "measured", "holds")
         return Page(
@@ -76,7 +76,7 @@ class Reproduction:
             },
             packages=("libsumo",) if study.world == "sumo" else (),
             sources={_SOURCE: "https://arxiv.org/abs/1908.10823"},
-            verdict=f"{held} of {len(self.claims)} claims of the paper hold in {world}",
+            verdict=f"{n_holds} of {len(self.claims)} claims of the paper hold in {world}",
         )
 
     def write(self, folder: Path, command: str = "evofsm paper") -> Path:
@@ -101,9 +101,9 @@ def reproduce(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Reproduction:
     """Drive the four cases of the paper, round by round, and hold every claim against the runs."""
-    told = Settings.load(settings)
+    run_settings = Settings.load(settings)
     with open_world(world) as place:
-        study = run_paper(place, world, told, rounds, progress)
+        study = run_paper(place, world, run_settings, rounds, progress)
     return Reproduction(study, check_claims(study))
 
 
@@ -160,12 +160,12 @@ def divergences(study: PaperStudy) -> pl.DataFrame:
         "constant": [constant] * len(CASES),
         "uniform": [uniform] * len(CASES),
     }
-    found = {_OURS: [run.surprise[1:] for run in study.last_round]}
-    for name, said in simple.items():
-        pairs = zip(said, study.last_round, strict=True)
-        found[name] = [np.asarray(jensen_shannon(row, run.belief[1:])) for row, run in pairs]
-    found[f"{_OURS}, a run's first"] = [np.array([run.first_surprise]) for run in study.last_round]
-    found[f"{_OURS}, all rounds"] = [
+    series = {_OURS: [run.surprise[1:] for run in study.last_round]}
+    for name, forecasts in simple.items():
+        pairs = zip(forecasts, study.last_round, strict=True)
+        series[name] = [np.asarray(jensen_shannon(row, run.belief[1:])) for row, run in pairs]
+    series[f"{_OURS}, a run's first"] = [np.array([run.first_surprise]) for run in study.last_round]
+    series[f"{_OURS}, all rounds"] = [
         np.concatenate([run.surprise[1:] for run in study.runs if run.case == case])
         for case in CASES
     ]
@@ -175,14 +175,14 @@ def divergences(study: PaperStudy) -> pl.DataFrame:
             **{f"case {case}": float(v.max()) for case, v in zip(CASES, by_case, strict=True)},
             "mean": float(np.concatenate(by_case).mean()),
         }
-        for name, by_case in found.items()
+        for name, by_case in series.items()
     )
 
 
 def _table_of_losses(study: PaperStudy) -> Table:
-    found = divergences(study).unpivot(index="forecast", variable_name="where")
-    machine = found.filter(forecast=_OURS).select("where", ours="value")
-    better = found.filter(~pl.col("forecast").str.starts_with(_OURS)).join(machine, on="where")
+    frame = divergences(study).unpivot(index="forecast", variable_name="where")
+    machine = frame.filter(forecast=_OURS).select("where", ours="value")
+    better = frame.filter(~pl.col("forecast").str.starts_with(_OURS)).join(machine, on="where")
     return Table(
         "Simple forecasts of the next belief that are better than the machine's",
         better.filter(pl.col("value") < pl.col("ours")),
@@ -197,12 +197,12 @@ def _table_of_losses(study: PaperStudy) -> Table:
 
 
 def _table_of_states(study: PaperStudy) -> Table:
-    recognised = np.concatenate([run.state for run in study.runs])
+    states = np.concatenate([run.state for run in study.runs])
     hopeless = np.concatenate([study.in_dead_end(run) for run in study.runs])
     ends = [run.state[-1] for run in study.runs if run.episode.collided]
     rows = []
     for state, center in enumerate(study.model.centers.tolist()):
-        here = recognised == state
+        here = states == state
         row = {
             "state": state + 1,
             **dict(zip(VARIABLES, center, strict=True)),
@@ -237,10 +237,10 @@ def _table_of_lead_times(study: PaperStudy) -> Table:
         time, end = run.episode.time[row], run.episode.time[-1]
         ttc = time_to_collision(run.episode.observations)
         off = np.flatnonzero(ttc >= _ALARM)
-        lasting = min(int(off[-1]) + 1, len(ttc) - 1) if len(off) else 0
-        warned = end - run.episode.time[lasting]
+        alarm_row = min(int(off[-1]) + 1, len(ttc) - 1) if len(off) else 0
+        alarm_lead_time = end - run.episode.time[alarm_row]
         name = run.name if run.round else f"extra: case {run.case}, {run.name}"
-        rows.append((name, end, time, end - time, ttc[row], warned))
+        rows.append((name, end, time, end - time, ttc[row], alarm_lead_time))
     names = ("run", "collision", "recognised", "before it", "TTC then", f"TTC < {_ALARM:g} s")
     return Table(
         f"How early #{study.dead_end + 1} is recognised, in the last round and the extra runs [s]",
@@ -254,8 +254,8 @@ def _table_of_lead_times(study: PaperStudy) -> Table:
 def _table_of_settings(settings: Settings) -> Table:
     """What was set, as it stands in ``settings.toml``."""
     rows = [
-        {"table": table, "settings": ", ".join(f"{name} {value}" for name, value in told.items())}
-        for table, told in settings.tables.items()
+        {"table": table, "settings": ", ".join(f"{name} {value}" for name, value in fields.items())}
+        for table, fields in settings.tables.items()
     ]
     return Table(
         "Settings",

@@ -227,18 +227,18 @@ def run_paper(
         """Drive a run and show it to the machine, row by row."""
         episode = world.run(scenario, settings.drivers[case])
         before = len(runs) + len(extra_runs)
-        seen = observe(before, episode) if observe else episode.observations
+        observations = observe(before, episode) if observe else episode.observations
         n, action = machine.n_states, settings.actions.encode(episode.accelerations)
         # Of the first row: the uniform belief through the marginal matrix.
-        foreseen = np.full(n, 1.0 / max(n, 1)) @ machine.marginal_matrix
-        ends = [len(seen) - 1] if episode.collided else []
-        trace = machine.learn_many(seen, action, [0], ends, belief=beliefs)
+        prior = np.full(n, 1.0 / max(n, 1)) @ machine.marginal_matrix
+        ends = [len(observations) - 1] if episode.collided else []
+        trace = machine.learn_many(observations, action, [0], ends, belief=beliefs)
         belief = np.empty((len(action), 0)) if trace.belief is None else trace.belief
-        known = beliefs and n > 0
-        first = jensen_shannon(_widen(foreseen, machine.n_states), belief[0]) if known else math.nan
+        is_known = beliefs and n > 0
+        first = jensen_shannon(_widen(prior, machine.n_states), belief[0]) if is_known else math.nan
         progress(before + 1, total)
-        found = action, trace.state, trace.n_states, belief, trace.surprise, float(first)
-        return Run(name, case, round_, episode, *found)
+        columns = action, trace.state, trace.n_states, belief, trace.surprise, float(first)
+        return Run(name, case, round_, episode, *columns)
 
     for round_ in range(1, rounds + 1):
         for case in order:
