@@ -24,8 +24,8 @@ def needs(package: str, extra: str, purpose: str) -> Iterator[None]:
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f"{purpose} needs {package}: {install(extra)}") from error
     except ImportError as error:  # it is there, and a library of the system that it needs is not
-        told = f"{purpose} needs {package}, which is installed but cannot be loaded: {error}"
-        raise ImportError(told) from error
+        message = f"{purpose} needs {package}, which is installed but cannot be loaded: {error}"
+        raise ImportError(message) from error
 
 
 def install(*extras: str) -> str:

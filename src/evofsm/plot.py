@@ -114,18 +114,18 @@ def states(
     pair = [check_index("variable", k, model.n_variables) for k in variables]
     ax = _given_or_new(ax)
     box = [ax.dataLim.frozen()] if ax.has_data() else []
-    centers, seen = model.centers[:, pair], np.reshape(rows, (-1, model.n_variables))[:, pair]
-    fails = np.resize(np.asarray(failed, np.bool_), len(seen)) & bool(np.size(failed))
+    centers, dots = model.centers[:, pair], np.reshape(rows, (-1, model.n_variables))[:, pair]
+    fails = np.resize(np.asarray(failed, np.bool_), len(dots)) & bool(np.size(failed))
     times = np.ceil(_GRID**2 * model.visits / max(float(model.visits.sum()), 1.0)).astype(int)
-    every = seen if len(seen) else centers.repeat(times, axis=0)
-    ends = np.transpose([usual_range(x, y) for x, y in zip(every.T, seen[fails].T, strict=True)])
+    every = dots if len(dots) else centers.repeat(times, axis=0)
+    ends = np.transpose([usual_range(x, y) for x, y in zip(every.T, dots[fails].T, strict=True)])
     centers, in_view = np.clip(centers, *ends), ((centers >= ends[0]) & (centers <= ends[1])).all(1)
     look: Look = {"markersize": 1.5, "color": ink(0.3), "zorder": 1.2, "rasterized": True}
-    if len(seen):
-        ax.plot(*seen.T, ".", label="observed", **look)
+    if len(dots):
+        ax.plot(*dots.T, ".", label="observed", **look)
     if np.any(fails):
         look = {"markersize": 5.0, "color": COLORS["dead end"], "zorder": 4.0}
-        ax.plot(*seen[fails].T, "x", label="failed", **look)
+        ax.plot(*dots[fails].T, "x", label="failed", **look)
     if ways and isinstance(model.rule, Novelty):
         reach = np.sqrt(model.width) * np.resize(model.rule.scales, model.n_variables)[pair]
         look = {"color": COLORS["leader"], "alpha": 0.1, "linewidth": 0.0, "zorder": 0.4}
@@ -145,8 +145,8 @@ def states(
             if (shares[i] > shares[i, j]).sum() < _DARK:
                 _arrow(ax, centers[i], centers[j], max(_WIDEST * shares[i, j], 0.4), ink(0.5))
         ax.plot([], [], color=ink(0.5), label="likeliest ways on")
-        inside = np.all((seen >= limits[::2]) & (seen <= limits[1::2]), axis=1)
-        if outside := len(seen) - int(inside.sum()):
+        inside = np.all((dots >= limits[::2]) & (dots <= limits[1::2]), axis=1)
+        if outside := len(dots) - int(inside.sum()):
             beyond = f"not in view: {outside:,} observed, of which {fails[~inside].sum():,} failed"
             ax.plot([], [], " ", label=beyond)
         _explain(ax)
@@ -178,16 +178,16 @@ def graph(model: FSMModel, ax: Axes | None = None, *, dead_ends: States = ()) ->
     matrix, n = model.averaged_matrix("observed"), model.n_states
     angle = 0.5 * np.pi - 2.0 * np.pi * np.arange(n) / n
     places = np.column_stack([np.cos(angle), np.sin(angle)])  # from the top, clockwise
-    numbered = n <= _DISCS
+    has_numbers = n <= _DISCS
     for state, (x, y) in enumerate(places):
         dead_end, note = state in dead_ends, f"stays {100 * matrix[state, state]:.0f} %"
-        draw_state(ax, x, y, state, 13.0, dead_end=dead_end, numbered=numbered)
-        if numbered or dead_end:  # among many there is room for dead ends alone
+        draw_state(ax, x, y, state, 13.0, dead_end=dead_end, numbered=has_numbers)
+        if has_numbers or dead_end:  # among many there is room for dead ends alone
             ha = "center" if abs(x) < 0.2 else "left" if x > 0.0 else "right"
             va = "center" if abs(y) < 0.5 else "bottom" if y > 0.0 else "top"
             color = COLORS["dead end"] if dead_end else ink()
-            said = f"dead end\n{note}" if dead_end else note
-            write(ax, said, (x, y), (11.0 * x, 11.0 * y), ha=ha, va=va, color=color)
+            text = f"dead end\n{note}" if dead_end else note
+            write(ax, text, (x, y), (11.0 * x, 11.0 * y), ha=ha, va=va, color=color)
     ax.set(xlim=(-1.75, 1.75), ylim=(-1.35, 1.35), aspect="equal")
     ax.set_axis_off()
     between = matrix * (1.0 - np.eye(n))
@@ -195,7 +195,7 @@ def graph(model: FSMModel, ax: Axes | None = None, *, dead_ends: States = ()) ->
     rank = np.argsort(np.argsort(-between, axis=1), axis=1)
     for i, j in np.argwhere(between > 0.005 * heaviest):
         pale = rank[i, j] >= _DARK
-        if pale and not numbered:
+        if pale and not has_numbers:
             continue
         color = ink(0.19) if pale else COLORS["dead end"] if j in dead_ends else ink(0.69)
         wide = max(_WIDEST * between[i, j] / heaviest, 0.4)
@@ -247,20 +247,20 @@ def experience(
     judge = guard.judge
     if not isinstance(judge, LearntRisk) or not judge.n_variables:
         raise ValueError("the judge of this guard has not learnt where it fails")
-    known, m = judge.state, judge.n_variables
-    fails = known.forms[known.forms[:, SAYS] == FAILS]
-    told = telling(fails)
-    pair = list(variables or dict.fromkeys([*told, *range(max(m, 2))]))[:2]
+    memory, m = judge.state, judge.n_variables
+    fails = memory.forms[memory.forms[:, SAYS] == FAILS]
+    failure_variables = telling(fails)
+    pair = list(variables or dict.fromkeys([*failure_variables, *range(max(m, 2))]))[:2]
     pair = [check_index("variable", k, m) for k in pair]
-    ax, called, red = _given_or_new(ax), judge.labels.variable, COLORS["dead end"]
-    seen = np.concatenate([known.survived, known.brinks])
+    ax, label_of, color = _given_or_new(ax), judge.labels.variable, COLORS["dead end"]
+    dots = np.concatenate([memory.survived, memory.brinks])
     label = "survived (blank: nothing was seen)"
-    ax.plot(*seen[:, pair].T, ".", markersize=1.5, color=ink(0.4), label=label)
-    ax.plot(*known.failures[:, pair].T, "x", markersize=5.0, color=ink(), label="failed")
-    sizes = 2.0 * known.radii[:, None] * known.survived.std(0)[pair]
+    ax.plot(*dots[:, pair].T, ".", markersize=1.5, color=ink(0.4), label=label)
+    ax.plot(*memory.failures[:, pair].T, "x", markersize=5.0, color=ink(), label="failed")
+    sizes = 2.0 * memory.radii[:, None] * memory.survived.std(0)[pair]
     label = "dead end" + ", all else as in its centre" * (m > 2)
-    for k, (centre, (wide, high)) in enumerate(zip(known.centres[:, pair], sizes, strict=True)):
-        look: Look = {"fill": False, "edgecolor": red, "label": "" if k else label, "zorder": 3.0}
+    for k, (centre, (wide, high)) in enumerate(zip(memory.centres[:, pair], sizes, strict=True)):
+        look: Look = {"fill": False, "edgecolor": color, "label": "" if k else label, "zorder": 3.0}
         ax.add_patch(Ellipse(centre, wide, high, **look))
     centers = np.empty((0, 2)) if guard.machine is None else guard.machine.centers[:, pair]
     ax.update_datalim(centers)
@@ -270,16 +270,16 @@ def experience(
     draw_centers(ax, centers, (), 10.0)
     ax.axis(limits)
     ax.plot([], [], "o", fillstyle="none", color=ink(), label="state")
-    if elsewhere := sorted({*told} - {*pair}):
-        ax.plot([], [], " ", label=f"not in view: fails by {', '.join(map(called, elsewhere))}")
+    if elsewhere := sorted({*failure_variables} - {*pair}):
+        ax.plot([], [], " ", label=f"not in view: fails by {', '.join(map(label_of, elsewhere))}")
     _explain(ax, columns=2)
-    ax.set(xlabel=called(pair[0]), ylabel=called(pair[1]))
+    ax.set(xlabel=label_of(pair[0]), ylabel=label_of(pair[1]))
     return ax
 
 
 def _tint(ax: Axes, pair: list[int], table: NDArray[np.float64], label: str) -> None:
     """Tint where forms (r, SIZE) of two variables are passed, or by `HELD` nearly, with an edge."""
-    limits, red = ax.axis(), COLORS["dead end"]
+    limits, failure_color = ax.axis(), COLORS["dead end"]
     table = table[np.isin(table[:, [I, J]], pair).all(1)]
     if not len(table):
         return
@@ -287,9 +287,9 @@ def _tint(ax: Axes, pair: list[int], table: NDArray[np.float64], label: str) -> 
     z = np.zeros((x.size, max(pair) + 1))
     z[:, pair] = np.column_stack([x.ravel(), y.ravel()])
     form = (-distances(table, z) - table[:, HELD, None]).max(0).reshape(x.shape)
-    ax.contourf(x, y, form, [0.0, np.inf], colors=[red], alpha=0.15, zorder=0.5)
-    ax.contour(x, y, form, [0.0], colors=[red], linewidths=1.2, zorder=2.0)
-    look: Look = {"markersize": 8.0, "color": red, "alpha": 0.3}
+    ax.contourf(x, y, form, [0.0, np.inf], colors=[failure_color], alpha=0.15, zorder=0.5)
+    ax.contour(x, y, form, [0.0], colors=[failure_color], linewidths=1.2, zorder=2.0)
+    look: Look = {"markersize": 8.0, "color": failure_color, "alpha": 0.3}
     ax.plot([], [], "s", label=label, **look)
 
 
@@ -328,10 +328,10 @@ def belief(
     >>> plot.belief(trace, Figure().subplots()).lines[0].get_ydata()  # from 0: #2 at last
     array([0, 0, 0, 1])
     """
-    held = belief.belief if isinstance(belief, Trace) else belief
-    if held is None:
+    beliefs = belief.belief if isinstance(belief, Trace) else belief
+    if beliefs is None:
         raise ValueError("the trace holds no beliefs (learn_many(..., belief=True) keeps them)")
-    rows = np.asarray(held, dtype=np.float64)
+    rows = np.asarray(beliefs, dtype=np.float64)
     if rows.ndim != 2 or rows.size == 0:
         raise ValueError(f"belief has shape {rows.shape}; it must be (T, n), not empty")
     n = rows.shape[1]
@@ -379,8 +379,8 @@ def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = No
     low, high, proposed, executed = until_the_end
     band: Look = {"step": "post", "alpha": 0.25, "linewidth": 0.0, "label": "90 % interval"}
     ax.fill_between(when, low, high, color=COLORS["follower"], **band)
-    dashed: Look = {"color": COLORS["dead end"], "linestyle": "--", "label": "proposed"}
-    ax.step(when, proposed, where="post", **dashed)
+    dashes: Look = {"color": COLORS["dead end"], "linestyle": "--", "label": "proposed"}
+    ax.step(when, proposed, where="post", **dashes)
     ax.step(when, executed, where="post", color=COLORS["follower"], label="executed")
     if tolerance is not None:
         look: Look = {"linestyle": ":", "linewidth": 1.0, "label": f"tolerance, {tolerance:g}"}
@@ -414,28 +414,28 @@ def history(
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
     fails, lasts = np.asarray(failed, np.bool_), np.ptp(when)
     unit, size = ("hours", 3600.0) if lasts > 7200.0 else ("minutes", 60.0)
-    steps, dated = np.diff(when), bool(when[0] >= DATES)
-    unit, size = ("days", 86400.0) if lasts > 2e5 or dated else (unit, size)
+    steps, is_dated = np.diff(when), bool(when[0] >= DATES)
+    unit, size = ("days", 86400.0) if lasts > 2e5 or is_dated else (unit, size)
     step = float(np.median(steps)) if len(steps) else 0.0
     holes = np.flatnonzero(steps > 3.0 * step) + 1  # before each a row without numbers ends lines
-    x, red, blue = (when - when[0] * (not dated)) / size, COLORS["dead end"], COLORS["follower"]
-    drawn = np.insert(x, holes, x[holes - 1] + step / size)
-    said = np.insert(np.asarray(risk, np.float64), holes, np.nan)
-    look: Look = {"color": blue, "alpha": 0.3, "linewidth": 2.5, "label": "alarm"}
+    x, failure_color = (when - when[0] * (not is_dated)) / size, COLORS["dead end"]
+    line_x = np.insert(x, holes, x[holes - 1] + step / size)
+    risks = np.insert(np.asarray(risk, np.float64), holes, np.nan)
+    look: Look = {"color": COLORS["follower"], "alpha": 0.3, "linewidth": 2.5, "label": "alarm"}
     for ax in axes:
         over = ax.get_xaxis_transform()
-        ax.fill_between(drawn, 0.0, 1.0, said > tolerance, transform=over, **look)
+        ax.fill_between(line_x, 0.0, 1.0, risks > tolerance, transform=over, **look)
         for cross in x[fails]:
-            ax.axvline(cross, color=red, linewidth=0.8, linestyle="--")
+            ax.axvline(cross, color=failure_color, linewidth=0.8, linestyle="--")
     for k, (ax, name, values) in enumerate(zip(axes, names, z.T, strict=False)):
-        ax.plot(drawn, np.insert(values, holes, np.nan), color=ink(), linewidth=0.6)
+        ax.plot(line_x, np.insert(values, holes, np.nan), color=ink(), linewidth=0.6)
         at = [value for variable, value in limits if variable == k]
         low, high = usual_range(values, values[fails])
         low, high = min(low, *at, high), max(high, *at, low)
         pad = 0.06 * (high - low) or 1.0
         ax.set_ylim(low - pad, high + pad)
         for value in at:
-            ax.axhline(value, color=red, linewidth=1.0)
+            ax.axhline(value, color=failure_color, linewidth=1.0)
         if beyond := int(((values < low) | (values > high)).sum()):
             look = {"ha": "right", "xycoords": "axes fraction"}
             write(ax, f"{beyond:,} rows not in view", (1.0, 1.0), (0.0, 4.0), **look)
@@ -444,20 +444,20 @@ def history(
         ax.set_ylabel(textwrap.fill(name, max(letters, 8)))
     if model is not None:
         sample = np.arange(0, len(z), max(len(z) // 2000, 1))
-        seen = [model.nearest(row).state for row in z[sample]]
-        axes[-2].plot(x[sample], seen, ".", markersize=1.5, color=COLORS["leader"])
+        nearest_states = [model.nearest(row).state for row in z[sample]]
+        axes[-2].plot(x[sample], nearest_states, ".", markersize=1.5, color=COLORS["leader"])
         label_states(axes[-2].yaxis, model.n_states)
         axes[-2].set_ylabel("state")
-    axes[-1].step(drawn, said, where="post", color=blue)
-    axes[-1].axhline(tolerance, color=red, linewidth=1.0, label="limit of alarms")
+    axes[-1].step(line_x, risks, where="post", color=COLORS["follower"])
+    axes[-1].axhline(tolerance, color=failure_color, linewidth=1.0, label="limit of alarms")
     look = {"linestyle": "none", "marker": "X", "markersize": 4.5, "clip_on": False}
-    axes[-1].plot(x[fails], np.ones(fails.sum()), color=red, label="failure", **look)
+    axes[-1].plot(x[fails], np.ones(fails.sum()), color=failure_color, label="failure", **look)
     _explain(axes[-1])
     axes[-1].set(ylim=(-0.03, 1.03), ylabel="risk", xlabel=f"time [{unit}]")
-    if dated:
+    if is_dated:
         ticks = AutoDateLocator(maxticks=8)  # type: ignore[no-untyped-call]
-        written = ConciseDateFormatter(ticks)  # type: ignore[no-untyped-call]
-        axes[-1].xaxis.set(major_locator=ticks, major_formatter=written, label_text="time")
+        formatter = ConciseDateFormatter(ticks)  # type: ignore[no-untyped-call]
+        axes[-1].xaxis.set(major_locator=ticks, major_formatter=formatter, label_text="time")
 
 
 def _explain(ax: Axes, columns: int = 3) -> None:
@@ -492,16 +492,16 @@ def points(size: float) -> float:
 def ink(share: float = 1.0) -> str:
     """The colour of type in the style that holds, of which a share is left on its ground."""
     type_, ground = (to_rgb(matplotlib.rcParams[key]) for key in ("text.color", "axes.facecolor"))
-    red, green, blue = (share * a + (1.0 - share) * b for a, b in zip(type_, ground, strict=True))
-    return to_hex((red, green, blue))
+    rgb = [share * a + (1.0 - share) * b for a, b in zip(type_, ground, strict=True)]
+    return to_hex((rgb[0], rgb[1], rgb[2]))
 
 
 def write(
     axes: Axes, text: str, xy: Point, offset: Point = (0.0, 0.0), *, size: float = 7.0, **look: Any
 ) -> Annotation:
     """Write beside a place, ``offset`` points from it."""
-    given = {"textcoords": "offset points", "annotation_clip": False, "va": "center", **look}
-    return axes.annotate(text, xy, xytext=offset, fontsize=points(size), **given)
+    options = {"textcoords": "offset points", "annotation_clip": False, "va": "center", **look}
+    return axes.annotate(text, xy, xytext=offset, fontsize=points(size), **options)
 
 
 def mark(axes: Axes, x: float, y: float, **look: Any) -> None:
@@ -532,15 +532,15 @@ def draw_state(
 def draw_centers(axes: Axes, centers: NDArray[np.float64], dead_ends: States, size: float) -> None:
     """Draw centres (n, 2); discs that would meet move apart and point to their place."""
     places = centers
-    numbered = len(centers) <= _DISCS
-    if numbered:
+    has_numbers = len(centers) <= _DISCS
+    if has_numbers:
         scale = axes.figure.dpi / 72.0
-        moved = _apart(axes.transData.transform(centers) / scale, size + 1.0)
-        places = axes.transData.inverted().transform(moved * scale)
+        disc_places = _apart(axes.transData.transform(centers) / scale, size + 1.0)
+        places = axes.transData.inverted().transform(disc_places * scale)
     for state, (center, (x, y)) in enumerate(zip(centers, places, strict=True)):
         axes.plot([center[0], x], [center[1], y], color=ink(), linewidth=0.6, zorder=4.5)
         axes.plot(*center, marker="o", markersize=1.6, color=ink(), zorder=4.5)
-        draw_state(axes, x, y, state, size, dead_end=state in dead_ends, numbered=numbered)
+        draw_state(axes, x, y, state, size, dead_end=state in dead_ends, numbered=has_numbers)
 
 
 def _apart(places: NDArray[np.float64], size: float) -> NDArray[np.float64]:
@@ -563,11 +563,11 @@ def label_states(axis: Axis, n: int, dead_ends: States = (), *, called: str = ""
 
     On an upward axis the rows of dead ends are tinted as well where they are ``called`` something.
     """
-    numbered = range(0, n, 1 if n <= _TICKS else math.ceil(n / 8))
+    ticks = range(0, n, 1 if n <= _TICKS else math.ceil(n / 8))
     sign = "" if axis is axis.axes.xaxis else "#"  # which there is no room for
-    axis.set_ticks(numbered, [f"{sign}{state + 1}" for state in numbered])
+    axis.set_ticks(ticks, [f"{sign}{state + 1}" for state in ticks])
     axis.set_tick_params(length=0, labelsize=points(7.0), pad=2.0)
-    for state, label in zip(numbered, axis.get_ticklabels(), strict=False):
+    for state, label in zip(ticks, axis.get_ticklabels(), strict=False):
         if state in dead_ends:
             label.set(color=COLORS["dead end"], fontweight="bold")
     if called:

@@ -106,8 +106,8 @@ class Numbers(NamedTuple):
         for size, have in zip(self.shape, shape, strict=False):
             fits &= have == (size if isinstance(size, int) else sizes.setdefault(size, have))
         if not fits:
-            wanted = tuple(sizes.get(size, size) for size in self.shape)
-            raise ValueError(f"{name} has shape {shape}, not {wanted}, as others say")
+            right_shape = tuple(sizes.get(size, size) for size in self.shape)
+            raise ValueError(f"{name} has shape {shape}, not {right_shape}, as others say")
 
 
 COUNT = Numbers(least=0.0, most=MOST_COUNTED, whole=True)
@@ -185,18 +185,18 @@ def _packed(kind: Kind, header: Header, arrays: Mapping[str, NDArray[Any]]) -> l
         end = begin + array.nbytes
         entries[name] = _Entry(_TYPE_NAMES[array.dtype], list(array.shape), [begin, end])
         begin = end
-    told = json.dumps(header._asdict())
-    sizes = _refuse_unfit(kind, json.loads(told)["settings"], entries)
+    text = json.dumps(header._asdict())
+    sizes = _refuse_unfit(kind, json.loads(text)["settings"], entries)
     for name, numbers in kind.arrays.items():
         numbers.refuse_others(name, arrays[name], sizes)
     index: dict[str, Any] = {name: entry._asdict() for name, entry in entries.items()}
-    encoded = json.dumps({"__metadata__": {"sha256": _UNSIGNED, "evofsm": told}, **index}).encode()
-    encoded += b" " * (-len(encoded) % 8)  # so that numbers begin at a multiple of eight
-    if len(encoded) > _LARGEST_HEADER or begin > _LARGEST_FILE:
+    head = json.dumps({"__metadata__": {"sha256": _UNSIGNED, "evofsm": text}, **index}).encode()
+    head += b" " * (-len(head) % 8)  # so that numbers begin at a multiple of eight
+    if len(head) > _LARGEST_HEADER or begin > _LARGEST_FILE:
         raise ValueError(f"{kind.name} is too large for a file: more than {_LARGEST_FILE:,} bytes")
     content = [np.ascontiguousarray(array).data for array in arrays.values()]
-    signed = encoded.replace(_UNSIGNED.encode(), _sha256(encoded, content).encode(), 1)
-    return [len(signed).to_bytes(8, "little"), signed, *content]
+    signed_head = head.replace(_UNSIGNED.encode(), _sha256(head, content).encode(), 1)
+    return [len(signed_head).to_bytes(8, "little"), signed_head, *content]
 
 
 def only_writer(file: BinaryIO, path: str | os.PathLike[str], otherwise: str) -> None:
@@ -273,11 +273,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     sweep(target)
     # Not all systems can flush a folder; the file is whole, if not under its name, without it.
     with suppress(OSError):
-        opened = os.open(target.parent, os.O_RDONLY)
+        descriptor = os.open(target.parent, os.O_RDONLY)
         try:
-            os.fsync(opened)
+            os.fsync(descriptor)
         finally:
-            os.close(opened)
+            os.close(descriptor)
 
 
 def _write_over(target: Path, whole: BinaryIO) -> None:
@@ -298,17 +298,17 @@ def _write_over(target: Path, whole: BinaryIO) -> None:
 
 def _place_of(path: str | os.PathLike[str]) -> tuple[Path, int | None]:
     """Where a file is once links are followed, and its mode; None where there is none yet."""
-    given = Path(path)
-    if not given.parent.is_dir():
-        raise FileNotFoundError(f"{given}: there is no folder {given.parent}")
-    target = Path(os.path.realpath(given))
+    file_path = Path(path)
+    if not file_path.parent.is_dir():
+        raise FileNotFoundError(f"{file_path}: there is no folder {file_path.parent}")
+    target = Path(os.path.realpath(file_path))
     try:
-        mode = os.stat(given).st_mode
+        mode = os.stat(file_path).st_mode
     except FileNotFoundError:
         return target, None
     if not stat.S_ISREG(mode):
         type_name = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
-        raise OSError(f"{given} is {type_name}, which no file may take the place of")
+        raise OSError(f"{file_path} is {type_name}, which no file may take the place of")
     return target, stat.S_IMODE(mode)
 
 
@@ -358,14 +358,14 @@ def read(place: Place, kind: Kind) -> tuple[dict[str, Any], dict[str, NDArray[An
     """
     with _opened(place) as file:
         with explained(place):
-            header, entries, encoded, sha256 = _unpacked(file)
+            header, entries, head, sha256 = _unpacked(file)
         if header.kind != kind.name:
             raise ValueError(f"{_named(place)} holds a {header.kind}, not a {kind.name}")
         with explained(place):
             sizes = _refuse_unfit(kind, header.settings, entries)
             arrays = {name: _read_array(file, entry) for name, entry in entries.items()}
-            unsigned = encoded.replace(sha256.encode(), _UNSIGNED.encode(), 1)
-            if _sha256(unsigned, [array.data for array in arrays.values()]) != sha256:
+            unsigned_head = head.replace(sha256.encode(), _UNSIGNED.encode(), 1)
+            if _sha256(unsigned_head, [array.data for array in arrays.values()]) != sha256:
                 raise ValueError("its SHA-256 is another one: it was changed or damaged")
             for name, numbers in kind.arrays.items():
                 numbers.refuse_others(name, arrays[name], sizes)
@@ -388,12 +388,12 @@ def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
     length = int.from_bytes(file.read(8), "little")
     if not 2 <= length <= min(size - 8, _LARGEST_HEADER):
         raise ValueError("it is another program's file, or cut off (a log? evofsm learn reads it)")
-    encoded = file.read(length)
+    head = file.read(length)
     try:
-        index = json.loads(encoded)
+        index = json.loads(head)
         metadata = index.pop("__metadata__")
-        told, sha256 = json.loads(metadata["evofsm"]), str(metadata["sha256"])
-        version = told["version"]
+        header_fields, sha256 = json.loads(metadata["evofsm"]), str(metadata["sha256"])
+        version = header_fields["version"]
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise ValueError("it is another program's file, or its header is damaged") from None
     if type(version) is int and version > _VERSION:
@@ -401,7 +401,7 @@ def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
             f"its version {version} is newer than this library's {_VERSION}; "
             "a newer evofsm reads it"
         )
-    header = Header(**told)
+    header = Header(**header_fields)
     types = (str, int, str, dict, dict)
     if tuple(map(type, header)) != types or not re.fullmatch("[a-z]{1,20}", header.kind):
         raise ValueError("its header does not say what it holds")
@@ -410,7 +410,7 @@ def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
         begin = _end_of(name, entry, begin)
     if begin != size - 8 - length:
         raise ValueError(f"its arrays claim {begin:,} bytes, but it has {size - 8 - length:,}")
-    return header, entries, encoded, sha256
+    return header, entries, head, sha256
 
 
 def _end_of(name: str, entry: _Entry, begin: int) -> int:
@@ -452,14 +452,14 @@ def _refuse_unfit(
     """Raise for what does not fit; returns the number that each name in a shape stands for."""
     sizes: dict[int | str, int] = {}
     _refuse_settings(settings, kind.settings, sizes)
-    if lacking := set(kind.arrays) - set(entries):
-        raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+    if omissions := set(kind.arrays) - set(entries):
+        raise ValueError(f"it lacks {', '.join(sorted(omissions))}")
     if unknown := set(entries) - set(kind.arrays):
         raise ValueError(f"it has {', '.join(sorted(unknown))}, which no {kind.name} has")
     for name, numbers in kind.arrays.items():
-        expected = _TYPE_NAMES[np.dtype(numbers.dtype)]
-        if entries[name].dtype != expected:
-            raise ValueError(f"{name} is of type {entries[name].dtype}, not {expected}")
+        dtype = _TYPE_NAMES[np.dtype(numbers.dtype)]
+        if entries[name].dtype != dtype:
+            raise ValueError(f"{name} is of type {entries[name].dtype}, not {dtype}")
         numbers.refuse_shape(name, tuple(entries[name].shape), sizes)
     return sizes
 
@@ -470,21 +470,21 @@ def _refuse_settings(
     sizes: dict[int | str, int],
     within: str = "",
 ) -> None:
-    for name, wanted in declared.items():
+    for name, declaration in declared.items():
         value, full_name = settings.get(name), f"{within}{name}"
-        if isinstance(wanted, Mapping):
+        if isinstance(declaration, Mapping):
             if not isinstance(value, Mapping | None):
                 raise ValueError(f"{full_name} is {value!r}; it must be a mapping")
-            _refuse_settings(value or {}, wanted, sizes, f"{full_name}.")
-        elif not isinstance(wanted, Numbers):
-            if not _is(value, wanted):
-                kind = wanted.__name__ if isinstance(wanted, type) else wanted
+            _refuse_settings(value or {}, declaration, sizes, f"{full_name}.")
+        elif not isinstance(declaration, Numbers):
+            if not _is(value, declaration):
+                kind = declaration.__name__ if isinstance(declaration, type) else declaration
                 raise ValueError(f"{full_name} is {value!r}; it must be of type {kind}")
         elif value is not None:
-            wanted.refuse_others(full_name, value, sizes)
-            if wanted.whole and wanted.shape == ():
+            declaration.refuse_others(full_name, value, sizes)
+            if declaration.whole and declaration.shape == ():
                 sizes[f"settings.{full_name}"] = int(value)
-        elif not wanted.optional:
+        elif not declaration.optional:
             raise ValueError(f"it lacks {full_name}")
 
 
