@@ -8,7 +8,7 @@ import pytest
 from evofsm.guard import AuditLog, Guard, LearntRisk, Mode, audit
 from evofsm.guard.api import Search
 from evofsm.guard.export import write_c99
-from evofsm.guard.harm import Harm
+from evofsm.guard.harm import Harm, Outcome
 from evofsm.guard.learnt.judge import _unjudged
 
 _ALONE = 0.05  # what the controller wants: so it fails after 20 steps
@@ -165,7 +165,7 @@ def arms(guarded, alone):
     ],
 )
 def test_frozen_it_acts_where_episodes_ended_better(guarded, alone, helps):
-    assert arms([guarded] * 3, [alone] * 3).helps == helps
+    assert arms([guarded] * 3, [alone] * 3).helps(learning=False) == helps
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,17 @@ def test_frozen_it_acts_where_it_prevents_most_failures(failed, kept, helps):
     """A lander's guard: later crashes count for little; one that flies by itself has to do more."""
     guarded = [(150, "f", None)] * failed + [(300, "", None)] * (20 - failed)
     harm = arms(guarded, [(110, "f", None)] * 6)._replace(decided=500.0, kept=kept)
-    assert harm.helps == helps
+    assert harm.helps(learning=False) == helps
+
+
+def test_frozen_it_does_not_forget_why_it_was_there():
+    """While it learned a careless controller had luck of late: it may have been another one."""
+    luck = [(45, "e", None)] * 3
+    harm = arms([(60, "e", None)] * 19 + [(28, "f", None)], luck)
+    first = [Outcome(-k, 20, failed=True, guarded=False) for k in (1, 2)]
+    harm = harm._replace(outcomes=(*first, *harm.outcomes))
+    assert not harm.helps(learning=True)
+    assert harm.helps(learning=False)
 
 
 def test_the_arm_that_is_better_is_drawn_ever_more_often():
@@ -204,7 +214,7 @@ def test_a_controller_that_became_good_drives_on_alone_under_a_guard_that_always
         harm = harm.after(driven, failed=failed[-1])
     assert sum(failed[20:]) <= 3
     assert not any(failed[24:])
-    assert not harm.helps
+    assert not harm.helps(learning=False)
 
 
 @pytest.mark.parametrize(("how", "least", "most"), [("e", 20, 60), ("", 0, 8)])

@@ -26,10 +26,10 @@ then the controller drives until it fails, and after two guarded episodes at the
 latest three failed, too, there is little to lose, and the guard, which learns, drives the others,
 twelve at most.
 
-Frozen, it acts unless its record says that it harms, or does not help: it loses more pairs than it
-wins or, of three episodes at least, all failed, however late, or it prevents less than half of the
-failures per step, nine of ten if it replaces nearly every proposal. A guard, or a controller,
-that was never tried has no record: then it acts.
+Frozen, it acts unless its record, of which then both arms fade alike, says that it harms, or does
+not help: it loses more pairs than it wins or, of three episodes at least, all failed, however late,
+or it prevents less than half of the failures per step, nine of ten if it replaces nearly every
+proposal. A guard, or a controller, that was never tried has no record: then it acts.
 """
 
 from __future__ import annotations
@@ -117,8 +117,7 @@ class Harm(NamedTuple):
         """Whether hardly a proposal is kept."""
         return self.decided >= _FEWEST_DECISIONS and self.kept < 0.05 * self.decided
 
-    @property
-    def helps(self) -> bool:
+    def helps(self, *, learning: bool) -> bool:
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
 
         Of three episodes at least, a guard that failed in all prevents nothing, however late; nor
@@ -130,10 +129,13 @@ class Harm(NamedTuple):
             return False
         if not guarded or not alone:
             return True
+        weights, rates = zip(
+            *(self._record(arm, learning) for arm in (guarded, alone)), strict=True
+        )
         left = _LEFT_BY_ITSELF if self.replaces else _LEFT
-        if len(guarded) >= _CAREFUL and self._rate(guarded) > left * self._rate(alone):
+        if len(guarded) >= _CAREFUL and rates[0] > left * rates[1]:
             return False
-        return bool(self._weights(guarded) @ better(guarded, alone) @ self._weights(alone) >= 0.0)
+        return bool(weights[0] @ better(guarded, alone) @ weights[1] >= 0.0)
 
     def drives(self, draws: int) -> float:
         """In how many of some draws the guard would drive the next episode, as a share.
@@ -144,25 +146,28 @@ class Harm(NamedTuple):
         arms = [[*self.guarded, well], [*self.alone, well]]
         random = np.random.default_rng([self.n_episodes, draws])
         guarded, alone = (
-            random.gamma(np.append(self._weights(arm[:-1]), hope), size=(draws, len(arm)))
+            random.gamma(
+                np.append(self._weights(arm[:-1], learning=True), hope), size=(draws, len(arm))
+            )
             for arm, hope in zip(arms, _HOPES, strict=True)
         )
         won = np.einsum("ni,ij,nj->n", guarded, better(*arms), alone)
         return float((won >= 0.0).mean())
 
-    def _weights(self, outcomes: Sequence[Outcome]) -> NDArray[np.float64]:
-        fades = [_FADES[o.guarded or not self.ends] for o in outcomes]
+    def _weights(self, outcomes: Sequence[Outcome], *, learning: bool) -> NDArray[np.float64]:
+        fades = [_FADES[o.guarded or not (self.ends and learning)] for o in outcomes]
         return np.power(fades, [self.n_episodes - o.episode for o in outcomes])
 
-    def _rate(self, outcomes: Sequence[Outcome]) -> float:
-        """Failures per step."""
-        fails, steps = self._weights(outcomes) @ [(o.failed, o.steps) for o in outcomes]
-        return float(fails / steps)
+    def _record(self, arm: Sequence[Outcome], learning: bool) -> tuple[NDArray[np.float64], float]:
+        """Weights of an arm, and its failures per step."""
+        weights = self._weights(arm, learning=learning)
+        fails, steps = weights @ [(o.failed, o.steps) for o in arm]
+        return weights, float(fails / steps)
 
     def passing(self, *, learning: bool) -> str:
         """Why proposals pass in the episode to come; empty where they are revised."""
         if not learning:
-            return "" if self.helps else "was not shown to help"
+            return "" if self.helps(learning=False) else "was not shown to help"
         if _all_failed(self.guarded):
             turn_is_over = all(outcome.guarded for outcome in self.outcomes[-_TURN:])
             if turn_is_over or not _all_failed(self.alone, 1):
@@ -170,7 +175,7 @@ class Harm(NamedTuple):
             if _all_failed(self.alone) and len(self.guarded) < _TRIES:
                 return ""
         fails = any(outcome.failed for outcome in self.outcomes[-1:])
-        asked = self.refuses and (fails or self._long_ago or not self.helps)
+        asked = self.refuses and (fails or self._long_ago or not self.helps(learning=True))
         return "shadow" if asked and not self.drives(self._draws) else ""
 
     @property
@@ -192,7 +197,7 @@ class Harm(NamedTuple):
         if not guarded or not alone:
             return ""
         doubted = learning and (1.0 - self.drives(_DRAWS)) ** self._draws > 1.0 - _SAID
-        if self.helps and not doubted:
+        if self.helps(learning=learning) and not doubted:
             return ""
         how = "both are tried" if learning else "proposals pass"
         found = f"guarded episodes {_ended(guarded)}, the controller alone {_ended(alone)}"
