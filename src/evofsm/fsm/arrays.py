@@ -205,8 +205,8 @@ _SUM = COUNT._replace(whole=False)
 
 def _optional(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        name: told._replace(optional=True) if isinstance(told, Numbers) else told
-        for name, told in settings.items()
+        name: form._replace(optional=True) if isinstance(form, Numbers) else form
+        for name, form in settings.items()
     }
 
 

@@ -146,7 +146,7 @@ def _update_potentials(learnt: Learnt, settings: Settings, n: int) -> float:
 def _absorb(now: Any, variables: Records, weights: Floats, z: Floats) -> None:
     """Add the observation to the running mean and scatter (Welford 1962)."""
     share = 1.0 / (now.n_observations + 1.0)
-    added = 0.0
+    increment = 0.0
     for j in range(len(z)):
         variable = variables[j]
         variable.latest = z[j]
@@ -154,9 +154,9 @@ def _absorb(now: Any, variables: Records, weights: Floats, z: Floats) -> None:
         before = offset - variable["mean"]
         mean = variable["mean"] + before * share
         variable["mean"] = mean
-        added += (before * weights[j]) * ((offset - mean) * weights[j])
+        increment += (before * weights[j]) * ((offset - mean) * weights[j])
     now.n_observations += 1
-    now.scatter += added
+    now.scatter += increment
 
 
 # -- Recognise ------------------------------------------------------------------------------------

@@ -96,29 +96,29 @@ def explain(
     here = Tally(int(known.failed_soon[state]), int(known.episodes[state]), is_exact, is_told)
     visits = int(known.visits[state])
     outcomes = zip(known.failed_after[:, state], known.tried[:, state], strict=True)
-    after = [Tally(int(failed), int(tried), is_exact, is_told) for failed, tried in outcomes]
-    asked = None if action is None else after[action]
-    better = _best(after, here if asked is None or not asked.episodes else asked)
+    after = [Tally(int(failed), int(episodes), is_exact, is_told) for failed, episodes in outcomes]
+    tally = None if action is None else after[action]
+    better = _best(after, here if tally is None or not tally.episodes else tally)
     after_better = None if better is None else after[better]
     arrivals = np.where(np.arange(len(belief)) == state, 0.0, known.changes[:, state])
-    came_from = int(arrivals.argmax()) if arrivals.any() else None
+    origin = int(arrivals.argmax()) if arrivals.any() else None
 
     horizon = known.settings.get("failure_horizon")
     soon = "later on" if horizon is None else f"within {labels.duration(horizon)}"
     sentences = [
         _of_place(known, belief, state, labels),
-        _of_episodes(here, visits, soon, asked, "" if action is None else labels.action(action)),
+        _of_episodes(here, visits, soon, tally, "" if action is None else labels.action(action)),
         "" if better is None else f"Better after {labels.action(better)}: {after_better}",
         _of_onsets(known, state, labels),
         "" if is_exact else "States were joined here, so an episode may count twice",
         ""
-        if came_from is None
-        else f"Most often reached from {state_name(came_from)}: {arrivals[came_from]:,.0f} of "
+        if origin is None
+        else f"Most often reached from {state_name(origin)}: {arrivals[origin]:,.0f} of "
         f"{arrivals.sum():,.0f} times",
     ]
     text = " ".join(f"{sentence}." for sentence in sentences if sentence)
-    counted = visits, here, came_from, asked, better, after_better
-    return Explanation(text, state, float(belief[state]), *counted)
+    contents = visits, here, origin, tally, better, after_better
+    return Explanation(text, state, float(belief[state]), *contents)
 
 
 def _never_seen(known: Any, belief: Floats, nearest: Nearest, labels: Labels) -> Explanation:

@@ -105,8 +105,8 @@ class Forecasts:
             self._make_room(horizon, actions)
             for row in range(steps, len(beliefs)):
                 if (before := row - steps) >= begins[row]:
-                    given = beliefs[before], states[before], beliefs[row], states[row]
-                    self._learn(horizon, int(actions[before]), *given)
+                    arguments = beliefs[before], states[before], beliefs[row], states[row]
+                    self._learn(horizon, int(actions[before]), *arguments)
 
     def predict(self, belief: ArrayLike, i: ArrayLike | None, steps: int) -> Floats:
         """(n,) forecast of the state, or (T, n) of many; nothing is changed by asking.
@@ -126,39 +126,39 @@ class Forecasts:
         valid.refuse_unless_distribution("belief", rows)
         self._check_states(rows.shape[1])
         if steps not in self.steps:
-            known = ", ".join(map(str, self.steps))
-            raise ValueError(f"there is no horizon of {steps} steps; there are {known}")
-        given = np.broadcast_to(np.asarray(NO_ACTION if i is None else i), len(rows))
-        actions = valid.check_actions(given, len(rows), self.n_actions)
-        predicted, n = rows.copy(), np.arange(self.n_states)
+            horizons = ", ".join(map(str, self.steps))
+            raise ValueError(f"there is no horizon of {steps} steps; there are {horizons}")
+        indices = np.broadcast_to(np.asarray(NO_ACTION if i is None else i), len(rows))
+        actions = valid.check_actions(indices, len(rows), self.n_actions)
+        forecast, n = rows.copy(), np.arange(self.n_states)
         for action in np.unique(actions).tolist():
-            of_it = np.ix_(actions == action, n)
-            predicted[of_it] = rows[of_it] @ self._matrix(self.steps.index(steps), action, n, n)
-        return predicted if np.ndim(belief) == 2 else predicted[0]
+            block = np.ix_(actions == action, n)
+            forecast[block] = rows[block] @ self._matrix(self.steps.index(steps), action, n, n)
+        return forecast if np.ndim(belief) == 2 else forecast[0]
 
     def _matrix(self, horizon: int, action: int, i: Any, j: Any) -> Floats:
         """Transition probabilities from states i to j; presumed are those of all actions."""
         block, stays = np.ix_(i, j), i[:, None] == j
         share = self._moving[horizon][1] / self._moving[horizon].sum()
-        presumed = share * self._elsewhere[block] + (1.0 - share) * stays
+        matrix = share * self._elsewhere[block] + (1.0 - share) * stays
         for counts in (self._counts[horizon].get(key) for key in {NO_ACTION: 0, action: 0}):
             if counts is not None:
                 weight = 1.0 / (counts[i].sum(axis=1, keepdims=True) + _EVIDENCE)
-                presumed = (counts[block] + _EVIDENCE * presumed) * weight
-        return np.asarray(presumed)
+                matrix = (counts[block] + _EVIDENCE * matrix) * weight
+        return np.asarray(matrix)
 
     def _learn(
         self, horizon: int, action: int, origin: Floats, i: Any, reached: Floats, j: Any
     ) -> None:
         """Count one transition from states i to states j, by how likely each pair is."""
-        moving, counts = self._moving[horizon], self._counts[horizon]
+        evidence, counts = self._moving[horizon], self._counts[horizon]
         keys = {NO_ACTION: 0, action: 0}
         likely = {key: origin[i, None] * self._matrix(horizon, key, i, j) for key in keys}
-        share = moving[1] / moving.sum()
-        stayed = (1.0 - share) * origin[j]
-        moved = share * (origin[i] @ self._elsewhere[np.ix_(i, j)])
-        gain = reached[j] / np.maximum(stayed + moved, _TINY)
-        moving += (gain * stayed).sum(), (gain * moved).sum()
+        share = evidence[1] / evidence.sum()
+        stay = (1.0 - share) * origin[j]
+        move = share * (origin[i] @ self._elsewhere[np.ix_(i, j)])
+        gain = reached[j] / np.maximum(stay + move, _TINY)
+        evidence += (gain * stay).sum(), (gain * move).sum()
         for key, pairs in likely.items():
             counts[key][np.ix_(i, j)] += pairs * (reached[j] / np.maximum(pairs.sum(axis=0), _TINY))
 

@@ -123,8 +123,8 @@ def exponential(x: float) -> float:
 
     ``exp(x) = 2^k exp(r)`` with ``|r| <= ln(2) / 2``: 14 terms of the Taylor series.
     """
-    rounded = x * _LOG2_E + _INTEGER
-    k = rounded - _INTEGER
+    k_bits = x * _LOG2_E + _INTEGER
+    k = k_bits - _INTEGER
     r = (x - k * _LN_2_HIGH) - k * _LN_2_LOW
     r2 = r * r
     r4 = r2 * r2
@@ -133,7 +133,7 @@ def exponential(x: float) -> float:
     third = 1 / 40320 + r * (1 / 362880) + r2 * (1 / 3628800 + r * (1 / 39916800))
     fourth = 1 / 479001600 + r * (1 / 6227020800)
     series = first + r4 * (second + r4 * (third + r4 * fourth))
-    power = (np.float64(rounded).view(np.int64) + _BIAS) << _MANTISSA
+    power = (np.float64(k_bits).view(np.int64) + _BIAS) << _MANTISSA
     return float(series * np.int64(power).view(np.float64))
 
 
@@ -199,12 +199,12 @@ def announce_compiling() -> None:
 
 def _drop_stale_caches(package: Path) -> None:
     """Delete cached code where a file of kernels has changed; Numba looks at its own file only."""
-    noted = package / "__pycache__" / "kernels.json"
+    note = package / "__pycache__" / "kernels.json"
     files = [(path, path.stat()) for path in sorted(package.rglob("*.py"))]
     times = [[str(path), stat.st_size, stat.st_mtime_ns] for path, stat in files]
     before: dict[str, Any] = {}
     with suppress(OSError, ValueError):
-        before = json.loads(noted.read_text("utf-8"))
+        before = json.loads(note.read_text("utf-8"))
     if before.get("times") == times:
         return
     sources = [path.read_bytes() for path, _ in files]
@@ -213,10 +213,10 @@ def _drop_stale_caches(package: Path) -> None:
     if before.get("digest") != digest:
         for path in package.rglob("__pycache__/*.nb[ic]"):
             path.unlink(missing_ok=True)
-    noted.parent.mkdir(exist_ok=True)
-    written = noted.with_name(f"{noted.name}.{os.getpid()}")
-    written.write_text(json.dumps({"times": times, "digest": digest}), "utf-8")
-    written.replace(noted)
+    note.parent.mkdir(exist_ok=True)
+    draft = note.with_name(f"{note.name}.{os.getpid()}")
+    draft.write_text(json.dumps({"times": times, "digest": digest}), "utf-8")
+    draft.replace(note)
 
 
 # Not possible where the installation may not be written, or another process cleans up too.

@@ -112,7 +112,7 @@ class EvolvingFSM(Retraced):
         failure_horizon: int | None = None,
     ) -> None:
         self._rule = rules.Paper() if rule is None else rules.check_rule(rule)
-        given = Settings(
+        settings = Settings(
             radius=0.3 if radius is None else positive("radius", radius),
             distance_weight=positive("distance_weight", distance_weight),
             learning_rate=_below_1("learning_rate", learning_rate),
@@ -127,11 +127,11 @@ class EvolvingFSM(Retraced):
             weights=np.empty(0),
         )
         table = {name: float(value) for name, value in self._rule.table.items() if name != "rule"}
-        given = given._replace(rule=int(self._rule.table["rule"]), **cast(Any, table))
+        settings = settings._replace(rule=int(self._rule.table["rule"]), **cast(Any, table))
         for name, value in (("radius", radius), ("spread", spread)):
-            if value not in (None, getattr(given, name)):
+            if value not in (None, getattr(settings, name)):
                 raise ValueError(f"{name} is {value}, but the rule has its own: {self._rule}")
-        self._settings = given
+        self._settings = settings
         self._learnt = arrays.blank(0, whole("n_actions", n_actions), 0, 0)
         self._share()
         MACHINE.refuse_others(self._content)
@@ -172,9 +172,9 @@ class EvolvingFSM(Retraced):
             machine is then as it was.
         """
         if missing is not Missing.REJECT:
-            given = valid.real_array("observation", z, ndim=1)
-            if (absent := np.isnan(given)).any():
-                return self._observe_partly(given, absent, missing, failed)
+            vector = valid.real_array("observation", z, ndim=1)
+            if (absent := np.isnan(vector)).any():
+                return self._observe_partly(vector, absent, missing, failed)
         return self._step(self._checked(z), NO_ACTION, failed)
 
     @alone
@@ -245,9 +245,9 @@ class EvolvingFSM(Retraced):
         beliefs = np.zeros((rows if belief else 0, self._capacity))
         self._known = None
         while row < rows:
-            given = self._learnt, self._settings, self._limit, observations, actions, starts
-            told, scratch = failures is not None, np.empty((3, self._capacity))
-            row = stepping.learn_rows(*given, ends, told, scratch, row, trace, beliefs)
+            arguments = self._learnt, self._settings, self._limit, observations, actions, starts
+            is_told, scratch = failures is not None, np.empty((3, self._capacity))
+            row = stepping.learn_rows(*arguments, ends, is_told, scratch, row, trace, beliefs)
             if row < rows:
                 self._make_room()
                 beliefs = np.pad(beliefs, [(0, 0), (0, self._capacity - beliefs.shape[1])])
@@ -348,22 +348,22 @@ class EvolvingFSM(Retraced):
         actions, names, units, dt
             What its numbers mean, as `Labels` takes them.
         """
-        found, now = arrays.by_name(self._learnt), self._learnt.now[0]
+        contents, now = arrays.by_name(self._learnt), self._learnt.now[0]
         q, n = self.n_actions, self.n_states
         if now["chained"]:  # what belongs to an episode that is going on is not shown yet
-            found["episodes"] -= found["latest_visit"] >= now["began"]
-            found["tried"] -= found["latest_try"] >= now["began"]
-        used = np.flatnonzero(found["place"] != NOT_OPEN)
+            contents["episodes"] -= contents["latest_visit"] >= now["began"]
+            contents["tried"] -= contents["latest_try"] >= now["began"]
+        indices = np.flatnonzero(contents["place"] != NOT_OPEN)
         of_actions = {
             "transition_matrices": np.full((q, n, n), 1.0 / max(n, 1)),
             "origin_frequency": np.full((q, n), n * self.prior_frequency),
             **{name: np.zeros((q, n)) for name in OF_ACTIONS},
         }
-        found["transition_matrices"] = found["matrices"]
+        contents["transition_matrices"] = contents["matrices"]
         for name, array in of_actions.items():
-            array[used] = found[name][found["place"][used]]
-        parts = {name: found[name] for name in OF_MODEL} | of_actions
-        parts["centers"] = found["centers"].T
+            array[indices] = contents[name][contents["place"][indices]]
+        parts = {name: contents[name] for name in OF_MODEL} | of_actions
+        parts["centers"] = contents["centers"].T
         return FSMModel(
             **parts,
             width=self.width,
@@ -390,8 +390,8 @@ class EvolvingFSM(Retraced):
     @property
     def settings(self) -> dict[str, Any]:
         """Its settings by name, but for the rule; those that were left as they are, left out."""
-        given = {name: getattr(self, name) for name in (*_SETTINGS, *_OPTIONS)}
-        return {name: value for name, value in given.items() if value != _OPTIONS.get(name, ...)}
+        values = {name: getattr(self, name) for name in (*_SETTINGS, *_OPTIONS)}
+        return {name: value for name, value in values.items() if value != _OPTIONS.get(name, ...)}
 
     @property
     def n_actions(self) -> int:
@@ -449,8 +449,8 @@ class EvolvingFSM(Retraced):
     def width(self) -> float:
         """Width of recognition, a squared distance; 0 before the first observation."""
         now = self._learnt.now[0]
-        seen = now["n_observations"]
-        return float(uncompiled(width_of)(self._settings, now["scatter"] / seen)) if seen else 0.0
+        count = now["n_observations"]
+        return float(uncompiled(width_of)(self._settings, now["scatter"] / count)) if count else 0.0
 
     @property
     @alone
@@ -528,8 +528,8 @@ class EvolvingFSM(Retraced):
         self._share()
 
     def __repr__(self) -> str:
-        shown = self.settings | ({} if self._rule == rules.Paper() else {"rule": self._rule})
-        settings = ", ".join(f"{name}={value}" for name, value in shown.items())
+        entries = self.settings | ({} if self._rule == rules.Paper() else {"rule": self._rule})
+        settings = ", ".join(f"{name}={value}" for name, value in entries.items())
         return f"{type(self).__name__}({settings})"
 
     # -- Inside ---------------------------------------------------------------------------------
@@ -556,16 +556,16 @@ class EvolvingFSM(Retraced):
         actions, starts, failures, trace, beliefs = self._one
         actions[0], failures[0] = action, bool(failed)
         scratch = np.empty((3, len(self._learnt.belief)))
-        given = self._settings, self._limit, row, actions, starts, failures, failed is not None
+        arguments = self._settings, self._limit, row, actions, starts, failures, failed is not None
         learn_row = (_UNLIMITED if self._limit is None else _LIMITED).call
-        while not learn_row(self._learnt, *given, scratch, 0, trace, beliefs):
+        while not learn_row(self._learnt, *arguments, scratch, 0, trace, beliefs):
             self._make_room()
             scratch = np.empty((3, len(self._learnt.belief)))
         n, surprise = trace.n_states.item(), trace.surprise.item()
-        predicted = scratch[PREDICTED, : n if surprise == surprise else 0].copy()
+        forecast = scratch[PREDICTED, : n if surprise == surprise else 0].copy()
         event = EVENTS[trace.event.item()]
         belief = self._learnt.belief[:n].copy()
-        return Step(trace.state.item(), belief, event, predicted, surprise)
+        return Step(trace.state.item(), belief, event, forecast, surprise)
 
     @step
     def _observe_partly(
@@ -573,24 +573,24 @@ class EvolvingFSM(Retraced):
     ) -> Step:
         """Recognise what some variables are missing of; only the belief changes."""
         now, n = self._learnt.now[0], self.n_states
-        gone = tuple(np.flatnonzero(absent).tolist())
+        gaps = tuple(np.flatnonzero(absent).tolist())
         if n == 0:
-            raise ValueError(f"variables {gone} of a machine's first observation are missing")
+            raise ValueError(f"variables {gaps} of a machine's first observation are missing")
         if missing is Missing.HOLD and not now["chained"]:
-            raise ValueError(f"variables {gone} are missing, and nothing to hold since the start")
+            raise ValueError(f"variables {gaps} are missing, and nothing to hold since the start")
         self._refuse_other_length(len(z))
-        filled = np.where(absent, self._learnt.variables["latest"], z)
-        valid.refuse_unusable("observation", filled)
+        vector = np.where(absent, self._learnt.variables["latest"], z)
+        valid.refuse_unusable("observation", vector)
         action = int(now["action"])
-        predicted = self.predict(action) if now["chained"] and action >= 0 else np.empty(0)
+        forecast = self.predict(action) if now["chained"] and action >= 0 else np.empty(0)
         if missing is Missing.PARTIAL and absent.all():
-            belief = predicted if len(predicted) else self.belief
+            belief = forecast if len(forecast) else self.belief
         else:
             weights = self._settings.weights
-            counted = weights * ~absent if missing is Missing.PARTIAL else weights
+            effective_weights = weights * ~absent if missing is Missing.PARTIAL else weights
             centers = self._learnt.centers[:, :n]
-            belief = believed(centers, counted, filled[None], self.width)[0]
-        surprise = jensen_shannon(predicted, belief) if len(predicted) else np.nan
+            belief = believed(centers, effective_weights, vector[None], self.width)[0]
+        surprise = jensen_shannon(forecast, belief) if len(forecast) else np.nan
         # In a copy, which takes the place of what there was as a whole.
         learnt = arrays.resized(self._learnt, *room_for(self._learnt, self._settings))
         stepping.believe(learnt, belief)
@@ -599,7 +599,7 @@ class EvolvingFSM(Retraced):
         if failed is not None:
             learnt.now["failures_told"] = 1
         self._learnt = learnt
-        return Step(int(belief.argmax()), belief, Event.NONE, predicted, surprise, gone)
+        return Step(int(belief.argmax()), belief, Event.NONE, forecast, surprise, gaps)
 
     def _checked(self, z: ArrayLike) -> Floats:
         """An observation as a vector of its own, of as many variables as the first one had."""

@@ -101,17 +101,17 @@ class FSMModel:
         m, q, n = self.n_variables, self.n_actions, self.n_states
         sizes: dict[int | str, int] = {"n": n, "m": m, "q": q}
         for name, numbers in OF_MODEL.items():
-            given = getattr(self, name)
+            values = getattr(self, name)
             shape = [sizes[size] for size in numbers.shape]
-            array = np.zeros(shape) if given is None else np.array(given, np.float64)
+            array = np.zeros(shape) if values is None else np.array(values, np.float64)
             numbers.refuse_others(name, array, sizes)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         MODEL.refuse_others(self._content)
         refuse_more_failures({name: getattr(self, name) for name in OF_MODEL})
-        counted = self.failures, self.endings, self.failed_soon
-        told = bool(self.failures_told) or any(counts.any() for counts in counted)
-        object.__setattr__(self, "failures_told", told)
+        failure_counts = self.failures, self.endings, self.failed_soon
+        is_told = bool(self.failures_told) or any(counts.any() for counts in failure_counts)
+        object.__setattr__(self, "failures_told", is_told)
         if n:
             refuse_unless_distribution("a row of transition_matrices", self.transition_matrices)
         for name in ("names", "units"):
@@ -152,9 +152,9 @@ class FSMModel:
 
     def recognise(self, z: ArrayLike) -> Floats:
         """(n,) belief of an observation (m,), or (N, n) of many: the paper's Section 2.2.2."""
-        given, rows = self._observations(z)
+        array, rows = self._observations(z)
         belief = believed(*self._places, rows, self.width)
-        return belief if given.ndim == 2 else belief[0]
+        return belief if array.ndim == 2 else belief[0]
 
     def nearest(self, z: ArrayLike) -> Nearest:
         """Which state an observation (m,) is nearest to, and how far a state reaches."""
@@ -190,8 +190,8 @@ class FSMModel:
         if action is not None:
             there, steps = there @ self._matrix(action), steps - 1
         if steps:
-            held = action if policy == "hold" else None
-            there = there @ np.linalg.matrix_power(self._matrix(held, policy), steps)
+            later_action = action if policy == "hold" else None
+            there = there @ np.linalg.matrix_power(self._matrix(later_action, policy), steps)
         return there
 
     def averaged_matrix(self, policy: Policy = "observed") -> Floats:
@@ -313,32 +313,32 @@ class FSMModel:
 
     def _observations(self, z: ArrayLike) -> tuple[Floats, Floats]:
         """One observation or many, as given and row by row; refused where it is none."""
-        given = real_array("z", z, ndim=np.ndim(z))
-        rows = np.atleast_2d(given)
+        array = real_array("z", z, ndim=np.ndim(z))
+        rows = np.atleast_2d(array)
         if rows.ndim != 2 or rows.shape[1] != self.n_variables:
-            raise ValueError(f"z has shape {given.shape}; a row needs {self.n_variables} variables")
-        refuse_unusable("z", given)
+            raise ValueError(f"z has shape {array.shape}; a row needs {self.n_variables} variables")
+        refuse_unusable("z", array)
         if self.n_states == 0:
             raise ValueError("this model has no states: its machine had observed nothing")
-        return given, rows
+        return array, rows
 
     def _belief(self, belief: Any) -> Floats:
-        given = np.asarray(belief, dtype=np.float64)
-        if given.shape != (self.n_states,):
+        array = np.asarray(belief, dtype=np.float64)
+        if array.shape != (self.n_states,):
             raise ValueError(
-                f"belief has shape {given.shape}; the model has {self.n_states} states"
+                f"belief has shape {array.shape}; the model has {self.n_states} states"
             )
         if self.n_states:
-            refuse_unless_distribution("belief", given)
-        return given
+            refuse_unless_distribution("belief", array)
+        return array
 
 
 def believed(centers: Floats, weights: Floats, rows: Floats, width: float) -> Floats:
     """(N, n) beliefs of rows (N, m), given centres (m, n) and 1 / scale of each variable."""
     n = centers.shape[1]
     belief = np.empty((len(rows), lanes(n)))
-    given = np.ascontiguousarray(centers), weights, np.ascontiguousarray(rows)
-    recognise_rows(*given, float(width), n, belief)
+    arguments = np.ascontiguousarray(centers), weights, np.ascontiguousarray(rows)
+    recognise_rows(*arguments, float(width), n, belief)
     return belief[:, :n].copy()
 
 

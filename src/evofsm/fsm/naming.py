@@ -69,8 +69,8 @@ class Labels(NamedTuple):
         if not self.names:
             return f"({', '.join(values)})"
         units = self.units or ("",) * len(values)
-        named = zip(self.names, values, units, strict=True)
-        return ", ".join(" ".join(part for part in parts if part) for parts in named)
+        entries = zip(self.names, values, units, strict=True)
+        return ", ".join(" ".join(part for part in parts if part) for parts in entries)
 
     def variable(self, index: int) -> str:
         """Name and unit of a variable (from 0), as far as they are known."""

@@ -93,20 +93,20 @@ class ObservationEncoder:
 
     def encode(self, values: Mapping[str, float | str]) -> Floats:
         """(len(names),) vector of a number or category for each variable; others are left out."""
-        encoded: list[float] = []
+        vector: list[float] = []
         for variable in self.variables:
             name = variable.name if isinstance(variable, Category) else variable
             if name not in values:
                 raise ValueError(f"observation lacks {name!r}; it has {', '.join(values)}")
             value = values[name]
             if not isinstance(variable, Category):
-                encoded.append(_number(name, value))
+                vector.append(_number(name, value))
             elif value in variable.values:
                 height = variable.distance / math.sqrt(2.0)
-                encoded += [height * (value == known) for known in variable.values]
+                vector += [height * (value == category) for category in variable.values]
             else:
                 raise ValueError(f"{name} is {value!r}; it may be {', '.join(variable.values)}")
-        return np.array(encoded)
+        return np.array(vector)
 
 
 def _number(name: str, value: object) -> float:

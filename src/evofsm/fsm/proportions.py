@@ -91,22 +91,22 @@ class FailureRecord(NamedTuple):
     episodes: int | None = None
 
     def __str__(self) -> str:
-        ran = [] if self.episodes is None else [counted(self.episodes, "episode")]
-        said = []
-        for done, unit, per, words in (
+        exposures = [] if self.episodes is None else [counted(self.episodes, "episode")]
+        rates = []
+        for exposure, unit, per, words in (
             (self.hours, "h", 1.0, "per hour"),
             (self.kilometres, "km", 1000.0, "per 1,000 km"),
         ):
-            if done is not None:
-                ran.append(f"{_exposure(done)} {unit}")
-            if done:
-                said.append(_rate(self.failures, done / per, words))
-        text = f"{counted(self.failures, 'failure')} in {', '.join(ran)}"
-        if not said:
+            if exposure is not None:
+                exposures.append(f"{_exposure(exposure)} {unit}")
+            if exposure:
+                rates.append(_rate(self.failures, exposure / per, words))
+        text = f"{counted(self.failures, 'failure')} in {', '.join(exposures)}"
+        if not rates:
             return f"{text}: nothing is known"
         if self.failures == 0:
-            return f"{text}: at most {', '.join(said)}, 95 %"
-        return f"{text}: {', '.join(said)}, 90 %"
+            return f"{text}: at most {', '.join(rates)}, 95 %"
+        return f"{text}: {', '.join(rates)}, 90 %"
 
 
 def _rate(failures: int, exposure: float, words: str) -> str:

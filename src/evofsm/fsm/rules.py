@@ -151,9 +151,9 @@ def register_rule(name: str, rule: type) -> None:
     is_frozen = is_dataclass(rule) and cast(Any, rule).__dataclass_params__.frozen
     if not (is_frozen and hasattr(rule, "table")):
         raise TypeError(f"{rule!r} is no state rule: a frozen dataclass with a `table`")
-    known = _RULES.get(name, rule)
-    if (known.__module__, known.__qualname__) != (rule.__module__, rule.__qualname__):
-        raise ValueError(f"there is a state rule {name!r} already: {known.__name__}")
+    owner = _RULES.get(name, rule)
+    if (owner.__module__, owner.__qualname__) != (rule.__module__, rule.__qualname__):
+        raise ValueError(f"there is a state rule {name!r} already: {owner.__name__}")
     _RULES[name] = rule  # anew where its module, or a cell of a notebook, was run again
 
 
@@ -174,8 +174,8 @@ def rule_named(name: object) -> Any:
 def check_rule(rule: StateRule) -> StateRule:
     """One of the rules, as an object."""
     if type(rule) not in _RULES.values():
-        known = ", ".join(f"{kind.__name__}(...)" for kind in _RULES.values())
-        raise TypeError(f"rule is {rule!r}; it must be an object: {known}")
+        names = ", ".join(f"{kind.__name__}(...)" for kind in _RULES.values())
+        raise TypeError(f"rule is {rule!r}; it must be an object: {names}")
     return rule
 
 

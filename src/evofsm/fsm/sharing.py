@@ -77,8 +77,8 @@ class Retraced:
 
         def rollback() -> None:
             again = deepcopy(before)
-            for method, args, named in steps[:count]:
-                method(again, *args, **named)
+            for method, args, kwargs in steps[:count]:
+                method(again, *args, **kwargs)
             self._become(again)
             self._known = None
 
@@ -93,11 +93,11 @@ def step(method: Method) -> Method:
 
     @wraps(method)
     def noted(self: Any, *args: Any, **named: Any) -> Any:
-        known, self._known = self._known, None  # of a step that is broken off nothing is known
+        history, self._known = self._known, None  # of a step that is broken off nothing is known
         result = method(self, *args, **named)
-        if known is not None and len(known[1]) < _MOST_STEPS:
-            known[1].append((method, args, named))
-            self._known = known
+        if history is not None and len(history[1]) < _MOST_STEPS:
+            history[1].append((method, args, named))
+            self._known = history
         return result
 
     return cast(Method, noted)

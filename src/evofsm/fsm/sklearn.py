@@ -84,12 +84,12 @@ class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # bo
         rows = self._checked(X, reset=anew)
         if anew:
             settings = self.get_params(deep=False).items()
-            told = {name: value for name, value in settings if value is not None}
-            self.machine_ = EvolvingFSM(n_actions=1, **told)
+            arguments = {name: value for name, value in settings if value is not None}
+            self.machine_ = EvolvingFSM(n_actions=1, **arguments)
         self.labels_ = self.machine_.learn_many(rows, np.zeros(len(rows), np.int64)).state
         return self
 
     def _checked(self, X: ArrayLike, reset: bool) -> Floats:
         # Kernels are made for arrays that may be written to; others would make them anew.
-        wanted = {"dtype": np.float64, "order": "C", "force_writeable": True}
-        return np.asarray(validate_data(self, X, reset=reset, **wanted))
+        requirements = {"dtype": np.float64, "order": "C", "force_writeable": True}
+        return np.asarray(validate_data(self, X, reset=reset, **requirements))

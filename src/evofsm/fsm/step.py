@@ -35,7 +35,7 @@ def step(
 
     Where the episode ``failed`` it ends in failure after this observation.
     """
-    now, recognised, predicted = learnt.now[0], scratch[RECOGNISED], scratch[PREDICTED]
+    now, new_belief, forecast = learnt.now[0], scratch[RECOGNISED], scratch[PREDICTED]
     _tick(now)
 
     # Section 2.2.1: does the observation move a state, or create one?
@@ -51,7 +51,7 @@ def step(
         nearest,
         width_of(settings, now.scatter / now.n_observations),
         settings.belief_tolerance,
-        recognised,
+        new_belief,
     )
 
     # Section 2.3: was it foreseen, and what does it teach about the action taken before it?
@@ -63,18 +63,18 @@ def step(
             learnt.origin_frequency[place],
             n,
             learnt.belief,
-            recognised,
+            new_belief,
             settings.learning_rate,
-            predicted,
+            forecast,
         )
-        surprise = jensen_shannon_kernel(predicted, recognised, lanes(n), scratch[TERMS])
+        surprise = jensen_shannon_kernel(forecast, new_belief, lanes(n), scratch[TERMS])
         learnt.actions[now.action].uses += 1.0
         _count_decision(learnt, place, n, failed)
 
     if now.chained:
         learnt.changes[now.state, nearest] += 1.0
     for i in range(lanes(n)):
-        learnt.belief[i] = recognised[i]
+        learnt.belief[i] = new_belief[i]
     learnt.sums[VISITS, nearest] += 1.0
     _count_visit(learnt, nearest)
     now.state, now.action, now.chained = nearest, NO_ACTION, 1
@@ -123,10 +123,10 @@ def learn_rows(
 def fail(learnt: Learnt, settings: Settings) -> None:
     """End the episode in failure, to which the pending action led; there is room for its matrix."""
     now = learnt.now[0]
-    pending = now.action != NO_ACTION  # a variable: with True itself it would be compiled again
-    if pending:
+    is_pending = now.action != NO_ACTION  # a variable: with True itself it would be compiled again
+    if is_pending:
         place = place_of(learnt, now.action, settings.prior_frequency)
-        _count_decision(learnt, place, now.n_states, pending)
+        _count_decision(learnt, place, now.n_states, is_pending)
     _end(learnt, settings)
 
 
@@ -246,11 +246,11 @@ class Step(NamedTuple):
     missing: tuple[int, ...] = ()  #: variables that were not observed, so that nothing was learnt
 
     def __repr__(self) -> str:
-        missing = f", missing={self.missing}" if self.missing else ""
+        suffix = f", missing={self.missing}" if self.missing else ""
         return (
             f"Step(state={self.state}, belief={self.belief[self.state]:.3g} of "
             f"{len(self.belief)} states, event={self.event.name}, surprise={self.surprise:.3g}"
-            f"{missing})"
+            f"{suffix})"
         )
 
 

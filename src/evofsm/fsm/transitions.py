@@ -64,16 +64,16 @@ def forecast_and_identify(
     for j in range(lanes(n)):
         predicted[j] = 0.0
     for i in range(n):
-        believed = origin[i]
-        gain = learning_rate * believed
+        belief = origin[i]
+        gain = learning_rate * belief
         frequency = (1.0 - learning_rate) * origin_frequency[i] + gain
-        known = frequency >= _LOWEST_FREQUENCY
-        origin_frequency[i] = frequency if known else 0.0
-        if believed > 0.0:
-            rate = gain / frequency if known else 0.0
+        is_known = frequency >= _LOWEST_FREQUENCY
+        origin_frequency[i] = frequency if is_known else 0.0
+        if belief > 0.0:
+            rate = gain / frequency if is_known else 0.0
             for j in range(lanes(n)):
                 probability = matrix[i, j]
-                predicted[j] += believed * probability
+                predicted[j] += belief * probability
                 matrix[i, j] = (1.0 - rate) * probability + rate * reached[j]
 
 
@@ -115,7 +115,7 @@ def merge_closest(learnt: Learnt, settings: Settings, nearest: int) -> Any:
     """
     n, weights = learnt.now[0].n_states, settings.weights
     closest = learnt.squared_distances[nearest]
-    kept, given = nearest, n
+    survivor, donor = nearest, n
     for i in range(n):
         for j in range(i):
             squared_distance = 0.0
@@ -123,10 +123,10 @@ def merge_closest(learnt: Learnt, settings: Settings, nearest: int) -> Any:
                 offset = (learnt.centers[k, i] - learnt.centers[k, j]) * weights[k]
                 squared_distance += offset * offset
             if squared_distance < closest:
-                closest, kept, given = squared_distance, j, i
-    if given < n:
-        _merge(learnt, weights, kept, given, n)
-    return given
+                closest, survivor, donor = squared_distance, j, i
+    if donor < n:
+        _merge(learnt, weights, survivor, donor, n)
+    return donor
 
 
 @rare_kernel
@@ -153,11 +153,11 @@ def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> No
     for place in range(now.n_places):
         learnt.decisions[place, kept] += learnt.decisions[place, given]
         learnt.failures[place, kept] += learnt.failures[place, given]
-        done, more = learnt.tries[place, kept], learnt.tries[place, given]
-        in_both = done.latest_try >= now.began and more.latest_try >= now.began
-        done.tried += more.tried - in_both
-        done.failed_after += more.failed_after
-        done.latest_try = max(done.latest_try, more.latest_try)
+        record, addition = learnt.tries[place, kept], learnt.tries[place, given]
+        in_both = record.latest_try >= now.began and addition.latest_try >= now.began
+        record.tried += addition.tried - in_both
+        record.failed_after += addition.failed_after
+        record.latest_try = max(record.latest_try, addition.latest_try)
     now.state = kept if now.state == given else now.state
     now.before = kept if now.before == given else now.before
     _forget(learnt, given, n)
@@ -176,8 +176,8 @@ def _forget(learnt: Learnt, given: int, n: int) -> None:
         learnt.changes[given, i] = learnt.changes[i, given] = 0.0
     for place in range(learnt.now[0].n_places):
         learnt.decisions[place, given] = learnt.failures[place, given] = 0.0
-        done = learnt.tries[place, given]
-        done.tried = done.failed_after = done.latest_try = 0.0
+        record = learnt.tries[place, given]
+        record.tried = record.failed_after = record.latest_try = 0.0
 
 
 @spliced_kernel

@@ -47,8 +47,8 @@ def check_index(what: str, i: Any, n: int, name: Callable[[int], str] = str) -> 
         hint = "from 0" if what == "state" else f"from 0 ({_ENCODE})"
         raise TypeError(f"{what} is {i!r}; it must be an integer index, {hint}") from None
     if not 0 <= index < n:
-        called = "" if name is str else f", which texts call {name(0)} to {name(n - 1)}"
-        there = f"{what}s 0 to {n - 1}{called}" if n else f"no {what}s yet"
+        note = "" if name is str else f", which texts call {name(0)} to {name(n - 1)}"
+        there = f"{what}s 0 to {n - 1}{note}" if n else f"no {what}s yet"
         raise ValueError(f"{what} is {index}; there are {there}")
     return index
 
@@ -106,8 +106,8 @@ def real_array(name: str, values: ArrayLike, ndim: int) -> Floats:
             "(is there a text, a None or a complex number among them?)"
         )
     if array.ndim != ndim or array.shape[-1] == 0:
-        wanted = "(variables,)" if ndim == 1 else "(rows, variables)"
-        raise ValueError(f"{name} has shape {array.shape}; it must be {wanted}, not empty")
+        shape = "(variables,)" if ndim == 1 else "(rows, variables)"
+        raise ValueError(f"{name} has shape {array.shape}; it must be {shape}, not empty")
     return array.astype(np.float64)
 
 
@@ -187,11 +187,11 @@ def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.i
 
 def check_rows(name: str, numbers: ArrayLike, rows: int) -> NDArray[np.bool_]:
     """Mark the rows that are named."""
-    given = _array(name, numbers)
-    if given.size and given.dtype.kind not in "iu":
-        raise TypeError(f"{name} has dtype {given.dtype}; it must hold row numbers, none masked")
-    if (wrong := given[(given < 0) | (given >= rows)]).size:
+    array = _array(name, numbers)
+    if array.size and array.dtype.kind not in "iu":
+        raise TypeError(f"{name} has dtype {array.dtype}; it must hold row numbers, none masked")
+    if (wrong := array[(array < 0) | (array >= rows)]).size:
         raise ValueError(f"{name} names row {wrong[0]}, but there are {rows} rows")
-    marked = np.zeros(rows, np.bool_)
-    marked[given.astype(np.int64)] = True
-    return marked
+    marks = np.zeros(rows, np.bool_)
+    marks[array.astype(np.int64)] = True
+    return marks
