@@ -156,15 +156,15 @@ class Seeing:
     def pair(self, car: str) -> tuple[float, float, float] | None:
         """Gap from bumper to bumper [m], its speed and that of whoever is ahead [m/s]."""
         speed = self._vehicle.getSpeed(car)
-        found = self.ahead(car, speed)
-        return None if found is None else (found.gap, speed, found.speed)
+        leader = self.ahead(car, speed)
+        return None if leader is None else (leader.gap, speed, leader.speed)
 
     def ahead(self, car: str, speed: float) -> Neighbour | None:
         """Whoever is ahead on its route, if near enough to matter."""
-        found = self._vehicle.getLeader(car, _far(speed))
-        if not found or not found[0]:
+        leader_and_gap = self._vehicle.getLeader(car, _far(speed))
+        if not leader_and_gap or not leader_and_gap[0]:
             return None
-        leader, gap = found
+        leader, gap = leader_and_gap
         v, body = self._vehicle.getSpeed(leader), self.body(car)
         return Neighbour(leader, gap + body.min_gap, self._room(gap, body, speed - v), v)
 
@@ -184,17 +184,17 @@ class Seeing:
             return float(fastest)
         gap = ahead.gap - self.body(car).min_gap  # as SUMO's models take it
         decel = vehicle.getApparentDecel(ahead.id)
-        wanted = vehicle.getFollowSpeed(car, speed, gap, ahead.speed, decel, ahead.id)
+        follow_speed = vehicle.getFollowSpeed(car, speed, gap, ahead.speed, decel, ahead.id)
         slowest = speed - vehicle.getEmergencyDecel(car) * self.dt
-        return float(max(min(wanted, fastest), slowest, 0.0))
+        return float(max(min(follow_speed, fastest), slowest, 0.0))
 
     def _room(self, gap: float, follower: _Facts, closing: float) -> float:
         euler = self._euler
         late = 0.125 * follower.decel * euler * euler - 0.5 * euler * closing
         # Who is nearer than SUMO lets anybody be stands in a queue, or beside, where lanes merge.
         # Across a junction SUMO says 0 of all that is nearer than minGap.
-        kept = (1.0 - self._factor) * follower.min_gap if gap else 0.0
-        return max(gap + kept - late, _NEAREST)
+        spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
+        return max(gap + spare_gap - late, _NEAREST)
 
     def rows(
         self, car: str, speed: float, ahead: Neighbour | None, behind: Neighbour | None
@@ -349,9 +349,9 @@ class Guarding:
         if revision is None or revision.executed >= car.high:
             self._hand_back(car)
             return
-        reached = max(0.0, speed + float(revision.executed) * self._seeing.dt)
+        next_speed = max(0.0, speed + float(revision.executed) * self._seeing.dt)
         # Nor faster than it would drive on a free road.
-        car.limit = min(reached, self._vehicle.getAllowedSpeed(car.id))
+        car.limit = min(next_speed, self._vehicle.getAllowedSpeed(car.id))
         car.wish = self._seeing.wish(car.id, speed, car.around[0])
         late = self._seeing.body(car.id).late
         if not late and car.wish <= car.limit + _COARSE * self._seeing.dt:
@@ -371,56 +371,56 @@ class Guarding:
 
     def _look_back(self, car: _Car, speed: float) -> None:
         """What the driver wanted, now that it shows; in shadow it is what is judged."""
-        wanted = speed
+        desired_speed = speed
         if car.mode is not None and speed > car.limit + _FASTER:
             self.overruled += 1
             if self.overruled == _OFTEN:
-                said = _OVERRULED.format(car.id, _OFTEN)
-                warnings.warn(said, RuntimeWarning, stacklevel=4)
+                text = _OVERRULED.format(car.id, _OFTEN)
+                warnings.warn(text, RuntimeWarning, stacklevel=4)
         # Slower than the limit is what SUMO itself wanted, such as to stop at a red light.
         if car.mode is not None and speed >= car.limit - _SAME_SPEED:
-            wanted = max(car.wish, speed)
-        wish, deed = ((reached - car.speed) / self._seeing.dt for reached in (wanted, speed))
+            desired_speed = max(car.wish, speed)
+        wish, acceleration = ((v - car.speed) / self._seeing.dt for v in (desired_speed, speed))
         if not self._acts and car.revision is None:
             self._decide(car, wish)
         revision = car.revision
         assert revision is not None
-        stands = max(car.speed, speed, wanted) < _STANDS
-        allowed = deed if self._acts else float(revision.advised)
-        self.revised += not stands and allowed < wish - SLIGHT
+        stands = max(car.speed, speed, desired_speed) < _STANDS
+        outcome = acceleration if self._acts else float(revision.advised)
+        self.revised += not stands and outcome < wish - SLIGHT
         if self._report is not None:
-            self._report(GuardedStep(car.time, car.id, wish, deed, revision, *car.about))
+            self._report(GuardedStep(car.time, car.id, wish, acceleration, revision, *car.about))
 
     def _watch(self, speeds: dict[str, float]) -> None:
         """Learn how hard leaders brake, each by itself, whoever follows it.
 
         What a guard makes a car do, whoever attached it, is not what leaders do: it is not learnt.
         """
-        ended = []
-        guarding = [a.guarding for a in _ATTACHED if a._sumo is self._sumo and a.guarding]
-        for car in chain.from_iterable(guards.cars.values() for guards in guarding):
+        decels = []
+        groups = [a.guarding for a in _ATTACHED if a._sumo is self._sumo and a.guarding]
+        for car in chain.from_iterable(group.cars.values() for group in groups):
             if car.mode is not None:
                 speeds.pop(car.id, None)
                 self._watches.pop(car.id, None)
         for leader, speed in speeds.items():
             if leader not in self._watches:
                 self._watches[leader] = BrakeWatch(self.interval)
-            ended.append(self._watches[leader].see(0.0, speed, speed))
+            decels.append(self._watches[leader].see(0.0, speed, speed))
         for leader in sorted(self._watches.keys() - speeds.keys()):
-            ended.append(self._watches.pop(leader).end())
-        self.leaders.remember(*ended)
+            decels.append(self._watches.pop(leader).end())
+        self.leaders.remember(*decels)
 
     # -- Guards ---------------------------------------------------------------------------------
 
     def _guard_for(self, car: str, high: float) -> Guard:
         mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
-            decel, told, dt = self._vehicle.getDecel(car), self._settings, self.interval
-            how = {"margin": _MARGIN, "regain": told["regain"]}
-            judge = TrafficRisk(LatentRisk.given(-decel, decel, told["leader_decel"], dt, **how))
-            judge.ahead.manoeuvres = self.leaders
-            low, tolerance = -max(self._vehicle.getEmergencyDecel(car), decel), told["tolerance"]
-            limits = low, high, decel, dt
+            decel, settings, dt = self._vehicle.getDecel(car), self._settings, self.interval
+            leader_decel, regain = settings["leader_decel"], settings["regain"]
+            risk = LatentRisk.given(-decel, decel, leader_decel, dt, margin=_MARGIN, regain=regain)
+            risk.manoeuvres = self.leaders
+            low, judge = -max(self._vehicle.getEmergencyDecel(car), decel), TrafficRisk(risk)
+            limits, tolerance = (low, high, decel, dt), settings["tolerance"]
             return guard_for_traffic(*limits, judge=judge, tolerance=tolerance, mode=mode)
         guard = self._template.copy()
         guard.freeze()
@@ -450,8 +450,8 @@ def _leaders_of(guard: Guard | None, leader_decel: float) -> Manoeuvres:
             f"TrafficRisk, or observe {', '.join(VARIABLES)}"
         )
     # How hard SUMO's cars brake is exactly known, and has an end.
-    assumed = Manoeuvres(leader_decel, width=_SEEN_TO)
-    return copy.deepcopy(judge.manoeuvres if isinstance(judge, LatentRisk) else assumed)
+    assumption = Manoeuvres(leader_decel, width=_SEEN_TO)
+    return copy.deepcopy(judge.manoeuvres if isinstance(judge, LatentRisk) else assumption)
 
 
 # -- Which cars, and what came of them ------------------------------------------------------------
@@ -506,9 +506,9 @@ class Watching:
     def step(self, time: float) -> None:
         """Look at every car."""
         pairs = {car: self._seeing.pair(car) for car in self.cars}
-        met = {car: pair for car, pair in pairs.items() if pair is not None}
-        self.ids = list(met)
-        self.observations = np.array(list(met.values())).reshape(-1, 3)
+        observations = {car: pair for car, pair in pairs.items() if pair is not None}
+        self.ids = list(observations)
+        self.observations = np.array(list(observations.values())).reshape(-1, 3)
         self.ttc = time_to_collision(self.observations)
         self.drac = deceleration_to_avoid_collision(self.observations)
         for k in np.flatnonzero(np.isfinite(self.ttc)).tolist():
@@ -651,12 +651,12 @@ class Attachment:
         return True
 
     def _say_if_deaf(self) -> None:
-        guarding = self.guarding
+        guards = self.guarding
         is_many = self.looked > _MANY_STEPS and len(self.ever) >= _MANY_CARS
-        if is_many and not self._was_deaf and guarding is not None and not guarding.decisions:
+        if is_many and not self._was_deaf and guards is not None and not guards.decisions:
             self._was_deaf = True
-            said = _DEAF.format(len(self.ever), f"{self.looked:,}")
-            warnings.warn(said, RuntimeWarning, stacklevel=4)
+            text = _DEAF.format(len(self.ever), f"{self.looked:,}")
+            warnings.warn(text, RuntimeWarning, stacklevel=4)
 
     def summary(self) -> dict[str, float]:
         """What came of the cars that are, or were, guarded or watched; numbers by name.
@@ -669,18 +669,18 @@ class Attachment:
         ``revised`` (those that changed what the driver wanted, `Guarding.revised`), and
         ``microseconds`` for each decision, all that guarding takes.
         """
-        met, guarded, guarding = self.collisions, self.ever, self.guarding
-        told = {
-            "cars": len(guarded),
-            "collisions": len(met),
-            "of_guarded": sum(c.collider in guarded for c in met),
-            "into_guarded": sum(c.victim in guarded and c.collider not in guarded for c in met),
+        collisions, cars, guards = self.collisions, self.ever, self.guarding
+        numbers = {
+            "cars": len(cars),
+            "collisions": len(collisions),
+            "of_guarded": sum(c.collider in cars for c in collisions),
+            "into_guarded": sum(c.victim in cars and c.collider not in cars for c in collisions),
             **self._ride.told(),
         }
-        if guarding is not None and guarding.decisions:
-            told |= {name: getattr(guarding, name) for name in ("decisions", "limited", "revised")}
-            told["microseconds"] = 1e6 * self.seconds / guarding.decisions
-        return told
+        if guards is not None and guards.decisions:
+            numbers |= {name: getattr(guards, name) for name in ("decisions", "limited", "revised")}
+            numbers["microseconds"] = 1e6 * self.seconds / guards.decisions
+        return numbers
 
     def _is_new(self) -> bool:
         return bool(self._sumo.simulation.getParameter("", self._key) != "1")
@@ -712,10 +712,10 @@ class Attachment:
         self._known = here
 
     def _count_collisions(self, now: float) -> None:
-        for found in self._sumo.simulation.getCollisions():
-            pair = found.collider, found.victim
+        for collision in self._sumo.simulation.getCollisions():
+            pair = collision.collider, collision.victim
             if now - self._met.get(pair, -math.inf) > _SAME_COLLISION:
-                self.collisions.append(Collision(now, *pair, found.type))
+                self.collisions.append(Collision(now, *pair, collision.type))
             self._met[pair] = now
 
 
@@ -794,11 +794,11 @@ def attach(
         raise ValueError(f"there is no mode {mode!r}; there are {', '.join(_MODES)}")
     if mode == "watch" and guard is not None:
         raise ValueError("mode 'watch' asks no guard; use mode 'shadow'")
-    chosen, seeing = choose(vehicles, seed), Seeing(sumo)
-    cars: Guarding | Watching = Watching(seeing)
+    is_chosen, sight = choose(vehicles, seed), Seeing(sumo)
+    cars: Guarding | Watching = Watching(sight)
     if mode != "watch":
         settings = {"tolerance": tolerance, "leader_decel": leader_decel, "regain": regain}
-        cars = Guarding(sumo, seeing, guard, mode == "act", settings, report)
-    attachment = Attachment(sumo, chosen, seeing, cars)
+        cars = Guarding(sumo, sight, guard, mode == "act", settings, report)
+    attachment = Attachment(sumo, is_chosen, sight, cars)
     attachment.listen()
     return attachment

@@ -90,8 +90,8 @@ class OwnBrakes:
     def expected(self, before: float, command: float) -> float:
         """Acceleration that a command most likely brings, after the one before it [m/s²]."""
         hardest = -self._likely
-        last, asked, lag = max(before, hardest), max(command, hardest), self.lag
-        return lag * last + (1.0 - lag) * asked
+        last, demand, lag = max(before, hardest), max(command, hardest), self.lag
+        return lag * last + (1.0 - lag) * demand
 
     def clear(self) -> None:
         """An episode begins: what comes is not a consequence of what was."""
@@ -109,39 +109,39 @@ class OwnBrakes:
         must not be told from it. ``watched`` says that someone else drives, whose proposal may be
         no command to the brakes; then ordinary braking does not show that they weakened.
         """
-        asked = max(command, self.lowest)
+        demand = max(command, self.lowest)
         # Nothing is learnt from standing still, nor from a sensor's jump.
         if (
             self._speed is not None
             and min(speed, self._speed) > _STANDING
             and abs(speed - self._speed) <= self._most_change
         ):
-            realised, estimated = (speed - self._speed), (speed - self._estimate)
-            self._learn(realised / self.dt, estimated / self.dt, asked, watched=watched)
+            change, likely_change = (speed - self._speed), (speed - self._estimate)
+            self._learn(change / self.dt, likely_change / self.dt, demand, watched=watched)
         self._speed = speed
         self._estimate = speed if estimate is None else estimate
-        self._commands = [*self._commands[-2:], asked]
+        self._commands = [*self._commands[-2:], demand]
 
     def _learn(self, realised: float, estimated: float, now: float, *, watched: bool) -> None:
         if self.known and len(self._commands) >= 2:
-            last, asked = (max(command, -self._likely) for command in self._commands[-2:])
+            last, demand = (max(command, -self._likely) for command in self._commands[-2:])
             products, squares = self.lagged
-            change = last - asked
-            self.set_lagged(products + (estimated - asked) * change, squares + change * change)
+            change = last - demand
+            self.set_lagged(products + (estimated - demand) * change, squares + change * change)
         # However late commands take effect, it was one of the latest three that ruled.
-        ruled = max(self._commands) if len(self._commands) == 3 else 0.0
+        softest_command = max(self._commands) if len(self._commands) == 3 else 0.0
         # What is commanded now must be full braking, too: commands answer to noise, and of braking
         # that noise has ended the brakes would seem better than they are.
-        is_full = max(ruled, now) < self.lowest + _SAME_COMMAND
+        is_full = max(softest_command, now) < self.lowest + _SAME_COMMAND
         if is_full:
             self.remember([(-realised, not self._was_full)])
         self._was_full = is_full
         # Any braking shows whether the brakes are weaker than they were.
-        is_braking = ruled < -_GENTLE and len(self.full) >= _FEWEST and not watched
+        is_braking = softest_command < -_GENTLE and len(self.full) >= _FEWEST and not watched
         if is_braking:
             begins = not self._was_braking
             self.brought.append((-realised, begins))
-            self.shortfalls.append((min(-ruled, self.decel) + realised, begins))
+            self.shortfalls.append((min(-softest_command, self.decel) + realised, begins))
             if self._is_sure_to_fall_short():  # begin anew
                 self.full.clear()
                 self.remember(self.brought)
@@ -150,9 +150,9 @@ class OwnBrakes:
 
     def _is_sure_to_fall_short(self) -> bool:
         """Without noise the latest few tell; in noise it takes more."""
-        seen = [*self.shortfalls]
-        bounds = (_mean_and_bound(samples, _SURE)[1] for samples in (seen[-_FEWEST:], seen))
-        return len(seen) >= _FEWEST and any(bound > _SHORTFALL for bound in bounds)
+        shortfalls = [*self.shortfalls]
+        bounds = (_mean_and_bound(part, _SURE)[1] for part in (shortfalls[-_FEWEST:], shortfalls))
+        return len(shortfalls) >= _FEWEST and any(bound > _SHORTFALL for bound in bounds)
 
 
 def _mean_and_bound(samples: Iterable[tuple[float, float]], errors: float) -> tuple[float, float]:

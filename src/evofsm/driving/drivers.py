@@ -41,8 +41,8 @@ def idm_kernel(
     time_headway = phases[now, 4]
     decel = phases[now, 5]
     exponent = phases[now, 6]
-    closing = speed * (speed - leader_speed) / (2.0 * math.sqrt(accel * decel))
-    desired_gap = min_gap + max(0.0, speed * time_headway + closing)
+    approach_gap = speed * (speed - leader_speed) / (2.0 * math.sqrt(accel * decel))
+    desired_gap = min_gap + max(0.0, speed * time_headway + approach_gap)
     # A gap of 0 or less is a collision, beyond the model: brake as hard as the bounds allow.
     interaction = (desired_gap / gap) ** 2 if gap > 0.0 else np.inf
     acceleration = accel * (1.0 - (speed / desired_speed) ** exponent - interaction)

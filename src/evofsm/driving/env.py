@@ -101,12 +101,12 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     ) -> tuple[NDArray[np.float64], dict[str, Any]]:
         """Begin a scenario, drawn by ``seed`` or with ``split`` and ``index`` of ``options``."""
         super().reset(seed=seed)
-        asked = dict(options or {})
-        split = asked.pop("split", "train")
-        drawn = int(self.np_random.integers(_INDICES))
-        index = int(asked.pop("index", drawn))
-        if asked:
-            raise ValueError(f"there is no option {', '.join(asked)}; there are index and split")
+        choices = dict(options or {})
+        split = choices.pop("split", "train")
+        random_index = int(self.np_random.integers(_INDICES))
+        index = int(choices.pop("index", random_index))
+        if choices:
+            raise ValueError(f"there is no option {', '.join(choices)}; there are index and split")
         self.draw = self.family.draw(self.seed, index, split)
         self._which = {"split": split, "index": index}
         self._run.close()
@@ -126,12 +126,12 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         if not math.isfinite(acceleration):
             raise ValueError(f"action is {acceleration}; an acceleration must be finite")
         actions, row = self.family.actions, road.row
-        seen, _, terminated, truncated, came = road.step(
+        observation, _, terminated, truncated, outcome = road.step(
             min(max(acceleration, actions.low), actions.high)
         )
-        info = self._info(road.episode(first=row)) | {"realised": came["realised"]}
+        info = self._info(road.episode(first=row)) | {"realised": outcome["realised"]}
         reward = info["distance"] - (self.collision_cost if terminated else 0.0)
-        return np.clip(seen, LOW, HIGH), reward, terminated, truncated, info
+        return np.clip(observation, LOW, HIGH), reward, terminated, truncated, info
 
     def close(self) -> None:
         """Leave the road and the world."""

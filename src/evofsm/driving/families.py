@@ -47,8 +47,8 @@ def _paper(numbers: Numbers) -> tuple[Scenario, IDM | ChangingIDM]:
     """
     leader = Leader(_LEADER_MODEL, brake_decel=9.0, brake_speed=24.2)
     hasty, calm = _aggressive(-4.0), _normal(-4.0)
-    changing = ChangingIDM(hasty, ((15.0, calm),)), ChangingIDM(calm, ((10.0, hasty),))
-    drivers = hasty, calm, *changing
+    changing_drivers = ChangingIDM(hasty, ((15.0, calm),)), ChangingIDM(calm, ((10.0, hasty),))
+    drivers = hasty, calm, *changing_drivers
     return Scenario(leader, initial_gap=5.0, duration=60.0), drivers[numbers.variant]
 
 
@@ -97,12 +97,12 @@ def _waves(numbers: Numbers, duration: float) -> tuple[tuple[float, float], ...]
         decel = numbers.between(f"{at}.decel", 1.0, 3.5)
         cruise = numbers.between(f"{at}.cruise", 2.0, 8.0)
         pause = numbers.between(f"{at}.pause", 1.0, 5.0)
-        for wanted, hold in ((fast, cruise), (slow, pause)):
-            acceleration = accel if wanted > speed else -decel
+        for target, hold in ((fast, cruise), (slow, pause)):
+            acceleration = accel if target > speed else -decel
             waves.append((time, acceleration))
-            time += (wanted - speed) / acceleration
+            time += (target - speed) / acceleration
             waves.append((time, 0.0))
-            time, speed = time + hold, wanted
+            time, speed = time + hold, target
     return tuple(waves)
 
 

@@ -188,8 +188,8 @@ class Family:
                 f"{where}: a leader brakes by {leader_brakes:g} m/s², but leader_decel is "
                 f"{self.leader_decel:g}"
             )
-        commanded = min(self.low, float(driver.parameters[:, 7].min()))
-        brakes = -max(scenario.body.lowest, commanded)
+        lowest_command = min(self.low, float(driver.parameters[:, 7].min()))
+        brakes = -max(scenario.body.lowest, lowest_command)
         if brakes > self.decel + _ROUNDING:
             raise ValueError(
                 f"{where}: the follower can brake by {brakes:g} m/s², but decel is "
@@ -207,13 +207,13 @@ class Family:
 def read_family(path: str | Path, switches: Iterable[str] = ()) -> Family:
     """The ``family`` that a file of Python defines."""
     try:
-        found = runpy.run_path(str(path)).get("family")
-        if not isinstance(found, Family):
+        definition = runpy.run_path(str(path)).get("family")
+        if not isinstance(definition, Family):
             raise ValueError("it defines no Family that is called family")
-        family = replace(found, source=str(path)).with_switches(switches)
-        for drawn in filter(None, (family, family.shifted)):
-            for variant in range(max(1, len(drawn.variants))):
-                drawn.draw_by(Numbers(0, 0), variant)  # so that a mistake shows at once
+        family = replace(definition, source=str(path)).with_switches(switches)
+        for version in filter(None, (family, family.shifted)):
+            for variant in range(max(1, len(version.variants))):
+                version.draw_by(Numbers(0, 0), variant)  # so that a mistake shows at once
     except Exception as error:
         text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
         where = "" if text.startswith(f"{path}: ") else f"{path}: "
@@ -240,8 +240,8 @@ def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
 
 def _with(part: str, **values: float) -> Callable[[Scenario, Numbers], Scenario]:
     def switch(scenario: Scenario, numbers: Numbers) -> Scenario:
-        changed = replace(getattr(scenario, part), **values)
-        return replace(scenario, **{part: changed})
+        new_part = replace(getattr(scenario, part), **values)
+        return replace(scenario, **{part: new_part})
 
     return switch
 

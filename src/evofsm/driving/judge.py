@@ -215,22 +215,22 @@ class LatentRisk(Retraced):
     def _take_in(
         self, observation: ArrayLike, acceleration: float, *, learn: bool, watched: bool = False
     ) -> None:
-        seen = _three_finite(observation, whole=False)
+        triple = _three_finite(observation, whole=False)
         command = _one_finite("acceleration", acceleration)
-        self._keep_up(seen, command, learn and is_whole(seen), watched)
+        self._keep_up(triple, command, learn and is_whole(triple), watched)
 
     @step
     def _keep_up(self, seen: Three, command: float, learn: bool, watched: bool) -> None:
         estimate = self.perception.see(seen, self._expected, sure=self.brakes.known, learn=learn)
         self._commands = (self._commands[1], command)
-        ended = None
+        decel = None
         if is_whole(seen):
-            ended = self._watch.see(*seen, self._of_change(2))
+            decel = self._watch.see(*seen, self._of_change(2))
         else:
             self._watch.clear()
             self.brakes.clear()
         if learn:
-            self.manoeuvres.remember(ended)
+            self.manoeuvres.remember(decel)
             self.brakes.see(seen[1], command, estimate.mean[1], watched=watched)
             if watched:
                 if not self._watched:
@@ -241,10 +241,10 @@ class LatentRisk(Retraced):
     @step
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
-        ended, shown = self._watch.end(), self._own_watch.end()
+        decel, own_decel = self._watch.end(), self._own_watch.end()
         if learn:
-            self.manoeuvres.remember(ended)
-            self.brakes.show(shown)
+            self.manoeuvres.remember(decel)
+            self.brakes.show(own_decel)
         self._watch.clear()
         self._own_watch.clear()
         self.brakes.clear()
@@ -254,11 +254,11 @@ class LatentRisk(Retraced):
     def savepoint(self) -> Rollback:
         """What takes back all that it learns from now on, of leaders, whom others share, too."""
         take_back, leaders = super().savepoint(), self.manoeuvres
-        known = leaders.gentle, leaders.decels, leaders.table
+        memory = leaders.gentle, leaders.decels, leaders.table
 
         def rollback() -> None:
             take_back()
-            leaders.gentle, leaders.decels, leaders.table = known
+            leaders.gentle, leaders.decels, leaders.table = memory
 
         return rollback
 
@@ -301,9 +301,9 @@ class LatentRisk(Retraced):
         if not is_whole(here):  # where one is cannot be told: nothing can be survived for sure
             sure = np.ones(len(actions))
             return Judgement(sure, 0.0 * sure, sure, 0.0 * sure, evidence, situation.seen)
-        judged = np.empty((4, len(actions)))
-        _judge(here, actions, self._commands[1], self.body, self.dt, table, evidence, judged)
-        risk, low, high, critical = judged
+        rows = np.empty((4, len(actions)))
+        _judge(here, actions, self._commands[1], self.body, self.dt, table, evidence, rows)
+        risk, low, high, critical = rows
         return Judgement(risk, low, high, critical, evidence, situation.seen)
 
     def why(self, judged: Judgement) -> str:
@@ -317,9 +317,9 @@ class LatentRisk(Retraced):
         """Full braking, until it is known what it brings."""
         if self.brakes.known:
             return None
-        assumed = f"{self.brakes.decel:.1f} m/s² assumed"
-        doing = "braking in full to learn them"
-        return Trial(self.lowest, "own brakes not known yet", "in full", doing, assumed)
+        assumption = f"{self.brakes.decel:.1f} m/s² assumed"
+        activity = "braking in full to learn them"
+        return Trial(self.lowest, "own brakes not known yet", "in full", activity, assumption)
 
     def effective(self, situation: Situation, actions: NDArray[np.float64]) -> NDArray[np.float64]:
         """What actions come to here: where the car stands, to stay is enough."""
@@ -354,10 +354,10 @@ class LatentRisk(Retraced):
     ) -> NDArray[np.bool_]:
         """(2, k) whether options avoid what is seen, and regain a safe gap, as `foresee` has it."""
         worst = self.manoeuvres.exceeded_by(tolerance)
-        found = np.empty((2, len(options)), np.bool_)
-        seen = min(braking, worst), options, self._commands[1], self.body
-        foresee(observation, *seen, self.dt, worst, self.regain, hardest, found)
-        return found
+        outcomes = np.empty((2, len(options)), np.bool_)
+        arguments = min(braking, worst), options, self._commands[1], self.body
+        foresee(observation, *arguments, self.dt, worst, self.regain, hardest, outcomes)
+        return outcomes
 
     def _leader_braking(self, situation: Situation) -> float:
         now, before = self._estimate(situation.observation).mean, self.perception.latest
@@ -395,8 +395,8 @@ class LatentRisk(Retraced):
         return gap - _CAUTION * doubt, speed, leader_speed
 
     def _estimate(self, observation: ArrayLike) -> Estimate:
-        seen = _three_finite(observation, whole=False)
-        return self.perception.estimate(seen, self._expected, sure=self.brakes.known)
+        triple = _three_finite(observation, whole=False)
+        return self.perception.estimate(triple, self._expected, sure=self.brakes.known)
 
     def critical(
         self, observation: ArrayLike, accelerations: ArrayLike, margin: float | None = None
@@ -406,10 +406,10 @@ class LatentRisk(Retraced):
         0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where none is. Another
         ``margin`` may be asked for [m].
         """
-        seen, actions = _three_finite(observation), _finite("accelerations", accelerations)
+        triple, actions = _three_finite(observation), _finite("accelerations", accelerations)
         body = self.body if margin is None else self.body._replace(margin=margin)
         critical = np.empty(len(actions))
-        critical_decelerations(seen, actions, self._commands[1], body, self.dt, critical)
+        critical_decelerations(triple, actions, self._commands[1], body, self.dt, critical)
         return critical
 
     @property
@@ -518,10 +518,10 @@ def in_proportion(
     All arrays have an entry for each option (k,); the first option is the proposal.
     """
     gentle, lower = options >= min(-comfort, options[0]), avoids & (options <= options[0])
-    passing = [gentle & ((risk <= tolerated) | (lower & regains)) for tolerated in tolerances]
-    for allowed in (*passing, lower & (options <= -comfort)):
-        if allowed.any():
-            best = int(np.where(allowed, np.abs(options - options[0]), np.inf).argmin())
+    passes = [gentle & ((risk <= tolerance) | (lower & regains)) for tolerance in tolerances]
+    for candidates in (*passes, lower & (options <= -comfort)):
+        if candidates.any():
+            best = int(np.where(candidates, np.abs(options - options[0]), np.inf).argmin())
             if risk[best] <= tolerances[-1]:
                 return best, "the closest that can"
             least = "the least braking that regains a safe gap in time"
@@ -561,9 +561,9 @@ def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[State
     """
     actions = np.array([risk.lowest, 0.0])
     critical = [risk.critical(center, actions) for center in known.centers]
-    braking, keeping = risk.manoeuvres.harder(np.reshape(critical, (-1, 2))).T
-    hardest = [survived[0] for survived in critical]
-    columns = braking, keeping - braking, hardest, known.visits * risk.dt, known.endings
+    brake_risk, keep_risk = risk.manoeuvres.harder(np.reshape(critical, (-1, 2))).T
+    hardest = [decels[0] for decels in critical]
+    columns = brake_risk, keep_risk - brake_risk, hardest, known.visits * risk.dt, known.endings
     rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
     return [StateRisk(state, *row) for state, row in enumerate(rows)]
 
@@ -573,15 +573,15 @@ def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[State
 
 def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     """Gap and speeds, as they can be judged; unless they must be ``whole``, NaN where not seen."""
-    seen = _series("observation", observation)
-    if len(seen) != 3:
+    numbers = _series("observation", observation)
+    if len(numbers) != 3:
         raise ValueError(
-            f"observation has shape {seen.shape}; it must be (3,): gap, speed of the follower "
+            f"observation has shape {numbers.shape}; it must be (3,): gap, speed of the follower "
             "and of the leader"
         )
-    gap, speed, leader_speed = seen.tolist()
+    gap, speed, leader_speed = numbers.tolist()
     if not math.isfinite(gap + speed + leader_speed):  # looked at closely only where it has to be
-        refuse_unusable("observation", seen if whole else seen[~np.isnan(seen)])
+        refuse_unusable("observation", numbers if whole else numbers[~np.isnan(numbers)])
     return gap, speed, leader_speed
 
 

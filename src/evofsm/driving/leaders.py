@@ -101,9 +101,9 @@ class Manoeuvres:
 
     def remember(self, *decels: float | None) -> None:
         """Take in manoeuvres [m/s²], the oldest first; None for none."""
-        seen = [min(positive("decel", decel), HARDEST) for decel in decels if decel is not None]
-        hard = [decel for decel in seen if decel >= _HARD]
-        self.gentle += len(seen) - len(hard)
+        samples = [min(positive("decel", decel), HARDEST) for decel in decels if decel is not None]
+        hard = [decel for decel in samples if decel >= _HARD]
+        self.gentle += len(samples) - len(hard)
         if hard:
             self.decels = deque([*self.decels, *hard], self.decels.maxlen)
             self._tabulate()
@@ -132,10 +132,10 @@ class Manoeuvres:
         grid = np.arange(0.0, HARDEST + _GRID, _GRID)
         harder = (self.assumed > grid).astype(np.float64)
         if self.decels:
-            seen = np.array(self.decels)
+            samples = np.array(self.decels)
             # Silverman's rule; where few were seen their spread says little.
-            width = self.width or max(_NARROWEST, 2.34 * seen.std() * len(seen) ** -0.2)
-            offset = np.clip((seen - grid[:, None]) / width, -1.0, 1.0)
+            width = self.width or max(_NARROWEST, 2.34 * samples.std() * len(samples) ** -0.2)
+            offset = np.clip((samples - grid[:, None]) / width, -1.0, 1.0)
             harder += (0.5 + offset * (0.75 - 0.25 * offset * offset)).sum(axis=1)
         harder[grid >= HARDEST] = 0.0
         #: Decelerations [m/s²], and the chance that the next hard manoeuvre is harder.
@@ -168,24 +168,24 @@ class BrakeWatch:
         """
         now = gap, speed, leader_speed
         if self._recent and is_another(self._recent[-1], now, self.dt):
-            ended = self.end()
+            decel = self.end()
             self.clear()
             self._recent.append(now)
-            return ended
+            return decel
         self._recent.append(now)
         self._noise = noise
         span = min(self._long_enough(self._recently, _BLUR), 4 * self._recently)
         if len(self._recent) <= span:
             return None
-        lost = self._recent[-1 - span][2] - leader_speed
+        loss = self._recent[-1 - span][2] - leader_speed
         seconds = span * self.dt
         if self._braking:
             self._braking.append(leader_speed)
             if leader_speed <= 0.0:
                 self._recent.clear()  # who stands does not brake, though noise may move it
-            if lost < _ENDS * seconds or leader_speed <= 0.0:
+            if loss < _ENDS * seconds or leader_speed <= 0.0:
                 return self.end()
-        elif lost >= _BEGINS * seconds + _DOUBT * noise:
+        elif loss >= _BEGINS * seconds + _DOUBT * noise:
             self._braking = [speed for _, _, speed in self._recent][-1 - span :]
         return None
 
@@ -197,10 +197,10 @@ class BrakeWatch:
         if len(speeds) <= self._shortest:
             return None
         span = min(self._long_enough(self._window, _BLUR_HARDEST), len(speeds) - 1)
-        lost = np.array(speeds[:-span]) - np.array(speeds[span:])
+        losses = np.array(speeds[:-span]) - np.array(speeds[span:])
         # Less than a gentle second's worth may be noise, however short.
         least = _BEGINS * _WINDOW + _DOUBT * self._noise
-        return float(lost.max()) / (span * self.dt) if lost.max() >= least else None
+        return float(losses.max()) / (span * self.dt) if losses.max() >= least else None
 
     def _long_enough(self, span: int, blur: float) -> int:
         """So many decisions, or more if noise blurs a deceleration over them."""
@@ -213,7 +213,7 @@ def is_another(before: Three, now: Three, dt: float) -> bool:
     Gap [m] and both speeds [m/s], ``dt`` [s] apart.
     """
     gap, speed, leader_speed = before
-    expected = gap + 0.5 * dt * (leader_speed + now[2] - speed - now[1])
+    expected_gap = gap + 0.5 * dt * (leader_speed + now[2] - speed - now[1])
     if abs(now[2] - leader_speed) > HARDEST * dt + _ANOTHER_SPEED:
         return True
-    return abs(now[0] - expected) > _ANOTHER_GAP
+    return abs(now[0] - expected_gap) > _ANOTHER_GAP

@@ -112,10 +112,10 @@ def modified_time_to_collision(observations: Floats, dt: float) -> Floats:
     As published, it lets cars roll backwards where they would in truth have come to a standstill.
     """
     gap, speed, leader_speed = _columns(observations)
-    closing = speed - leader_speed
-    discriminant = closing**2 + 2.0 * _acceleration(closing, dt) * gap
+    closing_speed = speed - leader_speed
+    radicand = closing_speed**2 + 2.0 * _acceleration(closing_speed, dt) * gap
     # Gap over the mean closing speed until then: the first positive root, whatever the sign of Δa.
-    mean = np.where(discriminant >= 0.0, (closing + np.sqrt(np.maximum(discriminant, 0.0))) / 2, 0)
+    mean = np.where(radicand >= 0.0, (closing_speed + np.sqrt(np.maximum(radicand, 0.0))) / 2, 0)
     return _time_to_cover(gap, mean)
 
 
@@ -158,11 +158,11 @@ def deceleration_to_avoid_collision(observations: Floats) -> Floats:
     infinite where the cars have met.
     """
     gap, speed, leader_speed = _columns(observations)
-    closing = np.maximum(speed - leader_speed, 0.0)
-    needed = np.zeros_like(gap)
+    closing_speed = np.maximum(speed - leader_speed, 0.0)
+    decel = np.zeros_like(gap)
     with np.errstate(over="ignore"):
-        np.divide(closing**2, 2.0 * gap, out=needed, where=gap > 0.0)
-    return _unsafe_once_met(gap, needed)
+        np.divide(closing_speed**2, 2.0 * gap, out=decel, where=gap > 0.0)
+    return _unsafe_once_met(gap, decel)
 
 
 @dataclass(frozen=True)
@@ -200,8 +200,8 @@ class Picud(_Measure):
     def score(self, observations: Floats, dt: float) -> Floats:
         """Minus the gap left [m]; infinite where the cars have met."""
         gap, speed, leader_speed = _columns(observations)
-        braked = (leader_speed**2 - speed**2) / (2.0 * self.decel)
-        return _unsafe_once_met(gap, -(gap + braked - speed * self.reaction))
+        gain = (leader_speed**2 - speed**2) / (2.0 * self.decel)
+        return _unsafe_once_met(gap, -(gap + gain - speed * self.reaction))
 
 
 # -- Safe distances -------------------------------------------------------------------------------
@@ -258,10 +258,10 @@ class ResponsibilitySensitiveSafety(_Measure):
         """
         _, speed, leader_speed = _columns(observations)
         fastest = speed + self.response * self.accel
-        travelled = (speed + fastest) / 2.0 * self.response
-        stopping = travelled + fastest**2 / (2.0 * self.decel)
-        left = stopping - leader_speed**2 / (2.0 * self.leader_decel)
-        return np.asarray(np.maximum(left, 0.0))
+        response_distance = (speed + fastest) / 2.0 * self.response
+        stopping_distance = response_distance + fastest**2 / (2.0 * self.decel)
+        distance = stopping_distance - leader_speed**2 / (2.0 * self.leader_decel)
+        return np.asarray(np.maximum(distance, 0.0))
 
 
 @dataclass(frozen=True)
@@ -301,9 +301,9 @@ class PerformanceModel(_Measure):
     def score(self, observations: Floats, dt: float) -> Floats:
         """Distance to avoid the collision − gap [m]; infinite where the cars have met."""
         gap, speed, leader_speed = _columns(observations)
-        closing = np.maximum(speed - leader_speed, 0.0)
-        needed = closing**2 / (2.0 * self.decel) + closing * self.reaction
-        return _unsafe_once_met(gap, needed - gap)
+        closing_speed = np.maximum(speed - leader_speed, 0.0)
+        distance = closing_speed**2 / (2.0 * self.decel) + closing_speed * self.reaction
+        return _unsafe_once_met(gap, distance - gap)
 
 
 # -- Fuzzy safety ---------------------------------------------------------------------------------
@@ -366,9 +366,9 @@ class FuzzySafety(_Measure):
         s(comfortable_decel) + margin, and linear in between.
         """
         gap, speed, leader_speed = _columns(observations)
-        shared = speed * self.reaction - leader_speed**2 / (2.0 * self.leader_decel)
-        unsafe = shared + speed**2 / (2.0 * self.decel)
-        safe = shared + speed**2 / (2.0 * self.comfortable_decel) + self.margin
+        common_distance = speed * self.reaction - leader_speed**2 / (2.0 * self.leader_decel)
+        unsafe = common_distance + speed**2 / (2.0 * self.decel)
+        safe = common_distance + speed**2 / (2.0 * self.comfortable_decel) + self.margin
         return np.where(gap <= 0.0, 1.0, _membership(gap - self.margin, unsafe, safe))
 
     def critical(self, observations: Floats, dt: float) -> Floats:
@@ -381,17 +381,17 @@ class FuzzySafety(_Measure):
         present braking does not do, and 0 else; 1 where the cars have met.
         """
         gap, speed, leader_speed = _columns(observations)
-        closing, comfortable = speed - leader_speed, self.comfortable_decel
+        closing_speed, comfortable = speed - leader_speed, self.comfortable_decel
         accel = _acceleration(speed, dt)
-        later = closing + np.maximum(accel, -comfortable) * self.reaction
-        travelled = (closing + later) / 2.0 * self.reaction
-        approaches = closing > 0.0
+        later = closing_speed + np.maximum(accel, -comfortable) * self.reaction
+        gap_loss = (closing_speed + later) / 2.0 * self.reaction
+        approaches = closing_speed > 0.0
         slows = approaches & (later < 0.0)
         # What the present braking needs until the speeds are equal.
         present = np.zeros_like(gap)
-        np.divide(closing**2, -2.0 * accel, out=present, where=slows)
-        unsafe = np.where(slows, present, travelled + later**2 / (2.0 * self.decel))
-        safe = np.where(slows, present, travelled + later**2 / (2.0 * comfortable))
+        np.divide(closing_speed**2, -2.0 * accel, out=present, where=slows)
+        unsafe = np.where(slows, present, gap_loss + later**2 / (2.0 * self.decel))
+        safe = np.where(slows, present, gap_loss + later**2 / (2.0 * comfortable))
         critical = np.where(approaches, _membership(gap, unsafe, safe), 0.0)
         return np.where(gap <= 0.0, 1.0, critical)
 
@@ -424,12 +424,12 @@ def is_dead_end(observations: Floats, decel: float, leader_decel: float) -> NDAr
     array([False,  True])
     """
     gap, speed, leader_speed = _columns(observations)
-    stopped = gap + leader_speed**2 / (2 * leader_decel) - speed**2 / (2 * decel)
-    smallest = np.minimum(gap, stopped)
+    final_gap = gap + leader_speed**2 / (2 * leader_decel) - speed**2 / (2 * decel)
+    smallest = np.minimum(gap, final_gap)
     # A follower who brakes harder is nearest when the speeds meet, if both still move then.
     if decel > leader_decel:
-        meeting = (speed - leader_speed) / (decel - leader_decel)
-        moving = (meeting > 0.0) & (meeting < leader_speed / leader_decel)
+        meeting_time = (speed - leader_speed) / (decel - leader_decel)
+        are_moving = (meeting_time > 0.0) & (meeting_time < leader_speed / leader_decel)
         nearest = gap - (speed - leader_speed) ** 2 / (2 * (decel - leader_decel))
-        smallest = np.where(moving, np.minimum(smallest, nearest), smallest)
+        smallest = np.where(are_moving, np.minimum(smallest, nearest), smallest)
     return np.asarray(smallest <= 0.0)

@@ -37,9 +37,9 @@ def name_state(center: ArrayLike) -> str:
     'far (60 m), fast (25 m/s), opening at 2 m/s'
     """
     gap, speed, leader = real_array("center", center, 1).tolist()
-    closing = speed - leader
-    change = f"{'closing' if closing > 0.0 else 'opening'} at {abs(closing):.0f} m/s"
-    change = "at equal speeds" if abs(closing) < _EQUAL_SPEED else change
+    closing_speed = speed - leader
+    change = f"{'closing' if closing_speed > 0.0 else 'opening'} at {abs(closing_speed):.0f} m/s"
+    change = "at equal speeds" if abs(closing_speed) < _EQUAL_SPEED else change
     return ", ".join([_placed(gap, _DISTANCES, "m"), _placed(speed, _FAST, "m/s"), change])
 
 

@@ -111,9 +111,9 @@ class Perception:
     def _learn(self, before: Three, now: Three, realised: float) -> None:
         """Take in what kinematics do not explain; of who may stand nothing."""
         dt, (was, last) = self.dt, self._changes
-        closing = now[1] + before[1] - now[2] - before[2]
+        closing_sum = now[1] + before[1] - now[2] - before[2]
         self._changes = speed, leader = now[1] - before[1] - realised * dt, now[2] - before[2]
-        self._sizes[0].add(now[0] - before[0] + 0.5 * dt * closing)
+        self._sizes[0].add(now[0] - before[0] + 0.5 * dt * closing_sum)
         if min(now[1], before[1]) > _STANDING:
             self._sizes[1].add(speed - was)
         if min(now[2], before[2]) > _STANDING:
@@ -164,8 +164,8 @@ def _filtered(
     ``doubt`` is the standard deviation of the acceleration that was ``realised`` [m/s²].
     """
     gap, speed, leader = before
-    reached = max(speed + realised * dt, 0.0)
-    mean = np.array([gap + (leader - 0.5 * (speed + reached)) * dt, reached, leader])
+    next_speed = max(speed + realised * dt, 0.0)
+    mean = np.array([gap + (leader - 0.5 * (speed + next_speed)) * dt, next_speed, leader])
     (gg, gv, gu), (_, vv, vu), (_, _, uu) = covariance
     # F P Fᵀ, where only the gap changes with the others.
     to_v, to_u = gv + (vu - vv) * dt, gu + (uu - vu) * dt
@@ -179,8 +179,8 @@ def _filtered(
     variances = _diagonal(noise)
     whole = not np.isnan(now[0] + now[1] + now[2])
     for i in (0, 2):
-        off, expected = now[i] - mean[i], spread[i, i] + variances[i][i]
-        if whole and off * off > _ANOTHER_LEADER * _ANOTHER_LEADER * expected:
+        off, variance = now[i] - mean[i], spread[i, i] + variances[i][i]
+        if whole and off * off > _ANOTHER_LEADER * _ANOTHER_LEADER * variance:
             return now, variances
     for i in range(3):
         if np.isnan(now[i]):
@@ -232,6 +232,6 @@ def _noise(sizes: Iterable[_Sizes], dt: float) -> Three:
     gap, speed, leader = [s.deviation() for s in sizes]
     speed, leader = speed / _SIX, leader / _SIX
     gap = sqrt(max(gap**2 - 0.5 * dt**2 * (speed**2 + leader**2), 0.0) / 2.0)
-    found = zip((gap, speed, leader), _FINEST, strict=True)
-    gap, speed, leader = (size if size >= finest else 0.0 for size, finest in found)
+    pairs = zip((gap, speed, leader), _FINEST, strict=True)
+    gap, speed, leader = (size if size >= finest else 0.0 for size, finest in pairs)
     return gap, speed, leader

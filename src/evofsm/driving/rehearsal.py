@@ -91,14 +91,14 @@ def foresee(
     """
     gap, speed, leader_speed = observation[0], max(observation[1], 0.0), max(observation[2], 0.0)
     room = max(gap, _TOUCHING)
-    near, kept = (room, speed, leader_speed), min(body.margin, 0.5 * room)
-    leader_distance, reached_by_leader = _drive_on(leader_speed, -braking, regain)
+    near, margin = (room, speed, leader_speed), min(body.margin, 0.5 * room)
+    leader_distance, leader_end_speed = _drive_on(leader_speed, -braking, regain)
     for k in range(len(accelerations)):
         full = max(body.decel, min(-accelerations[k], hardest))
-        careful = Body(full, body.lag, kept)
+        careful = Body(full, body.lag, margin)
         found[0, k] = survives(near, accelerations[k], before, careful, braking, dt)
-        distance, reached = _drive_on(speed, accelerations[k], regain)
-        then = (gap + leader_distance - distance, reached, reached_by_leader)
+        distance, end_speed = _drive_on(speed, accelerations[k], regain)
+        then = (gap + leader_distance - distance, end_speed, leader_end_speed)
         found[1, k] = survives(then, 0.0, accelerations[k], body, worst, dt)
 
 
@@ -116,30 +116,30 @@ def survives(
     # Sensors may show a car that stands as one that rolls back.
     speed, leader_speed = max(observation[1], 0.0), max(observation[2], 0.0)
     caution = -body.decel
-    asked = max(acceleration, caution)
+    demand = max(acceleration, caution)
     last = max(before, caution)
-    if speed <= 0.0 and max(asked, last) <= 0.0:
+    if speed <= 0.0 and max(demand, last) <= 0.0:
         return bool(observation[0] > 0.0)  # who stands, and stays, may be closer than the margin
     for _ in range(2):  # until full braking rules alone
-        if gap <= 0.0 or (asked == caution and last == caution):
+        if gap <= 0.0 or (demand == caution and last == caution):
             break
-        distance, speed = _drive_on(speed, body.lag * last + (1.0 - body.lag) * asked, dt)
+        distance, speed = _drive_on(speed, body.lag * last + (1.0 - body.lag) * demand, dt)
         leader_distance, leader_speed = _drive_on(leader_speed, -leader_decel, dt)
         gap += leader_distance - distance
-        last, asked = asked, caution
+        last, demand = demand, caution
     # Both brake until they stand: the gap is smallest at the end, if it shrinks until then, ...
     if leader_decel >= body.decel or speed * leader_decel > leader_speed * body.decel:
         leader_distance = 0.5 * leader_speed * leader_speed / leader_decel
-        left = leader_distance - 0.5 * speed * speed / body.decel
-        return bool(gap + min(left, 0.0) > 0.0)
-    closing = max(speed - leader_speed, 0.0)  # ... or where they are as fast as each other
-    return bool(gap - 0.5 * closing * closing / (body.decel - leader_decel) > 0.0)
+        gap_change = leader_distance - 0.5 * speed * speed / body.decel
+        return bool(gap + min(gap_change, 0.0) > 0.0)
+    closing_speed = max(speed - leader_speed, 0.0)  # ... or where they are as fast as each other
+    return bool(gap - 0.5 * closing_speed * closing_speed / (body.decel - leader_decel) > 0.0)
 
 
 @kernel
 def _drive_on(speed: float, acceleration: float, dt: float) -> tuple[float, float]:
     """Distance covered and speed reached in ``dt``; no one drives backwards."""
-    reached = speed + acceleration * dt
-    if reached >= 0.0:
-        return 0.5 * (speed + reached) * dt, reached
+    end_speed = speed + acceleration * dt
+    if end_speed >= 0.0:
+        return 0.5 * (speed + end_speed) * dt, end_speed
     return -0.5 * speed * speed / acceleration, 0.0

@@ -57,7 +57,7 @@ class EnvelopeReviser:
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """Full braking where the measure is above 0, else the proposal."""
-        wanted, remark = make_usable(proposal, self.actions, self.fallback)
+        action, remark = make_usable(proposal, self.actions, self.fallback)
         self._seen = [*self._seen[-1:], situation.observation.copy()]
         danger = float(self.measure.score(np.array(self._seen), self.dt)[-1])
         if math.isnan(danger):
@@ -65,7 +65,7 @@ class EnvelopeReviser:
                 self.actions.low, proposal, unseen_text(situation, VARIABLES) or "danger unknown"
             )
         if danger <= 0.0:
-            return unjudged_revision(wanted, proposal, remark or "measure calls for nothing")
+            return unjudged_revision(action, proposal, remark or "measure calls for nothing")
         return unjudged_revision(
             self.actions.low, proposal, remark or f"measure calls for it: {danger:.3g}"
         )
@@ -80,10 +80,10 @@ class EnvelopeReviser:
     @classmethod
     def restored(cls, described: Mapping[str, Any], actions: IntervalActions) -> Self:
         """The one that was `described`."""
-        given = dict(described["measure"])
-        name = given.pop("class")
+        settings = dict(described["measure"])
+        name = settings.pop("class")
         kind = getattr(measures, name, None) or part_class(name)
-        return cls(kind(**given), actions, described["dt"])
+        return cls(kind(**settings), actions, described["dt"])
 
 
 class Unrevised:
@@ -99,8 +99,8 @@ class Unrevised:
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """The proposal, made usable."""
-        wanted, remark = make_usable(proposal, self.actions, self.fallback)
-        return unjudged_revision(wanted, proposal, remark or "not revised")
+        action, remark = make_usable(proposal, self.actions, self.fallback)
+        return unjudged_revision(action, proposal, remark or "not revised")
 
     def described(self) -> dict[str, Any]:
         """Nothing: its class says all."""

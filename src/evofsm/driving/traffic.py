@@ -130,13 +130,13 @@ def pairs_of(rows: ArrayLike) -> list[Pair]:
     if len(flat) % len(COLUMNS):
         raise ValueError(f"{len(flat)} numbers are no rows of {len(COLUMNS)}: {', '.join(COLUMNS)}")
     ego, *objects = flat.reshape(-1, len(COLUMNS)).tolist()
-    found = []
+    pairs = []
     for index, obj in enumerate(objects, start=1):
         if obj[0] > 0.5 and not math.isnan(sum(obj)):
             pair = _pair(ego, obj, index)
             if pair is not None:
-                found.append(pair)
-    return sorted(found, key=lambda pair: pair.gap)
+                pairs.append(pair)
+    return sorted(pairs, key=lambda pair: pair.gap)
 
 
 def _pair(ego: list[float], obj: list[float], index: int) -> Pair | None:
@@ -145,8 +145,8 @@ def _pair(ego: list[float], obj: list[float], index: int) -> Pair | None:
     crosses = abs(vy) > abs(vx)
     along, across = (width, length) if crosses else (length, width)
     free = abs(aside) - 0.5 * (ego[6] + across)  # between the sides
-    closing = (ego[4] - vy) * math.copysign(1.0, aside)
-    if free >= max(0.0, closing * _AHEAD):  # not in one's path, nor soon
+    closing_speed = (ego[4] - vy) * math.copysign(1.0, aside)
+    if free >= max(0.0, closing_speed * _AHEAD):  # not in one's path, nor soon
         return None
     gap = abs(apart) - 0.5 * (ego[5] + along)
     if apart < 0.0:
@@ -206,30 +206,30 @@ class TrafficRisk(ActionJudge):
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each acceleration [m/s²]: the highest of all pairs."""
         actions = np.ascontiguousarray(actions, np.float64)
-        nothing = np.zeros(len(actions))
+        zeros = np.zeros(len(actions))
         worst: Judgement | None = None
-        self.worst, hardest, survived = None, -float(actions.min()), math.inf
+        self.worst, hardest, limit = None, -float(actions.min()), math.inf
         follower = None
         for pair in pairs_of(situation.observation):
             if pair.role is Role.BEHIND:
                 # Who does not brake is hit by nobody that it has to mind.
                 bound = self._survived(pair) if hardest > 0.0 else math.inf
-                if bound < survived:
-                    survived, follower = bound, pair
+                if bound < limit:
+                    limit, follower = bound, pair
                 continue
             here = Situation(pair.observation, _ONE, None, math.nan, 0.0)
-            judged = self.ahead.judge(here, actions)
-            if worst is None or judged.risk[0] > worst.risk[0]:
+            judgement = self.ahead.judge(here, actions)
+            if worst is None or judgement.risk[0] > worst.risk[0]:
                 self.worst = pair
-            worst = judged if worst is None else _worse(worst, judged)
+            worst = judgement if worst is None else _worse(worst, judgement)
         if worst is None:
-            worst = Judgement(nothing, nothing, nothing, nothing + math.inf, 0.0)
-        if hardest <= survived:
+            worst = Judgement(zeros, zeros, zeros, zeros + math.inf, 0.0)
+        if hardest <= limit:
             return worst
-        hit = np.where(actions < -survived, 1.0, 0.0)
+        hit = np.where(actions < -limit, 1.0, 0.0)
         if self.worst is None or hit[0] > worst.risk[0]:
             self.worst = follower
-        return _worse(worst, Judgement(hit, hit, hit, nothing + math.inf, 0.0))
+        return _worse(worst, Judgement(hit, hit, hit, zeros + math.inf, 0.0))
 
     def _survived(self, pair: Pair) -> float:
         """The hardest braking of oneself that who is behind survives [m/s²]."""
@@ -244,19 +244,19 @@ class TrafficRisk(ActionJudge):
     ) -> tuple[int, str] | None:
         """Index of the acceleration that is in proportion ahead and survived behind, and why."""
         avoids, regains = np.ones((2, len(options)), np.bool_)
-        survived = math.inf
+        limit = math.inf
         for pair in pairs_of(situation.observation):
             if pair.role is Role.BEHIND:
-                survived = min(survived, self._survived(pair))
+                limit = min(limit, self._survived(pair))
                 continue
-            seen = pair[2:5], pair.braking, options, tolerances[-1]
-            two = self.ahead.foreseen(*seen, hardest=-float(options.min()))
+            pair_arguments = pair[2:5], pair.braking, options, tolerances[-1]
+            two = self.ahead.foreseen(*pair_arguments, hardest=-float(options.min()))
             avoids, regains = avoids & two[0], regains & two[1]
         avoids &= options <= options[0]
-        bearable = options >= -survived
-        asked = options, judged.risk, tolerances, self.ahead.comfort, avoids & bearable, regains
-        if (found := in_proportion(*asked)) is not None:
-            return found
+        bearable = options >= -limit
+        arguments = options, judged.risk, tolerances, self.ahead.comfort, avoids & bearable, regains
+        if (choice := in_proportion(*arguments)) is not None:
+            return choice
         if bearable.any() and judged.critical[bearable].max() > 0.0:
             # Of several that are survived as well the hardest braking.
             rank = np.lexsort((options, -judged.critical, ~bearable))

@@ -121,8 +121,8 @@ def reference_of(family: Family, draw: Draw, world: World | None = None) -> Refe
 def outcome_of(episode: Episode, unrevised: Reference, interval: float) -> Outcome:
     """What came of an episode, against the unrevised controller in the same draw."""
     change = np.abs(episode.executed - episode.proposed)
-    realised = [d.realised for d in episode.decisions if math.isfinite(d.realised)]
-    jerk = np.diff(realised) / interval
+    accelerations = [d.realised for d in episode.decisions if math.isfinite(d.realised)]
+    jerk = np.diff(accelerations) / interval
     return Outcome(
         episode.collided,
         episode.rear_ended,
@@ -148,12 +148,12 @@ def lead_time(episode: Episode, tolerance: float = TOLERANCE) -> float | None:
     """
     if not episode.collided or math.isnan(episode.decisions[0].revision.risk_proposed):
         return None
-    began = episode.time[-1]
+    start = episode.time[-1]
     for decision in reversed(episode.decisions):
         if not decision.revision.risk_proposed > tolerance:
             break
-        began = decision.situation.time
-    return float(episode.time[-1] - began)
+        start = decision.situation.time
+    return float(episode.time[-1] - start)
 
 
 def try_out(
@@ -176,8 +176,8 @@ def try_out(
     frozen.freeze()
     alone = alone or [reference_of(family, draw) for draw in draws]
     return [
-        outcome_of(driven, base, family.interval)
-        for base, driven in zip(alone, teach(frozen, draws), strict=True)
+        outcome_of(episode, base, family.interval)
+        for base, episode in zip(alone, teach(frozen, draws), strict=True)
     ]
 
 
@@ -196,14 +196,14 @@ class Trial:
         world = _opened(self.world) if isinstance(self.world, str) else self.world
         draw = self.family.draw(self.seed, number, split=self.split)
         alone = reference_of(self.family, draw, world)
-        driven = drive(self.guard, draw, world)
-        outcome = outcome_of(driven, alone, self.family.interval)
+        episode = drive(self.guard, draw, world)
+        outcome = outcome_of(episode, alone, self.family.interval)
         tolerance = getattr(self.guard.reviser, "tolerance", TOLERANCE)
-        return driven, {
+        return episode, {
             "episode": number,
             "variant": draw.variant,
             **outcome._asdict(),
-            "lead_time": lead_time(driven, tolerance),
+            "lead_time": lead_time(episode, tolerance),
         }
 
     def __call__(self, number: int) -> dict[str, Any]:

@@ -113,14 +113,14 @@ class Plan(NamedTuple):
     def of(cls, scenario: Scenario) -> Plan:
         """Tables of a scenario."""
         leader, body, cut_in = scenario.leader, scenario.body, scenario.leader.cut_in
-        moved = [scenario.steps(cut_in.time), cut_in.gap, cut_in.speed] if cut_in else [-1, 0, 0]
+        entry = [scenario.steps(cut_in.time), cut_in.gap, cut_in.speed] if cut_in else [-1, 0, 0]
         return cls(
             scenario.times,
             scenario.dt,
             leader.driver.parameters,
             np.array(leader.waves, dtype=np.float64).reshape(-1, 2),
             np.array([leader.brake_decel, leader.brake_speed, leader.brake_time, 0.0]),
-            np.array(moved, dtype=np.float64),
+            np.array(entry, dtype=np.float64),
             np.array(
                 [body.lowest, body.highest, scenario.steps(body.delay), body.jerk * scenario.dt]
             ),
@@ -131,8 +131,8 @@ class Plan(NamedTuple):
 @compiled
 def move(position: float, speed: float, acceleration: float, dt: float) -> tuple[float, float]:
     """Position and speed one step later (SUMO's ballistic update); no one drives backwards."""
-    reached = max(0.0, speed + acceleration * dt)
-    return position + 0.5 * (speed + reached) * dt, reached
+    next_speed = max(0.0, speed + acceleration * dt)
+    return position + 0.5 * (speed + next_speed) * dt, next_speed
 
 
 @compiled
@@ -158,13 +158,13 @@ def decide(plan: Plan, record: NDArray[np.float64], row: int, command: float) ->
         now[LEADER_ACCELERATION] = idm_kernel(plan.leader, time, np.inf, now[LEADER_SPEED], 0.0)
 
     now[COMMANDED] = command
-    told = row - int(body[2])
-    realised = record[told, COMMANDED] if told >= 0 else 0.0
-    realised = min(max(realised, body[0]), body[1])
+    command_row = row - int(body[2])
+    acceleration = record[command_row, COMMANDED] if command_row >= 0 else 0.0
+    acceleration = min(max(acceleration, body[0]), body[1])
     if body[3] < np.inf:
         last = record[row - 1, REALISED] if row > 0 else 0.0
-        realised = min(max(realised, last - body[3]), last + body[3])
-    now[REALISED] = realised
+        acceleration = min(max(acceleration, last - body[3]), last + body[3])
+    now[REALISED] = acceleration
 
     if len(plan.behind) > 0:
         now[ACCELERATION_BEHIND] = idm_kernel(
@@ -245,11 +245,11 @@ class Road:
     @property
     def observation(self) -> NDArray[np.float64]:
         """(3,) ndarray: gap [m], v_follower [m/s], v_leader [m/s], as the follower sees them."""
-        seen = self._record[max(0, self.row - self._delay), GAP : LEADER_SPEED + 1].copy()
+        observation = self._record[max(0, self.row - self._delay), GAP : LEADER_SPEED + 1].copy()
         if self._noise is not None:
-            seen = seen + self._noise[self.row]
-            seen[1:] = np.maximum(seen[1:], 0.0)
-        return seen
+            observation = observation + self._noise[self.row]
+            observation[1:] = np.maximum(observation[1:], 0.0)
+        return observation
 
     @property
     def over(self) -> bool:
@@ -281,16 +281,16 @@ class Road:
         self, action: float, /
     ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
         """Drive on; of two collisions that end a run, running into the leader is a failure."""
-        began, speed = self.time, self._record[self.row, SPEED]
+        start, speed = self.time, self._record[self.row, SPEED]
         self.advance(action, self.every)
-        lasted, failed = self.time - began, self.collided
-        came = {
+        seconds, failed = self.time - start, self.collided
+        outcome = {
             "time": self.time,
             "failed": failed,
-            "realised": (self._record[self.row, SPEED] - speed) / lasted if lasted else math.nan,
+            "realised": (self._record[self.row, SPEED] - speed) / seconds if seconds else math.nan,
         }
         terminated = failed or self.rear_ended
-        return self.observation, 0.0, terminated, self.over and not terminated, came
+        return self.observation, 0.0, terminated, self.over and not terminated, outcome
 
 
 class World(ABC):
@@ -311,13 +311,13 @@ class World(ABC):
         over = False
         with self.open(scenario) as road:
             while not over:
-                over, time, seen = road.over, road.time, road.observation
-                wanted = propose(seen, time)
-                asked = float(wanted.action if isinstance(wanted, Proposal) else wanted)
-                if not math.isfinite(asked):
-                    where = f"at {time:g} s, gap {seen[0]:g} m"
-                    raise ValueError(f"controller proposed {asked} {where}")
-                road.advance(asked, steps)
+                over, time, observation = road.over, road.time, road.observation
+                proposal = propose(observation, time)
+                command = float(proposal.action if isinstance(proposal, Proposal) else proposal)
+                if not math.isfinite(command):
+                    where = f"at {time:g} s, gap {observation[0]:g} m"
+                    raise ValueError(f"controller proposed {command} {where}")
+                road.advance(command, steps)
             return road.episode()
 
 
