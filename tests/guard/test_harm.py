@@ -184,7 +184,7 @@ def test_frozen_it_does_not_forget_why_it_was_there():
     luck = [(45, "e", None)] * 3
     harm = arms([(60, "e", None)] * 19 + [(28, "f", None)], luck)
     first = [Outcome(-k, 20, failed=True, guarded=False) for k in (1, 2)]
-    harm = harm._replace(outcomes=(*first, *harm.outcomes))
+    harm = harm._replace(outcomes=(*first, *harm.outcomes), kept=400.0)
     assert not harm.helps(learning=True)
     assert harm.helps(learning=False)
 
