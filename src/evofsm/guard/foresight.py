@@ -225,10 +225,10 @@ class Foresight(LearningJudge):
         cls, *, dt: float, names: Sequence[str], horizon: float | None = None, hold: float = 0.0
     ) -> Self:
         """One that has seen nothing, and learns as it goes; all as in `learn_log`."""
-        learnt = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((len(RATES), 4))
-        learnt[2][:, 3] = _NO_KIND
-        given: dict[str, Any] = {"log": _nothing(len(names)), "asked": horizon}
-        return cls(dt, _FEWEST, 1 + round(hold / dt), *learnt, names, **given)
+        tables = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((len(RATES), 4))
+        tables[2][:, 3] = _NO_KIND
+        keywords: dict[str, Any] = {"log": _nothing(len(names)), "asked": horizon}
+        return cls(dt, _FEWEST, 1 + round(hold / dt), *tables, names, **keywords)
 
     @classmethod
     def _of_log(
@@ -249,8 +249,8 @@ class Foresight(LearningJudge):
             horizon = max(float(np.median(log.lengths)) * _SHORT, _FEWEST) * dt
         ahead = max(round(positive("horizon", horizon) / dt), 1)
         names = names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
-        nothing = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 4))
-        fresh = cls(dt, ahead, held, *nothing)
+        empty_tables = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 4))
+        fresh = cls(dt, ahead, held, *empty_tables)
         number = np.arange(len(log.failed)) * _PARTS // len(log.failed)
         tallies = np.zeros((2, len(_PRICES), 3))  # warned, foreseen, false
         there = np.zeros((2, 2))  # of failures, and rows: how many are where others failed, and all
@@ -262,17 +262,17 @@ class Foresight(LearningJudge):
             for n, z in enumerate((rest.failures, rest.rows)):
                 there[n] += failure.inside(judge.forms, z).any(0).sum(), len(z)
             for side, price in np.ndindex(2, len(_PRICES)):
-                found, _ = judge.tally(rest, price, plain=bool(side), columns=columns)
-                tallies[side, price] += found.lead * found.failures, found.foreseen, found.false
+                tally, _ = judge.tally(rest, price, plain=bool(side), columns=columns)
+                tallies[side, price] += tally.lead * tally.failures, tally.foreseen, tally.false
         judge, days = fresh._fitted(log), there[1, 1] * dt / _DAY
         holds, shares = judge.forms[:, failure.HELD], there[:, 0] / np.maximum(there[:, 1], 1.0)
         is_known = not there[0, 1] or shares[0] - shares[1] >= _KNOWN
         holds[holds < (_SAID * log.failed.sum() if is_known else np.inf)] = 0.0
         fewest = np.array([[poisson_bounds(int(n))[0] for n in row] for row in tallies[..., 2]])
         chance, limits = log.failed.sum() * ahead / len(log.rows), [np.empty((0, 6))]
-        before, told = limits[0], list[Any]()  # limits of the rate before
-        for rate, stated in enumerate(RATES):
-            fit = fewest <= stated * days
+        latest, scores = limits[0], list[Any]()
+        for rate, daily_rate in enumerate(RATES):
+            fit = fewest <= daily_rate * days
             best = np.where(fit, tallies[..., 0], -1.0).argmax(1)
             parts = [judge.of_rate(int(best[k]), plain=k > 0)[:, 1:] for k in range(2)]
             usable = fit[[0, 1], best] & [len(part) > 0 for part in parts]
@@ -284,19 +284,19 @@ class Foresight(LearningJudge):
             n = right + false
             low = wilson_bounds(right / n, n, _NO_CHANCE)[0] if right else 0.0
             kind = kind if low > chance else _NO_KIND  # no better than an alarm at any time
-            is_same = bool(told) and told[-1][3] == kind and np.array_equal(parts[kind % 2], before)
-            told.append(told[-1] if is_same else (right, false, float(log.failed.sum()), kind))
-            before = parts[kind % 2]
-        known = judge.forms, np.concatenate(limits), np.array(told, np.float64)
-        return cls(dt, ahead, held, *known, names, units)
+            before, latest = latest, parts[kind % 2]  # limits of the rate before, and of this one
+            is_same = bool(scores) and scores[-1][3] == kind and np.array_equal(latest, before)
+            scores.append(scores[-1] if is_same else (right, false, float(log.failed.sum()), kind))
+        tables = judge.forms, np.concatenate(limits), np.array(scores, np.float64)
+        return cls(dt, ahead, held, *tables, names, units)
 
     def _fitted(self, log: Runs) -> Self:
         """With forms and limits of both kinds, for all rates."""
         rows, failed = np.delete(log.rows, log.last[log.failed], 0), log.failures
         unit = np.median(np.abs(np.diff(log.rows, axis=0)), axis=0) + 1e-12
         box, sample = np.sort(rows, axis=0), rows[:: max(len(rows) // _ROWS, 1)]
-        survived = failure.Survived(sample, box[:2], box[:-3:-1], unit, rows.std(0), rows[:0])
-        forms = failure.explain(FAILS, failed, survived)
+        survival = failure.Survived(sample, box[:2], box[:-3:-1], unit, rows.std(0), rows[:0])
+        forms = failure.explain(FAILS, failed, survival)
         judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
         columns = judge.columns(log.rows, log.starts)
         judge.limits = np.vstack([judge._searched(columns, log, plain=k) for k in (False, True)])
@@ -306,17 +306,17 @@ class Foresight(LearningJudge):
         """The limits that warn longest, of each rate."""
         m, of = log.rows.shape[1], len(columns) // len(_AHEAD)
         above = product(range(1 if plain else len(_AHEAD)), range(m if plain else of), (1, -1))
-        asked = [(v, when, sign) for when, v, sign in above if v < m or sign > 0]
+        limits = [(v, when, sign) for when, v, sign in above if v < m or sign > 0]
         # Rows are looked at by blocks, in which it is enough that one of them is beyond.
         # The last row, with which it may fail, is one by itself.
         coarse = min(len(log.rows) // _MOST_BLOCKS, self.horizon // _FEWEST_BLOCKS)
         size = max(self.horizon // _BLOCKS, coarse, 1)
-        left = np.repeat(log.last, log.lengths) - np.arange(len(log.rows))
-        blocks = np.union1d(np.flatnonzero(left % size == 0), log.starts)
+        countdown = np.repeat(log.last, log.lengths) - np.arange(len(log.rows))
+        blocks = np.union1d(np.flatnonzero(countdown % size == 0), log.starts)
         shares = 1.0 - np.geomspace(0.3, max(3.0 / len(log.rows), 1e-5), _TRIED)
-        signed = [sign * columns[v + of * when] for v, when, sign in asked]
-        tried = [np.quantile(x, shares) for x in signed]
-        x = [np.maximum.reduceat(x, blocks) for x in signed]
+        series = [sign * columns[v + of * when] for v, when, sign in limits]
+        thresholds = [np.quantile(x, shares) for x in series]
+        x = [np.maximum.reduceat(x, blocks) for x in series]
         spans = np.maximum(self._spans // size, 1)
         starts, leads = np.searchsorted(blocks, log.starts), np.zeros(len(log.starts))
         most = spans[0] * log.failed.sum(), len(log.rows) * self.dt / _DAY
@@ -324,14 +324,14 @@ class Foresight(LearningJudge):
         @cache
         def more(rule: _Rule) -> Floats:
             """(limits, thresholds, 2) share that is warned, and false alarms a day, of one more."""
-            above, found = np.zeros(len(blocks), np.bool_), np.zeros((len(asked), _TRIED, 2))
+            above, sums = np.zeros(len(blocks), np.bool_), np.zeros((len(limits), _TRIED, 2))
             for k, j in rule:
-                above |= x[k] > tried[k][j]
-            for k, j in np.ndindex(len(asked), _TRIED):
-                beyond = above | (x[k] > tried[k][j])
+                above |= x[k] > thresholds[k][j]
+            for k, j in np.ndindex(len(limits), _TRIED):
+                beyond = above | (x[k] > thresholds[k][j])
                 false = _tally(beyond, beyond, starts, log.failed, spans, leads)
-                found[k, j] = leads.sum(), false
-            return np.asarray(found / most)
+                sums[k, j] = leads.sum(), false
+            return np.asarray(sums / most)
 
         # What one failure alone speaks for is no further limit.
         rows, alone = [], max(_WORTH, 1.0 / log.failed.sum())
@@ -343,11 +343,11 @@ class Foresight(LearningJudge):
                 if gain[best] <= worth + (alone if rule else _WORTH):
                     break
                 worth, rule = gain[best], (*rule, best)
-            parts = [signed[k] > tried[k][j] for k, j in rule]
+            parts = [series[k] > thresholds[k][j] for k, j in rule]
             for n, (k, j) in enumerate(rule):  # what others imply is no part of it
                 rest = [part for m, part in enumerate(parts) if m != n]
                 if not rest or (parts[n] & ~np.logical_or.reduce(rest)).any():
-                    rows.append((number, plain, *asked[k], asked[k][2] * tried[k][j]))
+                    rows.append((number, plain, *limits[k], limits[k][2] * thresholds[k][j]))
                 else:
                     parts[n] = np.zeros_like(parts[n])
         return np.array(rows, np.float64).reshape(-1, 6)
@@ -363,9 +363,9 @@ class Foresight(LearningJudge):
         """(3 v, T) variables and nearness to forms: now, and as far ahead as `_AHEAD` says."""
         x = np.vstack([rows.T, -failure.distances(self.forms, rows)])
         memory = np.full((2, len(x)), np.nan) if memory is None else memory
-        keeps, found = np.exp(-1.0 / (_SMOOTHED * self.horizon)), np.empty((len(_AHEAD), *x.shape))
-        _look_ahead(x, starts, keeps, np.array(_AHEAD) * self.horizon, memory, found)
-        columns: Floats = found.reshape(-1, len(rows))
+        keeps, ahead = np.exp(-1.0 / (_SMOOTHED * self.horizon)), np.empty((len(_AHEAD), *x.shape))
+        _look_ahead(x, starts, keeps, np.array(_AHEAD) * self.horizon, memory, ahead)
+        columns: Floats = ahead.reshape(-1, len(rows))
         return columns
 
     def _passed(self, columns: Floats, limits: Floats, *, soon: bool = False) -> Flags:
@@ -379,16 +379,16 @@ class Foresight(LearningJudge):
     def of_rate(self, rate: int, *, plain: bool | None = None) -> Floats:
         """The limits of an alarm, by default of the kind that did better, cross-validated."""
         kind = self.held_out[rate, 3] if plain is None else _PLAIN if plain else _LEARNT
-        chosen = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
-        return np.asarray(self.limits[chosen])
+        is_of_rate = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
+        return np.asarray(self.limits[is_of_rate])
 
     def where(self, rate: int) -> Floats:
         """(r, SIZE) forms beyond which an alarm is on while nothing changes; `HELD` is how near."""
-        m, found = len(self.labels.names), []
+        m, forms = len(self.labels.names), []
         for *_, v, _, sign, at in self.of_rate(rate).tolist():
             side = FAILS, v, v, 0.0, 0.0, 1.0, 1.0, -sign * at, sign, *np.zeros(5)
-            found.append(side if v < m else (*self.forms[int(v) - m, : failure.HELD], at))
-        return np.array(found).reshape(-1, failure.SIZE)
+            forms.append(side if v < m else (*self.forms[int(v) - m, : failure.HELD], at))
+        return np.array(forms).reshape(-1, failure.SIZE)
 
     def thresholds(self, rate: int) -> list[tuple[int, float]]:
         """The variables that alarm by themselves, and at which values."""
@@ -498,12 +498,12 @@ class Foresight(LearningJudge):
     def told_by_experience(self) -> str:
         """Where it fails; what each alarm is, how often it was right, and with which tolerance."""
         there = " or ".join(map(self._region, self._said))
-        told = [f"it fails where {there}"] if there else []
-        for stated, last in self.alarms.items():
+        texts = [f"it fails where {there}"] if there else []
+        for rates, last in self.alarms.items():
             at = f"{self.tolerance_of(RATES[last]):.3g}"
-            taken = f" (tolerance {at})" if self.rate_of(float(at)) == last else ""
-            told.append(f"for {stated} false alarms a day{taken} {self.of(last)}")
-        return "; ".join(told)
+            note = f" (tolerance {at})" if self.rate_of(float(at)) == last else ""
+            texts.append(f"for {rates} false alarms a day{note} {self.of(last)}")
+        return "; ".join(texts)
 
     @property
     def alarms(self) -> dict[str, int]:
@@ -517,16 +517,16 @@ class Foresight(LearningJudge):
         if kind == _NO_KIND:
             return "no alarm is false so seldom and better than chance"
         plain = "plain thresholds do as well: " * (kind == _PLAIN)
-        told = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
-        return f"{plain}{self.words(rate)} ({told}, cross-validated)"
+        record = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
+        return f"{plain}{self.words(rate)} ({record}, cross-validated)"
 
     # -- Beside a machine -----------------------------------------------------------------------
 
     def start_episode(self, *, learn: bool = True) -> None:
         """Nothing was seen yet; what was before, of an episode that nobody ended, went well."""
         if self._seen and self.log is not None:
-            seen, self._seen = self._seen, []
-            self._learn_from(seen, self.log, failed=False)
+            observations, self._seen = self._seen, []
+            self._learn_from(observations, self.log, failed=False)
         kinds = self.held_out[self.limits[:, _RATE].astype(int), 3]
         self._limits: Floats = self.limits[self.limits[:, _KIND] == kinds]
         # Variables smoothed once and twice; rows since limits were passed, and not; what is on.
@@ -537,12 +537,12 @@ class Foresight(LearningJudge):
         memory, up, down, on = self._now
         memory = np.full((2, len(z) + len(self.forms)), np.nan) if memory is None else memory.copy()
         columns = self.columns(z[None], np.empty(0, np.int64), memory)
-        passed, soon = (self._passed(columns, self._limits, soon=k)[:, 0] for k in (False, True))
-        rates = (self._limits[flags, _RATE].astype(int) for flags in (passed, soon))
+        is_passed, soon = (self._passed(columns, self._limits, soon=k)[:, 0] for k in (False, True))
+        rates = (self._limits[flags, _RATE].astype(int) for flags in (is_passed, soon))
         above, near = (np.bincount(rate, minlength=len(up)) > 0 for rate in rates)
         up, down = np.where(above, up + 1, 0), np.where(above | (near & (on > 0)), 0, down + 1)
         on = (up >= self.hold) | ((on > 0) & (down < self._spans[2]))
-        return passed, (memory, up, down, on)
+        return is_passed, (memory, up, down, on)
 
     def search(
         self,
@@ -556,22 +556,22 @@ class Foresight(LearningJudge):
     ) -> Search:
         """Keep what is proposed, as nobody acts; the risk is that of the alarm that is on."""
         self._accepted = tolerance
-        passed, (*_, on) = self._next(situation.observation)
+        is_passed, (*_, on) = self._next(situation.observation)
         rate, risk, reason = self.rate_of(tolerance), 0.0, "no alarm is on"
         evidence = 0.0 if rate is None else float(self.held_out[rate, :2].sum())
         if rate is not None and on[rate]:
             risk = float(self.shares[rate])
-            reason = self.reason(rate, situation.observation, self._limits[passed])
+            reason = self.reason(rate, situation.observation, self._limits[is_passed])
         low, high = wilson_bounds(risk, evidence) if risk else (0.0, 1.0)
-        risks, lows, highs, left = np.array([[risk], [low], [high], [np.nan]])
-        judged = Judgement(risks, lows, highs, left, evidence)
-        return Search(np.array([float(wanted)]), judged, 0, reason)
+        risks, lows, highs, slack = np.array([[risk], [low], [high], [np.nan]])
+        judgement = Judgement(risks, lows, highs, slack, evidence)
+        return Search(np.array([float(wanted)]), judgement, 0, reason)
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
         """The risk, whatever would be done, with the tolerance that was asked for last."""
-        found = self.search(situation, 0.0, tolerance=self._accepted, revising=False).judged
-        risk, low, high, left = (np.repeat(values, np.size(actions)) for values in found[:4])
-        return Judgement(risk, low, high, left, found.evidence)
+        judgement = self.search(situation, 0.0, tolerance=self._accepted, revising=False).judged
+        risk, low, high, slack = (np.repeat(values, np.size(actions)) for values in judgement[:4])
+        return Judgement(risk, low, high, slack, judgement.evidence)
 
     def why(self, judged: Judgement, /) -> str:
         """Why it is dangerous."""
@@ -603,16 +603,16 @@ class Foresight(LearningJudge):
         rows = rows[np.isfinite(rows).all(axis=1)][-_HELD_ROWS // 4 :]
         if not len(rows):
             return
-        joined = np.concatenate([log.rows, rows]), np.append(log.starts, len(log.rows))
-        log = Runs(*joined, np.append(log.failed, failed))
+        episodes = np.concatenate([log.rows, rows]), np.append(log.starts, len(log.rows))
+        log = Runs(*episodes, np.append(log.failed, failed))
         if len(log.rows) > _HELD_ROWS:  # of failures and of others the latest
             sides = [np.where(side, log.lengths, 0) for side in (log.failed, ~log.failed)]
             recent = [np.cumsum(side[::-1])[::-1] <= _HELD_ROWS // 2 for side in sides]
             log = log.part(np.where(log.failed, *recent))
         count = int(log.failed.sum()), len(log.rows)
         if count[0] and any(np.array(count) > np.multiply(_MORE, self._learnt)):
-            known = self.labels.names, self.labels.units
-            new = self._of_log(log, self.dt, self.asked, self.hold, *known)
+            labels = self.labels.names, self.labels.units
+            new = self._of_log(log, self.dt, self.asked, self.hold, *labels)
             self.horizon, self.forms, self.limits = new.horizon, new.forms, new.limits
             self.held_out, self._learnt = new.held_out, count
         self.log = log
@@ -646,9 +646,9 @@ class Foresight(LearningJudge):
             if (np.diff(starts, append=len(rows)) <= 0).any() or (starts[:1] != 0).any():
                 raise ValueError("an episode begins beyond its rows")
             log = Runs(rows, starts.astype(np.int64), failed > 0.0)
-            known: dict[str, Any] = {**settings, **arrays}
-            known["log"] = log if known.pop("learns") else None
-            return cls(**known)
+            keywords: dict[str, Any] = {**settings, **arrays}
+            keywords["log"] = log if keywords.pop("learns") else None
+            return cls(**keywords)
 
 
 def span(seconds: float) -> str:
@@ -702,25 +702,25 @@ def _tally(above: Flags, on: Flags, starts: Ints, failed: Flags, spans: Ints, le
     for e in range(len(starts)):
         end = starts[e + 1] if e + 1 < len(starts) else len(above)
         fails = end - 1 if failed[e] else end + horizon
-        up, down, begun = 0, 0, -1
+        up, down, onset = 0, 0, -1
         leads[e] = 0.0
         for t in range(starts[e], end + 1):
-            if begun < 0 and t < end and not above[t]:  # most rows
+            if onset < 0 and t < end and not above[t]:  # most rows
                 up, on[t] = 0, False
             elif t < end and above[t]:
                 up, down = up + 1, 0
-                if begun < 0 and up >= hold:
-                    begun = t
-            elif t < end and begun >= 0 and on[t]:
+                if onset < 0 and up >= hold:
+                    onset = t
+            elif t < end and onset >= 0 and on[t]:
                 up, down = 0, 0
             else:
                 up, down = 0, down + 1
-            if begun >= 0 and (t == end or down >= stays):
-                wrong = false_times(begun, t, fails, horizon)
+            if onset >= 0 and (t == end or down >= stays):
+                wrong = false_times(onset, t, fails, horizon)
                 false += wrong
-                if failed[e] and wrong * horizon < t - begun:
-                    leads[e] = max(leads[e], min(fails - begun, horizon))
-                begun = -1
+                if failed[e] and wrong * horizon < t - onset:
+                    leads[e] = max(leads[e], min(fails - onset, horizon))
+                onset = -1
             if t < end:
-                on[t] = begun >= 0
+                on[t] = onset >= 0
     return false
