@@ -93,8 +93,8 @@ def evolved(
 
     def worth(policy: Floats) -> Floats:
         """(S,) how well it ends in each situation, in the mean of all disturbances."""
-        found = rollout(model, situations, policy, residuals, scale).worth
-        return np.asarray(found.reshape(-1, n_disturbances).mean(1))
+        worths = rollout(model, situations, policy, residuals, scale).worth
+        return np.asarray(worths.reshape(-1, n_disturbances).mean(1))
 
     values = np.array([worth(policy) for policy in policies])
     parents = np.flatnonzero(linear == 1.0)
@@ -108,19 +108,19 @@ def evolved(
         if random.random() >= _OF_BEST:
             parent = int(random.integers(len(policies)))
         size = 10.0 ** random.uniform(*_SIZES)
-        drawn = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
-        child = policies[parent] + drawn[cells] * signs
-        reached = worth(child)
-        tried = np.repeat(values[None], 1 + len(parents), 0)  # as they are, and with the child
-        tried[1 + np.arange(len(parents)), parents] = reached
-        together = tried.max(1).mean(1) + _BY_ITSELF * tried.mean(2).sum(1)
+        mutation = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
+        child = policies[parent] + mutation[cells] * signs
+        child_values = worth(child)
+        variants = np.repeat(values[None], 1 + len(parents), 0)  # as they are, and with the child
+        variants[1 + np.arange(len(parents)), parents] = child_values
+        together = variants.max(1).mean(1) + _BY_ITSELF * variants.mean(2).sum(1)
         best = int(together.round(_ROUNDED).argmax())  # of equals the first: nothing changes
         if best:
-            policies[parents[best - 1]], values[parents[best - 1]] = child, reached
-    left, most, order = list(range(len(values))), np.full(values.shape[1], -1.0), []
-    while left:  # first the one that is worth most, then whichever adds most
-        adds = np.maximum(values[left] - most, 0.0).mean(1)
-        adds = (adds + _BY_ITSELF * values[left].mean(1)).round(_ROUNDED)
-        order.append(left.pop(int(adds.argmax())))
+            policies[parents[best - 1]], values[parents[best - 1]] = child, child_values
+    pool, most, order = list(range(len(values))), np.full(values.shape[1], -1.0), []
+    while pool:  # first the one that is worth most, then whichever adds most
+        adds = np.maximum(values[pool] - most, 0.0).mean(1)
+        adds = (adds + _BY_ITSELF * values[pool].mean(1)).round(_ROUNDED)
+        order.append(pool.pop(int(adds.argmax())))
         most = np.maximum(most, values[order[-1]])
     return policies[order], linear[order]

@@ -52,18 +52,18 @@ def fails(
         change = np.diff(went_on, axis=0)
         smooth = np.flatnonzero(~model.jumps(change, state.unit).any(1))
         new = np.concatenate([went_on, (went_on[:-1] + 0.5 * change)[smooth]])
-        left = 0 if episode.terminated else _UNPROVEN
+        tail = 0 if episode.terminated else _UNPROVEN
         if episode.failed:
-            left = min(state.horizon, len(went_on) // 2)
+            tail = min(state.horizon, len(went_on) // 2)
         at = np.append(np.arange(len(went_on)), smooth)
-        proven = np.append(state.proven, 1.0 * (at < len(went_on) - left))
-        survived = np.concatenate([state.survived, new])
+        proven = np.append(state.proven, 1.0 * (at < len(went_on) - tail))
+        safe_rows = np.concatenate([state.survived, new])
         if given is not None:
             fine = np.append(np.full(len(state.survived), True), [not given(row) for row in new])
-            survived, proven = survived[fine], proven[fine]
-        while len(survived) > settings.max_survived:
-            survived, proven = survived[::2], proven[::2]
-        state = state._replace(survived=survived, proven=proven)
+            safe_rows, proven = safe_rows[fine], proven[fine]
+        while len(safe_rows) > settings.max_survived:
+            safe_rows, proven = safe_rows[::2], proven[::2]
+        state = state._replace(survived=safe_rows, proven=proven)
     if failed:
         brinks = np.vstack([state.brinks, rows[-1:]])[-most:]
         state = state._replace(failures=np.vstack([state.failures, z[-1]])[-most:], brinks=brinks)
@@ -74,32 +74,32 @@ def fails(
 
 def _explained(state: State, settings: LearntSettings, *, failed: bool, bends: bool) -> State:
     """Explain all that failed or ended by forms, anew if it ``failed`` now."""
-    known, table = sizes(state), state.forms
+    survival, table = sizes(state), state.forms
     if len(state.ended) >= _ENDED:
-        table = _endings(state, table, known)
+        table = _endings(state, table, survival)
     ends, crashes = table[table[:, SAYS] == ENDS], table[table[:, SAYS] == CRASHES]
     is_end = failure.inside(ends, state.failures).any(0)
     failures = state.failures[~(is_end & failure.inside(crashes, state.failures, 0.0).any(0))]
     blur = np.where(state.reached < 2, state.scale[:, None], 0.0)
-    known = known._replace(rows=np.concatenate([known.rows, state.ended]))
+    survival = survival._replace(rows=np.concatenate([survival.rows, state.ended]))
     was = table[table[:, SAYS] == FAILS]
     are_sides = failure.are_sides(was)
-    bent = failure.without(was[~are_sides], known.rows)
-    sides = failure.explain(FAILS, failures, known, blur, bends=False)
+    bent = failure.without(was[~are_sides], survival.rows)
+    sides = failure.explain(FAILS, failures, survival, blur, bends=False)
     if len(bent):  # others come with other bent forms
-        kept = set(map(tuple, was[are_sides][:, [I, B]]))
-        sides = sides[[row in kept for row in map(tuple, sides[:, [I, B]])]]
+        old_sides = set(map(tuple, was[are_sides][:, [I, B]]))
+        sides = sides[[row in old_sides for row in map(tuple, sides[:, [I, B]])]]
     rows = np.concatenate([sides, bent])
     is_told = not len(failures) or failure.inside(rows, failures).any(0).all()
     if bends and (failed or not is_told):
-        rows = failure.explain(FAILS, failures, known, blur)
+        rows = failure.explain(FAILS, failures, survival, blur)
     rows[:, HELD] = failure.inside(rows, failures).sum(1)
-    state = state._replace(dropped=_dropped(state, was, rows, known, settings))
+    state = state._replace(dropped=_dropped(state, was, rows, survival, settings))
     forms = np.concatenate([ends, crashes, rows, table[table[:, SAYS] == DEAD]])
-    if state.held < 0 and failed and not _foreseen(state, table, known):
+    if state.held < 0 and failed and not _foreseen(state, table, survival):
         return state._replace(forms=forms, held=0, wrong=state.wrong + 1)
-    changed = state.held >= 0 and (failed or _shape(was) != _shape(rows))
-    return state._replace(forms=forms, held=0 if changed else state.held)
+    has_changed = state.held >= 0 and (failed or _shape(was) != _shape(rows))
+    return state._replace(forms=forms, held=0 if has_changed else state.held)
 
 
 def _dropped(
@@ -130,12 +130,12 @@ def _shape(table: Floats) -> tuple[list[list[float]], int]:
 
 def _endings(state: State, table: Floats, known: Survived) -> Floats:
     """Where it ends by itself: nowhere where it went on, nor where it failed like that."""
-    rows, ended = failure.without(table[table[:, SAYS] == ENDS], known.rows), state.ended
-    if len(known.rows) and not failure.inside(rows, ended).any(0).all():
-        rows = failure.explain(ENDS, ended, failure.boxed(known, known.rows))
-    rows = rows[failure.inside(rows, ended).sum(1) >= _ENDED]
+    rows, endings = failure.without(table[table[:, SAYS] == ENDS], known.rows), state.ended
+    if len(known.rows) and not failure.inside(rows, endings).any(0).all():
+        rows = failure.explain(ENDS, endings, failure.boxed(known, known.rows))
+    rows = rows[failure.inside(rows, endings).sum(1) >= _ENDED]
     failed = state.failures[failure.inside(rows, state.failures).any(0)]
-    crashes = failure.crashing(failed, ended, known, *set(rows[:, I].astype(int).tolist()))
+    crashes = failure.crashing(failed, endings, known, *set(rows[:, I].astype(int).tolist()))
     rows = failure.without(rows, failed[~failure.inside(crashes, failed, 0.0).any(0)])
     return np.concatenate([rows, crashes, table[np.isin(table[:, SAYS], [FAILS, DEAD])]])
 
@@ -145,16 +145,16 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
 
     Looked for in drawn directions, farther along variables that change slowly.
     """
-    known, survived, spread = sizes(state), state.survived, sizes(state).spread
-    if not len(survived) or not spread.any():
+    survival, safe_rows, spread = sizes(state), state.survived, sizes(state).spread
+    if not len(safe_rows) or not spread.any():
         return state
-    pace = np.abs(np.diff(survived, axis=0)).mean(0) / np.where(spread > 0.0, spread, np.inf)
-    drawn = np.random.default_rng(state.n_episodes).normal(size=(_RAYS, len(spread)))
-    towards = np.empty_like(drawn)
-    towards[:, np.argsort(pace, kind="stable")] = drawn
-    towards *= np.where(((survived - survived.mean(0)) ** 3).sum(0) < 0.0, -1.0, 1.0) * spread
-    starts = survived[np.linspace(0, len(survived) - 1, _RAYS).astype(int)]
-    lost, kept = list[Floats](), [*survived]
+    pace = np.abs(np.diff(safe_rows, axis=0)).mean(0) / np.where(spread > 0.0, spread, np.inf)
+    draws = np.random.default_rng(state.n_episodes).normal(size=(_RAYS, len(spread)))
+    towards = np.empty_like(draws)
+    towards[:, np.argsort(pace, kind="stable")] = draws
+    towards *= np.where(((safe_rows - safe_rows.mean(0)) ** 3).sum(0) < 0.0, -1.0, 1.0) * spread
+    starts = safe_rows[np.linspace(0, len(safe_rows) - 1, _RAYS).astype(int)]
+    hits, misses = list[Floats](), [*safe_rows]
     for z, off in zip(starts, towards, strict=True):
         near = 0.0
         for far in _RADII:
@@ -163,12 +163,12 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
                     half = 0.5 * (near + far)
                     near, far = (near, half) if given(z + half * off) else (half, far)
                 deep = far + _DEEP
-                lost.append(z + (deep if given(z + deep * off) else far) * off)
-                kept.append(z + near * off)
+                hits.append(z + (deep if given(z + deep * off) else far) * off)
+                misses.append(z + near * off)
                 break
-            kept.append(z + far * off)
+            misses.append(z + far * off)
             near = far
-    failures, rows = np.array(lost).reshape(-1, len(spread)), np.array(kept)
+    failures, rows = np.array(hits).reshape(-1, len(spread)), np.array(misses)
 
     def differs(table: Floats) -> float:
         """The share of observations of which the function says otherwise."""
@@ -176,11 +176,11 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
             ~failure.inside(table, failures).any(0),
             (failure.distances(table, rows) < 0.0).any(0),
         )
-        return float(np.concatenate(wrong).mean()) if lost else 0.0
+        return float(np.concatenate(wrong).mean()) if hits else 0.0
 
     table = state.forms
     if differs(table) > 0.0:
-        table = failure.explain(FAILS, failures, failure.boxed(known, rows), bends=bends)
+        table = failure.explain(FAILS, failures, failure.boxed(survival, rows), bends=bends)
     return state._replace(forms=table, differs=differs(table))
 
 
@@ -193,8 +193,8 @@ def dead_ends(state: State, known: Model, z: Floats, episode: Episode, before: F
     ``before`` is what was survived before the episode.
     """
     inverse, centres, counts = known.inverse, state.centres, state.counts
-    held = np.flatnonzero(episode.certified[: len(z) - 1]) if episode.failed else np.empty(0, int)
-    rows = z[held[-1] + 1 :] if len(held) else z[:0]
+    steps = np.flatnonzero(episode.certified[: len(z) - 1]) if episode.failed else np.empty(0, int)
+    rows = z[steps[-1] + 1 :] if len(steps) else z[:0]
     rows = rows[np.isfinite(rows).all(1)]
     if len(rows):
         counts = counts + (_between(rows, centres, inverse) < _LARGEST_RADIUS).any(0)
@@ -213,9 +213,9 @@ def dead_ends(state: State, known: Model, z: Floats, episode: Episode, before: F
     far = _between(centres, went_on[-_MAX_ROWS::_EACH], inverse)
     radii = np.minimum(radii, _WAY * far.min(1, initial=np.inf))
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2)))
-    left = np.flatnonzero(radii > _SAME_PLACE * typical)
-    left = np.sort(left[np.argsort(-counts[left], kind="stable")[:_MAX_ENDS]])
-    return state._replace(centres=centres[left], radii=radii[left], counts=counts[left])
+    index = np.flatnonzero(radii > _SAME_PLACE * typical)
+    index = np.sort(index[np.argsort(-counts[index], kind="stable")[:_MAX_ENDS]])
+    return state._replace(centres=centres[index], radii=radii[index], counts=counts[index])
 
 
 def barred(state: State) -> State:

@@ -145,13 +145,13 @@ def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
     """
     rows: list[Floats] = []
     for row, is_side, holds in zip(table, are_sides(table), inside(table, failures), strict=True):
-        held = failures[holds]
-        if row[SAYS] != FAILS or not len(held) or not len(survived.rows):
+        held_failures = failures[holds]
+        if row[SAYS] != FAILS or not len(held_failures) or not len(survived.rows):
             rows.append(row)
         elif is_side:
-            rows += _as_failed(row, held, survived)
+            rows += _as_failed(row, held_failures, survived)
         else:
-            rows += _ellipses(row, held, survived)
+            rows += _ellipses(row, held_failures, survived)
     return np.array(rows).reshape(-1, SIZE)
 
 
@@ -190,10 +190,10 @@ def _ellipses(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
 
 def _as_failed(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
     """That it ends beyond a threshold, and fails only as it did; or the threshold as it is."""
-    end, ended = row.copy(), survived.ended[inside(row[None], survived.ended)[0]]
+    end, endings = row.copy(), survived.ended[inside(row[None], survived.ended)[0]]
     end[SAYS] = ENDS
-    if len(ended):
-        crashes = nearer(crashing(held, ended, survived, int(row[I])), held, 0.5)
+    if len(endings):
+        crashes = nearer(crashing(held, endings, survived, int(row[I])), held, 0.5)
     else:
         crashes = _rare(held, survived, int(row[I]))
     return [end, *crashes] if len(crashes) else [row]
@@ -209,17 +209,17 @@ def _rare(held: Floats, survived: Survived, at: int) -> Floats:
     off = (np.abs(held - centre).min(0) - BLUR * unit).clip(0.0)
     share = np.array([rows >= low, rows <= high, np.abs(rows - centre) >= off]).mean(1)
     share[:, (survived.spread == 0.0) | (np.arange(m) == at)] = np.inf
-    found = np.zeros((m, SIZE))
-    found[:, SAYS], found[:, [I, J]] = CRASHES, np.arange(m)[:, None]
-    found[:, [ONE, OTHER]], found[:, HELD] = 1.0 / unit[:, None], len(held)
+    table = np.zeros((m, SIZE))
+    table[:, SAYS], table[:, [I, J]] = CRASHES, np.arange(m)[:, None]
+    table[:, [ONE, OTHER]], table[:, HELD] = 1.0 / unit[:, None], len(held)
     for k, side in enumerate(share.argmin(0)):
-        found[k, [AT, TO]] = (low, high, centre)[side][k]
-        found[k, [C, B, P]] = (
+        table[k, [AT, TO]] = (low, high, centre)[side][k]
+        table[k, [C, B, P]] = (
             (0.0, 1.0, 0.0),
             (0.0, -1.0, 0.0),
             (-((off[k] / unit[k]) ** 2), 0.0, 1.0),
         )[side]
-    return np.asarray(found[share.min(0) < _RARE])
+    return np.asarray(table[share.min(0) < _RARE])
 
 
 def boxed(known: Survived, rows: Floats) -> Survived:
@@ -232,10 +232,10 @@ def crashing(failed: Floats, ended: Floats, survived: Survived, *at: int) -> Flo
     """How it fails where it ends: by variables other than those ``at`` which it ends, if it can."""
     alike = failed.copy()
     alike[:, at] = ended[:, at].mean(0)
-    known = boxed(survived, ended)
-    table = explain(CRASHES, alike, known, least=1.0)
+    end_box = boxed(survived, ended)
+    table = explain(CRASHES, alike, end_box, least=1.0)
     if not inside(table, alike, 0.0).any(0).all():
-        table = explain(CRASHES, failed, known, least=1.0)
+        table = explain(CRASHES, failed, end_box, least=1.0)
     return table
 
 
@@ -286,7 +286,7 @@ def explain(
         if whole:
             bent, strong = alone, np.zeros(len(strong), bool)
     within: Flags = np.asarray(inside(bent, failures).any(0))
-    keep = [bool(s or not within[held].all()) for s, held in zip(strong, by, strict=True)]
+    keep = [bool(s or not within[holds].all()) for s, holds in zip(strong, by, strict=True)]
     return _counted(np.concatenate([stay[keep], bent]), failures)
 
 
@@ -314,23 +314,23 @@ def _sides(says: int, failures: Floats, survived: Survived, blur: Floats, least:
     with np.errstate(over="ignore"):  # of a variable that never changed it is far enough
         beyond = far / np.tile(unit, 2)
     perhaps = (far > -_BLURRED * blur.T.ravel()) | ((again > 0.0) & np.isfinite(again))
-    left = np.ones(len(failures), bool)
-    found: dict[int, float] = {}
+    is_open = np.ones(len(failures), bool)
+    thresholds: dict[int, float] = {}
     for clear in (max(least, _BEYOND), _BEYOND):
-        while (explained := (beyond > clear) & left[:, None]).any():
-            tied, best = _most_telling(explained, perhaps, beyond)
-            left &= ~(beyond[:, best] > _BEYOND)
-            undecided = len(failures) <= _MOST_UNDECIDED and len(tied) == 2
-            for k in tied if undecided else [best]:
-                found[k] = float(ends[k])
-    while (explained := perhaps & left[:, None]).any():
-        _, best = _most_telling(explained, perhaps, beyond)
-        left &= ~explained[:, best]
-        among = failures[explained[:, best], best % m]
-        found[best] = float(among.max() if best < m else among.min())  # the innermost
+        while (is_explained := (beyond > clear) & is_open[:, None]).any():
+            ties, best = _most_telling(is_explained, perhaps, beyond)
+            is_open &= ~(beyond[:, best] > _BEYOND)
+            is_undecided = len(failures) <= _MOST_UNDECIDED and len(ties) == 2
+            for k in ties if is_undecided else [best]:
+                thresholds[k] = float(ends[k])
+    while (is_explained := perhaps & is_open[:, None]).any():
+        _, best = _most_telling(is_explained, perhaps, beyond)
+        is_open &= ~is_explained[:, best]
+        among = failures[is_explained[:, best], best % m]
+        thresholds[best] = float(among.max() if best < m else among.min())  # the innermost
     rows = [
         [says, k % m, k % m, at, at, 1 / unit[k % m], 1 / unit[k % m], 0, (1, -1)[k < m], *[0] * 5]
-        for k, at in found.items()
+        for k, at in thresholds.items()
     ]
     return np.array(rows, np.float64).reshape(-1, SIZE)
 
@@ -338,9 +338,9 @@ def _sides(says: int, failures: Floats, survived: Survived, blur: Floats, least:
 def _most_telling(explained: Flags, perhaps: Flags, beyond: Floats) -> tuple[list[int], int]:
     """Ends that explain most failures, and of them the one that may explain most, and by most."""
     votes = explained.sum(0)
-    tied = np.flatnonzero(votes == votes.max()).tolist()
-    return tied, max(
-        tied, key=lambda k: (perhaps[:, k].sum(), float(np.median(beyond[explained[:, k], k])), -k)
+    ties = np.flatnonzero(votes == votes.max()).tolist()
+    return ties, max(
+        ties, key=lambda k: (perhaps[:, k].sum(), float(np.median(beyond[explained[:, k], k])), -k)
     )
 
 
@@ -348,40 +348,40 @@ def _bent(
     says: int, failures: Floats, survived: Survived, fewer: float = np.inf
 ) -> tuple[Floats, bool]:
     """Bent forms that explain failures, and whether these are ``fewer`` and explain all of them."""
-    asked = _asked(failures, survived)
-    found: list[Floats] = []
+    candidates = _asked(failures, survived)
+    bent_rows: list[Floats] = []
     groups, whole = [np.arange(len(failures))], True
-    while groups and len(asked) and len(found) < _MAX_FORMS:  # or nothing ever moved
-        if len(found) + len(groups) >= fewer:  # each takes a form at least
+    while groups and len(candidates) and len(bent_rows) < _MAX_FORMS:  # or nothing ever moved
+        if len(bent_rows) + len(groups) >= fewer:  # each takes a form at least
             whole = False
             break
         groups.sort(key=len, reverse=True)
         group = groups.pop(0)
         F = failures[group]
-        rows, within, score = _fitted(F, asked, survived)
+        rows, within, score = _fitted(F, candidates, survived)
         count = within.sum(1)
-        best = max(range(len(asked)), key=lambda n: (count[n], score[n]))
+        best = max(range(len(candidates)), key=lambda n: (count[n], score[n]))
         if 2 < len(group) and count[best] < len(group):
-            by_two, first = _in_two(F, asked, score, survived)
+            by_two, first = _in_two(F, candidates, score, survived)
             if by_two > count[best]:
                 groups += [group[first], group[~first]]
                 continue
         if count[best] >= min(max(2, 0.5 * len(group)), len(group)):
-            found.append(rows[best])
+            bent_rows.append(rows[best])
             groups += [group[~within[best]]] if count[best] < len(group) else []
             continue
-        likeliest = asked[int(score.argmax())][:2]
+        likeliest = candidates[int(score.argmax())][:2]
         first = _split(F[:, likeliest] / survived.spread[likeliest])
         whole &= not first.all()
         groups += [] if first.all() else [group[first], group[~first]]
-    table = np.array(found).reshape(-1, SIZE)
+    table = np.array(bent_rows).reshape(-1, SIZE)
     table[:, SAYS] = says
     return table, whole and not groups
 
 
 def _in_two(F: Floats, asked: Ints, score: Floats, survived: Survived) -> tuple[int, Flags]:
     """How many failures two forms of the likeliest pairs of variables explain, and which half."""
-    found = 0, np.ones(len(F), bool)
+    best_split = 0, np.ones(len(F), bool)
     pairs = np.flatnonzero(asked[:, 2] == 2)
     for n in pairs[np.argsort(-score[pairs], kind="stable")[:_IN_TWO]]:
         first = _split(F[:, asked[n, :2]] / survived.spread[asked[n, :2]])
@@ -390,12 +390,12 @@ def _in_two(F: Floats, asked: Ints, score: Floats, survived: Survived) -> tuple[
                 break
             fits = [_fitted(F[half], asked[[n]], survived) for half in (first, ~first)]
             far = np.concatenate([distances(rows, F) for rows, _, _ in fits])
-            explained = int((far.min(0) <= BLUR).sum())
-            found = (explained, first) if explained > found[0] else found
+            count = int((far.min(0) <= BLUR).sum())
+            best_split = (count, first) if count > best_split[0] else best_split
             if (first == (far[0] <= far[1])).all():
                 break
             first = far[0] <= far[1]
-    return found
+    return best_split
 
 
 def _asked(failures: Floats, survived: Survived) -> Ints:
@@ -404,16 +404,16 @@ def _asked(failures: Floats, survived: Survived) -> Ints:
     A variable tells failed observations from survived ones where they have another mean or spread;
     of pairs those are tried, too, that tell most beyond what their variables do.
     """
-    moving = np.flatnonzero(survived.spread > 0.0)
-    pairs = [*combinations(moving.tolist(), 2)]
-    if len(moving) > _SCREENED:
-        x, y = (z[:, moving] / survived.spread[moving] for z in (failures, survived.rows))
+    variables = np.flatnonzero(survived.spread > 0.0)
+    pairs = [*combinations(variables.tolist(), 2)]
+    if len(variables) > _SCREENED:
+        x, y = (z[:, variables] / survived.spread[variables] for z in (failures, survived.rows))
         alone, more = _tells(x, y)
-        coupled = [pairs[n] for n in np.argsort(-more, kind="stable")[:_COUPLED]]
-        moving = np.sort(moving[np.argsort(-alone, kind="stable")[:_SCREENED]])
-        pairs = [*dict.fromkeys([*combinations(moving.tolist(), 2), *coupled])]
+        couples = [pairs[n] for n in np.argsort(-more, kind="stable")[:_COUPLED]]
+        variables = np.sort(variables[np.argsort(-alone, kind="stable")[:_SCREENED]])
+        pairs = [*dict.fromkeys([*combinations(variables.tolist(), 2), *couples])]
     bent = [(i, j, kind) for i, j in pairs for kind in (1, 2)]
-    return np.array([*((j, j, 0) for j in moving), *bent], np.int64).reshape(-1, 3)
+    return np.array([*((j, j, 0) for j in variables), *bent], np.int64).reshape(-1, 3)
 
 
 def _tells(failures: Floats, survived: Floats) -> tuple[Floats, Floats]:
@@ -428,8 +428,8 @@ def _tells(failures: Floats, survived: Floats) -> tuple[Floats, Floats]:
     S = (x.T @ x + R) / (len(x) + 1.0)
     i, j = np.triu_indices(len(scale), 1)
     joint, free = S[i, i] + S[j, j], np.maximum(1.0 - R[i, j] ** 2, _ALIKE)
-    left = np.maximum(1.0 - S[i, j] ** 2 / (S[i, i] * S[j, j]), _ALIKE)
-    more = (joint - 2.0 * R[i, j] * S[i, j]) / free - joint - np.log(left / free)
+    remainder = np.maximum(1.0 - S[i, j] ** 2 / (S[i, i] * S[j, j]), _ALIKE)
+    more = (joint - 2.0 * R[i, j] * S[i, j]) / free - joint - np.log(remainder / free)
     return square - 1.0 - np.log(square), more
 
 
@@ -462,23 +462,23 @@ def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, 
     table, likelihood = np.zeros((len(asked), SIZE)), np.zeros(len(asked))
     again = np.arange(len(asked))
     for _ in range(_REFITS):  # with what the fit before has wrongly inside
-        seen = rows[index[..., None], asked[again][:, None, :2]]
-        x = np.concatenate([points[again], seen], 1) - at[again][:, None]
+        neighbours = rows[index[..., None], asked[again][:, None, :2]]
+        x = np.concatenate([points[again], neighbours], 1) - at[again][:, None]
         u, v = (x / scale[again][:, None]).transpose(2, 0, 1)
         phi = np.stack([u, v, u * u, u * v, v * v], 2) * _KINDS[asked[again, 2]][:, None]
         w, likelihood[again] = _logistic(phi, np.append(np.ones(k), np.zeros(index.shape[1])))
         times = unit[asked[again, :2]] / scale[again]
-        found = np.zeros((len(again), SIZE))
-        found[:, I:AT], found[:, AT:ONE] = asked[again, :2], at[again]
-        found[:, ONE:C] = 1.0 / unit[asked[again, :2]]
-        found[:, C], found[:, B:P] = w[:, 5], w[:, :2] * times
-        found[:, P], found[:, R] = w[:, 2] * times[:, 0] ** 2, w[:, 4] * times[:, 1] ** 2
-        found[:, Q] = w[:, 3] * times[:, 0] * times[:, 1]
-        form = forms(found, rows)[0]
+        fits = np.zeros((len(again), SIZE))
+        fits[:, I:AT], fits[:, AT:ONE] = asked[again, :2], at[again]
+        fits[:, ONE:C] = 1.0 / unit[asked[again, :2]]
+        fits[:, C], fits[:, B:P] = w[:, 5], w[:, :2] * times
+        fits[:, P], fits[:, R] = w[:, 2] * times[:, 0] ** 2, w[:, 4] * times[:, 1] ** 2
+        fits[:, Q] = w[:, 3] * times[:, 0] * times[:, 1]
+        form = forms(fits, rows)[0]
         most = form.max(1)  # as large as it may be with none of them inside
         wrong = (most > 0.0) & (likelihood[again] > -_UNLIKELY * k)
-        found[:, C] -= most + 1e-12 * (np.abs(found[:, C]) + np.abs(most))
-        table[again] = found
+        fits[:, C] -= most + 1e-12 * (np.abs(fits[:, C]) + np.abs(most))
+        table[again] = fits
         again, form, index = again[wrong], form[wrong], index[wrong]
         if not len(again) or len(rows) <= _FIT_ROWS:
             break
@@ -517,31 +517,31 @@ def _logistic(phi: Floats, y: Floats) -> tuple[Floats, Floats]:
     def tried(index: Ints, A: Floats, w: Floats) -> tuple[Floats, Floats]:
         """What weights cost, and what each row adds up to."""
         t = np.einsum("cnp,cp->cn", A, w)
-        lost = np.maximum(t * to, 0.0) + np.log1p(np.exp(-np.abs(t)))
-        return np.asarray(lost.sum(1) + 0.5 * (hold[index] * w**2).sum(1)), t
+        loss = np.maximum(t * to, 0.0) + np.log1p(np.exp(-np.abs(t)))
+        return np.asarray(loss.sum(1) + 0.5 * (hold[index] * w**2).sum(1)), t
 
-    going, A = np.arange(count), X
-    now, t = tried(going, A, w)
+    open_fits, A = np.arange(count), X
+    now, t = tried(open_fits, A, w)
     for _ in range(_NEWTON):
         q = 0.5 * (1.0 + np.tanh(0.5 * t))
-        down = np.einsum("cnp,cn->cp", A, q - y) + hold[going] * w[going]
-        curved = (A * np.maximum(q * (1.0 - q), 1e-12)[..., None]).transpose(0, 2, 1) @ A
-        curved += hold[going][:, :, None] * np.eye(p + 1)
-        step = np.linalg.solve(curved, down[..., None])[..., 0]
-        rate = np.ones(len(going))
+        down = np.einsum("cnp,cn->cp", A, q - y) + hold[open_fits] * w[open_fits]
+        hessian = (A * np.maximum(q * (1.0 - q), 1e-12)[..., None]).transpose(0, 2, 1) @ A
+        hessian += hold[open_fits][:, :, None] * np.eye(p + 1)
+        step = np.linalg.solve(hessian, down[..., None])[..., 0]
+        rate = np.ones(len(open_fits))
         for _ in range(10):
-            new, t = tried(going, A, w[going] - rate[:, None] * step)
-            worse = new > now[going] - 1e-12
+            new, t = tried(open_fits, A, w[open_fits] - rate[:, None] * step)
+            worse = new > now[open_fits] - 1e-12
             if not worse.any():
                 break
             rate[worse] *= 0.5
-        w[going] -= np.where(worse, 0.0, rate)[:, None] * step
-        was = now[going]
-        now[going] = np.where(worse, was, new)
+        w[open_fits] -= np.where(worse, 0.0, rate)[:, None] * step
+        was = now[open_fits]
+        now[open_fits] = np.where(worse, was, new)
         on = ~worse & (was - new >= 1e-4 * new + 1e-9)
-        going, A, t = going[on], A[on], t[on]
-        if not len(going):
+        open_fits, A, t = open_fits[on], A[on], t[on]
+        if not len(open_fits):
             break
     likelihood = -(now - 0.5 * (hold * w**2).sum(1))
-    found = w[:, :p] / size
-    return np.column_stack([found, w[:, p] - (found * mean).sum(1)]), likelihood
+    weights = w[:, :p] / size
+    return np.column_stack([weights, w[:, p] - (weights * mean).sum(1)]), likelihood

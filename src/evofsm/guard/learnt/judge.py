@@ -91,13 +91,13 @@ class Parts(NamedTuple):
         if not len(state.policies):
             return None
         model = model_of(state, settings)
-        daring = model._replace(forms=forms_of(state, settings, daring=True))
+        daring_model = model._replace(forms=forms_of(state, settings, daring=True))
         rest, scale = residuals_of(state, model, state.horizon), disturbance_scale(state, settings)
         few = settings.n_asked if len(pairs(len(state.origin))[0]) else 2
         cost = (model.weights.size + model.dead_ends.size) * rest.shape[2]
         most = max(min(settings.work, settings.work_rate * dt) / cost, few * state.horizon)
-        n_judged = 1 if most < 2 * few * state.horizon else few
-        return cls(model, daring, rest, scale, few, n_judged, most)
+        n_backups = 1 if most < 2 * few * state.horizon else few
+        return cls(model, daring_model, rest, scale, few, n_backups, most)
 
 
 class LearntRisk(ActionJudge):
@@ -312,43 +312,43 @@ class LearntRisk(ActionJudge):
             return Search(options, _unjudged(1), 0, why)
         model = parts.daring if self.learning else parts.model
         proposal, scale, margin = self.encode(wanted), parts.scale, self.state.margin
-        remembered, ranks, most = self.remembered, self._ranks[: parts.n_asked], parts.most
-        allowed = self._allowed(tolerance, remembered)
+        memory, ranks, most = self.remembered, self._ranks[: parts.n_asked], parts.most
+        allowance = self._allowed(tolerance, memory)
         policies = self.state.policies
         if mask is not None:
             policies = policies.copy()
             policies[:, ~mask, 0] = _NEVER
-        asked = model, here, policies, ranks, parts.residuals, scale
+        inputs = model, here, policies, ranks, parts.residuals, scale
         longer = self.settings.longer if self.learning else NO_LONGER
-        how, action, best, left = search(*asked, proposal, margin, allowed, most, longer=longer)
-        tried = None
+        how, action, best, slack = search(*inputs, proposal, margin, allowance, most, longer=longer)
+        trial = None
         if best != ranks[0]:  # what passed now is asked first the next time
             self._ranks = np.append(best, self._ranks[self._ranks != best])
         passes, self._refused, cut = how < CUT_SHORT, how != KEPT, how == CUT_SHORT
         self._holds = passes
         if not passes:
             if self._certified and not cut:
-                how = search(*asked, action, 0.0, allowed, most, lasting=False)[0]
+                how = search(*inputs, action, 0.0, allowance, most, lasting=False)[0]
                 self._holds = how < CUT_SHORT
             self._certified &= how != CUT_SHORT  # whether one is violated is not known
-            is_alike = self.learning and left < self.settings.alike
-            tried = self._untried(action, mask) if is_alike else None
-            action = action if tried is None else tried
-        judged, self._lost, fails_after = self._judged(
+            is_alike = self.learning and slack < self.settings.alike
+            trial = self._untried(action, mask) if is_alike else None
+            action = action if trial is None else trial
+        judgement, self._lost, fails_after = self._judged(
             situation,
             here,
             policies,
             [proposal, action] if self._refused else [proposal],
-            left if passes and not allowed else None,
+            slack if passes and not allowance else None,
         )
         self._fails_after = max(self._fails_after, fails_after)
         backup = self.backup_text(best, policies)
         if not self._refused:
-            return Search(options, judged, 0, words.kept(backup, remembered, left, allowed))
-        why = words.refused(self._unsurvived, remembered, margin, scale, allowed)
+            return Search(options, judgement, 0, words.kept(backup, memory, slack, allowance))
+        why = words.refused(self._unsurvived, memory, margin, scale, allowance)
         if passes:
-            instead = words.changed(backup, remembered, margin, allowed)
-        elif tried is not None:
+            instead = words.changed(backup, memory, margin, allowance)
+        elif trial is not None:
             instead = words.TRIED
         else:
             instead = words.NO_LONGER if action is proposal else words.lasting(backup, cut=cut)
@@ -357,14 +357,14 @@ class LearntRisk(ActionJudge):
         executed = wanted
         if action is not proposal:
             executed = np.reshape(self.decode(action), np.shape(wanted))
-        return Search(np.array((options[0], executed)), judged, 1, f"{why}; {instead}")
+        return Search(np.array((options[0], executed)), judgement, 1, f"{why}; {instead}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each action, (k,) or (k, d); NaN as long as nothing can be said."""
-        given, here = np.asarray(actions, np.float64), self._here(situation.observation)
+        options, here = np.asarray(actions, np.float64), self._here(situation.observation)
         if here is None or self.parts is None or not len(self.state.forms):
-            return _unjudged(len(given))
-        inner = [self.encode(action) for action in given]
+            return _unjudged(len(options))
+        inner = [self.encode(action) for action in options]
         return self._judged(situation, here, self.state.policies, inner)[0]
 
     def why(self, judged: Judgement) -> str:
@@ -387,19 +387,19 @@ class LearntRisk(ActionJudge):
         latest.
         """
         assert self.parts is not None
-        asked = actions if passes is None else actions[:-1]
+        options = actions if passes is None else actions[:-1]
         best = policies[self._ranks[: self.parts.n_judged]]
-        foreseen = [self._foresee(here, action[None], best) for action in asked]
+        outcomes = [self._foresee(here, action[None], best) for action in options]
         if passes is not None:
-            foreseen.append((0.0, passes, 0.0))
-        unsurvived, left, after = zip(*foreseen, strict=True)
-        self._unsurvived = -1 if math.isinf(unsurvived[0]) else int(unsurvived[0])
-        remembered = self.remembered
-        soon = self._soon(remembered.seconds)
-        risk, low, high = np.array([self._risk(n, soon) for n in unsurvived]).T
-        number = float(remembered.number)
-        judged = Judgement(risk, low, high, np.array(left), number, situation.seen)
-        return judged, math.isinf(unsurvived[-1]), max(after)
+            outcomes.append((0.0, passes, 0.0))
+        counts, slacks, after = zip(*outcomes, strict=True)
+        self._unsurvived = -1 if math.isinf(counts[0]) else int(counts[0])
+        memory = self.remembered
+        soon = self._soon(memory.seconds)
+        risk, low, high = np.array([self._risk(n, soon) for n in counts]).T
+        number = float(memory.number)
+        judgement = Judgement(risk, low, high, np.array(slacks), number, situation.seen)
+        return judgement, math.isinf(counts[-1]), max(after)
 
     def _foresee(self, here: Floats, plan: Floats, policies: Floats) -> tuple[float, float, float]:
         """What comes of a situation and an action if the best of some backups follows.
@@ -411,9 +411,9 @@ class LearntRisk(ActionJudge):
         model, rest = self.parts.model, self.parts.residuals
         ends = value_of(model, here[None], policies, rest, 1.0, plan, 0.0)[0]
         fails = ends[ends < 0.0]
-        unsurvived = math.inf if ends[0] < 0.0 else float(len(fails))
+        count = math.inf if ends[0] < 0.0 else float(len(fails))
         steps = len(rest)
-        return unsurvived, float(ends.min()), float(fails.max(initial=-1.0 - steps)) + 1.0 + steps
+        return count, float(ends.min()), float(fails.max(initial=-1.0 - steps)) + 1.0 + steps
 
     def fails_after(self, situation: Floats, plan: Floats) -> Floats:
         """(1 + K,) steps after which a plan (T, a) fails, undisturbed and amid each disturbance.
@@ -451,42 +451,42 @@ class LearntRisk(ActionJudge):
 
     def _allowed(self, tolerance: float, remembered: Remembered) -> int:
         """How many of the disturbances need not be survived, by share and bound of the risk."""
-        soon, most, allowed = self._soon(remembered.seconds), tolerance * remembered.number, 0
-        while allowed + 1 <= most and self._risk(allowed + 1, soon)[2] <= tolerance:
-            allowed += 1
-        return allowed
+        soon, most, allowance = self._soon(remembered.seconds), tolerance * remembered.number, 0
+        while allowance + 1 <= most and self._risk(allowance + 1, soon)[2] <= tolerance:
+            allowance += 1
+        return allowance
 
     def _here(self, z: Floats) -> Floats | None:
         """The situation, if that is seen; what was not is taken to have gone on as before."""
-        seen, stride, n = self._filled(z), self.state.stride, len(self._done)
-        if not n or seen is None:
-            return None if seen is None else np.append(seen, np.zeros(len(z) + self.size))
-        change = (seen - self._past[-n]) * (stride / n)
-        return np.concatenate([seen, change, sum(self._done) / n])
+        row, stride, n = self._filled(z), self.state.stride, len(self._done)
+        if not n or row is None:
+            return None if row is None else np.append(row, np.zeros(len(z) + self.size))
+        change = (row - self._past[-n]) * (stride / n)
+        return np.concatenate([row, change, sum(self._done) / n])
 
     def _filled(self, z: Floats) -> Floats | None:
         """An observation, in which what was not seen has gone on as before; None at first."""
-        past, n, stride = self._past, len(self._past) - 1, self.state.stride
+        history, n, stride = self._past, len(self._past) - 1, self.state.stride
         if not math.isnan(z.dot(z)):
             return z
         if n < 0:
             return None
-        change = (past[-1] - past[0]) * (stride / n) if n else np.zeros(len(z))
-        return np.where(np.isnan(z), past[-1] + change / stride, z)
+        change = (history[-1] - history[0]) * (stride / n) if n else np.zeros(len(z))
+        return np.where(np.isnan(z), history[-1] + change / stride, z)
 
     def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
-        used, tries = self.state.used + self._used, self.settings.tries
+        uses, tries = self.state.used + self._used, self.settings.tries
         if self.choices:
             order = self.state.policies[self.state.linear == 0.0, :, 0].argmax(1)
             order = order if mask is None else order[mask[order]]  # of equals whose backup is first
-            i = int(order[used[order, 1].argmin()])
-            is_rare = used[i, 1] < tries and used[i, 1] < used[:, 1].max()
-            return np.asarray(np.eye(len(used))[i]) if is_rare else None
+            i = int(order[uses[order, 1].argmin()])
+            is_rare = uses[i, 1] < tries and uses[i, 1] < uses[:, 1].max()
+            return np.asarray(np.eye(len(uses))[i]) if is_rare else None
         order, turns = basis(self.state.situations[:, 2 * self.n_variables :])
-        turned = np.where(turns[:, None] > 0.0, used, used[:, ::-1])[order]
-        k, end = divmod(int(turned.argmin()), 2)
-        if turned[k, end] < tries and turned[k, end] < turned[k, 1 - end]:
+        turned_uses = np.where(turns[:, None] > 0.0, uses, uses[:, ::-1])[order]
+        k, end = divmod(int(turned_uses.argmin()), 2)
+        if turned_uses[k, end] < tries and turned_uses[k, end] < turned_uses[k, 1 - end]:
             best = best.copy()
             best[order[k]] = (-1.0, 1.0)[end] * turns[order[k]]
             return best
@@ -508,11 +508,11 @@ class LearntRisk(ActionJudge):
 
     def savepoint(self) -> Rollback:
         """What takes back all that it learns from now on."""
-        saved = {**self.__dict__}
-        lengths = {name: len(saved[name]) for name in ("_z", "_u", "_notes")}
+        fields = {**self.__dict__}
+        lengths = {name: len(fields[name]) for name in ("_z", "_u", "_notes")}
 
         def rollback() -> None:
-            self.__dict__ = {**saved}
+            self.__dict__ = {**fields}
             for name, length in lengths.items():
                 del self.__dict__[name][length:]
 
@@ -547,9 +547,9 @@ class LearntRisk(ActionJudge):
     def learn(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
         """Take in what was executed, and whether the certificate of before still held."""
         if "margin" not in self.without and self.parts is not None:
-            violated = self._certified and not self._holds
+            is_violated = self._certified and not self._holds
             s = self.settings
-            margin = self.state.margin + s.margin_step * (violated - s.violation_rate)
+            margin = self.state.margin + s.margin_step * (is_violated - s.violation_rate)
             self.state = self.state._replace(margin=min(s.margin_max, max(s.margin_step, margin)))
         self._certified = self._holds
         self._take_in(observation, action)
@@ -621,9 +621,9 @@ class LearntRisk(ActionJudge):
         self._z, self._u, self._notes = [], [], []
         if not len(z) or not np.isfinite(z).all(1).any() or not (n or failed):
             return
-        refused, lost, certified = notes.T
-        seen = z, u, failed, terminated
-        episode = Episode(*seen, refused, lost, certified, self._fails_after)
+        refusals, losses, certificates = notes.T
+        inputs = z, u, failed, terminated
+        episode = Episode(*inputs, refusals, losses, certificates, self._fails_after)
         if not self.n_variables:
             now = self.state
             blank = State.none(z.shape[1], self.size, self.choices, self.settings, None)
@@ -664,8 +664,8 @@ class LearntRisk(ActionJudge):
     @property
     def told_by_experience(self) -> str:
         """What was learnt so far, in words."""
-        told = words.experience(self.state, self.remembered, self.called, self._no_threshold)
-        return told + words.harm(self.harm, learning=self.learning)
+        text = words.experience(self.state, self.remembered, self.called, self._no_threshold)
+        return text + words.harm(self.harm, learning=self.learning)
 
     def told_here(self, observation: Floats) -> tuple[str, Floats | None]:
         """What was learnt of an observation, in words, and the centre of the dead end it is near.
@@ -713,11 +713,11 @@ class LearntRisk(ActionJudge):
         settings, arrays = store.read(path, KIND)
         with store.explained(path):
             names = ("n_actions", "seed", "without", "names", "units")
-            given = {name: settings[name] for name in names}
-            if given["n_actions"] is None:
-                given |= {"low": settings["low"], "high": settings["high"]}
-            given |= {"horizon": settings["given_horizon"]}
-            judge = cls(settings["dt"], settings=LearntSettings(**settings["settings"]), **given)
+            keywords = {name: settings[name] for name in names}
+            if keywords["n_actions"] is None:
+                keywords |= {"low": settings["low"], "high": settings["high"]}
+            keywords |= {"horizon": settings["given_horizon"]}
+            judge = cls(settings["dt"], settings=LearntSettings(**settings["settings"]), **keywords)
             of = judge.choices, judge.size, judge.settings
             judge.state = unpacked(settings["state"], arrays, *of)
             judge.harm = Harm.restored(settings["harm"], arrays["harm"])
@@ -745,5 +745,5 @@ def _range(
 
 
 def _unjudged(count: int) -> Judgement:
-    nothing = np.full(count, math.nan)
-    return Judgement(nothing, nothing, nothing, nothing, 0.0)
+    nans = np.full(count, math.nan)
+    return Judgement(nans, nans, nans, nans, 0.0)

@@ -73,16 +73,16 @@ def learn(
     decisions, before = episode, state
     episode = decisions.every(state.stride)
     random = np.random.default_rng([seed, state.n_episodes])
-    seen = np.isfinite(episode.observations).all(1)
+    is_seen = np.isfinite(episode.observations).all(1)
     if not state.n_seen:
-        state = state._replace(origin=episode.observations[seen][0])
+        state = state._replace(origin=episode.observations[is_seen][0])
     unit = state.unit if state.n_moves else model.typical_step(episode.observations)
     z = model.without_glitches(episode.observations, unit)
     safe = z[:-1] if episode.failed else z
     u = episode.actions[: max(0, len(safe) - 1)]
     margin = max(settings.margin_step, settings.margin_fade * state.margin)
     state = state._replace(
-        n_seen=state.n_seen + int(seen.sum()),
+        n_seen=state.n_seen + int(is_seen.sum()),
         margin=0.0 if "margin" in without else margin,
         used=state.used + motion.used_at(u, state.choices).sum(0),
     )
@@ -96,8 +96,8 @@ def learn(
     # Failure
     state = danger.fails(state, z, episode, settings, without, given.failed)
     if "dead-ends" not in without and len(state.forms):
-        known = model_of(state, settings)
-        state = danger.dead_ends(state, known, safe, episode, before.survived)
+        motion_model = model_of(state, settings)
+        state = danger.dead_ends(state, motion_model, safe, episode, before.survived)
     if not moves:
         return state._replace(n_episodes=state.n_episodes + 1)
     if not len(state.policies):
@@ -106,32 +106,32 @@ def learn(
         state = state._replace(policies=policies, linear=linear)
     state = noted(state, safe, u, episode, settings, random)
     if "rivals" not in without and given.failed is None:
-        tried = failure.inside(before.forms[before.forms[:, SAYS] == FAILS], safe, 0.0).any()
-        state = doubted(state, episode, settings, tried=bool(tried))
-    refuted = 1 + np.flatnonzero(episode.lost[1 : max(1, len(safe) - state.horizon)])
-    if len(refuted):
-        state = motion.misled(state, safe, u, refuted, settings, failed=episode.failed)
+        was_tried = failure.inside(before.forms[before.forms[:, SAYS] == FAILS], safe, 0.0).any()
+        state = doubted(state, episode, settings, tried=bool(was_tried))
+    refutations = 1 + np.flatnonzero(episode.lost[1 : max(1, len(safe) - state.horizon)])
+    if len(refutations):
+        state = motion.misled(state, safe, u, refutations, settings, failed=episode.failed)
     # Disturbances
-    known, fails = model_of(state, settings), len(state.forms) > 0
+    motion_model, fails = model_of(state, settings), len(state.forms) > 0
     looks = fails and len(state.situations) > _ENOUGH
     state = state._replace(n_scanned=state.n_scanned + looks)
     if "stretches" not in without:
-        state = disturbances(state, known, safe, u, settings, random, looks=looks)
-    rest = residuals_of(state, known, state.horizon)
+        state = disturbances(state, motion_model, safe, u, settings, random, looks=looks)
+    rest = residuals_of(state, motion_model, state.horizon)
     if looks and not has_horizon:
-        if is_too_short(state, known, episode, settings):
+        if is_too_short(state, motion_model, episode, settings):
             decisions = decisions._replace(fails_after=0.5 * decisions.fails_after)
-            known_now = coarser(before, settings), decisions, settings
-            return learn(*known_now, seed=seed, without=without, has_horizon=False, given=given)
-        state = look_ahead(state, known, rest, episode, settings)
+            retry = coarser(before, settings), decisions, settings
+            return learn(*retry, seed=seed, without=without, has_horizon=False, given=given)
+        state = look_ahead(state, motion_model, rest, episode, settings)
     # Backups
     if given.backup is not None:
-        state = fitted(state, known, given.backup)
+        state = fitted(state, motion_model, given.backup)
     if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
-        picked = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
-        rest, scale = np.ascontiguousarray(rest[:, :, picked]), disturbance_scale(state, settings)
-        asked = known, state.situations, rest, scale, settings, random
-        policies, linear = evolved(state.policies, state.linear, *asked)
+        numbers = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
+        rest, scale = np.ascontiguousarray(rest[:, :, numbers]), disturbance_scale(state, settings)
+        inputs = motion_model, state.situations, rest, scale, settings, random
+        policies, linear = evolved(state.policies, state.linear, *inputs)
         state = state._replace(policies=policies, linear=linear)
     return state._replace(n_episodes=state.n_episodes + 1)
 
@@ -150,9 +150,9 @@ def doubted(state: State, episode: Episode, settings: LearntSettings, *, tried: 
     if state.held < 0:
         return state._replace(held=state.held - (tried and not episode.failed))
     much = episode.refused.sum() > settings.refused * len(episode.actions)
-    held = state.held + bool(much and not episode.failed)
+    count = state.held + bool(much and not episode.failed)
     patience = settings.patience * settings.again**state.wrong
-    return state._replace(held=-1 if held >= patience else held)
+    return state._replace(held=-1 if count >= patience else count)
 
 
 # -- Disturbances ---------------------------------------------------------------------------------
@@ -213,15 +213,15 @@ def disturbances(
     if looks:
         calm = model.undisturbed(H, m, 1)[:, : new.shape[1]]
         with_none = np.concatenate([calm, new], 2)
-        picked = S[random.permutation(len(S))[:_TRIED_IN]]
-        ends = _worst(known, picked, state.policies[:1], with_none, 1.0)
+        sample = S[random.permutation(len(S))[:_TRIED_IN]]
+        ends = _worst(known, sample, state.policies[:1], with_none, 1.0)
     harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_MOST_WINDOWS]
     starts = starts[harmful]
     longest = settings.horizon_max + 2
     windows, lengths, of = list(state.windows), state.lengths.tolist(), state.seen_in.tolist()
     for t in starts:
-        seen: Flags = np.asarray(np.isfinite(z[t : t + longest]).all(1))
-        n = len(seen) if seen.all() else int(seen.argmin())
+        is_seen: Flags = np.asarray(np.isfinite(z[t : t + longest]).all(1))
+        n = len(is_seen) if is_seen.all() else int(is_seen.argmin())
         if n > _AT_ONCE + 1:
             row = np.zeros((longest, m + a))
             row[:n, :m], row[: n - 1, m:] = z[t : t + n], u[t : t + n - 1]
@@ -233,17 +233,17 @@ def disturbances(
         lengths=np.array(lengths),
         seen_in=np.array(of),
     )
-    found = residuals_of(state, known, H)
+    residuals = residuals_of(state, known, H)
     if looks and len(windows):
-        state, found = _fatal(state, known, found, settings)
+        state, residuals = _fatal(state, known, residuals, settings)
     if len(state.windows) <= settings.n_disturbances:
         return state
     if looks:
         scale = disturbance_scale(state, settings)
-        ends = _worst(known, S, state.policies[:2], found, scale)
+        ends = _worst(known, S, state.policies[:2], residuals, scale)
         keep = _chosen(ends, settings.n_disturbances)
     else:
-        keep = _sizes(found[:, :, 1:], state)[: settings.n_disturbances]
+        keep = _sizes(residuals[:, :, 1:], state)[: settings.n_disturbances]
     return _kept(state, keep)
 
 
@@ -262,8 +262,8 @@ def _fatal(
     size = np.abs(found[:, :m, 1 + fatal] / (state.unit[:, None] + 1e-300)).sum(1)
     rows = state.windows[fatal, (size >= _ONSET * size.max(0)).argmax(0), :m]
     is_new = ~(rows[:, None] == state.fatal).all(2).any(1)
-    seen = np.concatenate([state.fatal, rows[is_new]])[-settings.max_failures :]
-    state = danger.barred(state._replace(fatal=seen))
+    fatal_rows = np.concatenate([state.fatal, rows[is_new]])[-settings.max_failures :]
+    state = danger.barred(state._replace(fatal=fatal_rows))
     within = failure.inside(state.forms[state.forms[:, SAYS] == DEAD], rows).any(0)
     keep = np.setdiff1d(np.arange(len(state.windows)), fatal[within])
     return _kept(state, keep.tolist()), found[:, :, np.append(0, 1 + keep)]
@@ -318,24 +318,22 @@ def look_ahead(
     H, s, most = state.horizon, settings, farthest(known, settings)
     ends = value_of(known, state.situations, state.policies[: s.n_asked], rest)
     after = float(ends[ends < 0.0].max(initial=-1.0 - H) + 1 + H)
-    refuted = len(episode.lost) > H and episode.lost[:-H].any()
-    T, believed = state.time_to_failure, state.believed
+    is_refuted = len(episode.lost) > H and episode.lost[:-H].any()
+    T, trust = state.time_to_failure, state.believed
     too_short = s.latest * state.too_short
-    if refuted and not episode.failed:  # it sees less far than it looks
+    if is_refuted and not episode.failed:  # it sees less far than it looks
         T = max(s.refuted * T, s.horizon_min / s.ahead, state.too_short)
-        believed = T
+        trust = T
     else:
-        believed = min(believed / s.latest, float(s.horizon_max))
-        longest = max(s.latest * T, min(episode.fails_after, believed))
+        trust = min(trust / s.latest, float(s.horizon_max))
+        longest = max(s.latest * T, min(episode.fails_after, trust))
         if episode.failed and episode.certified.any():  # it did not look far enough
             too_short = max(too_short, min(s.ahead * T, s.horizon_max / s.ahead))
             longest = min(s.ahead * longest, s.horizon_max / s.ahead)
-            believed = max(believed, longest)
-        T = max(min(after, believed), longest)
+            trust = max(trust, longest)
+        T = max(min(after, trust), longest)
     horizon = int(max(min(s.ahead * T, most), s.horizon_min))
-    return state._replace(
-        time_to_failure=T, believed=believed, horizon=horizon, too_short=too_short
-    )
+    return state._replace(time_to_failure=T, believed=trust, horizon=horizon, too_short=too_short)
 
 
 def farthest(known: Model, settings: LearntSettings) -> float:
@@ -346,8 +344,8 @@ def farthest(known: Model, settings: LearntSettings) -> float:
 
 def is_too_short(state: State, known: Model, episode: Episode, settings: LearntSettings) -> bool:
     """Whether a certified episode failed later than it looks ahead, as far as that may be."""
-    held = np.flatnonzero(episode.certified)
-    is_late = len(held) > 0 and len(episode.actions) - held[-1] > state.horizon
+    steps = np.flatnonzero(episode.certified)
+    is_late = len(steps) > 0 and len(episode.actions) - steps[-1] > state.horizon
     return bool(episode.failed and is_late and state.horizon + 1 > farthest(known, settings))
 
 

@@ -49,8 +49,8 @@ def jumps(change: Floats, unit: Floats) -> Flags:
 
 def are_jumps(z: Floats, unit: Floats) -> Flags:
     """(T,) which transitions, from the second of T + 2 observations on, begin or end in a jump."""
-    jumped: Flags = np.asarray(jumps(np.diff(z, axis=0), unit).any(1))
-    return np.asarray(jumped[1:] | jumped[:-1])
+    is_jump: Flags = np.asarray(jumps(np.diff(z, axis=0), unit).any(1))
+    return np.asarray(is_jump[1:] | is_jump[:-1])
 
 
 def without_glitches(z: Floats, unit: Floats) -> Floats:
@@ -62,8 +62,8 @@ def without_glitches(z: Floats, unit: Floats) -> Floats:
     rows = np.abs(rows)
     rows = np.where(rows >= n, 2 * (n - 1) - rows, rows)
     around = np.median(z[rows], axis=1)
-    moved = np.abs(np.diff(around, axis=0, prepend=around[:1]))
-    pace = np.maximum(moved, np.vstack([moved[1:], moved[-1:]]))
+    moves = np.abs(np.diff(around, axis=0, prepend=around[:1]))
+    pace = np.maximum(moves, np.vstack([moves[1:], moves[-1:]]))
     bad = np.abs(z - around) > JUMP * np.maximum(unit, pace)
     bad[[0, -1]] = False
     return np.where(bad.any(1, keepdims=True), np.nan, z)
@@ -99,8 +99,8 @@ def solve(
     times[lags(m, a)] = min(prior[2], _NEVER)
     weights = np.empty_like(products)
     for j, share in enumerate(noisy):
-        held = np.where(is_plain, 1e-6 + share * prior[0] / n, 30e-6 + share * prior[1] / n)
-        weights[:, [j]] = ridge(squares, products[:, [j]], held * times * variance)
+        penalty = np.where(is_plain, 1e-6 + share * prior[0] / n, 30e-6 + share * prior[1] / n)
+        weights[:, [j]] = ridge(squares, products[:, [j]], penalty * times * variance)
     return weights
 
 
@@ -108,9 +108,9 @@ def ridge(squares: Floats, products: Floats, held: Floats) -> Floats:
     """(p, k) weights that are held to 0 by ``held`` (p,), as by so many squares more."""
     size = np.diag(squares)
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
-    scaled = scale[:, None] * (squares + np.diag(held)) * scale
-    scaled[np.diag_indices_from(scaled)] += _ALL_ALIKE
-    return np.asarray(scale[:, None] * _solved(scaled, scale[:, None] * products))
+    matrix = scale[:, None] * (squares + np.diag(held)) * scale
+    matrix[np.diag_indices_from(matrix)] += _ALL_ALIKE
+    return np.asarray(scale[:, None] * _solved(matrix, scale[:, None] * products))
 
 
 def _solved(squares: Floats, products: Floats) -> Floats:
@@ -121,9 +121,9 @@ def _solved(squares: Floats, products: Floats) -> Floats:
     upper = _solved(squares[:n, :n], np.hstack([squares[:n, n:], columns[:n]]))
     rest = np.hstack([squares[n:, n:], columns[n:]])
     rest = rest - np.einsum("ij,jk->ik", squares[n:, :n], upper)
-    left = len(squares) - n
-    below = _solved(rest[:, :left], rest[:, left:])
-    above = upper[:, left:] - np.einsum("ij,jk->ik", upper[:, :left], below)
+    n_lower = len(squares) - n
+    below = _solved(rest[:, :n_lower], rest[:, n_lower:])
+    above = upper[:, n_lower:] - np.einsum("ij,jk->ik", upper[:, :n_lower], below)
     return np.vstack([above, below]).reshape(products.shape)
 
 
@@ -132,11 +132,11 @@ def rows_of(model: Model, z: Floats, u: Floats) -> tuple[Floats, Floats, Flags]:
 
     A row counts where its observation and those before and after were seen.
     """
-    seen: Flags = np.asarray(np.isfinite(z).all(1))
-    known = seen[:-2] & seen[1:-1] & seen[2:]
+    is_finite: Flags = np.asarray(np.isfinite(z).all(1))
+    is_seen = is_finite[:-2] & is_finite[1:-1] & is_finite[2:]
     z = np.where(np.isfinite(z), z, model.origin)
     phi = features(model, z[1:-1], np.diff(z[:-1], axis=0), u[:-1], u[1:])
-    return phi, np.diff(z[1:], axis=0), known
+    return phi, np.diff(z[1:], axis=0), is_seen
 
 
 def residuals(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
@@ -150,24 +150,24 @@ def residuals(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
 
 def disturbed(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
     """(T, 2m) `residuals`, and where variables landed that jumped unexpectedly, else inf."""
-    phi, change, known = rows_of(model, z, u)
+    phi, change, is_seen = rows_of(model, z, u)
     move, after = phi @ model.weights, z[2:]
     to = z[1:-1] + move
-    held = ((to < model.lowest) & (after <= model.lowest)) | (
+    is_held = ((to < model.lowest) & (after <= model.lowest)) | (
         (to > model.highest) & (after >= model.highest)
     )
-    no_rest = ~known | (change == 0.0).all(1) | are_jumps(z, unit)
-    jumped = jumps(np.diff(z, axis=0), unit)[1:] & known[:, None]
-    jumped &= np.abs(change - move) > 0.5 * np.abs(change)
-    rest = np.where(held | no_rest[:, None], 0.0, after - to)
-    return np.hstack([rest, np.where(jumped, after, np.inf)])
+    no_rest = ~is_seen | (change == 0.0).all(1) | are_jumps(z, unit)
+    is_jump = jumps(np.diff(z, axis=0), unit)[1:] & is_seen[:, None]
+    is_jump &= np.abs(change - move) > 0.5 * np.abs(change)
+    rest = np.where(is_held | no_rest[:, None], 0.0, after - to)
+    return np.hstack([rest, np.where(is_jump, after, np.inf)])
 
 
 def undisturbed(steps: int, m: int, count: int) -> Floats:
     """(T, 2m, K) no residuals, no landings."""
-    found = np.zeros((steps, 2 * m, count))
-    found[:, m:] = np.inf
-    return found
+    calm = np.zeros((steps, 2 * m, count))
+    calm[:, m:] = np.inf
+    return calm
 
 
 def trimmed(found: Floats) -> Floats:

@@ -44,29 +44,29 @@ def steps(state: State, z: Floats) -> State:
     close = _SAME_SHARE * (high - low)
     lowest, new_low = _extremes(state.lowest, low, close)
     highest, new_high = _extremes(-state.highest, -high, close)
-    reached = np.where(np.array([new_low, new_high]).T, 0.0, state.reached)
-    state = state._replace(lowest=lowest, highest=-highest, reached=reached)
+    visits = np.where(np.array([new_low, new_high]).T, 0.0, state.reached)
+    state = state._replace(lowest=lowest, highest=-highest, reached=visits)
     change = np.diff(z, axis=0)
-    seen: Flags = np.asarray(np.isfinite(change).all(1))
-    if not seen.any():
+    is_seen: Flags = np.asarray(np.isfinite(change).all(1))
+    if not is_seen.any():
         return state
     latest = model.typical_step(z)
     unit = state.unit if state.n_moves else latest
-    size = np.minimum(np.abs(change[seen]), _LARGEST_STEP * np.maximum(unit, latest))
+    size = np.minimum(np.abs(change[is_seen]), _LARGEST_STEP * np.maximum(unit, latest))
     n = min(state.n_moves, _MOST_CHANGES)
-    ordinary = np.where(model.jumps(change, unit) | ~seen[:, None], 0.0, change)
-    moving = np.abs(change) > close  # it arrived there, and did not start there
-    arrived = [
-        ((z[1:] <= lowest[0] + close) & moving).any(0),
-        ((z[1:] >= -highest[0] - close) & moving).any(0),
+    ordinary = np.where(model.jumps(change, unit) | ~is_seen[:, None], 0.0, change)
+    is_moving = np.abs(change) > close  # it arrived there, and did not start there
+    arrivals = [
+        ((z[1:] <= lowest[0] + close) & is_moving).any(0),
+        ((z[1:] >= -highest[0] - close) & is_moving).any(0),
     ]
     return state._replace(
         unit=(n * unit + size.sum(0)) / (n + len(size)),
-        power=(n * state.power + (change[seen] ** 2).sum(0)) / (n + len(size)),
+        power=(n * state.power + (change[is_seen] ** 2).sum(0)) / (n + len(size)),
         n_moves=state.n_moves + len(size),
         least=np.minimum(state.least, ordinary.min(0)),
         most=np.maximum(state.most, ordinary.max(0)),
-        reached=reached + np.array(arrived).T,
+        reached=visits + np.array(arrivals).T,
     )
 
 
@@ -83,15 +83,15 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
     Outliers of the model ``known`` weigh less, but for those that follow an action that was hardly
     used; jumps, and what is held at an end of a variable, are left out.
     """
-    phi, change, seen = model.rows_of(known, z, u)
-    if not seen.any():
+    phi, change, is_seen = model.rows_of(known, z, u)
+    if not is_seen.any():
         return state
-    rest, jumped = model.residuals(known, z, u, state.unit), model.are_jumps(z, state.unit)
+    rest, is_jump = model.residuals(known, z, u, state.unit), model.are_jumps(z, state.unit)
     after, rests = z[2:], z[2:] == z[1:-1]
     to, is_known = z[1:-1] + phi @ known.weights, bool(state.scale.any())
     is_beyond = np.abs(to - after) > state.scale if is_known else rests.mean(0) <= _MOSTLY
-    held = rests & _held(state, to, after).any(0) & is_beyond
-    weight = np.where(jumped | held.any(1), 0.0, 1.0)
+    is_held = rests & _held(state, to, after).any(0) & is_beyond
+    weight = np.where(is_jump | is_held.any(1), 0.0, 1.0)
     if is_known:
         off = np.abs(rest) / np.maximum(state.scale, model.FLOOR * state.unit + 1e-300)
         is_new = (used_at(u[1:], state.choices) & (state.used < settings.rare)).any((1, 2))
@@ -99,30 +99,30 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
         weight *= np.where(is_new, 1.0, usual)
         free = ((after > known.lowest) & (after < known.highest)).all(1)
         ordinary = ((change >= state.least) & (change <= state.most)).all(1)
-        rows = seen & free & ordinary
+        rows = is_seen & free & ordinary
         state = _drifted(state, known, phi[rows], change[rows], np.diff(z, axis=0), settings)
-    x, weighed = phi[seen], weight[seen, None]
+    x, row_weights = phi[is_seen], weight[is_seen, None]
     state = state._replace(
-        squares=state.squares + x.T @ (weighed * x),
-        products=state.products + x.T @ (weighed * change[seen]),
+        squares=state.squares + x.T @ (row_weights * x),
+        products=state.products + x.T @ (row_weights * change[is_seen]),
     )
-    moved = seen[:, None] & ~rests
-    if (here := moved.any(1)).sum() < _FEWEST_CHANGES:
+    is_moving = is_seen[:, None] & ~rests
+    if (here := is_moving.any(1)).sum() < _FEWEST_CHANGES:
         return state
     now = model_of(state, settings)
     rest = np.abs(model.residuals(now, z, u, state.unit))
     size = [
         1.4826 * np.median(r[h]) if h.sum() >= _FEWEST_CHANGES else 0.0
-        for r, h in zip(rest.T, moved.T, strict=True)
+        for r, h in zip(rest.T, is_moving.T, strict=True)
     ]
     share = _LATEST if is_known else 1.0
     scale = (1.0 - share) * state.scale + share * np.array(size)
     noise = (1.0 - share) * state.noise + share * (rest[here] ** 2).mean(0)
     scale = np.maximum(scale, model.FLOOR * state.unit)
     to = z[1:-1] + phi @ now.weights
-    stops = _held(state, to, after) & rests & seen[:, None] & (np.abs(to - after) > _STOPS * scale)
-    reached = np.where(stops.any(1).T & is_known, np.maximum(state.reached, 2.0), state.reached)
-    return state._replace(scale=scale, noise=noise, reached=reached)
+    stops = _held(state, to, after) & rests & is_seen[:, None] & (abs(to - after) > _STOPS * scale)
+    visits = np.where(stops.any(1).T & is_known, np.maximum(state.reached, 2.0), state.reached)
+    return state._replace(scale=scale, noise=noise, reached=visits)
 
 
 def misled(
@@ -147,18 +147,18 @@ def misled(
     ahead = begins[:, None] + np.arange(-1, state.horizon + 1)
     if not np.isfinite(z[ahead]).all():
         return state
-    missed = []
+    errors = []
     for doubt in (0.0, settings.misled):
-        known = model_of(state._replace(misled=doubt), settings)
+        motion_model = model_of(state._replace(misled=doubt), settings)
         at, before, total = z[ahead[:, 1]], z[ahead[:, 0]], 0.0
         for now in ahead[:, 1:-1].T:
-            phi = features(known, at, at - before, u[now - 1], u[now])
-            move = np.clip(phi @ known.weights, known.least, known.most)
-            at, before = np.clip(at + move, known.lowest, known.highest), at
+            phi = features(motion_model, at, at - before, u[now - 1], u[now])
+            move = np.clip(phi @ motion_model.weights, motion_model.least, motion_model.most)
+            at, before = np.clip(at + move, motion_model.lowest, motion_model.highest), at
             off = np.abs(at - z[now + 1]) / np.maximum(state.unit, 1e-300)
             total += np.log1p(np.minimum(off, _FAR_OFF) ** 2).sum(1).mean()
-        missed.append(total / state.horizon)
-    worse = np.clip(missed[0] - missed[1], 0.0 if failed else -1.0, 1.0)
+        errors.append(total / state.horizon)
+    worse = np.clip(errors[0] - errors[1], 0.0 if failed else -1.0, 1.0)
     return state._replace(misled=max(0.0, state.misled + float(worse)))
 
 
@@ -222,10 +222,10 @@ def _drifted(
     """
     n = state.n_episodes
     size = np.maximum(np.maximum(state.scale, 0.5 * state.unit), 1e-100)
-    missed = change - phi @ known.weights
-    left = missed - phi @ _correction(state, known)
-    gained = np.log1p((missed / size) ** 2) - 2.0 * np.log1p((left / size) ** 2)
-    doubt = np.maximum(state.doubt + gained.sum(0), 0.0) * (n >= _LEARNT)
+    errors = change - phi @ known.weights
+    new_errors = errors - phi @ _correction(state, known)
+    gains = np.log1p((errors / size) ** 2) - 2.0 * np.log1p((new_errors / size) ** 2)
+    doubt = np.maximum(state.doubt + gains.sum(0), 0.0) * (n >= _LEARNT)
     young = n - state.drifts[:, 2] < _LEARNT
     fades = settings.drift_fade if young.any() or doubt.any() else 0.0
     state = state._replace(
@@ -234,22 +234,22 @@ def _drifted(
         doubt=doubt,
         since=np.where(doubt > 0.0, state.since, float(n)),
     )
-    begun = np.flatnonzero(doubt > settings.drift)
-    moved = np.unique(np.append(begun, state.drifts[young, 0])).astype(int)
-    if not len(moved):
+    new_drifters = np.flatnonzero(doubt > settings.drift)
+    drifters = np.unique(np.append(new_drifters, state.drifts[young, 0])).astype(int)
+    if not len(drifters):
         return state
     products, doubt, since = state.products.copy(), doubt.copy(), state.since.copy()
     least, most = state.least.copy(), state.most.copy()
     weights = known.weights + _correction(state, known)
-    products[:, moved] = state.squares @ weights[:, moved]
+    products[:, drifters] = state.squares @ weights[:, drifters]
     moves = np.where(model.jumps(moves, state.unit) | ~np.isfinite(moves), 0.0, moves)
-    least[begun], most[begun] = moves.min(0)[begun], moves.max(0)[begun]
-    drifts = np.vstack([state.drifts, *[[j, since[j], n] for j in begun]])
-    doubt[moved], since[moved] = 0.0, float(n)
+    least[new_drifters], most[new_drifters] = moves.min(0)[new_drifters], moves.max(0)[new_drifters]
+    drifts = np.vstack([state.drifts, *[[j, since[j], n] for j in new_drifters]])
+    doubt[drifters], since[drifters] = 0.0, float(n)
     state = state._replace(
         drifts=drifts, products=products, doubt=doubt, since=since, least=least, most=most
     )
-    return _anew(state, settings) if len(begun) else state
+    return _anew(state, settings) if len(new_drifters) else state
 
 
 def _anew(state: State, settings: LearntSettings) -> State:
@@ -271,9 +271,9 @@ def _correction(state: State, known: Model) -> Floats:
     size = np.diag(state.squares) / n
     variance = np.maximum(size - (state.squares[0] / n) ** 2, 1e-6 * size)
     variance[0] = 1.0
-    held, late = _HELD * variance, lags(m, a)
-    held[1 + 2 * m + 2 * a :] *= 30.0
-    held[late] = 1e12 * np.maximum(size[late], 1e-12)  # these stay as they are
-    missed = state.recent_products - state.recent_squares @ known.weights
-    found = model.ridge(state.recent_squares, missed, held)
-    return found if np.isfinite(found).all() else np.zeros_like(found)
+    penalty, late = _HELD * variance, lags(m, a)
+    penalty[1 + 2 * m + 2 * a :] *= 30.0
+    penalty[late] = 1e12 * np.maximum(size[late], 1e-12)  # these stay as they are
+    remainder = state.recent_products - state.recent_squares @ known.weights
+    correction = model.ridge(state.recent_squares, remainder, penalty)
+    return correction if np.isfinite(correction).all() else np.zeros_like(correction)

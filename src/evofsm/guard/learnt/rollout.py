@@ -128,8 +128,8 @@ def features(model: Model, z: Floats, change: Floats, before: Floats, action: Fl
     ``z`` and ``change`` (T, m), ``before`` and ``action`` (T, a).
     """
     off, m = z - model.origin, z.shape[1]
-    lagged = np.where(np.abs(change) <= model.reach, change, 0.0)
-    parts = [np.ones((len(z), 1)), off, lagged, action, before]
+    lag = np.where(np.abs(change) <= model.reach, change, 0.0)
+    parts = [np.ones((len(z), 1)), off, lag, action, before]
     if not model.choices:
         parts.append(np.abs(action[:, :, None] - KNOTS).reshape(len(z), -1))
     acts = action[:, : crossed(m, action.shape[1]), None]
@@ -286,8 +286,8 @@ def _measure(
             within = max(far[l] / worth + radius, 0.0)
             nearer += 1 if square[l] <= within * within * _ROUNDED_UP else 0
         for l in range(n if nearer > 0 else 0):
-            left = (np.sqrt(square[l]) - radius) * worth + aside[s, l]
-            far[l] = left if left < far[l] else far[l]
+            distance = (np.sqrt(square[l]) - radius) * worth + aside[s, l]
+            far[l] = distance if distance < far[l] else far[l]
 
 
 # -- A rollout ------------------------------------------------------------------------------------
@@ -319,8 +319,8 @@ def _rollout(
     count = len(situations) * n_disturbances
     n = lanes(count)
     z, change, move = np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
-    before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
-    column, survived = np.empty(n, np.int64), np.empty(n, np.int64)
+    before, action, phi = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
+    column, lifetime = np.empty(n, np.int64), np.empty(n, np.int64)
     near, far, square = np.empty(n), np.empty(n), np.empty(n)
     over, last = np.empty(n), np.empty(n)
     aside = np.empty((len(model.dead_ends), n))
@@ -330,7 +330,7 @@ def _rollout(
             z[j, l], change[j, l] = situations[start, j], situations[start, m + j]
         for i in range(a):
             before[i, l] = situations[start, 2 * m + i]
-        near[l], survived[l] = np.inf, steps if l < count else -1
+        near[l], lifetime[l] = np.inf, steps if l < count else -1
         column[l] = l % n_disturbances if l < count else 0
     for s in range(len(aside)):
         _from_centre(model, s, z, square)
@@ -338,17 +338,17 @@ def _rollout(
         for l in range(n):
             within = (square[l] < radius * radius) & (allowed >= count)
             aside[s, l] = np.inf if within else 0.0
-    lost, ended, end, took = 0, 0, 1.0 - _RESERVE * enough, 0
+    n_failures, n_endings, end, n_steps = 0, 0, 1.0 - _RESERVE * enough, 0
     for t in range(steps):
-        took += 1
+        n_steps += 1
         if t < len(plan):
             for i in range(a):
                 for l in range(n):
                     action[i, l] = plan[t, i]
         else:
             _follow(model, policy, z, end, action)
-        _fill_features(model, z, change, before, action, scale, found)
-        _expect(model.weights, found, move)
+        _fill_features(model, z, change, before, action, scale, phi)
+        _expect(model.weights, phi, move)
         for j in range(m):
             low, high = scale * model.least[j], scale * model.most[j]
             lowest, highest = model.lowest[j], model.highest[j]
@@ -367,34 +367,34 @@ def _rollout(
         fails = 0
         for l in range(n):
             nearer = far[l] if far[l] < near[l] else near[l]
-            near[l] = nearer if survived[l] == steps else near[l]
+            near[l] = nearer if lifetime[l] == steps else near[l]
         for l in range(n):
-            fails += 1 if (survived[l] == steps) & (near[l] < enough) else 0
+            fails += 1 if (lifetime[l] == steps) & (near[l] < enough) else 0
         if fails > 0:
             for l in range(count):
-                if survived[l] == steps and near[l] < enough:
-                    survived[l] = t
-                    lost += 1
+                if lifetime[l] == steps and near[l] < enough:
+                    lifetime[l] = t
+                    n_failures += 1
                     if allowed < count and column[l] == 0:
-                        lost = count
-            if lost >= count or lost > allowed:
+                        n_failures = count
+            if n_failures >= count or n_failures > allowed:
                 break
         for l in range(count):  # what fails at once has failed
-            if survived[l] == steps and over[l] <= -SHRUNK:
-                survived[l] = steps + 1
-                ended += 1
-        if ended > 0 and lost + ended >= count:
+            if lifetime[l] == steps and over[l] <= -SHRUNK:
+                lifetime[l] = steps + 1
+                n_endings += 1
+        if n_endings > 0 and n_failures + n_endings >= count:
             break
-    left = np.inf
+    slack = np.inf
     for l in range(count):
-        share, distance = min(survived[l], steps) / steps, near[l]
+        share, distance = min(lifetime[l], steps) / steps, near[l]
         if near[l] >= enough:
-            left = min(left, near[l])
-        ends.value[l] = near[l] if survived[l] >= steps else survived[l] - steps - 1.0
-        if survived[l] == steps:
+            slack = min(slack, near[l])
+        ends.value[l] = near[l] if lifetime[l] >= steps else lifetime[l] - steps - 1.0
+        if lifetime[l] == steps:
             distance = 0.5 * (near[l] + far[l])  # those in the end
         ends.worth[l] = share + _DISTANCE * min(1.0, max(-1.0, _FAR * distance))
-    return lost, left, took
+    return n_failures, slack, n_steps
 
 
 _enter = Entry(_rollout)
@@ -448,14 +448,12 @@ def value_of(
 
     As `Ends.value` has it; once all are ``enough`` no other backup is asked.
     """
-    found = np.full(len(situations) * residuals.shape[2], -np.inf)
+    ends = np.full(len(situations) * residuals.shape[2], -np.inf)
     for policy in policies:
-        np.maximum(
-            found, rollout(model, situations, policy, residuals, scale, plan).value, out=found
-        )
-        if found.min() >= enough:
+        np.maximum(ends, rollout(model, situations, policy, residuals, scale, plan).value, out=ends)
+        if ends.min() >= enough:
             break
-    return found.reshape(len(situations), -1)
+    return ends.reshape(len(situations), -1)
 
 
 # -- What decides ---------------------------------------------------------------------------------
@@ -492,56 +490,56 @@ def search(
     failure that is then left; where nothing passes, how far apart backups are, near 0 if all last
     as long.
     """
-    m, choices, done = len(model.origin), model.choices, 0
-    begin, count = situation[None], residuals.shape[2]
+    m, choices, total = len(model.origin), model.choices, 0
+    rows, count = situation[None], residuals.shape[2]
     ends = Ends(np.empty(count), np.empty(count))
 
     def after(action: Floats, backup: int) -> tuple[bool, float]:
         """Whether the backup survives after the action, and by how much."""
-        nonlocal done
+        nonlocal total
         amid = residuals, scale, margin, allowed, ends
-        lost, left, took = _enter.call(model, begin, action[None], policies[backup], *amid)
-        done += took
-        return lost <= allowed and left >= margin, left
+        n_failures, slack, n_steps = _enter.call(model, rows, action[None], policies[backup], *amid)
+        total += n_steps
+        return n_failures <= allowed and slack >= margin, slack
 
     for q in ranks:
-        if done >= most:
+        if total >= most:
             break
-        passes, left = after(proposal, q)
+        passes, slack = after(proposal, q)
         if passes:
-            return KEPT, proposal, q, left
+            return KEPT, proposal, q, slack
     for q in ranks:
         fallback = action_of(model, policies[q], situation[:m])
-        if done >= most:
+        if total >= most:
             first = action_of(model, policies[ranks[0]], situation[:m])
             return CUT_SHORT, first, ranks[0], math.inf
         if (fallback == proposal).all():
             continue  # it was refused
-        passes, left = after(fallback, q)
+        passes, slack = after(fallback, q)
         if not passes:
             continue
-        action, off, refused, share = fallback, fallback - proposal, 0.0, 1.0
+        action, off, refused_share, share = fallback, fallback - proposal, 0.0, 1.0
         for _ in range(0 if choices else _HALVINGS):
-            half = 0.5 * (refused + share)
+            half = 0.5 * (refused_share + share)
             closer = proposal + half * off
             passes, distance = after(closer, q)
             if passes:
-                action, share, left = closer, half, distance
+                action, share, slack = closer, half, distance
             else:
-                refused = half
-        return CHANGED, action, q, left
+                refused_share = half
+        return CHANGED, action, q, slack
     if not lasting:
         return NOTHING_PASSES, proposal, ranks[0], math.inf
-    best, longest, shortest, wanted = ranks[0], -np.inf, np.inf, -np.inf
+    best, longest, shortest, proposal_worth = ranks[0], -np.inf, np.inf, -np.inf
     for q in ranks:
-        asked = model, begin, policies[q], residuals, scale
-        lasts = float(rollout(*asked).worth.mean())
+        inputs = model, rows, policies[q], residuals, scale
+        lasts = float(rollout(*inputs).worth.mean())
         shortest = min(shortest, lasts)
         if lasts > longest + _EQUAL:
             best, longest = q, lasts
-        wanted = max(wanted, float(rollout(*asked, proposal[None]).worth.mean()))
+        proposal_worth = max(proposal_worth, float(rollout(*inputs, proposal[None]).worth.mean()))
     apart = (longest - shortest) / (abs(longest) + 1e-12)
-    if wanted >= longest - longer:
+    if proposal_worth >= longest - longer:
         return NOTHING_PASSES, proposal, best, apart
     return NOTHING_PASSES, action_of(model, policies[best], situation[:m]), best, apart
 

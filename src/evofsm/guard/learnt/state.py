@@ -298,8 +298,8 @@ def model_of(state: State, settings: LearntSettings) -> Model:
     share = state.noise / np.where(state.power > 0.0, state.power, 1.0)
     noisy = np.where(state.scale > 0.0, share.clip(1e-3, 1.0), 1.0)
     lags = settings.lags if state.misled < settings.misled else np.inf
-    held = settings.prior, settings.shy, lags
-    weights = model.solve(state.squares, state.products, noisy, len(state.used), held)
+    prior = settings.prior, settings.shy, lags
+    weights = model.solve(state.squares, state.products, noisy, len(state.used), prior)
     return Model(
         weights=weights if np.isfinite(weights).all() else np.zeros_like(weights),
         origin=state.origin,
@@ -325,14 +325,14 @@ def residuals_of(state: State, known: Model, steps: int) -> Floats:
     seen with the model of then. Where some variable jumps, also where it lands, (H, 2m, 1 + K).
     """
     m = len(state.origin)
-    found = model.undisturbed(steps, m, 1 + len(state.windows))
+    residuals = model.undisturbed(steps, m, 1 + len(state.windows))
     rows = zip(state.windows, state.lengths.astype(int), state.seen_in, strict=True)
     for k, (window, n, episode) in enumerate(rows, 1):
-        seen = window[:n, :m], window[: n - 1, m:], state.unit
-        rest = model.disturbed(known, *seen)[:steps]
+        inputs = window[:n, :m], window[: n - 1, m:], state.unit
+        rest = model.disturbed(known, *inputs)[:steps]
         rest[:, state.drifts[state.drifts[:, 1] > episode, 0].astype(int)] = 0.0
-        found[: len(rest), :, k] = rest
-    return model.trimmed(found)
+        residuals[: len(rest), :, k] = rest
+    return model.trimmed(residuals)
 
 
 # -- In a file -----------------------------------------------------------------------------------

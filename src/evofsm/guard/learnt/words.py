@@ -109,10 +109,10 @@ def dead_ends(counts: Sequence[int]) -> str:
 
 def failed(counts: Sequence[int]) -> str:
     """How many episodes failed from each of some dead ends."""
-    shown = [f"{count:,}" for count in counts[:_ENDS_SHOWN]] + ["..."] * (len(counts) > _ENDS_SHOWN)
+    texts = [f"{count:,}" for count in counts[:_ENDS_SHOWN]] + ["..."] * (len(counts) > _ENDS_SHOWN)
     comma = ", " if len(counts) > _ENDS_SHOWN else " and "
-    several = comma.join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]
-    return f"{several} episode{'s' * (shown != ['1'])} that had been certified failed"
+    several = comma.join([", ".join(texts[:-1]), texts[-1]]) if len(texts) > 1 else texts[0]
+    return f"{several} episode{'s' * (texts != ['1'])} that had been certified failed"
 
 
 def changed(backup: str, remembered: Remembered, margin: float, spared: int = 0) -> str:
@@ -136,50 +136,50 @@ def no_threshold(n_failed: int, *, is_given: bool) -> str:
         return "failed= is true nowhere around what was survived, so nothing is refused"
     if not n_failed:
         return NO_FAILURE
-    seen = counted(n_failed, "failure")
-    return f"{seen} seen, but beyond no value that was survived, so nothing is refused"
+    failures = counted(n_failed, "failure")
+    return f"{failures} seen, but beyond no value that was survived, so nothing is refused"
 
 
 def experience(state: State, remembered: Remembered, names: Sequence[str], nothing: str) -> str:
     """What was learnt so far; what is said of failure where that is not known is ``nothing``."""
-    there, ends, barred = _where(state.forms, names)
+    there, ends, fatal_places = _where(state.forms, names)
     latest = {int(j): int(since) + 1 for j, since, _ in state.drifts}
     more = "".join(f"; since episode {k} {names[j]} moves otherwise" for j, k in latest.items())
     if state.stride > 1:
         more += f"; it looks ahead in steps of {state.stride} decisions"
     if ends:
         more += f"; ends by itself {' or '.join(ends)}"
-    if barred:
-        more += f"; nothing survives what begins {' or '.join(barred)}"
+    if fatal_places:
+        more += f"; nothing survives what begins {' or '.join(fatal_places)}"
     if not there:
         return nothing + more
     if state.differs:
         more += f"; failed= says otherwise in {state.differs:.1%} of the states around, where this "
         more += "decides"
     if state.held < 0:
-        tried, *_ = _where(failure.rivals(state.forms, state.failures, sizes(state)), names)
+        rivals, *_ = _where(failure.rivals(state.forms, state.failures, sizes(state)), names)
         more += "; much was refused without a failure: while it learns it tries whether it only "
-        more += f"fails {' or '.join(tried)}"
+        more += f"fails {' or '.join(rivals)}"
     if len(state.dropped):
         until, *_ = _where(state.dropped, names)
         more += f"; frozen it refuses, too, {until[0]}, as what took its place is new"
-    seen = f"{remembered}, to be survived by {changes(state.margin)}"
-    return f"fails {' or '.join(there)}; {seen}{more}{dead_ends(state.counts.astype(int).tolist())}"
+    test = f"{remembered}, to be survived by {changes(state.margin)}"
+    return f"fails {' or '.join(there)}; {test}{more}{dead_ends(state.counts.astype(int).tolist())}"
 
 
 def _where(table: Floats, names: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
     """Where it fails, where it ends by itself, and where nothing survives what begins."""
-    said: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: [], DEAD: []}
+    places: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: [], DEAD: []}
     sides = []
     for row, is_side in zip(table, failure.are_sides(table), strict=True):
-        told = region(names, row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])])
+        text = region(names, row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])])
         if is_side and row[SAYS] == FAILS:
-            sides.append(told.removeprefix("where ").partition(" (")[0])
+            sides.append(text.removeprefix("where ").partition(" (")[0])
         else:
-            said[int(row[SAYS])].append(told)
+            places[int(row[SAYS])].append(text)
     there = [f"where {' or '.join(sides)}"] if sides else []
-    there += said[FAILS] + [f"if it ends {place}" for place in said[CRASHES]]
-    return there, said[ENDS], said[DEAD]
+    there += places[FAILS] + [f"if it ends {place}" for place in places[CRASHES]]
+    return there, places[ENDS], places[DEAD]
 
 
 def here(
@@ -189,21 +189,21 @@ def here(
 
     Empty, and None, where failures and dead ends are farther than ``near``.
     """
-    told, forms = "", state.forms[~failure.are_sides(state.forms) & (state.forms[:, SAYS] == FAILS)]
+    text, forms = "", state.forms[~failure.are_sides(state.forms) & (state.forms[:, SAYS] == FAILS)]
     away = failure.distances(forms, z[None])[:, 0]
     if away.min(initial=math.inf) <= near:
-        row, left = forms[int(away.argmin())], float(away.min())
-        where = "" if left < 0.0 else f"{changes(left)} from "
+        row, distance = forms[int(away.argmin())], float(away.min())
+        where = "" if distance < 0.0 else f"{changes(distance)} from "
         place = region(names, row[I:HELD].tolist(), int(row[HELD]))
-        told = f"This is {where}where it fails: {place}."
+        text = f"This is {where}where it fails: {place}."
     off = np.sqrt((((state.centres - z) * model.inverse) ** 2).sum(1)) - state.radii
     off = off * model.dead_ends[:, -1]
     if off.min(initial=math.inf) > near:
-        return told, None
-    k, left = int(off.argmin()), float(off.min())
-    where = "in" if left < 0.0 else f"{changes(left)} from"
+        return text, None
+    k, distance = int(off.argmin()), float(off.min())
+    where = "in" if distance < 0.0 else f"{changes(distance)} from"
     from_there = f"This is {where} a dead end, from where {failed([int(state.counts[k])])}."
-    return f"{told} {from_there}".lstrip(), state.centres[k]
+    return f"{text} {from_there}".lstrip(), state.centres[k]
 
 
 def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "failure") -> str:
@@ -216,25 +216,25 @@ def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "
     >>> region(["x", "y"], [0, 1, 0.0, 0.0, 1.0, 1.0, -5.0, 3.0, 4.0, 0.0, 0.0, 0.0], 1)
     'where 0.6 x + 0.8 y is above 1 (1 failure)'
     """
-    seen = f"({counted(count, what)})"
+    note = f"({counted(count, what)})"
     i, j, at, to, sx, sy, c, b, d, p, q, r = row
     x, y = names[int(i)], names[int(j)]
     if i == j:
         if p == 0.0 and b != 0.0:
-            return f"where {x} is {'above' if b > 0.0 else 'below'} {at - c / (b * sx):.4g} {seen}"
+            return f"where {x} is {'above' if b > 0.0 else 'below'} {at - c / (b * sx):.4g} {note}"
         spare = b * b - 4.0 * p * c
         if p == 0.0 or spare < 0.0:
-            return f"where {x} is near {at:.3g} {seen}"
+            return f"where {x} is near {at:.3g} {note}"
         low, high = sorted(at + (-b + sign * math.sqrt(spare)) / (2.0 * p * sx) for sign in (1, -1))
         if p < 0.0:
-            return f"where {x} is between {low:.3g} and {high:.3g} {seen}"
-        return f"where {x} is below {low:.3g} or above {high:.3g} {seen}"
+            return f"where {x} is between {low:.3g} and {high:.3g} {note}"
+        return f"where {x} is below {low:.3g} or above {high:.3g} {note}"
     if p == q == r == 0.0:
         length = math.hypot(b * sx, d * sy)
         u, v = b * sx / length, d * sy / length
         beyond = u * at + v * to - c / length
         sign = "+" if v >= 0.0 else "-"
-        return f"where {u:.3g} {x} {sign} {abs(v):.3g} {y} is above {beyond:.3g} {seen}"
+        return f"where {u:.3g} {x} {sign} {abs(v):.3g} {y} is above {beyond:.3g} {note}"
     inner = p * r - 0.25 * q * q
     if inner > 0.0:
         u, v = (0.25 * q * d - 0.5 * r * b) / inner, (0.25 * q * b - 0.5 * p * d) / inner
@@ -244,27 +244,27 @@ def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "
             where = f"around ({at + u / sx:.3g}, {to + v / sy:.3g})"
             size = f"{wide / sx:.3g} wide and {high / sy:.3g} high"
             side = "inside" if p < 0.0 else "outside"
-            return f"{side} an ellipse of {x} and {y} {where}, {size} {seen}"
-    return f"beyond a curve of {x} and {y}, as at ({at:.3g}, {to:.3g}) {seen}"
+            return f"{side} an ellipse of {x} and {y} {where}, {size} {note}"
+    return f"beyond a curve of {x} and {y}, as at ({at:.3g}, {to:.3g}) {note}"
 
 
 def harm(known: Harm, *, learning: bool) -> str:
     """What is said of a guard that was not shown to help, or that is no filter any more."""
-    said = known.told(learning=learning)
-    said = f"; {said}" if said else ""
+    text = known.told(learning=learning)
+    text = f"; {text}" if text else ""
     if known.replaces:
         share = f"{known.kept / known.decided:.0%}"
-        said += f"; it refuses nearly everything: {share} of proposals pass; that is no filter"
-    return said
+        text += f"; it refuses nearly everything: {share} of proposals pass; that is no filter"
+    return text
 
 
 def constant(values: Sequence[float]) -> str:
     """A backup that does the same all the time."""
-    shown = ", ".join(f"{value:.4g}" for value in values)
-    return f"always {shown if len(values) == 1 else f'({shown})'}"
+    text = ", ".join(f"{value:.4g}" for value in values)
+    return f"always {text if len(values) == 1 else f'({text})'}"
 
 
 def changes(size: float) -> str:
     """A distance to failure, in typical steps."""
-    shown = f"{size:.2g}" if abs(size) < 100.0 else f"{size:,.0f}"
-    return f"{shown} typical step{'s' * (shown != '1')}"
+    text = f"{size:.2g}" if abs(size) < 100.0 else f"{size:,.0f}"
+    return f"{text} typical step{'s' * (text != '1')}"
