@@ -110,8 +110,8 @@ def monitor(
     log are learnt from.
     """
     if file is not None and file.is_file() and guard is None:
-        with file.open("rb") as beginning:
-            if _SAVED in beginning.read(64):  # rows then come from elsewhere
+        with file.open("rb") as stream:
+            if _SAVED in stream.read(64):  # rows then come from elsewhere
                 file, guard = None, file
     if sum(source is not None for source in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
@@ -131,105 +131,105 @@ def monitor(
 
     if guard is not None and brakes != BRAKES:
         raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
-    tolerated = TOLERANCE if tolerance is None else tolerance
+    accepted_risk = TOLERANCE if tolerance is None else tolerance
 
     def fresh() -> Guard:
         if guard is not None:
             return Guard.load(guard)
-        if begun is not None:
-            return begun
-        made = guard_of_traffic if traffic else guard_of_monitor
-        return made(interval or _INTERVAL, brakes, tolerated)
+        if new_guard is not None:
+            return new_guard
+        maker = guard_of_traffic if traffic else guard_of_monitor
+        return maker(interval or _INTERVAL, brakes, accepted_risk)
 
     is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
     parts = {"low": low, "high": high, "n_actions": n_actions, "observe": observe}
-    told, begun = {name: part for name, part in parts.items() if part is not None}, None
-    if guard is None and not is_log and (told or "action" in given_of(reading)):
+    options, new_guard = {name: part for name, part in parts.items() if part is not None}, None
+    if guard is None and not is_log and (options or "action" in given_of(reading)):
         if traffic:
             raise ValueError("--traffic is of cars, and goes with no --observe or --action")
-        begun, learn = _begun({**told}, reading, interval, tolerance, horizon, persist), True
-    kept, learnt = dict[str, Any](), guard or state
+        new_guard, learn = _begun({**options}, reading, interval, tolerance, horizon, persist), True
+    defaults, learnt = dict[str, Any](), guard or state
     if learnt is not None and learnt.is_file():
-        kept = dict(read_header(learnt).provenance.get("read with", {}))
+        defaults = dict(read_header(learnt).provenance.get("read with", {}))
     if is_log and episode is None:
-        episode = kept.get("episode")
-    given = {k: v for k, v in kept.items() if k not in ("observe", "episode")}
-    reading = partial(reading_of, **{**reading.keywords, **given, **given_of(reading)})
+        episode = defaults.get("episode")
+    arguments = {k: v for k, v in defaults.items() if k not in ("observe", "episode")}
+    reader = partial(reading_of, **{**reading.keywords, **arguments, **given_of(reading)})
     if episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
         raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns of a log")
     rows = EPISODE if episode is None or is_log else int(episode)
     with ExitStack() as stack:
-        chunks, saved = None, None
+        chunks, keeper, slots = None, None, None
         if summary and file is not None and is_log:
             from evofsm.cli.foreseen import show_foreseen
             from evofsm.cli.learning import episodes_read
             from evofsm.fsm import Labels
 
-            used = fresh() if guard else None
-            alone = reading.keywords["action"] == "" or isinstance(used and used.judge, Foresight)
-            names = used.variables if used else VARIABLES
+            sentry = fresh() if guard else None
+            alone = not reader.keywords["action"] or isinstance(sentry and sentry.judge, Foresight)
+            names = sentry.variables if sentry else VARIABLES
             if observe is None or set(split_names(observe)) == set(names):  # in its own order
                 observe = quoted(names)
             if alone:
-                reading = partial(reading, action="")
-            asked = reading(observe=observe, episode=episode)
+                reader = partial(reader, action="")
+            log_format = reader(observe=observe, episode=episode)
             fewest = 1 if alone else 2  # a failure that comes at once counts as well
-            episodes = episodes_read(str(file), asked, dated=alone, fewest=fewest)
+            episodes = episodes_read(str(file), log_format, dated=alone, fewest=fewest)
             if (first := next(episodes, None)) is None:
                 raise ValueError(f"{file}: no episode has two rows")
             chunks, interval = chain([first], episodes), first.dt
-            if used and not abs(interval / used.interval - 1.0) < _SAME_STEP:
+            if sentry and not abs(interval / sentry.interval - 1.0) < _SAME_STEP:
                 text = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
-                warn(f"warning: {text} {used.interval:g} s: --resample {used.interval:g}s")
+                warn(f"warning: {text} {sentry.interval:g} s: --resample {sentry.interval:g}s")
             if alone:
-                labels = Labels(names=asked.columns.observe.names)
-                wanted = horizon, persist, tolerance
-                show_foreseen(file, list(chunks), used, labels, wanted, plot, as_json=as_json)
+                labels = Labels(names=log_format.columns.observe.names)
+                requests = horizon, persist, tolerance
+                show_foreseen(file, list(chunks), sentry, labels, requests, plot, as_json=as_json)
                 return None
         if summary and (as_json or plot):
             raise ValueError("--json and --plot are for logs where nobody acts: --action ''")
         if state is not None:
             is_other = guard is not None and guard.resolve() != state.resolve()
             digest = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
-            made = {"interval": interval, "brakes": brakes} if guard is None else {}
+            basics = {"interval": interval, "brakes": brakes} if guard is None else {}
             how = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
-            read = {k: v for k, v in given_of(reading).items() if k != "topics"}
-            saved = State(state, {"guard": digest, **made, **how, **told, **read})
-            stack.callback(saved.close)
+            columns = {k: v for k, v in given_of(reader).items() if k != "topics"}
+            keeper = State(state, {"guard": digest, **basics, **how, **options, **columns})
+            stack.callback(keeper.close)
         elif learn and not summary:
             warn("nothing of what is learnt is saved; --state FILE saves it")
-        used = fresh() if saved is None else saved.guard(fresh, begun.failed if begun else None)
-        _prepare(used, mode, tolerance, audit, stack, learn=learn)
-        slots = None
+        failed = new_guard.failed if new_guard else None
+        sentry = fresh() if keeper is None else keeper.guard(fresh, failed)
+        _prepare(sentry, mode, tolerance, audit, stack, learn=learn)
         if not (is_log or traffic):
-            slots = Slots(reading(observe=quoted(used.variables or VARIABLES), dt=None).columns)
-        rate = RATE if begun and tolerance is None else None
-        decider = Decider(used, episode=rows, slots=slots, rate=rate)
-        assumed = assumptions(brakes, tolerated)
+            slots = Slots(reader(observe=quoted(sentry.variables or VARIABLES), dt=None).columns)
+        rate = RATE if new_guard and tolerance is None else None
+        decider = Decider(sentry, episode=rows, slots=slots, rate=rate)
+        notice = assumptions(brakes, accepted_risk)
         if guard is not None:
-            risk = getattr(used.reviser, "tolerance", None)
+            risk = getattr(sentry.reviser, "tolerance", None)
             accepts = "" if risk is None else f"; a risk of {risk:.3g} is accepted (--tolerance)"
-            assumed = f"assumed: what {guard} was given and has learnt{accepts}"
-        if begun:
-            assumed = f"a guard of {', '.join(used.variables)} begins, and learns from what comes"
+            notice = f"assumed: what {guard} was given and has learnt{accepts}"
+        if new_guard:
+            notice = f"a guard of {', '.join(sentry.variables)} begins, and learns from what comes"
         if summary and file is not None:
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
 
-            warn(assumed)
+            warn(notice)
             answers = decided_on_log(decider, chunks) if chunks else decided_on_lines(decider, file)
             show(*summary_of(decider, answers, str(file)))
             return None
         if warm:
             _compile(decider)
-        if saved is not None:
-            again = saved.begin(decider)
+        if keeper is not None:
+            again = keeper.begin(decider)
             if decider.n:
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
-        server = Server(decider, heartbeat or math.inf, keeps=saved is not None)
+        server = Server(decider, heartbeat or math.inf, keeps=keeper is not None)
         transport, where = _transport(file, socket, udp, zenoh, stack)
-        warn(assumed)
-        if slots is not None and (as_typed := given_of(reading)):
-            warn(f"rows are read as in a log: {typed(as_typed)}")
+        warn(notice)
+        if slots is not None and (log_options := given_of(reader)):
+            warn(f"rows are read as in a log: {typed(log_options)}")
         warn(f"ready: {where}")
         try:
             server.run(transport)
@@ -237,8 +237,8 @@ def monitor(
             warn("nobody reads the decisions any more")
             return 1
         finally:
-            if saved is not None:
-                saved.rest(decider)
+            if keeper is not None:
+                keeper.rest(decider)
             elif decider.rows:
                 decider.end()
     return None
@@ -285,8 +285,8 @@ def _begun(
     if "observe" not in told:
         raise ValueError("say what is observed, the keys of rows: --observe temperature,load")
     columns, *_, acts = reading(observe=told.pop("observe"), dt=None)
-    names, made = columns.observe.names, columns.resample
-    if (step := made.step if made else interval) is None:
+    names, scheme = columns.observe.names, columns.resample
+    if (step := scheme.step if scheme else interval) is None:
         raise ValueError("say how often rows come [s]: --interval 1; or --resample 10s of jittered")
     if not acts and told:
         raise ValueError("--action '' says that nobody acts, and goes with no range of actions")
@@ -344,11 +344,11 @@ def _compile(decider: Decider) -> None:
 
     from evofsm.driving import Object, Scene
 
-    twin, seen = decider.guard.copy(), np.ones(decider.form.count or 1)
+    twin, observation = decider.guard.copy(), np.ones(decider.form.count or 1)
     if decider.form.scenes:
         ego, car = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
-        seen = Scene(ego, [car, car._replace(x=-20.0)]).rows(2)
+        observation = Scene(ego, [car, car._replace(x=-20.0)]).rows(2)
     for k in range(4):
-        twin.decide(seen + 0.1 * k, None)
-    twin.end(observation=seen)
+        twin.decide(observation + 0.1 * k, None)
+    twin.end(observation=observation)
     warn("compiled")

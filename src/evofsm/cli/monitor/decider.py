@@ -99,33 +99,33 @@ class Decider:
         Messages that are sent again, as after a connection was lost, get the answers of before.
         """
         try:
-            if (message := self._csv.read(line)) is None:
+            if (json_line := self._csv.read(line)) is None:
                 return self._of("waiting", alarm=self._alarm, reason="names the columns")
-            told = self.form.read(message)
-            beyond = self.guard.beyond(np.array(told.observation or (), np.float64))
+            message = self.form.read(json_line)
+            beyond = self.guard.beyond(np.array(message.observation or (), np.float64))
             if beyond is not None:
-                raise MessageError(*beyond, told.time)
-            self._next = self._sent_before(told)
+                raise MessageError(*beyond, message.time)
+            self._next = self._sent_before(message)
             if self._next is not None:
                 return self._recent[self._next][1]
-            if isinstance(told, Row) and isinstance(self.latest, Row):
-                _refuse_stale(told, self.latest)
-            if isinstance(told, Row):
-                self.slots.refuse(told)
-            if isinstance(told, Row) and self.slots.is_over(told):
-                fault = f"comes after its {self.slots.step:g} s were decided on, as nothing came"
-                raise MessageError("time", fault, told.time)
-            if self.slots.step and isinstance(told, Row) and (told.ahead or not told.observation):
-                raise MessageError("objects", "are not resampled; send rows of the variables")
-            if isinstance(told, Row) and not told.time < told.time + self.guard.interval:
-                raise MessageError("time", "is too large to tell rows apart", told.time)
-        except MessageError as refused:
-            return self.error(refused.about, f"{self._csv.place}{refused}", refused.time)
+            if isinstance(message, Row):
+                if isinstance(self.latest, Row):
+                    _refuse_stale(message, self.latest)
+                self.slots.refuse(message)
+                if self.slots.is_over(message):
+                    text = f"comes after its {self.slots.step:g} s were decided on, as nothing came"
+                    raise MessageError("time", text, message.time)
+                if self.slots.step and (message.ahead or not message.observation):
+                    raise MessageError("objects", "are not resampled; send rows of the variables")
+                if not message.time < message.time + self.guard.interval:
+                    raise MessageError("time", "is too large to tell rows apart", message.time)
+        except MessageError as error:
+            return self.error(error.about, f"{self._csv.place}{error}", error.time)
         try:
-            answer = self.act(told)
+            answer = self.act(message)
         except Exception as error:  # an end that the guard cannot take
             return self.error("end", f"was refused: {type(error).__name__}: {error}")
-        self.keep(told)
+        self.keep(message)
         return answer
 
     def _sent_before(self, told: Message) -> int | None:
@@ -135,9 +135,9 @@ class Decider:
         after the same: that is no repetition.
         """
         recent, latest = self._recent, self.latest
-        following = len(recent) if self._next is None else self._next + 1
-        if following < len(recent) and recent[following][0] == told:
-            return following
+        next_place = len(recent) if self._next is None else self._next + 1
+        if next_place < len(recent) and recent[next_place][0] == told:
+            return next_place
         if told == latest:
             return len(recent) - 1
         if isinstance(told, End) and told.time is None:
@@ -170,10 +170,10 @@ class Decider:
         """Take in what was accepted, and answer it."""
         if isinstance(told, Pause):
             return dict(self._waited(early=True).get("last", {}))
-        lacking = "" if self.rows or self.slots.waiting else self.slots.lacking(told)  # once
+        omission = "" if self.rows or self.slots.waiting else self.slots.lacking(told)  # once
         answer = self._ended(told) if isinstance(told, End) else self._taken(told)
-        if lacking:
-            answer["note"] = "; ".join(filter(None, [answer.get("note"), lacking]))
+        if omission:
+            answer["note"] = "; ".join(filter(None, [answer.get("note"), omission]))
         self._recent.append((told, answer))
         if self.rows >= self.episode and (not answer.get("alarm") or self.rows >= 2 * self.episode):
             self._end_unasked()
@@ -212,10 +212,10 @@ class Decider:
                 self.end(is_new, _numbers(row.observation) if is_new and counts else None)
             columns = slots.columns
             why = f"--failed {columns.failed}" if fails else f"not --where {columns.where}"
-            done = {} if self._is_alone else {"executed": plain(row.proposal)}
-            told = {"failed": is_new} if is_end else {"alarm": False}
+            action = {} if self._is_alone else {"executed": plain(row.proposal)}
+            verdict = {"failed": is_new} if is_end else {"alarm": False}
             kind = "end" if is_end else "waiting"
-            return self._of(kind, time=row.time, **told, **done, reason=why, **last)
+            return self._of(kind, time=row.time, **verdict, **action, reason=why, **last)
         if not slots.step:
             return self._decided(row)
         if (whole := slots.add(row)) is not None:
@@ -250,10 +250,10 @@ class Decider:
         self.n += 1
         leader = {} if row.ahead is None else {"ahead": row.ahead}
         if row.observation is None:  # nothing is ahead: whatever is wanted is done
-            said = dict.fromkeys(("proposed", "executed", "advised"), plain(row.proposal))
-            said |= dict.fromkeys(_RISKS) | {"reason": "nothing is ahead in the lane"}
-            said |= {"alarm": False, "mode": self.mode.value}
-            return self._of("decision", time=row.time, ahead=None, **said, **note)
+            body = dict.fromkeys(("proposed", "executed", "advised"), plain(row.proposal))
+            body |= dict.fromkeys(_RISKS) | {"reason": "nothing is ahead in the lane"}
+            body |= {"alarm": False, "mode": self.mode.value}
+            return self._of("decision", time=row.time, ahead=None, **body, **note)
         try:
             revision = self._revision(row, before)
         except Exception as error:  # whatever a judge of somebody's own raises
@@ -263,11 +263,11 @@ class Decider:
             return self.error("guard", f"failed: {type(error).__name__}: {error}", row.time)
         self.rows += 1
         low, high = revision.interval
-        known = {**revision._asdict(), "risk_low": low, "risk_high": high}
-        said = {name: plain(known[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
+        parts = {**revision._asdict(), "risk_low": low, "risk_high": high}
+        body = {name: plain(parts[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
         self._alarm = self._is_alarm(revision)
-        said |= {"reason": revision.reason, "alarm": self._alarm, "mode": self.mode.value}
-        return self._of("decision", time=row.time, **leader, **self._worst(row), **said, **note)
+        body |= {"reason": revision.reason, "alarm": self._alarm, "mode": self.mode.value}
+        return self._of("decision", time=row.time, **leader, **self._worst(row), **body, **note)
 
     def _worst(self, row: Row) -> Answer:
         """Who of a scene the proposal is most dangerous with."""
@@ -297,14 +297,14 @@ class Decider:
             return [f"{step:.3g} s without a row: nothing is learnt or carried across"]
         if step < _OFTEN * interval and not self._said_often:
             self._said_often = True
-            made = f"the guard was made for {interval:g} s: --resample {interval:g}s"
-            return [f"rows come every {step:.3g} s, but {made}"]
+            text = f"the guard was made for {interval:g} s: --resample {interval:g}s"
+            return [f"rows come every {step:.3g} s, but {text}"]
         return []
 
     def _odd_speeds(self, row: Row) -> list[str]:
         """What can hardly be m/s; said once in an episode."""
-        seen = zip(self.form.variables, self._units, row.observation or (), strict=False)
-        fast = [name for name, unit, z in seen if unit == "m/s" and abs(z or 0.0) > _FAST]
+        variables = zip(self.form.variables, self._units, row.observation or (), strict=False)
+        fast = [name for name, unit, z in variables if unit == "m/s" and abs(z or 0.0) > _FAST]
         was_said, self._said_fast = self._said_fast, self._said_fast or bool(fast)
         return [f"{fast[0]} is above {_FAST:g} m/s: is that km/h?"] if fast and not was_said else []
 
@@ -312,10 +312,10 @@ class Decider:
         proposal: Any = 0 if self._is_alone else row.proposal
         if isinstance(self.guard.actions, BoxActions) and proposal is not None:
             proposal = np.array(proposal)
-        seen: Any = _numbers(row.observation)
+        observation: Any = _numbers(row.observation)
         if self.form.scenes:
-            seen = _accelerating(row, before if isinstance(self.latest, Row) else None)
-        return self._without_lost_audit(lambda: self.guard.decide(seen, proposal, row.time))
+            observation = _accelerating(row, before if isinstance(self.latest, Row) else None)
+        return self._without_lost_audit(lambda: self.guard.decide(observation, proposal, row.time))
 
     def _without_lost_audit(self, call: Callable[[], _T]) -> _T:
         """Somebody has to go on; the log says itself with which record it ends."""
@@ -339,23 +339,23 @@ class Decider:
             return is_spoken(reviser, revision)
         if self.rows > 1 and self._alarm:
             return bool(reviser.refuses or revision.risk_proposed > reviser.tolerance)
-        wanted = make_usable(Proposal(revision.proposed), reviser.actions, reviser.fallback).action
-        change = abs(float(revision.advised) - float(wanted))
+        wish = make_usable(Proposal(revision.proposed), reviser.actions, reviser.fallback).action
+        change = abs(float(revision.advised) - float(wish))
         return bool(reviser.refuses and not 0.0 < change <= SLIGHT)
 
     # -- Its end, and its beginning -------------------------------------------------------------
 
     def memory(self) -> dict[str, Any]:
         """What it knows between two episodes, beside the guard: for JSON."""
-        known = {"recent": list(self._recent), "waiting": self.slots.waiting}
-        return {"n": self.n, **msgspec.to_builtins(known)}
+        queues = {"recent": list(self._recent), "waiting": self.slots.waiting}
+        return {"n": self.n, **msgspec.to_builtins(queues)}
 
     def remember(self, memory: Mapping[str, Any]) -> None:
         """Go on from what `memory` returned."""
         self.n = int(memory["n"])
         self.slots.waiting = msgspec.convert(memory["waiting"], list[Row])
-        for told, answer in memory["recent"]:
-            self._recent.append((msgspec.convert(told, Message), dict(answer)))
+        for message, answer in memory["recent"]:
+            self._recent.append((msgspec.convert(message, Message), dict(answer)))
         self.decided_on = self.latest if isinstance(self.latest, Row) else None
 
 
@@ -385,8 +385,8 @@ def _accelerating(row: Row, before: Row | None) -> NDArray[np.float64]:
     latest, step = {}, math.nan
     if before is not None and before.time < row.time:
         step = row.time - before.time
-        seen = np.array(_numbers(before.observation)).reshape(-1, len(COLUMNS))
-        latest = dict(zip(("", *before.objects), seen[:, _VX].tolist(), strict=False))
+        last_rows = np.array(_numbers(before.observation)).reshape(-1, len(COLUMNS))
+        latest = dict(zip(("", *before.objects), last_rows[:, _VX].tolist(), strict=False))
     for name, values in zip(("", *row.objects), rows, strict=False):
         if math.isnan(values[_AX]):
             values[_AX] = (values[_VX] - latest[name]) / step if name in latest else 0.0

@@ -114,31 +114,31 @@ class Form:
         self.variables: tuple[str, ...] = guard.variables
         #: Whether the guard observes whole scenes.
         self.scenes = isinstance(reviser, ActionReviser) and isinstance(reviser.risk, TrafficRisk)
-        known = 0 if guard.machine is None else guard.machine.n_variables
+        n_variables = 0 if guard.machine is None else guard.machine.n_variables
         #: Number of variables; 0 where any will do.
-        self.count = len(self.variables) or known
+        self.count = len(self.variables) or n_variables
         length = Meta(min_length=self.count or 1, max_length=self.count or None)
         several: Any = Annotated[list[_Seen], length]
         # By keys of our own: a column may be called "Tank 1 [mm]", which no attribute can be.
         self._keys = {f"v{k}": name for k, name in enumerate(self.variables or ["observation"])}
         self._others = {f"w{k}": name for k, name in enumerate(others)}
         clocks = dict.fromkeys([clock, *clock.split(",")])  # of date and time of day
-        taken = {"time", *self._keys.values(), *others}
-        self._clocks = {f"x{k}": name for k, name in enumerate(clocks) if name not in taken}
+        names = {"time", *self._keys.values(), *others}
+        self._clocks = {f"x{k}": name for k, name in enumerate(clocks) if name not in names}
         self._form, self._unit = unit if "%" in unit else "", TIMES.get(unit, 1.0)
-        seen = [(key, _Seen if self.variables else several) for key in self._keys]
+        variables = [(key, _Seen if self.variables else several) for key in self._keys]
         action: Any = ("proposal", _action(guard))
         if isinstance(guard.actions, Choices) and guard.actions.n_actions == 1:  # nobody acts
             action = (*action, 0)
         version = ("schema", Literal[1], SCHEMA)
         also = [(key, float | bool | str | None, None) for key in self._others]
         when = [(key, _Number | str | UnsetType, UNSET) for key in ("time", *self._clocks)]
-        self._row = self._struct("Row", *when, action, *seen, *also, version)
-        placed = ("ego", _Vehicle), ("objects", list[_Vehicle])
-        self._scene = self._struct("Scene", ("time", _Number), action, *placed, version)
-        last = [(key, kind | UnsetType, UNSET) for key, kind in seen]
-        ended = ("end", bool), ("failed", bool, False), ("time", _Seen | str | UnsetType, UNSET)
-        self._end = self._struct("End", *ended, *when[1:], *last, *also, version)
+        self._row = self._struct("Row", *when, action, *variables, *also, version)
+        vehicles = ("ego", _Vehicle), ("objects", list[_Vehicle])
+        self._scene = self._struct("Scene", ("time", _Number), action, *vehicles, version)
+        last = [(key, kind | UnsetType, UNSET) for key, kind in variables]
+        end = ("end", bool), ("failed", bool, False), ("time", _Seen | str | UnsetType, UNSET)
+        self._end = self._struct("End", *end, *when[1:], *last, *also, version)
         self._decoders = {kind: msgspec.json.Decoder(kind) for kind in (self._row, self._scene)}
 
     def _struct(self, name: str, *fields: Any) -> Any:
@@ -158,17 +158,17 @@ class Form:
         try:
             if self.scenes or b'"objects"' in line or b'"ego"' in line:
                 kind = self._scene
-            if b'"end"' in line and "end" in (told := _parsed(line)):
+            if b'"end"' in line and "end" in (body := _parsed(line)):
                 kind = self._end
-                return self._of_end(msgspec.convert(told, kind))
-            told = self._decoders[kind].decode(line)
+                return self._of_end(msgspec.convert(body, kind))
+            body = self._decoders[kind].decode(line)
             if kind is self._scene:
-                return self._of_scene(told)
-            also = tuple(getattr(told, key) for key in self._others)
-            if (time := self._when(told)) is None:
+                return self._of_scene(body)
+            also = tuple(getattr(body, key) for key in self._others)
+            if (time := self._when(body)) is None:
                 names = "".join(f", or {name!r}" for name in self._clocks.values())
                 raise MessageError("time", f"is missing{names}; every message of its kind has it")
-            return Row(time, self._observed(told), _frozen(told.proposal), told=also)
+            return Row(time, self._observed(body), _frozen(body.proposal), told=also)
         except MessageError as error:
             error.time = _time(_parsed(line))
             raise
@@ -178,12 +178,12 @@ class Form:
     def _when(self, told: Any) -> float | None:
         """The time of a message [s], as it or a log has it."""
         keys = {"time": "time", **self._clocks}
-        found = {name: getattr(told, key) for key, name in keys.items()}
-        said = {name: value for name, value in found.items() if value not in (UNSET, None)}
-        name, time = next(iter(said.items()), ("time", None))
+        fields = {name: getattr(told, key) for key, name in keys.items()}
+        times = {name: value for name, value in fields.items() if value not in (UNSET, None)}
+        name, time = next(iter(times.items()), ("time", None))
         if isinstance(time, str):
             try:
-                return seconds_of_date(" ".join(map(str, said.values())), self._form)
+                return seconds_of_date(" ".join(map(str, times.values())), self._form)
             except ValueError:
                 fault = f"is {_shown(time)}; it must be float [s], or a date as logs have them"
                 raise MessageError(name, fault) from None
@@ -199,11 +199,11 @@ class Form:
     def _of_end(self, told: Any) -> End:
         if not told.end:
             raise MessageError("end", "is false; it must be true")
-        lacking = [name for key, name in self._keys.items() if getattr(told, key) is UNSET]
-        if len(lacking) == len(self._keys):
+        omissions = [name for key, name in self._keys.items() if getattr(told, key) is UNSET]
+        if len(omissions) == len(self._keys):
             return End(told.failed, time=self._when(told))
-        if lacking:
-            raise MessageError(lacking[0], "is missing; a variable that was not seen is null")
+        if omissions:
+            raise MessageError(omissions[0], "is missing; a variable that was not seen is null")
         return End(told.failed, self._observed(told), self._when(told))
 
     def _of_scene(self, told: Any) -> Row:
@@ -229,8 +229,7 @@ class Form:
             names = tuple(obj.id for obj in scene.objects[1 : _MOST_OBJECTS + 1])
             rows = (None if math.isnan(z) else z for z in scene.rows(_MOST_OBJECTS).tolist())
             return Row(told.time, tuple(rows), proposal, objects=names)
-        ahead = _nearest_ahead(ego, told.objects, along)
-        if ahead is None:
+        if (ahead := _nearest_ahead(ego, told.objects, along)) is None:
             return Row(told.time, None, proposal)
         gap, car = ahead
         return Row(told.time, (gap, ego.vx, car.vx), proposal, None if car.id is UNSET else car.id)
@@ -241,24 +240,24 @@ class Form:
         place = place.removesuffix("`").removeprefix(".")
         if text == "Number out of range":
             return MessageError(place or "line", "is too large")
-        told = _parsed(line)
-        time = _time(told)
-        if found := re.fullmatch(r"Object (missing|contains).* field `(.*)`", text):
-            about = f"{place}.{found[2]}".removeprefix(".")
-            if found[1] == "missing":
+        body = _parsed(line)
+        time = _time(body)
+        if match := re.fullmatch(r"Object (missing|contains).* field `(.*)`", text):
+            about = f"{place}.{match[2]}".removeprefix(".")
+            if match[1] == "missing":
                 return MessageError(about, f"is missing{_missing(about)}", time)
-            known = msgspec.structs.fields(_Vehicle if place else kind)
-            names = ", ".join(sorted(field.encode_name for field in known))
+            fields = msgspec.structs.fields(_Vehicle if place else kind)
+            names = ", ".join(sorted(field.encode_name for field in fields))
             return MessageError(about[:_LETTERS], f"is not known; known are {names}", time)
-        value = _shown(_at(told, place))
+        value = _shown(_at(body, place))
         if place == "schema":
             fault = f"is {value}; this monitor knows version {SCHEMA} alone"
         else:
-            expected = re.sub("^Expected |, got .*|`", "", text).replace(" | ", " or ")
-            fault = f"is {value}; it must be {expected}"
-            if isinstance(sent := _at(told, place), str) and is_number(sent.replace(",", ".")):
-                cause = "a decimal comma" if "," in sent else "a number in quotes"
-                fault += f" ({cause}? send {sent.replace(',', '.')})"
+            demand = re.sub("^Expected |, got .*|`", "", text).replace(" | ", " or ")
+            fault = f"is {value}; it must be {demand}"
+            if isinstance(word := _at(body, place), str) and is_number(word.replace(",", ".")):
+                cause = "a decimal comma" if "," in word else "a number in quotes"
+                fault += f" ({cause}? send {word.replace(',', '.')})"
         return MessageError(place or "line", fault, time)
 
 
@@ -325,22 +324,22 @@ def _in_lane(ego: Any, car: Any) -> bool:
 def _parsed(line: bytes) -> dict[str, Any]:
     """Whatever JSON it is."""
     try:
-        told = msgspec.json.decode(line)
+        body = msgspec.json.decode(line)
     except RecursionError:
         raise MessageError("line", "is nested too deeply") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         if not line.strip():
             raise MessageError("line", "is empty") from None
-        if found := re.search(rb"-?\b(NaN|Infinity)\b", line):
-            name = found[0].decode()
+        if match := re.search(rb"-?\b(NaN|Infinity)\b", line):
+            name = match[0].decode()
             fault = f"holds {name}, which is no JSON; a number that was not seen is null"
             raise MessageError("line", fault) from None
         kind = "not UTF-8" if isinstance(error, UnicodeDecodeError) else "no JSON"
         hint = "" if line.lstrip().startswith(b"{") else f"; {_NO_ROW}"
         raise MessageError("line", f"is {kind}: {error}{hint}") from None
-    if not isinstance(told, dict):
-        raise MessageError("line", f"is {_shown(told)}; it must be a JSON object")
-    return told
+    if not isinstance(body, dict):
+        raise MessageError("line", f"is {_shown(body)}; it must be a JSON object")
+    return body
 
 
 def _time(told: dict[str, Any]) -> float | None:
@@ -352,9 +351,10 @@ def _time(told: dict[str, Any]) -> float | None:
 
 def _at(told: Any, place: str) -> Any:
     """The value at a place such as ``objects[3].vx``."""
-    for part in [place] if place in told else re.findall(r"[^.\[\]]+", place):
-        told = told[int(part)] if isinstance(told, list) else told.get(part)
-    return told
+    value, keys = told, [place] if place in told else re.findall(r"[^.\[\]]+", place)
+    for key in keys:
+        value = value[int(key)] if isinstance(value, list) else value.get(key)
+    return value
 
 
 def _missing(about: str) -> str:

@@ -28,13 +28,13 @@ class Slots:
 
     def __init__(self, columns: LogColumns | None = None) -> None:
         self.columns = columns = columns or LogColumns()
-        made = columns.resample
-        self.step = 0.0 if made is None else made.step  #: [s]; 0 where rows stay as they are
+        scheme = columns.resample
+        self.step = 0.0 if scheme is None else scheme.step  #: [s]; 0 where rows stay as they are
         self.hole = columns.longest_hole  #: up to which a hole costs no episode [s]
         self.names = columns.observe.names
-        self._how = {} if made is None else made.how
-        told = {"--where": columns.where, "--failed": columns.failed}
-        self._conditions = {o: Condition.parse(t, o) for o, t in told.items() if t is not None}
+        self._how = {} if scheme is None else scheme.how
+        texts = {"--where": columns.where, "--failed": columns.failed}
+        self._conditions = {o: Condition.parse(t, o) for o, t in texts.items() if t is not None}
         every = [term for c in self._conditions.values() for term in c.terms]
         self.compared = [term.column for term in every if term.of_number]  #: with a number
         #: Keys that rows may have beside the guard's variables, for the conditions.
@@ -46,16 +46,16 @@ class Slots:
 
     def refuse(self, row: Row) -> None:
         """Raise where a row tells of what a condition names what cannot be compared with it."""
-        told = dict(zip(self.keys, row.told, strict=False))
+        fields = dict(zip(self.keys, row.told, strict=False))
         for option, condition in self._conditions.items():
             for term in condition.terms:
-                if fault := term.fault(told.get(term.column)):
+                if fault := term.fault(fields.get(term.column)):
                     raise MessageError(term.column, f"{fault} ({option})", row.time)
 
     def lacking(self, row: Message) -> str:
         """What a row does not tell of what conditions name, in words."""
-        told = zip(self.keys, row.told, strict=False) if isinstance(row, Row) else ()
-        names = ", ".join(name for name, value in told if value is None)
+        pairs = zip(self.keys, row.told, strict=False) if isinstance(row, Row) else ()
+        names = ", ".join(name for name, value in pairs if value is None)
         return f"no {names} in the row, which --failed or --where names" if names else ""
 
     def fails(self, row: Message | None) -> bool:
@@ -95,11 +95,11 @@ class Slots:
         rows, self.waiting = self.waiting, []
         begin = self._time(rows[0])
         self._done = begin if early else math.nan
-        seen = zip_longest(self.names, zip(*(row.observation or () for row in rows), strict=True))
-        observation = tuple(_joined(self._how.get(name), column) for name, column in seen if column)
+        pairs = zip_longest(self.names, zip(*(row.observation or () for row in rows), strict=True))
+        observation = tuple(_joined(self._how.get(name), cells) for name, cells in pairs if cells)
         proposals = [row.proposal for row in rows]
-        is_number = all(isinstance(wanted, float | None) for wanted in proposals)
-        how = self._how.get(self.columns.action) if is_number else "last"
+        are_numbers = all(isinstance(proposal, float | None) for proposal in proposals)
+        how = self._how.get(self.columns.action) if are_numbers else "last"
         return Row(begin + self.step, observation, _joined(how, proposals))  # at its end
 
     def leave_out(self, row: Row) -> None:
@@ -120,9 +120,9 @@ class CsvRows:
         self._numbers = {*variables, *action, *slots.compared}
         if "%" not in columns.units.get(columns.time, ""):
             self._numbers.add(columns.time)
-        kept = *variables, *slots.keys, *columns.time.split(","), "proposal"
+        names = *variables, *slots.keys, *columns.time.split(","), "proposal"
         #: What messages call the columns that are read.
-        self._called = dict(zip(kept, kept, strict=True)) | dict.fromkeys(action, "proposal")
+        self._called = dict(zip(names, names, strict=True)) | dict.fromkeys(action, "proposal")
         self._called[columns.time] = "time"
         self._header, self._count, self._factors = "", 0, dict[str, float]()
         self._dialect: Dialect | None = None
@@ -154,19 +154,19 @@ class CsvRows:
         """Whether it names those of all variables; of some alone is an error."""
         if not any(name in text for name in self._variables):
             return False
-        named = Dialect(text, ()).columns
-        lacking = [name for name in self._variables if name not in named]
-        if 0 < len(lacking) < len(self._variables):
-            raise MessageError(lacking[0], f"is no column; there are {', '.join(named)}")
-        return not lacking
+        columns = Dialect(text, ()).columns
+        omissions = [name for name in self._variables if name not in columns]
+        if 0 < len(omissions) < len(self._variables):
+            raise MessageError(omissions[0], f"is no column; there are {', '.join(columns)}")
+        return not omissions
 
     def _has_units(self, text: str) -> bool:
         """Whether the first line below the names tells units; it tells the dialect as well."""
         if self._dialect is not None:
             return False
-        dialect, given = Dialect(self._header, [text]), self._columns.units
+        dialect, log_units = Dialect(self._header, [text]), self._columns.units
         numbers = [name for name in dialect.columns if name in self._numbers]
-        units = {name: unit for name, unit in given.items() if "%" not in unit}
+        units = {name: unit for name, unit in log_units.items() if "%" not in unit}
         units = {**dialect.units, **units_of(units, numbers)}
         self._factors = {name: UNITS.get(units.get(name, ""), 1.0) for name in numbers}
         self._dialect = dialect
@@ -175,13 +175,13 @@ class CsvRows:
     def _told(self, dialect: Dialect, text: str) -> Iterator[tuple[str, Any]]:
         """What a row tells, by the keys of messages."""
         fields = next(csv.reader([text], delimiter=dialect.separator, strict=True))
-        if len(fields) != (named := len(dialect.columns)):
-            raise MessageError("line", dialect.miscounted(len(fields), named))
-        for name, told in zip(dialect.columns, map(str.strip, fields), strict=True):
-            if name in self._numbers and not is_date(told):
-                yield self._called[name], self._number(name, told, dialect)
+        if len(fields) != (n_columns := len(dialect.columns)):
+            raise MessageError("line", dialect.miscounted(len(fields), n_columns))
+        for name, field in zip(dialect.columns, map(str.strip, fields), strict=True):
+            if name in self._numbers and not is_date(field):
+                yield self._called[name], self._number(name, field, dialect)
             elif name in self._called:
-                yield self._called[name], told or None
+                yield self._called[name], field or None
 
     def _number(self, name: str, text: str, dialect: Dialect) -> float | None:
         """What stands in a field, in units of the SI; None where nothing does."""
@@ -195,5 +195,5 @@ class CsvRows:
 
 def _joined(how: str | None, values: Sequence[Any]) -> Any:
     """What values become, of those that were seen."""
-    seen = [value for value in values if value is not None]
-    return _BECOME[how or "mean"](seen) if seen else None
+    entries = [value for value in values if value is not None]
+    return _BECOME[how or "mean"](entries) if entries else None

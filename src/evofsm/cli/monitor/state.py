@@ -55,20 +55,20 @@ class State:
         journal, is_there = self._journal, self.path.exists()
         if is_there:
             self._provenance = dict(store.read_header(self.path).provenance)
-        saved = self._provenance.pop(_PROVENANCE, None)
-        if saved is None:
+        entry = self._provenance.pop(_PROVENANCE, None)
+        if entry is None:
             if journal.records:
                 raise ValueError(
                     f"{journal.path} holds what came after a guard that is not in {self.path}; put "
                     "that back, or delete the journal to begin anew"
                 )
             return load() if is_there else fresh()
-        if found := differences(saved["settings"], self.settings):
+        if changes := differences(entry["settings"], self.settings):
             raise ValueError(
-                f"{self.path} was saved with other settings: {found}; go on with those, or name "
+                f"{self.path} was saved with other settings: {changes}; go on with those, or name "
                 "another file"
             )
-        self._mark, self._memory = int(saved["mark"]), saved["memory"]
+        self._mark, self._memory = int(entry["mark"]), entry["memory"]
         if journal.settings.get("mark") not in (self._mark, self._mark - 1):
             raise ValueError(
                 f"{journal.path} is missing or empty: rows that came after {self.path} was saved "
@@ -121,7 +121,7 @@ class State:
     def _save(self, decider: Decider) -> None:
         """Write the guard, and begin a journal; the one before counts until it is written."""
         mark = self._mark + 1
-        saved = {"mark": mark, "settings": self.settings, "memory": decider.memory()}
-        decider.guard.save(self.path, {**self._provenance, _PROVENANCE: saved})
+        entry = {"mark": mark, "settings": self.settings, "memory": decider.memory()}
+        decider.guard.save(self.path, {**self._provenance, _PROVENANCE: entry})
         self._journal.begin_anew({"mark": mark})
         self._mark, self._count = mark, 0

@@ -33,12 +33,12 @@ Answers = Iterable[tuple[Answer, Row | None]]
 def decided_on_log(decider: Decider, episodes: Iterable[Chunk]) -> Answers:
     """The answers to the rows of a log; with the last row of an episode it ends."""
     for episode in episodes:
-        *seen, last = (
+        *rows, last = (
             tuple(None if math.isnan(value) else value for value in row)
             for row in episode.observations.tolist()
         )
-        for here, wanted, time in zip(seen, episode.actions.tolist(), episode.times, strict=False):
-            row = Row(float(time), here, None if math.isnan(wanted) else wanted)
+        for here, action, time in zip(rows, episode.actions.tolist(), episode.times, strict=False):
+            row = Row(float(time), here, None if math.isnan(action) else action)
             yield decider.act(row), row
         yield decider.act(End(episode.failed, last)), None
 
@@ -58,7 +58,7 @@ def decided_on_lines(decider: Decider, file: Path) -> Answers:
 def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[RenderableType]:
     """Tables of what was decided; a ValueError if nothing was."""
     rows: list[Row] = []
-    numbers, refused, failed = [], [], []
+    numbers, errors, failed = [], [], []
     for answer, row in answers:
         if answer["kind"] == "decision" and row is not None:
             rows.append(row)
@@ -67,56 +67,56 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
         elif answer["kind"] == "end" and answer["failed"] and rows:
             failed.append(len(rows) - 1)
         elif answer["kind"] == "error":
-            refused.append(f"{answer['about']}: {answer['error']}")
+            errors.append(f"{answer['about']}: {answer['error']}")
     if not rows:
-        raise ValueError(f"{title}: nothing was decided ({'; '.join(refused[:1]) or 'no rows'})")
+        raise ValueError(f"{title}: nothing was decided ({'; '.join(errors[:1]) or 'no rows'})")
     times, risks, alarms, begins = np.array(numbers, np.float64).T
     steps, interval = np.diff(times, prepend=math.nan), decider.guard.interval
     follows = (begins == 0.0) & (steps > 0.0) & (steps <= HOLE * interval)
-    lasted = np.where(follows, steps, interval)
+    durations = np.where(follows, steps, interval)
 
     def counted(above: NDArray[np.bool_]) -> tuple[str, str, str]:
         count = (above & ~(np.roll(above, 1) & follows)).sum()
-        hourly = count * 3600.0 / lasted.sum()
-        return f"{count:,}", f"{hourly:,.1f}", f"{above @ lasted / lasted.sum():.2%}"
+        hourly = count * 3600.0 / durations.sum()
+        return f"{count:,}", f"{hourly:,.1f}", f"{above @ durations / durations.sum():.2%}"
 
     count, hourly, share = counted(alarms > 0.0)
-    told = f"{len(rows):,} in {begins.sum():,.0f} episodes, {lasted.sum() / 3600.0:.3g} h"
-    pairs = [("rows", told), ("alarms", f"{count}, or {hourly} an hour, {share} of the time")]
-    if useless := refusing(alarms @ lasted / lasted.sum()):
+    text = f"{len(rows):,} in {begins.sum():,.0f} episodes, {durations.sum() / 3600.0:.3g} h"
+    pairs = [("rows", text), ("alarms", f"{count}, or {hourly} an hour, {share} of the time")]
+    if useless := refusing(alarms @ durations / durations.sum()):
         pairs.append(("beware", f"it {useless}"))
     # A moment lasts while an alarm does; the highest risk within it stands for it.
     calm = (alarms == 0.0) & (np.diff(times // _MOMENT, prepend=0.0) != 0.0)
     moments = np.cumsum(~follows | calm | (np.diff(alarms, prepend=0.0) != 0.0))
-    long = np.bincount(moments, lasted * alarms)[moments]
+    long = np.bincount(moments, durations * alarms)[moments]
     if failed:
         before = long[failed]
-        told = f"{len(failed):,}; {(before > 0.0).sum():,} in alarm by then"
+        text = f"{len(failed):,}; {(before > 0.0).sum():,} in alarm by then"
         ahead = f", for {np.median(before[before > 0.0]):.1f} s (median)" if before.any() else ""
-        pairs.append(("failures", told + ahead))
-    if refused:
-        pairs.append(("refused", f"{len(refused):,} messages, the first because {refused[0]}"))
+        pairs.append(("failures", text + ahead))
+    if errors:
+        pairs.append(("refused", f"{len(errors):,} messages, the first because {errors[0]}"))
     yield facts(title, pairs)
-    given = getattr(decider.guard.reviser, "tolerance", None)
-    known = sorted({*_TOLERANCES, *([] if given is None else [given])})
-    lines = [(f"{risk:g}", *counted(risks > risk)) for risk in known]
-    bold = [place for place, risk in enumerate(known) if risk == given]
+    tolerance = getattr(decider.guard.reviser, "tolerance", None)
+    tolerances = sorted({*_TOLERANCES, *([] if tolerance is None else [tolerance])})
+    risk_rows = [(f"{risk:g}", *counted(risks > risk)) for risk in tolerances]
+    bold = [place for place, risk in enumerate(tolerances) if risk == tolerance]
     # Whether it would alarm with another tolerance, one pass does not say.
     header = ("above", "times", "an hour", "of the time")
-    yield table("\nBy risk of what was proposed", header, lines, bold=bold)
+    yield table("\nBy risk of what was proposed", header, risk_rows, bold=bold)
     order = np.lexsort((-risks, moments))
     highest = order[np.unique(moments[order], return_index=True)[1]]
-    ranked = np.lexsort((-long[highest], -risks[highest]))[:_WORST]
+    ranks = np.lexsort((-long[highest], -risks[highest]))[:_WORST]
     names = decider.form.variables or [f"{k + 1}" for k in range(len(rows[0].observation or ()))]
     names = () if decider.form.scenes else names[:_MOST_VARIABLES]
     episodes, worst = np.cumsum(begins), []
-    for at in highest[ranked].tolist():
+    for at in highest[ranks].tolist():
         if risks[at] or alarms[at]:
-            seen = [*(rows[at].observation or ())[: len(names)], rows[at].proposal]
-            shown = [
-                f"{v:.4g}" if isinstance(v, float) else str("" if v is None else v) for v in seen
+            cells = [*(rows[at].observation or ())[: len(names)], rows[at].proposal]
+            texts = [
+                f"{v:.4g}" if isinstance(v, float) else str("" if v is None else v) for v in cells
             ]
-            where = (f"{episodes[at]:.0f}", f"{times[at]:.10g}", *shown)
+            where = (f"{episodes[at]:.0f}", f"{times[at]:.10g}", *texts)
             worst.append((*where, f"{risks[at]:.1%}", f"{long[at]:.1f}"))
     header = ("episode", "time", *names, "proposed", "risk", "alarm lasts [s]")
     yield table("\nThe worst moments", header, worst)

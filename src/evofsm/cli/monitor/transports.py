@@ -64,11 +64,11 @@ class Server:
         Each is answered before the next is decided on: of those that were and nobody heard of, as
         it is killed, there are never more than are known again when they are sent again.
         """
-        begun, data = b"", b"\n"
+        fragment, data = b"", b"\n"
         while data:
             data = read(_CHUNK)
-            *whole, begun = (begun + (data or b"\n" * bool(begun))).split(b"\n")
-            begun = begun[: LONGEST + 1]  # however long it gets
+            *whole, fragment = (fragment + (data or b"\n" * bool(fragment))).split(b"\n")
+            fragment = fragment[: LONGEST + 1]  # however long it gets
             for line in whole:
                 write(self.answer([line.removesuffix(b"\r")]))
 
@@ -167,9 +167,9 @@ class Stream:
         """Write it."""
         with self._writing:
             while line:
-                if (written := self._sink.write(line)) is None:
+                if (count := self._sink.write(line)) is None:
                     time.sleep(_POLL)
-                line = line[written or 0 :]
+                line = line[count or 0 :]
 
     def close(self) -> None:
         """Others opened them."""
@@ -213,8 +213,8 @@ class SocketTransport:
 
     def send(self, line: bytes) -> None:
         """Pass it to all that are not being answered; who does not read is let go."""
-        for peer, writing in list(self._peers.items()):
-            if not writing.acquire(blocking=False):
+        for peer, lock in list(self._peers.items()):
+            if not lock.acquire(blocking=False):
                 continue
             with suppress(OSError):  # gone meanwhile
                 try:
@@ -223,7 +223,7 @@ class SocketTransport:
                     is_sent = False
                 if not is_sent:
                     peer.shutdown(socket.SHUT_RDWR)
-            writing.release()
+            lock.release()
 
     def close(self) -> None:
         """Remove the socket."""
