@@ -82,29 +82,28 @@ def watch(
     is_log = _is_log(what)
     if not is_log and (given_of(reading) or guard):
         raise ValueError(f"--guard and options of columns are for a log, and {what} is none")
-    if guard is not None:
-        kept = read_header(guard).provenance.get("read with", {})
-        reading = partial(reading_of, **{**reading.keywords, **kept, **given_of(reading)})
+    defaults = {} if guard is None else read_header(guard).provenance.get("read with", {})
+    reader = partial(reading_of, **{**reading.keywords, **defaults, **given_of(reading)})
     with suppress(KeyboardInterrupt), ExitStack() as stack:
-        watched: Session | Recording
+        run: Session | Recording
         if is_log:
-            given = None if tolerance == TOLERANCE else tolerance
-            saved = None if guard is None else Guard.load(guard)
+            risk = None if tolerance == TOLERANCE else tolerance
+            log_guard = None if guard is None else Guard.load(guard)
             try:
-                logged = _logged(what, reading(), given, case, saved, judge=judge, brakes=brakes)
+                run = _logged(what, reader(), risk, case, log_guard, judge=judge, brakes=brakes)
             except ValueError as error:
                 if given_of(reading) or "has no column" not in str(error):
                     raise
                 look = f"evofsm learn {quote(what)} says what it holds, and what to name"
                 raise ValueError(f"{error}. Is it no log of cars? {look}") from error
-            watched = stack.enter_context(logged)
+            run = stack.enter_context(run)
         elif what.endswith(".mcap"):
-            watched = Recording(what)
+            run = Recording(what)
             if case is not None:
-                watched.restart(case - 1)
+                run.restart(case - 1)
         else:
-            watched = _driven(stack, what, case or 1, world, judge, tolerance, seed, learn_first)
-        asyncio.run(_serve(watched, port, browse=not no_browser))
+            run = _driven(stack, what, case or 1, world, judge, tolerance, seed, learn_first)
+        asyncio.run(_serve(run, port, browse=not no_browser))
     say("\nThe page is closed.")
 
 
@@ -155,10 +154,10 @@ def _logged(what: str, reading: Reading, *asked: Any, **settings: Any) -> Sessio
         return watched_log(what, reading, *asked, **settings)
     with TemporaryDirectory() as folder:
         log = Path(folder) / Path(what).name
-        written, is_cut, met = trace_configuration(Path(what), log, _SECONDS, _ENOUGH)
+        duration, is_cut, crashes = trace_configuration(Path(what), log, _SECONDS, _ENOUGH)
         if is_cut:
-            warn(f"watched are the first {written:,.0f} s of the simulation")
-        return watched_log(str(log), reading, *asked, collisions=met, **settings)
+            warn(f"watched are the first {duration:,.0f} s of the simulation")
+        return watched_log(str(log), reading, *asked, collisions=crashes, **settings)
 
 
 def _driven(
@@ -181,8 +180,8 @@ def _driven(
         watched_guard,
     )
 
-    simulated = read_simulated(what, seed=seed, tolerance=tolerance)
-    if simulated is None:
+    environment = read_simulated(what, seed=seed, tolerance=tolerance)
+    if environment is None:
         require_world(world)
         from evofsm.driving import load_family
         from evofsm.driving.sumo import open_world
@@ -191,7 +190,7 @@ def _driven(
         system: System = OnRoads(family, stack.enter_context(open_world(world)), seed)
         guard = watched_guard(family, judge=judge, tolerance=tolerance)
     else:
-        system, guard = simulated, simulated.guard
+        system, guard = environment, environment.guard
     with progress("Learning first", episodes) as move:
         learn_first(guard, system, episodes, move)
     return stack.enter_context(Session(system, guard, case=case - 1))

@@ -52,17 +52,17 @@ def watched_log(
     of_cars = is_kinematic or (reading.acts and names == VARIABLES)
     most = _ROWS_OF_CARS if of_cars else None
     episodes = episodes_read(path, reading, dated=not of_cars, most=most)
-    found = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
-    if not found:
+    stretches = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
+    if not stretches:
         why = f"nobody follows anybody for {_FEWEST_ROWS}" if of_cars else "no episode has two"
         raise ValueError(f"{path}: {why} rows")
-    if case is not None and not 1 <= case <= len(found):
-        raise ValueError(f"episode is {case}; there are 1 to {len(found)}")
-    if guard is None and not (of_cars or any(played.fails for played in found)):
+    if case is not None and not 1 <= case <= len(stretches):
+        raise ValueError(f"episode is {case}; there are 1 to {len(stretches)}")
+    if guard is None and not (of_cars or any(stretch.fails for stretch in stretches)):
         why = "no episode failed, so there is nothing to foresee; --failed says what did"
         raise ValueError(f"{path}: {why}")
     labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
-    rows = [played.rows for played in found]
+    rows = [stretch.rows for stretch in stretches]
     risk = TOLERANCE if tolerance is None else tolerance
     if guard is not None:
         if tuple(names) != guard.variables or abs(rows[0].dt / guard.interval - 1.0) > _OTHER_STEP:
@@ -84,11 +84,11 @@ def watched_log(
         guard = _learnt_guard(rows, labels, risk)
     guard.learn = False
     if of_cars:
-        found = list(_judged(guard, found))
+        stretches = list(_judged(guard, stretches))
     if isinstance(guard.judge, Foresight):
         limit = float(guard.reviser.tolerance)  # type: ignore[attr-defined]
-        found = list(_alarmed(guard.judge, guard.judge.rate_of(limit), found))
-    system = Logged(path, found, labels, acts=reading.acts, of_cars=of_cars)
+        stretches = list(_alarmed(guard.judge, guard.judge.rate_of(limit), stretches))
+    system = Logged(path, stretches, labels, acts=reading.acts, of_cars=of_cars)
     return Session(system, guard, case=system.places.get(case or 0, system.first), on=False)
 
 
@@ -96,8 +96,8 @@ def _alarmed(judge: Foresight, rate: int | None, found: Sequence[Played]) -> Ite
     """With whether alarms come before the last row, with which nothing is decided."""
     runs = judge.runs([p.rows.observations for p in found], [bool(p.fails) for p in found])
     on = np.zeros(len(runs.rows), np.bool_) if rate is None else judge.tally(runs, rate)[1]
-    for played, part in zip(found, np.split(on, runs.starts[1:]), strict=True):
-        yield played._replace(alarms=bool((part[1:-1] & ~part[:-2]).any()))
+    for stretch, part in zip(found, np.split(on, runs.starts[1:]), strict=True):
+        yield stretch._replace(alarms=bool((part[1:-1] & ~part[:-2]).any()))
 
 
 def _whole(episodes: Iterable[Chunk]) -> Iterator[Played]:
@@ -118,19 +118,19 @@ def _of_cars(
 
 def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Chunk, str]]:
     """Those of an episode that are long enough, and how each failed."""
-    counted = np.zeros(len(episode.times), np.bool_)
+    crashes = np.zeros(len(episode.times), np.bool_)
     for time in collisions:  # who collides may be taken off the road before it is written down
         row = int(np.searchsorted(episode.times, time + _TICK)) - 1
-        counted[row] |= row >= 0 and time - episode.times[row] < LONGEST_STEP * episode.dt
-    touching = counted | (episode.observations[:, 0] <= 0.0)
-    begins = np.flatnonzero(~touching & np.append(True, touching[:-1]))
+        crashes[row] |= row >= 0 and time - episode.times[row] < LONGEST_STEP * episode.dt
+    contacts = crashes | (episode.observations[:, 0] <= 0.0)
+    begins = np.flatnonzero(~contacts & np.append(True, contacts[:-1]))
     for first in begins.tolist():
-        ends = np.flatnonzero(touching[first:])
-        last = first + int(ends[0]) if len(ends) else len(touching) - 1
+        ends = np.flatnonzero(contacts[first:])
+        last = first + int(ends[0]) if len(ends) else len(contacts) - 1
         if last + 1 - first < _FEWEST_ROWS:
             continue
         fails = "Failure (by the log)" * bool(episode.fails[last])
-        if touching[last]:
+        if contacts[last]:
             fails = "Collision (by SUMO)" if episode.observations[last, 0] > 0.0 else "Collision"
         rows = episode.rows(first, last + 1)
         failures = np.array([last - first] if fails else [], np.int64)
@@ -139,16 +139,16 @@ def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Ch
 
 def _judged(guard: Guard, found: Sequence[Played]) -> Iterator[Played]:
     with progress("Judging", len(found)) as move:
-        for number, played in enumerate(found, 1):
-            risks = [said.risk_proposed for said in decided_on(guard, played.rows)]
+        for number, stretch in enumerate(found, 1):
+            risks = [revision.risk_proposed for revision in decided_on(guard, stretch.rows)]
             move(number)
-            yield played._replace(risks=risks)
+            yield stretch._replace(risks=risks)
 
 
 def _learnt_guard(episodes: Sequence[Chunk], labels: Labels, tolerance: float) -> Guard:
-    did = np.concatenate([e.actions for e in episodes])
-    known = did[np.isfinite(did)]
-    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    deeds = np.concatenate([e.actions for e in episodes])
+    numbers = deeds[np.isfinite(deeds)]
+    low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (0.0, 1.0)
     high = high if high > low else low + 1.0
     actions = IntervalActions(low, high, (high - low) / _INTERVALS, outside="clip")
     machine = system_machine(_INTERVALS, np.concatenate([e.observations for e in episodes]))
@@ -160,7 +160,7 @@ def _learnt_guard(episodes: Sequence[Chunk], labels: Labels, tolerance: float) -
 
 def _learn_states(machine: EvolvingFSM, episodes: Sequence[Chunk], actions: Any) -> None:
     for rows in episodes:
-        did = np.full(len(rows.times), -1)
-        known = np.isfinite(rows.actions)
-        did[known] = actions.encode(rows.actions[known])
-        machine.learn_many(rows.observations, did, [0], rows.failures)
+        indices = np.full(len(rows.times), -1)
+        is_known = np.isfinite(rows.actions)
+        indices[is_known] = actions.encode(rows.actions[is_known])
+        machine.learn_many(rows.observations, indices, [0], rows.failures)

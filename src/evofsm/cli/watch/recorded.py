@@ -66,13 +66,13 @@ class Recording:
         self.start = self._begun(case)
         # Where it acts, what is executed is what it advises; else a proposal that can be executed.
         episode, columns = self._episode, self._episode.columns
-        passed = (np.abs(columns["advised"] - columns["executed"]) > _SAME_ACCEL).any()
-        idle = _IDLE.get(self._mode, _PASSED if passed else "")
+        has_passed = (np.abs(columns["advised"] - columns["executed"]) > _SAME_ACCEL).any()
+        idle = _IDLE.get(self._mode, _PASSED if has_passed else "")
         chronicle, self._frames = Chronicle(self.start.tolerance), list[Frame]()
         times = np.append(columns["time"], episode.end_time)
-        seen = np.column_stack([columns[name] for name in VARIABLES])
-        seen = _held(np.vstack([seen, episode.end]))
-        rows = zip(times.tolist(), seen, cars_of(times, seen), strict=True)
+        observations = np.column_stack([columns[name] for name in VARIABLES])
+        observations = _held(np.vstack([observations, episode.end]))
+        rows = zip(times.tolist(), observations, cars_of(times, observations), strict=True)
         for number, (time, row, cars) in enumerate(rows):
             here, observation = _LABELS.place(row), tuple(row.tolist())
             frame = Frame(number, time, observation, here=here, idle=idle, cars=cars)
@@ -104,9 +104,9 @@ class Recording:
         about, columns = self._run.about, self._episode.columns
         times = np.append(columns["time"], self._episode.end_time)
         commands = np.concatenate([[0.0], *(columns[name] for name in _ACTIONS)])
-        unjudged = "no failure was known yet"
+        reason = "no failure was known yet"
         if self._reviser not in ("least-risk", "none"):
-            unjudged = f"{self._reviser} knows no risk"
+            reason = f"{self._reviser} knows no risk"
         return Start(
             system=about.get("family", self._name),
             about=f"from {self._name}.",
@@ -119,21 +119,21 @@ class Recording:
             high=(float(np.nanmax(commands)),),
             judge=about.get("judge", "kinematic"),
             mode=self._mode,
-            unjudged="the reviser was off" if self._mode == "off" else unjudged,
+            unjudged="the reviser was off" if self._mode == "off" else reason,
         )
 
     def _decided(self, frame: Frame, number: int) -> Frame:
         row = {name: values[number] for name, values in self._episode.columns.items()}
         executed = Judged(*map(float, (row["risk_executed"], row["risk_low"], row["risk_high"])))
         risk = float(row["risk_proposed"])
-        proposed, executes, advised = (float(row[name]) for name in _ACTIONS)
-        revised = not frame.idle and abs(executes - proposed) > _SAME_ACCEL
+        proposal, action, advice = (float(row[name]) for name in _ACTIONS)
+        is_revised = not frame.idle and abs(action - proposal) > _SAME_ACCEL
         return frame._replace(
-            proposed=(proposed,),
-            executed=(proposed if frame.idle else executes,),
-            advised=(advised,),
-            revised=revised,
-            advises=revised or abs(advised - executes) > _SAME_ACCEL,
+            proposed=(proposal,),
+            executed=(proposal if frame.idle else action,),
+            advised=(advice,),
+            revised=is_revised,
+            advises=is_revised or abs(advice - action) > _SAME_ACCEL,
             reason=str(row["reason"]),
             explanation=str(row["explanation"]),
             state=None if row["state"] == _NO_STATE else int(row["state"]),
@@ -146,8 +146,8 @@ class Recording:
 def _held(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """What was not seen is as it was seen last; before that, as it was seen first."""
     for column in rows.T:
-        known = np.flatnonzero(np.isfinite(column))
-        if len(known):
-            latest = np.searchsorted(known, np.arange(len(column)), side="right") - 1
-            column[:] = column[known[np.maximum(latest, 0)]]
+        places = np.flatnonzero(np.isfinite(column))
+        if len(places):
+            latest = np.searchsorted(places, np.arange(len(column)), side="right") - 1
+            column[:] = column[places[np.maximum(latest, 0)]]
     return rows

@@ -57,19 +57,19 @@ def message(kind: str, what: Any, start: Start | None = None) -> str:
     >>> message("failed", "no road")
     '{"kind":"failed","text":"no road"}'
     """
-    told: dict[str, Any] = what._asdict() if hasattr(what, "_asdict") else {"text": what}
+    body: dict[str, Any] = what._asdict() if hasattr(what, "_asdict") else {"text": what}
     if isinstance(what, Start):
-        told |= {"live": what.mode == LIVE, **introduce(what)}
+        body |= {"live": what.mode == LIVE, **introduce(what)}
     elif isinstance(what, Frame):
         assert start is not None
         story, danger = what.story, what.story.danger
-        told["danger"] = None
+        body["danger"] = None
         dead_end = None if danger is None else danger.dead_end  # since when no braking helps [s]
         if danger is not None and story.in_danger:
-            told["danger"] = {"since": danger.began.time, "last": danger.last, "dead_end": dead_end}
-        told["story"] = {**story._asdict(), "danger": None, "dead_end": dead_end}
-        told["told"] = tell(what, start)
-    return msgspec.json.encode(_rounded({"kind": kind, **told})).decode()
+            body["danger"] = {"since": danger.began.time, "last": danger.last, "dead_end": dead_end}
+        body["story"] = {**story._asdict(), "danger": None, "dead_end": dead_end}
+        body["told"] = tell(what, start)
+    return msgspec.json.encode(_rounded({"kind": kind, **body})).decode()
 
 
 def _rounded(value: Any) -> Any:
@@ -95,8 +95,8 @@ class LivePage:
         self._frames: deque[str] = deque(maxlen=_MOST_FRAMES)
         self._clients: set[ServerConnection] = set()
         self._start: Start | None = None
-        found = (files(__package__) / "live").iterdir()
-        self._files = {file.name: file.read_bytes() for file in found}
+        paths = (files(__package__) / "live").iterdir()
+        self._files = {file.name: file.read_bytes() for file in paths}
 
     @property
     def address(self) -> str:
@@ -117,8 +117,8 @@ class LivePage:
             server_header=None,
             logger=_log,
         )
-        (listening,) = self._server.sockets
-        self.port = int(listening.getsockname()[1])
+        (listener,) = self._server.sockets
+        self.port = int(listener.getsockname()[1])
         return self
 
     async def __aexit__(self, *error: object) -> None:

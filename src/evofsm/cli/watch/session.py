@@ -121,15 +121,15 @@ def learn_first(
     is learnt. In the second half the guard acts, and comes to kinds of failure that are farther
     off; that is over once it prevented all of some in a row.
     """
-    lasted = 0
+    streak = 0
     for index in range(episodes):
         acts = 2 * index >= episodes
         if isinstance(system, Simulated):
             guard.reviser.mode = Mode.ACT if acts else Mode.SHADOW  # type: ignore[attr-defined]
         system.teach(guard, index)
         show(index + 1)
-        lasted = lasted + 1 if acts and isinstance(system, Simulated) and not system.failed else 0
-        if lasted == _LASTED:
+        streak = streak + 1 if acts and isinstance(system, Simulated) and not system.failed else 0
+        if streak == _LASTED:
             break
 
 
@@ -173,8 +173,8 @@ class OnRoads:
 
     def propose(self) -> Action:
         """What the driver wants, by what was seen last of each variable."""
-        seen = self.observation
-        self._held = np.where(np.isnan(seen), self._held, seen)
+        observation = self.observation
+        self._held = np.where(np.isnan(observation), self._held, observation)
         return self._controller.propose(self._held, self.time).action
 
     def advance(self, revision: Revision) -> None:
@@ -186,20 +186,20 @@ class OnRoads:
         """Where they are."""
         road, episode = self._road, self._road.episode()
         record, speeds, now = episode.record, episode.record[:, SPEED], episode.record[-1]
-        driven = 0.5 * (speeds[1:] + speeds[:-1]).sum() * road.scenario.dt
+        distance = 0.5 * (speeds[1:] + speeds[:-1]).sum() * road.scenario.dt
         a_leader = float(record[-2, LEADER_ACCELERATION]) if len(record) > 1 else math.nan
         stands = now[SPEED] == now[LEADER_SPEED] == 0.0 and a_leader < 0.0
         self._stood = self._stood + self.interval if stands else 0.0
-        seen = self.observation
+        observation = self.observation
         return Cars(
             gap=float(now[GAP]),
             v_follower=float(speeds[-1]),
             v_leader=float(now[LEADER_SPEED]),
             a_follower=float(episode.realised[-2:][0]),
             a_leader=a_leader,
-            x_follower=float(driven),
-            time_to_collision=float(time_to_collision(seen)),
-            time_headway=float(time_headway(seen)),
+            x_follower=float(distance),
+            time_to_collision=float(time_to_collision(observation)),
+            time_headway=float(time_headway(observation)),
             gap_behind=float(now[GAP_BEHIND]),
             rear_ended=road.rear_ended,
         )
@@ -252,16 +252,16 @@ class Simulated:
         fails = "what its file says" if failed else "an episode that is terminated"
         self.about = f"{acts} drives it; failure is {fails}."
         ends = _ends(name, env.action_space)
-        named = [text.partition(" [") for text in variables or _names_of(env)]
-        names, units = [parts[0] for parts in named], [parts[2].rstrip("]") for parts in named]
+        titles = [text.partition(" [") for text in variables or _names_of(env)]
+        names, units = [parts[0] for parts in titles], [parts[2].rstrip("]") for parts in titles]
         judge = LearntRisk(self.interval, **ends, names=names, units=units, seed=seed)
-        made = Guard(**ends, interval=self.interval, judge=judge, tolerance=tolerance)
+        guard = Guard(**ends, interval=self.interval, judge=judge, tolerance=tolerance)
         spaces = env.observation_space, env.action_space
-        self._terms = gym.Terms(made, *spaces, None, failed, 0.0)
-        seen = np.array([z for k in range(_LOOKED_AT) for z in self._run(env, -1 - k)])
-        machine = system_machine(made.actions.n_actions, seen)
-        self.guard = Guard.of(made.reviser, interval=self.interval, machine=machine)
-        names = names or [f"variable {k + 1}" for k in range(seen.shape[1])]
+        self._terms = gym.Terms(guard, *spaces, None, failed, 0.0)
+        observations = np.array([z for k in range(_LOOKED_AT) for z in self._run(env, -1 - k)])
+        machine = system_machine(guard.actions.n_actions, observations)
+        self.guard = Guard.of(guard.reviser, interval=self.interval, machine=machine)
+        names = names or [f"variable {k + 1}" for k in range(observations.shape[1])]
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.interval)
 
     def _reset(self, env: Any, index: int) -> None:
@@ -286,11 +286,11 @@ class Simulated:
     def _run(self, env: Any, index: int) -> list[NDArray[np.float64]]:
         """An episode that nobody watches: what was observed."""
         self._reset(env, index)
-        seen = [self.observation]
-        while not self.over and len(seen) <= _MOST_DECISIONS:
+        observations = [self.observation]
+        while not self.over and len(observations) <= _MOST_DECISIONS:
             self._step(env, self._wish())
-            seen.append(self.observation)
-        return seen
+            observations.append(self.observation)
+        return observations
 
     def teach(self, guard: Guard, index: int) -> None:
         """Let a guard learn from an episode that nobody watches, by looking on."""
@@ -312,8 +312,8 @@ class Simulated:
     def propose(self) -> Action:
         """What the controller wants."""
         self._wanted = self._wish()
-        wanted: Action = self._terms.to_guard(self._wanted)
-        return wanted
+        action: Action = self._terms.to_guard(self._wanted)
+        return action
 
     def advance(self, revision: Revision) -> None:
         """Take a step."""
@@ -330,8 +330,8 @@ class Simulated:
 def _names_of(env: Any) -> list[str]:
     """Of an environment's variables, with their units, where it is one that is known."""
     name = env.spec.id.partition("-v")[0].removesuffix("Continuous") if env.spec else ""
-    known = _ENV_NAMES.get(name, "").split(", ")
-    return known if (len(known),) == env.observation_space.shape else []
+    names = _ENV_NAMES.get(name, "").split(", ")
+    return names if (len(names),) == env.observation_space.shape else []
 
 
 def _ends(name: str, space: Any) -> dict[str, Any]:
@@ -356,13 +356,13 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
     """
     if what.endswith(".py"):
         try:
-            found = runpy.run_path(what)
-            if "environment" not in found:
-                if "family" in found:
+            definitions = runpy.run_path(what)
+            if "environment" not in definitions:
+                if "family" in definitions:
                     return None
                 raise ValueError("it defines neither environment() nor a Family called family")
-            parts = {name: found[name] for name in _PARTS if name in found}
-            return Simulated(Path(what).stem, found["environment"](), **parts, **settings)
+            parts = {name: definitions[name] for name in _PARTS if name in definitions}
+            return Simulated(Path(what).stem, definitions["environment"](), **parts, **settings)
         except Exception as error:  # of somebody's own
             raise ValueError(f"{what}: {type(error).__name__}: {error}") from error
     if not re.search(r"-v\d+$", what):
@@ -435,8 +435,8 @@ class Logged:
         self._cars = list(cars_of(times, self._rows.observations)) if self.of_cars else None
         begins = self._times[max(len(times) - _PLAYED, 0)]
         if self.of_cars:
-            seen = not fails and np.isfinite(risks).any()
-            begins = self._times[int(np.nanargmax(risks)) if seen else -1] - _BEFORE
+            has_risk = not fails and np.isfinite(risks).any()
+            begins = self._times[int(np.nanargmax(risks)) if has_risk else -1] - _BEFORE
         began = float(self._rows.times[0])
         clock = math.nan if self.of_cars or self.interval < 1.0 else 0.0
         clock = began if began >= DATES else clock
@@ -483,9 +483,9 @@ class Session(AbstractContextManager["Session"]):
         self._tolerance = float(self._reviser.tolerance)  # type: ignore[attr-defined]
         guard.explaining = True
         # As a decision logger it is told of each before anything is learnt from it.
-        rest = dict.fromkeys(("begin", "seen", "ended"), lambda *_, **__: None)
-        told: Any = SimpleNamespace(decided=self._ask, **rest)
-        guard.audit = told
+        hooks = dict.fromkeys(("begin", "seen", "ended"), lambda *_, **__: None)
+        logger: Any = SimpleNamespace(decided=self._ask, **hooks)
+        guard.audit = logger
         self.revising = on
         self.start = self.restart()
 
@@ -500,11 +500,11 @@ class Session(AbstractContextManager["Session"]):
 
     def _idle(self) -> str:
         if not self.revising:
-            watched = "the reviser only watched, in shadow mode"
-            return watched if self._is_log else "the reviser is off"
-        passing: str = self._reviser.passing  # type: ignore[attr-defined]
-        why = "was not shown to help yet" if passing == "shadow" else passing
-        return passing and f"the guard {why}, so what is proposed passes"
+            text = "the reviser only watched, in shadow mode"
+            return text if self._is_log else "the reviser is off"
+        reason: str = self._reviser.passing  # type: ignore[attr-defined]
+        why = "was not shown to help yet" if reason == "shadow" else reason
+        return reason and f"the guard {why}, so what is proposed passes"
 
     def restart(self, case: int | None = None) -> Start:
         """Begin a run anew, or another one; one that is under way is broken off."""
@@ -522,14 +522,14 @@ class Session(AbstractContextManager["Session"]):
 
     def step(self) -> Frame:
         """One decision, and what came of the one before."""
-        seen, cars = self.system.observation, self.system.cars()
+        observation, cars = self.system.observation, self.system.cars()
         if cars is not None and isinstance(self.judge, LatentRisk):
             cars = cars._replace(decel=self.judge.brakes.decel)
         frame = Frame(
             number=self._number,
             time=self.system.time,
-            observation=tuple(seen.tolist()),
-            here=self._place(seen),
+            observation=tuple(observation.tolist()),
+            here=self._place(observation),
             idle=self._idle(),
             cars=cars,
         )
@@ -581,14 +581,14 @@ class Session(AbstractContextManager["Session"]):
     def _decide(self, frame: Frame) -> Frame:
         guard = self._guard
         revision = guard.decide(self.system.observation, self.system.propose(), frame.time)
-        situation, judged = guard.situation, self._judged
+        situation, judgement = guard.situation, self._judged
         self.system.advance(revision)
-        numbered = zip(judged.risk, judged.low, judged.high, judged.critical, strict=True)
-        wished, done, best = (Judged(*map(float, values)) for values in numbered)
+        rows = zip(judgement.risk, judgement.low, judgement.high, judgement.critical, strict=True)
+        wish, act, best = (Judged(*map(float, values)) for values in rows)
         return frame._replace(
             state=situation.state,
-            proposed_risk=wished,
-            executed_risk=done,
+            proposed_risk=wish,
+            executed_risk=act,
             least_risk=math.nan if isinstance(self.judge, Foresight) else best.risk,
             proposed=numbers(revision.proposed),
             executed=numbers(revision.executed),
@@ -597,7 +597,7 @@ class Session(AbstractContextManager["Session"]):
             advises=change(guard.actions, self._wanted, revision.advised) > _SAME_ACTION,
             reason=revision.reason,
             explanation=revision.explanation,
-            **self._needed(judged),
+            **self._needed(judgement),
         )
 
     def _ask(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
@@ -606,14 +606,14 @@ class Session(AbstractContextManager["Session"]):
         if is_usable(actions, revision.proposed):
             self._wanted = put_into(actions, revision.proposed)
         safest = actions.low if isinstance(self.judge, LatentRisk) else revision.advised
-        asked = np.array([self._wanted, revision.executed, safest], np.float64)
-        self._judged = self.judge.judge(situation, asked)
+        candidates = np.array([self._wanted, revision.executed, safest], np.float64)
+        self._judged = self.judge.judge(situation, candidates)
 
     def _needed(self, judged: Judgement) -> dict[str, Any]:
         judge = self.judge
         if isinstance(judge, LatentRisk):
-            expected = judge.manoeuvres.exceeded_by
-            return {"needed": expected(self._tolerance), "usual": expected(0.5)}
+            quantile = judge.manoeuvres.exceeded_by
+            return {"needed": quantile(self._tolerance), "usual": quantile(0.5)}
         if isinstance(judge, Foresight):
             return {}
         assert isinstance(judge, LearntRisk)

@@ -129,15 +129,15 @@ class Cars(NamedTuple):
 
 def cars_of(times: NDArray[np.float64], observed: NDArray[np.float64]) -> Iterator[Cars]:
     """Where cars were at each time [s] of a record, and how they got there, by the variables."""
-    lasted, speeds = np.diff(times, prepend=math.nan), observed[:, 1:]
+    durations, speeds = np.diff(times, prepend=math.nan), observed[:, 1:]
     with np.errstate(divide="ignore", invalid="ignore"):
-        accelerations = np.diff(speeds, axis=0, prepend=math.nan) / lasted[:, None]
-    moved = 0.5 * (speeds[1:, 0] + speeds[:-1, 0]) * lasted[1:]
-    positions = np.insert(np.cumsum(moved), 0, 0.0)
+        accelerations = np.diff(speeds, axis=0, prepend=math.nan) / durations[:, None]
+    distances = 0.5 * (speeds[1:, 0] + speeds[:-1, 0]) * durations[1:]
+    positions = np.insert(np.cumsum(distances), 0, 0.0)
     rows = np.column_stack([observed, accelerations, positions]).tolist()
     for gap, follower, leader, a_follower, a_leader, x in rows:
-        seen = np.array([gap, follower, leader])
-        measures = float(time_to_collision(seen)), float(time_headway(seen))
+        observation = np.array([gap, follower, leader])
+        measures = float(time_to_collision(observation)), float(time_headway(observation))
         yield Cars(gap, follower, leader, a_follower, a_leader, x, *measures)
 
 
@@ -200,11 +200,11 @@ def graph_of(
 
     Only a `LatentRisk` says which are dead ends; else those are marked in which a failure ended.
     """
-    marked = [ended > 0.5 for ended in known.endings.tolist()]
+    marks = [count > 0.5 for count in known.endings.tolist()]
     if isinstance(judge, LatentRisk):
-        marked = [state.is_dead_end for state in assess_states(known, judge)]
-    told = map(tuple, known.centers.tolist()), known.visits.tolist(), marked
-    states = map(StateShown, range(known.n_states), *told)
+        marks = [state.is_dead_end for state in assess_states(known, judge)]
+    columns = map(tuple, known.centers.tolist()), known.visits.tolist(), marks
+    states = map(StateShown, range(known.n_states), *columns)
     changes = known.changes * ~np.eye(known.n_states, dtype=bool)
     shares = changes / np.maximum(changes.sum(axis=1, keepdims=True), 1.0)
     usual = np.argsort(-shares, axis=1, kind="stable")[:, :_MOST_WAYS]
@@ -237,35 +237,35 @@ class Known(NamedTuple):
 def known_of(judge: LearningJudge, tolerance: float) -> Known:
     """What a judge knows that learns of failure; nothing of another."""
     if isinstance(judge, Foresight):
-        known, rate = Known(told=judge.told_by_experience), judge.rate_of(tolerance)
+        knowledge, rate = Known(told=judge.told_by_experience), judge.rate_of(tolerance)
         if rate is None:
-            return known
+            return knowledge
         table, m = judge.where(rate), len(judge.labels.names)
         first, second, *_ = [*dict.fromkeys([*telling(table), *range(m)]), 0]
-        known = known._replace(forms=table.tolist(), limits=judge.thresholds(rate))
-        return known._replace(plane=(first, second))
+        knowledge = knowledge._replace(forms=table.tolist(), limits=judge.thresholds(rate))
+        return knowledge._replace(plane=(first, second))
     if not isinstance(judge, LearntRisk) or not judge.n_variables:
         return Known()
-    learnt, survived = judge.state, judge.state.survived
-    said = harm(judge.harm, learning=judge.learning).removeprefix("; ")
+    learnt, survivals = judge.state, judge.state.survived
+    text = harm(judge.harm, learning=judge.learning).removeprefix("; ")
     fails = learnt.forms[learnt.forms[:, SAYS] == FAILS]
-    spread = survived.std(0) if len(survived) else np.zeros(judge.n_variables)
+    spread = survivals.std(0) if len(survivals) else np.zeros(judge.n_variables)
     return Known(
         _plane(learnt, fails),
-        survived[:: 1 + len(survived) // _MOST_SURVIVED].tolist(),
+        survivals[:: 1 + len(survivals) // _MOST_SURVIVED].tolist(),
         learnt.failures.tolist(),
         fails.tolist(),
         learnt.centres.tolist(),
         (learnt.radii[:, None] * spread).tolist(),
         judge.told_by_experience,
-        said,
+        text,
     )
 
 
 def first_of_its_kind(seen: Sequence[float], before: Known, after: Known) -> str:
     """What was learnt of a failure there, if nothing told of such failures before; else nothing."""
-    now, known = _kinds(after, seen), _kinds(before)
-    return "" if not now or now & known or _kinds(before, seen) else after.told.partition(";")[0]
+    now, kinds = _kinds(after, seen), _kinds(before)
+    return "" if not now or now & kinds or _kinds(before, seen) else after.told.partition(";")[0]
 
 
 def _kinds(known: Known, seen: Sequence[float] | None = None) -> set[tuple[float, float]]:
@@ -279,11 +279,11 @@ def _kinds(known: Known, seen: Sequence[float] | None = None) -> set[tuple[float
 
 def _plane(learnt: State, fails: Any) -> tuple[int, int]:
     """Variables by which it fails, then those that differ most where it failed."""
-    named = telling(fails)
+    order = telling(fails)
     if len(learnt.failures) and len(learnt.survived):
         apart = np.abs(learnt.failures.mean(0) - learnt.survived.mean(0))
-        named += np.argsort(-apart / (learnt.survived.std(0) + 1e-9), kind="stable").tolist()
-    first, second, *_ = [*dict.fromkeys([*named, *range(len(learnt.origin))]), 0]
+        order += np.argsort(-apart / (learnt.survived.std(0) + 1e-9), kind="stable").tolist()
+    first, second, *_ = [*dict.fromkeys([*order, *range(len(learnt.origin))]), 0]
     return first, second
 
 
@@ -338,11 +338,11 @@ def _on_the_road(story: Story, frame: Frame, cars: Cars) -> Story:
 
     warns = cars.time_to_collision < _TTC.threshold
     # A record may hold the speeds after the impact.
-    closing = cars.v_follower - cars.v_leader
+    closing_speed = cars.v_follower - cars.v_leader
     return story._replace(
         time_to_collision=first(story.time_to_collision, moves and warns),
         time_headway=first(story.time_headway, moves and cars.time_headway < near),
-        closing=closing if closing > 0.0 or not frame.failed else story.closing,
+        closing=closing_speed if closing_speed > 0.0 or not frame.failed else story.closing,
         leader_brakes=first(story.leader_brakes, brakes),
         leader_decel=max(story.leader_decel, -cars.a_leader if brakes else 0.0),
     )

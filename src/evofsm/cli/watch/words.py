@@ -57,11 +57,11 @@ class Told(NamedTuple):
 def introduce(start: Start) -> dict[str, str]:
     """What is said of a run before it begins: what the reviser does in it, and what was learnt."""
     before = f"Learnt from {start.learnt} episodes before" if start.learnt else "Began from empty"
-    learning = f"{before}, and goes on learning."
+    note = f"{before}, and goes on learning."
     if start.mode != LIVE:
-        learning = "Recorded: the states as they were at its end."
+        note = "Recorded: the states as they were at its end."
     mode = start.mode if start.acts else "alone"
-    return {"intro": _INTRODUCED.get(mode, _INTRODUCED["shadow"]), "learning": learning}
+    return {"intro": _INTRODUCED.get(mode, _INTRODUCED["shadow"]), "learning": note}
 
 
 def tell(frame: Frame, start: Start) -> Told:
@@ -77,21 +77,21 @@ def tell(frame: Frame, start: Start) -> Told:
     headline = headlines[status]
     if danger is None:
         when = "No danger was seen." if frame.over else "No danger so far."
-        why, done = _no_danger(frame, start), _quiet(frame, start)
+        why, response = _no_danger(frame, start), _quiet(frame, start)
     else:
         when, why = _when(start, story, danger, knows_leaders), _why(danger.began, start)
-        done = _done(danger, frame, start)
+        response = _done(danger, frame, start)
     if not start.acts:
         when = when.replace("Danger began", "An alarm came").replace("No danger", "No alarm")
     if frame.over and danger and story.revised:
-        done += f" In all it changed {story.revised} of {counted(frame.number, 'decision')}."
+        response += f" In all it changed {story.revised} of {counted(frame.number, 'decision')}."
     if frame.failed and story.revised and story.alone > frame.time:
-        done += " The controller alone would have lasted longer."
+        response += " The controller alone would have lasted longer."
     if frame.novel:
         headline += ", the first of its kind"
-        done += f" {_FIRST_FAILURE}: {frame.novel}."
-    told = status, headline, when, why, done, _outcome(frame, start), _alone(frame, start)
-    return Told(*(_UNIT.sub("\u00a0", text) for text in told))
+        response += f" {_FIRST_FAILURE}: {frame.novel}."
+    texts = status, headline, when, why, response, _outcome(frame, start), _alone(frame, start)
+    return Told(*(_UNIT.sub("\u00a0", text) for text in texts))
 
 
 def _status(frame: Frame, tolerance: float) -> str:
@@ -160,20 +160,20 @@ def _why(began: Frame, start: Start) -> str:
     if not start.acts:
         return f"At {began.here}: {began.reason}."
     if cars is None:
-        wanted = f"At {began.here}, the controller wanted {_action(began.proposed, start)}"
+        text = f"At {began.here}, the controller wanted {_action(began.proposed, start)}"
     else:
-        closing = cars.v_follower - cars.v_leader
-        pace = f"{abs(closing):.1f} m/s {'faster' if closing > 0.0 else 'slower'} than it"
-        if abs(closing) <= _EQUAL_SPEED:
+        excess_speed = cars.v_follower - cars.v_leader
+        pace = f"{abs(excess_speed):.1f} m/s {'faster' if excess_speed > 0.0 else 'slower'} than it"
+        if abs(excess_speed) <= _EQUAL_SPEED:
             pace = "as fast as it"
         at = f"{cars.gap:.1f} m behind the leader at {cars.v_follower:.0f} m/s, {pace}"
-        wanted = f"{at}, the driver wanted {_wish(began.proposed[0])}"
+        text = f"{at}, the driver wanted {_wish(began.proposed[0])}"
     if began.why:
-        return f"{wanted}: a risk of {risk.risk:.0%}. After that {began.why}."
+        return f"{text}: a risk of {risk.risk:.0%}. After that {began.why}."
     if cars is None or math.isnan(risk.critical):  # which recordings do not hold
-        return f"{wanted}: a risk of {risk.risk:.0%}."
+        return f"{text}: a risk of {risk.risk:.0%}."
     return (
-        f"{wanted}. After that, not even braking in full (by {cars.decel:.1f} m/s²) would avoid "
+        f"{text}. After that, not even braking in full (by {cars.decel:.1f} m/s²) would avoid "
         f"a collision if the leader braked harder than {risk.critical:.1f} m/s² – and leaders "
         f"must be expected to brake by up to {began.needed:.1f} m/s²."
     )
@@ -182,7 +182,7 @@ def _why(began: Frame, start: Start) -> str:
 def _done(danger: Danger, frame: Frame, start: Start) -> str:
     if not start.acts:
         return f"Alarm in {counted(danger.wishes, 'row')}: nobody acts here."
-    first, called = danger.stepped_in, danger.called
+    first, call = danger.stepped_in, danger.called
     n = danger.wishes
     risky = f"of {n} wishes that were too risky" if n > 1 else "wish that was too risky"
     if first is not None:
@@ -192,12 +192,12 @@ def _done(danger: Danger, frame: Frame, start: Start) -> str:
             f"{_instead(first.executed, first.proposed, start)}. "
             f"It changed {danger.revised} {risky}{now}."
         )
-    if called is None:
+    if call is None:
         idle = f"{frame.idle}, and it" if frame.idle else "the reviser"
         return f"Nothing: {idle} knew nothing better."
     return (
-        f"Nothing: {frame.idle}. From {clock(called.time, start)} on it would have changed "
-        f"{danger.advised} {risky}, at first {_instead(called.advised, called.proposed, start)}."
+        f"Nothing: {frame.idle}. From {clock(call.time, start)} on it would have changed "
+        f"{danger.advised} {risky}, at first {_instead(call.advised, call.proposed, start)}."
     )
 
 
@@ -223,16 +223,16 @@ def _instead(better: Sequence[float], wished: Sequence[float], start: Start) -> 
 def _action(action: Sequence[float], start: Start) -> str:
     if start.discrete:
         return action_name(int(action[0])) if math.isfinite(action[0]) else "nothing"
-    shown = [float(f"{value:.2g}") for value in action[:_COMPONENTS]]
-    text = action_text(shown[0] if len(action) == 1 else shown)
+    components = [float(f"{value:.2g}") for value in action[:_COMPONENTS]]
+    text = action_text(components[0] if len(action) == 1 else components)
     return text if len(action) <= _COMPONENTS else f"{text[:-1]}, ...)"
 
 
 def _outcome(frame: Frame, start: Start) -> str:
     story, parts, when, cars = frame.story, [], clock(frame.time, start), frame.cars
     if cars is None:
-        ended = f"Failed at {when}." if frame.failed else f"It ended at {when} without failure."
-        return ended if frame.over else ""
+        text = f"Failed at {when}." if frame.failed else f"It ended at {when} without failure."
+        return text if frame.over else ""
     if not math.isnan(story.leader_brakes):
         since = clock(story.leader_brakes, start)
         parts.append(f"The leader braked from {since} on, by up to {story.leader_decel:.1f} m/s².")
