@@ -38,63 +38,63 @@ def audit(
     from evofsm.guard import Head
     from evofsm.guard import audit as examine
 
-    found = examine(
+    report = examine(
         file,
         None if head is None else Head.parse(head),
         failed=None if failed is None else imported(failed),
     )
     if as_json:
-        told = {**found._asdict(), "head": str(found.head), "is_good": found.is_good}
-        print_json({"file": file, **told})
+        document = {**report._asdict(), "head": str(report.head), "is_good": report.is_good}
+        print_json({"file": file, **document})
     else:
-        show(facts(str(file), list(_facts(found))))
-        if found.is_good and head is None:
+        show(facts(str(file), list(_facts(report))))
+        if report.is_good and head is None:
             show(f"\n{_KEEP}")
-    return 0 if found.is_good else 1
+    return 0 if report.is_good else 1
 
 
 def _facts(found: Audit) -> Iterator[tuple[str, str]]:
     from evofsm.fsm.validation import counted
 
-    finding, contents = found.finding, found.contents
-    if finding is None:
+    breach, contents = found.finding, found.contents
+    if breach is None:
         yield "chain", f"unbroken: {counted(found.head.number, 'record')}"
     else:
-        yield "chain", f"TAMPERED WITH at record {finding.record}: {finding.explanation}"
+        yield "chain", f"TAMPERED WITH at record {breach.record}: {breach.explanation}"
     if found.half_written:
         cause = "as by a crash, or it is being written now"
         yield "", f"its last line is half written ({found.half_written} bytes): {cause}"
-    held = f"{counted(contents.sessions, 'session')}, {counted(contents.episodes, 'episode')}, "
-    held += counted(contents.decisions, "decision")
-    held += f" ({contents.spoke:,} changed something or warned)"
+    text = f"{counted(contents.sessions, 'session')}, {counted(contents.episodes, 'episode')}, "
+    text += counted(contents.decisions, "decision")
+    text += f" ({contents.spoke:,} changed something or warned)"
     if contents.settings:
-        held += f", {counted(contents.settings, 'setting change')}"
-    yield "holds", held + ("" if finding is None else ", so far")
+        text += f", {counted(contents.settings, 'setting change')}"
+    yield "holds", text + ("" if breach is None else ", so far")
     yield from _of_replay(found)
-    if finding is None:
+    if breach is None:
         yield "head", str(found.head)
 
 
 def _of_replay(found: Audit) -> Iterator[tuple[str, str]]:
     from evofsm.fsm.validation import counted
 
-    difference, replayed = found.difference, found.replayed
+    difference, n_matches = found.difference, found.replayed
     decisions = found.contents.decisions
-    good = f"{counted(replayed, 'decision')} as recorded, to the last bit"
+    text = f"{counted(n_matches, 'decision')} as recorded, to the last bit"
     if difference is None:
-        yield "replay", good
+        yield "replay", text
     else:
         yield "replay", f"DIFFERS at record {difference.record}: {difference.explanation}"
-        for name, recorded, again in difference.fields[:_FIELDS]:
-            yield "", f"{name}: recorded {_short(recorded)}, replayed {_short(again)}"
-        yield "", f"before it {good}"
+        for name, original, replay in difference.fields[:_FIELDS]:
+            yield "", f"{name}: recorded {_short(original)}, replayed {_short(replay)}"
+        yield "", f"before it {text}"
     for why in dict.fromkeys(found.not_replayed):
         yield "", f"{counted(found.not_replayed.count(why), 'session')} not replayed: {why}"
-    if difference is None and replayed < decisions:
-        yield "", f"{counted(decisions - replayed, 'decision')} compared with nothing"
+    if difference is None and n_matches < decisions:
+        yield "", f"{counted(decisions - n_matches, 'decision')} compared with nothing"
     if difference is not None and found.other_makers:
-        then = ", ".join(f"{field.name} {field.recorded}" for field in found.other_makers)
-        yield "", f"it was recorded with {then}: floats may differ there"
+        makers = ", ".join(f"{field.name} {field.recorded}" for field in found.other_makers)
+        yield "", f"it was recorded with {makers}: floats may differ there"
 
 
 def _short(text: str) -> str:

@@ -83,19 +83,19 @@ def drive(
     A SUMO configuration (my.sumocfg) is run as it is, once, with guards in the cars that --vehicles
     names; of all else only --mode (act or shadow), --tolerance and --json hold then.
     """
-    given = {"learn": learn, "frozen": frozen, "workers": workers}
-    given |= {"out": out, "audit": audit, "mcap": mcap}
-    given = {name: value for name, value in given.items() if value is not None}
+    options = {"learn": learn, "frozen": frozen, "workers": workers}
+    options |= {"out": out, "audit": audit, "mcap": mcap}
+    options = {name: value for name, value in options.items() if value is not None}
     if family.endswith(".sumocfg"):
-        if given:
+        if options:
             text = "is for families of scenarios, not for a configuration"
-            raise ValueError(f"--{next(iter(given))} {text}")
+            raise ValueError(f"--{next(iter(options))} {text}")
         from evofsm.cli.sumocfg import run_configuration
 
         run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
     for (a, b), reason in _EXCLUDE.items():
-        if a in given and b in given:
+        if a in options and b in options:
             raise ValueError(f"--{a} and --{b} exclude each other: {reason}")
     require_world(world, **({"polars": "tables"} if out is not None and workers is None else {}))
     require(**({} if mcap is None else {"mcap": "mcap"}))
@@ -103,24 +103,24 @@ def drive(
     from evofsm.driving import load_family
     from evofsm.guard import Mode
 
-    chosen = load_family(family).with_switches(split_names(switches))
-    before, reached, digest = None, 0, ""
+    scenarios = load_family(family).with_switches(split_names(switches))
+    before, n_learnt, digest = None, 0, ""
     if (start := learn or frozen) is not None:
-        before, reached = load_guard(start)
+        before, n_learnt = load_guard(start)
         digest = sha256((start / GUARD).read_bytes()).hexdigest()
     learns = frozen is None and workers is None
-    asked = chosen, reviser, judge, Mode(mode), tolerance, seed, world
-    setup = Setup(*asked, learns, reached, digest)
+    choices = scenarios, reviser, judge, Mode(mode), tolerance, seed, world
+    setup = Setup(*choices, learns, n_learnt, digest)
     with closing(Results(setup, make_guard(setup, before), out)) as results:
         if mcap is not None and results.rows:
-            found = f"{out} has {len(results.rows):,} episodes already; name another folder"
-            raise ValueError(f"--mcap holds what one run drives, but {found}")
+            fault = f"{out} has {len(results.rows):,} episodes already; name another folder"
+            raise ValueError(f"--mcap holds what one run drives, but {fault}")
         try:
             if workers is not None:
                 with progress("Driving", episodes) as move:
-                    driving = drive_at_once(results, episodes, workers, move)
+                    summary = drive_at_once(results, episodes, workers, move)
             else:
-                driving = _drive_in_turn(results, episodes, audit, mcap)
+                summary = _drive_in_turn(results, episodes, audit, mcap)
         except KeyboardInterrupt:
             if out is None:
                 raise
@@ -128,9 +128,9 @@ def drive(
             warn(f"stopped after {how_far}; the same command goes on from there")
             return 130
     if as_json:
-        print_json({**asdict(driving.row), "lead_times": driving.lead_times})
+        print_json({**asdict(summary.row), "lead_times": summary.lead_times})
         return None
-    show(facts("What came of driving", _summary(driving, setup)))
+    show(facts("What came of driving", _summary(summary, setup)))
     if out is not None:
         say(f"What was learnt, and every episode: {out}")
     if mcap is not None:
@@ -160,12 +160,12 @@ def _drive_in_turn(
         progress("Driving", episodes) as move,
     ):
         record = None if run is None else run.add
-        driving = drive_in_turn(results, episodes, place, move, log, record)
+        summary = drive_in_turn(results, episodes, place, move, log, record)
         if run is not None:
-            run.attach(learners_of(driving.guard)[0].model(**setup.family.labels._asdict()))
+            run.attach(learners_of(summary.guard)[0].model(**setup.family.labels._asdict()))
     if log is not None:
         warn(f"head of {audit}, to be kept elsewhere: {log.head}")
-    return driving
+    return summary
 
 
 # -- What came of it ------------------------------------------------------------------------------
@@ -187,12 +187,12 @@ def _summary(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
     if row.rear_ends:
         yield "rear-ended", f"{row.rear_ends}"
     yield "mobility", f"{row.mobility:.2f} of the way that the controller makes by itself"
-    changed = f"{row.intervention_rate:.1%} of decisions"
-    yield "interventions", f"{changed}; mean change {row.mean_change:.2f} m/s²"
+    interventions = f"{row.intervention_rate:.1%} of decisions"
+    yield "interventions", f"{interventions}; mean change {row.mean_change:.2f} m/s²"
     yield "comfort", f"RMS jerk {row.jerk:.2f} m/s³"
     if times := driving.lead_times:
-        warned = sum(time > 0.0 for time in times)
-        text = f"{warned} of {len(times)} collisions had an alarm that stayed on"
+        n_alarms = sum(time > 0.0 for time in times)
+        text = f"{n_alarms} of {len(times)} collisions had an alarm that stayed on"
         yield "lead time", f"{text}; median {median(times):.1f} s before"
     yield "learnt", _learnt(driving.guard)
 
@@ -205,5 +205,5 @@ def _learnt(guard: Guard) -> str:
     if isinstance(judge, LatentRisk):
         ends = sum(state.is_dead_end for state in assess_states(machine, judge))
         states += f", {ends} of them dead ends"
-    told = getattr(judge, "told_by_experience", "")
-    return f"{states}; {told}" if told else states
+    experience = getattr(judge, "told_by_experience", "")
+    return f"{states}; {experience}" if experience else states

@@ -103,8 +103,8 @@ class Driving(NamedTuple):
 
 def load_guard(folder: Path) -> tuple[Guard, int]:
     """What a folder of results holds, and from how many episodes it has learnt."""
-    reached = store.read_header(folder / GUARD).provenance.get("episodes", 0)
-    return Guard.load(folder / GUARD), int(reached)
+    n_learnt = store.read_header(folder / GUARD).provenance.get("episodes", 0)
+    return Guard.load(folder / GUARD), int(n_learnt)
 
 
 def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
@@ -113,8 +113,8 @@ def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     if name not in ("least-risk", "none", *FIXED_MEASURES):
         raise ValueError(f"there is no reviser {name!r}; there are {', '.join(REVISERS)}")
     machine, judge = (None, None) if before is None else learners_of(before)
-    if judge is not None and (found := name_judge(judge)) != setup.judge:
-        raise ValueError(f"what was learnt is of the judge {found!r}, not of {setup.judge!r}")
+    if judge is not None and (kind := name_judge(judge)) != setup.judge:
+        raise ValueError(f"what was learnt is of the judge {kind!r}, not of {setup.judge!r}")
     guard = guard_for_family(
         family,
         tolerance=setup.tolerance,
@@ -144,7 +144,7 @@ class Results:
     def __init__(self, setup: Setup, guard: Guard, folder: Path | None = None) -> None:
         self.setup = setup
         self.folder = folder
-        #: As the guard is after `done` episodes, where it learns.
+        #: As the guard is after all `rows`, where it learns.
         self.guard = guard
         self.rows: dict[int, Outcomes] = {}
         self._journal: Journal | None = None
@@ -161,11 +161,11 @@ class Results:
             self._journal.go_on(setup.settings, "run it with those, or name another folder")
             self.rows = {int(row["episode"]): row for row in self._journal.records}
             if setup.learn and self.rows:
-                learnt = 0
+                n_learnt = 0
                 if (folder / GUARD).exists():
-                    saved, learnt = load_guard(folder)
-                    self.guard = make_guard(setup, saved)
-                for number in self.rows.keys() - range(setup.first, learnt):
+                    guard, n_learnt = load_guard(folder)
+                    self.guard = make_guard(setup, guard)
+                for number in self.rows.keys() - range(setup.first, n_learnt):
                     del self.rows[number]  # it came after what was learnt
         except BaseException:
             self._journal.close()
@@ -180,19 +180,19 @@ class Results:
 
     def show(self, move: Advance) -> None:
         """Tell how many were driven, and with how many collisions."""
-        done, met = len(self.rows), self._collisions
-        rate = f" ({met} collisions, {met / done:.1%})" if done else ""
-        move(done, description=f"Driving{rate}")
+        n_episodes, collisions = len(self.rows), self._collisions
+        rate = f" ({collisions} collisions, {collisions / n_episodes:.1%})" if n_episodes else ""
+        move(n_episodes, description=f"Driving{rate}")
 
     def save_guard(self, *, now: bool = False) -> None:
         """Write what was learnt from all rows, if it was not for a while."""
         if self.folder is None or not (now or time.monotonic() - self._saved >= _EVERY):
             return
         setup = self.setup
-        told = {"family": setup.family.name, "seed": setup.seed, "reviser": setup.reviser}
-        reached = setup.learnt + len(self.rows) * setup.learn
+        provenance = {"family": setup.family.name, "seed": setup.seed, "reviser": setup.reviser}
+        n_learnt = setup.learnt + len(self.rows) * setup.learn
         try:
-            self.guard.save(self.folder / GUARD, {**told, "episodes": reached})
+            self.guard.save(self.folder / GUARD, {**provenance, "episodes": n_learnt})
         except OSError as error:
             error.add_note("what was driven is kept: make room, and run the same command again")
             raise
@@ -234,8 +234,8 @@ def _write_decisions(path: Path, rows: Sequence[Outcomes]) -> None:
     with needs("polars", "tables", "writing decisions as Parquet"):
         import polars
     kinds = {name: polars.List(DECISION_COLUMNS[name].kind) for name in DECISION_TABLE}
-    told = [{"episode": row["episode"], **row["decided"]} for row in rows]
-    table = polars.DataFrame(told, {"episode": polars.Int64, **kinds}).explode(*kinds)
+    records = [{"episode": row["episode"], **row["decided"]} for row in rows]
+    table = polars.DataFrame(records, {"episode": polars.Int64, **kinds}).explode(*kinds)
     table = table.with_columns(polars.selectors.float().fill_null(math.nan))  # as JSON has none
     with store.replacing(path) as file:
         table.write_parquet(file)
@@ -258,18 +258,18 @@ def drive_in_turn(
     record: Callable[[Episode], None] | None = None,
 ) -> Driving:
     """Drive those episodes that the results lack, one after the other."""
-    setup, guard, done = results.setup, results.guard, len(results.rows)
-    if setup.learn and done > episodes:
-        raise ValueError(f"{results.folder} has driven {done} episodes, more than {episodes}")
+    setup, guard, n_episodes = results.setup, results.guard, len(results.rows)
+    if setup.learn and n_episodes > episodes:
+        raise ValueError(f"{results.folder} has driven {n_episodes} episodes, more than {episodes}")
     guard.audit, guard.explaining = audit, record is not None
     trial = setup.trial(guard, world)
     for number in range(setup.first, setup.first + episodes):
         if number in results.rows:
             continue
-        driven, row = trial.drive(number)
+        episode, row = trial.drive(number)
         if record is not None:
-            record(driven)
-        results.add({**row, "decided": _decided(driven)})
+            record(episode)
+        results.add({**row, "decided": _decided(episode)})
         if setup.learn:
             results.save_guard()
         results.show(move)
@@ -289,13 +289,13 @@ def drive_at_once(
     guard = results.guard.copy(states=False)  # what is decided does not depend on them
     guard.freeze()
     trial = results.setup.trial(guard, results.setup.world)
-    missing = [number for number in range(episodes) if number not in results.rows]
-    size = max(1, min(_BATCH, len(missing) // (8 * workers)))
+    numbers = [number for number in range(episodes) if number not in results.rows]
+    size = max(1, min(_BATCH, len(numbers) // (8 * workers)))
     results.show(move)
     # Forking a process that has started threads may hang; a fresh one costs a second.
     pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_work)
     try:
-        for row in pool.map(trial, missing, chunksize=size):
+        for row in pool.map(trial, numbers, chunksize=size):
             results.add(row)
             results.show(move)
         return results.summed_up(episodes)

@@ -35,8 +35,8 @@ def export(
 
         if out is None:
             raise ValueError(f"--to {to} prints nothing: name a file, of c99 a folder, by --out")
-        saved = file / "guard.evofsm" if file.is_dir() else file
-        guard = Guard.load(saved, failed=lambda seen: False)
+        path = file / "guard.evofsm" if file.is_dir() else file
+        guard = Guard.load(path, failed=lambda seen: False)
         if mode and hasattr(guard.reviser, "mode"):
             guard.reviser.mode = Mode(mode)
         return write_c99(guard, out, prefix) if to == "c99" else write_fmu(guard, out)
@@ -45,14 +45,14 @@ def export(
     from evofsm.io import graphs
 
     model, dead_ends = _learnt(file)
-    drawn = {"least": least, "evidence": evidence, "dead_ends": dead_ends if to == "dot" else None}
-    given = {name: value for name, value in drawn.items() if value is not None}
-    text = visible(getattr(graphs, f"to_{to}")(model, **given))
+    style = {"least": least, "evidence": evidence, "dead_ends": dead_ends if to == "dot" else None}
+    arguments = {name: value for name, value in style.items() if value is not None}
+    text = visible(getattr(graphs, f"to_{to}")(model, **arguments))
     if out is None:
         sys.stdout.write(text)
         return
-    with store.replacing(out) as written:
-        written.write(text.encode())
+    with store.replacing(out) as stream:
+        stream.write(text.encode())
 
 
 def _refuse_learnt(out: Path | None) -> None:

@@ -48,8 +48,8 @@ def guard_where_nobody_acts(
     """
     runs, dt = _runs(episodes), float(episodes[0].dt)
     rows, names, units = [e.observations for e in episodes], labels.names, labels.units
-    asked: dict[str, Any] = {"dt": dt, "horizon": horizon, "hold": hold}
-    judge = Foresight.learn_log(rows, runs.failed, **asked, names=names, units=units)
+    settings: dict[str, Any] = {"dt": dt, "horizon": horizon, "hold": hold}
+    judge = Foresight.learn_log(rows, runs.failed, **settings, names=names, units=units)
     tolerance = judge.tolerance_of(RATE) if tolerance is None else tolerance
     return _guard_of(judge, tolerance, machine, learn=False)
 
@@ -104,11 +104,11 @@ def show_foreseen(
     columns = judge.columns(runs.rows, runs.starts)
     if plot is not None:
         _draw(judge, tolerance, guard.machine, runs, times, columns, plot)
-    found = {**_document(judge, tolerance, runs, times, columns), "failures_at_once": at_once}
+    document = {**_document(judge, tolerance, runs, times, columns), "failures_at_once": at_once}
     if as_json:
-        print_json({"file": file, **found})
+        print_json({"file": file, **document})
     else:
-        show(*_tables(found, judge, title, held_out))
+        show(*_tables(document, judge, title, held_out))
 
 
 def _of_two_rows(episodes: Sequence[Chunk]) -> Sequence[Chunk]:
@@ -123,14 +123,14 @@ def _runs(episodes: Sequence[Chunk]) -> Runs:
 def _document(
     judge: Foresight, tolerance: float, runs: Runs, times: Floats, columns: Floats
 ) -> dict[str, Any]:
-    chosen, alarms, limits = judge.rate_of(tolerance), [], []
-    for rate, stated in enumerate(RATES):
-        row: dict[str, Any] = {"stated": stated, "is_own": rate == chosen}
+    own_rate, alarms, limits = judge.rate_of(tolerance), [], []
+    for rate, budget in enumerate(RATES):
+        row: dict[str, Any] = {"stated": budget, "is_own": rate == own_rate}
         for kind, plain in (("learnt", None), ("plain", True)):
-            came, _ = judge.tally(runs, rate, plain=plain, columns=columns)
-            row[kind] = {**came._asdict(), "false_a_day": came.rate}
+            tally, _ = judge.tally(runs, rate, plain=plain, columns=columns)
+            row[kind] = {**tally._asdict(), "false_a_day": tally.rate}
         alarms.append(row)
-        row = {"stated": stated, "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 3])]}
+        row = {"stated": budget, "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 3])]}
         row |= {"share_right": judge.shares[rate], "learnt": judge.words(rate) or "none"}
         row |= {"plain": judge.words(rate, plain=True) or "none"}
         row["thresholds"] = [
@@ -141,12 +141,12 @@ def _document(
     head: dict[str, Any] = {"rows": len(times), "episodes": len(runs.starts)}
     head |= {"failures": int(runs.failed.sum()), "seconds": len(times) * judge.dt}
     head |= {"horizon": judge.horizon * judge.dt, "tolerance": tolerance}
-    listed = [] if chosen is None else list(_listed(judge, chosen, runs, times, columns))
-    missed = [row for row in listed if "lasts" not in row]
-    listed = [row for row in listed if "lasts" in row]
+    entries = [] if own_rate is None else list(_listed(judge, own_rate, runs, times, columns))
+    misses = [row for row in entries if "lasts" not in row]
+    hits = [row for row in entries if "lasts" in row]
     fails = [dict(zip(("where", "came", "failed"), row, strict=True)) for row in judge.fails(runs)]
-    told = {"alarms": alarms, "limits": limits, "fails": fails}
-    return {**head, **told, "listed": listed, "missed": missed}
+    tables = {"alarms": alarms, "limits": limits, "fails": fails}
+    return {**head, **tables, "listed": hits, "missed": misses}
 
 
 def _listed(
@@ -159,17 +159,17 @@ def _listed(
         edges = np.flatnonzero(np.diff(on[first:end], prepend=False, append=False)) + first
         fails, why = end - 1 if runs.failed[k] else end + horizon, ""
         foreseen = not runs.failed[k]
-        for begun, over in edges.reshape(-1, 2).tolist():
-            if begun == fails:
+        for onset, stop in edges.reshape(-1, 2).tolist():
+            if onset == fails:
                 why = "; one came with it"
                 continue
-            false = false_times(begun, over, fails, horizon)
-            right = bool(runs.failed[k]) and false * horizon < over - begun
+            false = false_times(onset, stop, fails, horizon)
+            right = bool(runs.failed[k]) and false * horizon < stop - onset
             foreseen |= right
-            passed = judge.passed(columns[:, begun])
-            row = {"episode": k, "row": begun, "time": times[begun], "failed": right}
-            row |= {"lasts": (over - begun) * judge.dt, "false": int(false)}
-            yield {**row, "reason": judge.reason(rate, runs.rows[begun], passed)}
+            limits = judge.passed(columns[:, onset])
+            row = {"episode": k, "row": onset, "time": times[onset], "failed": right}
+            row |= {"lasts": (stop - onset) * judge.dt, "false": int(false)}
+            yield {**row, "reason": judge.reason(rate, runs.rows[onset], limits)}
         if not foreseen:
             row = {"episode": k, "row": fails, "time": times[fails]}
             yield {**row, "reason": f"no alarm within {span(horizon * judge.dt)} before it{why}"}
@@ -183,9 +183,9 @@ def _tables(
     text, rows, bold = "none: cross-validated, no alarm was better than chance", [], []
     for k, alarm in enumerate(found["alarms"]):
         row = [f"{alarm['stated']:g}"]
-        for came in (alarm["learnt"], alarm["plain"]):
-            share, ahead = f"{came['foreseen']} of {came['failures']}", span(came["lead"])
-            row += [share, ahead, f"{came['false_a_day']:.2g}"]
+        for tally in (alarm["learnt"], alarm["plain"]):
+            share, ahead = f"{tally['foreseen']} of {tally['failures']}", span(tally["lead"])
+            row += [share, ahead, f"{tally['false_a_day']:.2g}"]
         rows.append(row)
         if alarm["is_own"]:
             text = f"{row[1]} failures foreseen, {row[2]} ahead (mean; not foreseen: 0)"
@@ -202,13 +202,13 @@ def _tables(
     yield facts(title, pairs)
     title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
     yield table(title, _HEADER, rows, bold=bold)
-    said = []
-    for stated, k in judge.alarms.items():
+    places = []
+    for rates, k in judge.alarms.items():
         limit = found["limits"][k]
         is_other = limit["kind"] != "plain" and limit["plain"] != "none"
         beside = f"; plain thresholds would be {limit['plain']}" if is_other else ""
-        said.append((stated, f"{judge.of(k)}{beside}"))
-    yield facts("\nWhere they alarm, by false alarms a day", said)
+        places.append((rates, f"{judge.of(k)}{beside}"))
+    yield facts("\nWhere they alarm, by false alarms a day", places)
     rows = [[x["where"], f"{x['came']:,}", f"{x['failed']:,}"] for x in found["fails"]]
     header = "it fails where", "episodes that came there", "of them failed"
     yield table("\nWhere it fails, as it was learnt", header, rows)
@@ -220,10 +220,10 @@ def _tables(
         rows.append([f"{hit['episode'] + 1}", date(hit["time"]), span(hit["lasts"]), failed, why])
     title = _last(found["listed"], "Alarms")
     yield table(title, ("episode", "time", "lasts", "failed", "why"), rows, left=(0, 4))
-    if missed := found["missed"]:
-        rows = [[f"{x['episode'] + 1}", date(x["time"]), x["reason"]] for x in missed[-_LISTED:]]
+    if misses := found["missed"]:
+        rows = [[f"{x['episode'] + 1}", date(x["time"]), x["reason"]] for x in misses[-_LISTED:]]
         header = "episode", "time", "why"
-        yield table(_last(missed, "Failures that were not foreseen"), header, rows, left=(0, 2))
+        yield table(_last(misses, "Failures that were not foreseen"), header, rows, left=(0, 2))
 
 
 def _last(hits: Sequence[Any], what: str) -> str:
@@ -250,18 +250,18 @@ def _draw(
     """Variables, states, risk, alarms and failures over time: all of it, and the last failure."""
     from evofsm import plot
 
-    chosen = judge.rate_of(tolerance)
-    on = judge.tally(runs, chosen or 0, columns=columns)[1]
-    risk = on * (0.0 if chosen is None else judge.shares[chosen])  # as a live row tells it
+    own_rate = judge.rate_of(tolerance)
+    on = judge.tally(runs, own_rate or 0, columns=columns)[1]
+    risk = on * (0.0 if own_rate is None else judge.shares[own_rate])  # as a live row tells it
     failed, ends = np.zeros(len(risk), np.bool_), runs.last
     failed[ends[runs.failed]] = True
     # Of those that lasted for a while, if there are any, the last one that failed, if one did.
     number = int(np.lexsort([runs.starts, runs.failed, runs.lengths > judge.horizon])[-1])
     last = int(ends[number])
     near = max(int(runs.starts[number]), last - 4 * judge.horizon)
-    limits = [] if chosen is None else judge.thresholds(chosen)
-    stated = next((rates for rates, last in judge.alarms.items() if chosen == last), "")
-    alarm = f", alarm for {stated} false a day" if stated else ", no alarm"
+    limits = [] if own_rate is None else judge.thresholds(own_rate)
+    rate_text = next((rates for rates, last in judge.alarms.items() if own_rate == last), "")
+    alarm = f", alarm for {rate_text} false a day" if rate_text else ", no alarm"
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
     model = None if machine is None or not machine.n_states else machine.model()
     count = len(names) + 1 + (model is not None)
@@ -271,7 +271,7 @@ def _draw(
         title += f": {date(times[last])}" * bool(times[last] >= DATES)
         parts = {f"{len(ends):,} episodes{alarm}": slice(None), title: slice(near, last + 1)}
         for column, (title, part) in zip(axes.T, parts.items(), strict=True):
-            seen = times[part], runs.rows[part], names, risk[part], failed[part]
-            plot.history(column, *seen, tolerance, model=model, limits=limits)
+            series = times[part], runs.rows[part], names, risk[part], failed[part]
+            plot.history(column, *series, tolerance, model=model, limits=limits)
             column[0].set_title(title, loc="left")
         axes[-1, 1].get_legend().remove()

@@ -48,18 +48,18 @@ def inspect(
     provenance = {} if header is None else header.provenance
     if plot is not None:
         title = f"States of {file.name}" + (f" over {Path(log).name}" if log else "")
-        seen = _logged(log, model, provenance.get("read with", {}))
-        _draw(model, guard, plot, axes, seen, title)
-    told = getattr(guard and guard.judge, "told_by_experience", None)
-    known = [] if told is None else [("experience", str(told))]
+        rows = _logged(log, model, provenance.get("read with", {}))
+        _draw(model, guard, plot, axes, rows, title)
+    experience = getattr(guard and guard.judge, "told_by_experience", None)
+    pairs = [] if experience is None else [("experience", str(experience))]
     if as_json:
-        head = {"file": file, "provenance": provenance, **dict(known)}
+        head = {"file": file, "provenance": provenance, **dict(pairs)}
         print_json({**head, **model_document(model)})
         return
     of_file = [("file", str(file))]
     if header is not None:
         of_file.append(("holds", f"a {header.kind}, written by evofsm {header.library}"))
-    of_file += [*_learnt_from(provenance), *_model_facts(model), *known]
+    of_file += [*_learnt_from(provenance), *_model_facts(model), *pairs]
     show(facts("Model", of_file), *tables_of(model))
 
 
@@ -73,10 +73,10 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None, Guard | None]:
     from evofsm.guard import Guard
 
     if place.is_dir():
-        found = next((place / name for name in _MODELS if (place / name).exists()), None)
-        if found is None:
+        path = next((place / name for name in _MODELS if (place / name).exists()), None)
+        if path is None:
             raise FileNotFoundError(f"{place}: there is neither {' nor '.join(_MODELS)} in it")
-        return load_model(found)
+        return load_model(path)
     if place.suffix == ".mcap":
         from evofsm.io import read_run
 
@@ -110,13 +110,13 @@ def _logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> d
     if log is None:
         return {}
     rows, failed = list[Any](), list[Any]()
-    known = {**read_with} if read_with else {"observe": quoted(model.names)}
-    for chunk in reading_of(**known).traces([log]):
+    options = {**read_with} if read_with else {"observe": quoted(model.names)}
+    for chunk in reading_of(**options).traces([log]):
         rows.append(chunk.observations)
         failed.append(chunk.fails)
-    every, ended = np.concatenate(rows), np.concatenate(failed)
-    shown = ended | (np.arange(len(every)) % (1 + len(every) // _ROWS_SHOWN) == 0)
-    return {"rows": every[shown], "failed": ended[shown]}
+    every, failures = np.concatenate(rows), np.concatenate(failed)
+    is_shown = failures | (np.arange(len(every)) % (1 + len(every) // _ROWS_SHOWN) == 0)
+    return {"rows": every[is_shown], "failed": failures[is_shown]}
 
 
 def _draw(
@@ -130,17 +130,17 @@ def _draw(
     from evofsm.guard.learnt.failure import telling
 
     names = [model.labels.variable(k).split(" [")[0] for k in range(model.n_variables)]
-    asked = [name.split(" [")[0] for name in split_names(axes or "")]
-    pair: Any = [names.index(name) for name in asked if name in names]
+    requests = [name.split(" [")[0] for name in split_names(axes or "")]
+    pair: Any = [names.index(name) for name in requests if name in names]
     if len(pair) != 2 * (axes is not None):
         raise ValueError(f"--axes is {axes}; name two of {', '.join(names)}")
-    judge, told = guard and guard.judge, list[int]()
+    judge, order = guard and guard.judge, list[int]()
     if isinstance(judge, Foresight):
         rate = judge.rate_of(getattr(guard and guard.reviser, "tolerance", 1.0))
         logged["alarm"] = () if rate is None else judge.where(rate)
-        told = [] if rate is None else telling(judge.where(rate))
+        order = [] if rate is None else telling(judge.where(rate))
     away = (model.centers - np.median(model.centers, axis=0)) ** 2  # then what differs at failures
-    told += np.argsort(-(model.endings @ away) / (away.sum(0) + 1e-12), kind="stable").tolist()
+    order += np.argsort(-(model.endings @ away) / (away.sum(0) + 1e-12), kind="stable").tolist()
     with picture(out, 7.2, 5.0) as figure:
         figure.suptitle(title, x=0.01, ha="left")
         if guard is not None and isinstance(judge, LearntRisk):
@@ -148,7 +148,7 @@ def _draw(
         elif model.n_variables == 1:
             plot.graph(model, figure.subplots())
         else:
-            pair = pair or [*dict.fromkeys(told)][:2]
+            pair = pair or [*dict.fromkeys(order)][:2]
             plot.states(model, figure.subplots(), variables=pair, ways=True, **logged)
 
 
@@ -183,18 +183,18 @@ def passages(model: FSMModel, most: int = 12) -> list[Passage]:
 
 def model_document(model: FSMModel) -> dict[str, Any]:
     """All that is printed of a model, for JSON; states and actions from 0."""
-    found = zip(model.centers, model.visits.tolist(), model.created.tolist(), strict=True)
+    states = zip(model.centers, model.visits.tolist(), model.created.tolist(), strict=True)
     intervals = [model.actions and model.actions.interval(r) for r in range(model.n_actions)]
     uses = enumerate(zip(intervals, model.uses.tolist(), strict=True))
     return {
         **{name: getattr(model, name) for name in ("dt", "names", "units", "failures_told")},
         "settings": dict(model.settings),
         "states": [
-            {"state": i, "center": center, "visits": visits, "first_seen": int(created)}
-            for i, (center, visits, created) in enumerate(found)
+            {"state": i, "center": center, "visits": visits, "first_seen": int(row)}
+            for i, (center, visits, row) in enumerate(states)
         ],
         "transitions": passages(model),
-        "actions": [{"action": r, "interval": of, "uses": used} for r, (of, used) in uses],
+        "actions": [{"action": r, "interval": of, "uses": count} for r, (of, count) in uses],
     }
 
 
@@ -207,8 +207,8 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
     heads = map(model.labels.variable, range(model.n_variables))
     centers = zip(*map(_aligned, model.centers.T), strict=True)
     states = [
-        (f"#{i + 1}", *center, f"{visits / total:.1%}", f"{stays[i]:.3f}", f"{created:,.0f}")
-        for i, (center, visits, created) in enumerate(
+        (f"#{i + 1}", *center, f"{visits / total:.1%}", f"{stays[i]:.3f}", f"{row:,.0f}")
+        for i, (center, visits, row) in enumerate(
             zip(centers, model.visits.tolist(), model.created.tolist(), strict=True)
         )
     ]
@@ -224,15 +224,15 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
             "evofsm explain says what came of one)"
         )
     yield ""
-    found = passages(model)
-    if not found:
+    transitions = passages(model)
+    if not transitions:
         yield "The recognised state never changed."
         return
     rows = [
         (f"#{i + 1} → #{j + 1}", f"{times:,}", f"{share:.4f}", f"{learnt:.3f}")
-        for i, j, times, share, learnt in found
+        for i, j, times, share, learnt in transitions
     ]
-    title = f"Transitions that matter: the {len(found)} most frequent"
+    title = f"Transitions that matter: the {len(transitions)} most frequent"
     yield table(title, ("from → to", "times", "share", "learnt"), rows)
     yield (
         "\nTimes and share: of the steps from that state, as recognised. Learnt: probability per "
@@ -296,23 +296,23 @@ def explain(
     if (observation is None) == (state is None):
         raise ValueError("name one situation, by --observation or by --state")
     model, _, guard = load_model(file)
-    done = None if action is None else _index("--action", action, model.n_actions)
+    index = None if action is None else _index("--action", action, model.n_actions)
     if observation is not None:
         if (count := len(_values(observation))) != model.n_variables:
             names = ", ".join(map(model.labels.variable, range(model.n_variables)))
             raise ValueError(f"--observation has {count} values; it needs {names}, in this order")
-        found = [model.explain(action=done, observation=_values(observation))]
+        explanations = [model.explain(action=index, observation=_values(observation))]
     elif state == "all":
-        found = [model.explain(k, done) for k in range(model.n_states)]
+        explanations = [model.explain(k, index) for k in range(model.n_states)]
     else:
-        found = [model.explain(_index("--state", state, model.n_states), done)]
+        explanations = [model.explain(_index("--state", state, model.n_states), index)]
     if as_json:
-        print_json({"file": file, "situations": [_document(model, e) for e in found]})
+        print_json({"file": file, "situations": [_document(model, e) for e in explanations]})
         return
     if not model.failures_told:
         print(textwrap.fill(_UNTOLD, 80))
     here = guard.told_here(_values(observation)) if guard and observation is not None else ""
-    for explanation in found:
+    for explanation in explanations:
         say(textwrap.fill(f"{explanation.text} {here}", 80, subsequent_indent="   "))
 
 

@@ -58,10 +58,10 @@ class Journal:
 
     def go_on(self, settings: Record, otherwise: str) -> None:
         """Refuse, saying what to do, where it has records of other settings."""
-        if not (found := differences(self.settings, settings)):
+        if not (changes := differences(self.settings, settings)):
             return
         if self.records:
-            raise ValueError(f"{self.path} was begun with other settings: {found}; {otherwise}")
+            raise ValueError(f"{self.path} was begun with other settings: {changes}; {otherwise}")
         self.begin_anew(settings)
 
     def append(self, *records: Record, sync: bool = True) -> None:
@@ -98,25 +98,25 @@ class Journal:
 
     def _read(self) -> int:
         """Read what is there, and say up to where it is good; without a record, nothing is."""
-        good, damaged, begun_with = 0, 0, self.settings
+        good, bad_line, settings = 0, 0, self.settings
         for number, line in enumerate(lines(self.path, _LONGEST_RECORD), 1):
             record = _record(line)
             if record is None:
                 if number == 1 and not _line({"settings": self.settings}).startswith(line):
                     raise ValueError(f"{self.path} is no journal")
-                damaged = damaged or number
+                bad_line = bad_line or number
                 continue
-            if damaged:
+            if bad_line:
                 raise ValueError(
-                    f"{self.path}, line {damaged} is damaged (was it edited?); delete that line, "
+                    f"{self.path}, line {bad_line} is damaged (was it edited?); delete that line, "
                     "and what it said is done again"
                 )
             if number == 1:
-                begun_with = record["settings"]
+                settings = record["settings"]
             else:
                 self.records.append(record)
             good += len(line)
-        self.settings = begun_with
+        self.settings = settings
         return good
 
 

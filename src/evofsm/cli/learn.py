@@ -103,8 +103,8 @@ def learn(
     _check_out(out)
     _check_out(guard, "--guard")
     columns, lengths, _, acts = read = reading()
-    lacking = _look_first(files[0], read)
-    if lacking is None:
+    hints = _look_first(files[0], read)
+    if hints is None:
         if out or guard or given_of(reading):
             raise ValueError(f"say what is observed in {files[0]}: --observe; a way stands above")
         return
@@ -114,61 +114,61 @@ def learn(
     encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
     kind = None if guard is None else _judge_of(judge if acts else "learnt", columns)
-    noted = Noted()
-    known = [{"name": file, "bytes": _size(file)} for file in files]
+    notes = Noted()
+    sources = [{"name": file, "bytes": _size(file)} for file in files]
 
     def units_read() -> list[str]:
-        told = {**dict(zip(VARIABLES, UNITS, strict=True)), **noted.units}
-        units = [told.get(name, "") for name in encoder.names]
+        unit_of = {**dict(zip(VARIABLES, UNITS, strict=True)), **notes.units}
+        units = [unit_of.get(name, "") for name in encoder.names]
         return [SI.get(unit, unit) for unit in units]
 
-    kept: list[Chunk] | None = [] if guard is not None and not acts else None
-    with progress("Learning", sum(file["bytes"] for file in known)) as move:  # type: ignore[misc]
-        traces = read.traces(files, noted, lambda count: move(advance=count))
-        chunks = _saying(traces, lacking, kept)
-        learning = learn_traces(chunks, machine, actions, encoder.names, units_read)
-    provenance = {"files": known, "rows": learning.read.rows, "episodes": learning.read.episodes}
-    provenance |= {"transitions": learning.transitions, "failures": learning.read.failures}
+    log_chunks: list[Chunk] | None = [] if guard is not None and not acts else None
+    with progress("Learning", sum(file["bytes"] for file in sources)) as move:  # type: ignore[misc]
+        traces = read.traces(files, notes, lambda count: move(advance=count))
+        chunks = _saying(traces, hints, log_chunks)
+        lesson = learn_traces(chunks, machine, actions, encoder.names, units_read)
+    provenance = {"files": sources, "rows": lesson.read.rows, "episodes": lesson.read.episodes}
+    provenance |= {"transitions": lesson.transitions, "failures": lesson.read.failures}
     provenance["read with"] = {k: v for k, v in given_of(reading).items() if k != "topics"}
-    warnings = warnings_of(noted, columns)
+    warnings = warnings_of(notes, columns)
     for warning in warnings:
         warn(f"warning: {warning}")
     if out is not None:
-        learning.model.save(out, provenance)
-    taught = None
+        lesson.model.save(out, provenance)
+    new_guard = None
     if guard is not None:
         assert kind is not None
-        assert learning.model.dt is not None
-        if kept is None:
-            reckoned = kind, learning.model.dt, brakes, tolerance
-            taught = guard_of_log(*reckoned, actions, machine, encoder.names, learning.model.units)
-            with progress("Teaching the guard", learning.read.rows) as move:
-                share = teach(taught, read.traces(files), lambda count: move(count))
-            if refused := refusing(share):
-                warn(f"warning: in the later half of the log the guard {refused}")
+        assert lesson.model.dt is not None
+        if log_chunks is None:
+            settings = kind, lesson.model.dt, brakes, tolerance
+            new_guard = guard_of_log(*settings, actions, machine, encoder.names, lesson.model.units)
+            with progress("Teaching the guard", lesson.read.rows) as move:
+                share = teach(new_guard, read.traces(files), lambda count: move(count))
+            if refusal := refusing(share):
+                warn(f"warning: in the later half of the log the guard {refusal}")
         else:
-            asked = horizon, persist, None if tolerance == TOLERANCE else tolerance
-            episodes = [chunk for chunk in episodes_of(kept) if len(chunk.times) > 1]
-            labels = Labels(names=encoder.names, units=learning.model.units)
-            taught = guard_where_nobody_acts(episodes, labels, *asked, learning.machine)
-        taught.save(guard, provenance)
+            requests = horizon, persist, None if tolerance == TOLERANCE else tolerance
+            episodes = [chunk for chunk in episodes_of(log_chunks) if len(chunk.times) > 1]
+            labels = Labels(names=encoder.names, units=lesson.model.units)
+            new_guard = guard_where_nobody_acts(episodes, labels, *requests, lesson.machine)
+        new_guard.save(guard, provenance)
     if as_json:
         document = {"files": files, "saved": out, "guard": guard}
-        document |= _document(learning, provenance)
-        print_json({**document, "noted": noted, "warnings": warnings})
+        document |= _document(lesson, provenance)
+        print_json({**document, "noted": notes, "warnings": warnings})
         return
-    told = [*_read(learning, columns.action * acts), *_read_otherwise(noted, columns, learning)]
+    pairs = [*_read(lesson, columns.action * acts), *_read_otherwise(notes, columns, lesson)]
     if lengths.seen:
-        told.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
-    show(facts("What was read", told), *tables_of(learning.model))
+        pairs.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
+    show(facts("What was read", pairs), *tables_of(lesson.model))
     say("")
-    if out is None and taught is None:
+    if out is None and new_guard is None:
         say("Nothing was saved; --out MODEL saves the model.")
     elif out is not None:
         say(f"Saved to {out}. Look at it again: evofsm inspect {out}")
-    if taught is not None:
-        beyond = (learning.read.clipped_below + learning.read.clipped_above) / learning.read.rows
-        for line in _of_guard(taught, guard, brakes, beyond):
+    if new_guard is not None:
+        beyond = (lesson.read.clipped_below + lesson.read.clipped_above) / lesson.read.rows
+        for line in _of_guard(new_guard, guard, brakes, beyond):
             say(line)
 
 
@@ -206,9 +206,9 @@ def _machine(
         width = {} if spread is None else {"spread": spread}
         novelty = Novelty(1.0 if radius is None else radius, _scales(scale, encoder), **width)
         return EvolvingFSM(n_actions, rule=novelty, max_states=max_states)
-    found = imported(rule) if ":" in rule else rule_named(rule)
-    chosen = found() if isinstance(found, type) else found
-    return EvolvingFSM(n_actions, radius, spread=spread, max_states=max_states, rule=chosen)
+    part = imported(rule) if ":" in rule else rule_named(rule)
+    state_rule = part() if isinstance(part, type) else part
+    return EvolvingFSM(n_actions, radius, spread=spread, max_states=max_states, rule=state_rule)
 
 
 def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]:
@@ -218,24 +218,24 @@ def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]
     from evofsm.fsm.validation import positive
     from evofsm.io.tables import quoted_name
 
-    given = {}
+    scales = {}
     for text in scale or ():
         column, _, number = text.rpartition("=")
         try:
-            given["".join(quoted_name(column))] = positive("it", float(number))
+            scales["".join(quoted_name(column))] = positive("it", float(number))
         except ValueError:
             hint = "write COLUMN=NUMBER, such as gap=4"
             raise ValueError(f"--scale is {text!r}; {hint}") from None
     single = [name for name in encoder.variables if isinstance(name, str)]
-    if unknown := [column for column in given if column not in single]:
+    if unknown := [column for column in scales if column not in single]:
         raise ValueError(f"--scale names {unknown[0]!r}; observed are {', '.join(single)}")
-    given = dict(zip(VARIABLES, SAFETY_RULE.scales, strict=True)) | given
-    if lacking := [column for column in single if column not in given]:
+    scales = dict(zip(VARIABLES, SAFETY_RULE.scales, strict=True)) | scales
+    if omissions := [column for column in single if column not in scales]:
         raise ValueError(
-            f"--rule novelty has to know the difference that counts as 1 in {lacking[0]!r}: "
-            f"--scale {quote(lacking[0])}=2 (a fifth of what it spans, or so)"
+            f"--rule novelty has to know the difference that counts as 1 in {omissions[0]!r}: "
+            f"--scale {quote(omissions[0])}=2 (a fifth of what it spans, or so)"
         )
-    return [given.get(name, 1.0) for name in encoder.names]
+    return [scales.get(name, 1.0) for name in encoder.names]
 
 
 def _size(file: str) -> int:
@@ -297,19 +297,19 @@ def _look_first(file: str, reading: Reading) -> list[str] | None:
     table = open_table(file, columns, reading.lengths, silent, reading.topics, Skips(), [])
     if not isinstance(table, CsvTable | ParquetTable):
         return []
-    found, options = look_at(table)
+    contents, options = look_at(table)
     could = dict(options)
     if columns.observe.names == VARIABLES and not {*VARIABLES} & {*table.columns} and options:
         to_file = "--guard" if "--failed" in could else "--out"
         options.append((to_file, f"{to_file[2:]}.evofsm"))
         command = [f"evofsm learn {quote(file)}", *(f"{a} {in_quotes(b)}" for a, b in options)]
-        show(facts(f"What {file} holds", found), "\nA way to learn from it:")
+        show(facts(f"What {file} holds", contents), "\nA way to learn from it:")
         print("  " + " \\\n      ".join(command), flush=True)
         return None
-    said = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
-    asked = zip(_UNASKED.items(), said, strict=True)
+    answers = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
+    questions = zip(_UNASKED.items(), answers, strict=True)
     return [
-        f"{why}: {a} {in_quotes(could[a])}" for (a, why), b in asked if b is None and a in could
+        f"{why}: {a} {in_quotes(could[a])}" for (a, why), b in questions if b is None and a in could
     ]
 
 
@@ -350,8 +350,8 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
         return
-    nothing = "" if len(guard.judge.state.forms) else " nothing yet"
-    yield f"It judges{nothing}: {guard.judge.told_by_experience}."
+    note = "" if len(guard.judge.state.forms) else " nothing yet"
+    yield f"It judges{note}: {guard.judge.told_by_experience}."
     if beyond:
         yield f"It knows no action beyond --action-range, where {beyond:.1%} of the log's are."
 
@@ -359,11 +359,11 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
 def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """All that is printed, for JSON; states and actions from 0."""
     names = ("rows", "episodes", "seconds", "clipped_below", "clipped_above", "jumps", "failures")
-    found = {name: getattr(learning.read, name) for name in names}
+    totals = {name: getattr(learning.read, name) for name in names}
     if not learning.model.failures_told:
-        found["failures"] = None
+        totals["failures"] = None
     model = {**model_document(learning.model), "provenance": provenance}
-    return {**found, "transitions": learning.transitions, "model": model}
+    return {**totals, "transitions": learning.transitions, "model": model}
 
 
 def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
@@ -377,17 +377,17 @@ def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     yield "transitions", f"{learning.transitions:,}"
     assert actions is not None
     text = f"{actions.n_actions} intervals of {action} from {actions.low:g} to {actions.high:g}"
-    if clipped := read.clipped_below + read.clipped_above:
+    if n_beyond := read.clipped_below + read.clipped_above:
         text += f"; {read.clipped_below:,} below and {read.clipped_above:,} above "
-        text += f"({clipped / read.rows:.1%} of rows) were put into the end intervals"
-    text = text if clipped else f"{text}; none was beyond"
+        text += f"({n_beyond / read.rows:.1%} of rows) were put into the end intervals"
+    text = text if n_beyond else f"{text}; none was beyond"
     yield "actions", text if action else "none: nobody acts (--action '')"
     settings = describe_rule(learning.machine.rule)
     for name in ("radius", "spread"):  # which the rule may have itself
         settings.setdefault(name, learning.machine.settings[name])
-    named = settings.pop("name")
-    told = (f"{name} {value}" for name, value in settings.items())
-    yield "rule", f"{named} (--rule), {', '.join(told)}"
+    rule = settings.pop("name")
+    texts = (f"{name} {value}" for name, value in settings.items())
+    yield "rule", f"{rule} (--rule), {', '.join(texts)}"
 
 
 def _read_otherwise(
@@ -406,8 +406,8 @@ def _read_otherwise(
     hole = columns.longest_hole
     if columns.resample:
         step, ways = columns.resample
-        rest = "".join(f", the {way} of {name}" for name, way in ways.items())
-        means = f"{noted.resampled:,} became means of {step:g} s{rest}"
+        extras = "".join(f", the {way} of {name}" for name, way in ways.items())
+        means = f"{noted.resampled:,} became means of {step:g} s{extras}"
         yield "resampled", f"{means} (--resample {step:g}s,NAME=max: others are min, last)"
     if noted.crossed:
         yield "holes", f"{noted.crossed:,} of at most {hole:g} s (--hole) cost a transition each"
@@ -421,7 +421,7 @@ def _read_otherwise(
     if noted.elsewhere:
         why = f"--where {columns.where} does not hold; there an episode ends"
         yield "left out", f"{noted.elsewhere:,} rows: {why}"
-    told = {name: unit for name, unit in noted.units.items() if UNITS.get(unit, 1.0) != 1.0}
-    if told:
-        given = (f"{name} from {unit}" for name, unit in told.items())
-        yield "converted", f"{', '.join(given)} to units of the SI"
+    conversions = {name: unit for name, unit in noted.units.items() if UNITS.get(unit, 1.0) != 1.0}
+    if conversions:
+        texts = (f"{name} from {unit}" for name, unit in conversions.items())
+        yield "converted", f"{', '.join(texts)} to units of the SI"

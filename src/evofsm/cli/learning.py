@@ -93,10 +93,10 @@ def learn_traces(
 
 def _called(name: str, *, is_time: bool) -> str:
     """The unit that is part of a column's name, if it is none of the SI."""
-    found = (_TIME_CALLED if is_time else _CALLED).search(name)
-    if found is None:
+    match = (_TIME_CALLED if is_time else _CALLED).search(name)
+    if match is None:
         return ""
-    word = found[1].lower()
+    word = match[1].lower()
     return {"feet": "ft", "knots": "kn"}.get(word) or (word if word in UNITS else "km/h")
 
 
@@ -104,62 +104,62 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
     """What is most likely a mistake, and what would mend it."""
     columns = columns or LogColumns()
     time = columns.time
-    called = {name: unit for name in noted.untold if (unit := _called(name, is_time=name == time))}
-    found = [
+    units = {name: unit for name in noted.untold if (unit := _called(name, is_time=name == time))}
+    warnings = [
         f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
         f"mph? --unit {quote(f'{name}=km/h')} converts it"
         for name, fastest in noted.fastest.items()
-        if name not in called and fastest < _NO_SPEED
+        if name not in units and fastest < _NO_SPEED
     ]
-    found += [
+    warnings += [
         f"{name} is called as if it were in {unit}, and was read as one of the SI: --unit "
         f"{quote(f'{name}={unit}')} converts it, before --failed compares it "
         f"(--unit {quote(f'{name}={SI[unit]}')}: it is right)"
-        for name, unit in called.items()
+        for name, unit in units.items()
     ]
     if columns.failed and not noted.failing:
         goes = []
-        for name, (seen, *more) in ((k, v) for k, v in noted.compared.items() if v):
-            if isinstance(seen, str):
-                goes.append(f"{name} is {', '.join(map(repr, [seen, *more]))}")
+        for name, (start, *more) in ((k, v) for k, v in noted.compared.items() if v):
+            if isinstance(start, str):
+                goes.append(f"{name} is {', '.join(map(repr, [start, *more]))}")
             else:
-                told = f"{name}, as compared, goes from {seen:.6g} to {more[0]:.6g} "
-                goes.append(told + SI.get(noted.units.get(name, ""), ""))
-        told = ": ".join([f"no row meets --failed {quote(columns.failed)}", *goes])
-        found.append(told.rstrip())
-    is_untold = time in noted.untold and time not in called and not noted.resampled
+                text = f"{name}, as compared, goes from {start:.6g} to {more[0]:.6g} "
+                goes.append(text + SI.get(noted.units.get(name, ""), ""))
+        text = ": ".join([f"no row meets --failed {quote(columns.failed)}", *goes])
+        warnings.append(text.rstrip())
+    is_untold = time in noted.untold and time not in units and not noted.resampled
     if (step := noted.longest_step) > 0.0 and is_untold:
         unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
         cause = f"is the time in {unit}? --unit {time}={unit} converts it"
-        found.append(f"there is a row every {step:,.6g} s: {cause}")
+        warnings.append(f"there is a row every {step:,.6g} s: {cause}")
     constant = [kv for kv in noted.at_once.items() if kv[1] in _NOBODY or noted.failed_at_once > 1]
     if constant and noted.failed_at_once >= noted.failed / 2:
         name, value = min(constant, key=lambda kv: kv[1] not in _NOBODY)
-        found.append(
+        warnings.append(
             f"{noted.failed_at_once:,} of {noted.failed:,} failed episodes fail with their first "
             f"row, and {name} is {value:g} there each time: does that stand for a missing "
             f"value (no leader)? --no-leader {quote(f'{name}=={value:g}')} leaves such rows out"
         )
     if noted.failed_at_once:
-        found.append(
+        warnings.append(
             f"{noted.failed_at_once:,} of {noted.failed:,} failures came right after a hole or "
             "standstill: what led there was not recorded, so no alarm could foresee them"
         )
     if alone := [(name, *pair) for name, pair in noted.below.items() if pair[0] and pair[1] > 2]:
         name, value, rows = min(alone, key=lambda entry: entry[1] not in _NOBODY)
-        found.append(
+        warnings.append(
             f"{name} is {value!r} in {rows:,} rows, and else never below 0: is that a missing "
             f"value (no leader)? --no-leader {quote(f'{name}=={value!r}')} leaves such rows out"
         )
-    found += _contradictions(noted, columns)
+    warnings += _contradictions(noted, columns)
     if noted.unplaced:
         lie = "failure lies" if noted.unplaced == 1 else "failures lie"
         why = "in rows that are left out, outside of any episode: not counted"
-        found.append(f"{noted.unplaced:,} {lie} {why}")
+        warnings.append(f"{noted.unplaced:,} {lie} {why}")
     for kind, (count, first) in noted.skipped.items():
         text = _LEFT_OUT.get(kind, "bad rows were left out (--skip-bad)")
-        found.append(f"{count:,} {text}, the first: {first}")
-    return [*found, *noted.told]
+        warnings.append(f"{count:,} {text}, the first: {first}")
+    return [*warnings, *noted.told]
 
 
 def _contradictions(noted: Noted, columns: LogColumns) -> Iterator[str]:
@@ -178,8 +178,8 @@ def _contradictions(noted: Noted, columns: LogColumns) -> Iterator[str]:
             if UNITS[unit] != 1.0 and names and abs(rate * UNITS[unit] ** -power - 1.0) < _MATCHES:
                 options = (f"--unit {quote(f'{name}={unit}')}" for name in names)
                 mend = f"{' '.join(options)} converts from {unit}"
-        shown, said = ("gap", " and ".join(speeds)) if is_gap else ("v_follower", columns.action)
-        yield f"{shown} changes {rate:.3g} times as fast as {said} say in the first rows: {mend}"
+        column, cause = ("gap", " and ".join(speeds)) if is_gap else ("v_follower", columns.action)
+        yield f"{column} changes {rate:.3g} times as fast as {cause} say in the first rows: {mend}"
 
 
 def episodes_read(
@@ -189,22 +189,22 @@ def episodes_read(
 
     They have dates where these are wanted, and where the log has some.
     """
-    noted = Noted()
-    chunks = reading.traces([path], noted)
+    notes = Noted()
+    chunks = reading.traces([path], notes)
     for episode in episodes_of(chunks if most is None else _first(chunks, most)):
         if len(episode.times) >= fewest:
-            yield episode._replace(times=episode.times + noted.began) if dated else episode
-    for warning in warnings_of(noted, reading.columns):
+            yield episode._replace(times=episode.times + notes.began) if dated else episode
+    for warning in warnings_of(notes, reading.columns):
         warn(f"warning: {warning}")
 
 
 def _first(chunks: Iterable[Chunk], most: int) -> Iterator[Chunk]:
-    left = most
+    remainder = most
     for chunk in chunks:
-        if left:
-            yield chunk.rows(0, left)
-        left -= len(chunk.times)
-        if left < 0:
+        if remainder:
+            yield chunk.rows(0, remainder)
+        remainder -= len(chunk.times)
+        if remainder < 0:
             warn(f"watched are the first {most:,} rows; there are more")
             return
 
@@ -232,20 +232,20 @@ def guard_of_log(
 
 def decided_on(guard: Guard, episode: Chunk) -> Iterator[Revision]:
     """What a guard says of each row of an episode but the last one, with which it ends."""
-    seen, times = episode.observations, episode.times - episode.times[0]
-    for row, proposal, at in zip(seen[:-1], episode.actions, times, strict=False):
+    rows, times = episode.observations, episode.times - episode.times[0]
+    for row, proposal, at in zip(rows[:-1], episode.actions, times, strict=False):
         yield guard.decide(row, proposal, at)
-    guard.end(episode.failed, seen[-1])
+    guard.end(episode.failed, rows[-1])
 
 
 def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) -> float:
     """The share in which a guard refuses, of the later half of a log; ``show`` is told of rows."""
-    taken, refused, reviser = 0, bytearray(), guard.reviser
+    n_rows, refusals, reviser = 0, bytearray(), guard.reviser
     assert isinstance(reviser, ActionReviser)
     for episode in episodes_of(chunks):
-        refused.extend(reviser.refuses for _ in decided_on(guard, episode))
-        show(taken := taken + len(episode.times))
-    return float(np.mean(np.array(refused[len(refused) // 2 :])))
+        refusals.extend(reviser.refuses for _ in decided_on(guard, episode))
+        show(n_rows := n_rows + len(episode.times))
+    return float(np.mean(np.array(refusals[len(refusals) // 2 :])))
 
 
 def refusing(share: float) -> str:
@@ -259,8 +259,8 @@ def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: R
     """Learn a chunk."""
     read.dt = chunk.dt
     indices = np.full(len(chunk.times), -1)
-    known = ~np.isnan(chunk.actions)
-    indices[known] = actions.encode(chunk.actions[known])
+    is_known = ~np.isnan(chunk.actions)
+    indices[is_known] = actions.encode(chunk.actions[is_known])
     if chunk.failures is not None:
         machine.tell_of_failures()
     machine.learn_many(chunk.observations, indices, chunk.starts, chunk.failures)

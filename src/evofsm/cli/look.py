@@ -39,8 +39,8 @@ _NICE = [(seconds("", text), text) for text in _LONG.split()]
 
 def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     """What the first rows hold, by column and in all, and options that could be asked for."""
-    skipped, odd = dict[str, tuple[int, str]](), dict[str, int]()
-    table.skips = Skips(1 << 60, skipped)
+    skips, odd = dict[str, tuple[int, str]](), dict[str, int]()
+    table.skips = Skips(1 << 60, skips)
     frame, clock, form = _first_rows(table, odd)
     if not len(frame):
         return [], []
@@ -51,45 +51,43 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
     limit = _round(0.1 * float(np.nanquantile(np.abs(values[still]), 0.95))) if still else 0.0
     runs = values[still] > limit if still else runs
-    shown = {name: _range(name, z, z if name == still else z[runs]) for name, z in values.items()}
-    shown |= {name: _told(frame[name]) for name in texts}
-    facts = [*shown.items()][:_COLUMNS_SHOWN]
-    if more := len(shown) - len(facts):
+    columns = {name: _range(name, z, z if name == still else z[runs]) for name, z in values.items()}
+    columns |= {name: _told(frame[name]) for name in texts}
+    facts = [*columns.items()][:_COLUMNS_SHOWN]
+    if more := len(columns) - len(facts):
         facts.append(("...", f"and {more:,} more columns"))
-    lacking = int(np.isnan([*values.values()]).any(0).sum())
-    facts += [("incomplete", f"{lacking:,} rows, in which a number is missing")] * (lacking > 0)
-    facts += [("bad fields", f"{n:,} {told}") for told, n in odd.items()]
-    facts += [
-        (f"bad {kind}s", f"{n:,}, the first: {first}") for kind, (n, first) in skipped.items()
-    ]
+    n_partial = int(np.isnan([*values.values()]).any(0).sum())
+    facts += [("incomplete", f"{n_partial:,} rows, in which a number is missing")] * (n_partial > 0)
+    facts += [("bad fields", f"{n:,} {text}") for text, n in odd.items()]
+    facts += [(f"bad {kind}s", f"{n:,}, the first: {first}") for kind, (n, first) in skips.items()]
     facts.append(("the clock", clock or "no column (--dt)"))
     facts.append(("rows looked at", f"{len(frame):,}"))
     options = [("--time", clock) if clock else ("--dt", "1"), *([("--unit", form)] if form else [])]
     groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
     group = next((name for name in groups if _is_in_blocks(frame[name])), "")
-    if (bad := max(lacking, sum(n for n, _ in skipped.values()) + sum(odd.values()))) > SKIPPED:
+    if (bad := max(n_partial, sum(n for n, _ in skips.values()) + sum(odd.values()))) > SKIPPED:
         options.append(("--skip-bad", f"{_round(2.0 * bad):.0f}"))
     if clock:
         within = ~np.diff(frame[group].rle_id().to_numpy()).astype(bool) if group else slice(None)
-        options += _of_steps(np.diff(frame[clock].to_numpy())[within], facts, lacking)
+        options += _of_steps(np.diff(frame[clock].to_numpy())[within], facts, n_partial)
     if still:
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
     rare = [*_rare(frame, [*texts, *values])]
     likely = [row for row in rare if _FAILURE.search(row[1])]
     rare = likely or [row for row in rare if row[0] in values]
-    facts += [("a failure?", f"{text} {told}") for _, text, told in rare]
+    facts += [("a failure?", f"{text} {frequency}") for _, text, frequency in rare]
     options += [("--failed", text) for _, text, _ in rare[:1]]
     if group:
         facts.append(("an episode?", f"each {group}"))
         options.append(("--episode", _named(group, ",")))
-    told_by = {group, *(name for name, *_ in rare)}
-    ends = {n: np.nanquantile(z[runs], (0.02, 0.98)) for n, z in values.items() if n not in told_by}
+    markers = {group, *(name for name, *_ in rare)}
+    ends = {n: np.nanquantile(z[runs], (0.02, 0.98)) for n, z in values.items() if n not in markers}
     if still in ends and ends[still][1] < 1.05 * ends[still][0]:  # as it runs it is always the same
         del ends[still]
     # What goes on by the same from row to row is a count of them.
-    moved = {n: e.tolist() for n, e in ends.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
-    return facts, _of_numbers(moved, options)
+    spans = {n: e.tolist() for n, e in ends.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
+    return facts, _of_numbers(spans, options)
 
 
 def _first_rows(
@@ -99,11 +97,11 @@ def _first_rows(
     firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
     pairs = zip(firsts, [*firsts][1:], strict=False)
     together = (f"{a},{b}" for a, b in pairs if is_date(f"{firsts[a]} {firsts[b]}"))
-    dated = [name for name, text in firsts.items() if is_date(text)]
-    clock, form = next(iter(dated), "") or next(together, ""), ""
+    date_columns = [name for name, text in firsts.items() if is_date(text)]
+    clock, form = next(iter(date_columns), "") or next(together, ""), ""
     dates = clock.split(",") if clock else []
     numbers = [name for name in firsts if table.holds(name) == "number"]
-    texts = [name for name in firsts if name not in {*numbers, *dated, *dates}]
+    texts = [name for name in firsts if name not in {*numbers, *date_columns, *dates}]
     frame = polars.DataFrame()
     for piece in table.pieces(Wanted(numbers, texts, dates)):
         frame.vstack(polars.DataFrame({**piece.numbers, **piece.texts}), in_place=True)
@@ -111,17 +109,17 @@ def _first_rows(
             break
     for name in texts if len(frame) else ():  # of which the first alone is no number
         fields = frame[name].str.strip_chars().replace("", None)
-        read = fields.str.replace(",", ".", literal=True).cast(polars.Float64, strict=False)
-        bad = fields.filter(read.is_null() & fields.is_not_null())
-        if read.n_unique() > _MOST_TEXTS and 2 * len(bad) < len(fields.drop_nulls()):
-            frame = frame.with_columns(read.fill_null(math.nan).alias(name))
+        floats = fields.str.replace(",", ".", literal=True).cast(polars.Float64, strict=False)
+        bad = fields.filter(floats.is_null() & fields.is_not_null())
+        if floats.n_unique() > _MOST_TEXTS and 2 * len(bad) < len(fields.drop_nulls()):
+            frame = frame.with_columns(floats.fill_null(math.nan).alias(name))
             if len(bad):
                 odd[f"in column {name!r}, the first: {str(bad.first())!r}"] = len(bad)
     texts = [name for name in texts if len(frame) and frame[name].dtype == polars.String]
     numbers = [name for name in firsts if name in frame.columns and frame[name].dtype.is_numeric()]
     if not clock and (form := next(filter(None, map(_form, map(frame.get_column, texts))), "")):
-        clock, _, written = form.partition("=")
-        at = frame[clock].str.to_datetime(written, strict=False)
+        clock, _, pattern = form.partition("=")
+        at = frame[clock].str.to_datetime(pattern, strict=False)
         frame = frame.with_columns(at.dt.epoch("us").alias(clock))
     scale = 1e-6
     if not clock and (clock := next(filter(_TIME.match, numbers), "")) and len(frame):
@@ -142,13 +140,13 @@ def _of_steps(steps: NDArray[np.float64], facts: Pairs, lacking: int) -> Pairs:
     holes = steps > LONGEST_STEP * usual
     if len(late := steps[steps <= 0.0]):
         twice, earlier = (late == 0.0).sum(), (late < 0.0).sum()
-        told = f"{twice:,} at the time of the row before, {earlier:,} earlier"
-        facts.append(("late rows", f"{told} (rows twice, unsorted, or --episode?)"))
+        text = f"{twice:,} at the time of the row before, {earlier:,} earlier"
+        facts.append(("late rows", f"{text} (rows twice, unsorted, or --episode?)"))
     if odd.sum() + lacking < max(_MANY, _ODD * len(steps)):
         if holes.any():
-            told = f"{holes.sum():,}, the longest {span(later.max())}, together"
-            told += f" {span(float((steps[holes] - usual).sum()))}; each begins an episode (--hole)"
-            facts.append(("holes", told))
+            text = f"{holes.sum():,}, the longest {span(later.max())}, together"
+            text += f" {span(float((steps[holes] - usual).sum()))}; each begins an episode (--hole)"
+            facts.append(("holes", text))
         return []
     facts.append(("other steps", f"{odd.sum():,}, the longest {span(later.max())}"))
     least = max(usual, 3.5 * float(np.median(steps)))  # of few digits many times are the same
@@ -162,26 +160,26 @@ def _of_numbers(ends: dict[str, list[float]], options: Pairs) -> Pairs:
     if not ends:
         return []
     action = next(filter(_SET.search, ends), "")  # else nobody acts
-    seen = [name for name in ends if name != action] or [action]
+    variables = [name for name in ends if name != action] or [action]
     apart = {name: _round((high - low) / 4.0) for name, (low, high) in ends.items()}
     acts = [("--action", _named(action, ""))]
     if action:
         width, (low, high) = apart[action], ends[action]
         low, high = math.floor(low / width) * width, math.ceil(high / width) * width
         acts.append(("--action-range", f"{low:.6g}:{high:.6g}:{width:g}"))
-    scales = [("--scale", f"{_named(name, '=')}={apart[name]:g}") for name in seen]
-    observed = ",".join(_named(name, ",=") for name in seen)
-    return [("--observe", observed), *acts, *options, ("--rule", "novelty"), *scales]
+    scales = [("--scale", f"{_named(name, '=')}={apart[name]:g}") for name in variables]
+    text = ",".join(_named(name, ",=") for name in variables)
+    return [("--observe", text), *acts, *options, ("--rule", "novelty"), *scales]
 
 
 def _form(texts: polars.Series) -> str:
     """How dates with slashes are written, as --unit takes it; of others nothing."""
-    found = re.match(r"\d\d?/\d\d?/\d{4} \d\d?:\d\d(:\d\d)?( [AP]M)?$", texts[0] or "")
-    if not found:
+    match = re.match(r"\d\d?/\d\d?/\d{4} \d\d?:\d\d(:\d\d)?( [AP]M)?$", texts[0] or "")
+    if not match:
         return ""
-    is_usual = found[2] or int(str(texts.str.extract(r"/(\d\d?)/").cast(polars.Int8).max())) > 12
-    day, hour = "%m/%d" if is_usual else "%d/%m", "%I:%M" if found[2] else "%H:%M"
-    return f"{texts.name}={day}/%Y {hour}{':%S' if found[1] else ''}{' %p' if found[2] else ''}"
+    is_usual = match[2] or int(str(texts.str.extract(r"/(\d\d?)/").cast(polars.Int8).max())) > 12
+    day, hour = "%m/%d" if is_usual else "%d/%m", "%I:%M" if match[2] else "%H:%M"
+    return f"{texts.name}={day}/%Y {hour}{':%S' if match[1] else ''}{' %p' if match[2] else ''}"
 
 
 def _round(number: float) -> float:
@@ -216,8 +214,8 @@ def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str
                 text = f"{kind:g}" if is_number else kind
                 value = text if is_number or re.fullmatch(r"[^\W\d]\w*", text) else f"'{text}'"
                 often = "once" if times == 1 else f"{times:,} times"
-                told = f"({often}, {here.mean():.2%} of rows)"
-                yield name, f"{_named(name, _SIGNS)}=={value}", told
+                frequency = f"({often}, {here.mean():.2%} of rows)"
+                yield name, f"{_named(name, _SIGNS)}=={value}", frequency
 
 
 def _is_in_blocks(values: polars.Series) -> bool:
@@ -228,17 +226,17 @@ def _is_in_blocks(values: polars.Series) -> bool:
 
 def _range(name: str, values: NDArray[np.float64], seen: NDArray[np.float64]) -> str:
     """From where to where numbers go; where some seen are far outside, what leaves those out."""
-    told = f"{np.nanmin(values):.5g} to {np.nanmax(values):.5g}"
-    seen = seen[np.isfinite(seen)]
-    low, high = np.quantile(seen, (0.005, 0.995)) if len(seen) else (0.0, 0.0)
+    text = f"{np.nanmin(values):.5g} to {np.nanmax(values):.5g}"
+    numbers = seen[np.isfinite(seen)]
+    low, high = np.quantile(numbers, (0.005, 0.995)) if len(numbers) else (0.0, 0.0)
     unit, beyond, column = _round(high - low) or 1.0, _FAR * (high - low), _named(name, _SIGNS)
     least, most = math.floor((low - beyond) / unit) * unit, math.ceil((high + beyond) / unit) * unit
-    below, above = int((seen < least).sum()), int((seen > most).sum())
+    below, above = int((numbers < least).sum()), int((numbers > most).sum())
     if not high > low or not below + above:
-        return told
+        return text
     parts = [f"{column}>{least:.6g}"] * (below > 0) + [f"{column}<{most:.6g}"] * (above > 0)
-    told += f"; 99 % in {low:.5g} to {high:.5g}, {below + above:,} far outside"
-    return f"{told} (--where {in_quotes(' and '.join(parts))} leaves them out)"
+    text += f"; 99 % in {low:.5g} to {high:.5g}, {below + above:,} far outside"
+    return f"{text} (--where {in_quotes(' and '.join(parts))} leaves them out)"
 
 
 def _told(texts: polars.Series) -> str:

@@ -69,9 +69,9 @@ Brakes = Annotated[
 
 def require(**extras: str) -> None:
     """Refuse before the long work what lacks packages after it; all that lack at once."""
-    if lacking := [package for package in extras if find_spec(package) is None]:
-        command = install(*dict.fromkeys(["cli", *(extras[package] for package in lacking)]))
-        raise ModuleNotFoundError(f"this needs {' and '.join(lacking)}: {command}")
+    if packages := [package for package in extras if find_spec(package) is None]:
+        command = install(*dict.fromkeys(["cli", *(extras[package] for package in packages)]))
+        raise ModuleNotFoundError(f"this needs {' and '.join(packages)}: {command}")
 
 
 @contextmanager
@@ -98,14 +98,14 @@ def imported(name: str) -> Any:
     if "" not in sys.path:
         sys.path.insert(0, "")  # as `python -m` does
     try:
-        thing: Any = importlib.import_module(module)
+        target: Any = importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise ValueError(f"{module}: {error} (is it in this folder, or installed?)") from error
     for part in path.split("."):
-        if not hasattr(thing, part):
+        if not hasattr(target, part):
             raise ValueError(f"{module} has no {path!r}")
-        thing = getattr(thing, part)
-    return thing
+        target = getattr(target, part)
+    return target
 
 
 def in_quotes(text: str) -> str:
@@ -135,8 +135,8 @@ def _named(text: str) -> list[tuple[str, str]]:
     """What stands between commas: a name in quotes, if there is one, and the rest."""
     from evofsm.io.tables import quoted_name
 
-    found = re.findall(r'(?:"(?:[^"]|"")*"(?=\s*(?:[,=]|$))|[^,])+', text)
-    return [quoted_name(part.strip()) for part in found if part.strip()]
+    parts = re.findall(r'(?:"(?:[^"]|"")*"(?=\s*(?:[,=]|$))|[^,])+', text)
+    return [quoted_name(part.strip()) for part in parts if part.strip()]
 
 
 class Reading(NamedTuple):
@@ -254,8 +254,8 @@ def reading_of(
         hole=None if hole is None else seconds("--hole", hole),
     )
     lengths = lengths_given(vehicle_length or ())
-    given = None if topics is None else Topics.load(topics)
-    return Reading(columns, lengths, given, acts=action != "")
+    topic_map = None if topics is None else Topics.load(topics)
+    return Reading(columns, lengths, topic_map, acts=action != "")
 
 
 def given_of(reading: partial[Reading]) -> dict[str, Any]:
@@ -284,10 +284,10 @@ def seconds(name: str, text: str) -> float:
     from evofsm.fsm.validation import positive
     from evofsm.io.tables import TIMES
 
-    found = re.fullmatch(r"\s*([0-9.]+)\s*([a-z]*)\s*", text)
+    match = re.fullmatch(r"\s*([0-9.]+)\s*([a-z]*)\s*", text)
     try:
-        assert found is not None
-        return positive(name, float(found[1])) * (TIMES | {"d": 86400.0})[found[2] or "s"]
+        assert match is not None
+        return positive(name, float(match[1])) * (TIMES | {"d": 86400.0})[match[2] or "s"]
     except (AssertionError, ValueError, KeyError):
         raise ValueError(f"{name} is {text!r}; write how long, such as 30s, 10min or 1h") from None
 
@@ -295,9 +295,9 @@ def seconds(name: str, text: str) -> float:
 def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
     from evofsm.io.logs import BECOME, Resample
 
-    step, *told = _named(text) or [("", "")]
+    step, *ways = _named(text) or [("", "")]
     how = {}
-    for parts in told:
+    for parts in ways:
         name, _, become = "".join(parts).rpartition("=")
         if name not in (*encoder.variables, action) or become not in BECOME:
             may = f"NAME=HOW with one of {', '.join(BECOME)}, of a number that is read"
@@ -313,19 +313,19 @@ def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
     """
     parameters = signature(command, eval_str=True).parameters
     options = signature(reading_of, eval_str=True).parameters
-    shared = {name: parameter for name, parameter in options.items() if name not in parameters}
+    log_options = {name: parameter for name, parameter in options.items() if name not in parameters}
 
     @wraps(command)
     def run(**given: Any) -> Any:
-        typed = {name: given.pop(name) for name in shared}
-        return command(**given, reading=partial(reading_of, **typed))
+        arguments = {name: given.pop(name) for name in log_options}
+        return command(**given, reading=partial(reading_of, **arguments))
 
-    taken = list[Parameter]()
+    all_parameters = list[Parameter]()
     for parameter in parameters.values():
-        taken += shared.values() if parameter.name == "reading" else [parameter]
-    taken = [p.replace(kind=Parameter.KEYWORD_ONLY) for p in taken]
-    run.__dict__["__signature__"] = Signature(taken)
-    run.__annotations__ = {p.name: p.annotation for p in taken}
+        all_parameters += log_options.values() if parameter.name == "reading" else [parameter]
+    all_parameters = [p.replace(kind=Parameter.KEYWORD_ONLY) for p in all_parameters]
+    run.__dict__["__signature__"] = Signature(all_parameters)
+    run.__annotations__ = {p.name: p.annotation for p in all_parameters}
     return run
 
 
@@ -333,15 +333,15 @@ def units_given(texts: Iterable[str]) -> dict[str, str]:
     """Units by the column, or the beginning of columns, from what --unit was given."""
     from evofsm.io.tables import UNITS, quoted_name
 
-    found: dict[str, str] = {}
+    units: dict[str, str] = {}
     for text in texts:
         name, _, unit = ("".join(quoted_name(part.strip())) for part in text.rpartition("="))
         if not (name and (unit in UNITS or "%" in unit)):
             raise ValueError(f"--unit is {text!r}; write NAME=UNIT with one of {', '.join(UNITS)}")
-        if name in found:
+        if name in units:
             raise ValueError(f"--unit names {name!r} twice")
-        found[name] = unit
-    return found
+        units[name] = unit
+    return units
 
 
 def lengths_given(texts: Iterable[str]) -> VehicleLengths:

@@ -27,13 +27,13 @@ def paper(
     from evofsm.paper import print_page
     from evofsm.paper.reproduction import reproduce
 
-    with progress(f"Driving and learning ({world})") as done:
-        found = reproduce(world, rounds, settings, done)
+    with progress(f"Driving and learning ({world})") as move:
+        reproduction = reproduce(world, rounds, settings, move)
     command = shlex.join(["evofsm", *sys.argv[1:]])
-    page = found.write(out, command)
+    page = reproduction.write(out, command)
     if as_json:
-        print_json([claim._asdict() for claim in found.claims])
+        print_json([claim._asdict() for claim in reproduction.claims])
     else:
-        print_page(found.page(command))
+        print_page(reproduction.page(command))
         print(f"\nPage with all figures: {page}")
-    return 0 if found.holds else 1
+    return 0 if reproduction.holds else 1

@@ -29,9 +29,9 @@ def show(*parts: RenderableType) -> None:
         out = Console(markup=False, highlight=False, emoji=False)
         any_width = out.options.update(max_width=10_000)
         out.width = max(out.width, Measurement.get(out, any_width, part).minimum)
-        with out.capture() as printed:
+        with out.capture() as capture:
             out.print(part, crop=False)
-        print("\n".join(line.rstrip() for line in printed.get().splitlines()))
+        print("\n".join(line.rstrip() for line in capture.get().splitlines()))
 
 
 def say(text: object) -> None:
@@ -79,19 +79,19 @@ def table(
 
     from evofsm.fsm.naming import visible
 
-    made = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1, 0, 0))
-    made.title, made.title_justify, made.title_style = Text(title, "bold"), "left", ""
+    grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1, 0, 0))
+    grid.title, grid.title_justify, grid.title_style = Text(title, "bold"), "left", ""
     for place, name in enumerate(header):
         words = [word for row in (header, *rows) for word in row[place].split()]
-        made.add_column(
+        grid.add_column(
             visible(name),
             justify="left" if place in left else "right",
             vertical="bottom",
             min_width=max(map(len, words), default=0),
         )
     for place, row in enumerate(rows):
-        made.add_row(*map(visible, row), style="bold" if place in bold else "")
-    return made
+        grid.add_row(*map(visible, row), style="bold" if place in bold else "")
+    return grid
 
 
 def print_json(document: object) -> None:
@@ -137,8 +137,8 @@ def progress(text: str, total: float | None = None) -> Iterator[Advance]:
     from rich.console import Console
     from rich.progress import Progress
 
-    unwatched = not sys.stderr.isatty()
-    with Progress(console=Console(stderr=True), transient=True, disable=unwatched) as bars:
+    is_unwatched = not sys.stderr.isatty()
+    with Progress(console=Console(stderr=True), transient=True, disable=is_unwatched) as bars:
         task = bars.add_task(text, total=total)
         yield lambda done=None, total=None, **more: bars.update(
             task, completed=done, total=total, **more

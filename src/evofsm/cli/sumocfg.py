@@ -21,12 +21,12 @@ def run_configuration(
     if mode not in ("act", "shadow"):
         raise ValueError(f"--mode is {mode!r}; for a configuration it is act or shadow")
     with progress("Driving") as move:
-        came = drive_configuration(file, vehicles, mode, tolerance, move)
+        outcome = drive_configuration(file, vehicles, mode, tolerance, move)
     if as_json:
-        print_json(came)
+        print_json(outcome)
         return
-    title, alone = f"What came of {came['seconds']:,.0f} s", came["alone"]
-    runs = (came,) if alone is None else (alone, came)
+    title, alone = f"What came of {outcome['seconds']:,.0f} s", outcome["alone"]
+    runs = (outcome,) if alone is None else (alone, outcome)
     rows = [(name, *map(tell, runs)) for name, tell in _TOLD.items()]
     rows = [row for row in rows if any(row[1:])]
     header = ("", "in shadow") if alone is None else ("", "alone", "guarded")
@@ -42,15 +42,15 @@ def drive_configuration(
 ) -> dict[str, Any]:
     """What came of it, as `Attachment.summary` has it; where guards act, without them as well."""
     by_ids = not (vehicles == "all" or vehicles.startswith("type:") or vehicles.endswith("%"))
-    chosen = split_names(vehicles) if by_ids else vehicles
+    choice = split_names(vehicles) if by_ids else vehicles
 
     def driven(how: str) -> dict[str, Any]:
         with _running(file) as (sumo, steps):
-            cars = attach(sumo, chosen, mode=how, tolerance=tolerance)
+            cars = attach(sumo, choice, mode=how, tolerance=tolerance)
             for seconds in steps:
                 if seconds == int(seconds):
-                    met = f"{len(cars.collisions)} collisions"
-                    move(description=f"Driving, {how} ({seconds:,.0f} s, {met})")
+                    collisions = f"{len(cars.collisions)} collisions"
+                    move(description=f"Driving, {how} ({seconds:,.0f} s, {collisions})")
             seconds, kinds = float(sumo.simulation.getTime()), sumo.vehicletype.getIDList()
         if not cars.ever:
             types = ", ".join(kind for kind in kinds if not kind.startswith("DEFAULT_"))
@@ -61,8 +61,8 @@ def drive_configuration(
         return {"seconds": seconds, **cars.summary()}
 
     alone = driven("watch") if mode == "act" else None
-    told = {"configuration": str(file), "vehicles": vehicles, "mode": mode}
-    return {**told, **driven(mode), "alone": alone}
+    settings = {"configuration": str(file), "vehicles": vehicles, "mode": mode}
+    return {**settings, **driven(mode), "alone": alone}
 
 
 def _share(what: str) -> Callable[[Mapping[str, Any]], str]:
@@ -95,18 +95,18 @@ def trace_configuration(
     So many seconds at most, and no more once so many positions were written. Returns how long [s],
     whether it would have gone on, and when there were collisions [s], by who was behind whom.
     """
-    met: dict[str, list[float]] = {}
+    crashes: dict[str, list[float]] = {}
     with _running(file, "--fcd-output", str(out)) as (sumo, steps):
-        begun, written, is_cut = float(sumo.simulation.getTime()), 0, False
-        now, dt = begun, float(sumo.simulation.getDeltaT())
+        start, n_positions, is_cut = float(sumo.simulation.getTime()), 0, False
+        now, dt = start, float(sumo.simulation.getDeltaT())
         for now in steps:
             for crash in sumo.simulation.getCollisions():
                 # A step is written with the time at which it began.
-                met.setdefault(f"{crash.collider} behind {crash.victim}", []).append(now - dt)
-            written += sumo.vehicle.getIDCount()
-            if is_cut := now >= begun + seconds or written >= enough:
+                crashes.setdefault(f"{crash.collider} behind {crash.victim}", []).append(now - dt)
+            n_positions += sumo.vehicle.getIDCount()
+            if is_cut := now >= start + seconds or n_positions >= enough:
                 break
-        return now - begun, is_cut, met
+        return now - start, is_cut, crashes
 
 
 @contextmanager
