@@ -4,9 +4,9 @@ Rooms are the folders and files at the top of the package; their order stands in
 under ``tool.importlinter``, their budgets under ``tool.house``. It fails where a room imports from
 one above it or uses its private names, where modules import in a circle, where a class name stands
 in three rooms or a private constant's in three modules, where a local is named by a pronoun or a
-participle, and where a room has more lines, files or public names than its budget. With ``--draw`` the picture in
-CONTRIBUTING.md is drawn anew; with ``--lower`` budgets fall to what is there and 2 %, as at each
-release.
+participle, and where a room has more lines, files or public names than its budget. With ``--draw``
+the picture in CONTRIBUTING.md is drawn anew; with ``--lower`` budgets fall to what is there and
+2 %, as at each release.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _PRONOUN = re.compile(
     "all|any|both|each|he|her|him|his|it|its|mine|none|one|others?|ours|own|same|she|some|something"
     "|such|that|theirs?|them|these|they|this|those|us|we|what|which|who|whom"
 )
-# Participles by their last word, if a noun is not among them; what is or has something is a flag, and
-# some are words of Gymnasium and of this project.
+# By their last word, if that is no noun as well; what is or has something is a flag, and some are
+# words of Gymnasium and of this project.
 _PARTICIPLE = re.compile(
     r"(?!(is|has|was|are|may|can)_)(.*_)?"
     "(?!(leader_|wind_)?speed|seed|need|feed|string|ring|warning|heading|spacing|setting|encoding"

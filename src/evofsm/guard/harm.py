@@ -132,8 +132,8 @@ class Harm(NamedTuple):
         weights, rates = zip(
             *(self._record(arm, learning) for arm in (guarded, alone)), strict=True
         )
-        left = _LEFT_BY_ITSELF if self.replaces else _LEFT
-        if len(guarded) >= _CAREFUL and rates[0] > left * rates[1]:
+        most = _LEFT_BY_ITSELF if self.replaces else _LEFT
+        if len(guarded) >= _CAREFUL and rates[0] > most * rates[1]:
             return False
         return bool(weights[0] @ better(guarded, alone) @ weights[1] >= 0.0)
 
@@ -175,8 +175,8 @@ class Harm(NamedTuple):
             if _all_failed(self.alone) and len(self.guarded) < _TRIES:
                 return ""
         fails = any(outcome.failed for outcome in self.outcomes[-1:])
-        asked = self.refuses and (fails or self._long_ago or not self.helps(learning=True))
-        return "shadow" if asked and not self.drives(self._draws) else ""
+        is_drawn = self.refuses and (fails or self._long_ago or not self.helps(learning=True))
+        return "shadow" if is_drawn and not self.drives(self._draws) else ""
 
     @property
     def _long_ago(self) -> bool:
@@ -196,19 +196,19 @@ class Harm(NamedTuple):
         guarded, alone = self.guarded, self.alone
         if not guarded or not alone:
             return ""
-        doubted = learning and (1.0 - self.drives(_DRAWS)) ** self._draws > 1.0 - _SAID
-        if self.helps(learning=learning) and not doubted:
+        in_doubt = learning and (1.0 - self.drives(_DRAWS)) ** self._draws > 1.0 - _SAID
+        if self.helps(learning=learning) and not in_doubt:
             return ""
-        how = "both are tried" if learning else "proposals pass"
-        found = f"guarded episodes {_ended(guarded)}, the controller alone {_ended(alone)}"
-        return f"it was not shown to help: {found}; {how}"
+        manner = "both are tried" if learning else "proposals pass"
+        arms = f"guarded episodes {_ended(guarded)}, the controller alone {_ended(alone)}"
+        return f"it was not shown to help: {arms}; {manner}"
 
     @classmethod
     def restored(cls, settings: Mapping[str, Any], outcomes: NDArray[Any]) -> Harm:
         """As it was in a file, whose rows and settings hold to what is declared."""
         rows = [
-            Outcome(int(n), int(k), f > 0, g > 0, e > 0, score if told else math.nan)
-            for n, k, f, g, e, told, score in outcomes[-2 * _KEPT :].tolist()
+            Outcome(int(n), int(k), f > 0, g > 0, e > 0, score if has_score else math.nan)
+            for n, k, f, g, e, has_score, score in outcomes[-2 * _KEPT :].tolist()
         ]
         return cls(tuple(rows), **settings)
 
@@ -232,20 +232,22 @@ class Harm(NamedTuple):
         which they could not, and of the first in which they were kept. With both it is of neither
         kind, and is left out.
         """
-        acted, watched, kept = driven
-        refuses, n = self.refuses or kept < acted, self.n_episodes + 1
+        n_acted, n_watched, n_kept = driven
+        refuses, n = self.refuses or n_kept < n_acted, self.n_episodes + 1
         ends = self.ends or (ended and not failed)
         now = self._replace(n_episodes=n, refuses=refuses, ends=ends)
-        fades = math.exp(-acted / _DECISIONS)
+        fades = math.exp(-n_acted / _DECISIONS)
         if refuses:
-            now = now._replace(decided=fades * self.decided + acted, kept=fades * self.kept + kept)
-        if bool(acted) == bool(watched):
+            now = now._replace(
+                decided=fades * self.decided + n_acted, kept=fades * self.kept + n_kept
+            )
+        if bool(n_acted) == bool(n_watched):
             return now
-        told = math.nan if score is None else score
-        new = Outcome(n, acted + watched, failed, refuses and acted > 0, ended, told)
+        number = math.nan if score is None else score
+        new = Outcome(n, n_acted + n_watched, failed, refuses and n_acted > 0, ended, number)
         alike = [o for o in self.outcomes if o.guarded == new.guarded]
-        gone = alike[: max(0, len(alike) - _KEPT + 1)]
-        return now._replace(outcomes=(*(o for o in self.outcomes if o not in gone), new))
+        oldest = alike[: max(0, len(alike) - _KEPT + 1)]
+        return now._replace(outcomes=(*(o for o in self.outcomes if o not in oldest), new))
 
 
 def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.float64]:
@@ -271,8 +273,8 @@ def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.flo
     worse = (s_fails[:, None] > 0) & (s_steps[:, None] <= o_last)
     best = (o_fails > 0) & (o_steps <= s_last[:, None])
     more, size = s_score[:, None] - o_score, np.maximum(np.abs(s_score)[:, None], np.abs(o_score))
-    scored = np.where(np.abs(more) > _SAME_SCORE * size, np.sign(more), 0.0)
-    neither = np.where(scored != 0.0, scored, s_well[:, None] - o_well)
+    by_score = np.where(np.abs(more) > _SAME_SCORE * size, np.sign(more), 0.0)
+    neither = np.where(by_score != 0.0, by_score, s_well[:, None] - o_well)
     fails = (s_fails[:, None] > 0) | (o_fails > 0)
     failed = (s_fails[:, None] > 0) & (o_fails > 0)
     return np.where(fails, np.where(failed, _SOONER, 1.0) * (best.astype(float) - worse), neither)
@@ -287,9 +289,9 @@ def _ended(outcomes: Sequence[Outcome]) -> str:
     """After how many steps episodes failed, and how those ended that did not."""
     steps = [o.steps for o in outcomes if o.failed]
     n, well = len(outcomes), sum(o.ended for o in outcomes)
-    said = f"did not fail in {n}"
+    text = f"did not fail in {n}"
     if steps:
-        said = f"failed after {np.median(steps):g} steps in the median ({len(steps)} of {n})"
+        text = f"failed after {np.median(steps):g} steps in the median ({len(steps)} of {n})"
     scores = [o.score for o in outcomes if o.score == o.score]
-    said += f", {well} ended by themselves" if well else ""
-    return said + (f", median score {np.median(scores):.3g}" if any(scores) else "")
+    text += f", {well} ended by themselves" if well else ""
+    return text + (f", median score {np.median(scores):.3g}" if any(scores) else "")
