@@ -35,10 +35,10 @@ _PRONOUN = re.compile(
     "all|any|both|each|he|her|him|his|it|its|mine|none|one|others?|ours|own|same|she|some|something"
     "|such|that|theirs?|them|these|they|this|those|us|we|what|which|who|whom"
 )
-# By their last word, if that is no noun as well; what is or has something is a flag, and some are
+# By their last word, if that is no noun as well; a flag is or has something, and some are
 # words of Gymnasium and of this project.
 _PARTICIPLE = re.compile(
-    r"(?!(is|has|was|are|may|can)_)(.*_)?"
+    r"(?!(n|is|has|was|are|may|can)_)(.*_)?"
     "(?!(leader_|wind_)?speed|seed|need|feed|string|ring|warning|heading|spacing|setting|encoding"
     "|braking|failed|terminated|truncated|guarded|executed|proposed)"
     r"([a-z]+(ed|ing)|known|shown|given|told|taken|seen|held|kept|left|found|made|gone|driven|begun"
