@@ -7,7 +7,6 @@ colour alone. The same colours stand in ``io/graphs.py`` and ``cli/watch/live/pa
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -398,64 +397,79 @@ def history(
     time: ArrayLike,
     rows: ArrayLike,
     names: Sequence[str],
-    risk: ArrayLike,
-    failed: ArrayLike,
-    tolerance: float,
+    alarms: ArrayLike,
+    failures: ArrayLike,
     *,
     model: FSMModel | None = None,
     limits: Sequence[tuple[int, float]] = (),
 ) -> None:
-    """What was seen over time [s], above the risk; bands are alarms, crosses failures.
+    """What was seen over time, and below when alarms were on, and failures came.
 
-    Axes are one for each variable, then one for the states if there is a model, and one for the
-    risk. What is far from nearly all else of a variable is not in view, but counted. Limits are
-    variables, by their index, and the values at which they alarm.
+    What is far from nearly all else of a variable is not in view, but counted.
+
+    Parameters
+    ----------
+    axes : sequence of Axes
+        One for each variable, then one for the states if there is a model, and one for alarms.
+    time : (T,) array_like
+        In seconds, or as dates since 1970.
+    rows : (T, m) array_like
+    names : sequence of str
+    alarms : (T,) array_like
+        1 while an alarm is on that a failure followed, 2 while one is that none did; else 0.
+    failures : (T,) array_like
+        1 with a failure that was foreseen, 2 with one that was not; else 0.
+    model : FSMModel, optional
+    limits : sequence of (int, float)
+        Variables, by their index, and the values at which they alarm.
     """
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
-    fails, lasts = np.asarray(failed, np.bool_), np.ptp(when)
+    fails, lasts = np.asarray(failures), np.ptp(when)
     unit, size = ("hours", 3600.0) if lasts > 7200.0 else ("minutes", 60.0)
     steps, is_dated = np.diff(when), bool(when[0] >= DATES)
     unit, size = ("days", 86400.0) if lasts > 2e5 or is_dated else (unit, size)
     step = float(np.median(steps)) if len(steps) else 0.0
     holes = np.flatnonzero(steps > 3.0 * step) + 1  # before each a row without numbers ends lines
-    x, failure_color = (when - when[0] * (not is_dated)) / size, COLORS["dead end"]
+    x = (when - when[0] * (not is_dated)) / size
     line_x = np.insert(x, holes, x[holes - 1] + step / size)
-    risks = np.insert(np.asarray(risk, np.float64), holes, np.nan)
-    look: Look = {"color": COLORS["follower"], "alpha": 0.3, "linewidth": 2.5, "label": "alarm"}
+    on = np.insert(np.asarray(alarms), holes, 0)
+    kinds = ("right alarm", COLORS["follower"]), ("false alarm", COLORS["third"])
     for ax in axes:
         over = ax.get_xaxis_transform()
-        ax.fill_between(line_x, 0.0, 1.0, risks > tolerance, transform=over, **look)
-        for cross in x[fails]:
-            ax.axvline(cross, color=failure_color, linewidth=0.8, linestyle="--")
+        for kind, (label, color) in enumerate(kinds, 1):
+            look: Look = {"color": color, "alpha": 0.35, "linewidth": 1.5, "label": label}
+            ax.fill_between(line_x, 0.0, 1.0, on == kind, transform=over, **look)
+        for cross in x[fails > 0]:
+            ax.axvline(cross, color=COLORS["dead end"], linewidth=0.8, linestyle="--")
     for k, (ax, name, values) in enumerate(zip(axes, names, z.T, strict=False)):
         ax.plot(line_x, np.insert(values, holes, np.nan), color=ink(), linewidth=0.6)
         at = [value for variable, value in limits if variable == k]
-        low, high = usual_range(values, values[fails])
+        low, high = usual_range(values, values[fails > 0])
         low, high = min(low, *at, high), max(high, *at, low)
         pad = 0.06 * (high - low) or 1.0
         ax.set_ylim(low - pad, high + pad)
         for value in at:
-            ax.axhline(value, color=failure_color, linewidth=1.0)
+            ax.axhline(value, color=COLORS["leader"], linewidth=1.0)
+            look = {"xycoords": ax.get_yaxis_transform(), "ha": "right"}
+            write(ax, f"{value:.4g}", (1.0, value), (-2.0, 5.0), **look)
+        write(ax, name, (0.0, 1.0), (0.0, 5.0), size=8.0, xycoords="axes fraction")
         if beyond := int(((values < low) | (values > high)).sum()):
             look = {"ha": "right", "xycoords": "axes fraction"}
-            write(ax, f"{beyond:,} rows not in view", (1.0, 1.0), (0.0, 4.0), **look)
-        height = 72.0 * ax.get_window_extent().height / ax.figure.dpi
-        letters = int(height / (0.65 * float(ax.yaxis.label.get_fontsize())))
-        ax.set_ylabel(textwrap.fill(name, max(letters, 8)))
+            write(ax, f"{beyond:,} rows beyond this range", (1.0, 1.0), (0.0, 5.0), **look)
     if model is not None:
         sample = np.arange(0, len(z), max(len(z) // 2000, 1))
         nearest_states = [model.nearest(row).state for row in z[sample]]
         axes[-2].plot(x[sample], nearest_states, ".", markersize=1.5, color=COLORS["leader"])
         label_states(axes[-2].yaxis, model.n_states)
-        axes[-2].set_ylabel("state")
-    axes[-1].step(line_x, risks, where="post", color=COLORS["follower"])
-    axes[-1].axhline(tolerance, color=failure_color, linewidth=1.0, label="limit of alarms")
-    look = {"linestyle": "none", "marker": "X", "markersize": 4.5, "clip_on": False}
-    axes[-1].plot(x[fails], np.ones(fails.sum()), color=failure_color, label="failure", **look)
-    _explain(axes[-1])
-    axes[-1].set(ylim=(-0.03, 1.03), ylabel="risk", xlabel=f"time [{unit}]")
+        write(axes[-2], "state", (0.0, 1.0), (0.0, 5.0), size=8.0, xycoords="axes fraction")
+    look = {"linestyle": "none", "marker": "X", "markersize": 5.0, "color": COLORS["dead end"]}
+    for kind, label in enumerate(("failure, foreseen", "failure, not foreseen"), 1):
+        there, face = x[fails == kind], COLORS["dead end"] if kind == 1 else "none"
+        axes[-1].plot(there, np.full(len(there), 0.5), label=label, markerfacecolor=face, **look)
+    _explain(axes[-1], columns=4)
+    axes[-1].set(ylim=(0.0, 1.0), yticks=[], xlabel=f"time [{unit}]")
     if is_dated:
-        ticks = AutoDateLocator(maxticks=8)  # type: ignore[no-untyped-call]
+        ticks = AutoDateLocator(minticks=3, maxticks=9)  # type: ignore[no-untyped-call]
         formatter = ConciseDateFormatter(ticks)  # type: ignore[no-untyped-call]
         axes[-1].xaxis.set(major_locator=ticks, major_formatter=formatter, label_text="time")
 

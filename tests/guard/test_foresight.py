@@ -89,21 +89,20 @@ def test_a_warning_of_one_row_is_found_where_the_horizon_is_long():
     assert "plain thresholds do as well: variable 1 above 5.3" in judge.told_by_experience
 
 
-def test_one_failure_is_learnt_from_and_no_later_tolerance_silences_an_alarm(surge):
+def test_one_failure_is_learnt_from_and_of_alarms_the_closest_that_there_is_counts(surge):
     rising = np.linspace(0.0, 1.0, 60)[:, None]
     for runs in ([rising], [rising * 0.5, rising]):
         one = Foresight.learn_log(runs, [run.max() == 1.0 for run in runs], dt=DT)
-        assert one.rate_of(0.01) is None  # cross-validated it was never right
+        assert one.alarm is None  # cross-validated it was never right
     judge = copy.deepcopy(surge)
-    for right in np.array([[4, 4, 4, 4], [4, 3, 3, 2], [2, 3, 3, 4]]):
-        judge.held_out = np.column_stack([right, 4 - right, [4] * 4, [0] * 4])
-        for rate in RATES:
-            assert judge.rate_of(judge.tolerance_of(rate)) is not None
+    judge.held_out = np.array([[0, 0, 4, 2], [3, 1, 4, 0], [2, 2, 4, 1], [4, 4, 4, 0]])
+    for judge.stated, alarm in ((0.05, 1), (0.1, 1), (0.3, 1), (1.0, 2), (2.0, 2), (9.0, 3)):
+        assert judge.alarm == alarm
 
 
 def test_where_nothing_foresees_a_failure_there_is_no_alarm():
     judge = learnt(random, 40)
-    assert judge.rate_of(0.01) is None
+    assert judge.alarm is None
     for_all = (
         "for 0.1, 0.3, 1, 3 false alarms a day no alarm is false so seldom and better than chance"
     )
@@ -111,10 +110,12 @@ def test_where_nothing_foresees_a_failure_there_is_no_alarm():
 
 
 def test_a_guard_alarms_row_by_row_as_the_log_was_judged_also_from_its_file(surge, reloaded):
-    reviser = ActionReviser(surge, Choices(1), tolerance=surge.tolerance_of(1.0))
+    surge = copy.deepcopy(surge)
+    surge.stated = 1.0
+    reviser = ActionReviser(surge, Choices(1), tolerance=1e-6)
     guard = reloaded(Guard.of(reviser, interval=DT, learn=False))
     episodes, failed = log_of(surging, 2, 8)
-    tally, on = surge.tally(Runs.of(episodes, failed), surge.rate_of(reviser.tolerance))
+    tally, on = surge.tally(Runs.of(episodes, failed), surge.alarm)
     said = []
     for episode, is_failed in zip(episodes, failed, strict=True):
         said += [guard.decide(z, 0) for z in episode]

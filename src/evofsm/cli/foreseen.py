@@ -15,7 +15,7 @@ from evofsm.cli.show import facts, print_json, show, table
 from evofsm.fsm import EvolvingFSM, Labels
 from evofsm.fsm.proportions import poisson_bounds
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
-from evofsm.guard.foresight import DATES, RATES, Runs, false_times, span
+from evofsm.guard.foresight import DATES, RATE, RATES, Runs, false_times, span
 from evofsm.io import Chunk
 
 if TYPE_CHECKING:
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-#: False alarms a day that are accepted, where nobody says how risky it may be.
-RATE = 0.3
 #: The share of a log that is learnt from, where the rest is to judge it.
-LEARNT = 0.6
+SPLIT = 0.6
+# Less than the share of alarms of any kind that are right: which alarm it is the judge says.
+_ANY_ALARM = 1e-6
 # Alarms that are listed.
 _LISTED = 12
 _CAME = ("ahead", "false/day")
@@ -39,34 +39,31 @@ def guard_where_nobody_acts(
     labels: Labels,
     horizon: float | None,
     hold: float,
-    tolerance: float | None,
+    false_a_day: float | None,
     machine: EvolvingFSM | None = None,
 ) -> Guard:
-    """A guard that alarms before failures, as it was learnt from the episodes of a log.
-
-    The tolerance is by default such that there are `RATE` false alarms a day.
-    """
+    """A guard that alarms before failures, as it was learnt from the episodes of a log."""
     runs, dt = _runs(episodes), float(episodes[0].dt)
     rows, names, units = [e.observations for e in episodes], labels.names, labels.units
     settings: dict[str, Any] = {"dt": dt, "horizon": horizon, "hold": hold}
     judge = Foresight.learn_log(rows, runs.failed, **settings, names=names, units=units)
-    tolerance = judge.tolerance_of(RATE) if tolerance is None else tolerance
-    return _guard_of(judge, tolerance, machine, learn=False)
+    return _guard_of(judge, false_a_day, machine, learn=False)
 
 
 def guard_from_zero(
-    dt: float, names: Sequence[str], horizon: float | None, hold: float, tolerance: float | None
+    dt: float, names: Sequence[str], horizon: float | None, hold: float, false_a_day: float | None
 ) -> Guard:
     """The same, of one that has seen nothing, and learns as it goes."""
     judge = Foresight.from_zero(dt=dt, names=names, horizon=horizon, hold=hold)
     machine = EvolvingFSM(1, max_states=200)
-    return _guard_of(judge, 0.5 if tolerance is None else tolerance, machine, learn=True)
+    return _guard_of(judge, false_a_day, machine, learn=True)
 
 
 def _guard_of(
-    judge: Foresight, tolerance: float, machine: EvolvingFSM | None, *, learn: bool
+    judge: Foresight, false_a_day: float | None, machine: EvolvingFSM | None, *, learn: bool
 ) -> Guard:
-    reviser = ActionReviser(judge, Choices(1), tolerance=tolerance, mode=Mode.SHADOW)
+    judge.stated = RATE if false_a_day is None else false_a_day
+    reviser = ActionReviser(judge, Choices(1), tolerance=_ANY_ALARM, mode=Mode.SHADOW)
     return Guard.of(reviser, interval=judge.dt, machine=machine, learn=learn)
 
 
@@ -76,35 +73,35 @@ def show_foreseen(
     guard: Guard | None,
     labels: Labels,
     asked: tuple[float | None, float, float | None],
+    split: float,
     plot: Path | None,
     *,
     as_json: bool,
 ) -> None:
     """Say what came of the alarms of a guard, or of one that learns from the log's first part.
 
-    What is asked for are the horizon, the hold time and the tolerance.
+    What is asked for are the horizon, the hold time and false alarms a day.
     """
     title, held_out = str(file), "; not held out, if this guard learnt from them"
     if guard is None:
         rows = np.cumsum([len(e.times) for e in episodes])
-        first = int((rows <= LEARNT * rows[-1]).sum())
+        first = int((rows <= split * rows[-1]).sum())
         first_part, episodes = _of_two_rows(episodes[:first]), episodes[first:]
         if not (first_part and _of_two_rows(episodes)):
             raise ValueError(f"{file}: it takes two episodes at least, to learn and to judge")
         guard = guard_where_nobody_acts(first_part, labels, *asked)
         title += f": learnt from its first {len(first_part):,} episodes, judged by the rest"
-        held_out = f", held out (the last {1.0 - LEARNT:.0%} of the rows)"
+        held_out = f", held out (the last {1.0 - split:.0%} of the rows)"
     at_once = sum(e.failed for e in episodes if len(e.times) == 1)
     episodes = _of_two_rows(episodes)
-    reviser, judge = guard.reviser, guard.judge
-    assert isinstance(reviser, ActionReviser)
+    judge = guard.judge
     assert isinstance(judge, Foresight)
-    tolerance = reviser.tolerance if asked[-1] is None else asked[-1]
+    judge.stated = judge.stated if asked[-1] is None else asked[-1]
     runs, times = _runs(episodes), np.concatenate([e.times for e in episodes])
     columns = judge.columns(runs.rows, runs.starts)
+    document = {**_document(judge, runs, times, columns), "failures_at_once": at_once}
     if plot is not None:
-        _draw(judge, tolerance, guard.machine, runs, times, columns, plot)
-    document = {**_document(judge, tolerance, runs, times, columns), "failures_at_once": at_once}
+        _draw(judge, guard.machine, runs, times, document, plot)
     if as_json:
         print_json({"file": file, **document})
     else:
@@ -120,14 +117,13 @@ def _runs(episodes: Sequence[Chunk]) -> Runs:
     return Runs.of([e.observations for e in episodes], [e.failed for e in episodes])
 
 
-def _document(
-    judge: Foresight, tolerance: float, runs: Runs, times: Floats, columns: Floats
-) -> dict[str, Any]:
-    own_rate, alarms, limits = judge.rate_of(tolerance), [], []
+def _document(judge: Foresight, runs: Runs, times: Floats, columns: Floats) -> dict[str, Any]:
+    own_rate, alarms, limits = judge.alarm, [], []
+    options = {"columns": columns, "early": _early(judge, runs, times)}
     for rate, budget in enumerate(RATES):
         row: dict[str, Any] = {"stated": budget, "is_own": rate == own_rate}
         for kind, plain in (("learnt", None), ("plain", True)):
-            tally, _ = judge.tally(runs, rate, plain=plain, columns=columns)
+            tally, _ = judge.tally(runs, rate, plain=plain, **options)
             row[kind] = {**tally._asdict(), "false_a_day": tally.rate}
         alarms.append(row)
         row = {"stated": budget, "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 3])]}
@@ -140,13 +136,19 @@ def _document(
         limits.append(row)
     head: dict[str, Any] = {"rows": len(times), "episodes": len(runs.starts)}
     head |= {"failures": int(runs.failed.sum()), "seconds": len(times) * judge.dt}
-    head |= {"horizon": judge.horizon * judge.dt, "tolerance": tolerance}
+    head |= {"horizon": judge.horizon * judge.dt}
     entries = [] if own_rate is None else list(_listed(judge, own_rate, runs, times, columns))
     misses = [row for row in entries if "lasts" not in row]
     hits = [row for row in entries if "lasts" in row]
     fails = [dict(zip(("where", "came", "failed"), row, strict=True)) for row in judge.fails(runs)]
     tables = {"alarms": alarms, "limits": limits, "fails": fails}
     return {**head, **tables, "listed": hits, "missed": misses}
+
+
+def _early(judge: Foresight, runs: Runs, times: Floats) -> Floats:
+    """(E,) how much sooner than a step after the row before each episode failed [rows]."""
+    steps = (times[runs.last] - times[runs.last - 1]) / judge.dt
+    return np.where(runs.failed, np.clip(1.0 - steps, 0.0, 1.0), 0.0)
 
 
 def _listed(
@@ -202,13 +204,7 @@ def _tables(
     yield facts(title, pairs)
     title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
     yield table(title, _HEADER, rows, bold=bold)
-    places = []
-    for rates, k in judge.alarms.items():
-        limit = found["limits"][k]
-        is_other = limit["kind"] != "plain" and limit["plain"] != "none"
-        beside = f"; plain thresholds would be {limit['plain']}" if is_other else ""
-        places.append((rates, f"{judge.of(k)}{beside}"))
-    yield facts("\nWhere they alarm, by false alarms a day", places)
+    yield from alarms_of(judge)
     rows = [[x["where"], f"{x['came']:,}", f"{x['failed']:,}"] for x in found["fails"]]
     header = "it fails where", "episodes that came there", "of them failed"
     yield table("\nWhere it fails, as it was learnt", header, rows)
@@ -226,6 +222,18 @@ def _tables(
         yield table(_last(misses, "Failures that were not foreseen"), header, rows, left=(0, 2))
 
 
+def alarms_of(judge: Foresight) -> Iterator[RenderableType]:
+    """What each alarm is, and how often it was right, beside plain thresholds."""
+    places = []
+    for rates, rate in judge.alarms.items():
+        plain = judge.words(rate, plain=True)
+        beside = (
+            f"; plain thresholds would be {plain}" if plain and not judge.is_plain(rate) else ""
+        )
+        places.append((rates, f"{judge.of(rate)}{beside}"))
+    yield facts("\nWhere they alarm, by false alarms a day", places)
+
+
 def _last(hits: Sequence[Any], what: str) -> str:
     n = len(hits)
     return f"\n{what}: {'all' if n <= _LISTED else f'the last {_LISTED} of'} {n:,}"
@@ -235,43 +243,59 @@ def date(time: float) -> str:
     """A time [s], as people read it."""
     if time < DATES:
         return f"{time:.10g}"
-    return f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M}"
+    text = f"{datetime.fromtimestamp(round(time), UTC):%Y-%m-%d %H:%M:%S}"
+    return text.removesuffix(":00")
 
 
 def _draw(
     judge: Foresight,
-    tolerance: float,
     machine: EvolvingFSM | None,
     runs: Runs,
     times: Floats,
-    columns: Floats,
+    document: dict[str, Any],
     out: Path,
 ) -> None:
-    """Variables, states, risk, alarms and failures over time: all of it, and the last failure."""
+    """Variables, states, alarms and failures over time: all of it, one foreseen, and one missed."""
     from evofsm import plot
 
-    own_rate = judge.rate_of(tolerance)
-    on = judge.tally(runs, own_rate or 0, columns=columns)[1]
-    risk = on * (0.0 if own_rate is None else judge.shares[own_rate])  # as a live row tells it
-    failed, ends = np.zeros(len(risk), np.bool_), runs.last
-    failed[ends[runs.failed]] = True
-    # Of those that lasted for a while, if there are any, the last one that failed, if one did.
-    number = int(np.lexsort([runs.starts, runs.failed, runs.lengths > judge.horizon])[-1])
-    last = int(ends[number])
-    near = max(int(runs.starts[number]), last - 4 * judge.horizon)
-    limits = [] if own_rate is None else judge.thresholds(own_rate)
-    rate_text = next((rates for rates, last in judge.alarms.items() if own_rate == last), "")
-    alarm = f", alarm for {rate_text} false a day" if rate_text else ", no alarm"
+    alarms, failures = np.zeros((2, len(times)), np.int64)
+    failures[runs.last[runs.failed]] = 1
+    failures[[row["row"] for row in document["missed"]]] = 2
+    for hit in document["listed"]:
+        alarms[hit["row"] : hit["row"] + round(hit["lasts"] / judge.dt)] = 1 if hit["failed"] else 2
+    limits = [] if judge.alarm is None else judge.thresholds(judge.alarm)
+    parts = {_headline(document): slice(None)}
+    for kind, word in ((1, "foreseen"), (2, "not foreseen")):
+        ends = np.flatnonzero(failures == kind)
+        if len(ends):  # the one whose episode lasted as long as most
+            numbers = np.searchsorted(runs.last, ends)
+            typical = int(np.argsort(runs.lengths[numbers])[len(ends) // 2])
+            first, last = int(runs.starts[numbers[typical]]), int(ends[typical])
+            title = f"{word}: episode {numbers[typical] + 1:,}"
+            title += f", {date(times[last])}" * bool(times[last] >= DATES)
+            parts[title] = slice(max(first, last - 4 * judge.horizon), last + 1)
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
     model = None if machine is None or not machine.n_states else machine.model()
     count = len(names) + 1 + (model is not None)
-    with picture(out, 10.0, 1.3 * count) as figure:
-        axes = figure.subplots(count, 2, sharex="col")
-        title = f"Episode {number + 1:,}{', before it failed' if runs.failed[number] else ''}"
-        title += f": {date(times[last])}" * bool(times[last] >= DATES)
-        parts = {f"{len(ends):,} episodes{alarm}": slice(None), title: slice(near, last + 1)}
+    heights = [1.0] * (count - 1) + [0.35]
+    with picture(out, 5.0 * len(parts), 1.3 * count) as figure:
+        axes = figure.subplots(
+            count, len(parts), sharex="col", squeeze=False, height_ratios=heights
+        )
         for column, (title, part) in zip(axes.T, parts.items(), strict=True):
-            series = times[part], runs.rows[part], names, risk[part], failed[part]
-            plot.history(column, *series, tolerance, model=model, limits=limits)
-            column[0].set_title(title, loc="left")
-        axes[-1, 1].get_legend().remove()
+            series = times[part], runs.rows[part], names, alarms[part], failures[part]
+            plot.history(column, *series, model=model, limits=limits)
+            column[0].set_title(title, loc="left", pad=16.0)
+        for ax in axes[-1, 1:]:
+            ax.get_legend().remove()
+
+
+def _headline(document: dict[str, Any]) -> str:
+    """What came of the alarm, in a line."""
+    rows = [row for row in document["alarms"] if row["is_own"]]
+    if not rows:
+        return f"{document['failures']:,} failures, no alarm"
+    tally = rows[0]["learnt"]
+    rates = f"{tally['false_a_day']:.2g} false a day ({rows[0]['stated']:g} stated)"
+    ahead = f"{tally['foreseen']} of {tally['failures']} failures foreseen, {span(tally['lead'])}"
+    return f"{ahead} ahead, {rates}"

@@ -136,7 +136,7 @@ def _draw(
         raise ValueError(f"--axes is {axes}; name two of {', '.join(names)}")
     judge, order = guard and guard.judge, list[int]()
     if isinstance(judge, Foresight):
-        rate = judge.rate_of(getattr(guard and guard.reviser, "tolerance", 1.0))
+        rate = judge.alarm
         logged["alarm"] = () if rate is None else judge.where(rate)
         order = [] if rate is None else telling(judge.where(rate))
     away = (model.centers - np.median(model.centers, axis=0)) ** 2  # then what differs at failures

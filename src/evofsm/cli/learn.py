@@ -14,6 +14,7 @@ from evofsm.cli.options import (
     BRAKES,
     TOLERANCE,
     Brakes,
+    FalseADay,
     Horizon,
     Json,
     Judge,
@@ -26,6 +27,7 @@ from evofsm.cli.options import (
     in_quotes,
     option,
     reads_logs,
+    refuse_other_limit,
 )
 from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
@@ -78,6 +80,7 @@ def learn(
     tolerance: Tolerance = TOLERANCE,
     horizon: Horizon = None,
     persist: Persist = 0.0,
+    false_a_day: FalseADay = None,
     as_json: Json = False,
 ) -> None:
     """Learn a state machine from logs of your own, of any size, row by row.
@@ -87,15 +90,15 @@ def learn(
     knows what failed.
 
     With --guard, a guard in shadow mode then goes through all rows and learns from them too. Where
-    nobody acts (--action ''), it learns alarms, with 0.3 false ones a day unless --tolerance says
-    how risky it may be.
+    nobody acts (--action ''), it learns alarms (--false-a-day).
 
     Of a log whose columns nobody named, evofsm learn LOG prints what is in it, and what to ask.
     """
-    from evofsm.cli.foreseen import guard_where_nobody_acts
+    from evofsm.cli.foreseen import alarms_of, guard_where_nobody_acts
     from evofsm.cli.learning import guard_of_log, learn_traces, refusing, teach, warnings_of
     from evofsm.driving.naming import UNITS, VARIABLES
     from evofsm.fsm import Labels
+    from evofsm.guard import Foresight
     from evofsm.io import episodes_of
     from evofsm.io.logs import Noted
     from evofsm.io.tables import SI
@@ -110,6 +113,7 @@ def learn(
         return
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
+    refuse_other_limit(acts, false_a_day, None if tolerance == TOLERANCE else tolerance)
     actions = _actions(action_range if acts else "0:1:1")
     encoder = columns.observe
     machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
@@ -147,7 +151,7 @@ def learn(
             if refusal := refusing(share):
                 warn(f"warning: in the later half of the log the guard {refusal}")
         else:
-            requests = horizon, persist, None if tolerance == TOLERANCE else tolerance
+            requests = horizon, persist, false_a_day
             episodes = [chunk for chunk in episodes_of(log_chunks) if len(chunk.times) > 1]
             labels = Labels(names=encoder.names, units=lesson.model.units)
             new_guard = guard_where_nobody_acts(episodes, labels, *requests, lesson.machine)
@@ -170,6 +174,8 @@ def learn(
         beyond = (lesson.read.clipped_below + lesson.read.clipped_above) / lesson.read.rows
         for line in _of_guard(new_guard, guard, brakes, beyond):
             say(line)
+        if isinstance(new_guard.judge, Foresight):
+            show(*alarms_of(new_guard.judge))
 
 
 # -- What was asked for ---------------------------------------------------------------------------
@@ -338,14 +344,12 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     takes = f"evofsm monitor --guard {path} takes rows of {keys}{also}."
     yield f"The guard was saved to {path}. {takes}"
     if isinstance(guard.judge, Foresight):
-        tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
-        soon = f"up to {span(guard.judge.horizon * guard.judge.dt)} (--horizon)"
-        if (rate := guard.judge.rate_of(tolerance)) is None:
+        soon = f"up to {span(guard.judge.horizon * guard.judge.dt)} before a failure (--horizon)"
+        if guard.judge.alarm is None:
             why = "cross-validated, no alarm was better than chance"
             yield f"It never alarms: {why} (fewer columns, or a longer --horizon?)."
         else:
-            yield f"It alarms {soon} before a failure, where {guard.judge.of(rate)}."
-        yield f"All that it learnt (--tolerance takes one): {guard.judge.told_by_experience}."
+            yield f"{guard.judge.alarm_in_words.capitalize()} (--false-a-day), {soon}."
         return
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."

@@ -278,6 +278,19 @@ Persist = Annotated[
     float, option("Where nobody acts: how long a limit is passed before it alarms [s].", min=0.0)
 ]
 
+FalseADay = Annotated[
+    float | None,
+    option("Where nobody acts: false alarms a day that are stated. [default: 0.3]", min=0.0),
+]
+
+
+def refuse_other_limit(acts: bool, false_a_day: float | None, tolerance: float | None) -> None:
+    """Raise if what is said of alarms is said of somebody's actions, or the other way round."""
+    if acts and false_a_day is not None:
+        raise ValueError("--false-a-day is of alarms where nobody acts: --action ''")
+    if not acts and tolerance is not None:
+        raise ValueError("--tolerance is of actions; where nobody acts, --false-a-day counts")
+
 
 def seconds(name: str, text: str) -> float:
     """How long a text says it is [s]: ``10min``, or ``0.5``."""

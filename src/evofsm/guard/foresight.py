@@ -37,8 +37,8 @@ from evofsm.guard.learnt.rollout import FAILS, Flags, Floats, Ints
 from evofsm.guard.learnt.words import region
 from evofsm.store import COUNT, FROM_1, SIZE, Kind, Numbers, Place
 
-#: False alarms a day that an alarm may be asked for, the fewest first.
-RATES = (0.1, 0.3, 1.0, 3.0)
+#: False alarms a day that an alarm may be asked for, the fewest first; and where nobody says.
+RATES, RATE = (0.1, 0.3, 1.0, 3.0), 0.3
 #: Times from here on are dates [s].
 DATES = 1e8
 # In horizons: how far ahead limits look, over what the rate is taken, how long an alarm stays on.
@@ -82,7 +82,7 @@ KIND = Kind(
     },
     {
         **{"dt": SIZE, "horizon": FROM_1, "hold": FROM_1, "names": list[str], "units": list[str]},
-        **{"learns": bool, "asked": SIZE._replace(optional=True)},
+        **{"learns": bool, "asked": SIZE._replace(optional=True), "stated": SIZE},
     },
 )
 
@@ -148,8 +148,8 @@ class Foresight(LearningJudge):
     the latest 20,000 rows (half of them of episodes that failed), where enough has come since.
 
     The risk is the share of such alarms that a failure followed, cross-validated; 0 while none is
-    on. Which alarm it is, of those for several rates of false ones, says the tolerance: the one
-    with most alarms of which more than that were right.
+    on. ``stated`` says which alarm it is, of those for several rates of false ones: the one for
+    most of them a day that are no more; if there is none, the one for fewest.
 
     Examples
     --------
@@ -166,7 +166,6 @@ class Foresight(LearningJudge):
     fallback = Fallback(0.0, "nobody acts")
     rates = RATES  #: for each there is an alarm
     runs = Runs.of
-    _accepted = 0.0
 
     def __init__(
         self,
@@ -180,6 +179,7 @@ class Foresight(LearningJudge):
         units: Sequence[str] = (),
         log: Runs | None = None,
         asked: float | None = None,
+        stated: float = RATE,
     ) -> None:
         self.dt = positive("dt", dt)
         self.horizon, self.hold = horizon, hold  #: [rows]
@@ -191,6 +191,7 @@ class Foresight(LearningJudge):
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=dt)
         self.log = log  #: what it learns from, if it does as it goes
         self.asked = asked  #: horizon that was asked for, if any [s]
+        self.stated = stated  #: false alarms a day
         self._seen: list[Floats] = []  # of the episode under way
         self._learnt = (0, 0) if log is None else (int(log.failed.sum()), len(log.rows))
         self.start_episode()
@@ -382,6 +383,10 @@ class Foresight(LearningJudge):
         is_of_rate = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
         return np.asarray(self.limits[is_of_rate])
 
+    def is_plain(self, rate: int) -> bool:
+        """Whether plain thresholds do as well."""
+        return bool(self.held_out[rate, 3] == _PLAIN)
+
     def where(self, rate: int) -> Floats:
         """(r, SIZE) forms beyond which an alarm is on while nothing changes; `HELD` is how near."""
         m, forms = len(self.labels.names), []
@@ -396,11 +401,26 @@ class Foresight(LearningJudge):
         return [(int(v), at) for *_, v, when, _, at in limits if v < m and not when]
 
     def tally(
-        self, log: Runs, rate: int, *, plain: bool | None = None, columns: Floats | None = None
+        self,
+        log: Runs,
+        rate: int,
+        *,
+        plain: bool | None = None,
+        columns: Floats | None = None,
+        early: ArrayLike = 0.0,
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,).
 
-        With the `columns` of the log, if they are known.
+        Parameters
+        ----------
+        log : Runs
+        rate : int
+        plain : bool, optional
+            Whether it is that of plain thresholds; by default of the kind that did better.
+        columns : ndarray, optional
+            The `columns` of the log, if they are known.
+        early : (E,) array_like, optional
+            How much sooner than its row each failure came [rows].
         """
         limits = self.of_rate(rate, plain=plain)
         columns = self.columns(log.rows, log.starts) if columns is None else columns
@@ -408,7 +428,7 @@ class Foresight(LearningJudge):
         leads = np.zeros(len(log.starts))
         false = _tally(above, on, log.starts, log.failed, self._spans, leads)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
-        lead = float(leads.sum()) / max(n, 1) * self.dt
+        lead = float(np.maximum(leads - np.asarray(early), 0.0).sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
 
     def words(self, rate: int, *, plain: bool | None = None) -> str:
@@ -464,18 +484,19 @@ class Foresight(LearningJudge):
         right, false, _, kind = self.held_out.T
         return np.where(kind == _NO_KIND, 0.0, right / np.maximum(right + false, 1.0))
 
-    def rate_of(self, tolerance: float) -> int | None:
-        """Which of `RATES` the alarm is for, more of which are right; None if there is none."""
-        fit = np.flatnonzero(self.shares > tolerance)
-        return int(fit[-1]) if len(fit) else None
+    @property
+    def alarm(self) -> int | None:
+        """Which of `RATES` the alarm is for; None if no alarm was better than chance."""
+        rates = [k for k in range(len(RATES)) if self.shares[k] > 0.0]
+        return max((k for k in rates if RATES[k] <= self.stated), default=min(rates, default=None))
 
-    def tolerance_of(self, rate: float) -> float:
-        """The tolerance with which there are at most so many false alarms a day, or else few."""
-        k = max(int(np.searchsorted(RATES, rate, "right")) - 1, 0)
-        k = next((n for n in range(k, len(RATES)) if self.shares[n] > 0.0), k)
-        more = self.shares[k + 1 :]
-        below = float(more[more < self.shares[k]].max(initial=0.0))
-        return float(np.clip(0.5 * (self.shares[k] + below), 0.01, 0.99))
+    @property
+    def alarm_in_words(self) -> str:
+        """Which alarm it is."""
+        if self.alarm is None:
+            return "no alarm was better than chance"
+        fewest = ", as none is for fewer" * (RATES[self.alarm] > self.stated)
+        return f"it alarms as for {RATES[self.alarm]:g} false alarms a day{fewest}"
 
     def fails(self, log: Runs) -> list[tuple[str, int, int]]:
         """Where it fails, in words; how many episodes came there, and how many of them failed."""
@@ -496,13 +517,11 @@ class Foresight(LearningJudge):
 
     @property
     def told_by_experience(self) -> str:
-        """Where it fails; what each alarm is, how often it was right, and with which tolerance."""
+        """Where it fails; what each alarm is, and how often it was right."""
         there = " or ".join(map(self._region, self._said))
         texts = [f"it fails where {there}"] if there else []
         for rates, last in self.alarms.items():
-            at = f"{self.tolerance_of(RATES[last]):.3g}"
-            note = f" (tolerance {at})" if self.rate_of(float(at)) == last else ""
-            texts.append(f"for {rates} false alarms a day{note} {self.of(last)}")
+            texts.append(f"for {rates} false alarms a day {self.of(last)}")
         return "; ".join(texts)
 
     @property
@@ -555,9 +574,8 @@ class Foresight(LearningJudge):
         mask: Any = None,
     ) -> Search:
         """Keep what is proposed, as nobody acts; the risk is that of the alarm that is on."""
-        self._accepted = tolerance
         is_passed, (*_, on) = self._next(situation.observation)
-        rate, risk, reason = self.rate_of(tolerance), 0.0, "no alarm is on"
+        rate, risk, reason = self.alarm, 0.0, "no alarm is on"
         evidence = 0.0 if rate is None else float(self.held_out[rate, :2].sum())
         if rate is not None and on[rate]:
             risk = float(self.shares[rate])
@@ -568,8 +586,8 @@ class Foresight(LearningJudge):
         return Search(np.array([float(wanted)]), judgement, 0, reason)
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
-        """The risk, whatever would be done, with the tolerance that was asked for last."""
-        judgement = self.search(situation, 0.0, tolerance=self._accepted, revising=False).judged
+        """The risk, whatever would be done."""
+        judgement = self.search(situation, 0.0, tolerance=1.0, revising=False).judged
         risk, low, high, slack = (np.repeat(values, np.size(actions)) for values in judgement[:4])
         return Judgement(risk, low, high, slack, judgement.evidence)
 
@@ -626,7 +644,8 @@ class Foresight(LearningJudge):
         log = _nothing(0) if self.log is None else self.log
         arrays = {name: getattr(self, name) for name in ("forms", "limits", "held_out")}
         arrays |= {name: np.asarray(values, np.float64) for name, values in log._asdict().items()}
-        settings = {name: getattr(self, name) for name in ("dt", "horizon", "hold", "asked")}
+        names = "dt", "horizon", "hold", "asked", "stated"
+        settings = {name: getattr(self, name) for name in names}
         settings["learns"] = self.log is not None
         settings |= {name: list(getattr(self.labels, name)) for name in ("names", "units")}
         store.write(path, KIND, settings, arrays, provenance)

@@ -15,6 +15,7 @@ from evofsm.cli.options import (
     BRAKES,
     TOLERANCE,
     Brakes,
+    FalseADay,
     Horizon,
     Json,
     ModeName,
@@ -26,6 +27,7 @@ from evofsm.cli.options import (
     quoted,
     reading_of,
     reads_logs,
+    refuse_other_limit,
     split_names,
     typed,
 )
@@ -83,6 +85,9 @@ def monitor(
     heartbeat: Annotated[
         float | None, option("Send a heartbeat after so long without a row [s].", min=0.001)
     ] = None,
+    text: Annotated[
+        bool, option("Print alarms and failures alone, in words, for people.", "--text")
+    ] = False,
     warm: Annotated[bool, option("Compile before the first row comes.", "--warm")] = False,
     summary: Annotated[
         bool, option("Print how often it would have alarmed, and the worst moments.", "--summary")
@@ -92,6 +97,10 @@ def monitor(
     reading: partial[Reading],
     horizon: Horizon = None,
     persist: Persist = 0.0,
+    false_a_day: FalseADay = None,
+    split: Annotated[
+        float, option("Of --summary without --guard: the share that is learnt from.", min=0, max=1)
+    ] = 0.6,
     plot: Annotated[Path | None, option("Of --summary, where nobody acts: a picture.")] = None,
     as_json: Json = False,
 ) -> int | None:
@@ -106,8 +115,8 @@ def monitor(
     --resample), and who acts: --low and --high, --n-actions, or nobody (--action '').
 
     With --summary it reads FILE, such lines or a log, and prints how often it would have alarmed.
-    Where nobody acts, alarms stand beside plain thresholds; without --guard the first 60 % of the
-    log are learnt from.
+    Where nobody acts, alarms stand beside plain thresholds; without --guard the log's first part
+    is learnt from (--split).
     """
     if file is not None and file.is_file() and guard is None:
         with file.open("rb") as stream:
@@ -119,11 +128,11 @@ def monitor(
         raise ValueError("--traffic learns nothing: it goes with no --guard, --state or --learn")
     if summary and (file is None or state or audit):
         raise ValueError("--summary needs FILE, and goes with no --state or --audit")
-    from evofsm.cli.foreseen import RATE
     from evofsm.cli.monitor.decider import EPISODE, Decider
     from evofsm.cli.monitor.slots import Slots
     from evofsm.cli.monitor.state import State
-    from evofsm.cli.monitor.transports import Server
+    from evofsm.cli.monitor.summary import Text
+    from evofsm.cli.monitor.transports import Server, json_line
     from evofsm.driving.assumed import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
     from evofsm.guard import Foresight, Guard
@@ -132,6 +141,7 @@ def monitor(
     if guard is not None and brakes != BRAKES:
         raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
     accepted_risk = TOLERANCE if tolerance is None else tolerance
+    alarms = horizon, persist, false_a_day
 
     def fresh() -> Guard:
         if guard is not None:
@@ -147,7 +157,7 @@ def monitor(
     if guard is None and not is_log and (options or "action" in given_of(reading)):
         if traffic:
             raise ValueError("--traffic is of cars, and goes with no --observe or --action")
-        new_guard, learn = _begun({**options}, reading, interval, tolerance, horizon, persist), True
+        new_guard, learn = _begun({**options}, reading, interval, tolerance, alarms), True
     defaults, learnt = dict[str, Any](), guard or state
     if learnt is not None and learnt.is_file():
         defaults = dict(read_header(learnt).provenance.get("read with", {}))
@@ -179,12 +189,13 @@ def monitor(
                 raise ValueError(f"{file}: no episode has two rows")
             chunks, interval = chain([first], episodes), first.dt
             if sentry and not abs(interval / sentry.interval - 1.0) < _SAME_STEP:
-                text = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
-                warn(f"warning: {text} {sentry.interval:g} s: --resample {sentry.interval:g}s")
+                warning = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
+                warn(f"warning: {warning} {sentry.interval:g} s: --resample {sentry.interval:g}s")
             if alone:
                 labels = Labels(names=log_format.columns.observe.names)
-                requests = horizon, persist, tolerance
-                show_foreseen(file, list(chunks), sentry, labels, requests, plot, as_json=as_json)
+                refuse_other_limit(False, false_a_day, tolerance)
+                to = split, plot
+                show_foreseen(file, list(chunks), sentry, labels, alarms, *to, as_json=as_json)
                 return None
         if summary and (as_json or plot):
             raise ValueError("--json and --plot are for logs where nobody acts: --action ''")
@@ -193,6 +204,7 @@ def monitor(
             digest = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
             basics = {"interval": interval, "brakes": brakes} if guard is None else {}
             how = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
+            how["false_a_day"] = false_a_day
             columns = {k: v for k, v in given_of(reader).items() if k != "topics"}
             keeper = State(state, {"guard": digest, **basics, **how, **options, **columns})
             stack.callback(keeper.close)
@@ -200,15 +212,17 @@ def monitor(
             warn("nothing of what is learnt is saved; --state FILE saves it")
         failed = new_guard.failed if new_guard else None
         sentry = fresh() if keeper is None else keeper.guard(fresh, failed)
-        _prepare(sentry, mode, tolerance, audit, stack, learn=learn)
+        _prepare(sentry, mode, (tolerance, false_a_day), audit, stack, learn=learn)
         if not (is_log or traffic):
             slots = Slots(reader(observe=quoted(sentry.variables or VARIABLES), dt=None).columns)
-        rate = RATE if new_guard and tolerance is None else None
-        decider = Decider(sentry, episode=rows, slots=slots, rate=rate)
+        decider = Decider(sentry, episode=rows, slots=slots)
         notice = assumptions(brakes, accepted_risk)
         if guard is not None:
-            risk = getattr(sentry.reviser, "tolerance", None)
-            accepts = "" if risk is None else f"; a risk of {risk:.3g} is accepted (--tolerance)"
+            risk, accepts = getattr(sentry.reviser, "tolerance", None), ""
+            if isinstance(sentry.judge, Foresight):
+                accepts = f"; {sentry.judge.alarm_in_words} (--false-a-day)"
+            elif risk is not None:
+                accepts = f"; a risk of {risk:.3g} is accepted (--tolerance)"
             notice = f"assumed: what {guard} was given and has learnt{accepts}"
         if new_guard:
             notice = f"a guard of {', '.join(sentry.variables)} begins, and learns from what comes"
@@ -225,7 +239,8 @@ def monitor(
             again = keeper.begin(decider)
             if decider.n:
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
-        server = Server(decider, heartbeat or math.inf, keeps=keeper is not None)
+        line = Text().line if text else json_line
+        server = Server(decider, heartbeat or math.inf, keeps=keeper is not None, line=line)
         transport, where = _transport(file, socket, udp, zenoh, stack)
         warn(notice)
         if slots is not None and (log_options := given_of(reader)):
@@ -247,7 +262,7 @@ def monitor(
 def _prepare(
     guard: Guard,
     mode: ModeName,
-    tolerance: float | None,
+    limits: tuple[float | None, float | None],
     audit: Path | None,
     stack: ExitStack,
     *,
@@ -255,8 +270,12 @@ def _prepare(
 ) -> None:
     """Set how far it goes, whether it learns, and who writes it down."""
     from evofsm.fsm.validation import probability
-    from evofsm.guard import ActionReviser, AuditLog, Mode
+    from evofsm.guard import ActionReviser, AuditLog, Foresight, Mode
 
+    tolerance, false_a_day = limits
+    refuse_other_limit(not isinstance(guard.judge, Foresight), false_a_day, tolerance)
+    if isinstance(guard.judge, Foresight) and false_a_day is not None:
+        guard.judge.stated = false_a_day
     if isinstance(guard.reviser, ActionReviser):
         guard.reviser.mode = Mode(mode)
         if tolerance is not None:
@@ -274,8 +293,7 @@ def _begun(
     reading: partial[Reading],
     interval: float | None,
     tolerance: float | None,
-    horizon: float | None,
-    persist: float,
+    alarms: tuple[float | None, float, float | None],
 ) -> Guard:
     """A guard that knows nothing yet, from what was told of a system."""
     from evofsm.cli.foreseen import guard_from_zero
@@ -291,7 +309,7 @@ def _begun(
     if not acts and told:
         raise ValueError("--action '' says that nobody acts, and goes with no range of actions")
     if not acts:
-        return guard_from_zero(step, names, horizon, persist, tolerance)
+        return guard_from_zero(step, names, *alarms)
     if not told:
         raise ValueError("say who acts: --low and --high, --n-actions; or --action '', if nobody")
     for name in {"low", "high"} & {*told}:
@@ -306,7 +324,7 @@ def _begun(
         return condition.holds_of(dict(zip(names, z, strict=True)))
 
     is_told = columns.failed and {term.column for term in condition.terms} <= {*names}
-    judge = LearntRisk(step, horizon=horizon, names=names, **told)
+    judge = LearntRisk(step, horizon=alarms[0], names=names, **told)
     return Guard(
         **told,
         interval=step,

@@ -16,7 +16,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Pause, Row, Taken
+from evofsm.cli.monitor.messages import (
+    NO_ROW,
+    SCHEMA,
+    End,
+    Form,
+    Message,
+    MessageError,
+    Pause,
+    Row,
+    Taken,
+)
 from evofsm.cli.monitor.slots import CsvRows, Slots
 from evofsm.cli.show import plain
 from evofsm.driving.judge import SLIGHT, LatentRisk
@@ -61,12 +71,10 @@ class Decider:
         *,
         episode: int = EPISODE,
         slots: Slots | None = None,
-        rate: float | None = None,
     ) -> None:
         self.guard = guard
         self.episode = episode
         self.slots = slots or Slots()
-        self.rate = rate  #: false alarms a day, where nobody acts, that the tolerance is set to
         self.form = Form(guard, self.slots.keys, *self.slots.clock)
         self.keep: Callable[[Taken], None] = lambda taken: None
         self.n = 0  #: decisions so far
@@ -100,7 +108,7 @@ class Decider:
         """
         try:
             if (json_line := self._csv.read(line)) is None:
-                return self._of("waiting", alarm=self._alarm, reason="names the columns")
+                return self._of("waiting", alarm=self._alarm, reason=NO_ROW)
             message = self.form.read(json_line)
             beyond = self.guard.beyond(np.array(message.observation or (), np.float64))
             if beyond is not None:
@@ -231,9 +239,7 @@ class Decider:
         """End the episode under way."""
         self._without_lost_audit(lambda: self.guard.end(failed, observation))
         self.rows, self._said_often, self._said_fast = 0, False, False
-        self._alarm, judge = False, self.guard.judge
-        if self.rate is not None and isinstance(judge, Foresight):
-            self.guard.reviser.tolerance = judge.tolerance_of(self.rate)  # type: ignore[attr-defined]
+        self._alarm = False
 
     def _end_unasked(self) -> None:
         """The same where nobody waits for an answer to it; what somebody's judge raises is said."""

@@ -33,9 +33,10 @@ LONGEST = 1 << 16
 _MOST_OBJECTS = 64
 # So much of what is refused is shown, and so long may a name be [letters].
 _LETTERS = 40
-# What is later than this is in another unit [s]; what is said of lines of another kind.
+# What is later than this is in another unit [s].
 _LATEST = 1e11
-_NO_ROW = "rows are JSON, one per line, or CSV below a line that names columns (tail -n +1 -f LOG)"
+#: What is said of lines of another kind.
+NO_ROW = "rows are JSON, one per line, or CSV below a line that names columns (tail -n +1 -f LOG)"
 # Where a width is not given [m].
 _USUAL_WIDTH = 1.8
 
@@ -335,7 +336,7 @@ def _parsed(line: bytes) -> dict[str, Any]:
             fault = f"holds {name}, which is no JSON; a number that was not seen is null"
             raise MessageError("line", fault) from None
         kind = "not UTF-8" if isinstance(error, UnicodeDecodeError) else "no JSON"
-        hint = "" if line.lstrip().startswith(b"{") else f"; {_NO_ROW}"
+        hint = "" if line.lstrip().startswith(b"{") else f"; {NO_ROW}"
         raise MessageError("line", f"is {kind}: {error}{hint}") from None
     if not isinstance(body, dict):
         raise MessageError("line", f"is {_shown(body)}; it must be a JSON object")

@@ -20,6 +20,8 @@ from evofsm.io import LogColumns
 from evofsm.io.logs import Condition, units_of
 from evofsm.io.tables import MISSING, UNITS, Dialect, decoded, explained, is_date, is_number
 
+# In so many lines that are no row the names of columns are looked for; and so many may be below.
+_MOST_ABOVE, _MOST_BELOW = 100, 4
 _BECOME: dict[str, Any] = {"mean": fmean, "last": itemgetter(-1), "max": max, "min": min}
 
 
@@ -126,21 +128,26 @@ class CsvRows:
         self._called[columns.time] = "time"
         self._header, self._count, self._factors = "", 0, dict[str, float]()
         self._dialect: Dialect | None = None
+        self._below: list[str] = []  # lines below the names, to the first row
+        self._may_be_title = not acts  # who drives along sends no log
         self.place = ""  #: of a line of CSV, as what is said of it begins
 
     def read(self, line: bytes) -> bytes | None:
-        """The message on a line; None where it names the columns, or their units."""
+        """The message on a line; None where it names the columns, or is a title or units."""
         self.place, self._count = "", self._count + 1
-        if line.lstrip(b"\xef\xbb\xbf \t")[:1] in (b"{", b""):
-            return line
+        begin = line.lstrip(b"\xef\xbb\xbf \t")[:1]
+        self._may_be_title &= begin != b"{" and self._count < _MOST_ABOVE
+        if begin in (b"{", b""):
+            return None if self._may_be_title else line
         try:
             text = decoded(line, "").removeprefix("\ufeff")
         except ValueError:
             return line
         if is_header := self._names_columns(text):
-            self._header, self._dialect = text, None
+            self._header, self._dialect, self._below = text, None, []
+            self._may_be_title = False
         if not self._header:
-            return line
+            return None if self._may_be_title else line
         self.place = f"line {self._count}: "
         try:
             if is_header or self._has_units(text):
@@ -161,16 +168,24 @@ class CsvRows:
         return not omissions
 
     def _has_units(self, text: str) -> bool:
-        """Whether the first line below the names tells units; it tells the dialect as well."""
+        """Whether a line below the names tells units, or the like; the first row tells the dialect.
+
+        That is the first line in which anything is a number, or a date.
+        """
         if self._dialect is not None:
             return False
-        dialect, log_units = Dialect(self._header, [text]), self._columns.units
+        self._below.append(text)
+        dialect, log_units = Dialect(self._header, self._below), self._columns.units
+        fields = next(csv.reader([text], delimiter=dialect.separator, strict=True))
+        is_row = any(is_number(field.replace(",", ".")) or is_date(field) for field in fields)
+        if not is_row and len(self._below) <= _MOST_BELOW:
+            return True
         numbers = [name for name in dialect.columns if name in self._numbers]
         units = {name: unit for name, unit in log_units.items() if "%" not in unit}
         units = {**dialect.units, **units_of(units, numbers)}
         self._factors = {name: UNITS.get(units.get(name, ""), 1.0) for name in numbers}
         self._dialect = dialect
-        return dialect.n_told > 0
+        return dialect.n_told == len(self._below)
 
     def _told(self, dialect: Dialect, text: str) -> Iterator[tuple[str, Any]]:
         """What a row tells, by the keys of messages."""

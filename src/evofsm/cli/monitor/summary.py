@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evofsm.cli.foreseen import date
 from evofsm.cli.learning import refusing
 from evofsm.cli.monitor.decider import HOLE, Answer, Decider
 from evofsm.cli.monitor.messages import End, Row
 from evofsm.cli.show import facts, table
+from evofsm.fsm.naming import visible
 from evofsm.guard.audit_log import lines
+from evofsm.guard.foresight import span
 from evofsm.io.logs import Chunk
 
 if TYPE_CHECKING:
@@ -26,6 +29,36 @@ _LONGEST_MESSAGE = 1 << 20
 _TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 # So many moments and variables are shown; without an alarm a moment lasts so long [s].
 _WORST, _MOST_VARIABLES, _MOMENT = 10, 4, 5.0
+
+
+class Text:
+    """Answers in words: when an alarm begins and ends, when it failed, and what was refused."""
+
+    def __init__(self) -> None:
+        self._since: float | None = None  # when the alarm began that is on [s]
+
+    def line(self, answer: Answer) -> bytes:
+        """What there is to say of one; mostly nothing."""
+        parts = [part for part in (answer.get("last"), answer) if part]
+        return "".join(f"{visible(text)}\n" for part in parts for text in self._said(part)).encode()
+
+    def _said(self, part: Answer) -> Iterator[str]:
+        time, since = part.get("time"), self._since
+        when = "" if time is None else f"{date(time)}  "
+        after = "" if time is None or since is None else f" {span(time - since)}"
+        if part["kind"] == "error":
+            yield f"{when}refused: {part['about']}: {part['error']}"
+        elif part["kind"] == "end":
+            self._since = None
+            if part["failed"]:
+                yield f"{when}failure,{after + ' after the alarm' if after else ' no alarm was on'}"
+        elif part["kind"] == "decision" and part["alarm"] and since is None:
+            self._since = time
+            yield f"{when}alarm: {part['reason']}"
+        elif part["kind"] == "decision" and not part["alarm"] and since is not None:
+            self._since = None
+            yield f"{when}over, after{after}"
+
 
 Answers = Iterable[tuple[Answer, Row | None]]
 

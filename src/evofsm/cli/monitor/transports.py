@@ -36,13 +36,25 @@ _POLL = 0.005
 _LONGEST_WAIT = 0.5
 
 
+def json_line(answer: Answer) -> bytes:
+    """An answer as a line of JSON."""
+    line = msgspec.json.encode(answer) + b"\n"
+    return line if line.isascii() else visible(line.decode()[:-1]).encode() + b"\n"
+
+
 class Server:
     """A decider that threads share: lines in, lines out, a sign of life where nothing comes."""
 
     def __init__(
-        self, decider: Decider, heartbeat: float = math.inf, *, keeps: bool = False
+        self,
+        decider: Decider,
+        heartbeat: float = math.inf,
+        *,
+        keeps: bool = False,
+        line: Callable[[Answer], bytes] = json_line,
     ) -> None:
         self.decider = decider
+        self._line = line  # of an answer
         self.keeps = keeps  #: what waits as the input ends, for whoever goes on
         self.heartbeat = heartbeat  #: where so long nothing came, it says that it is there [s]
         self._heard = self._said = time.monotonic()
@@ -54,7 +66,7 @@ class Server:
         """What is answered to lines, each with an end."""
         with self._turn:
             going_on = takewhile(lambda _: not self._ends, lines)
-            answers = b"".join([_line(self.decider.answer(line)) for line in going_on])
+            answers = b"".join([self._line(self.decider.answer(line)) for line in going_on])
             self._heard = self._said = time.monotonic()
         return answers
 
@@ -79,7 +91,7 @@ class Server:
             return self.answer(lines)
         with self._turn:
             fault = f"is one of {len(lines)} at once; at most {_MOST_LINES} may be"
-            return _line(self.decider.error("line", fault))
+            return self._line(self.decider.error("line", fault))
 
     def run(self, transport: Transport) -> None:
         """Serve until the input ends, or SIGTERM, SIGHUP or Ctrl-C comes; no decision is cut short.
@@ -118,12 +130,12 @@ class Server:
         """What is decided on rows that wait, as nothing comes."""
         with self._turn:
             answer = self.decider.lapse()
-        return b"" if answer is None else _line(answer)
+        return b"" if answer is None else self._line(answer)
 
     def _beat(self) -> bytes:
         with self._turn:
             self._said = time.monotonic()
-            return _line(self.decider.heartbeat(round(self._said - self._heard, 3)))
+            return self._line(self.decider.heartbeat(round(self._said - self._heard, 3)))
 
 
 @contextmanager
@@ -139,11 +151,6 @@ def _stoppable() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _line(answer: Answer) -> bytes:
-    line = msgspec.json.encode(answer) + b"\n"
-    return line if line.isascii() else visible(line.decode()[:-1]).encode() + b"\n"
 
 
 class Stream:

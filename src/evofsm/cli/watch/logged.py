@@ -10,7 +10,7 @@ import numpy as np
 
 from evofsm.cli.foreseen import date, guard_where_nobody_acts
 from evofsm.cli.learning import decided_on, episodes_read, guard_of_log, teach
-from evofsm.cli.options import BRAKES, TOLERANCE, Reading
+from evofsm.cli.options import BRAKES, TOLERANCE, Reading, refuse_other_limit
 from evofsm.cli.show import progress, warn
 from evofsm.cli.watch.session import Logged, Played, Session, system_machine
 from evofsm.driving.assumed import assumptions, guard_of_monitor
@@ -63,18 +63,19 @@ def watched_log(
         raise ValueError(f"{path}: {why}")
     labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
     rows = [stretch.rows for stretch in stretches]
+    refuse_other_limit(reading.acts, None, tolerance)
     risk = TOLERANCE if tolerance is None else tolerance
     if guard is not None:
         if tuple(names) != guard.variables or abs(rows[0].dt / guard.interval - 1.0) > _OTHER_STEP:
             holds = f"{', '.join(names)} every {rows[0].dt:.4g} s"
             wants = f"{', '.join(guard.variables)} every {guard.interval:.4g} s"
             raise ValueError(f"{path} is read as {holds}; this guard decides on {wants}")
-        if tolerance is not None:
+        if tolerance is not None and not isinstance(guard.judge, Foresight):
             guard.reviser.tolerance = tolerance  # type: ignore[attr-defined]
     elif not reading.acts:
         machine = system_machine(1, np.concatenate([chunk.observations for chunk in rows]))
         _learn_states(machine, rows, IntervalActions(0.0, 1.0, 1.0))
-        guard = guard_where_nobody_acts(rows, labels, None, 0.0, tolerance, machine)
+        guard = guard_where_nobody_acts(rows, labels, None, 0.0, None, machine)
     elif is_kinematic:
         guard = guard_of_monitor(rows[0].dt, brakes, risk)
         assert guard.machine is not None
@@ -86,8 +87,7 @@ def watched_log(
     if of_cars:
         stretches = list(_judged(guard, stretches))
     if isinstance(guard.judge, Foresight):
-        limit = float(guard.reviser.tolerance)  # type: ignore[attr-defined]
-        stretches = list(_alarmed(guard.judge, guard.judge.rate_of(limit), stretches))
+        stretches = list(_alarmed(guard.judge, guard.judge.alarm, stretches))
     system = Logged(path, stretches, labels, acts=reading.acts, of_cars=of_cars)
     return Session(system, guard, case=system.places.get(case or 0, system.first), on=False)
 

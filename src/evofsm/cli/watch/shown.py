@@ -237,7 +237,7 @@ class Known(NamedTuple):
 def known_of(judge: LearningJudge, tolerance: float) -> Known:
     """What a judge knows that learns of failure; nothing of another."""
     if isinstance(judge, Foresight):
-        knowledge, rate = Known(told=judge.told_by_experience), judge.rate_of(tolerance)
+        knowledge, rate = Known(told=judge.told_by_experience), judge.alarm
         if rate is None:
             return knowledge
         table, m = judge.where(rate), len(judge.labels.names)

@@ -109,7 +109,7 @@ def _status(frame: Frame, tolerance: float) -> str:
 
 def _no_danger(frame: Frame, start: Start) -> str:
     if not start.acts:
-        return f"Nothing reached the alarm limit of {start.tolerance:.0%}."
+        return "No limit of its alarm was passed."
     if not frame.story.judged:
         return f"Nothing was judged, for {start.unjudged}."
     if math.isnan(frame.needed) or start.judge == "learnt":  # which recordings do not hold
