@@ -10,9 +10,8 @@ horizon, and is false as often as no failure came. A failure is foreseen by the 
 An alarm is of at most so many limits. Those are searched for that warn longest on average (none
 counts as 0), less a price for each false alarm, and beside them plain thresholds in the same way.
 For each rate of false alarms that may be stated the price is the one with the longest warning at no
-more false alarms than such a rate explains (the lower end of the 90 % interval of their count) by
-cross-validation: of each third of the log, as it was learnt from the others. So it is told how many
-failures it foresees, and how many alarms are false.
+more of them by cross-validation: of each third of the log, as it was learnt from the others. So it
+is told how many failures it foresees, and how many alarms are false.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm import store
 from evofsm.fsm.kernels import kernel
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.proportions import poisson_bounds, wilson_bounds
+from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.validation import positive, refuse_unusable
 from evofsm.guard.actions import Action
 from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, Situation
@@ -52,7 +51,7 @@ _MOST_ROWS, _FAILURES = 500_000, 100
 _BLOCKS, _FEWEST_BLOCKS, _MOST_BLOCKS = 15, 5, 100_000
 # Kinds of alarms; plain thresholds are taken unless others, as often false, warn for longer.
 _LEARNT, _PLAIN, _NO_KIND = range(3)
-_BETTER = 0.95
+_BETTER = 0.8
 # What a limit has to add to the share of the horizon that is warned before; survived rows of which
 # forms of failure are learnt.
 _WORTH, _ROWS = 2e-3, 4000
@@ -269,11 +268,10 @@ class Foresight(LearningJudge):
         holds, shares = judge.forms[:, failure.HELD], there[:, 0] / np.maximum(there[:, 1], 1.0)
         is_known = not there[0, 1] or shares[0] - shares[1] >= _KNOWN
         holds[holds < (_SAID * log.failed.sum() if is_known else np.inf)] = 0.0
-        fewest = np.array([[poisson_bounds(int(n))[0] for n in row] for row in tallies[..., 2]])
         chance, limits = log.failed.sum() * ahead / len(log.rows), [np.empty((0, 6))]
         latest, scores = limits[0], list[Any]()
         for rate, daily_rate in enumerate(RATES):
-            fit = fewest <= daily_rate * days
+            fit = tallies[..., 2] <= daily_rate * days
             best = np.where(fit, tallies[..., 0], -1.0).argmax(1)
             parts = [judge.of_rate(int(best[k]), plain=k > 0)[:, 1:] for k in range(2)]
             usable = fit[[0, 1], best] & [len(part) > 0 for part in parts]

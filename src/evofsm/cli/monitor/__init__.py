@@ -28,6 +28,7 @@ from evofsm.cli.options import (
     reading_of,
     reads_logs,
     refuse_other_limit,
+    require,
     split_names,
     typed,
 )
@@ -124,6 +125,8 @@ def monitor(
                 file, guard = None, file
     if sum(source is not None for source in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
+    if plot is not None:
+        require(matplotlib="plot")
     if traffic and (guard or state or learn):
         raise ValueError("--traffic learns nothing: it goes with no --guard, --state or --learn")
     if summary and (file is None or state or audit):
