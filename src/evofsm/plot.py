@@ -466,7 +466,7 @@ def history(
     for kind, label in enumerate(("failure, foreseen", "failure, not foreseen"), 1):
         there, face = x[fails == kind], COLORS["dead end"] if kind == 1 else "none"
         axes[-1].plot(there, np.full(len(there), 0.5), label=label, markerfacecolor=face, **look)
-    _explain(axes[-1], columns=4)
+    _explain(axes[-1], columns=2)
     axes[-1].set(ylim=(0.0, 1.0), yticks=[], xlabel=f"time [{unit}]")
     if is_dated:
         ticks = AutoDateLocator(minticks=3, maxticks=9)  # type: ignore[no-untyped-call]
