@@ -179,6 +179,19 @@ def test_frozen_it_acts_where_it_prevents_most_failures(failed, kept, helps):
     assert harm.helps(learning=False) == helps
 
 
+def test_a_controller_of_which_much_more_is_kept_is_another_one_until_it_fails():
+    harm = arms([(100, "", None)] * 9, [(30, "f", None)] * 3)  # of which nothing was kept
+    assert not any(harm._replace(n_episodes=n).passing(learning=True) for n in (12, 13, 14))
+    other = harm.after((100, 0, 60), failed=False)
+    assert (other.passing(learning=True), other.passing(learning=False)) == ("shadow", "")
+    same = other.after((0, 30, 0), failed=True)
+    assert not same.is_on_trial
+    assert len(same.lately) == 4
+    good = other.after((0, 80, 0), failed=False, ended=True)
+    assert len(good.lately) == 1
+    assert good.passing(learning=True)
+
+
 def test_frozen_it_does_not_forget_why_it_was_there():
     """While it learned a careless controller had luck of late: it may have been another one."""
     luck = [(45, "e", None)] * 3

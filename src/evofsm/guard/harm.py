@@ -26,6 +26,10 @@ then the controller drives until it fails, and after two guarded episodes at the
 latest three failed, too, there is little to lose, and the guard, which learns, drives the others,
 twelve at most.
 
+Where in an episode a guard that has not failed of late keeps a quarter more of the proposals than
+before, another controller seems to have come: what is known of the controller alone is of the other
+one, and it drives the next episode, to show it. If that one fails, it is the same.
+
 Frozen, it acts unless its record, of which then both arms fade alike, says that it harms, or does
 not help: it loses more pairs than it wins or, of three episodes at least, all failed, however late,
 or it prevents less than half of the failures per step, nine of ten if it replaces nearly every
@@ -66,6 +70,9 @@ _TURN, _TRIES = 2, 12
 _DRAWS, _SAID = 300, 0.5
 # Decisions over which the share of proposals that are kept is counted, and at least for a word.
 _DECISIONS, _FEWEST_DECISIONS = 500, 100
+# Where in an episode of so many decisions so much more is kept than before, although none of the
+# latest guarded episodes failed, of which it would have learnt, it is another controller.
+_FEWEST, _ANOTHER, _SETTLED = 20, 0.25, 4
 # Steps of who never fails.
 _FOREVER = 1 << 52
 
@@ -85,7 +92,7 @@ class Outcome(NamedTuple):
 #: told; and numbers.
 OUTCOMES = Numbers().of("h", 7)
 SETTINGS = {
-    "n_episodes": COUNT,
+    **dict.fromkeys(("n_episodes", "changed"), COUNT),
     "refuses": bool,
     "ends": bool,
     **dict.fromkeys(("decided", "kept"), Numbers(least=0.0, most=COUNT.most)),
@@ -101,11 +108,22 @@ class Harm(NamedTuple):
     ends: bool = False  #: whether an episode ever ended by itself, without failing
     decided: float = 0.0  #: decisions of late in which it could refuse
     kept: float = 0.0  #: and of these proposals that were kept
+    changed: int = 0  #: the latest episode in which another controller seems to have come, or 0
 
     @property
     def alone(self) -> list[Outcome]:
         """Of the controller alone."""
         return [outcome for outcome in self.outcomes if not outcome.guarded]
+
+    @property
+    def is_on_trial(self) -> bool:
+        """Whether another controller seems to have come with the latest episode."""
+        return 0 < self.changed == self.n_episodes
+
+    @property
+    def lately(self) -> list[Outcome]:
+        """Of the controller alone, as far as it seems to be this one."""
+        return [outcome for outcome in self.alone if outcome.episode > self.changed]
 
     @property
     def guarded(self) -> list[Outcome]:
@@ -124,7 +142,7 @@ class Harm(NamedTuple):
         does one that fails more than half as often per step as the controller alone; more than a
         tenth, if it replaces nearly every proposal: then it would fly any controller's craft so.
         """
-        guarded, alone = self.guarded, self.alone
+        guarded, alone = self.guarded, self.lately if learning else self.alone
         if _all_failed(guarded, max(_CAREFUL, len(guarded))):
             return False
         if not guarded or not alone:
@@ -143,7 +161,7 @@ class Harm(NamedTuple):
         The same for the same record.
         """
         well = Outcome(0, _FOREVER, failed=False, guarded=False, ended=self.ends)
-        arms = [[*self.guarded, well], [*self.alone, well]]
+        arms = [[*self.guarded, well], [*self.lately, well]]
         random = np.random.default_rng([self.n_episodes, draws])
         guarded, alone = (
             random.gamma(
@@ -168,11 +186,13 @@ class Harm(NamedTuple):
         """Why proposals pass in the episode to come; empty where they are revised."""
         if not learning:
             return "" if self.helps(learning=False) else "was not shown to help"
+        if self.is_on_trial:
+            return "shadow"
         if _all_failed(self.guarded):
             turn_is_over = all(outcome.guarded for outcome in self.outcomes[-_TURN:])
-            if turn_is_over or not _all_failed(self.alone, 1):
+            if turn_is_over or not _all_failed(self.lately, 1):
                 return "shadow"
-            if _all_failed(self.alone) and len(self.guarded) < _TRIES:
+            if _all_failed(self.lately) and len(self.guarded) < _TRIES:
                 return ""
         fails = any(outcome.failed for outcome in self.outcomes[-1:])
         is_drawn = self.refuses and (fails or self._long_ago or not self.helps(learning=True))
@@ -181,13 +201,13 @@ class Harm(NamedTuple):
     @property
     def _long_ago(self) -> bool:
         """Whether it is long ago that the controller drove alone."""
-        n = self.n_episodes - (self.alone[-1].episode if self.alone else 0)
+        n = self.n_episodes - (self.lately[-1].episode if self.lately else self.changed)
         return n > 0 and n % _RARELY == 0
 
     @property
     def _draws(self) -> int:
         """The guard drives if it does in one of so many draws."""
-        is_new = len(self.alone) < _CAREFUL
+        is_new = len(self.lately) < _CAREFUL
         is_bold = is_new or self._long_ago or _all_failed(self.guarded)
         return 1 if is_bold else _CAREFUL
 
@@ -243,6 +263,12 @@ class Harm(NamedTuple):
             )
         if bool(n_acted) == bool(n_watched):
             return now
+        latest = [outcome.failed for outcome in self.guarded[-_SETTLED:]]
+        is_settled = len(latest) == _SETTLED and not any(latest) and n_acted >= _FEWEST
+        if is_settled and n_kept / n_acted > self.kept / self.decided + _ANOTHER:
+            now = now._replace(changed=n, decided=float(n_acted), kept=float(n_kept))
+        elif self.is_on_trial and failed:
+            now = now._replace(changed=0)  # it is the same
         number = math.nan if score is None else score
         new = Outcome(n, n_acted + n_watched, failed, refuses and n_acted > 0, ended, number)
         alike = [o for o in self.outcomes if o.guarded == new.guarded]
