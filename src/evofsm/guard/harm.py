@@ -72,7 +72,7 @@ _DRAWS, _SAID = 300, 0.5
 _DECISIONS, _FEWEST_DECISIONS = 500, 100
 # Where in an episode of so many decisions so much more is kept than before, although none of the
 # latest guarded episodes failed, of which it would have learnt, it is another controller.
-_ENOUGH, _ANOTHER, _SETTLED = 20, 0.25, 4
+_NOTED, _ANOTHER, _SETTLED = 20, 0.25, 4
 # Steps of who never fails.
 _FOREVER = 1 << 52
 
@@ -264,7 +264,7 @@ class Harm(NamedTuple):
         if bool(n_acted) == bool(n_watched):
             return now
         latest = [outcome.failed for outcome in self.guarded[-_SETTLED:]]
-        is_settled = len(latest) == _SETTLED and not any(latest) and n_acted >= _ENOUGH
+        is_settled = len(latest) == _SETTLED and not any(latest) and n_acted >= _NOTED
         if is_settled and n_kept / n_acted > self.kept / self.decided + _ANOTHER:
             now = now._replace(changed=n, decided=float(n_acted), kept=float(n_kept))
         elif self.is_on_trial and failed:
