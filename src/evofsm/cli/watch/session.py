@@ -543,7 +543,7 @@ class Session(AbstractContextManager["Session"]):
 
     def known(self) -> Known:
         """What is known of failure."""
-        return known_of(self.judge, self._tolerance)
+        return known_of(self.judge)
 
     def __exit__(self, *error: object) -> None:
         self.system.close()

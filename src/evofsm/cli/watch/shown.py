@@ -234,7 +234,7 @@ class Known(NamedTuple):
     limits: Any = ()  #: variables, and values at which they alarm
 
 
-def known_of(judge: LearningJudge, tolerance: float) -> Known:
+def known_of(judge: LearningJudge) -> Known:
     """What a judge knows that learns of failure; nothing of another."""
     if isinstance(judge, Foresight):
         knowledge, rate = Known(told=judge.told_by_experience), judge.alarm

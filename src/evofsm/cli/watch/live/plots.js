@@ -20,11 +20,11 @@ function panels(run) {
   const changed = (k) => ({ ...wish((f) => (f.revised ? f.proposed[k] : null)), label: "proposed, where changed", dots: true });
   const byLeaders = start.judge !== "learnt", fails = cars ? "collision" : "failure";
   const risk = {
-    title: "Risk", about: !start.acts ? `share of such alarms that were right; above ${percent(start.tolerance)} it alarms` : `${byLeaders ? "of collision if the leader brakes now" : `that ${fails} can't be avoided any more`}; ${percent(start.tolerance)} is accepted`,
+    title: "Risk", about: !start.acts ? "share of such alarms that were right; 0 while none is on" : `${byLeaders ? "of collision if the leader brakes now" : `that ${fails} can't be avoided any more`}; ${percent(start.tolerance)} is accepted`,
     low: 0, high: 1, ticks: [0, 0.5, 1], show: percent,
     lines: [wish((f) => f.proposed_risk.risk), ...(acts ? [executed((f) => f.executed_risk.risk)] : [])],
     bands: [{ ink: colour.band, ends: ({ proposed_risk: { low, high } }) => (high === null || high - low > MOST_BAND ? null : [low, high]) }],
-    limits: [{ at: start.tolerance, ink: soft }],
+    limits: start.acts ? [{ at: start.tolerance, ink: soft }] : [],
   };
   const most = byLeaders ? 12 : 10;
   const margin = {
