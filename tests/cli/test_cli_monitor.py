@@ -320,7 +320,7 @@ def test_where_nobody_acts_a_summary_judges_alarms_on_what_they_did_not_learn_fr
     assert f"plain thresholds do as well: {VIBRATION} above" in printed
     assert picture.stat().st_size > 10_000
     found = json.loads(evofsm(log, "--summary", *asked, "--json").stdout)
-    assert [*found["limits"][1]["thresholds"][0]] == ["variable", "above"]
+    assert [*found["limits"][3]["thresholds"][0]] == ["variable", "above"]
     own = next(one["learnt"] for one in found["alarms"] if one["is_own"])
     assert own["failures"] == own["foreseen"] == found["failures"] == 14
     foreseen = [one["episode"] for one in found["listed"] if one["failed"]]
