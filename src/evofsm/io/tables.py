@@ -76,8 +76,7 @@ UNITS = {unit: factor for group in _GROUPS.values() for unit, factor in group.it
 SI = {unit: base for base, group in _GROUPS.items() for unit in group}
 _SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": "m/s", "sec": "s"}
 _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
-# Names of columns are looked for in so many lines; what stands before the last line of a comment.
-_MOST_ABOVE, _COMMENT = 100, re.compile(r"\A\s*(#|%|//)+\s*")
+_COMMENT = re.compile(r"\A\s*(#|%|//)+\s*")  # what stands before the last line of a comment
 #: What stands in a field where there is no number.
 MISSING = ("", "na", "n/a", "null", "none")
 # By which a comma is known to be a decimal one; groups of three digits it may separate as well.
@@ -423,6 +422,8 @@ class _Odd(NamedTuple):
 class Dialect:
     """How fields stand in the lines of a table: by the line that names columns, and some below."""
 
+    most_above, most_below = 100, 4  #: lines in which names are looked for, and units below them
+
     def __init__(self, header: str, below: Sequence[str]) -> None:
         header = _COMMENT.sub("", header, count=1)
         self.separator = _separator(header)
@@ -474,9 +475,10 @@ class CsvTable(Table):
         csv.field_size_limit(max(csv.field_size_limit(), _CSV_BYTES + 2 * _LONGEST_LINE))
         with Source(path, skips=Skips(1)) as source:  # said where the rows are read
             text = decoded(source.rows(), path).removeprefix("\ufeff")
-        lines = [line.rstrip("\r") for line in text.split("\n", _MOST_ABOVE)[:_MOST_ABOVE]]
+        most = Dialect.most_above
+        lines = [line.rstrip("\r") for line in text.split("\n", most)[:most]]
         at = self._header(lines, set(names))
-        self._dialect = dialect = Dialect(lines[at], lines[at + 1 : at + 5])
+        self._dialect = dialect = Dialect(lines[at], lines[at + 1 : at + 1 + Dialect.most_below])
         self.columns, self.units, header = dialect.columns, dialect.units, lines[at]
         self._above = at + 1 + dialect.n_told  # lines before the first row
         # With nothing in it that has a meaning; polars is not to be left alone with others.

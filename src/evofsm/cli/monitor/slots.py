@@ -20,8 +20,6 @@ from evofsm.io import LogColumns
 from evofsm.io.logs import Condition, units_of
 from evofsm.io.tables import MISSING, UNITS, Dialect, decoded, explained, is_date, is_number
 
-# In so many lines that are no row the names of columns are looked for; and so many may be below.
-_MOST_ABOVE, _MOST_BELOW = 100, 4
 _BECOME: dict[str, Any] = {"mean": fmean, "last": itemgetter(-1), "max": max, "min": min}
 
 
@@ -136,7 +134,7 @@ class CsvRows:
         """The message on a line; None where it names the columns, or is a title or units."""
         self.place, self._count = "", self._count + 1
         begin = line.lstrip(b"\xef\xbb\xbf \t")[:1]
-        self._may_be_title &= begin != b"{" and self._count < _MOST_ABOVE
+        self._may_be_title &= begin != b"{" and self._count < Dialect.most_above
         if begin in (b"{", b""):
             return None if self._may_be_title else line
         try:
@@ -178,7 +176,7 @@ class CsvRows:
         dialect, log_units = Dialect(self._header, self._below), self._columns.units
         fields = next(csv.reader([text], delimiter=dialect.separator, strict=True))
         is_row = any(is_number(field.replace(",", ".")) or is_date(field) for field in fields)
-        if not is_row and len(self._below) <= _MOST_BELOW:
+        if not is_row and len(self._below) <= Dialect.most_below:
             return True
         numbers = [name for name in dialect.columns if name in self._numbers]
         units = {name: unit for name, unit in log_units.items() if "%" not in unit}
