@@ -328,7 +328,8 @@ class Foresight(LearningJudge):
                 above |= x[k] > thresholds[k][j]
             for k, j in np.ndindex(len(limits), _TRIED):
                 beyond = above | (x[k] > thresholds[k][j])
-                false = _tally(beyond, beyond, starts, log.failed, spans, leads)
+                beyond_rows = np.flatnonzero(beyond)
+                false = _tally(beyond, beyond, beyond_rows, starts, log.failed, spans, leads)
                 sums[k, j] = leads.sum(), false
             return np.asarray(sums / most)
 
@@ -424,7 +425,8 @@ class Foresight(LearningJudge):
         columns = self.columns(log.rows, log.starts) if columns is None else columns
         above, on = (np.any(self._passed(columns, limits, soon=k), axis=0) for k in (False, True))
         leads = np.zeros(len(log.starts))
-        false = _tally(above, on, log.starts, log.failed, self._spans, leads)
+        rows = np.flatnonzero(above | on)
+        false = _tally(above, on, rows, log.starts, log.failed, self._spans, leads)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
         lead = float(np.maximum(leads - np.asarray(early), 0.0).sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
@@ -713,31 +715,36 @@ def false_times(begun: int, over: int, fails: int, horizon: int) -> int:
 
 
 @kernel
-def _tally(above: Flags, on: Flags, starts: Ints, failed: Flags, spans: Ints, leads: Floats) -> int:
-    """False alarms of rows (T,) above limits; on (T,) is where one stays, then is; leads (E,)."""
-    false, horizon, hold, stays = 0, spans[0], spans[1], spans[2]
+def _tally(
+    above: Flags, on: Flags, rows: Ints, starts: Ints, failed: Flags, spans: Ints, leads: Floats
+) -> int:
+    """False alarms of rows (T,) above limits; on (T,) is where one stays, then is; leads (E,).
+
+    Rows (n,) are those of which one of both is true; of the others only how many they are counts.
+    """
+    false, place, horizon, hold, stays = 0, 0, spans[0], spans[1], spans[2]
     for e in range(len(starts)):
         end = starts[e + 1] if e + 1 < len(starts) else len(above)
         fails = end - 1 if failed[e] else end + horizon
-        up, down, onset = 0, 0, -1
+        up, onset, latest = 0, -1, starts[e] - 1
         leads[e] = 0.0
-        for t in range(starts[e], end + 1):
-            if onset < 0 and t < end and not above[t]:  # most rows
-                up, on[t] = 0, False
-            elif t < end and above[t]:
-                up, down = up + 1, 0
-                if onset < 0 and up >= hold:
-                    onset = t
-            elif t < end and onset >= 0 and on[t]:
-                up, down = 0, 0
-            else:
-                up, down = 0, down + 1
-            if onset >= 0 and (t == end or down >= stays):
-                wrong = false_times(onset, t, fails, horizon)
-                false += wrong
-                if failed[e] and wrong * horizon < t - onset:
-                    leads[e] = max(leads[e], min(fails - onset, horizon))
-                onset = -1
-            if t < end:
-                on[t] = onset >= 0
+        while True:
+            t = rows[place] if place < len(rows) and rows[place] < end else end
+            up = up if t == latest + 1 else 0
+            if onset >= 0:
+                over = min(latest + stays, t)
+                on[latest + 1 : over] = True
+                if over < t or t == end:
+                    wrong = false_times(onset, over, fails, horizon)
+                    false += wrong
+                    if failed[e] and wrong * horizon < over - onset:
+                        leads[e] = max(leads[e], min(fails - onset, horizon))
+                    onset = -1
+            if t == end:
+                break
+            up = up + 1 if above[t] else 0
+            onset = t if onset < 0 and up >= hold else onset
+            on[t] = onset >= 0
+            latest = t
+            place += 1
     return false
