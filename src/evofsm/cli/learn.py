@@ -164,7 +164,12 @@ def learn(
     pairs = [*_read(lesson, columns.action * acts), *_read_otherwise(notes, columns, lesson)]
     if lengths.seen:
         pairs.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
-    show(facts("What was read", pairs), *tables_of(lesson.model))
+    show(facts("What was read", pairs))
+    alarms = None if new_guard is None else new_guard.judge
+    if isinstance(alarms, Foresight):
+        show(*alarms_of(alarms))
+    else:
+        show(*tables_of(lesson.model))
     say("")
     if out is None and new_guard is None:
         say("Nothing was saved; --out MODEL saves the model.")
@@ -174,8 +179,6 @@ def learn(
         beyond = (lesson.read.clipped_below + lesson.read.clipped_above) / lesson.read.rows
         for line in _of_guard(new_guard, guard, brakes, beyond):
             say(line)
-        if isinstance(new_guard.judge, Foresight):
-            show(*alarms_of(new_guard.judge))
 
 
 # -- What was asked for ---------------------------------------------------------------------------
@@ -350,6 +353,8 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
             yield f"It never alarms: {why} (fewer columns, or a longer --horizon?)."
         else:
             yield f"{guard.judge.alarm_in_words.capitalize()} (--false-a-day), {soon}."
+        yield "evofsm monitor LOG --summary, with the same options, judges such alarms held out."
+        yield f"evofsm inspect {path} prints its states."
         return
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
