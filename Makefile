@@ -57,7 +57,7 @@ LOWEST := .venv-lowest/bin/python
 lowest: .venv/installed         ## test the core with the lowest versions that are allowed
 	@$(BIN)/uv venv --quiet --allow-existing --python $(BIN)/python .venv-lowest
 	@$(BIN)/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct \
-	    --editable '.[tables,study,river,sklearn]' 'pytest>=8.3' 'hypothesis>=6.100'
+	    --editable '.[tables,study,river]' 'pytest>=8.3' 'hypothesis>=6.100'
 	@$(LOWEST) -m pytest -q -p no:cacheprovider tests/fsm
 supply: .venv/installed         ## a bill of materials: sbom.json; known holes in what is pinned
 	@$(BIN)/uv tool run --from cyclonedx-bom cyclonedx-py requirements requirements.lock -o sbom.json
