@@ -164,12 +164,9 @@ def learn(
     pairs = [*_read(lesson, columns.action * acts), *_read_otherwise(notes, columns, lesson)]
     if lengths.seen:
         pairs.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
-    show(facts("What was read", pairs))
-    alarms = None if new_guard is None else new_guard.judge
-    if isinstance(alarms, Foresight):
-        show(*alarms_of(alarms))
-    else:
-        show(*tables_of(lesson.model))
+    learner = new_guard and new_guard.judge
+    tables = alarms_of(learner) if isinstance(learner, Foresight) else tables_of(lesson.model)
+    show(facts("What was read", pairs), *tables)
     say("")
     if out is None and new_guard is None:
         say("Nothing was saved; --out MODEL saves the model.")
@@ -353,8 +350,8 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
             yield f"It never alarms: {why} (fewer columns, or a longer --horizon?)."
         else:
             yield f"{guard.judge.alarm_in_words.capitalize()} (--false-a-day), {soon}."
-        yield "evofsm monitor LOG --summary, with the same options, judges such alarms held out."
-        yield f"evofsm inspect {path} prints its states."
+        judges = "evofsm monitor LOG --summary, with the same options, judges such alarms held out"
+        yield f"{judges}; evofsm inspect {path} prints its states."
         return
     if not isinstance(guard.judge, LearntRisk):
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
