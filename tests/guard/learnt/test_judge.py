@@ -125,6 +125,25 @@ def test_what_was_seen_twice_before_a_decision_is_learnt_of_at_once(points):
     assert "no backup prevents failure" in reason
 
 
+def test_while_a_rival_is_tried_all_backups_are_asked(points):
+    """Those that come first saved by what is doubted; by its rival another one may."""
+    guard = points["box"].taught(4)
+    judge = guard.judge
+    policies = np.zeros((5, *judge.state.policies.shape[1:]))
+    policies[:, 0, 0] = [1.0, 1.0, 1.0, 1.0, -1.0]  # towards the wall, but for the last
+    backups = {"policies": policies, "linear": np.zeros(5)}
+
+    def passes(held):
+        judge.state = judge.state._replace(held=held, **backups)
+        judge.remake()
+        guard.decide([0.3, 0.02], 0.2)
+        return judge.is_certified
+
+    assert [passes(0), passes(-1)] == [False, True]
+    guard.freeze()
+    assert not passes(-1)
+
+
 def test_where_it_is_switched_off_nothing_counts_as_refused(points):
     guard = points["box"].taught(4)
     held = guard.judge.state.held

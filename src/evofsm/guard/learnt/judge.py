@@ -317,7 +317,9 @@ class LearntRisk(ActionJudge):
             return Search(options, _unjudged(1), 0, why)
         model = parts.daring if self.learning else parts.model
         proposal, scale, margin = self.encode(wanted), parts.scale, self.state.margin
-        memory, ranks, most = self.remembered, self._ranks[: parts.n_asked], parts.most
+        # Backups evolve by what is known: what saves by a rival that is tried may come last.
+        n_asked = len(self._ranks) if self.learning and self.state.held < 0 else parts.n_asked
+        memory, ranks, most = self.remembered, self._ranks[:n_asked], parts.most
         allowance = self._allowed(tolerance, memory)
         policies = self.state.policies
         if mask is not None:
