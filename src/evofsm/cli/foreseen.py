@@ -205,17 +205,18 @@ def _tables(
     title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
     yield table(title, _HEADER, rows, bold=bold)
     yield from alarms_of(judge)
-    rows = [[x["where"], f"{x['came']:,}", f"{x['failed']:,}"] for x in found["fails"]]
-    header = "it fails where", "episodes that came there", "of them failed"
-    yield table("\nWhere it fails, as it was learnt", header, rows)
+    if rows := [[x["where"], f"{x['came']:,}", f"{x['failed']:,}"] for x in found["fails"]]:
+        header = "it fails where", "episodes that came there", "of them failed"
+        yield table("\nWhere it fails, as it was learnt", header, rows)
     rows = []
     for hit in found["listed"][-_LISTED:]:
         false = {0: [], 1: ["no"]}.get(hit["false"], [f"{hit['false']} times no"])
         failed = ", then ".join([*false, *["yes"] * hit["failed"]])
         why = hit["reason"].partition("; after")[0]
         rows.append([f"{hit['episode'] + 1}", date(hit["time"]), span(hit["lasts"]), failed, why])
-    title = _last(found["listed"], "Alarms")
-    yield table(title, ("episode", "time", "lasts", "failed", "why"), rows, left=(0, 4))
+    if rows:
+        title = _last(found["listed"], "Alarms")
+        yield table(title, ("episode", "time", "lasts", "failed", "why"), rows, left=(0, 4))
     if misses := found["missed"]:
         rows = [[f"{x['episode'] + 1}", date(x["time"]), x["reason"]] for x in misses[-_LISTED:]]
         header = "episode", "time", "why"

@@ -86,7 +86,6 @@ def table(
         grid.add_column(
             visible(name),
             justify="left" if place in left else "right",
-            vertical="bottom",
             min_width=max(map(len, words), default=0),
         )
     for place, row in enumerate(rows):

@@ -449,8 +449,8 @@ class Foresight(LearningJudge):
         if is_flat:
             variable, _, beyond = there.partition(" is ")
             return variable, f"{beyond}{soon}"
-        how = "beyond" if at > 0.0 else "within"
-        return "it", f"{how} {abs(at):.2g} typical steps of where it fails{soon}: {there}"
+        steps = f"below {0.0 - at:.2g} typical steps{soon}"
+        return "distance to failure", f"{steps} (it fails {there})"
 
     def passed(self, column: Floats) -> Floats:
         """(n, 6) the limits that a row passes, of which this is the one of `columns`."""
