@@ -67,7 +67,7 @@ def test_a_pendulum_that_is_decided_every_5_ms_is_held_by_looking_ahead_in_longe
 
 def test_it_learns_beside_a_variable_that_rests_at_an_end(point):
     guard, failures = point.guard(), []
-    for episode in range(9):
+    for episode in range(7):  # then it doubts the wall
         steps = point.walk(episode)
         z, proposal, failed = next(steps)
         while proposal is not None:
@@ -76,8 +76,8 @@ def test_it_learns_beside_a_variable_that_rests_at_an_end(point):
         guard.end(failed=failed, observation=[*z, 0.0, float(z[0] > 0.9)])
         failures.append(failed)
     assert np.abs(guard.judge.parts.model.weights).max() > 0.0
-    assert sum(failures) <= 4
-    assert sum(failures[-4:]) <= 1
+    assert sum(failures) <= 2
+    assert not any(failures[-4:])
 
 
 def test_nothing_is_revised_before_the_first_failure_and_it_says_why(point):
