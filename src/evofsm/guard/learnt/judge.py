@@ -82,6 +82,7 @@ class Parts(NamedTuple):
     residuals: Floats  #: (H, m, 1 + K) of disturbances; number 0 is none
     scale: float  #: how much harder than they were disturbances are taken to be
     n_asked: int  #: backups that a search asks
+    n_tried: int  #: and while a rival is tried, by which others may save than first come
     n_judged: int  #: and those by which a risk is found
     most: float  #: steps of rollouts after which a search is cut short
 
@@ -97,7 +98,9 @@ class Parts(NamedTuple):
         cost = (model.weights.size + model.dead_ends.size) * rest.shape[2]
         most = max(min(settings.work, settings.work_rate * dt) / cost, few * state.horizon)
         n_backups = 1 if most < 2 * few * state.horizon else few
-        return cls(model, daring_model, rest, scale, few, n_backups, most)
+        n_policies = len(state.policies)
+        n_tried = few if state.held >= 0 or most < n_policies * state.horizon else n_policies
+        return cls(model, daring_model, rest, scale, few, n_tried, n_backups, most)
 
 
 class LearntRisk(ActionJudge):
@@ -317,8 +320,7 @@ class LearntRisk(ActionJudge):
             return Search(options, _unjudged(1), 0, why)
         model = parts.daring if self.learning else parts.model
         proposal, scale, margin = self.encode(wanted), parts.scale, self.state.margin
-        # Backups evolve by what is known: what saves by a rival that is tried may come last.
-        n_asked = len(self._ranks) if self.learning and self.state.held < 0 else parts.n_asked
+        n_asked = parts.n_tried if self.learning else parts.n_asked
         memory, ranks, most = self.remembered, self._ranks[:n_asked], parts.most
         allowance = self._allowed(tolerance, memory)
         policies = self.state.policies
