@@ -22,7 +22,6 @@ def wrong(monkeypatch):
     def search(judge, situation, wanted, **_):
         if not judge.state.n_failed:
             return Search(np.array([wanted]), _unjudged(1), 0, "nothing was learnt yet")
-        judge._holds = instead[0] == 0.0
         return Search(np.array([wanted, instead[0]]), _unjudged(2), 1, "it must")
 
     monkeypatch.setattr(LearntRisk, "search", search)
@@ -142,9 +141,9 @@ def test_a_score_that_is_no_number_is_refused_and_nothing_ends():
 
 def arms(guarded, alone):
     """A record of episodes: steps, ``f`` if it failed, ``e`` if it ended by itself, and a score."""
-    known = Harm().after((5, 0, 4, 5), failed=False)._replace(outcomes=())
+    known = Harm().after((5, 0, 4), failed=False)._replace(outcomes=())
     for number, (steps, how, score) in enumerate([*guarded, *alone]):
-        driven = (steps, 0, 0, steps) if number < len(guarded) else (0, steps, 0, 0)
+        driven = (steps, 0, 0) if number < len(guarded) else (0, steps, 0)
         known = known.after(driven, failed=how == "f", ended=how == "e", score=score)
     return known
 
@@ -180,25 +179,15 @@ def test_frozen_it_acts_where_it_prevents_most_failures(failed, kept, helps):
     assert harm.helps(learning=False) == helps
 
 
-def test_a_guard_that_is_blind_lets_the_controller_drive_every_third_episode():
-    """A lander's guard hovers by itself: which controller it replaces does not show."""
-    harm = arms([], [(110, "f", None)] * 3)
-    for n in range(30):
-        drives = not harm.passing(learning=True)
-        driven = (300, 0, 0, 0) if drives else (0, 90, 0, 0)
-        harm = harm.after(driven, failed=not drives and n < 15, ended=not drives and n >= 15)
-    assert {o.guarded for o in harm.outcomes if o.episode > 24} == {False}
-
-
 def test_a_controller_of_which_much_more_is_kept_is_another_one_until_it_fails():
     harm = arms([(100, "", None)] * 9, [(30, "f", None)] * 3)  # of which nothing was kept
     assert not any(harm._replace(n_episodes=n).passing(learning=True) for n in (12, 13, 14))
-    other = harm.after((100, 0, 60, 100), failed=False)
+    other = harm.after((100, 0, 60), failed=False)
     assert (other.passing(learning=True), other.passing(learning=False)) == ("shadow", "")
-    same = other.after((0, 30, 0, 0), failed=True)
+    same = other.after((0, 30, 0), failed=True)
     assert not same.is_on_trial
     assert len(same.lately) == 4
-    good = other.after((0, 80, 0, 0), failed=False, ended=True)
+    good = other.after((0, 80, 0), failed=False, ended=True)
     assert len(good.lately) == 1
     assert good.passing(learning=True)
 
@@ -218,22 +207,22 @@ def test_the_arm_that_is_better_is_drawn_ever_more_often():
     for better_by, least, most in ((3.0, 0.7, 1.0), (1.0, 0.2, 0.8), (1 / 3, 0.0, 0.4)):
         chance, guarded = np.random.default_rng(0), 0
         for _ in range(20):
-            harm = Harm().after((30, 0, 29, 30), failed=True)
+            harm = Harm().after((30, 0, 29), failed=True)
             for _ in range(40):
                 drives = not harm.passing(learning=True)
                 after = chance.exponential(100.0 * (better_by if drives else 1.0))
                 steps = 1 + int(min(after, 299.0))
-                driven = (steps, 0, 0, steps) if drives else (0, steps, 0, 0)
+                driven = (steps, 0, 0) if drives else (0, steps, 0)
                 harm = harm.after(driven, failed=after < 299.0)
                 guarded += drives
         assert least <= guarded / 800 <= most
 
 
 def test_a_controller_that_became_good_drives_on_alone_under_a_guard_that_always_fails():
-    harm, failed = Harm().after((30, 0, 29, 30), failed=True), []
+    harm, failed = Harm().after((30, 0, 29), failed=True), []
     for episode in range(40):
         drives = not harm.passing(learning=True)
-        driven = (30, 0, 0, 30) if drives else (0, 5 if episode < 20 else 60, 0, 0)
+        driven = (30, 0, 0) if drives else (0, 5 if episode < 20 else 60, 0)
         failed.append(drives or episode < 20)
         harm = harm.after(driven, failed=failed[-1])
     assert sum(failed[20:]) <= 3
@@ -248,7 +237,7 @@ def test_a_good_controller_that_is_kept_from_its_goal_is_tried(how, least, most)
         harm, alone = arms([(40, how, None)], [(30, "f", None)] * (3 + seed)), 0
         for episode in range(100):
             drives = not harm.passing(learning=True)
-            driven = (60, 0, 30, 60) if drives else (0, 40, 0, 0)
+            driven = (60, 0, 30) if drives else (0, 40, 0)
             fails = not drives and episode < 40
             ends = not drives and not fails and how == "e"
             harm = harm.after(driven, failed=fails, ended=ends)

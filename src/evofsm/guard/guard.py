@@ -124,8 +124,8 @@ class DecisionLogger(Protocol):
 _PLAIN_SETTINGS = ("explaining", "interval", "learn", "n_episodes", "n_failed", "shadow")
 # What of a guard changes in an episode.
 _CHANGING = (
-    *("_monitor", "_latest", "_under_way", "_passing", "_decisions", "_begun", "_learn", "_frozen"),
-    *("_acted", "_watched", "_kept", "_certified", "n_episodes", "n_failed"),
+    *("_monitor", "_latest", "_under_way", "_passing", "_decisions", "_acted", "_watched", "_kept"),
+    *("_begun", "_learn", "_frozen", "n_episodes", "n_failed"),
 )
 _CHANGES = attrgetter(*_CHANGING)
 # What a judge has that learns.
@@ -389,8 +389,7 @@ class Guard:
         self._monitor = InputMonitor(missing, interval)
         self._latest: Situation | None = None
         self._under_way, self._passing, self._learn = False, "", True
-        self._begun = self._decisions = 0
-        self._acted = self._watched = self._kept = self._certified = 0
+        self._begun = self._decisions = self._acted = self._watched = self._kept = 0
         self._lacking: NDArray[Any] | None = None  # since an observation was whole
         #: Whether proposals pass in some or all episodes where it was not shown to help.
         self.shadow = bool(shadow)
@@ -468,7 +467,7 @@ class Guard:
         """Begin the episode of that number."""
         self._monitor = InputMonitor(self.missing, self.interval)
         self._latest = None
-        self._decisions = self._acted = self._watched = self._kept = self._certified = 0
+        self._decisions = self._acted = self._watched = self._kept = 0
         self.reviser.start_episode()
         if isinstance(self.reviser, ActionReviser):
             self._passing = self._why_passing() if twin is None else twin._passing
@@ -706,7 +705,6 @@ class Guard:
             if isinstance(self.reviser, ActionReviser):
                 self._acted += 1
                 self._kept += not self.reviser.refuses
-                self._certified += self._observing is not None and self._observing.is_certified
 
     def _explained(self, situation: Situation, revision: Revision) -> Revision:
         """With what the machine has seen come of what is executed, where that is asked for."""
@@ -807,7 +805,7 @@ class Guard:
         self._under_way = False
         if self._learn:
             if (judge := self._observing) is not None:
-                counts = self._acted, self._watched, self._kept, self._certified
+                counts = self._acted, self._watched, self._kept
                 judge.harm = judge.harm.after(counts, failed=failed, ended=terminated, score=score)
             self.n_episodes += 1
             self.n_failed += failed

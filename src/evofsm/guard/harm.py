@@ -24,8 +24,7 @@ controller alone.
 A guard of which the latest three episodes failed may stand before a controller that became good:
 then the controller drives until it fails, and after two guarded episodes at the latest. If its own
 latest three failed, too, there is little to lose, and the guard, which learns, drives the others,
-twelve at most. So it is with a guard that after those replaces nearly every proposal, hardly ever
-with a certificate: it flies by itself, and nothing would show that another controller has come.
+twelve at most.
 
 Where in an episode a guard that has not failed of late keeps a quarter more of the proposals than
 before, another controller seems to have come: what is known of the controller alone is of the other
@@ -69,9 +68,8 @@ _CAREFUL = 3
 _TURN, _TRIES = 2, 12
 # Draws by which it is known how often the guard drives; below that share doubt is said.
 _DRAWS, _SAID = 300, 0.5
-# Decisions over which proposals that are kept and certificates are counted, at least for a word,
-# and the share of them that is hardly any.
-_DECISIONS, _FEWEST_DECISIONS, _HARDLY = 500, 100, 0.05
+# Decisions over which the share of proposals that are kept is counted, and at least for a word.
+_DECISIONS, _FEWEST_DECISIONS = 500, 100
 # Where in an episode of so many decisions so much more is kept than before, although none of the
 # latest guarded episodes failed, of which it would have learnt, it is another controller.
 _NOTED, _ANOTHER, _SETTLED = 20, 0.25, 4
@@ -97,7 +95,7 @@ SETTINGS = {
     **dict.fromkeys(("n_episodes", "changed"), COUNT),
     "refuses": bool,
     "ends": bool,
-    **dict.fromkeys(("decided", "kept", "certified"), Numbers(least=0.0, most=COUNT.most)),
+    **dict.fromkeys(("decided", "kept"), Numbers(least=0.0, most=COUNT.most)),
 }
 
 
@@ -110,7 +108,6 @@ class Harm(NamedTuple):
     ends: bool = False  #: whether an episode ever ended by itself, without failing
     decided: float = 0.0  #: decisions of late in which it could refuse
     kept: float = 0.0  #: and of these proposals that were kept
-    certified: float = 0.0  #: and decisions after which some backup survives all
     changed: int = 0  #: the latest episode in which another controller seems to have come, or 0
 
     @property
@@ -136,13 +133,7 @@ class Harm(NamedTuple):
     @property
     def replaces(self) -> bool:
         """Whether hardly a proposal is kept."""
-        return self.decided >= _FEWEST_DECISIONS and self.kept < _HARDLY * self.decided
-
-    @property
-    def is_blind(self) -> bool:
-        """Whether it had its tries, yet replaces nearly every proposal without a certificate."""
-        is_uncertified = self.replaces and self.certified < _HARDLY * self.decided
-        return is_uncertified and len(self.guarded) >= _TRIES
+        return self.decided >= _FEWEST_DECISIONS and self.kept < 0.05 * self.decided
 
     def helps(self, *, learning: bool) -> bool:
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
@@ -197,7 +188,7 @@ class Harm(NamedTuple):
             return "" if self.helps(learning=False) else "was not shown to help"
         if self.is_on_trial:
             return "shadow"
-        if self.is_blind or _all_failed(self.guarded):
+        if _all_failed(self.guarded):
             turn_is_over = all(outcome.guarded for outcome in self.outcomes[-_TURN:])
             if turn_is_over or not _all_failed(self.lately, 1):
                 return "shadow"
@@ -232,14 +223,6 @@ class Harm(NamedTuple):
         arms = f"guarded episodes {_ended(guarded)}, the controller alone {_ended(alone)}"
         return f"it was not shown to help: {arms}; {manner}"
 
-    def _counted(self, fades: float, decisions: int, keeps: int, certificates: int) -> Harm:
-        """With decisions, and those in which it kept, and in which it had a certificate."""
-        return self._replace(
-            decided=fades * self.decided + decisions,
-            kept=fades * self.kept + keeps,
-            certified=fades * self.certified + certificates,
-        )
-
     @classmethod
     def restored(cls, settings: Mapping[str, Any], outcomes: NDArray[Any]) -> Harm:
         """As it was in a file, whose rows and settings hold to what is declared."""
@@ -257,7 +240,7 @@ class Harm(NamedTuple):
 
     def after(
         self,
-        driven: tuple[int, int, int, int],
+        driven: tuple[int, int, int],
         *,
         failed: bool,
         ended: bool = False,
@@ -266,22 +249,24 @@ class Harm(NamedTuple):
         """What it is after an episode.
 
         Of its decisions there were so many in which proposals could be refused (``driven``), in
-        which they could not, and of the first in which they were kept, and with a certificate. With
-        both it is of neither kind, and is left out.
+        which they could not, and of the first in which they were kept. With both it is of neither
+        kind, and is left out.
         """
-        n_acted, n_watched, n_kept, n_certified = driven
+        n_acted, n_watched, n_kept = driven
         refuses, n = self.refuses or n_kept < n_acted, self.n_episodes + 1
         ends = self.ends or (ended and not failed)
         now = self._replace(n_episodes=n, refuses=refuses, ends=ends)
         fades = math.exp(-n_acted / _DECISIONS)
         if refuses:
-            now = now._counted(fades, n_acted, n_kept, n_certified)
+            now = now._replace(
+                decided=fades * self.decided + n_acted, kept=fades * self.kept + n_kept
+            )
         if bool(n_acted) == bool(n_watched):
             return now
         latest = [outcome.failed for outcome in self.guarded[-_SETTLED:]]
         is_settled = len(latest) == _SETTLED and not any(latest) and n_acted >= _NOTED
         if is_settled and n_kept / n_acted > self.kept / self.decided + _ANOTHER:
-            now = now._replace(changed=n)._counted(0.0, n_acted, n_kept, n_certified)
+            now = now._replace(changed=n, decided=float(n_acted), kept=float(n_kept))
         elif self.is_on_trial and failed:
             now = now._replace(changed=0)  # it is the same
         number = math.nan if score is None else score

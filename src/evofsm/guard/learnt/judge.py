@@ -252,11 +252,6 @@ class LearntRisk(ActionJudge):
         return self.state.margin
 
     @property
-    def is_certified(self) -> bool:
-        """Whether after the latest decision some backup survives all that is remembered."""
-        return self._holds
-
-    @property
     def horizon(self) -> int:
         """Decisions that it looks ahead."""
         return self.state.horizon * self.state.stride
