@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parent.parent
 HEAVY = {
-    *("numba", "scipy", "libsumo", "matplotlib", "jinja2", "river", "mcap"),
+    *("numba", "scipy", "libsumo", "matplotlib", "jinja2", "river", "sklearn", "mcap"),
     *("polars", "pyarrow", "pandas", "typer", "rich", "gymnasium", "highway_env"),
 }
 

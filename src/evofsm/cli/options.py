@@ -272,7 +272,11 @@ def typed(given: Mapping[str, Any]) -> str:
 
 Horizon = Annotated[
     float | None,
-    option("An alarm is right if failure comes so soon [s]. [default: 5 % of an episode]", min=0.0),
+    option(
+        "Where nobody acts: an alarm is right if a failure comes within this [s]. "
+        "[default: 5 % of an episode]",
+        min=0.0,
+    ),
 ]
 Persist = Annotated[
     float, option("Where nobody acts: how long a limit is passed before it alarms [s].", min=0.0)

@@ -33,7 +33,7 @@ from evofsm.guard.actions import Action
 from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, Situation
 from evofsm.guard.learnt import failure
 from evofsm.guard.learnt.rollout import FAILS, Flags, Floats, Ints
-from evofsm.guard.learnt.words import region
+from evofsm.guard.learnt.words import changes, region
 from evofsm.store import COUNT, FROM_1, SIZE, Kind, Numbers, Place
 
 #: False alarms a day that an alarm may be asked for, the fewest first; and where nobody says.
@@ -425,7 +425,7 @@ class Foresight(LearningJudge):
         columns = self.columns(log.rows, log.starts) if columns is None else columns
         above, on = (np.any(self._passed(columns, limits, soon=k), axis=0) for k in (False, True))
         leads = np.zeros(len(log.starts))
-        rows = np.flatnonzero(above | on)
+        rows = np.flatnonzero(on)
         false = _tally(above, on, rows, log.starts, log.failed, self._spans, leads)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
         lead = float(np.maximum(leads - np.asarray(early), 0.0).sum()) / max(n, 1) * self.dt
@@ -449,8 +449,7 @@ class Foresight(LearningJudge):
         if is_flat:
             variable, _, beyond = there.partition(" is ")
             return variable, f"{beyond}{soon}"
-        steps = f"below {0.0 - at:.2g} typical steps{soon}"
-        return "distance to failure", f"{steps} (it fails {there})"
+        return "distance to failure", f"below {changes(0.0 - at)}{soon} (it fails {there})"
 
     def passed(self, column: Floats) -> Floats:
         """(n, 6) the limits that a row passes, of which this is the one of `columns`."""
@@ -720,7 +719,7 @@ def _tally(
 ) -> int:
     """False alarms of rows (T,) above limits; on (T,) is where one stays, then is; leads (E,).
 
-    Rows (n,) are those of which one of both is true; of the others only how many they are counts.
+    Rows (n,) are those of ``on``, which has all above; of others only how many they are counts.
     """
     false, place, horizon, hold, stays = 0, 0, spans[0], spans[1], spans[2]
     for e in range(len(starts)):

@@ -82,7 +82,7 @@ class Parts(NamedTuple):
     residuals: Floats  #: (H, m, 1 + K) of disturbances; number 0 is none
     scale: float  #: how much harder than they were disturbances are taken to be
     n_asked: int  #: backups that a search asks
-    n_tried: int  #: and while a rival is tried, by which others may save than first come
+    n_tried: int  #: and while a rival is tried, by which another may save
     n_judged: int  #: and those by which a risk is found
     most: float  #: steps of rollouts after which a search is cut short
 
@@ -313,9 +313,9 @@ class LearntRisk(ActionJudge):
             why = words.NOTHING_LEARNT if parts is None else words.NOTHING_SEEN
             why = why if parts is None or here is None else self._no_threshold
             return Search(options, _unjudged(1), 0, why)
-        model = parts.daring if self.learning else parts.model
+        known, daring = (parts.model, parts.n_asked), (parts.daring, parts.n_tried)
+        model, n_asked = daring if self.learning else known
         proposal, scale, margin = self.encode(wanted), parts.scale, self.state.margin
-        n_asked = parts.n_tried if self.learning else parts.n_asked
         memory, ranks, most = self.remembered, self._ranks[:n_asked], parts.most
         allowance = self._allowed(tolerance, memory)
         policies = self.state.policies
