@@ -313,8 +313,8 @@ class LearntRisk(ActionJudge):
             why = words.NOTHING_LEARNT if parts is None else words.NOTHING_SEEN
             why = why if parts is None or here is None else self._no_threshold
             return Search(options, _unjudged(1), 0, why)
-        known, daring = (parts.model, parts.n_asked), (parts.daring, parts.n_tried)
-        model, n_asked = daring if self.learning else known
+        model = parts.daring if self.learning else parts.model
+        n_asked = parts.n_tried if self.learning else parts.n_asked
         proposal, scale, margin = self.encode(wanted), parts.scale, self.state.margin
         memory, ranks, most = self.remembered, self._ranks[:n_asked], parts.most
         allowance = self._allowed(tolerance, memory)
