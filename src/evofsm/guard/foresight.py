@@ -312,12 +312,13 @@ class Foresight(LearningJudge):
         size = max(self.horizon // _BLOCKS, coarse, 1)
         countdown = np.repeat(log.last, log.lengths) - np.arange(len(log.rows))
         blocks = np.union1d(np.flatnonzero(countdown % size == 0), log.starts)
-        shares = 1.0 - np.geomspace(0.3, max(3.0 / len(log.rows), 1e-5), _TRIED)
+        shares = 1.0 - np.geomspace(0.3, min(max(3.0 / len(log.rows), 1e-5), 0.3), _TRIED)
         series = [sign * columns[v + of * when] for v, when, sign in limits]
-        thresholds = [np.quantile(x, shares) for x in series]
-        x = [np.maximum.reduceat(x, blocks) for x in series]
+        thresholds = np.array([np.quantile(x, shares) for x in series])
+        x = np.array([np.maximum.reduceat(x, blocks) for x in series])
         spans = np.maximum(self._spans // size, 1)
         starts, leads = np.searchsorted(blocks, log.starts), np.zeros(len(log.starts))
+        on, rows = np.zeros(len(blocks), np.bool_), np.zeros(len(blocks), np.int64)
         most = spans[0] * log.failed.sum(), len(log.rows) * self.dt / _DAY
 
         @cache
@@ -325,16 +326,12 @@ class Foresight(LearningJudge):
             """(limits, thresholds, 2) share that is warned, and false alarms a day, of one more."""
             above, sums = np.zeros(len(blocks), np.bool_), np.zeros((len(limits), _TRIED, 2))
             for k, j in rule:
-                above |= x[k] > thresholds[k][j]
-            for k, j in np.ndindex(len(limits), _TRIED):
-                beyond = above | (x[k] > thresholds[k][j])
-                beyond_rows = np.flatnonzero(beyond)
-                false = _tally(beyond, beyond, beyond_rows, starts, log.failed, spans, leads)
-                sums[k, j] = leads.sum(), false
+                above |= x[k] > thresholds[k, j]
+            _one_more(x, thresholds, above, starts, log.failed, spans, sums, leads, on, rows)
             return np.asarray(sums / most)
 
         # What one failure alone speaks for is no further limit.
-        rows, alone = [], max(_WORTH, 1.0 / log.failed.sum())
+        table, alone = [], max(_WORTH, 1.0 / log.failed.sum())
         for number, price in enumerate(_PRICES):
             rule, worth = _Rule(), 0.0
             while len(rule) < _MOST_LIMITS:
@@ -343,14 +340,14 @@ class Foresight(LearningJudge):
                 if gain[best] <= worth + (alone if rule else _WORTH):
                     break
                 worth, rule = gain[best], (*rule, best)
-            parts = [series[k] > thresholds[k][j] for k, j in rule]
+            parts = [series[k] > thresholds[k, j] for k, j in rule]
             for n, (k, j) in enumerate(rule):  # what others imply is no part of it
                 rest = [part for m, part in enumerate(parts) if m != n]
                 if not rest or (parts[n] & ~np.logical_or.reduce(rest)).any():
-                    rows.append((number, plain, *limits[k], limits[k][2] * thresholds[k][j]))
+                    table.append((number, plain, *limits[k], limits[k][2] * thresholds[k, j]))
                 else:
                     parts[n] = np.zeros_like(parts[n])
-        return np.array(rows, np.float64).reshape(-1, 6)
+        return np.array(table, np.float64).reshape(-1, 6)
 
     # -- Telling --------------------------------------------------------------------------------
 
@@ -747,3 +744,35 @@ def _tally(
             latest = t
             place += 1
     return false
+
+
+@kernel
+def _one_more(
+    x: Floats,
+    thresholds: Floats,
+    above: Flags,
+    starts: Ints,
+    failed: Flags,
+    spans: Ints,
+    sums: Floats,
+    leads: Floats,
+    on: Flags,
+    rows: Ints,
+) -> None:
+    """(n, j, 2) leads and false alarms of rows ``above`` and where x (n, T) passes one of (n, j).
+
+    Thresholds rise: what passes one has passed those before. ``leads`` (E,), ``on`` and ``rows``
+    (T,) are room to work in.
+    """
+    for k in range(len(thresholds)):
+        n = len(rows)
+        for t in range(n):
+            rows[t] = t
+        for j in range(thresholds.shape[1]):
+            count, n = n, 0
+            for t in rows[:count]:
+                on[t] = above[t] or x[k, t] > thresholds[k, j]
+                rows[n] = t
+                n += on[t]
+            sums[k, j, 1] = _tally(on, on, rows[:n], starts, failed, spans, leads)
+            sums[k, j, 0] = leads.sum()
