@@ -198,6 +198,17 @@ def test_a_rival_of_a_threshold_asks_each_variable_in_which_failures_are_rare():
     assert crashes(np.vstack([touched[0], failures]), ended=touched[0]) == [False, True, True, True]
 
 
+def test_what_crashes_by_a_rival_is_not_said_of_other_ends():
+    rows = np.random.default_rng(2).uniform([0.0, -1.0], 1.0, (500, 2))
+    failures, known = np.array([[-0.1, -0.9], [-0.1, -0.8]]), survived_as(rows, np.full(2, 0.02))
+    table = explain(FAILS, failures, known, bends=False)
+    ends = table.copy()
+    ends[:, SAYS], ends[:, B] = ENDS, -ends[:, B]
+    tried = rivals(np.vstack([ends, table]), failures, known)
+    assert tried[:, SAYS].tolist() == [ENDS, CRASHES, ENDS]
+    assert tried[[0, 2], B].tolist() == [table[0, B], ends[0, B]]
+
+
 @pytest.mark.slow
 def test_what_refused_for_long_without_a_failure_is_tried_by_its_smallest_rival():
     """A craft that sinks fails if it touches fast, and ends if slowly, which it did never yet."""

@@ -144,6 +144,8 @@ def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
         what was survived.
     """
     rows: list[Floats] = []
+    # What crashes is told of the ends just before it: others come behind.
+    table = table[np.argsort(table[:, SAYS] != FAILS, kind="stable")]
     for row, is_side, holds in zip(table, are_sides(table), inside(table, failures), strict=True):
         held_failures = failures[holds]
         if row[SAYS] != FAILS or not len(held_failures) or not len(survived.rows):
