@@ -19,7 +19,6 @@ from evofsm.driving.judge import LatentRisk
 from evofsm.guard.actions import BoxActions, Choices, put_into, same_action
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Search
 from evofsm.guard.guard import KIND
-from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.loop import run_episode
 from evofsm.guard.reviser import Mode
 from evofsm.guard.scene import SceneRisk
@@ -409,26 +408,6 @@ def test_a_judge_that_wants_to_know_is_told_whether_it_may_learn(tmp_path):
     guard.learn = True
     assert guard.judge.learning is True
     assert not hasattr(continuous().judge, "learning")
-
-
-def test_what_a_judge_did_not_expect_is_counted_where_it_began_unless_it_failed_or_is_frozen():
-    class Surprised(LearntRisk):
-        seen = 0
-
-        def observe(self, observation):
-            self.seen += 1
-            return self.seen % 2 == 0
-
-    guard = continuous(judge=Surprised(DT, -4.0, 4.0))
-    for failed, counted in ((True, 1.0), (False, 3.0)):  # the last of 4 observations failed
-        for k in range(3):
-            guard.decide([0.1 * k, 0.0], 0.0)
-        guard.end(failed, [0.9, 0.0])
-        assert guard.machine.onsets.sum() == counted
-    guard.freeze()
-    guard.decide([0.0, 0.0], 1.0)
-    guard.end(failed=True)
-    assert guard.judge.seen == 8
 
 
 # -- What is refused ----------------------------------------------------------------------------

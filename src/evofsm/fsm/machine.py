@@ -273,7 +273,7 @@ class EvolvingFSM(Retraced):
     def onset(self) -> None:
         """Count that something unexpected began in the state before the latest observation's.
 
-        Whoever has a model of how the system moves says so, as `evofsm.Guard` does.
+        Whoever has a model of how the system moves says so.
         """
         if (before := self._learnt.now["before"][0]) >= 0:
             self._learnt.sums[arrays.ONSETS, before] += 1.0

@@ -641,9 +641,7 @@ class Guard:
             step = machine.observe(z, missing=policy)
             belief, state, surprise = step.belief, step.state, step.surprise
         if self._observing is not None and self._learn:
-            is_onset = self._observing.observe(z)
-            if is_onset and machine is not None:
-                machine.onset()
+            self._observing.observe(z)
         if machine is not None and state is not None:
             visits = opened(machine)[0].sums[VISITS] if model is None else model.visits
             state_time = float(visits[state]) * self.interval
@@ -791,9 +789,7 @@ class Guard:
                 machine.fail()
             machine.tell_of_failures()
         if z is not None and self._observing is not None and self._learn:
-            is_onset = self._observing.observe(z)
-            if is_onset and machine is not None and not failed:  # of what failed it counts nothing
-                machine.onset()
+            self._observing.observe(z)
         if machine is not None and not failed:
             machine.start_episode()
         if self.judge is not None:

@@ -522,8 +522,8 @@ class LearntRisk(ActionJudge):
 
         return rollback
 
-    def observe(self, observation: Floats) -> bool:
-        """Take in an observation, NaN where something was not seen; whether one is to be counted.
+    def observe(self, observation: Floats) -> None:
+        """Take in an observation, NaN where something was not seen.
 
         Raises
         ------
@@ -537,7 +537,6 @@ class LearntRisk(ActionJudge):
             self._study(failed=False, terminated=False)
         self._z.append(observation.copy())
         self._holds = self._refused = self._lost = False  # as long as nothing was asked
-        return False
 
     def act(self, action: Any) -> None:
         """Take in what was executed after the latest observation; another one replaces it."""
