@@ -308,7 +308,7 @@ def test_after_a_gap_in_time_nothing_follows_from_what_was(points):
         ({}, "either low and high, or n_actions"),
         ({"low": 0.0, "high": 1.0, "n_actions": 2}, "either"),
         ({"low": 1.0, "high": 0.0}, "below high"),
-        ({"low": [0.0, 0.0], "high": [1.0]}, "below high"),
+        ({"low": [0.0, 0.0], "high": [1.0]}, "low has 2 components and high has 1"),
         ({"n_actions": 0}, "n_actions"),
         ({"n_actions": 2, "without": ("luck",)}, "without names"),
         ({"n_actions": 2, "dt": 0.0}, "dt"),

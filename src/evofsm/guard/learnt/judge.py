@@ -21,15 +21,8 @@ from evofsm import store
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.sharing import Rollback
-from evofsm.fsm.validation import (
-    action_name,
-    function,
-    positive,
-    real_array,
-    refuse_unusable,
-    whole,
-)
-from evofsm.guard.actions import Mask
+from evofsm.fsm.validation import action_name, function, positive, whole
+from evofsm.guard.actions import BoxActions, Mask
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import words
@@ -739,12 +732,9 @@ def _range(
         raise ValueError("give either low and high, or n_actions")
     if low is None or high is None:
         return np.zeros(0), np.zeros(0)
-    ends = [real_array(name, np.atleast_1d(end), 1) for name, end in (("low", low), ("high", high))]
-    for name, end in zip(("low", "high"), ends, strict=True):
-        refuse_unusable(name, end)
-    if ends[0].shape != ends[1].shape or not (ends[0] < ends[1]).all():
-        raise ValueError(f"low is {low} and high is {high}; low must be below high")
-    return ends[0], ends[1]
+    ends: Any = np.atleast_1d(low), np.atleast_1d(high)
+    lowest, highest = BoxActions(*ends).bounds
+    return lowest, highest
 
 
 def _unjudged(count: int) -> Judgement:
