@@ -559,16 +559,7 @@ class Foresight(LearningJudge):
         on = (up >= self.hold) | ((on > 0) & (down < self._spans[2]))
         return is_passed, (memory, up, down, on)
 
-    def search(
-        self,
-        situation: Situation,
-        wanted: Action,
-        /,
-        *,
-        tolerance: float,
-        revising: bool,
-        mask: Any = None,
-    ) -> Search:
+    def search(self, situation: Situation, wanted: Action, /, **others: Any) -> Search:
         """Keep what is proposed, as nobody acts; the risk is that of the alarm that is on."""
         is_passed, (*_, on) = self._next(situation.observation)
         rate, risk, reason = self.alarm, 0.0, "no alarm is on"
@@ -583,7 +574,7 @@ class Foresight(LearningJudge):
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
         """The risk, whatever would be done."""
-        judgement = self.search(situation, 0.0, tolerance=1.0, revising=False).judged
+        judgement = self.search(situation, 0.0).judged
         risk, low, high, slack = (np.repeat(values, np.size(actions)) for values in judgement[:4])
         return Judgement(risk, low, high, slack, judgement.evidence)
 
