@@ -275,7 +275,10 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         buffer: Any = create_empty_array(space, self.num_envs)
         executed = concatenate(space, [decision.executed for decision in decisions], buffer)
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
-        self._learn(observations, rewards, terminated, truncated, infos)
+        rows = iterate(self.env.observation_space, observations)
+        for k, (lane, observation) in enumerate(zip(self._lanes, rows, strict=True)):
+            ends, info = (bool(terminated[k]), bool(truncated[k])), _of_one(infos, k, self.num_envs)
+            lane.follow(StepResult(observation, rewards[k], *ends, info), resets=self._same_step)
         if any(decision.cost for decision in decisions):
             shape = (-1,) + (1,) * (np.ndim(rewards) - 1)
             rewards = rewards - np.reshape([decision.cost for decision in decisions], shape)
@@ -287,14 +290,6 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
                 for name in decision.info:
                     infos[f"_{name}"][k] = False
         return observations, rewards, terminated, truncated, infos
-
-    def _learn(
-        self, observations: Any, rewards: Any, terminated: Any, truncated: Any, infos: Any
-    ) -> None:
-        rows = iterate(self.env.observation_space, observations)
-        for k, (lane, observation) in enumerate(zip(self._lanes, rows, strict=True)):
-            ends, info = (bool(terminated[k]), bool(truncated[k])), _of_one(infos, k, self.num_envs)
-            lane.follow(StepResult(observation, rewards[k], *ends, info), resets=self._same_step)
 
 
 def _of_one(infos: Mapping[str, Any], k: int, count: int) -> dict[str, Any]:
