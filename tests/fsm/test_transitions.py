@@ -1,34 +1,23 @@
-"""Transition matrices and forecasts, worked out by hand on two states and two actions."""
+"""Forecasts, worked out by hand on two states and two actions."""
 
 import numpy as np
 import pytest
 
 from evofsm.fsm.machine import EvolvingFSM
 
-# Learnt by `machine`, and by hand with phi = 1/2 and prior frequency 1/4 from
-# F = [[1/4, 1/4], [1/4, 1/4]]: action 0 led once from state 1 to 0, action 1 once from 0 to 0 and
-# once from 0 to 1.
-P = np.array([[[1 / 2, 1 / 2], [5 / 6, 1 / 6]], [[5 / 14, 9 / 14], [1 / 2, 1 / 2]]])
-F_O = np.array([[1 / 4, 3 / 4], [7 / 8, 1 / 8]])
-
 
 @pytest.fixture
 def machine():
-    """States at 0 and 1, recognised so sharply that a belief is exactly 0 or 1."""
+    """States at 0 and 1, recognised so sharply that a belief is exactly 0 or 1.
+
+    By hand P is [[1/2, 1/2], [5/6, 1/6]] of action 0, and [[5/14, 9/14], [1/2, 1/2]] of action 1.
+    """
     machine = EvolvingFSM(
         n_actions=2, radius=0.5, learning_rate=0.5, prior_frequency=0.25, spread=1e-6
     )
     machine.learn_many([[0.0], [0.0], [2.0], [1.0]], [-1, -1, -1, 0])
     machine.learn_many([[0.0], [0.0], [1.0]], [1, 1, -1])
     return machine
-
-
-def test_matrices_are_those_worked_out_by_hand(machine):
-    np.testing.assert_allclose(machine.transition_matrices, P, rtol=1e-15)
-    np.testing.assert_allclose(machine.origin_frequency, F_O, rtol=1e-15)
-    np.testing.assert_allclose(machine.joint_frequency, F_O[:, :, None] * P, rtol=1e-15)
-    marginal = [[3 / 7, 4 / 7], [2 / 3, 1 / 3]]
-    np.testing.assert_allclose(machine.marginal_matrix, marginal, rtol=1e-15)
 
 
 @pytest.mark.parametrize(

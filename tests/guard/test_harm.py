@@ -202,22 +202,6 @@ def test_frozen_it_does_not_forget_why_it_was_there():
     assert harm.helps(learning=False)
 
 
-def test_the_arm_that_is_better_is_drawn_ever_more_often():
-    """By simulation: failure after times that differ by a factor, cut off at 300 steps."""
-    for better_by, least, most in ((3.0, 0.7, 1.0), (1.0, 0.2, 0.8), (1 / 3, 0.0, 0.4)):
-        chance, guarded = np.random.default_rng(0), 0
-        for _ in range(20):
-            harm = Harm().after((30, 0, 29), failed=True)
-            for _ in range(40):
-                drives = not harm.passing(learning=True)
-                after = chance.exponential(100.0 * (better_by if drives else 1.0))
-                steps = 1 + int(min(after, 299.0))
-                driven = (steps, 0, 0) if drives else (0, steps, 0)
-                harm = harm.after(driven, failed=after < 299.0)
-                guarded += drives
-        assert least <= guarded / 800 <= most
-
-
 def test_a_controller_that_became_good_drives_on_alone_under_a_guard_that_always_fails():
     harm, failed = Harm().after((30, 0, 29), failed=True), []
     for episode in range(40):

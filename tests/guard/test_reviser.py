@@ -43,11 +43,6 @@ def nearest_values(actions, wanted):
     return np.minimum(np.maximum(wanted, lowest), highest)[1:].tolist()
 
 
-def above(limit, low=0.0, high=1.0):
-    """Tolerable up to an acceleration, and not above it."""
-    return lambda a: low if a <= limit else high
-
-
 @st.composite
 def risks(draw):
     """Any risk at all: waves on a slope, around the tolerance."""
@@ -154,27 +149,6 @@ def test_where_no_margin_can_be_had_what_is_tolerable_will_do_and_it_does_not_ch
     first, *others = (reviser.revise(HERE, Proposal(1.0)).executed for _ in range(6))
     assert LOW < first <= 0.0
     assert others == [first] * 5
-
-
-@pytest.mark.parametrize(
-    ("wanted", "executed", "remark"),
-    [
-        (9.0, HIGH, "proposal 9 is outside [-2.5, 2.5]"),
-        (-9.0, LOW, "proposal -9 is outside [-2.5, 2.5]"),
-        (math.nan, -1.0, "no usable proposal (nan)"),
-        (-math.inf, -1.0, "no usable proposal (-inf)"),
-    ],
-)
-def test_what_cannot_be_executed_is_made_usable_and_judged_as_such(wanted, executed, remark):
-    for mode in Mode:
-        revision = ActionReviser(Told(above(5.0)), ACTIONS, mode=mode).revise(
-            HERE, Proposal(wanted)
-        )
-        assert revision.executed == executed
-        assert revision.reason.startswith(remark)
-        np.testing.assert_equal(revision.proposed, wanted)
-    revision = ActionReviser(Told(above(-2.0)), ACTIONS).revise(HERE, Proposal(wanted))
-    assert revision.executed <= -2.0
 
 
 def test_what_was_never_seen_is_said_to_be_so_and_what_is_known_is_not():

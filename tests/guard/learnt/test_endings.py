@@ -64,11 +64,6 @@ def test_who_lands_is_let_land_and_what_lands_too_fast_is_not(lander):
     assert failed == 0 < 4 < alone[0] < 16 <= landed
 
 
-def test_a_file_holds_them(lander, reloaded):
-    again = reloaded(lander.judge)
-    assert again.told_by_experience == lander.judge.told_by_experience
-
-
 def walk(judge, place, **how):
     for part in np.linspace(0.0, 1.0, 1 + round(np.abs(place).max() / 0.1)):
         judge.observe(part * np.array(place))
