@@ -18,7 +18,7 @@ from itertools import product
 import numpy as np
 
 from evofsm.guard.learnt.rollout import Floats, Ints, Model, rollout
-from evofsm.guard.learnt.state import LearntSettings, State
+from evofsm.guard.learnt.state import State
 
 # Of mutants the share that are of the best, the share of numbers that differ, by a size of 10 to a
 # power between these.
@@ -33,13 +33,14 @@ _FITTED = 200
 _MAX_CORNERS = 3
 
 
-def first_backups(u: Floats, m: int, choices: int, n_linear: int) -> tuple[Floats, Floats]:
-    """(b, a, 1 + m) those that nothing was learnt of yet, and (b,) which evolve.
+def first_backups(state: State, u: Floats, n_linear: int) -> State:
+    """Begin with constants, and linear ones of which nothing was learnt yet.
 
     By actions (T, a) of the first episode: it makes no difference in which order or direction they
     come.
     """
-    a, (order, turns) = u.shape[1], basis(u, choices)
+    a, choices = u.shape[1], state.choices
+    order, turns = basis(u, choices)
     if choices:
         ends = np.eye(a)
     else:
@@ -47,12 +48,13 @@ def first_backups(u: Floats, m: int, choices: int, n_linear: int) -> tuple[Float
         if a <= _MAX_CORNERS:
             ends = np.array(list(product((-1.0, 1.0), repeat=a)))
         ends = np.vstack([ends, np.zeros(a)])
-    policies = np.zeros((len(ends) + n_linear, a, 1 + m))
+    policies = np.zeros((len(ends) + n_linear, a, 1 + len(state.origin)))
     policies[: len(ends), order, 0] = ends
     policies *= turns[:, None]
     if choices:  # of equals the first in that order, whatever its index
         policies[:, order, 0] -= _PREFERRED * np.arange(a)
-    return policies, np.append(np.zeros(len(ends)), np.ones(n_linear))
+    linear = np.append(np.zeros(len(ends)), np.ones(n_linear))
+    return state._replace(policies=policies, linear=linear)
 
 
 def fitted(state: State, model: Model, backup: Callable[[Floats], Floats]) -> State:
@@ -79,31 +81,29 @@ def basis(rows: Floats, choices: int = 0) -> tuple[Ints, Floats]:
 
 
 def evolved(
-    policies: Floats,
-    linear: Floats,
+    state: State,
     model: Model,
-    situations: Floats,
     residuals: Floats,
     scale: float,
-    settings: LearntSettings,
+    n_mutants: int,
     random: np.random.Generator,
-) -> tuple[Floats, Floats]:
-    """Backups that are worth more, in the order in which they are asked."""
-    policies, n_disturbances = policies.copy(), residuals.shape[2]
+) -> State:
+    """Take backups that are worth more, in the order in which they are asked."""
+    policies, situations = state.policies.copy(), state.situations
 
     def worth(policy: Floats) -> Floats:
         """(S,) how well it ends in each situation, in the mean of all disturbances."""
         worths = rollout(model, situations, policy, residuals, scale).worth
-        return np.asarray(worths.reshape(-1, n_disturbances).mean(1))
+        return np.asarray(worths.reshape(len(situations), -1).mean(1))
 
     values = np.array([worth(policy) for policy in policies])
-    parents = np.flatnonzero(linear == 1.0)
+    parents = np.flatnonzero(state.linear == 1.0)
     shape, m = policies.shape[1:], len(model.origin)
     variables, flips = basis((situations[:, :m] - model.mean) * model.inverse)
     actions, turns = basis(situations[:, 2 * m :], model.choices)
     cells = np.ix_(np.argsort(actions), np.argsort(np.append(0, 1 + variables)))
     signs = np.append(1.0, flips) * turns[:, None]
-    for _ in range(settings.n_mutants if len(parents) else 0):
+    for _ in range(n_mutants if len(parents) else 0):
         parent = parents[values[parents].mean(1).round(_ROUNDED).argmax()]
         if random.random() >= _OF_BEST:
             parent = int(random.integers(len(policies)))
@@ -123,4 +123,4 @@ def evolved(
         adds = (adds + _BY_ITSELF * values[pool].mean(1)).round(_ROUNDED)
         order.append(pool.pop(int(adds.argmax())))
         most = np.maximum(most, values[order[-1]])
-    return policies[order], linear[order]
+    return state._replace(policies=policies[order], linear=state.linear[order])

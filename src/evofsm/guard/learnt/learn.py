@@ -101,9 +101,7 @@ def learn(
     if not moves:
         return state._replace(n_episodes=state.n_episodes + 1)
     if not len(state.policies):
-        m = len(state.origin)
-        policies, linear = first_backups(u, m, state.choices, settings.n_linear)
-        state = state._replace(policies=policies, linear=linear)
+        state = first_backups(state, u, settings.n_linear)
     state = noted(state, safe, u, episode, settings, random)
     if "rivals" not in without and given.failed is None:
         was_tried = failure.inside(before.forms[before.forms[:, SAYS] == FAILS], safe, 0.0).any()
@@ -130,9 +128,7 @@ def learn(
     if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
         numbers = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
         rest, scale = np.ascontiguousarray(rest[:, :, numbers]), disturbance_scale(state, settings)
-        inputs = motion_model, state.situations, rest, scale, settings, random
-        policies, linear = evolved(state.policies, state.linear, *inputs)
-        state = state._replace(policies=policies, linear=linear)
+        state = evolved(state, motion_model, rest, scale, settings.n_mutants, random)
     return state._replace(n_episodes=state.n_episodes + 1)
 
 
