@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
-from evofsm.fsm.kernels import kernel
+from evofsm.fsm.kernels import compiled, kernel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.validation import positive, refuse_unusable
@@ -317,18 +317,16 @@ class Foresight(LearningJudge):
         thresholds = np.array([np.quantile(x, shares) for x in series])
         x = np.array([np.maximum.reduceat(x, blocks) for x in series])
         spans = np.maximum(self._spans // size, 1)
-        starts, leads = np.searchsorted(blocks, log.starts), np.zeros(len(log.starts))
-        on, rows = np.zeros(len(blocks), np.bool_), np.zeros(len(blocks), np.int64)
+        starts = np.searchsorted(blocks, log.starts)
         most = spans[0] * log.failed.sum(), len(log.rows) * self.dt / _DAY
 
         @cache
         def more(rule: _Rule) -> Floats:
             """(limits, thresholds, 2) share that is warned, and false alarms a day, of one more."""
-            above, sums = np.zeros(len(blocks), np.bool_), np.zeros((len(limits), _TRIED, 2))
+            above = np.zeros(len(blocks), np.bool_)
             for k, j in rule:
                 above |= x[k] > thresholds[k, j]
-            _one_more(x, thresholds, above, starts, log.failed, spans, sums, leads, on, rows)
-            return np.asarray(sums / most)
+            return _one_more(x, thresholds, above, starts, log.failed, spans) / most
 
         # What one failure alone speaks for is no further limit.
         table, alone = [], max(_WORTH, 1.0 / log.failed.sum())
@@ -737,24 +735,16 @@ def _tally(
     return false
 
 
-@kernel
+@compiled
 def _one_more(
-    x: Floats,
-    thresholds: Floats,
-    above: Flags,
-    starts: Ints,
-    failed: Flags,
-    spans: Ints,
-    sums: Floats,
-    leads: Floats,
-    on: Flags,
-    rows: Ints,
-) -> None:
+    x: Floats, thresholds: Floats, above: Flags, starts: Ints, failed: Flags, spans: Ints
+) -> Floats:
     """(n, j, 2) leads and false alarms of rows ``above`` and where x (n, T) passes one of (n, j).
 
-    Thresholds rise: what passes one has passed those before. ``leads`` (E,), ``on`` and ``rows``
-    (T,) are room to work in.
+    Thresholds rise: what passes one has passed those before.
     """
+    sums, leads = np.zeros((*thresholds.shape, 2)), np.zeros(len(starts))
+    on, rows = np.zeros(len(above), np.bool_), np.zeros(len(above), np.int64)
     for k in range(len(thresholds)):
         n = len(rows)
         for t in range(n):
@@ -767,3 +757,4 @@ def _one_more(
                 n += on[t]
             sums[k, j, 1] = _tally(on, on, rows[:n], starts, failed, spans, leads)
             sums[k, j, 0] = leads.sum()
+    return sums
