@@ -35,6 +35,7 @@ from evofsm.store import COUNT, FLAG, FROM_1, MOST_COUNTED, SIZE, Kind, Numbers,
 
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
+_Steps = tuple[_Floats, _Floats]  # places before and after
 
 # Numbers of a place.
 _P = 2
@@ -433,12 +434,7 @@ class Contact(NamedTuple):
     met: float  #: median closeness of what failed
 
     @classmethod
-    def learn(
-        cls,
-        survived: tuple[_Floats, _Floats],
-        failed: list[tuple[_Floats, _Floats]],
-        spread: _Floats,
-    ) -> Contact:
+    def learn(cls, survived: _Steps, failed: list[_Steps], spread: _Floats) -> Contact:
         """From steps, (s, p) places before and after, of objects survived and at each failure.
 
         The closest object in a failure was met. Of the shapes of a box of this ``spread``, that is
