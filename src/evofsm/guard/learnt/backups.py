@@ -16,6 +16,7 @@ from collections.abc import Callable
 from itertools import product
 
 import numpy as np
+from numpy.random import Generator
 
 from evofsm.guard.learnt.rollout import Floats, Ints, Model, rollout
 from evofsm.guard.learnt.state import State
@@ -81,12 +82,7 @@ def basis(rows: Floats, choices: int = 0) -> tuple[Ints, Floats]:
 
 
 def evolved(
-    state: State,
-    model: Model,
-    residuals: Floats,
-    scale: float,
-    n_mutants: int,
-    random: np.random.Generator,
+    state: State, model: Model, residuals: Floats, scale: float, n_mutants: int, random: Generator
 ) -> State:
     """Take backups that are worth more, in the order in which they are asked."""
     policies, situations = state.policies.copy(), state.situations

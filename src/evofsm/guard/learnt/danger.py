@@ -7,14 +7,14 @@ each further episode that failed near it doubles its radius.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Set
+from collections.abc import Callable
 
 import numpy as np
 
 from evofsm.guard.learnt import failure, model
 from evofsm.guard.learnt.failure import HELD, SAYS, B, I, Survived
 from evofsm.guard.learnt.rollout import CRASHES, DEAD, ENDS, FAILS, GROWN, Floats, Model
-from evofsm.guard.learnt.state import Episode, LearntSettings, State, sizes
+from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State, sizes
 
 # Episodes of which the end tells where there are any; observations so near the last one [typical
 # steps] cannot be told from it.
@@ -31,15 +31,9 @@ _RAYS, _EDGE_HALVINGS, _DEEP = 64, 40, 0.05
 _RADII = tuple(0.1 * 1.3**k for k in range(20))
 
 
-def fails(
-    state: State,
-    z: Floats,
-    episode: Episode,
-    settings: LearntSettings,
-    without: Set[str],
-    given: Callable[[Floats], bool] | None,
-) -> State:
+def fails(state: State, z: Floats, episode: Episode, given: Given) -> State:
     """Learn where it fails, and where it ends, of observations ``z`` (T + 1, m) of an episode."""
+    settings, function, bends = given.settings, given.failed, "regions" not in given.without
     failed = episode.failed and bool(np.isfinite(z[-1]).all())
     rows = z[:-1] if episode.failed else z
     rows = rows[np.isfinite(rows).all(1)]
@@ -58,8 +52,8 @@ def fails(
         at = np.append(np.arange(len(went_on)), smooth)
         proven = np.append(state.proven, 1.0 * (at < len(went_on) - tail))
         safe_rows = np.concatenate([state.survived, new])
-        if given is not None:
-            fine = np.append(np.full(len(state.survived), True), [not given(row) for row in new])
+        if function is not None:
+            fine = np.append(np.full(len(state.survived), True), [not function(row) for row in new])
             safe_rows, proven = safe_rows[fine], proven[fine]
         while len(safe_rows) > settings.max_survived:
             safe_rows, proven = safe_rows[::2], proven[::2]
@@ -67,9 +61,9 @@ def fails(
     if failed:
         brinks = np.vstack([state.brinks, rows[-1:]])[-most:]
         state = state._replace(failures=np.vstack([state.failures, z[-1]])[-most:], brinks=brinks)
-    if given is not None:
-        return _asked(state, given, bends="regions" not in without)
-    return _explained(state, settings, failed=failed, bends="regions" not in without)
+    if function is not None:
+        return _asked(state, function, bends=bends)
+    return _explained(state, settings, failed=failed, bends=bends)
 
 
 def _explained(state: State, settings: LearntSettings, *, failed: bool, bends: bool) -> State:

@@ -28,7 +28,7 @@ from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import words
 from evofsm.guard.learnt.backups import basis
 from evofsm.guard.learnt.failure import AT, SAYS, B, I, are_sides
-from evofsm.guard.learnt.learn import Given, disturbance_scale, learn
+from evofsm.guard.learnt.learn import disturbance_scale, learn
 from evofsm.guard.learnt.motion import used_at
 from evofsm.guard.learnt.rollout import (
     CUT_SHORT,
@@ -46,6 +46,7 @@ from evofsm.guard.learnt.rollout import (
 from evofsm.guard.learnt.state import (
     KIND,
     Episode,
+    Given,
     LearntSettings,
     State,
     forms_of,
@@ -586,7 +587,7 @@ class LearntRisk(ActionJudge):
 
     @property
     def _given(self) -> Given:
-        """What was given, of encoded actions."""
+        """What the user says, of encoded actions."""
         move, act, m = self.model, self.backup, self.n_variables
 
         def model(z: Floats, inner: Floats) -> Floats:
@@ -606,7 +607,8 @@ class LearntRisk(ActionJudge):
                 raise ValueError(f"backup gave {action} at {z}; it has to give an action")
             return self.encode(action[0] if self.choices else np.clip(action, self.low, self.high))
 
-        return Given(self.failed, move and model, act and backup)
+        numbers = self.settings, self.seed, self.without, self.given_horizon
+        return Given(*numbers, self.failed, move and model, act and backup)
 
     def _study(self, *, failed: bool, terminated: bool) -> None:
         """Learn from the rows of an episode, and forget them."""
@@ -625,15 +627,7 @@ class LearntRisk(ActionJudge):
             blank = State.none(z.shape[1], self.size, self.choices, self.settings, None)
             kept_names = ("horizon", "stride", "margin", "n_failed")
             self.state = blank._replace(**{name: getattr(now, name) for name in kept_names})
-        self.state = learn(
-            self.state,
-            episode,
-            self.settings,
-            seed=self.seed,
-            without=self.without,
-            has_horizon=self.given_horizon is not None,
-            given=self._given,
-        )
+        self.state = learn(self.state, episode, self._given)
         self.parts = Parts.of(self.state, self.settings, self.dt)
         self._used, self._ranks = np.zeros((self.size, 2)), np.arange(len(self.state.policies))
 

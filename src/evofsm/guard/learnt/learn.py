@@ -5,16 +5,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Set
-from typing import NamedTuple
-
 import numpy as np
+from numpy.random import Generator
 
 from evofsm.guard.learnt import danger, failure, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups, fitted
 from evofsm.guard.learnt.failure import SAYS
 from evofsm.guard.learnt.rollout import DEAD, FAILS, Flags, Floats, Model, value_of
-from evofsm.guard.learnt.state import Episode, LearntSettings, State, model_of, residuals_of
+from evofsm.guard.learnt.state import (
+    Episode,
+    Given,
+    LearntSettings,
+    State,
+    model_of,
+    residuals_of,
+)
 
 # Actions of an episode that says how a system moves, at least; situations from which on
 # disturbances are looked for and backups evolve; those that are drawn to look for some;
@@ -30,24 +35,7 @@ _MOST_WINDOWS, _BEFORE, _EARLIER = 3, 3, 2
 _ONSET = 0.5
 
 
-class Given(NamedTuple):
-    """Functions that a user gives, None where it is learnt; actions are encoded, (a,)."""
-
-    failed: Callable[[Floats], bool] | None = None  #: of an observation
-    model: Callable[[Floats, Floats], Floats] | None = None  #: next one, of it and an action
-    backup: Callable[[Floats], Floats] | None = None  #: action, of an observation
-
-
-def learn(
-    state: State,
-    episode: Episode,
-    settings: LearntSettings,
-    *,
-    seed: int,
-    without: Set[str],
-    has_horizon: bool,
-    given: Given,
-) -> State:
+def learn(state: State, episode: Episode, given: Given) -> State:
     """Learn from an episode, or from a part of a long one.
 
     Parameters
@@ -55,13 +43,6 @@ def learn(
     state : State
         What was known before it.
     episode : Episode
-    settings : LearntSettings
-    seed : int
-        Of what is drawn, together with the number of the episode.
-    without : set of str
-        Parts that are left out (`LearntRisk.PARTS`).
-    has_horizon : bool
-        Whether it was given how far to look ahead.
     given : Given
         What need not be learnt alone.
 
@@ -70,9 +51,9 @@ def learn(
     State
         What is known now.
     """
-    decisions, before = episode, state
+    decisions, before, settings, without = episode, state, given.settings, given.without
     episode = decisions.every(state.stride)
-    random = np.random.default_rng([seed, state.n_episodes])
+    random = np.random.default_rng([given.seed, state.n_episodes])
     is_seen = np.isfinite(episode.observations).all(1)
     if not state.n_seen:
         state = state._replace(origin=episode.observations[is_seen][0])
@@ -94,7 +75,7 @@ def learn(
         if given.model is not None:
             state = motion.told(state, model_of(state, settings), safe, given.model, random)
     # Failure
-    state = danger.fails(state, z, episode, settings, without, given.failed)
+    state = danger.fails(state, z, episode, given)
     if "dead-ends" not in without and len(state.forms):
         motion_model = model_of(state, settings)
         state = danger.dead_ends(state, motion_model, safe, episode, before.survived)
@@ -102,7 +83,7 @@ def learn(
         return state._replace(n_episodes=state.n_episodes + 1)
     if not len(state.policies):
         state = first_backups(state, u, settings.n_linear)
-    state = noted(state, safe, u, episode, settings, random)
+    state = noted(state, safe, episode, settings, random)
     if "rivals" not in without and given.failed is None:
         was_tried = failure.inside(before.forms[before.forms[:, SAYS] == FAILS], safe, 0.0).any()
         state = doubted(state, episode, settings, tried=bool(was_tried))
@@ -110,17 +91,15 @@ def learn(
     if len(refutations):
         state = motion.misled(state, safe, u, refutations, settings, failed=episode.failed)
     # Disturbances
-    motion_model, fails = model_of(state, settings), len(state.forms) > 0
-    looks = fails and len(state.situations) > _ENOUGH
+    motion_model, looks, fails = model_of(state, settings), looks_for_harm(state), len(state.forms)
     state = state._replace(n_scanned=state.n_scanned + looks)
     if "stretches" not in without:
-        state = disturbances(state, motion_model, safe, u, settings, random, looks=looks)
+        state = disturbances(state, motion_model, safe, u, settings, random)
     rest = residuals_of(state, motion_model, state.horizon)
-    if looks and not has_horizon:
+    if looks and given.horizon is None:
         if is_too_short(state, motion_model, episode, settings):
             decisions = decisions._replace(fails_after=0.5 * decisions.fails_after)
-            retry = coarser(before, settings), decisions, settings
-            return learn(*retry, seed=seed, without=without, has_horizon=False, given=given)
+            return learn(coarser(before, settings), decisions, given)
         state = look_ahead(state, motion_model, rest, episode, settings)
     # Backups
     if given.backup is not None:
@@ -155,18 +134,13 @@ def doubted(state: State, episode: Episode, settings: LearntSettings, *, tried: 
 
 
 def noted(
-    state: State,
-    z: Floats,
-    u: Floats,
-    episode: Episode,
-    settings: LearntSettings,
-    random: np.random.Generator,
+    state: State, z: Floats, episode: Episode, settings: LearntSettings, random: Generator
 ) -> State:
     """Note situations, on which disturbances and backups are tried: of all in their turn.
 
     One anywhere in an episode, one where a proposal was refused, and some before failure.
     """
-    T, rows = len(u), state.situations
+    T, rows = len(z) - 1, state.situations
     steps = [int(random.integers(1, T))]
     if len(tight := np.flatnonzero(episode.refused[1:T]) + 1):
         steps.append(int(random.choice(tight)))
@@ -174,7 +148,7 @@ def noted(
         back = random.integers(_EARLIER, max(_EARLIER + 1, min(T, state.horizon)), _BEFORE)
         steps += np.maximum(1, T - 1 - back).tolist()
     for t in steps:
-        row = np.concatenate([z[t], z[t] - z[t - 1], u[t - 1]])
+        row = np.concatenate([z[t], z[t] - z[t - 1], episode.actions[t - 1]])
         if not np.isfinite(row).all():
             continue
         if len(rows) < settings.n_situations:
@@ -185,22 +159,21 @@ def noted(
     return state._replace(situations=rows)
 
 
+def looks_for_harm(state: State) -> bool:
+    """Whether it is known where it fails, and enough situations to find what harms there."""
+    return len(state.forms) > 0 and len(state.situations) > _ENOUGH
+
+
 def disturbances(
-    state: State,
-    known: Model,
-    z: Floats,
-    u: Floats,
-    settings: LearntSettings,
-    random: np.random.Generator,
-    *,
-    looks: bool,
+    state: State, known: Model, z: Floats, u: Floats, settings: LearntSettings, random: Generator
 ) -> State:
     """Remember windows of an episode in which what was not expected harms most.
 
-    Where it ``looks``, for the best backup in some situation; else, as long as no failure is known,
-    the largest ones.
+    Where it looks for harm, for the best backup in some situation; else, as long as no failure is
+    known, the largest ones.
     """
     H, S, (T, a), m = state.horizon, state.situations, u.shape, z.shape[1]
+    looks = looks_for_harm(state)
     starts = np.arange(0, max(1, T - 4), max(1, (T - 1) // settings.n_starts))
     rest = model.undisturbed(len(u) + H, m, 1)[..., 0]
     rest[: T - 1] = model.disturbed(known, z, u, state.unit)
@@ -214,7 +187,7 @@ def disturbances(
     harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_MOST_WINDOWS]
     starts = starts[harmful]
     longest = settings.horizon_max + 2
-    windows, lengths, of = list(state.windows), state.lengths.tolist(), state.seen_in.tolist()
+    windows, lengths = list(state.windows), state.lengths.tolist()
     for t in starts:
         is_seen: Flags = np.asarray(np.isfinite(z[t : t + longest]).all(1))
         n = len(is_seen) if is_seen.all() else int(is_seen.argmin())
@@ -223,12 +196,9 @@ def disturbances(
             row[:n, :m], row[: n - 1, m:] = z[t : t + n], u[t : t + n - 1]
             windows.append(row)
             lengths.append(float(n))
-            of.append(float(state.n_episodes))
-    state = state._replace(
-        windows=np.array(windows).reshape(-1, longest, m + a),
-        lengths=np.array(lengths),
-        seen_in=np.array(of),
-    )
+    since = np.full(len(windows) - len(state.windows), float(state.n_episodes))
+    seen_in, table = np.append(state.seen_in, since), np.reshape(windows, (-1, longest, m + a))
+    state = state._replace(windows=table, lengths=np.array(lengths), seen_in=seen_in)
     residuals = residuals_of(state, known, H)
     if looks and len(windows):
         state, residuals = _fatal(state, known, residuals, settings)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
@@ -133,6 +133,18 @@ class LearntSettings:
     longer: float = 0.002
     work: float = 7e6
     work_rate: float = 8.75e8
+
+
+class Given(NamedTuple):
+    """What a user says, None where that is learnt; actions are encoded, (a,)."""
+
+    settings: LearntSettings
+    seed: int  #: of what is drawn, together with the number of the episode
+    without: Set[str]  #: parts that are left out (`LearntRisk.PARTS`)
+    horizon: float | None  #: how far to look ahead [s]
+    failed: Callable[[Floats], bool] | None  #: of an observation
+    model: Callable[[Floats, Floats], Floats] | None  #: next one, of it and an action
+    backup: Callable[[Floats], Floats] | None  #: action, of an observation
 
 
 class Episode(NamedTuple):
