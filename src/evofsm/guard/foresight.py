@@ -218,7 +218,8 @@ class Foresight(LearningJudge):
             raise ValueError("no episode failed, so there is nothing to foresee")
         log = Runs.of(episodes, failed)
         refuse_unusable("observations", log.rows)
-        return cls._of_log(log, dt, horizon, 1 + round(hold / dt), names, units)
+        labels = Labels(names=tuple(names), units=tuple(units))
+        return cls._of_log(log, dt, horizon, 1 + round(hold / dt), labels)
 
     @classmethod
     def from_zero(
@@ -232,13 +233,7 @@ class Foresight(LearningJudge):
 
     @classmethod
     def _of_log(
-        cls,
-        log: Runs,
-        dt: float,
-        horizon: float | None,
-        held: int,
-        names: Sequence[str],
-        units: Sequence[str],
+        cls, log: Runs, dt: float, horizon: float | None, held: int, labels: Labels
     ) -> Self:
         """Learn from a log in which there are failures; of a long one from some of the episodes."""
         every = min(-(-len(log.rows) // _MOST_ROWS), int(log.failed.sum()) // _FAILURES)
@@ -248,7 +243,7 @@ class Foresight(LearningJudge):
         if horizon is None:
             horizon = max(float(np.median(log.lengths)) * _SHORT, _FEWEST) * dt
         ahead = max(round(positive("horizon", horizon) / dt), 1)
-        names = names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
+        names = labels.names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
         empty_tables = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 4))
         fresh = cls(dt, ahead, held, *empty_tables)
         number = np.arange(len(log.failed)) * _PARTS // len(log.failed)
@@ -287,7 +282,7 @@ class Foresight(LearningJudge):
             is_same = bool(scores) and scores[-1][3] == kind and np.array_equal(latest, before)
             scores.append(scores[-1] if is_same else (right, false, float(log.failed.sum()), kind))
         tables = judge.forms, np.concatenate(limits), np.array(scores, np.float64)
-        return cls(dt, ahead, held, *tables, names, units)
+        return cls(dt, ahead, held, *tables, names, labels.units)
 
     def _fitted(self, log: Runs) -> Self:
         """With forms and limits of both kinds, for all rates."""
@@ -614,8 +609,7 @@ class Foresight(LearningJudge):
             log = log.part(np.where(log.failed, *recent))
         count = int(log.failed.sum()), len(log.rows)
         if count[0] and any(np.array(count) > np.multiply(_MORE, self._learnt)):
-            labels = self.labels.names, self.labels.units
-            new = self._of_log(log, self.dt, self.asked, self.hold, *labels)
+            new = self._of_log(log, self.dt, self.asked, self.hold, self.labels)
             self.horizon, self.forms, self.limits = new.horizon, new.forms, new.limits
             self.held_out, self._learnt = new.held_out, count
         self.log = log

@@ -332,13 +332,9 @@ class LearntRisk(ActionJudge):
             is_alike = self.learning and slack < self.settings.alike
             trial = self._untried(action, mask) if is_alike else None
             action = action if trial is None else trial
-        judgement, self._lost, fails_after = self._judged(
-            situation,
-            here,
-            policies,
-            [proposal, action] if self._refused else [proposal],
-            slack if passes and not allowance else None,
-        )
+        pair = [proposal, action] if self._refused else [proposal]
+        rest = slack if passes and not allowance else None
+        judgement, self._lost, fails_after = self._judged(situation, here, policies, pair, rest)
         self._fails_after = max(self._fails_after, fails_after)
         backup = self.backup_text(best, policies)
         if not self._refused:

@@ -7,13 +7,12 @@ of a heavy-tailed residual), the system moves otherwise now, and the model is co
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
+from numpy.random import Generator
 
 from evofsm.guard.learnt import model
 from evofsm.guard.learnt.rollout import Flags, Floats, Ints, Model, features, lags
-from evofsm.guard.learnt.state import LearntSettings, State, model_of
+from evofsm.guard.learnt.state import LearntSettings, Move, State, model_of
 
 # Changes of which the typical step is learnt; a larger one counts as so many times that.
 _MOST_CHANGES, _LARGEST_STEP = 5000.0, 6.0
@@ -162,13 +161,7 @@ def misled(
     return state._replace(misled=max(0.0, state.misled + float(worse)))
 
 
-def told(
-    state: State,
-    known: Model,
-    z: Floats,
-    move: Callable[[Floats, Floats], Floats],
-    random: np.random.Generator,
-) -> State:
+def told(state: State, known: Model, z: Floats, move: Move, random: Generator) -> State:
     """Learn what a given model says of observations (T + 1, m), each under an action that is drawn.
 
     Parameters
@@ -178,7 +171,6 @@ def told(
         For its features.
     z : (T + 1, m) ndarray
     move : callable
-        From an observation and an encoded action (a,) to the observation a decision later.
     random : numpy.random.Generator
     """
     latest = np.diff(z, axis=0)

@@ -23,6 +23,9 @@ from evofsm.guard.learnt.rollout import (
 )
 from evofsm.store import COUNT, FROM_1, SHARE, SIZE, SMALLEST, Kind, Numbers
 
+#: From an observation and an encoded action (a,) to the observation a decision later.
+Move = Callable[[Floats, Floats], Floats]
+
 # What files hold of a field: observations, what is not negative, and ends that may be infinite.
 _SEEN, _ABOVE_0 = Numbers(least=-1e30, most=1e30), Numbers(least=0.0)
 _BOUNDS = Numbers(least=-np.inf, most=np.inf)
@@ -143,7 +146,7 @@ class Given(NamedTuple):
     without: Set[str]  #: parts that are left out (`LearntRisk.PARTS`)
     horizon: float | None  #: how far to look ahead [s]
     failed: Callable[[Floats], bool] | None  #: of an observation
-    model: Callable[[Floats, Floats], Floats] | None  #: next one, of it and an action
+    model: Move | None
     backup: Callable[[Floats], Floats] | None  #: action, of an observation
 
 
