@@ -61,23 +61,13 @@ def can_be_made_again(guard: _Guard) -> bool:
 def _reviser(guard: _Guard) -> dict[str, Any] | None:
     reviser = guard.reviser
     if type(reviser) is ActionReviser:
-        judge = _judge(reviser.risk, guard)
-        return {"class": "ActionReviser", "judge": judge, "settings": settings_of(reviser)}
+        # Whom it asks, if that is who learns.
+        judge = part_name(reviser.risk) if reviser.risk is guard.judge else None
+        description = None if judge is None else {"class": judge}
+        return {"class": "ActionReviser", "judge": description, "settings": settings_of(reviser)}
     name = part_name(reviser)
     description = reviser.described() if name else None
     return None if description is None else {"class": name, **description}
-
-
-def _judge(judge: ActionJudge, guard: _Guard) -> dict[str, Any] | None:
-    """Whom the reviser asks, if those who learn are whom it asks."""
-    name = part_name(judge)
-    if name is None:
-        return None
-    if judge is guard.judge:
-        return {"class": name}
-    parts = getattr(judge, "risk", None), getattr(judge, "machine", None)
-    is_known = parts[0] is guard.judge and parts[1] is guard.machine and guard.machine is not None
-    return {"class": name, **judge.described()} if is_known else None  # type: ignore[attr-defined]
 
 
 def rebuild(
@@ -97,11 +87,9 @@ def rebuild(
     if reviser["class"] != "ActionReviser":
         return parts | {"reviser": part_class(reviser["class"]).restored(reviser, actions)}
     description = reviser["judge"]
+    if description is not None and part_class(description["class"]) is not type(risk):
+        raise ValueError(f"what its {description['class']} has learnt is missing")
     action_judge = judge if risk is None else risk
-    if description is not None and (of := part_class(description["class"])) is not type(risk):
-        if not hasattr(of, "restored"):
-            raise ValueError(f"what its {description['class']} has learnt is missing")
-        action_judge = of.restored(description, machine, risk)
     if action_judge is None:
         raise ValueError("no installed package declares its judge; give the judge as it is")
     again = ActionReviser(action_judge, actions)
