@@ -89,21 +89,17 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
     Usable(action=0.0, remark='no usable proposal (nan): doing nothing')
     """
     request, mask = proposal.action, proposal.mask
-    if not isinstance(actions, BoxActions) and actions.low <= request <= actions.high:
-        is_choice = isinstance(actions, Choices)
-        if not is_choice or (request == int(request) and (mask is None or mask[int(request)])):
-            return Usable(float(request), "")  # the usual case, at once
-    if mask is not None or not is_usable(actions, request):
-        action, words = put_into(actions, fallback.action), fallback.doing
-        if mask is not None and not mask[int(action)]:
-            action, words = float(mask.argmax()), "the first that is allowed"
-        note = ", not allowed here" if is_usable(actions, request) else ""
-        return Usable(action, f"no usable proposal ({action_text(request)}{note}): {words}")
-    action = put_into(actions, request)
-    if same_action(action, request):
-        return Usable(action, "")
-    low, high = (action_text(limit) for limit in limits(actions))
-    return Usable(action, f"proposal {action_text(request)} is outside [{low}, {high}]")
+    if is_usable(actions, request) and (mask is None or mask[int(request)]):
+        action = put_into(actions, request)
+        if same_action(action, request):
+            return Usable(action, "")
+        low, high = (action_text(limit) for limit in limits(actions))
+        return Usable(action, f"proposal {action_text(request)} is outside [{low}, {high}]")
+    action, words = put_into(actions, fallback.action), fallback.doing
+    if mask is not None and not mask[int(action)]:
+        action, words = float(mask.argmax()), "the first that is allowed"
+    note = ", not allowed here" if is_usable(actions, request) else ""
+    return Usable(action, f"no usable proposal ({action_text(request)}{note}): {words}")
 
 
 class ActionReviser:
