@@ -11,6 +11,7 @@ rests at an end of a variable, are no dynamics; outliers weigh less.
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from evofsm.guard.learnt.rollout import Flags, Floats, Model, features, lags
 
@@ -55,13 +56,10 @@ def are_jumps(z: Floats, unit: Floats) -> Flags:
 
 def without_glitches(z: Floats, unit: Floats) -> Floats:
     """Observations (T, m), NaN where a variable jumped there and back within two rows."""
-    n = len(z)
-    if n < 5:
+    if len(z) < 5:
         return z
-    rows = np.arange(n)[:, None] + np.arange(-2, 3)
-    rows = np.abs(rows)
-    rows = np.where(rows >= n, 2 * (n - 1) - rows, rows)
-    around = np.median(z[rows], axis=1)
+    rows = np.pad(z, ((2, 2), (0, 0)), "reflect")
+    around = np.median(sliding_window_view(rows, 5, axis=0), axis=2)
     moves = np.abs(np.diff(around, axis=0, prepend=around[:1]))
     pace = np.maximum(moves, np.vstack([moves[1:], moves[-1:]]))
     bad = np.abs(z - around) > JUMP * np.maximum(unit, pace)
