@@ -106,7 +106,7 @@ def compiled():
 
 @pytest.fixture(scope="session")
 def snapshot():
-    """Everything a machine holds, byte for byte: what it would write to a file."""
+    """All that a machine, a judge or a guard holds, byte for byte: what it writes to a file."""
     return one_machine.saved
 
 

@@ -1,7 +1,6 @@
 """Points that a wind drives towards a wall: small systems that are learnt in a few episodes."""
 
 from dataclasses import dataclass, field
-from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -101,14 +100,3 @@ def exactly():
         return value if isinstance(value, str) else np.asarray(value).tobytes()
 
     return lambda said: [bits(one) for one in said]
-
-
-@pytest.fixture(scope="session")
-def content():
-    """All that a guard or its judge has learnt, byte for byte: its file."""
-
-    def take(one):
-        one.save(file := BytesIO())
-        return file.getvalue()
-
-    return take

@@ -148,7 +148,7 @@ def taught():
     return guard
 
 
-def test_a_disc_is_learnt_said_and_no_threshold(taught, content, reloaded):
+def test_a_disc_is_learnt_said_and_no_threshold(taught, snapshot, reloaded):
     state = taught.judge.state
     assert (state.forms[:, SAYS] == FAILS).any()
     survived = np.concatenate([state.survived, state.brinks])
@@ -158,7 +158,7 @@ def test_a_disc_is_learnt_said_and_no_threshold(taught, content, reloaded):
     assert "typical steps from where it fails" in taught.told_here([-0.9, 0.0, 0.0, 0.0])
     assert taught.told_here([-2.0, 1.5, 0.0, 0.0]) == ""
     again = reloaded(taught)
-    assert content(again) == content(taught)
+    assert snapshot(again) == snapshot(taught)
     held = [play(again, 100 + episode) for episode in range(5)]
     assert sum(failed for _, failed in held) <= 1
 

@@ -12,15 +12,13 @@ from evofsm.guard.learnt.state import KIND
 
 
 @pytest.mark.parametrize("episodes", [0, pytest.param(3, marks=pytest.mark.slow)])
-def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(
-    point, exactly, content, reloaded, episodes
-):
+def test_saved_and_loaded_it_goes_on_bit_for_bit(point, exactly, snapshot, reloaded, episodes):
     guard = point.taught(episodes)
     again = reloaded(guard)
-    assert content(again) == content(guard)
+    assert snapshot(again) == snapshot(guard)
     for episode in range(40, 43):
         assert exactly(point.play(again, episode)[0]) == exactly(point.play(guard, episode)[0])
-        assert content(again) == content(guard)
+        assert snapshot(again) == snapshot(guard)
     again.freeze()
     guard.freeze()
     assert exactly(point.play(again, 50)[0]) == exactly(point.play(guard, 50)[0])
@@ -93,9 +91,7 @@ def within(of, name, value):
         (within("settings", "margin", "3"), "margin is '3'"),
     ],
 )
-def test_a_forged_file_is_refused_before_it_asks_for_memory(
-    points, content, forge, tmp_path, change, why
-):
+def test_a_forged_file_is_refused_before_it_asks_for_memory(points, forge, tmp_path, change, why):
     path = tmp_path / "judge"
     points["choices"].taught(1).judge.save(path)
     forge(path, change)
@@ -124,9 +120,9 @@ def test_a_forged_tolerance_and_a_missing_judge_are_refused(
         Guard.load(path)
 
 
-def test_a_judge_of_other_actions_or_variables_is_refused(points, content):
+def test_a_judge_of_other_actions_or_variables_is_refused(points, snapshot):
     box, plane = (points[name].taught(3) for name in ("box", "plane"))
-    files = [BytesIO(content(guard)) for guard in (box, plane)]
+    files = [BytesIO(snapshot(guard)) for guard in (box, plane)]
     (told, own), (_, others) = (store.read(file, GUARD) for file in files)
     mixed = BytesIO()
     store.write(mixed, GUARD, told, own | {"judge": others["judge"]})

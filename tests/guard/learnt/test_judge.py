@@ -188,32 +188,32 @@ def test_many_variables_are_learnt_of_in_a_few_episodes_too(points, places, relo
 
 
 @pytest.mark.parametrize("m", [65, 500, 21_168])
-def test_too_many_variables_are_refused_before_anything_is_allocated(point, content, m):
+def test_too_many_variables_are_refused_before_anything_is_allocated(point, snapshot, m):
     guard = point.guard()
-    before = content(guard)
+    before = snapshot(guard)
     for act in (lambda z: guard.decide(z, None), lambda z: guard.end(observation=z)):
         with pytest.raises(ValueError, match=rf"has {m} variables; .* at most 64: .* observe="):
             act(np.zeros(m))
-        assert content(guard) == before
+        assert snapshot(guard) == before
     point.play(guard, 0)
 
 
 @pytest.mark.parametrize("how", [lambda guard: guard.copy(), copy.deepcopy, pickle.dumps])
-def test_a_copy_goes_on_the_same_by_itself_until_it_is_frozen(points, exactly, content, how):
+def test_a_copy_goes_on_the_same_by_itself_until_it_is_frozen(points, exactly, snapshot, how):
     point = points["box"]
     guard = point.taught(3)
-    before = content(guard)
+    before = snapshot(guard)
     twin = how(guard)
     twin = pickle.loads(twin) if isinstance(twin, bytes) else twin
-    assert content(twin) == before
+    assert snapshot(twin) == before
     ahead = [exactly(point.play(twin, 60 + k)[0]) for k in range(2)]
-    assert content(guard) == before
+    assert snapshot(guard) == before
     assert [exactly(point.play(guard, 60 + k)[0]) for k in range(2)] == ahead
-    assert content(guard) == content(twin)
+    assert snapshot(guard) == snapshot(twin)
     guard.freeze()
     first, _, again = (exactly(point.play(guard, k)[0]) for k in (50, 51, 50))
     assert first == again
-    assert content(guard.judge) == content(twin.judge)
+    assert snapshot(guard.judge) == snapshot(twin.judge)
 
 
 @pytest.mark.parametrize(
@@ -322,7 +322,7 @@ def test_settings_that_cannot_be_are_refused(told, why):
         LearntRisk(**({"dt": 0.1} | told))
 
 
-def test_a_question_changes_nothing_of_what_is_learnt(point, content):
+def test_a_question_changes_nothing_of_what_is_learnt(point, snapshot):
     asked, unasked = point.guard(horizon=None), point.guard(horizon=None)
 
     def ask(k, z):
@@ -334,7 +334,7 @@ def test_a_question_changes_nothing_of_what_is_learnt(point, content):
     for episode in range(4):
         point.play(asked, episode, seen=ask)
         point.play(unasked, episode)
-    assert content(asked) == content(unasked)
+    assert snapshot(asked) == snapshot(unasked)
 
 
 def test_weaker_brakes_are_noticed_said_and_followed():
