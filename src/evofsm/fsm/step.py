@@ -45,28 +45,17 @@ def step(
     n = now.n_states
 
     # Section 2.2.2: which state is this?
-    recognise(
-        learnt.squared_distances,
-        lanes(n),
-        nearest,
-        width_of(settings, now.scatter / now.n_observations),
-        settings.belief_tolerance,
-        new_belief,
-    )
+    width = width_of(settings, now.scatter / now.n_observations)
+    far, tolerance = learnt.squared_distances, settings.belief_tolerance
+    recognise(far, lanes(n), nearest, width, tolerance, new_belief)
 
     # Section 2.3: was it foreseen, and what does it teach about the action taken before it?
     surprise = np.nan
     if now.chained and now.action != NO_ACTION:
         place = place_of(learnt, now.action, settings.prior_frequency)
-        forecast_and_identify(
-            learnt.matrices[place],
-            learnt.origin_frequency[place],
-            n,
-            learnt.belief,
-            new_belief,
-            settings.learning_rate,
-            forecast,
-        )
+        matrix, frequency = learnt.matrices[place], learnt.origin_frequency[place]
+        belief, rate = learnt.belief, settings.learning_rate
+        forecast_and_identify(matrix, frequency, n, belief, new_belief, rate, forecast)
         surprise = jensen_shannon_kernel(forecast, new_belief, lanes(n), scratch[TERMS])
         learnt.actions[now.action].uses += 1.0
         _count_decision(learnt, place, n, failed)
