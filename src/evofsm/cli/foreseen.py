@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-#: The share of a log that is learnt from, where the rest is to judge it.
-SPLIT = 0.6
 # Less than the share of alarms of any kind that are right: which alarm it is the judge says.
 _ANY_ALARM = 1e-6
 # Alarms that are listed.

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from shlex import quote
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,7 +76,8 @@ def learn_traces(
     """Learn all chunks in their order, each row once; units are known once they are read."""
     machine, read = machine.copy(), Read()
     for chunk in chunks:
-        _learn(machine, actions, chunk, read)
+        learn_chunk(machine, chunk, actions)
+        _count(read, chunk, actions)
     model = machine.model(
         actions=actions, names=names, units=units(), dt=None if np.isnan(read.dt) else read.dt
     )
@@ -255,15 +256,17 @@ def refusing(share: float) -> str:
     return f"refuses {share:.0%} of the time: perhaps {why}" if share > 0.5 else ""
 
 
-def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: Read) -> None:
-    """Learn a chunk."""
-    read.dt = chunk.dt
+def learn_chunk(machine: EvolvingFSM, chunk: Chunk, actions: Any) -> None:
+    """Learn the rows of a chunk; where an action is not known, no transition."""
     indices = np.full(len(chunk.times), -1)
     is_known = ~np.isnan(chunk.actions)
     indices[is_known] = actions.encode(chunk.actions[is_known])
-    if chunk.failures is not None:
-        machine.tell_of_failures()
     machine.learn_many(chunk.observations, indices, chunk.starts, chunk.failures)
+
+
+def _count(read: Read, chunk: Chunk, actions: IntervalActions) -> None:
+    """Count what is in a chunk."""
+    read.dt = chunk.dt
     steps = np.diff(chunk.times, prepend=read.last_time)
     steps[chunk.starts] = 0.0
     read.last_time = float(chunk.times[-1])

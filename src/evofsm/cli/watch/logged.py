@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
 from evofsm.cli.foreseen import date, guard_where_nobody_acts
-from evofsm.cli.learning import decided_on, episodes_read, guard_of_log, teach
+from evofsm.cli.learning import decided_on, episodes_read, guard_of_log, learn_chunk, teach
 from evofsm.cli.options import BRAKES, TOLERANCE, Reading, refuse_other_limit
 from evofsm.cli.show import progress, warn
 from evofsm.cli.watch.session import Logged, Played, Session, system_machine
 from evofsm.driving.assumed import assumptions, guard_of_monitor
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.naming import Labels
 from evofsm.guard import Foresight, Guard
 from evofsm.guard.foresight import DATES
@@ -74,12 +72,14 @@ def watched_log(
             guard.reviser.tolerance = tolerance  # type: ignore[attr-defined]
     elif not reading.acts:
         machine = system_machine(1, np.concatenate([chunk.observations for chunk in rows]))
-        _learn_states(machine, rows, IntervalActions(0.0, 1.0, 1.0))
+        for chunk in rows:
+            learn_chunk(machine, chunk, IntervalActions(0.0, 1.0, 1.0))
         guard = guard_where_nobody_acts(rows, labels, None, 0.0, None, machine)
     elif is_kinematic:
         guard = guard_of_monitor(rows[0].dt, brakes, risk)
         assert guard.machine is not None
-        _learn_states(guard.machine, rows, guard.actions)
+        for chunk in rows:
+            learn_chunk(guard.machine, chunk, guard.actions)
         warn(assumptions(brakes, risk))
     else:
         guard = _learnt_guard(rows, labels, risk)
@@ -156,11 +156,3 @@ def _learnt_guard(episodes: Sequence[Chunk], labels: Labels, tolerance: float) -
     guard = guard_of_log("learnt", episodes[0].dt, BRAKES, tolerance, *of)
     teach(guard, episodes, lambda done: None)
     return guard
-
-
-def _learn_states(machine: EvolvingFSM, episodes: Sequence[Chunk], actions: Any) -> None:
-    for rows in episodes:
-        indices = np.full(len(rows.times), -1)
-        is_known = np.isfinite(rows.actions)
-        indices[is_known] = actions.encode(rows.actions[is_known])
-        machine.learn_many(rows.observations, indices, [0], rows.failures)
