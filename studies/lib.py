@@ -91,7 +91,20 @@ def command(study: type[Study]) -> Callable[..., None]:
     """The function of which Typer makes a study's command."""
 
     def run(
-        short: bool, workers: int | None, out: Path | None, as_json: bool, **given: Any
+        short: Annotated[
+            bool, typer.Option("--short", help="Quick run, too small for conclusions.")
+        ] = False,
+        workers: Annotated[
+            int | None, typer.Option(min=1, help="Processes; one per core if not given.")
+        ] = None,
+        out: Annotated[
+            Path | None,
+            typer.Option(help="Folder for the page, figures and rows. evofsm-NAME if not given."),
+        ] = None,
+        as_json: Annotated[
+            bool, typer.Option("--json", help="Print all rows as JSON; write nothing.")
+        ] = False,
+        **given: Any,
     ) -> None:
         with refused():
             require(study.needed)
@@ -113,49 +126,20 @@ def command(study: type[Study]) -> Callable[..., None]:
 
     hints = get_type_hints(study, include_extras=True)
     options = [
-        (one.name, hints[one.name], one.default)
+        inspect.Parameter(
+            one.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if one.default is MISSING else one.default,
+            annotation=hints[one.name],
+        )
         for one in fields(study)
         if get_origin(hints[one.name]) is Annotated  # others say how much is done, for `shortened`
     ]
-    parameters = [
-        inspect.Parameter(
-            name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if default is MISSING else default,
-            annotation=hint,
-        )
-        for name, hint, default in [*options, *_SHARED]
-    ]
+    *shared, _ = inspect.signature(run, eval_str=True).parameters.values()
+    options += [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in shared]
     run.__name__, run.__doc__ = study.name, study.__doc__
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     return run
-
-
-_SHARED: tuple[tuple[str, Any, Any], ...] = (
-    (
-        "short",
-        Annotated[bool, typer.Option("--short", help="Quick run, too small for conclusions.")],
-        False,
-    ),
-    (
-        "workers",
-        Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")],
-        None,
-    ),
-    (
-        "out",
-        Annotated[
-            Path | None,
-            typer.Option(help="Folder for the page, figures and rows. evofsm-NAME if not given."),
-        ],
-        None,
-    ),
-    (
-        "as_json",
-        Annotated[bool, typer.Option("--json", help="Print all rows as JSON; write nothing.")],
-        False,
-    ),
-)
 
 
 @contextmanager
