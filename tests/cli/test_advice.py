@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 polars = pytest.importorskip("polars")
-pytest.importorskip("typer")
 
 
 @pytest.fixture(autouse=True)
@@ -51,6 +50,7 @@ def beside(*across):
 CARS = "time,gap,v_follower,v_leader,a_follower"
 LEVEL = "--observe level --action u"
 OWN = "--observe d,v,w --action u --guard car.evofsm"
+EPOCH = 17 * 10**17
 LAPS = {"time": lambda k: k % 30 / 10, "id": lambda k: k // 30}
 #: A log, how it is read, and where in what is said then stands what is to be added; and its value.
 OPTIONS = {
@@ -67,6 +67,9 @@ OPTIONS = {
     ),
     "km/h": (table(v_leader=lambda k: 70 + k / 9), "", r"\? (--unit v_leader=km/h) converts", ""),
     "ms": (table(time=lambda k: 100 * k), "", r"\? (--unit time=ms) converts", ""),
+    "50 Hz in ms": (table(time=lambda k: 20 * k), "", r"\? (--unit time=ms) converts", ""),
+    "us": (table(time=lambda k: 100_000 * k), "", r"\? (--unit time=us) converts", ""),
+    "ns": (table(time=lambda k: EPOCH + 10**8 * k), "", r"\? (--unit time=ns) converts", ""),
     "called km/h": (
         *(table("time,ego_kmh,u"), "--observe ego_kmh --action u"),
         *(r"of the SI: (--unit ego_kmh=km/h) converts", ""),

@@ -4,7 +4,6 @@ from zipfile import is_zipfile
 
 import pytest
 
-pytest.importorskip("typer")
 pytest.importorskip("scipy")
 pytest.importorskip("mcap")
 

@@ -9,9 +9,7 @@ import pytest
 
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.rules import Edges, Novelty, Paper
-
-pytest.importorskip("typer")
-pytest.importorskip("rich")
+from evofsm.io import tables
 
 
 def lines(rows=400, pair="v1-v2"):
@@ -41,7 +39,9 @@ def _in_80_columns(monkeypatch):
 # -- Learn ----------------------------------------------------------------------------------------
 
 
-def test_learn_prints_what_was_read_and_learnt(evofsm, log):
+@pytest.mark.parametrize("at_once", [100, 1 << 20])
+def test_learn_prints_what_was_read_and_learnt(evofsm, log, monkeypatch, at_once):
+    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
     result = evofsm("learn", log)
     assert result.exit_code == 0
     text = " ".join(result.stdout.split())
@@ -86,6 +86,22 @@ def test_json_is_one_document_with_counts_from_zero(evofsm, log, tmp_path):
     assert {"file": str(path), **learnt["model"]} == shown
     assert shown["states"][0]["state"] == 0
     assert sum(action["uses"] for action in shown["actions"]) == learnt["transitions"] == 697
+
+
+def test_transitions_go_from_where_it_was_to_where_it_came(evofsm, refused, tmp_path):
+    path, found = tmp_path / "log.csv", []
+    asked = "learn", path, "--observe", "x", "--action", "u", "--dt", 1
+    for places in ((0, 10, 30), (0, 0, 0)):
+        path.write_text("\n".join(["x,u", *(f"{x},0" for x in places * 40), ""]))
+        told = evofsm(*asked, "--rule", "novelty", "--scale", "x=2", "--json")
+        found.append(json.loads(told.stdout)["model"]["transitions"])
+    walk, rest = found
+    times = {(one["origin"], one["target"]): one["times"] for one in walk}
+    assert times == {(0, 1): 40, (1, 2): 40, (2, 0): 39}
+    assert rest == []
+    assert "The recognised state never changed." in evofsm(*asked).stdout
+    path.write_text("x,u\n0,0\n1,0\n")
+    assert "no transition could be learnt" in refused(*asked, "--episode", "x")
 
 
 OWN = ("--observe", "dist [m],ego_kmh,lead_kmh", "--action", "accel", "--unit", "ego_kmh=km/h")
@@ -344,17 +360,14 @@ def test_at_most_twenty_states_are_listed(evofsm, log, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--observe", "gap,speed"], "no column 'speed'"),
         (["--observe", ""], "--observe"),
         (["--observe", "hit=0/2"], "column 'hit': '1' is none of the values"),
         (["--action-range", "1:2"], "write LOW:HIGH:WIDTH"),
         (["--action-range", "0:1:1e-9"], "more than 1000 intervals"),
         (["--dt", "0"], "--dt is 0.0; it must be a positive"),
-        (["--vehicle-length", "long"], "--vehicle-length is 'long'"),
         (["--out", "/no/such/folder/model"], "there is no folder"),
         (["--failed", "gap<"], "--failed is 'gap<'"),
         (["--failed", "crash"], "no column 'crash'; it has pair, time, gap, v_follower, v_leader"),
-        (["--episode", "driver"], "no column 'driver'"),
         (["--unit", "v=warp"], "--unit is 'v=warp'"),
         (["--scale", "gap=4"], "--scale is for --rule novelty, not paper"),
         (["--rule", "novelty", "--scale", "speed=4"], "--scale names 'speed'; observed are gap"),

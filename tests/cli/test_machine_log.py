@@ -20,7 +20,6 @@ from evofsm.cli.watch.words import introduce, tell
 from evofsm.io import LogColumns, episodes_of
 
 polars = pytest.importorskip("polars")
-pytest.importorskip("typer")
 
 VIBRATION, BEARING = "Schwingung, mm/s", "Lagertemperatur °C"
 

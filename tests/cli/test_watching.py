@@ -339,27 +339,6 @@ def test_what_was_before_is_shown_at_once():
     assert 8 <= told.count("frame") <= 12  # one every 0.25 s of the run, then one a second
 
 
-# -- The clock ------------------------------------------------------------------------------------
-
-
-def test_it_waits_steps_and_goes_on():
-    async def play():
-        told = []
-        player = Player(opened(), lambda *what: told.append(what), paused=True, speed=math.inf)
-        playing = asyncio.create_task(player.play())
-        for number in range(4):
-            await asyncio.sleep(0.05)
-            assert [what.number for kind, what in told if kind == "frame"] == [*range(number)]
-            player.set(paused=number < 3, steps=True)
-        while not (told[-1][0] == "clock" and told[-1][1].over):
-            await asyncio.sleep(0.01)
-        playing.cancel()
-        return told
-
-    told = asyncio.run(asyncio.wait_for(play(), 60.0))
-    assert [what.over for kind, what in told if kind == "frame"][-1]
-
-
 def test_a_run_that_breaks_off_says_why():
     session, told = opened(), []
     session.step = lambda: 1 / 0

@@ -47,7 +47,7 @@ def test_an_episode_is_chosen_exactly():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"idx": 3}, "no option idx"), ({"split": "tset"}, "tset"), ({"index": -1}, "-1")],
+    [({"idx": 3}, "no option idx"), ({"index": -1}, "-1")],
 )
 def test_an_option_that_there_is_not_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
@@ -57,7 +57,6 @@ def test_an_option_that_there_is_not_is_refused(options, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"family": "emergancy"}, "emergancy"),
         ({"world": "mars"}, "mars"),
         ({"collision_cost": np.nan}, "collision_cost"),
     ],

@@ -148,13 +148,6 @@ def test_drac_is_what_stops_the_closing_within_the_gap():
     assert DecelerationToAvoidCollision(5.0).score(rows, DT).tolist() == [0.0, -5.0, np.inf]
 
 
-def test_the_safe_distance_of_rss_by_hand():
-    # 10 m and 0.25 m until it responds, 21²/10 m of braking, less 20²/16 m of the leader.
-    rows = np.array([[9.0, 20.0, 20.0], [9.0, 5.0, 40.0]])
-    safe = ResponsibilitySensitiveSafety(0.5, 2.0, 5.0, 8.0).safe_distance(rows)
-    assert safe == pytest.approx([29.35, 0.0])
-
-
 def test_pfs_falls_from_the_unsafe_to_the_safe_distance():
     # Unsafe below 20 m and safe from 32 m on, behind a margin of 2 m.
     gaps = np.array([21.0, 22.0, 28.0, 33.9, 34.0, 40.0, 0.0, -1.0])

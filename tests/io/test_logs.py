@@ -743,21 +743,6 @@ def test_a_row_of_units_below_the_names_is_none_of_the_log(tmp_path, row):
 
 
 @pytest.mark.parametrize(
-    ("step", "unit"), [(20, "ms"), (100, "ms"), (100_000, "us"), (10**8, "ns"), (2 * 10**7, "ns")]
-)
-def test_the_unit_of_the_time_is_told_from_its_step(tmp_path, step, unit):
-    lines = [f"p,{1_700_000_000_000_000_000 + step * k},9,10,10,0,0" for k in range(5)]
-    if unit != "ns":
-        lines = [f"p,{step * k},9,10,10,0,0" for k in range(5)]
-    noted, path = Noted(), write(tmp_path / "a.csv", lines, SHORT)
-    read(path, noted=noted)
-    (warning,) = warnings_of(noted)
-    assert f"is the time in {unit}? --unit time={unit} converts it" in warning
-    (chunk,) = read(path, units={"time": unit})
-    assert chunk.dt in (0.02, 0.1)
-
-
-@pytest.mark.parametrize(
     ("columns", "says"),
     [
         *(({"failed": text}, f"--failed is {text!r}") for text in ("", "<0", "gap<0<1", "gap<inf")),

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 # What folders of results hold, in the order in which it is looked for.
 _MODELS = ("guard.evofsm", "model.evofsm")
-# So many states are listed, those with most of the time.
-_STATES_LISTED = 20
+# So many states are listed, those with most of the time, and so many transitions between them.
+_STATES_LISTED, _PASSAGES = 20, 12
 # Of a longer log so many rows are drawn.
 _ROWS_SHOWN = 20_000
 _UNTOLD = (
@@ -165,14 +165,14 @@ class Passage(NamedTuple):
     learnt: float  #: probability per step that the matrices give, actions as often as used
 
 
-def passages(model: FSMModel, most: int = 12) -> list[Passage]:
+def passages(model: FSMModel) -> list[Passage]:
     """The transitions between states that were recognised most often."""
     import numpy as np
 
     counts = model.changes - np.diag(np.diag(model.changes))
     steps = model.changes.sum(axis=1)
     learnt = model.averaged_matrix("observed")
-    most_first = np.argsort(-counts, axis=None, kind="stable")[:most].tolist()
+    most_first = np.argsort(-counts, axis=None, kind="stable")[:_PASSAGES].tolist()
     places = (divmod(place, model.n_states) for place in most_first)
     return [
         Passage(i, j, int(counts[i, j]), float(counts[i, j] / steps[i]), float(learnt[i, j]))
