@@ -292,15 +292,15 @@ def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, refused, tmp_
     path.write_text("\n".join([header, *rows, ""]))
     assert "no leader? --no-leader end" in refused("learn", path, "--skip-bad", 0)
     told = evofsm(
-        *("learn", path, "--no-leader", "end", "--unit", "v=km/h", "--unit", "time=ms"),
-        *("--out", tmp_path / "model"),
+        *("learn", path, "--no-leader", "end", "--unit", "v=km/h", "--unit", "v_l=m/s"),
+        *("--unit", "time=ms", "--out", tmp_path / "model"),
     )
     text = " ".join(told.stdout.split())
     assert "left out 1 rows: a number is missing; there" in text
-    assert "converted v_follower from km/h, v_leader from km/h, time from ms" in text
+    assert "converted v_follower from km/h, time from ms" in text  # the longest name counts
     assert "rows 29, one every 0.1 s" in text
     assert told.stderr == ""
-    assert FSMModel.load(tmp_path / "model").centers[0].tolist() == pytest.approx([20, 15, 15])
+    assert FSMModel.load(tmp_path / "model").centers[0].tolist() == pytest.approx([20, 15, 54])
 
 
 @pytest.mark.parametrize(

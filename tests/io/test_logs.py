@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evofsm.cli.learning import warnings_of
-from evofsm.cli.options import reading_of, units_given
+from evofsm.cli.options import reading_of
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import tables
 from evofsm.io.logs import LogColumns, Noted, Resample, episodes_of, read_traces, rows_of
@@ -715,14 +715,6 @@ def test_times_may_be_dates(tmp_path, texts, point):
 def test_dates_that_are_none_are_refused(tmp_path, texts, says):
     lines = dated(f'"{text}"' for text in texts)
     assert re.search(says, refusal(write(tmp_path / "a.csv", lines, SHORT)))
-
-
-def test_units_are_converted_before_anything_is_learnt(tmp_path):
-    lines = [f"p,{100 * k},{1000 * k},36,72,0,0" for k in range(4)]
-    units = units_given(["v=km/h", "v_l=m/s", "time=ms", "gap=cm"])  # the longest name counts
-    (chunk,) = read(write(tmp_path / "a.csv", lines, SHORT), units=units)
-    assert chunk.observations[1] == pytest.approx([10.0, 10.0, 72.0])
-    assert chunk.dt == 0.1
 
 
 @pytest.mark.parametrize("row", ["-,[s],m,km/h,kph,m/s^2,", ",ms,cm,m/s,mps,g,-"])

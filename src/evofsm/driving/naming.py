@@ -55,7 +55,8 @@ WORDS = Words(name_state, "m/s²")
 LABELS = Labels(names=VARIABLES, units=UNITS)
 
 
-def _observed(about: str, of: Callable[[Any], Any], *, in_table: bool = True) -> Column:
+def observed(about: str, of: Callable[[Any], Any], *, in_table: bool = True) -> Column:
+    """The column of a number that is made of what was observed."""
     return Column(float, about, lambda record: float(of(record.situation.observation)), in_table)
 
 
@@ -63,13 +64,13 @@ def _observed(about: str, of: Callable[[Any], Any], *, in_table: bool = True) ->
 #: was observed, the numbers of every decision, what came of it, and texts.
 DECISION_COLUMNS: Mapping[str, Column] = {
     "time": RECORD["time"],
-    "gap": _observed("gap from bumper to bumper [m]; left out where missing", itemgetter(0)),
-    "v_follower": _observed("speed of the follower [m/s]; left out where missing", itemgetter(1)),
-    "v_leader": _observed("speed of the leader [m/s]; left out where missing", itemgetter(2)),
-    "time_to_collision": _observed(
+    "gap": observed("gap from bumper to bumper [m]; left out where missing", itemgetter(0)),
+    "v_follower": observed("speed of the follower [m/s]; left out where missing", itemgetter(1)),
+    "v_leader": observed("speed of the leader [m/s]; left out where missing", itemgetter(2)),
+    "time_to_collision": observed(
         "[s]; left out where the gap does not close", time_to_collision, in_table=False
     ),
-    "time_headway": _observed(
+    "time_headway": observed(
         "[s]; left out where the follower stands", time_headway, in_table=False
     ),
     **{name: column for name, column in RECORD.items() if column.kind is not str},

@@ -15,13 +15,13 @@ import os
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving.naming import DECISION_COLUMNS, VARIABLES
+from evofsm.driving.naming import DECISION_COLUMNS, VARIABLES, observed
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel
 from evofsm.guard.record import RECORD, Column
@@ -67,13 +67,9 @@ def columns_of(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[str, 
         return DECISION_COLUMNS
     suffixes = [f" [{unit}]" if unit else "" for unit in units] + [""] * len(names)
     return dict(RECORD) | {
-        name: Column(float, f"as observed{unit}; left out where missing", partial(_observed, k))
+        name: observed(f"as observed{unit}; left out where missing", itemgetter(k))
         for k, (name, unit) in enumerate(zip(names, suffixes, strict=False))
     }
-
-
-def _observed(place: int, decision: Any) -> float:
-    return float(decision.situation.observation[place])
 
 
 def schemas_of(

@@ -65,13 +65,7 @@ _T = TypeVar("_T")
 class Decider:
     """Answers messages by a guard's decisions."""
 
-    def __init__(
-        self,
-        guard: Guard,
-        *,
-        episode: int = EPISODE,
-        slots: Slots | None = None,
-    ) -> None:
+    def __init__(self, guard: Guard, *, episode: int = EPISODE, slots: Slots | None = None) -> None:
         self.guard = guard
         self.episode = episode
         self.slots = slots or Slots()
