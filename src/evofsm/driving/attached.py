@@ -161,10 +161,9 @@ class Seeing:
 
     def ahead(self, car: str, speed: float) -> Neighbour | None:
         """Whoever is ahead on its route, if near enough to matter."""
-        leader_and_gap = self._vehicle.getLeader(car, _far(speed))
-        if not leader_and_gap or not leader_and_gap[0]:
+        leader, gap = self._vehicle.getLeader(car, _far(speed)) or ("", 0.0)
+        if not leader:
             return None
-        leader, gap = leader_and_gap
         v, body = self._vehicle.getSpeed(leader), self.body(car)
         return Neighbour(leader, gap + body.min_gap, self._room(gap, body, speed - v), v)
 

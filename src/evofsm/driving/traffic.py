@@ -130,13 +130,9 @@ def pairs_of(rows: ArrayLike) -> list[Pair]:
     if len(flat) % len(COLUMNS):
         raise ValueError(f"{len(flat)} numbers are no rows of {len(COLUMNS)}: {', '.join(COLUMNS)}")
     ego, *objects = flat.reshape(-1, len(COLUMNS)).tolist()
-    pairs = []
-    for index, obj in enumerate(objects, start=1):
-        if obj[0] > 0.5 and not math.isnan(sum(obj)):
-            pair = _pair(ego, obj, index)
-            if pair is not None:
-                pairs.append(pair)
-    return sorted(pairs, key=lambda pair: pair.gap)
+    whole = ((k, obj) for k, obj in enumerate(objects, 1) if not math.isnan(sum(obj)))
+    pairs = [_pair(ego, obj, index) for index, obj in whole if obj[0] > 0.5]
+    return sorted(filter(None, pairs), key=lambda pair: pair.gap)
 
 
 def _pair(ego: list[float], obj: list[float], index: int) -> Pair | None:
