@@ -63,19 +63,6 @@ def xml(timesteps):
 PAIR = [("a", "e_0", 50.0, 1.0), ("b", "e_0", 20.0, 2.0)]
 
 
-def test_gap_is_between_bumpers_and_the_action_is_what_came_next(tmp_path):
-    road = {
-        0.0: [("a", "e_0", 50.0, 8.0), ("b", "e_0", 20.0, 10.0)],
-        0.5: [("a", "e_0", 54.0, 8.0), ("b", "e_0", 25.0, 9.0)],
-        1.0: [("a", "e_0", 58.0, 9.0), ("b", "e_0", 29.5, 9.5)],
-    }
-    ((observations, actions, times),) = episodes(write(tmp_path / "a.xml", xml(road)))
-    assert observations.tolist() == [[25.0, 10.0, 8.0], [24.0, 9.0, 8.0], [23.5, 9.5, 9.0]]
-    assert actions[:2].tolist() == [-2.0, 1.0]
-    assert np.isnan(actions[2])
-    assert times.tolist() == [0.0, 0.5, 1.0]
-
-
 def test_an_episode_ends_when_somebody_cuts_in_or_a_pair_is_away(tmp_path):
     a, b, c = ("a", "e_0", 90.0, 1.0), ("b", "e_0", 10.0, 1.0), ("c", "e_0", 50.0, 1.0)
     road = {0.0: [a, b], 0.1: [a, b], 0.2: [a, b, c], 0.3: [a, b], 0.4: [a], 0.5: [a, b], 0.6: []}

@@ -89,17 +89,6 @@ def test_rows_that_wait_for_their_slot_go_on_waiting(opened):
     assert kinds >= {"waiting", "decision", "error"}
 
 
-def test_a_last_record_that_was_half_written_is_left_out(opened):
-    decider, state = opened()
-    for row in traffic(5):
-        decider.answer(line(row))
-    journal = state._journal.path
-    abandoned(state)
-    journal.write_bytes(journal.read_bytes()[:-10])
-    decider, state = opened()
-    assert decider.n == 4
-
-
 def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path, opened):
     path = tmp_path / "state.evofsm"
     decider, state = opened(path)
@@ -122,8 +111,11 @@ def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path,
         with pytest.raises(ValueError, match=r"a guard that is not in .*state\.evofsm; put"):
             opened(path)
     path.write_bytes(guard)
-    decider, state = opened(path)
-    assert decider.n == 5
+    for end, known in ((None, 5), (-10, 4)):  # of a record that was half written nothing is
+        journal.write_bytes(whole[:end])
+        decider, state = opened(path)
+        assert decider.n == known
+        abandoned(state)
 
 
 @pytest.mark.parametrize("moment", ["before the guard is saved", "after it"])
