@@ -6,13 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evofsm.driving.measures import (
+    FIXED_MEASURES,
     DecelerationToAvoidCollision,
     FuzzySafety,
     ModifiedTimeToCollision,
     PerformanceModel,
-    Picud,
     ResponsibilitySensitiveSafety,
-    TimeHeadway,
     TimeToCollision,
     deceleration_to_avoid_collision,
     is_dead_end,
@@ -20,18 +19,7 @@ from evofsm.driving.measures import (
     time_to_collision,
 )
 
-MEASURES = [
-    TimeToCollision(),
-    ModifiedTimeToCollision(),
-    DecelerationToAvoidCollision(),
-    TimeHeadway(),
-    Picud(),
-    ResponsibilitySensitiveSafety.r157(),
-    ResponsibilitySensitiveSafety.matched(2.5, 4.5),
-    PerformanceModel.regulation(),
-    PerformanceModel.careful_human(),
-    FuzzySafety(),
-]
+MEASURES = [*FIXED_MEASURES.values(), ResponsibilitySensitiveSafety.matched(2.5, 4.5)]
 CAN_BE_ZERO = {"reaction", "response", "accel", "margin"}
 EVERY_MEASURE = pytest.mark.parametrize("measure", MEASURES, ids=repr)
 
@@ -99,7 +87,7 @@ def test_later_rows_change_nothing(measure, episode, data):
     )
 
 
-@pytest.mark.parametrize("measure", MEASURES, ids=repr)
+@EVERY_MEASURE
 @pytest.mark.parametrize("wrong", [-1.0, 0.0, float("nan"), float("inf"), "1"])
 def test_wrong_arguments_are_named(measure, wrong):
     for field in fields(measure):
