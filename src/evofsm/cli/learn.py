@@ -246,9 +246,8 @@ def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]
 
 def _size(file: str) -> int:
     """Bytes of a file, or of those in a folder."""
-    if not os.path.isdir(file):
-        return os.path.getsize(file)
-    return sum(entry.stat().st_size for entry in os.scandir(file))
+    path = Path(file)
+    return sum(part.stat().st_size for part in (path.iterdir() if path.is_dir() else [path]))
 
 
 def _judge_of(judge: Judge | None, columns: LogColumns) -> Judge:

@@ -504,8 +504,7 @@ class Watching:
 
     def step(self, time: float) -> None:
         """Look at every car."""
-        pairs = {car: self._seeing.pair(car) for car in self.cars}
-        observations = {car: pair for car, pair in pairs.items() if pair is not None}
+        observations = {car: pair for car in self.cars if (pair := self._seeing.pair(car))}
         self.ids = list(observations)
         self.observations = np.array(list(observations.values())).reshape(-1, 3)
         self.ttc = time_to_collision(self.observations)

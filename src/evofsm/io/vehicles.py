@@ -74,9 +74,9 @@ class PairTable(Table):
         before, starts, blocks, names = 0, [0], list[NDArray[np.float64]](), list[str]()
         for (_, follower, leader), rows in chain(self._episodes(), [(("", "", ""), None)]):
             if rows is not None:
-                blocks.append(rows)
+                blocks.append(_with_actions(rows))
                 names.append(f"{follower} behind {leader}")
-                starts.append(starts[-1] + len(rows))
+                starts.append(starts[-1] + len(blocks[-1]))
             if blocks and (rows is None or starts[-1] >= _ROWS_AT_ONCE):
                 numbers = dict(zip(COLUMNS, np.concatenate(blocks).T, strict=True))
                 episodes = starts[:-1], names
@@ -87,10 +87,10 @@ class PairTable(Table):
                 f"{self.path}: no vehicle ever follows another one on the same lane"
             )
 
-    def _episodes(self) -> Iterator[tuple[tuple[str, str, str], NDArray[np.float64] | None]]:
+    def _episodes(self) -> Iterator[tuple[tuple[str, str, str], array[float] | None]]:
         """Rows of a pair for as long as it stays one, or until too many wait."""
         open_pairs: dict[tuple[str, str, str], array[float]] = {}
-        n_rows, before = 0, -math.inf
+        before = -math.inf
         for moment in self._moments:
             if not moment.time > before:
                 self.skips.leave_out(
@@ -105,15 +105,12 @@ class PairTable(Table):
                 rows = open_pairs.pop(pair.who, None) or array("d")
                 rows.extend((moment.time, pair.gap, pair.v_follower, pair.v_leader))
                 present[pair.who] = rows
-            n_rows += len(moment.pairs)
-            for names, rows in open_pairs.items():
-                n_rows -= len(rows) // 4
-                yield names, _with_actions(rows)
+            yield from open_pairs.items()  # who has parted
             open_pairs = present
-            if n_rows > _MOST_WAITING:
-                yield from ((names, _with_actions(rows)) for names, rows in open_pairs.items())
-                open_pairs, n_rows = {}, 0
-        yield from ((names, _with_actions(rows)) for names, rows in open_pairs.items())
+            if sum(map(len, present.values())) > 4 * _MOST_WAITING:
+                yield from open_pairs.items()
+                open_pairs = {}
+        yield from open_pairs.items()
 
 
 def _with_actions(rows: array[float]) -> NDArray[np.float64]:
@@ -481,13 +478,11 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
 
 
 def _pointing(obj: Object, pointed: dict[str, float]) -> Object:
-    heading = obj.heading if math.isfinite(obj.heading) else math.nan
-    if math.isnan(heading) and math.hypot(obj.vx, obj.vy) >= _TURNS_ABOVE:
-        heading = math.atan2(obj.vy, obj.vx)
-    if math.isnan(heading):
-        heading = pointed.get(obj.id, math.nan)
-    else:
-        pointed[obj.id] = heading
+    heading = obj.heading
+    if not math.isfinite(heading):
+        moves = math.hypot(obj.vx, obj.vy) >= _TURNS_ABOVE
+        heading = math.atan2(obj.vy, obj.vx) if moves else pointed.get(obj.id, math.nan)
+    pointed[obj.id] = heading
     return obj._replace(heading=heading)
 
 

@@ -10,7 +10,6 @@ import math
 import os
 import signal
 import socket
-import stat
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -249,11 +248,9 @@ class SocketTransport:
 
 def _make_way(path: Path) -> None:
     """Remove the socket of a process that is gone."""
-    try:
-        mode = path.stat().st_mode
-    except FileNotFoundError:
+    if not path.exists():
         return
-    if not stat.S_ISSOCK(mode):
+    if not path.is_socket():
         raise ValueError(f"{path} is there, and is no socket; name another file")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         if probe.connect_ex(os.fspath(path)) == 0:
