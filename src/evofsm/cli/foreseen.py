@@ -41,10 +41,10 @@ def guard_where_nobody_acts(
     machine: EvolvingFSM | None = None,
 ) -> Guard:
     """A guard that alarms before failures, as it was learnt from the episodes of a log."""
-    runs, dt = _runs(episodes), float(episodes[0].dt)
-    rows, names, units = [e.observations for e in episodes], labels.names, labels.units
-    settings: dict[str, Any] = {"dt": dt, "horizon": horizon, "hold": hold}
-    judge = Foresight.learn_log(rows, runs.failed, **settings, names=names, units=units)
+    rows, failed = [e.observations for e in episodes], [e.failed for e in episodes]
+    settings: dict[str, Any] = {"dt": float(episodes[0].dt), "horizon": horizon, "hold": hold}
+    names, units = labels.names, labels.units
+    judge = Foresight.learn_log(rows, failed, **settings, names=names, units=units)
     return _guard_of(judge, false_a_day, machine, learn=False)
 
 
@@ -95,7 +95,8 @@ def show_foreseen(
     judge = guard.judge
     assert isinstance(judge, Foresight)
     judge.stated = judge.stated if asked[-1] is None else asked[-1]
-    runs, times = _runs(episodes), np.concatenate([e.times for e in episodes])
+    runs = judge.runs([e.observations for e in episodes], [e.failed for e in episodes])
+    times = np.concatenate([e.times for e in episodes])
     columns = judge.columns(runs.rows, runs.starts)
     document = {**_document(judge, runs, times, columns), "failures_at_once": at_once}
     if plot is not None:
@@ -109,10 +110,6 @@ def show_foreseen(
 def _of_two_rows(episodes: Sequence[Chunk]) -> Sequence[Chunk]:
     """Those of which something can be foreseen."""
     return [episode for episode in episodes if len(episode.times) > 1]
-
-
-def _runs(episodes: Sequence[Chunk]) -> Runs:
-    return Runs.of([e.observations for e in episodes], [e.failed for e in episodes])
 
 
 def _document(judge: Foresight, runs: Runs, times: Floats, columns: Floats) -> dict[str, Any]:
