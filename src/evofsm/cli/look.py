@@ -18,7 +18,7 @@ from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_da
 Pairs = list[tuple[str, str]]
 
 # So many fields and rows are looked at; columns of more texts are no list of states.
-_MOST_FIELDS, _ROWS_LOOKED_AT, _MOST_TEXTS = 20_000_000, 1_000_000, 12
+_MOST_FIELDS, _ROWS_LOOKED_AT, _MOST_TEXTS = 20_000_000, 500_000, 12
 _EPOCHS = {"ns": 1e17, "us": 1e14, "ms": 1e11}  # times since 1970 are larger
 _COLUMNS_SHOWN = 40  # columns
 _SIGNS = "<>=! "  # what in a name of a condition is ambiguous

@@ -34,7 +34,7 @@ OnRead = Callable[[int], object]
 Find = Callable[[int, "str | None"], tuple[str, str]]
 
 # Read at once. polars decodes a whole row group for each slice of it: small slices cost time.
-_CSV_BYTES, _PARQUET_ROWS = 1 << 23, 1 << 16
+_CSV_BYTES, _PARQUET_ROWS = 1 << 21, 1 << 16
 _LONGEST_LINE = 1_000_000
 _PLAIN: Mapping[str, Any] = {"has_header": False, "ignore_errors": True, "raise_if_empty": False}
 
@@ -578,7 +578,7 @@ class CsvTable(Table):
         """The columns, numbers as such where all are; None where anything is odd."""
         import polars
 
-        if b'"' in block and 2 * len(self._quoted.findall(block)) != block.count(b'"'):
+        if b'"' in block and 2 * len(self._quoted.findall(block)) != _count(block, b'"'):
             return None
         places = {name: columns.index(name) for name in wanted.all}
         # As polars calls columns, for there may be two of one name.

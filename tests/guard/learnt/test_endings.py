@@ -10,7 +10,7 @@ from evofsm.guard import LearntRisk, RevisedActions  # noqa: E402
 from evofsm.guard.learnt.danger import fails  # noqa: E402
 from evofsm.guard.learnt.failure import SAYS, are_sides, distances  # noqa: E402
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS  # noqa: E402
-from evofsm.guard.learnt.state import Episode, LearntSettings, State  # noqa: E402
+from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State  # noqa: E402
 
 
 class Descent(gymnasium.Env):
@@ -92,22 +92,22 @@ def test_where_something_went_on_or_failed_there_is_none():
     assert (distances(said(judge, ENDS), np.array([[1.2, 0.0], [3.0, 0.0]])) > 0.0).all()
 
 
-@pytest.mark.parametrize("went_on", [False, True])
-def test_it_does_not_crash_where_it_went_on_no_seldomer_than_anywhere(went_on):
-    """Of five failures one lies where it ends, beside which half of the observations are."""
-    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 40), np.linspace(-1.0, 1.0, 41))
-    rows = np.column_stack([x.ravel(), y.ravel()])
-    rows = rows if went_on else rows[rows[:, 1] < 0.5]
-    state = State.none(2, 1, 0, LearntSettings(), None)._replace(
+@pytest.mark.parametrize("elsewhere", [[[2.0, 0.0], [2.0, 0.1]], [[0.3, 0.95], [-0.3, 0.9]]])
+def test_what_fails_as_others_do_elsewhere_does_not_fail_for_how_it_ends(elsewhere):
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 40), np.linspace(-1.0, 0.5, 41))
+    rows, none = np.column_stack([x.ravel(), y.ravel()]), np.zeros(0)
+    given = Given(LearntSettings(), 0, set(), None, None, None, None)
+    episode = Episode(rows[:1], np.zeros((0, 1)), False, False, none, none, none, 0.0)
+    state = State.none(2, 1, 0, given.settings, None)._replace(
         unit=np.full(2, 0.1),
         survived=rows,
-        proven=np.ones(len(rows)),
         lowest=np.array([rows.min(0)] * 2),
         highest=np.array([rows.max(0)] * 2),
-        ended=np.array([[0.0, -0.51], [0.0, 0.49]]),
-        failures=np.array([[0.0, 0.89], [2.0, 0.0], [2.0, 0.1], [-2.0, 0.0], [-2.0, 0.2]]),
+        failures=np.array([[0.0, 0.89], *elsewhere]),
     )
-    none = np.zeros(0)
-    episode = Episode(rows[:1], np.zeros((0, 1)), False, False, none, none, none, 0.0)
-    forms = fails(state, rows[:1], episode, LearntSettings(), set(), None).forms
-    assert (CRASHES in forms[:, SAYS]) != went_on
+    state = fails(state, rows[:1], episode, given)
+    state = state._replace(ended=np.array([[0.0, -0.51], [0.0, 0.49]]))
+    forms = fails(state, rows[:1], episode, given).forms
+    at_end = distances(forms[forms[:, SAYS] == ENDS], state.failures[:1]) < 0.0
+    is_alike = elsewhere[0][1] > 0.5
+    assert (CRASHES in forms[:, SAYS]) == at_end.all() == (not is_alike)

@@ -13,7 +13,7 @@ import numpy as np
 
 from evofsm.guard.learnt import failure, model
 from evofsm.guard.learnt.failure import HELD, SAYS, B, I, Survived
-from evofsm.guard.learnt.rollout import CRASHES, DEAD, ENDS, FAILS, GROWN, Floats, Model
+from evofsm.guard.learnt.rollout import CRASHES, DEAD, ENDS, FAILS, Floats, Model
 from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State, sizes
 
 # Episodes of which the end tells where there are any; observations so near the last one [typical
@@ -128,14 +128,13 @@ def _endings(state: State, table: Floats, known: Survived) -> Floats:
     if len(known.rows) and not failure.inside(rows, endings).any(0).all():
         rows = failure.explain(ENDS, endings, failure.boxed(known, known.rows))
     rows = rows[failure.inside(rows, endings).sum(1) >= _ENDED]
-    failed = state.failures[failure.inside(rows, state.failures).any(0)]
+    # What fails as others do elsewhere does not fail for how it ends.
+    at_end = failure.inside(rows, state.failures).any(0)
+    by = failure.inside(table[table[:, SAYS] == FAILS], state.failures)
+    failed = state.failures[at_end & ~by[(by & ~at_end).any(1)].any(0)]
     crashes = failure.crashing(failed, endings, known, *set(rows[:, I].astype(int).tolist()))
-    # Rollouts have it that it crashes before it ends: not where that is no likelier than anywhere.
-    proven = state.survived[state.proven > 0.0]
-    near = proven[(failure.distances(rows, proven) <= GROWN).any(0)]
-    times = failure.inside(crashes, near, 0.0).sum(1) * len(state.failures)
-    crashes = crashes[times <= crashes[:, HELD] * len(proven)]
-    rows = failure.without(rows, failed[~failure.inside(crashes, failed, 0.0).any(0)])
+    others = state.failures[at_end & ~failure.inside(crashes, state.failures, 0.0).any(0)]
+    rows = failure.without(rows, others)
     return np.concatenate([rows, crashes, table[np.isin(table[:, SAYS], [FAILS, DEAD])]])
 
 
