@@ -9,11 +9,15 @@ from evofsm import Guard
 from evofsm.guard.learnt.failure import (
     AT,
     SAYS,
+    TO,
     B,
     C,
     I,
+    J,
     Survived,
     are_sides,
+    boxed,
+    crashing,
     distances,
     explain,
     inside,
@@ -207,6 +211,23 @@ def test_what_crashes_by_a_rival_is_not_said_of_other_ends():
     tried = rivals(np.vstack([ends, table]), failures, known)
     assert tried[:, SAYS].tolist() == [ENDS, CRASHES, ENDS]
     assert tried[[0, 2], B].tolist() == [table[0, B], ends[0, B]]
+
+
+def test_a_rival_of_a_crash_asks_how_far_out_failures_were():
+    """Two soft touches with a tilt tell nothing of upright ones."""
+    rows = np.random.default_rng(2).uniform([0.0, -2.0, -1.0], [5.0, 2.0, 1.0], (500, 3))
+    failures = np.array([[-0.1, -1.4, 0.1], [-0.1, -1.2, -0.2], [-0.1, -0.5, -0.9]])
+    known = survived_as(rows, np.full(3, 0.02), [[-0.1, -0.3, 0.2], [-0.1, -0.4, 0.3]])
+    ends = explain(ENDS, known.ended, boxed(known, rows))
+    table = np.vstack([ends, crashing(failures, known.ended, known, 0)])
+    table[1:] = table[1]
+    table[1:, [I, J]], table[1:, [AT, TO]], table[1:, B] = 2, 0.19, -1.0  # tilted less
+    touches = np.array([[-0.1, -0.3, 0.0], [-0.1, -1.3, 0.25], *failures])
+    tried = rivals(table, failures, known)
+    for forms, crash in ((table, [1, 0, 1, 1, 1]), (tried, [0, 1, 1, 1, 1])):
+        says = forms[:, SAYS]
+        assert inside(forms[says == CRASHES], touches, 0.0).any(0).tolist() == crash
+        assert not inside(forms[says == CRASHES], known.ended, 0.0).any()
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, FLAT, GROWN, Flags, Floats, Ints
+from evofsm.guard.learnt.rollout import CRASHES, DEAD, ENDS, FAILS, FLAT, GROWN, Flags, Floats, Ints
 
 #: Columns of a form: what it says, variables i and j, from where each is counted, the inverse of
 #: its unit, coefficients of 1, x, y, x x, x y, y y; how many failures it holds.
@@ -141,19 +141,25 @@ def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
         In place of a bent form ellipses around its failures. In place of a threshold that it
         *ends* there, and fails only nearer to its failures than to what ended; where nothing ended
         there, only beyond the innermost failure in another variable in which that is rare among
-        what was survived.
+        what was survived; and so where a form says that it crashes, as few endings tell little.
     """
     rows: list[Floats] = []
     # What crashes is told of the ends just before it: others come behind.
-    table = table[np.argsort(table[:, SAYS] != FAILS, kind="stable")]
-    for row, is_side, holds in zip(table, are_sides(table), inside(table, failures), strict=True):
+    fails, ends, crashes = (table[table[:, SAYS] == says] for says in (FAILS, ENDS, CRASHES))
+    for row, is_side, holds in zip(fails, are_sides(fails), inside(fails, failures), strict=True):
         held_failures = failures[holds]
-        if row[SAYS] != FAILS or not len(held_failures) or not len(survived.rows):
+        if not len(held_failures) or not len(survived.rows):
             rows.append(row)
         elif is_side:
             rows += _as_failed(row, held_failures, survived)
         else:
             rows += _ellipses(row, held_failures, survived)
+    at_end = inside(ends, failures).any(0) & inside(crashes, failures, 0.0).any(0)
+    if at_end.any() and len(survived.rows):
+        rare = _rare(failures[at_end], survived, *ends[:, I].astype(int).tolist())
+        rare = rare[~inside(rare, survived.ended).any(1)]
+        crashes = rare if len(rare) else crashes
+    rows += [*ends, *crashes, *table[table[:, SAYS] == DEAD]]
     return np.array(rows).reshape(-1, SIZE)
 
 
@@ -201,7 +207,7 @@ def _as_failed(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
     return [end, *crashes] if len(crashes) else [row]
 
 
-def _rare(held: Floats, survived: Survived, at: int) -> Floats:
+def _rare(held: Floats, survived: Survived, *at: int) -> Floats:
     """That it crashes as far out as the innermost failure, in each variable where that is rare.
 
     To one side, or on both sides of the median of what was survived; but of the variable ``at``.
@@ -210,7 +216,7 @@ def _rare(held: Floats, survived: Survived, at: int) -> Floats:
     low, high, centre = held.min(0) - BLUR * unit, held.max(0) + BLUR * unit, np.median(rows, 0)
     off = (np.abs(held - centre).min(0) - BLUR * unit).clip(0.0)
     share = np.array([rows >= low, rows <= high, np.abs(rows - centre) >= off]).mean(1)
-    share[:, (survived.spread == 0.0) | (np.arange(m) == at)] = np.inf
+    share[:, (survived.spread == 0.0) | np.isin(np.arange(m), at)] = np.inf
     table = np.zeros((m, SIZE))
     table[:, SAYS], table[:, [I, J]] = CRASHES, np.arange(m)[:, None]
     table[:, [ONE, OTHER]], table[:, HELD] = 1.0 / unit[:, None], len(held)
