@@ -133,8 +133,8 @@ def _endings(state: State, table: Floats, known: Survived) -> Floats:
     by = failure.inside(table[table[:, SAYS] == FAILS], state.failures)
     failed = state.failures[at_end & ~by[(by & ~at_end).any(1)].any(0)]
     crashes = failure.crashing(failed, endings, known, *set(rows[:, I].astype(int).tolist()))
-    others = state.failures[at_end & ~failure.inside(crashes, state.failures, 0.0).any(0)]
-    rows = failure.without(rows, others)
+    is_crash = failure.inside(crashes, state.failures, 0.0).any(0)
+    rows = failure.without(rows, state.failures[at_end & ~is_crash])
     return np.concatenate([rows, crashes, table[np.isin(table[:, SAYS], [FAILS, DEAD])]])
 
 
