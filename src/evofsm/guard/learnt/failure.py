@@ -157,7 +157,6 @@ def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
     at_end = inside(ends, failures).any(0) & inside(crashes, failures, 0.0).any(0)
     if at_end.any() and len(survived.rows):
         rare = _rare(failures[at_end], survived, *ends[:, I].astype(int).tolist())
-        rare = rare[~inside(rare, survived.ended).any(1)]
         crashes = rare if len(rare) else crashes
     rows += [*ends, *crashes, *table[table[:, SAYS] == DEAD]]
     return np.array(rows).reshape(-1, SIZE)
