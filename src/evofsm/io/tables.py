@@ -451,6 +451,15 @@ class Dialect:
         return f"{count} fields, but the header names {named} {why}"
 
 
+def _ahead(items: Iterator[Item]) -> Iterator[Item]:
+    """The same, each made by another thread while the one before is in use."""
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(next, items, None)
+        while (item := future.result()) is not None:
+            future = pool.submit(next, items, None)
+            yield item
+
+
 class CsvTable(Table):
     """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
 
@@ -534,7 +543,7 @@ class CsvTable(Table):
         with Source(self.path, self._on_read, self.skips) as source:
             for block, lines_before, series in _ahead(self._blocks(source, wanted)):
                 here = partial(self._odd, block, lines_before, columns, wanted)
-                if columns is not self.columns:
+                if columns != self.columns:  # as its blocks were read
                     series = self._plain(block, columns, wanted)
                 anew = [0] if behind else []
                 if series is None:
@@ -716,15 +725,6 @@ class ParquetTable(Table):
 
 
 # -- Fields ---------------------------------------------------------------------------------------
-
-
-def _ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """The same, each made by another thread while the one before is in use."""
-    with ThreadPoolExecutor(1) as pool:
-        future = pool.submit(next, items, None)
-        while (item := future.result()) is not None:
-            future = pool.submit(next, items, None)
-            yield item
 
 
 def decoded(block: bytes, path: str, reached: int = 0) -> str:

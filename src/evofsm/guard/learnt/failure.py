@@ -209,7 +209,7 @@ def _as_failed(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
 def _rare(held: Floats, survived: Survived, *at: int) -> Floats:
     """That it crashes as far out as the innermost failure, in each variable where that is rare.
 
-    To one side, or on both sides of the median of what was survived; but of the variable ``at``.
+    To one side, or on both sides of the median of what was survived; but of variables ``at``.
     """
     unit, rows, m = survived.unit, survived.rows, len(survived.unit)
     low, high, centre = held.min(0) - BLUR * unit, held.max(0) + BLUR * unit, np.median(rows, 0)
