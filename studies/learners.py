@@ -9,6 +9,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable
+from copy import deepcopy
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,9 +18,9 @@ import numpy as np
 from evofsm.driving import guard_for_cars
 from evofsm.extras import needs
 from evofsm.guard import Guard, RevisedActions
-from studies.peers import FIRST_STATE, GOAL, LEAN, TASKS, WAYS
-from studies.rivals import Rival, cart_shield, pendulum_shield
-from studies.systems import Box, Discrete
+from studies.peers import ALONE, FIRST_STATE, GOAL, LEAN, TASKS, WAYS
+from studies.rivals import Rival, States, cart_shield, pendulum_shield
+from studies.systems import Action, Box, Discrete, Vector
 
 with needs("stable-baselines3", "rl", "the study of peers"):
     import gymnasium
@@ -76,6 +77,36 @@ def _double(steps: int) -> Env:
     return env
 
 
+class Planar(gymnasium.Env[Any, Any]):
+    """A quadrotor in a plane: place [m], tilt, their rates; the two thrusts of up to its weight."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (6,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+    dt = TASKS["planar-quadrotor"].interval
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Begin anywhere in the inner half of the room, about upright, slowly."""
+        super().reset(seed=seed)
+        self.state = self.np_random.uniform(-1.0, 1.0, 6) * (1.5, 0.75, 0.1, 0.5, 0.5, 0.1)
+        return np.float32(self.state), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Four steps of Euler's method; mass 1 kg, arms of 0.2 m, inertia 0.02 kg m²."""
+        left, right = 0.5 * 9.81 * (1.0 + np.clip(action, -1.0, 1.0))
+        for _ in range(4):
+            tilt, lift = self.state[2], left + right
+            rates = [-lift * math.sin(tilt), lift * math.cos(tilt) - 9.81, 10.0 * (right - left)]
+            self.state[3:] += 0.25 * self.dt * np.array(rates)
+            self.state[:3] += 0.25 * self.dt * self.state[3:]
+        x, z, tilt = self.state[:3]
+        failed = abs(x) > 3.0 or abs(z) > 1.5 or abs(tilt) > math.pi / 3.0
+        return np.float32(self.state), math.exp(-(x**2) - z**2), bool(failed), False, {}
+
+
+def _planar(steps: int) -> Env:
+    return gymnasium.wrappers.TimeLimit(Planar(), steps)
+
+
 def _cars(steps: int) -> Env:
     env = _gym("evofsm.driving.env:evofsm/CarFollowing-v0", steps, collision_cost=100.0)
     return gymnasium.wrappers.TransformReward(env, lambda reward: 0.1 * float(reward))
@@ -90,6 +121,7 @@ MAKE: dict[str, Callable[[int], Env]] = {
     "double-pendulum": _double,
     "hopper": partial(_gym, "Hopper-v5"),
     "walker2d": partial(_gym, "Walker2d-v5"),
+    "planar-quadrotor": _planar,
     "car-following": _cars,
 }
 # What a network sees of cars is divided by this: gap [m] and speeds [m/s].
@@ -116,27 +148,140 @@ class Shielded(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
         self.seen, info = self.env.reset(**given)
+        self.shield.begin()
         return self.seen, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Execute what the shield makes of an action."""
-        proposal = np.asarray(action).item()
+        proposal = action if np.size(action) > 1 else np.asarray(action).item()
         executed = self.shield.action(np.asarray(self.seen, np.float64), proposal)
         size = self.actions.change(executed, proposal)
         if size > 0.0:
-            action = executed if np.ndim(action) == 0 else np.array([executed], np.float32)
+            action = executed if np.ndim(action) == 0 else np.atleast_1d(np.float32(executed))
         self.seen, reward, *ends, info = self.env.step(action)
+        if any(ends):
+            failed = bool(info.get("failed", ends[0]))
+            self.shield.end(failed, np.asarray(self.seen, np.float64), terminated=ends[0])
         info |= {"reviser/penalty": size, "reviser/executed_action": action}
         return self.seen, float(reward) - self.penalty * size, *ends, info
 
 
-def told_shield(task: str) -> tuple[Rival, Box | Discrete]:
-    """Who is told how a pole moves, and its actions."""
-    if task.startswith("cartpole"):
-        two = Discrete(2)
-        return cart_shield(two), two
-    torque = Box((-2.0,), (2.0,))
-    return pendulum_shield(torque, LEAN, True, TASKS[task].interval), torque
+class SafetyCritic(Rival):
+    """Executes the action least likely to fail where the proposal is likelier to than a limit.
+
+    A network learns of all that was executed Q(z, u) = 1 where it failed, else the discounted least
+    Q of the next state (Srinivasan et al. 2020, arXiv:2010.14603). Half of each batch led into
+    failures (Thananjeyan et al. 2021, arXiv:2010.15920). Chosen by us: it begins with nothing, and
+    all numbers.
+    """
+
+    told = "nothing but failures"
+    _LIMIT, _DISCOUNT, _BATCH, _OPTIONS, _AVERAGE = 0.05, 0.9, 64, 16, 0.01
+
+    def __init__(self, actions: Box | Discrete, width: int, seed: int) -> None:
+        torch.manual_seed(seed)
+        self._chance, self._actions = np.random.default_rng(seed), actions
+        self._rows: list[tuple[Vector, Vector, Vector, float]] = []
+        self._fatal: list[int] = []  # rows of the last steps before a failure
+        self._scale, self._learns = np.ones(width), True
+        width += actions.n_actions if isinstance(actions, Discrete) else len(actions.low)
+        self._net = torch.nn.Sequential(
+            torch.nn.Linear(width, 64), torch.nn.ReLU(),
+            torch.nn.Linear(64, 64), torch.nn.ReLU(), torch.nn.Linear(64, 1), torch.nn.Sigmoid(),
+        )  # fmt: skip
+        self._slow = deepcopy(self._net)
+        self._steps = torch.optim.Adam(self._net.parameters(), lr=1e-3)
+
+    def begin(self) -> None:
+        """Begin an episode."""
+        self._last: tuple[Vector, Vector] | None = None
+        if self._learns and self._rows:
+            spread = np.std([row[0] for row in self._rows], axis=0)
+            self._scale = np.where(spread > 1e-6, spread, 1.0)
+
+    def action(self, observation: Vector, proposal: Action) -> Action:
+        """The proposal, or of some actions that which is least likely to fail."""
+        self._note(observation, failed=False)
+        options = [proposal, *self._drawn()]
+        if self._fatal:
+            with torch.no_grad():
+                risk = self._risk(self._net, observation[None], self._coded(options))[0]
+            if risk[0] > self._LIMIT:
+                proposal = options[int(risk.argmin())]
+        self._last = observation, self._coded([proposal])[0]
+        return proposal
+
+    def end(
+        self, failed: bool = False, observation: Vector | None = None, *, terminated: bool = False
+    ) -> None:
+        """End the episode."""
+        assert observation is not None
+        self._note(observation, failed)
+
+    def freeze(self) -> None:
+        """Learn nothing from now on."""
+        self._learns = False
+
+    def _note(self, observation: Vector, failed: bool) -> None:
+        """Remember the last step, and learn from a batch."""
+        if not self._learns or self._last is None:
+            return
+        if failed:
+            self._fatal.append(len(self._rows))
+        self._rows.append((*self._last, observation, float(failed)))
+        if not self._fatal:
+            return
+        half = self._BATCH // 2
+        drawn = self._chance.integers(0, len(self._rows), half)
+        rows = [self._rows[k] for k in (*self._chance.choice(self._fatal, half), *drawn)]
+        z, u, after, fails = map(np.array, zip(*rows, strict=True))
+        with torch.no_grad():
+            best = self._risk(self._slow, after, self._coded(self._drawn())).min(dim=1).values
+        failed_at = torch.as_tensor(fails, dtype=torch.float32)
+        target = failed_at + (1.0 - failed_at) * self._DISCOUNT * best
+        risk = self._net(self._input(z, u))[:, 0]
+        self._steps.zero_grad()
+        torch.nn.functional.mse_loss(risk, target).backward()
+        self._steps.step()
+        for slow, fast in zip(self._slow.parameters(), self._net.parameters(), strict=True):
+            slow.data.lerp_(fast.data, self._AVERAGE)
+
+    def _drawn(self) -> list[Action]:
+        if isinstance(self._actions, Discrete):
+            return list(range(self._actions.n_actions))
+        return [self._actions.drawn(self._chance) for _ in range(self._OPTIONS)]
+
+    def _coded(self, options: list[Action]) -> Any:
+        """(k, c) one in n of indices, else actions scaled to [-1, 1]."""
+        if isinstance(self._actions, Discrete):
+            return np.identity(self._actions.n_actions)[options]
+        low, high = np.array(self._actions.low), np.array(self._actions.high)
+        return 2.0 * (np.array(options).reshape(len(options), -1) - low) / (high - low) - 1.0
+
+    def _risk(self, net: Any, states: States, options: States) -> Any:
+        """(b, k) of each option in each state."""
+        b, k = len(states), len(options)
+        return net(self._input(np.repeat(states, k, axis=0), np.tile(options, (b, 1)))).view(b, k)
+
+    def _input(self, states: States, options: States) -> Any:
+        return torch.as_tensor(np.hstack([states / self._scale, options]), dtype=torch.float32)
+
+
+def actions_of(space: Any) -> Box | Discrete:
+    """Actions of an environment, as rivals have them."""
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return Discrete(int(space.n))
+    return Box(tuple(space.low.tolist()), tuple(space.high.tolist()))
+
+
+def rival(kind: str, task: str, env: Env, seed: int) -> Rival:
+    """Who is told how a pole moves, or learns a critic."""
+    actions = actions_of(env.action_space)
+    if kind == "critic":
+        return SafetyCritic(actions, env.observation_space.shape[0], seed)  # type: ignore[index]
+    if isinstance(actions, Discrete):
+        return cart_shield(actions)
+    return pendulum_shield(actions, LEAN, True, TASKS[task].interval)
 
 
 def learning_guard(kind: str, task: str, actions: Any, seed: int) -> Guard:
@@ -185,14 +330,14 @@ class Diary(gymnasium.Wrapper[Any, Any, Any, Any]):
         return seen, reward, terminated, truncated, info
 
 
-def made(task: str, filtered: Guard | str | None = None, penalty: float = 0.0) -> Diary:
-    """The environment of a task, under a guard, a shield (``"shield"``) or nothing."""
+def made(task: str, filtered: Guard | Rival | None = None, penalty: float = 0.0) -> Diary:
+    """The environment of a task, under a guard, a rival or nothing."""
     env = MAKE[task](TASKS[task].episode)
     if isinstance(filtered, Guard):
         failed = lambda step: bool(step.info.get("failed", step.terminated))  # noqa: E731
         env = RevisedActions(env, filtered, failed=failed, penalty=penalty)
     elif filtered:
-        env = Shielded(env, *told_shield(task), penalty)
+        env = Shielded(env, filtered, actions_of(env.action_space), penalty)
     if task == "car-following":
         scaled = gymnasium.spaces.Box(-np.inf, np.inf, (3,))
         env = gymnasium.wrappers.TransformObservation(env, lambda z: np.float32(z / _CARS), scaled)
@@ -271,9 +416,11 @@ def trained(task: str, way: str, seed: int, steps: int, held_out: int) -> dict[s
     torch.set_num_threads(1)
     kind, penalty, stored = WAYS[way]
     guard: Guard | None = None
-    filtered: Guard | str | None = "shield" if kind == "told" else None
+    filtered: Guard | Rival | None = None
     if kind in ("learnt", "cars"):
         filtered = guard = learning_guard(kind, task, made(task).action_space, seed)
+    elif kind != ALONE:
+        filtered = rival(kind, task, made(task), seed)
     env = made(task, filtered, penalty)
     agent = learner(task, env, seed, steps, penalty if stored == "executed" else None)
     begun = time.perf_counter()
@@ -285,6 +432,8 @@ def trained(task: str, way: str, seed: int, steps: int, held_out: int) -> dict[s
         with warnings.catch_warnings(record=True) as said:  # that it lets proposals pass
             warnings.simplefilter("always")
             guard.freeze()
+    elif filtered:
+        filtered.freeze()
     alone = tried(agent, made(task), task, held_out)
     under = tried(agent, made(task, filtered), task, held_out) if filtered else {}
     done, quarter = env.changed, max(1, len(env.changed) // 4)

@@ -36,7 +36,7 @@ from studies.lib import ALL
 class Way(NamedTuple):
     """What is between a learner and its task."""
 
-    filter: str  #: alone, learnt, told (a shield), or cars
+    filter: str  #: alone, learnt, critic, told (a shield), or cars
     penalty: float  #: for a change of half a range, or to another index
     stored: str = "executed"  #: what a learner with a memory remembers of a change
 
@@ -50,12 +50,14 @@ WAYS = {
     "proposals-0": Way("learnt", 0.0, "proposed"),
     "told-1": Way("told", 1.0),
     "cars-1": Way("cars", 1.0),
+    "critic-1": Way("critic", 1.0),
 }
 _TOLD = {
     ALONE: "no filter",
     "learnt": "nothing but failures",
     "told": "linear model and limits",
     "cars": "how cars follow; failures",
+    "critic": "nothing but failures (safety critic)",
 }
 
 
@@ -77,7 +79,7 @@ class Task(NamedTuple):
 #: [rad, rad/s].
 GOAL, LEAN, FIRST_STATE = 1.5, 0.5, (0.1, 0.3)
 
-_PLAIN = (ALONE, "filter-0", "filter-1")
+_PLAIN = (ALONE, "filter-0", "filter-1", "critic-1")
 _POLE = (*_PLAIN, "told-1")
 _GYMNASIUM = "Gymnasium {}; it fails where it is terminated"
 # Learner, interval, decisions of an episode, steps, ways, cost, source, held-out episodes.
@@ -112,6 +114,11 @@ TASKS = {
     "walker2d": Task(
         "PPO", 0.008, 500, 6_000, _PLAIN, 60.0,
         _GYMNASIUM.format("Walker2d-v5, as in Dyna-SAuR"), 5,
+    ),
+    "planar-quadrotor": Task(
+        "PPO", 0.05, 200, 20_000, _PLAIN, 90.0,
+        "Ours: two thrusts hold a craft in a plane; reward exp(-distance²) to the middle; it fails "
+        "outside of 6 by 3 m and tilted by more than 60°",
     ),
     "car-following": Task(
         "DDPG", 0.25, 400, 6_000, (*_PLAIN, "filter-0.3", "proposals-0", "cars-1"), 25.0,
