@@ -186,18 +186,15 @@ class ClosedLoop(Study):
     def page(self, found: Frames) -> Page:
         """The table of all policies, what stands below it, and where ours loses."""
         lines = lines_of(found["rows"])
-        return Page(
-            name=self.name,
-            about=_ABOUT.format(
+        return self.shown(
+            _ABOUT.format(
                 tolerance=f"{100 * self.tolerance:g} %",
                 family=self.drawn_from.name,
                 about=self.drawn_from.about,
             ),
-            parts=list(_parts(self, found, lines)),
-            command=lib.command_line(),
-            lost=list(_lost(found, lines)),
-            targets=frame_of(_targets(self, found, lines)),
-            facts=self.facts,
+            _parts(self, found, lines),
+            lost=_lost(found, lines),
+            targets=_targets(self, found, lines),
             packages=("scipy", *(("libsumo",) if "worlds" in found else ())),
         )
 

@@ -597,14 +597,11 @@ class Detection(Study):
 
     def page(self, found: Frames) -> Page:
         """Who sees danger, how early, and where ours loses."""
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=list(_parts(found)),
-            command=lib.command_line(),
-            targets=frame_of(_targets(found)),
-            lost=list(_lost(found)),
-            facts=self.facts,
+        return self.shown(
+            _ABOUT,
+            _parts(found),
+            targets=_targets(found),
+            lost=_lost(found),
             packages=("scipy",),
         )
 

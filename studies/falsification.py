@@ -495,10 +495,9 @@ class Falsification(Study):
             pl.col("blind").is_between(1, self.runs - 1),
         )
         wide = (pl.col("probability") > 0) & (pl.col("high") > 3.0 * pl.col("probability"))
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[
+        return self.shown(
+            _ABOUT,
+            [
                 Table(
                     "How likely a failure is",
                     rows,
@@ -517,8 +516,7 @@ class Falsification(Study):
                 ),
                 *_tables_of_cases(found.get("cases")),
             ],
-            command=lib.command_line(),
-            targets=frame_of(_targets(rows)),
+            targets=_targets(rows),
             lost=[
                 Table(
                     "The guard fails",
@@ -532,7 +530,6 @@ class Falsification(Study):
                     "More runs or cases narrow an interval.",
                 ),
             ],
-            facts=self.facts,
             packages=("scipy",),
             sources=_SOURCES,
         )

@@ -831,10 +831,9 @@ class ForecastStudy(Study):
         )
         foreseen = {"task": "{task}", "steps": "{steps}", "method": "{method}"}
         against = _against(failures)
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[
+        return self.shown(
+            _ABOUT,
+            [
                 Table(
                     "Skill against persistence",
                     ours,
@@ -856,7 +855,6 @@ class ForecastStudy(Study):
                     pl.when(pl.col("method") == REPLAY).then(pl.lit("ours")),
                 ),
             ],
-            command=lib.command_line(),
             lost=[
                 Table(
                     "From 0.5 s on: intervals of the skill that hold 0",
@@ -883,8 +881,7 @@ class ForecastStudy(Study):
                     "Theirs against evofsm-replay.",
                 ),
             ],
-            targets=lib.frame_of(_targets(asked, failures, against)),
-            facts=self.facts,
+            targets=_targets(asked, failures, against),
             packages=("scipy", "deeptime", "gymnasium"),
             sources={
                 "T. Henzinger et al., Predictive monitoring of black-box dynamical systems, 2024, "

@@ -542,7 +542,7 @@ class Judges(Study):
         """What fails, what each part is worth, and where it loses."""
         rows = found["rows"]
         if self.quick:
-            return benchmark.page(rows, self.facts)
+            return benchmark.page(self, rows)
         whole = summary(rows.filter(_WHOLE))
         parts = [
             Table(
@@ -577,11 +577,9 @@ class Judges(Study):
         told = (pl.col("rate") < pl.col("rate_ours")) | (
             pl.col("score") > pl.col("score_ours") + 0.01
         )
-        return Page(
-            name=self.name,
-            about=_ABOUT_JUDGES,
-            parts=parts,
-            command=lib.command_line(),
+        return self.shown(
+            _ABOUT_JUDGES,
+            parts,
             lost=[
                 Table(
                     "Harm: less than 0.9 of the controller's own steps, held out or while learning",
@@ -602,7 +600,7 @@ class Judges(Study):
                     "The kinematic judge against the learnt one.",
                 ),
             ],
-            facts=self.facts | _present(self._wanted)[1],
+            facts=_present(self._wanted)[1],
             packages=("scipy", "gymnasium"),
         )
 
@@ -696,10 +694,9 @@ class Tasks(Study):
         above = (pl.col("best") > 0) & (pl.col("score") > 0)
         lines = lines.with_columns(of_told=pl.when(above).then(pl.col("score") / pl.col("best")))
         who, ours = {**_WHO, "told": "{told}"}, rows.filter(pl.col("judge").is_in(OURS))
-        return Page(
-            name=self.name,
-            about=_ABOUT_TASKS,
-            parts=[
+        return self.shown(
+            _ABOUT_TASKS,
+            [
                 Table("What fails", lines, who | _FAILS, _NOTE, _MARK),
                 Table(
                     "What it costs",
@@ -722,10 +719,9 @@ class Tasks(Study):
                     "ten up to episode 50, or up to half of fewer than 100.",
                 ),
             ],
-            command=lib.command_line(),
-            lost=list(_lost(lines)),
-            targets=frame_of([*_of_acc(ours), *_of_crashes(rows)]),
-            facts=self.facts | _present(self._wanted)[1],
+            lost=_lost(lines),
+            targets=[*_of_acc(ours), *_of_crashes(rows)],
+            facts=_present(self._wanted)[1],
             packages=("scipy", "gymnasium"),
             sources={
                 "ACC: G. Anderson et al., Guiding Safe Exploration with Weakest Preconditions, "

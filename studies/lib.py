@@ -34,7 +34,7 @@ from scipy.stats import beta
 
 from evofsm.cli import print_json
 from evofsm.extras import install
-from evofsm.paper import Page, print_page, write_page
+from evofsm.paper import Figure, Page, Table, print_page, write_page
 
 #: Rows of a study by name; those of its main table are called ``"rows"``.
 Frames = Mapping[str, pl.DataFrame]
@@ -72,7 +72,7 @@ class Study(ABC):
 
     @abstractmethod
     def page(self, found: Frames) -> Page:
-        """The tables and figures that show what `run` returned."""
+        """The tables and figures that show what `run` returned; see `shown`."""
 
     def write(self, found: Frames, folder: Path) -> None:  # noqa: B027
         """Write further files of one's own beside the rows."""
@@ -85,6 +85,21 @@ class Study(ABC):
             for one in fields(self)
             if (value := getattr(self, one.name)) not in (None, "")
         }
+
+    def shown(
+        self,
+        about: str,
+        parts: Iterable[Table | Figure],
+        *,
+        lost: Iterable[Table] = (),
+        targets: Iterable[Target] = (),
+        facts: Mapping[str, str] | None = None,
+        **others: Any,
+    ) -> Page:
+        """A `Page` of these, which also says all settings, and what was typed."""
+        told = {"lost": list(lost), "targets": frame_of(targets), **others}
+        facts = self.facts | dict(facts or {})
+        return Page(self.name, about, list(parts), command_line(), facts=facts, **told)
 
 
 def command(study: type[Study]) -> Callable[..., None]:

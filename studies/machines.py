@@ -208,17 +208,14 @@ class Machines(lib.Study):
             targets.append(
                 lib.at_least(f"{name}: minutes beyond thresholds", worst, -0.5, "{:.1f}")
             )
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[
+        return self.shown(
+            _ABOUT,
+            [
                 Table("At the rates that were stated", rivals, compared, _AT_AS_MANY),
                 Table("The states of an e-FSM alone", pooled.filter(alarm=STATES), shown),
             ],
-            command=lib.command_line(),
-            targets=lib.frame_of(targets),
+            targets=targets,
             lost=[Table("Rows in which thresholds warn longer", rivals.filter(fewer), compared)],
-            facts=self.facts,
         )
 
 

@@ -445,10 +445,9 @@ class Real(Study):
             "AUPRC (95 %)": "{auprc:.3f} ({auprc_low:.2f}–{auprc_high:.2f})",
         }
         counted = ["events", "runs_with_events", "runs", "decisions", "prevalence", "enough"]
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[
+        return self.shown(
+            _ABOUT,
+            [
                 Table(
                     "What was asked",
                     rows.select("target", "horizon", *counted).unique(maintain_order=True),
@@ -468,7 +467,6 @@ class Real(Study):
                     pl.when(is_ours).then(pl.lit("ours")),
                 ),
             ],
-            command=lib.command_line(),
             lost=[
                 Table(
                     "Measures that rank better than evofsm-approach",
@@ -484,8 +482,8 @@ class Real(Study):
                     asked | columns,
                 ),
             ],
-            targets=frame_of(_targets(shown)) if len(shown) else pl.DataFrame(),
-            facts=self.facts | {"checksums": f"{len(checksums_in(self.data))} in the list"},
+            targets=_targets(shown) if len(shown) else [],
+            facts={"checksums": f"{len(checksums_in(self.data))} in the list"},
             verdict="" if len(shown) else "Too few events in these runs to compare anything",
         )
 
@@ -653,10 +651,9 @@ class Leaders(Study):
         )
         share = (pl.col("alarms") / pl.col("decisions")).alias("share")
         alarms = found["alarms"].with_columns(share).pivot("told", index="source", values="share")
-        return Page(
-            name=self.name,
-            about=_ABOUT_LEADERS,
-            parts=[
+        return self.shown(
+            _ABOUT_LEADERS,
+            [
                 Table(
                     "Hard brakes of leaders, 2.5 m/s² and more",
                     rows,
@@ -687,8 +684,6 @@ class Leaders(Study):
                     "leave out the run that is judged.",
                 ),
             ],
-            command=lib.command_line(),
-            facts=self.facts,
         )
 
 

@@ -401,10 +401,9 @@ class Sensitivity(Study):
             space: f"{{{space}:%}} ({{{space}_low:p}}–{{{space}_high:p}})" for space in _COLUMNS
         }
         reaches = lib.frame_of(reach(rows, one) for one in PARAMETERS.values())
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[
+        return self.shown(
+            _ABOUT,
+            [
                 Table(
                     "In what share of settings each claim holds",
                     shares,
@@ -426,7 +425,6 @@ class Sensitivity(Study):
                     + ".",
                 ),
             ],
-            command=lib.command_line(),
             lost=[
                 Table(
                     "Claims that hold in less than half of what is left open",
@@ -434,8 +432,8 @@ class Sensitivity(Study):
                     {"claim": "{claim}", **cells},
                 ),
             ],
-            targets=lib.frame_of(_targets(shares)),
-            facts=self.facts | {"settings in all": f"{len(rows):,}"},
+            targets=_targets(shares),
+            facts={"settings in all": f"{len(rows):,}"},
             packages=("scipy",),
         )
 

@@ -312,25 +312,20 @@ class Traffic(Study):
         late: Any = risky.filter(ours & (pl.col("share") == "all"))["collisions"].sum()
         pairs = lib.compared(risky, ours, ["world", "drivers", "share"])
         fewer = pairs.filter(pl.col("collisions") < pl.col("collisions_ours"))
-        return Page(
-            name=self.name,
-            about=_ABOUT if demos() else f"{_ABOUT}\n\n{_SKIPPED}",
-            parts=[
+        return self.shown(
+            _ABOUT if demos() else f"{_ABOUT}\n\n{_SKIPPED}",
+            [
                 Table("Calm traffic", calm, _COLUMNS, mark=mark),
                 Table("Hasty drivers", risky, _COLUMNS, mark=mark),
                 Table("By what is to be regained", curve, _CURVE_COLUMNS),
                 Table("cut_in, held out", lib.with_share(driven, *_RATE), _CUT_IN_COLUMNS),
             ],
-            command=lib.command_line(),
-            targets=frame_of(
-                [
-                    at_most("emergency brakings more than alone in calm traffic", harm[0], 2),
-                    at_least("mean speed against alone in calm traffic", harm[1], 0.995, "{:.3f}"),
-                    at_most("collisions of hasty drivers, all guarded", late, 0),
-                ]
-            ),
+            targets=[
+                at_most("emergency brakings more than alone in calm traffic", harm[0], 2),
+                at_least("mean speed against alone in calm traffic", harm[1], 0.995, "{:.3f}"),
+                at_most("collisions of hasty drivers, all guarded", late, 0),
+            ],
             lost=[Table("Fewer collisions under a formula", fewer, _COLUMNS)],
-            facts=self.facts,
             packages=("libsumo",),
         )
 
