@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from itertools import chain, count, islice, product
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 import polars as pl
@@ -95,8 +95,6 @@ def world(name: str, since: int = 20) -> World:
     shift, with ``since`` episodes watched of it; ``shift-at-once`` is the same with none, and with
     thresholds from before it. ``paper`` is the paper's four cases with what it leaves open drawn.
 
-    Examples
-    --------
     >>> at_once = world("shift-at-once")
     >>> at_once.watched.decel, at_once.family.decel, at_once.since
     (4.5, 2.5, 0)
@@ -537,7 +535,6 @@ class Detection(Study):
     """
 
     name = "detection"
-    needed: ClassVar[dict[str, str]] = {"scipy": "study"}
 
     family: Annotated[
         str,

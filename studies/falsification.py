@@ -24,7 +24,7 @@ from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from statistics import NormalDist
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 import polars as pl
@@ -126,22 +126,11 @@ def to_chance(normal: float) -> float:
 
 
 def split(score: Score, seed: Sequence[int], cases: int, moves: int, least: float = 1e-9) -> Split:
-    """One run of splitting.
+    """One run of splitting, of so many ``cases`` side by side.
 
-    Parameters
-    ----------
-    score : callable
-    seed : sequence of int
-        The same gives the same run.
-    cases : int
-        That are kept side by side. Those of the same score are kept or given up together.
-    moves : int
-        Of each copy, at each level.
-    least : float
-        The run is given up below this probability, and counts as 0.
+    Those of the same score are kept or given up together; each copy is moved so often, at each
+    level. Below the ``least`` probability the run is given up, and counts as 0.
 
-    Examples
-    --------
     >>> def score(chance):
     ...     return math.inf if chance("x") >= 0.999 else chance("x")
     >>> 0.0005 < split(score, seed=[0], cases=200, moves=5).probability < 0.002
@@ -364,7 +353,6 @@ class Falsification(Study):
     """
 
     name = "falsification"
-    needed: ClassVar[dict[str, str]] = {"scipy": "study"}
 
     family: Annotated[
         str,
@@ -411,13 +399,7 @@ class Falsification(Study):
         )
 
     def asked(self) -> list[tuple[str, str]]:
-        """Each family with each judge.
-
-        Raises
-        ------
-        ValueError
-            If there is no such family or judge, none is named, or what was learnt is another's.
-        """
+        """Each family with each judge; it refuses what cannot be tried."""
         families, judges = (
             list(dict.fromkeys(lib.names_in(names))) for names in (self.family, self.judge)
         )

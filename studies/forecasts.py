@@ -140,10 +140,7 @@ def _encode(actions: IntervalActions, taken: Floats) -> NDArray[np.int64]:
 def logs_in(folder: Path) -> list[Logs]:
     """The logs in a folder, each file a run, by what stands before the first ``_`` of their names.
 
-    Raises
-    ------
-    ValueError
-        If there is nothing that could be split by run.
+    It refuses a folder with nothing that could be split by run.
     """
     found = defaultdict(list)
     for path in sorted(folder.glob("*")):
@@ -757,13 +754,7 @@ class ForecastStudy(Study):
         )
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
-        """Let all forecast drives, and foresee tasks.
-
-        Raises
-        ------
-        ValueError
-            If there is no such system, or the folder has no logs that can be split.
-        """
+        """Let all forecast drives, and foresee tasks."""
         names = lib.names_in(self.tasks)
         for name in names:  # so that a wrong one shows at once
             make_system(name)

@@ -87,26 +87,11 @@ ACC, ACC_SEEDS, ACC_TRAIN = ("acc", "acc-5"), 20, 200
 
 
 def make_judge(name: str, system: System, without: Sequence[str] = (), seed: int = 0) -> Any:
-    """A judge by its name.
+    """A judge by its name, of the learnt one ``without`` some parts.
 
-    Parameters
-    ----------
-    name : str
-        ``learnt``, ``told`` (the same guard, told the failure function), ``scene``, ``kinematic``,
-        ``counted``, ``unrevised``, one of `rivals_of` the system, or ``module:Name`` of a class
-        that is made with the system and a seed. It has the methods of a `Rival`, or, as an
-        `ActionJudge`, says how dangerous actions are: then a guard is made of it.
-    system : System
-    without : sequence of str
-        Parts of the learnt judge that are taken away.
-    seed : int
-
-    Raises
-    ------
-    ValueError
-        If there is no such judge, or it knows nothing of the system.
-    TypeError
-        If what is named makes no judge.
+    ``told`` is the learnt guard, told the failure function; the others are `rivals_of` the system,
+    or ``module:Name`` of a class that is made with the system and a seed. It has the methods of a
+    `Rival`, or, as an `ActionJudge`, says how dangerous actions are: then a guard is made of it.
     """
     told: dict[str, Any] = {**system.actions.settings, "interval": system.interval, "seed": seed}
     if ":" in name:
@@ -185,13 +170,6 @@ def learnt_guard(
 def setting(part: str) -> dict[str, Any]:
     """A number of `LearntSettings` by NAME=VALUE; nothing of another part.
 
-    Raises
-    ------
-    ValueError
-        If there is no such number.
-
-    Examples
-    --------
     >>> setting("horizon=32"), setting("harm")
     ({'horizon': 32}, {})
     """
@@ -285,31 +263,11 @@ def trial(
 ) -> dict[str, Any]:
     """Let a judge learn a system while controlling it, freeze it, and try it on held-out episodes.
 
-    Parameters
-    ----------
-    name, controller : str
-        As `make_system` takes them.
-    judge, without : str
-        As `make_judge` takes them; parts that are taken away with commas.
-    seed : int
-        Of the training episodes, and of the judge.
-    train : int, optional
-        Training episodes; without it as many as the system's own.
-    test : int
-        Held-out episodes, the same for every seed.
-    base : int
-        Of everything: another one draws other episodes, held-out ones too.
-    late : int
-        A failure after so many training episodes is a late one.
-    rounds : int
-        Of the bootstrap.
-    beside : bool
-        Whether the controller alone is run in the same draws, too.
-    change : str
-        One of `studies.benchmark.CHANGES`.
+    The ``seed`` is that of ``train`` episodes, the system's own number if not given, and of the
+    judge; ``base`` that of everything: with another one the ``test`` held-out ones differ, too. A
+    failure after ``late`` training episodes is a late one. With ``beside`` the controller alone is
+    run in the same draws; ``change`` is one of `studies.benchmark.CHANGES`.
 
-    Examples
-    --------
     >>> row = trial("acc", judge="unrevised", train=2, test=5)
     >>> row["failed"], row["kept"], row["mean_change"]
     (5, 1.0, 0.0)

@@ -101,8 +101,6 @@ class Coming(NamedTuple):
 def coming(happens: Bools, steps: int) -> Coming:
     """Look so many rows ahead from each row, that row itself left out.
 
-    Examples
-    --------
     >>> came, known = coming(np.array([False, False, True, False, False]), steps=2)
     >>> came.tolist(), known.tolist()
     ([True, True, False, False, False], [True, True, False, False, False])
@@ -126,13 +124,7 @@ class Case(NamedTuple):
 
 
 def case_of(episode: Episode) -> Case:
-    """Decisions of an episode; what came is looked up in all its rows.
-
-    Raises
-    ------
-    ValueError
-        If its rows do not fall on decisions.
-    """
+    """Decisions of an episode; what came is looked up in all its rows."""
     stride = round(INTERVAL / episode.dt)
     if stride < 1 or abs(stride * episode.dt - INTERVAL) > 0.02 * INTERVAL:
         raise ValueError(
@@ -156,8 +148,6 @@ def case_of(episode: Episode) -> Case:
 def recent_acceleration(speed: Floats) -> Floats:
     """(T,) mean acceleration over the latest 0.4 s [m/s²]; 0 where too little was seen.
 
-    Examples
-    --------
     >>> recent_acceleration(np.array([10.0, 10.0, 9.0, 8.0]))
     array([ 0. ,  0. , -2.5, -5. ])
     """
@@ -227,13 +217,10 @@ def as_they_are(case: Case) -> Floats:
 
 
 def approach(case: Case) -> Floats:
-    """How the follower approaches: three quantities that danger hangs on, from what was seen.
+    """(T, 3) what danger hangs on: how the follower approaches.
 
-    Returns
-    -------
-    (T, 3) ndarray
-        Closing speed over gap [1/s], the inverse of the time to collision; the leader's
-        acceleration over the latest 0.4 s [m/s²]; the natural logarithm of the time headway [s].
+    Closing speed over gap [1/s], the inverse of the time to collision; the leader's acceleration
+    over the latest 0.4 s [m/s²]; the natural logarithm of the time headway [s].
     """
     gap, speed, leader = case.observations.T
     headway = np.log(gap / np.maximum(speed, _SLOWEST))
@@ -347,16 +334,7 @@ class Real(Study):
         return replace(self, folds=2, rounds=100, most_runs=10)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
-        """Learn on some runs of ``data``, or on those of ``train``, and judge on the others.
-
-        Raises
-        ------
-        NotADirectoryError
-            If there is no such folder.
-        ValueError
-            If there are fewer runs than folds, a file is not what it should be, or a recording is
-            in both folders.
-        """
+        """Learn on some runs of ``data``, or on those of ``train``, and judge on the others."""
         cases = self.cases_in(self.data, dealt=self.train is None)
         if self.train is not None:
             parts = [_apart(self.cases_in(self.train), cases)]
@@ -524,8 +502,6 @@ def fold_of_runs(runs: Sequence[str], folds: int, seed: int) -> dict[str, int]:
 
     The source of a run is its name up to the first underscore.
 
-    Examples
-    --------
     >>> folds = fold_of_runs(["a_1", "a_2", "b_1", "b_2"], folds=2, seed=0)
     >>> [len({folds[f"{source}_1"], folds[f"{source}_2"]}) for source in "ab"]
     [2, 2]
@@ -606,13 +582,7 @@ class Leaders(Study):
         return replace(self, first=min(self.first or 3, 3))
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
-        """Count hard brakes in all runs, and alarms in the first ones.
-
-        Raises
-        ------
-        ValueError
-            If the folder holds no runs, or a file is not what it should be.
-        """
+        """Count hard brakes in all runs, and alarms in the first ones."""
         paths = runs_in(self.data)
         runs = lib.parallel([partial(watch_leaders, path) for path in paths], workers, "Watching")
         asked = [(k, told) for k in range(len(paths[: self.first])) for told in TOLD]

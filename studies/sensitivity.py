@@ -106,8 +106,6 @@ class Setting:
 def recovered() -> Setting:
     """The setting with which all claims of the paper come out.
 
-    Examples
-    --------
     >>> recovered().initial_gap, recovered().order, recovered().noise
     (5.0, '1234', 0.0)
     """
@@ -142,8 +140,6 @@ class Parameter:
 
     Places run from 0, the lower end, to 1, the upper end; values are spaced by the scale.
 
-    Examples
-    --------
     >>> radius = Parameter("radius", "radius ε", STATED, "a factor of ten", 0.1, 10.0, LOG)
     >>> round(radius.value_at(0.5), 6), round(radius.place_of(10.0), 6)
     (1.0, 1.0)
@@ -182,8 +178,6 @@ class Parameter:
     def levels(self, number: int) -> list[Any]:
         """About so many values over the range, the recovered one exactly among them; all choices.
 
-        Examples
-        --------
         >>> Parameter("initial_gap", "", OPEN, "", 3.0, 11.0).levels(5)
         [3.0, 5.0, 7.0, 9.0, 11.0]
         """
@@ -293,8 +287,6 @@ class Remembering(KinematicWorld):
 def evaluate(trial: Trial, world: KinematicWorld, rounds: int = 20) -> dict[str, Any]:
     """A row: the paper's own verdicts on one setting.
 
-    Examples
-    --------
     >>> row = evaluate(Trial("recovered", "", recovered()), Remembering())
     >>> row["held"], row["n_states"]
     (10, 7)

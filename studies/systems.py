@@ -42,8 +42,6 @@ Controllers = Mapping[str, Callable[[Vector], Action]]
 class Start(NamedTuple):
     """Which episode: the same is drawn for the same start, whoever controls the system.
 
-    Examples
-    --------
     >>> Start.held_out(seed=0, episode=3) == Start.training(seed=0, learning_seed=0, episode=3)
     False
     """
@@ -113,18 +111,7 @@ class Discrete:
 
 
 class System(ABC):
-    """A system with one of its controllers.
-
-    Parameters
-    ----------
-    controller : str, optional
-        Without it the first of `controllers`.
-
-    Raises
-    ------
-    ValueError
-        If it has no such controller.
-    """
+    """A system with one of its `controllers`: the first, unless another one is named."""
 
     name: str
     variables: tuple[str, ...]  #: of an observation, with their units
@@ -834,26 +821,12 @@ def lacking(name: str) -> str:
 
 
 def make_system(name: str, controller: str | None = None) -> System:
-    """A system by its name.
+    """A system by its name, with its first controller unless another one is named.
 
-    Parameters
-    ----------
-    name : str
-        One of `SYSTEMS`, `TASKS`, `SHAPES` or `PEERS`, a family of scenarios (``emergency+noise``
-        with a switch), or ``module:Name`` of a class derived from `System`, which is looked for in
-        the present folder too.
-    controller : str, optional
-        One of its controllers; without it the first.
+    It is one of `SYSTEMS`, `TASKS`, `SHAPES` or `PEERS`, a family of scenarios (``emergency+noise``
+    with a switch), or ``module:Name`` of a class derived from `System`, which is looked for in the
+    present folder too.
 
-    Raises
-    ------
-    ValueError
-        If there is no such system, or it has no such controller.
-    TypeError
-        If what is named makes no system.
-
-    Examples
-    --------
     >>> system = make_system("acc")
     >>> list(system.controllers), system.interval, system.steps
     (['full throttle'], 0.02, 300)
