@@ -59,13 +59,15 @@ from studies.policies import TUNED_MEASURES, Group, RiskByState, fixed_policies
 
 #: Ours that is told how cars follow each other, and ours that is told nothing but failures.
 OURS, MACHINE = "evofsm", "evofsm-machine"
+#: A safe distance whose constants were right before the shift; it learns nothing.
+UNCHANGED = "rss-unchanged"
 #: Our own reviser, told what ours has to learn: it shows the price of learning, and is no rival.
 OURS_TOLD = ("oracle", "evofsm-told")
 #: Collision rate of held-out episodes at most where a policy counts as safe.
 SAFE_RATE = 0.01
 #: After so many training episodes a learner is tested, and so many after a shift.
 CHECKPOINTS = {OURS: (0, 1, 2, 5, 10, 20, 50, 100, 200, 300), MACHINE: (0, 2, 5, 10, 30, 100)}
-AFTER = {OURS: (0, 1, 2, 5, 10, 20, 30), MACHINE: (0, 10, 30)}
+AFTER = {UNCHANGED: (0,), OURS: (0, 1, 2, 5, 10, 20, 30), MACHINE: (0, 10, 30)}
 #: State rules that are compared, by name.
 RULES: dict[str, StateRule | None] = {
     "paper": None,
@@ -169,9 +171,8 @@ class ClosedLoop(Study):
         if family.name == "paper":
             tasks.append(partial(_revise_cases, self))
         if family.shifted is not None:
-            tasks += [partial(_shift_unchanged, self, seed) for seed in seeds]
-            for one in learners:
-                most = self.seeds if one == OURS else self.machine_shift_seeds
+            for one in (UNCHANGED, *learners):
+                most = self.machine_shift_seeds if one == MACHINE else self.seeds
                 tasks += [partial(_shift, self, one, seed) for seed in seeds[:most]]
         found: Found = {}
         for some in lib.parallel(tasks, workers):
@@ -296,6 +297,10 @@ def _learner(study: ClosedLoop, policy: str, seed: int) -> Guard:
     family, tolerance = study.drawn_from, study.tolerance
     if policy == OURS:
         return guard_for_family(family, tolerance=tolerance)
+    if policy == UNCHANGED:
+        told = measures.ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
+        reviser = EnvelopeReviser(told, family.actions, family.interval)
+        return Guard.of(reviser, interval=family.interval, learn=False)
     seeded = study.seed * 1000 + seed
     return guard_for_family(family, tolerance=tolerance, judge="learnt", rule=None, seed=seeded)
 
@@ -450,7 +455,7 @@ def _stream(study: ClosedLoop, seed: int) -> list[tuple[int, Draw]]:
 
 
 def _shift(study: ClosedLoop, policy: str, seed: int) -> Found:
-    """Drive the stream of one learning seed with a policy that goes on learning."""
+    """Drive the stream of one learning seed with a policy that goes on learning, if it learns."""
     guard = _learner(study, policy, seed)
     found: Found = {"stream": [], "checks": []}
     for place, draw in _stream(study, seed):
@@ -458,30 +463,9 @@ def _shift(study: ClosedLoop, policy: str, seed: int) -> Found:
             found["checks"].append(_check(study, policy, seed, -1, guard))
         if place in AFTER[policy]:
             found["checks"].append(_check(study, policy, seed, place, guard))
-        collided = drive(guard, draw).collided
-        found["stream"].append(_streamed(policy, seed, place, collided))
+        row = {"policy": policy, "learning_seed": seed, "place": place}
+        found["stream"].append(row | {"collided": drive(guard, draw).collided})
     return found
-
-
-def _shift_unchanged(study: ClosedLoop, seed: int) -> Found:
-    """The same with a safe distance whose constants were right before; it learns nothing."""
-    family, name = study.drawn_from, "rss-unchanged"
-    told = measures.ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
-    reviser = EnvelopeReviser(told, family.actions, family.interval)
-    guard = Guard.of(reviser, interval=family.interval, learn=False)
-    places, draws = zip(*_stream(study, seed), strict=True)
-    drives = teach(guard, draws)
-    return {
-        "stream": [
-            _streamed(name, seed, place, one.collided)
-            for place, one in zip(places, drives, strict=True)
-        ],
-        "checks": [_check(study, name, seed, after, guard) for after in (-1, 0)],
-    }
-
-
-def _streamed(policy: str, seed: int, place: int, collided: bool) -> dict[str, Any]:
-    return {"policy": policy, "learning_seed": seed, "place": place, "collided": collided}
 
 
 def _check(study: ClosedLoop, policy: str, seed: int, after: int, guard: Guard) -> dict[str, Any]:
@@ -665,7 +649,7 @@ def _lost(found: Frames, lines: pl.DataFrame) -> Iterator[Table]:
     yield Table(title, both.filter(falls_short), columns)
     if "checks" in found:
         rates = around_shift(found["checks"])
-        other = rates.filter(policy="rss-unchanged").select(pl.col("after") >= 0, theirs="median")
+        other = rates.filter(policy=UNCHANGED).select(pl.col("after") >= 0, theirs="median")
         ours = rates.filter(policy=OURS).with_columns(shifted=pl.col("after") >= 0)
         worse = ours.join(other, left_on="shifted", right_on="after")
         yield Table(
@@ -843,7 +827,7 @@ def _table_of_learning(curve: pl.DataFrame) -> Table:
 _CURVES: dict[str, dict[str, Any]] = {
     OURS: {"color": COLORS["follower"]},
     MACHINE: {"color": COLORS["leader"], "linestyle": (0, (4, 1.6))},
-    "rss-unchanged": {"color": COLORS["dead end"], "linestyle": (0, (1, 1.2))},
+    UNCHANGED: {"color": COLORS["dead end"], "linestyle": (0, (1, 1.2))},
 }
 
 
