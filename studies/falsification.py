@@ -114,8 +114,7 @@ class Split(NamedTuple):
 
     probability: float  #: of failing; 0 where no case did
     tried: int  #: cases that were played
-    levels: tuple[float, ...]  #: scores that all cases had to exceed, in rising order
-    reached: float  #: probability of exceeding the last of them
+    reached: float  #: probability of exceeding the last level, a score that all had to
     best: float  #: the highest score of those that did not fail
     failed: tuple[Case, ...]  #: cases that failed, each once
 
@@ -139,13 +138,13 @@ def split(score: Score, seed: Sequence[int], cases: int, moves: int, least: floa
     rng = np.random.default_rng(seed)
     alive = [_played(score, {}, rng) for _ in range(cases)]
     best = max(map(_unfailing, alive))
-    probability, tried, levels = 1.0, cases, list[float]()
+    probability, tried = 1.0, cases
     given_up = math.ceil(_GIVEN_UP * cases)
     while (level := sorted(case.score for case in alive)[given_up - 1]) < math.inf:
         kept = [case for case in alive if case.score > level]
         next_probability = probability * (len(kept) / cases)
         if next_probability < least and not any(case.failed for case in kept):
-            return Split(0.0, tried, tuple(levels), probability, best, ())
+            return Split(0.0, tried, probability, best, ())
         probability = next_probability
         copies = []
         for parent in rng.integers(len(kept), size=cases - len(kept)).tolist():
@@ -157,12 +156,11 @@ def split(score: Score, seed: Sequence[int], cases: int, moves: int, least: floa
                 case = moved if moved.score > level else case
             copies.append(case)
         tried += len(copies) * moves
-        levels.append(level)
         alive = kept + copies
     failed = [case for case in alive if case.failed]
     each = {tuple(sorted(case.latent.items())): case for case in failed}
     found = probability * len(failed) / cases
-    return Split(found, tried, tuple(levels), probability, best, tuple(each.values()))
+    return Split(found, tried, probability, best, tuple(each.values()))
 
 
 def plain(score: Score, n: int, seed: Sequence[int]) -> int:

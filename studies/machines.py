@@ -5,7 +5,7 @@ A row for each machine, seed, rate of false alarms that was stated, and alarm.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, product
@@ -265,19 +265,15 @@ def judged(name: str, days: float, seed: int) -> list[dict[str, Any]]:
         THRESHOLDS: (known, then, True),
         STATES: (counted, Foresight.runs(risks[first:], failed[first:]), True),
     }
-
-    def told() -> Iterator[dict[str, Any]]:
-        for (alarm, (judge, log, plain)), rate in product(
-            alarms.items(), range(len(Foresight.rates))
-        ):
+    told = []
+    for alarm, (judge, log, plain) in alarms.items():
+        for rate, stated in enumerate(Foresight.rates):
             found, _ = judge.tally(log, rate, plain=plain)
-            limits = judge.words(rate, plain=plain)
-            who = {"machine": name, "seed": seed, "alarm": alarm, "stated": Foresight.rates[rate]}
+            who = {"machine": name, "seed": seed, "alarm": alarm, "stated": stated}
             came = {"failures": found.failures, "seen": found.foreseen, "false": found.false}
             warned = {"warned": found.lead * found.failures, "days": found.days}
-            yield {**who, **came, **warned, "limits": limits}
-
-    return list(told())
+            told.append({**who, **came, **warned, "limits": judge.words(rate, plain=plain)})
+    return told
 
 
 def risks_of(values: list[Floats], failed: list[bool], first: int) -> list[Floats]:

@@ -322,10 +322,8 @@ def find_edges(
     one: Parameter, sweep: Sequence[Mapping[str, Any]], halvings: int, rounds: int
 ) -> list[dict[str, Any]]:
     """Halve the steps of a sweep between which the first claim breaks, below and above."""
-    here = [row[one.name] for row in sweep].index(one.recovered)
     world, tried = Remembering(), []
-    for outward in (sweep[here::-1], sweep[here:]):
-        bad = next((place for place, row in enumerate(outward) if not row["holds"]), 0)
+    for outward, bad in _outward(sweep, one):
         if bad == 0:  # all hold to the end of the range, or not even here
             continue
         inner, outer = (one.place_of(outward[place][one.name]) for place in (bad - 1, bad))
@@ -483,14 +481,18 @@ def reach(rows: pl.DataFrame, one: Parameter) -> dict[str, Any]:
         held = [row[one.name] for row in alone if row["holds"]]
         only = f" ({held[0]})" if len(held) == 1 else ""
         return told | {"all_hold": f"{len(held)} of {len(alone)}{only}"}
-    here = [row[one.name] for row in alone].index(one.recovered)
-    if not alone[here]["holds"]:
+    (down, lower), (up, upper) = _outward(alone, one)
+    if not up[0]["holds"]:
         return told | {"all_hold": None}
-    ends, all_hold = [], []
-    for outward in (alone[here::-1], alone[here:]):
-        bad = next((place for place, row in enumerate(outward) if not row["holds"]), 0)
-        ends.append(outward[bad - 1][one.name])
-        all_hold.append(bad == 0)
-    at_low, at_high = all_hold[0] and ends[0] > 0.0, all_hold[1]
-    text = f"{'≤' * at_low}{ends[0]:.4g} to {'≥' * at_high}{ends[1]:.4g}"
-    return told | {"all_hold": text}
+    least, most = down[lower - 1][one.name], up[upper - 1][one.name]
+    at_low, at_high = lower == 0 and least > 0.0, upper == 0
+    return told | {"all_hold": f"{'≤' * at_low}{least:.4g} to {'≥' * at_high}{most:.4g}"}
+
+
+def _outward(
+    sweep: Sequence[Mapping[str, Any]], one: Parameter
+) -> Iterator[tuple[Sequence[Mapping[str, Any]], int]]:
+    """From the recovered value down, and up, each with the first place where not all hold, or 0."""
+    here = [row[one.name] for row in sweep].index(one.recovered)
+    for rows in (sweep[here::-1], sweep[here:]):
+        yield rows, next((place for place, row in enumerate(rows) if not row["holds"]), 0)
