@@ -126,24 +126,10 @@ class ClosedLoop(Study):
 
     def shortened(self) -> Self:
         """About a tenth of everything."""
-        return replace(
-            self,
-            train=min(self.train, 100),
-            test=min(self.test, 100),
-            seeds=min(self.seeds, 2),
-            machine_train=min(self.machine_train, 40),
-            rule_seeds=min(self.rule_seeds, 1),
-            rule_test=20,
-            world_train=40,
-            world_test=5,
-            machine_test=40,
-            machine_check=10,
-            before=60,
-            after=10,
-            shift_test=20,
-            machine_shift_seeds=1,
-            machine_shift_test=10,
-        )
+        few = self.smaller(train=100, test=100, seeds=2, world_train=40, world_test=5)
+        few = few.smaller(machine_train=40, machine_test=40, machine_check=10)
+        few = few.smaller(rule_seeds=1, rule_test=20, before=60, after=10, shift_test=20)
+        return few.smaller(machine_shift_seeds=1, machine_shift_test=10)
 
     @property
     def drawn_from(self) -> Family:

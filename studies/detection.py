@@ -555,18 +555,9 @@ class Detection(Study):
 
     def shortened(self) -> Self:
         """Just enough for one false alarm per hour to be measurable."""
-        return replace(
-            self,
-            train=min(self.train, 40),
-            seeds=min(self.seeds, 2),
-            hours=min(self.hours, 0.5),
-            long_hours=min(self.long_hours, 3.0),
-            rounds=min(self.rounds, 40),
-            seed_hours=0.2,
-            grid=(2.0, 4.0, 6.0),
-            grid_leader=(3.0, 6.0, 9.0),
-            grid_hours=0.2,
-        )
+        few = self.smaller(train=40, seeds=2, hours=0.5, long_hours=3.0, rounds=40)
+        few = few.smaller(seed_hours=0.2, grid_hours=0.2)
+        return replace(few, grid=(2.0, 4.0, 6.0), grid_leader=(3.0, 6.0, 9.0))
 
     @property
     def worlds(self) -> tuple[str, ...]:

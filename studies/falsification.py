@@ -383,17 +383,12 @@ class Falsification(Study):
 
     def shortened(self) -> Self:
         """Few cases, and rare only to 1 in 10,000."""
+        few = self.smaller(train=20, runs=3, cases=30, moves=3, plain=3000, guarded=100)
         return replace(
-            self,
+            few,
             family=f"{TOY},{SELDOM}" if self.family == _FAMILIES else self.family,
             judge=f"{NOBODY},kinematic" if self.judge == _JUDGES else self.judge,
-            train=min(self.train, 20),
-            runs=min(self.runs, 3),
-            cases=min(self.cases, 30),
-            moves=min(self.moves, 3),
             least=max(self.least, 1e-4),
-            plain=min(self.plain, 3000),
-            guarded=min(self.guarded, 100),
         )
 
     def asked(self) -> list[tuple[str, str]]:

@@ -6,7 +6,7 @@ The guard learnt of a careless controller; then a good one takes over, which the
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from itertools import chain, product
@@ -85,7 +85,7 @@ class Good(lib.Study):
 
     def shortened(self) -> Good:
         """One seed."""
-        return replace(self, seeds=1, episodes=min(self.episodes, 5))
+        return self.smaller(seeds=1, episodes=5)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Learn of the careless one, then let the good one drive."""

@@ -442,12 +442,9 @@ class Judges(Study):
     def shortened(self) -> Self:
         """One seed, one controller of each system, no part taken away."""
         return replace(
-            self,
+            self.smaller(seeds=1, train=30, test=20),
             without="none" if self.without == ALL else self.without,
             controllers=FIRST if self.controllers == ALL else self.controllers,
-            seeds=1,
-            train=min(self.train or 30, 30),
-            test=min(self.test, 20),
         )
 
     @property
@@ -601,14 +598,9 @@ class Tasks(Study):
     def shortened(self) -> Self:
         """One seed of 20 training episodes on three tasks."""
         return replace(
-            self,
+            self.smaller(seeds=1, train=20, test=10, acc_seeds=1, rounds=100),
             tasks=self.tasks or ("" if self.task else "acc,cartpole,pendulum"),
             controllers=FIRST if self.controllers == ALL else self.controllers,
-            seeds=1,
-            train=min(self.train or 20, 20),
-            test=min(self.test, 10),
-            acc_seeds=1,
-            rounds=100,
         )
 
     @property

@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import partial
 from importlib.util import find_spec
 from multiprocessing import get_context
@@ -59,6 +59,14 @@ class Study(ABC):
     def shortened(self) -> Self:
         """The same in a minute or a few: too small for conclusions."""
         return self
+
+    def smaller(self, **most: float) -> Self:
+        """The same, with at most so much of each of these amounts."""
+        own = {name: getattr(self, name) for name in most}
+        few: dict[str, Any] = {
+            name: n if own[name] is None else min(own[name], n) for name, n in most.items()
+        }
+        return replace(self, **few)
 
     @abstractmethod
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:

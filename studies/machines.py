@@ -6,7 +6,7 @@ A row for each machine, seed, rate of false alarms that was stated, and alarm.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain, product
 from typing import Annotated, Any, NamedTuple
@@ -175,7 +175,7 @@ class Machines(lib.Study):
 
     def shortened(self) -> Machines:
         """One short log of each machine."""
-        return replace(self, days=min(self.days, 40.0), seeds=1)
+        return self.smaller(days=40.0, seeds=1)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Learn from the first part of each log, and judge the rest."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -331,7 +331,7 @@ class Real(Study):
 
     def shortened(self) -> Self:
         """Ten runs: too few for conclusions."""
-        return replace(self, folds=2, rounds=100, most_runs=10)
+        return self.smaller(folds=2, rounds=100, most_runs=10)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Learn on some runs of ``data``, or on those of ``train``, and judge on the others."""
@@ -579,7 +579,7 @@ class Leaders(Study):
 
     def shortened(self) -> Self:
         """Alarms in three runs."""
-        return replace(self, first=min(self.first or 3, 3))
+        return self.smaller(first=3)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Count hard brakes in all runs, and alarms in the first ones."""

@@ -357,12 +357,7 @@ class Sensitivity(Study):
 
     def shortened(self) -> Self:
         """About a twentieth of everything: a look, not evidence."""
-        return replace(
-            self,
-            settings=min(self.settings, 80),
-            levels=min(self.levels, 7),
-            halvings=min(self.halvings, 2),
-        )
+        return self.smaller(settings=80, levels=7, halvings=2)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Try all settings."""
