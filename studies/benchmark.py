@@ -256,7 +256,7 @@ def _summed(rows: pl.DataFrame, by: Sequence[str]) -> pl.DataFrame:
     )
 
 
-def page(rows: pl.DataFrame, facts: dict[str, str]) -> Page:
+def page(asked: lib.Study, rows: pl.DataFrame) -> Page:
     """All lines beside what was accepted and the ceilings, and those that miss it."""
     from studies.told import table
 
@@ -284,11 +284,9 @@ def page(rows: pl.DataFrame, facts: dict[str, str]) -> Page:
     whole = lines.filter(without="")
     total = ("failed", "learning", "cpu_s", "failed_then", "learning_then", "cpu_s_then")
     sums = " · ".join(f"{name} {whole[name].sum():.0f}" for name in total)
-    return Page(
-        name="judges",
-        about="Is the learnt judge as good as it was?\n\nThe frozen benchmark, case by case.",
-        parts=[Table("The benchmark", lines, shown, note), table(lines)],
-        command=lib.command_line(),
+    return asked.shown(
+        "Is the learnt judge as good as it was?\n\nThe frozen benchmark, case by case.",
+        [Table("The benchmark", lines, shown, note), table(lines)],
         lost=[
             Table(
                 "Less than was accepted",
@@ -296,5 +294,5 @@ def page(rows: pl.DataFrame, facts: dict[str, str]) -> Page:
                 {"missed": "{missed}", **shown},
             )
         ],
-        facts=facts | {"sums": sums},
+        facts={"sums": sums},
     )

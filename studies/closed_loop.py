@@ -59,13 +59,15 @@ from studies.policies import TUNED_MEASURES, Group, RiskByState, fixed_policies
 
 #: Ours that is told how cars follow each other, and ours that is told nothing but failures.
 OURS, MACHINE = "evofsm", "evofsm-machine"
+#: A safe distance whose constants were right before the shift; it learns nothing.
+UNCHANGED = "rss-unchanged"
 #: Our own reviser, told what ours has to learn: it shows the price of learning, and is no rival.
 OURS_TOLD = ("oracle", "evofsm-told")
 #: Collision rate of held-out episodes at most where a policy counts as safe.
 SAFE_RATE = 0.01
 #: After so many training episodes a learner is tested, and so many after a shift.
 CHECKPOINTS = {OURS: (0, 1, 2, 5, 10, 20, 50, 100, 200, 300), MACHINE: (0, 2, 5, 10, 30, 100)}
-AFTER = {OURS: (0, 1, 2, 5, 10, 20, 30), MACHINE: (0, 10, 30)}
+AFTER = {UNCHANGED: (0,), OURS: (0, 1, 2, 5, 10, 20, 30), MACHINE: (0, 10, 30)}
 #: State rules that are compared, by name.
 RULES: dict[str, StateRule | None] = {
     "paper": None,
@@ -124,24 +126,10 @@ class ClosedLoop(Study):
 
     def shortened(self) -> Self:
         """About a tenth of everything."""
-        return replace(
-            self,
-            train=min(self.train, 100),
-            test=min(self.test, 100),
-            seeds=min(self.seeds, 2),
-            machine_train=min(self.machine_train, 40),
-            rule_seeds=min(self.rule_seeds, 1),
-            rule_test=20,
-            world_train=40,
-            world_test=5,
-            machine_test=40,
-            machine_check=10,
-            before=60,
-            after=10,
-            shift_test=20,
-            machine_shift_seeds=1,
-            machine_shift_test=10,
-        )
+        few = self.smaller(train=100, test=100, seeds=2, world_train=40, world_test=5)
+        few = few.smaller(machine_train=40, machine_test=40, machine_check=10)
+        few = few.smaller(rule_seeds=1, rule_test=20, before=60, after=10, shift_test=20)
+        return few.smaller(machine_shift_seeds=1, machine_shift_test=10)
 
     @property
     def drawn_from(self) -> Family:
@@ -169,9 +157,8 @@ class ClosedLoop(Study):
         if family.name == "paper":
             tasks.append(partial(_revise_cases, self))
         if family.shifted is not None:
-            tasks += [partial(_shift_unchanged, self, seed) for seed in seeds]
-            for one in learners:
-                most = self.seeds if one == OURS else self.machine_shift_seeds
+            for one in (UNCHANGED, *learners):
+                most = self.machine_shift_seeds if one == MACHINE else self.seeds
                 tasks += [partial(_shift, self, one, seed) for seed in seeds[:most]]
         found: Found = {}
         for some in lib.parallel(tasks, workers):
@@ -186,18 +173,15 @@ class ClosedLoop(Study):
     def page(self, found: Frames) -> Page:
         """The table of all policies, what stands below it, and where ours loses."""
         lines = lines_of(found["rows"])
-        return Page(
-            name=self.name,
-            about=_ABOUT.format(
+        return self.shown(
+            _ABOUT.format(
                 tolerance=f"{100 * self.tolerance:g} %",
                 family=self.drawn_from.name,
                 about=self.drawn_from.about,
             ),
-            parts=list(_parts(self, found, lines)),
-            command=lib.command_line(),
-            lost=list(_lost(found, lines)),
-            targets=frame_of(_targets(self, found, lines)),
-            facts=self.facts,
+            _parts(self, found, lines),
+            lost=_lost(found, lines),
+            targets=_targets(self, found, lines),
             packages=("scipy", *(("libsumo",) if "worlds" in found else ())),
         )
 
@@ -299,6 +283,10 @@ def _learner(study: ClosedLoop, policy: str, seed: int) -> Guard:
     family, tolerance = study.drawn_from, study.tolerance
     if policy == OURS:
         return guard_for_family(family, tolerance=tolerance)
+    if policy == UNCHANGED:
+        told = measures.ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
+        reviser = EnvelopeReviser(told, family.actions, family.interval)
+        return Guard.of(reviser, interval=family.interval, learn=False)
     seeded = study.seed * 1000 + seed
     return guard_for_family(family, tolerance=tolerance, judge="learnt", rule=None, seed=seeded)
 
@@ -453,7 +441,7 @@ def _stream(study: ClosedLoop, seed: int) -> list[tuple[int, Draw]]:
 
 
 def _shift(study: ClosedLoop, policy: str, seed: int) -> Found:
-    """Drive the stream of one learning seed with a policy that goes on learning."""
+    """Drive the stream of one learning seed with a policy that goes on learning, if it learns."""
     guard = _learner(study, policy, seed)
     found: Found = {"stream": [], "checks": []}
     for place, draw in _stream(study, seed):
@@ -461,30 +449,9 @@ def _shift(study: ClosedLoop, policy: str, seed: int) -> Found:
             found["checks"].append(_check(study, policy, seed, -1, guard))
         if place in AFTER[policy]:
             found["checks"].append(_check(study, policy, seed, place, guard))
-        collided = drive(guard, draw).collided
-        found["stream"].append(_streamed(policy, seed, place, collided))
+        row = {"policy": policy, "learning_seed": seed, "place": place}
+        found["stream"].append(row | {"collided": drive(guard, draw).collided})
     return found
-
-
-def _shift_unchanged(study: ClosedLoop, seed: int) -> Found:
-    """The same with a safe distance whose constants were right before; it learns nothing."""
-    family, name = study.drawn_from, "rss-unchanged"
-    told = measures.ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
-    reviser = EnvelopeReviser(told, family.actions, family.interval)
-    guard = Guard.of(reviser, interval=family.interval, learn=False)
-    places, draws = zip(*_stream(study, seed), strict=True)
-    drives = teach(guard, draws)
-    return {
-        "stream": [
-            _streamed(name, seed, place, one.collided)
-            for place, one in zip(places, drives, strict=True)
-        ],
-        "checks": [_check(study, name, seed, after, guard) for after in (-1, 0)],
-    }
-
-
-def _streamed(policy: str, seed: int, place: int, collided: bool) -> dict[str, Any]:
-    return {"policy": policy, "learning_seed": seed, "place": place, "collided": collided}
 
 
 def _check(study: ClosedLoop, policy: str, seed: int, after: int, guard: Guard) -> dict[str, Any]:
@@ -668,7 +635,7 @@ def _lost(found: Frames, lines: pl.DataFrame) -> Iterator[Table]:
     yield Table(title, both.filter(falls_short), columns)
     if "checks" in found:
         rates = around_shift(found["checks"])
-        other = rates.filter(policy="rss-unchanged").select(pl.col("after") >= 0, theirs="median")
+        other = rates.filter(policy=UNCHANGED).select(pl.col("after") >= 0, theirs="median")
         ours = rates.filter(policy=OURS).with_columns(shifted=pl.col("after") >= 0)
         worse = ours.join(other, left_on="shifted", right_on="after")
         yield Table(
@@ -846,7 +813,7 @@ def _table_of_learning(curve: pl.DataFrame) -> Table:
 _CURVES: dict[str, dict[str, Any]] = {
     OURS: {"color": COLORS["follower"]},
     MACHINE: {"color": COLORS["leader"], "linestyle": (0, (4, 1.6))},
-    "rss-unchanged": {"color": COLORS["dead end"], "linestyle": (0, (1, 1.2))},
+    UNCHANGED: {"color": COLORS["dead end"], "linestyle": (0, (1, 1.2))},
 }
 
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from itertools import chain, count, islice, product
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 import polars as pl
@@ -95,8 +95,6 @@ def world(name: str, since: int = 20) -> World:
     shift, with ``since`` episodes watched of it; ``shift-at-once`` is the same with none, and with
     thresholds from before it. ``paper`` is the paper's four cases with what it leaves open drawn.
 
-    Examples
-    --------
     >>> at_once = world("shift-at-once")
     >>> at_once.watched.decel, at_once.family.decel, at_once.since
     (4.5, 2.5, 0)
@@ -410,11 +408,8 @@ def _estimates(risk: LatentRisk, one: Watched) -> tuple[Floats, Floats]:
 
 
 # Classic measures that are shown, by their name here.
-_SHOWN = {
-    "ttc": "aeb-ttc",
-    **{name: name for name in ("mttc", "drac", "headway", "picud", "rss-r157", "r157-careful")},
-    "fuzzy": "fuzzy",
-}
+_UNCHANGED = ("mttc", "drac", "headway", "picud", "rss-r157", "r157-careful", "fuzzy")
+_SHOWN = {"ttc": "aeb-ttc", **{name: name for name in _UNCHANGED}}
 _RSS = measures.ResponsibilitySensitiveSafety
 
 
@@ -537,7 +532,6 @@ class Detection(Study):
     """
 
     name = "detection"
-    needed: ClassVar[dict[str, str]] = {"scipy": "study"}
 
     family: Annotated[
         str,
@@ -561,18 +555,9 @@ class Detection(Study):
 
     def shortened(self) -> Self:
         """Just enough for one false alarm per hour to be measurable."""
-        return replace(
-            self,
-            train=min(self.train, 40),
-            seeds=min(self.seeds, 2),
-            hours=min(self.hours, 0.5),
-            long_hours=min(self.long_hours, 3.0),
-            rounds=min(self.rounds, 40),
-            seed_hours=0.2,
-            grid=(2.0, 4.0, 6.0),
-            grid_leader=(3.0, 6.0, 9.0),
-            grid_hours=0.2,
-        )
+        few = self.smaller(train=40, seeds=2, hours=0.5, long_hours=3.0, rounds=40)
+        few = few.smaller(seed_hours=0.2, grid_hours=0.2)
+        return replace(few, grid=(2.0, 4.0, 6.0), grid_leader=(3.0, 6.0, 9.0))
 
     @property
     def worlds(self) -> tuple[str, ...]:
@@ -597,14 +582,11 @@ class Detection(Study):
 
     def page(self, found: Frames) -> Page:
         """Who sees danger, how early, and where ours loses."""
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=list(_parts(found)),
-            command=lib.command_line(),
-            targets=frame_of(_targets(found)),
-            lost=list(_lost(found)),
-            facts=self.facts,
+        return self.shown(
+            _ABOUT,
+            _parts(found),
+            targets=_targets(found),
+            lost=_lost(found),
             packages=("scipy",),
         )
 

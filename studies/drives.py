@@ -43,13 +43,6 @@ def runs_in(folder: Path) -> list[Path]:
     """The files of a folder that hold a run each, in the order of their names.
 
     Lists of checksums and of segments in capital letters are no runs.
-
-    Raises
-    ------
-    NotADirectoryError
-        If there is no such folder.
-    ValueError
-        If there is no run in it.
     """
     if not folder.is_dir():
         raise NotADirectoryError(f"{folder}: there is no such folder")
@@ -66,8 +59,6 @@ def runs_in(folder: Path) -> list[Path]:
 def name_of(path: Path) -> str:
     """Name of a run: the file's, without its endings.
 
-    Examples
-    --------
     >>> name_of(Path("data/run_7.csv.gz"))
     'run_7'
     """
@@ -75,14 +66,7 @@ def name_of(path: Path) -> str:
 
 
 def read_runs(paths: Iterable[Path]) -> Iterator[Episode]:
-    """Episodes of runs, each file held against the list of checksums beside it, if any.
-
-    Raises
-    ------
-    ValueError
-        If a file has another checksum than the list says, lacks a column, holds what is no number,
-        or in it nobody follows anybody; the message names the file.
-    """
+    """Episodes of runs, each file held against the list of checksums beside it, if any."""
     lists: dict[Path, dict[str, str]] = {}
     for path in paths:
         if path.parent not in lists:
@@ -129,11 +113,6 @@ def checksums_in(folder: Path) -> dict[str, str]:
 
     A list is CSV with the columns ``file`` and ``sha256``, or what ``sha256sum`` prints. Folders in
     the names it gives are left out.
-
-    Raises
-    ------
-    ValueError
-        If a list is there but cannot be one.
     """
     path = next((folder / name for name in _LISTS if (folder / name).is_file()), None)
     if path is None:

@@ -24,7 +24,7 @@ from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from statistics import NormalDist
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 import polars as pl
@@ -114,8 +114,7 @@ class Split(NamedTuple):
 
     probability: float  #: of failing; 0 where no case did
     tried: int  #: cases that were played
-    levels: tuple[float, ...]  #: scores that all cases had to exceed, in rising order
-    reached: float  #: probability of exceeding the last of them
+    reached: float  #: probability of exceeding the last level, a score that all had to
     best: float  #: the highest score of those that did not fail
     failed: tuple[Case, ...]  #: cases that failed, each once
 
@@ -126,22 +125,11 @@ def to_chance(normal: float) -> float:
 
 
 def split(score: Score, seed: Sequence[int], cases: int, moves: int, least: float = 1e-9) -> Split:
-    """One run of splitting.
+    """One run of splitting, of so many ``cases`` side by side.
 
-    Parameters
-    ----------
-    score : callable
-    seed : sequence of int
-        The same gives the same run.
-    cases : int
-        That are kept side by side. Those of the same score are kept or given up together.
-    moves : int
-        Of each copy, at each level.
-    least : float
-        The run is given up below this probability, and counts as 0.
+    Those of the same score are kept or given up together; each copy is moved so often, at each
+    level. Below the ``least`` probability the run is given up, and counts as 0.
 
-    Examples
-    --------
     >>> def score(chance):
     ...     return math.inf if chance("x") >= 0.999 else chance("x")
     >>> 0.0005 < split(score, seed=[0], cases=200, moves=5).probability < 0.002
@@ -150,13 +138,13 @@ def split(score: Score, seed: Sequence[int], cases: int, moves: int, least: floa
     rng = np.random.default_rng(seed)
     alive = [_played(score, {}, rng) for _ in range(cases)]
     best = max(map(_unfailing, alive))
-    probability, tried, levels = 1.0, cases, list[float]()
+    probability, tried = 1.0, cases
     given_up = math.ceil(_GIVEN_UP * cases)
     while (level := sorted(case.score for case in alive)[given_up - 1]) < math.inf:
         kept = [case for case in alive if case.score > level]
         next_probability = probability * (len(kept) / cases)
         if next_probability < least and not any(case.failed for case in kept):
-            return Split(0.0, tried, tuple(levels), probability, best, ())
+            return Split(0.0, tried, probability, best, ())
         probability = next_probability
         copies = []
         for parent in rng.integers(len(kept), size=cases - len(kept)).tolist():
@@ -168,12 +156,11 @@ def split(score: Score, seed: Sequence[int], cases: int, moves: int, least: floa
                 case = moved if moved.score > level else case
             copies.append(case)
         tried += len(copies) * moves
-        levels.append(level)
         alive = kept + copies
     failed = [case for case in alive if case.failed]
     each = {tuple(sorted(case.latent.items())): case for case in failed}
     found = probability * len(failed) / cases
-    return Split(found, tried, tuple(levels), probability, best, tuple(each.values()))
+    return Split(found, tried, probability, best, tuple(each.values()))
 
 
 def plain(score: Score, n: int, seed: Sequence[int]) -> int:
@@ -364,7 +351,6 @@ class Falsification(Study):
     """
 
     name = "falsification"
-    needed: ClassVar[dict[str, str]] = {"scipy": "study"}
 
     family: Annotated[
         str,
@@ -397,27 +383,16 @@ class Falsification(Study):
 
     def shortened(self) -> Self:
         """Few cases, and rare only to 1 in 10,000."""
+        few = self.smaller(train=20, runs=3, cases=30, moves=3, plain=3000, guarded=100)
         return replace(
-            self,
+            few,
             family=f"{TOY},{SELDOM}" if self.family == _FAMILIES else self.family,
             judge=f"{NOBODY},kinematic" if self.judge == _JUDGES else self.judge,
-            train=min(self.train, 20),
-            runs=min(self.runs, 3),
-            cases=min(self.cases, 30),
-            moves=min(self.moves, 3),
             least=max(self.least, 1e-4),
-            plain=min(self.plain, 3000),
-            guarded=min(self.guarded, 100),
         )
 
     def asked(self) -> list[tuple[str, str]]:
-        """Each family with each judge.
-
-        Raises
-        ------
-        ValueError
-            If there is no such family or judge, none is named, or what was learnt is another's.
-        """
+        """Each family with each judge; it refuses what cannot be tried."""
         families, judges = (
             list(dict.fromkeys(lib.names_in(names))) for names in (self.family, self.judge)
         )
@@ -495,10 +470,9 @@ class Falsification(Study):
             pl.col("blind").is_between(1, self.runs - 1),
         )
         wide = (pl.col("probability") > 0) & (pl.col("high") > 3.0 * pl.col("probability"))
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[
+        return self.shown(
+            _ABOUT,
+            [
                 Table(
                     "How likely a failure is",
                     rows,
@@ -517,8 +491,7 @@ class Falsification(Study):
                 ),
                 *_tables_of_cases(found.get("cases")),
             ],
-            command=lib.command_line(),
-            targets=frame_of(_targets(rows)),
+            targets=_targets(rows),
             lost=[
                 Table(
                     "The guard fails",
@@ -532,7 +505,6 @@ class Falsification(Study):
                     "More runs or cases narrow an interval.",
                 ),
             ],
-            facts=self.facts,
             packages=("scipy",),
             sources=_SOURCES,
         )

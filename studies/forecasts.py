@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -140,10 +140,7 @@ def _encode(actions: IntervalActions, taken: Floats) -> NDArray[np.int64]:
 def logs_in(folder: Path) -> list[Logs]:
     """The logs in a folder, each file a run, by what stands before the first ``_`` of their names.
 
-    Raises
-    ------
-    ValueError
-        If there is nothing that could be split by run.
+    It refuses a folder with nothing that could be split by run.
     """
     found = defaultdict(list)
     for path in sorted(folder.glob("*")):
@@ -224,11 +221,6 @@ def stays(beliefs: Floats, actions: NDArray[np.int64]) -> Floats:
     return beliefs
 
 
-def of_matrix(matrix: Floats) -> Forecaster:
-    """The same matrix, whatever the action."""
-    return lambda beliefs, actions: beliefs @ matrix
-
-
 def powers(model: FSMModel, steps: int) -> Forecaster:
     """The machine's own matrices: one step under the action, the others under any."""
     average = model.averaged_matrix("marginal")
@@ -259,7 +251,8 @@ def batch(taught: Taught, lag: int) -> Forecaster:
     estimator = TransitionCountEstimator(lagtime=lag, count_mode="sliding", n_states=n)
     counts = np.asarray(estimator.fit_fetch(long).count_matrix) if long else np.zeros((n, n))
     totals = counts.sum(axis=1, keepdims=True)
-    return of_matrix(np.where(totals > 0.0, counts / np.maximum(totals, 1.0), np.eye(n)))
+    matrix = np.where(totals > 0.0, counts / np.maximum(totals, 1.0), np.eye(n))
+    return lambda beliefs, actions: beliefs @ matrix
 
 
 # -- How forecasts of states are scored -----------------------------------------------------------
@@ -570,8 +563,7 @@ class Logistic:
     """Logistic regression on observation, change, action and the products of all of them."""
 
     def __init__(self, train: Cases, truth: Bools) -> None:
-        raw = _products(_inputs(train))
-        self._mean, self._scale = raw.mean(axis=0), _spread(raw)
+        self._standardise = _standard(_products(_inputs(train)))
         X = self._features(train)
         ridge = np.append(1e-9, np.full(X.shape[1] - 1, _RIDGE))
         self.weights = lib.logistic(X, truth, ridge)
@@ -582,7 +574,7 @@ class Logistic:
 
     def _features(self, some: Cases) -> Floats:
         raw = _products(_inputs(some))
-        return np.column_stack([np.ones(len(raw)), (raw - self._mean) / self._scale])
+        return np.column_stack([np.ones(len(raw)), self._standardise(raw)])
 
 
 class Neighbours:
@@ -592,14 +584,13 @@ class Neighbours:
     """
 
     def __init__(self, train: Cases, truth: Bools) -> None:
-        raw = _inputs(train)
-        self._mean, self._scale = raw.mean(axis=0), _spread(raw)
-        self._tree, self._truth = KDTree((raw - self._mean) / self._scale), truth
+        self._standardise = _standard(_inputs(train))
+        self._tree, self._truth = KDTree(self._standardise(_inputs(train))), truth
 
     def __call__(self, some: Cases) -> Floats:
         """(n,) share of the neighbours."""
         count = min(_NEIGHBOURS, len(self._truth))
-        _, near = self._tree.query((_inputs(some) - self._mean) / self._scale, count)
+        _, near = self._tree.query(self._standardise(_inputs(some)), count)
         return np.asarray(self._truth[np.reshape(near, (-1, count))].mean(axis=1))
 
 
@@ -640,9 +631,11 @@ def _products(raw: Floats) -> Floats:
     return np.column_stack([raw, raw[:, i] * raw[:, j]])
 
 
-def _spread(raw: Floats) -> Floats:
-    spread = raw.std(axis=0)
-    return np.where(spread > 1e-12, spread, 1.0)
+def _standard(raw: Floats) -> Callable[[Floats], Floats]:
+    """What takes these to a mean of 0 and a standard deviation of 1."""
+    mean, spread = raw.mean(axis=0), raw.std(axis=0)
+    scale = np.where(spread > 1e-12, spread, 1.0)
+    return lambda some: (some - mean) / scale
 
 
 # -- How foresight of failures is measured --------------------------------------------------------
@@ -741,29 +734,11 @@ class ForecastStudy(Study):
 
     def shortened(self) -> Self:
         """A look: two learning seeds, and a quarter of the episodes."""
-        return replace(
-            self,
-            seeds=min(self.seeds, 2),
-            train=40,
-            test=30,
-            fine_train=5,
-            fine_test=5,
-            parts=2,
-            runs=12,
-            task_train=20,
-            task_test=15,
-            calibration=10,
-            rounds=200,
-        )
+        few = self.smaller(seeds=2, train=40, test=30, fine_train=5, fine_test=5, rounds=200)
+        return few.smaller(parts=2, runs=12, task_train=20, task_test=15, calibration=10)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
-        """Let all forecast drives, and foresee tasks.
-
-        Raises
-        ------
-        ValueError
-            If there is no such system, or the folder has no logs that can be split.
-        """
+        """Let all forecast drives, and foresee tasks."""
         names = lib.names_in(self.tasks)
         for name in names:  # so that a wrong one shows at once
             make_system(name)
@@ -831,10 +806,9 @@ class ForecastStudy(Study):
         )
         foreseen = {"task": "{task}", "steps": "{steps}", "method": "{method}"}
         against = _against(failures)
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[
+        return self.shown(
+            _ABOUT,
+            [
                 Table(
                     "Skill against persistence",
                     ours,
@@ -856,7 +830,6 @@ class ForecastStudy(Study):
                     pl.when(pl.col("method") == REPLAY).then(pl.lit("ours")),
                 ),
             ],
-            command=lib.command_line(),
             lost=[
                 Table(
                     "From 0.5 s on: intervals of the skill that hold 0",
@@ -883,8 +856,7 @@ class ForecastStudy(Study):
                     "Theirs against evofsm-replay.",
                 ),
             ],
-            targets=lib.frame_of(_targets(asked, failures, against)),
-            facts=self.facts,
+            targets=_targets(asked, failures, against),
             packages=("scipy", "deeptime", "gymnasium"),
             sources={
                 "T. Henzinger et al., Predictive monitoring of black-box dynamical systems, 2024, "

@@ -6,7 +6,7 @@ The guard learnt of a careless controller; then a good one takes over, which the
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from itertools import chain, product
@@ -85,7 +85,7 @@ class Good(lib.Study):
 
     def shortened(self) -> Good:
         """One seed."""
-        return replace(self, seeds=1, episodes=min(self.episodes, 5))
+        return self.smaller(seeds=1, episodes=5)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Learn of the careless one, then let the good one drive."""
@@ -118,18 +118,14 @@ class Good(lib.Study):
         more = guarded.join(sums.filter(way=ALONE), on="system", suffix="_alone")
         failures = more.select((pl.col("failed") - pl.col("failed_alone")).max()).item()
         least, worst = guarded.select(pl.col("least", "worst").min()).row(0)
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[Table("Good controllers", lines, shown)],
-            command=lib.command_line(),
-            targets=lib.frame_of(
-                [
-                    lib.at_most("failures more than alone, worst system", failures, 0.0, "{:.0f}"),
-                    lib.at_least("kept, worst seed", least, 0.9, "{:.2f}"),
-                    lib.at_least("return, worst seed", worst, 0.95, "{:.2f}"),
-                ]
-            ),
+        return self.shown(
+            _ABOUT,
+            [Table("Good controllers", lines, shown)],
+            targets=[
+                lib.at_most("failures more than alone, worst system", failures, 0.0, "{:.0f}"),
+                lib.at_least("kept, worst seed", least, 0.9, "{:.2f}"),
+                lib.at_least("return, worst seed", worst, 0.95, "{:.2f}"),
+            ],
             lost=[
                 Table(
                     "Spoilt: kept below 0.9, return below 0.95, or failures that it had not alone",
@@ -143,7 +139,6 @@ class Good(lib.Study):
                     shown,
                 )
             ],
-            facts=self.facts,
         )
 
 

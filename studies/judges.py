@@ -87,26 +87,11 @@ ACC, ACC_SEEDS, ACC_TRAIN = ("acc", "acc-5"), 20, 200
 
 
 def make_judge(name: str, system: System, without: Sequence[str] = (), seed: int = 0) -> Any:
-    """A judge by its name.
+    """A judge by its name, of the learnt one ``without`` some parts.
 
-    Parameters
-    ----------
-    name : str
-        ``learnt``, ``told`` (the same guard, told the failure function), ``scene``, ``kinematic``,
-        ``counted``, ``unrevised``, one of `rivals_of` the system, or ``module:Name`` of a class
-        that is made with the system and a seed. It has the methods of a `Rival`, or, as an
-        `ActionJudge`, says how dangerous actions are: then a guard is made of it.
-    system : System
-    without : sequence of str
-        Parts of the learnt judge that are taken away.
-    seed : int
-
-    Raises
-    ------
-    ValueError
-        If there is no such judge, or it knows nothing of the system.
-    TypeError
-        If what is named makes no judge.
+    ``told`` is the learnt guard, told the failure function; the others are `rivals_of` the system,
+    or ``module:Name`` of a class that is made with the system and a seed. It has the methods of a
+    `Rival`, or, as an `ActionJudge`, says how dangerous actions are: then a guard is made of it.
     """
     told: dict[str, Any] = {**system.actions.settings, "interval": system.interval, "seed": seed}
     if ":" in name:
@@ -185,13 +170,6 @@ def learnt_guard(
 def setting(part: str) -> dict[str, Any]:
     """A number of `LearntSettings` by NAME=VALUE; nothing of another part.
 
-    Raises
-    ------
-    ValueError
-        If there is no such number.
-
-    Examples
-    --------
     >>> setting("horizon=32"), setting("harm")
     ({'horizon': 32}, {})
     """
@@ -285,31 +263,11 @@ def trial(
 ) -> dict[str, Any]:
     """Let a judge learn a system while controlling it, freeze it, and try it on held-out episodes.
 
-    Parameters
-    ----------
-    name, controller : str
-        As `make_system` takes them.
-    judge, without : str
-        As `make_judge` takes them; parts that are taken away with commas.
-    seed : int
-        Of the training episodes, and of the judge.
-    train : int, optional
-        Training episodes; without it as many as the system's own.
-    test : int
-        Held-out episodes, the same for every seed.
-    base : int
-        Of everything: another one draws other episodes, held-out ones too.
-    late : int
-        A failure after so many training episodes is a late one.
-    rounds : int
-        Of the bootstrap.
-    beside : bool
-        Whether the controller alone is run in the same draws, too.
-    change : str
-        One of `studies.benchmark.CHANGES`.
+    The ``seed`` is that of ``train`` episodes, the system's own number if not given, and of the
+    judge; ``base`` that of everything: with another one the ``test`` held-out ones differ, too. A
+    failure after ``late`` training episodes is a late one. With ``beside`` the controller alone is
+    run in the same draws; ``change`` is one of `studies.benchmark.CHANGES`.
 
-    Examples
-    --------
     >>> row = trial("acc", judge="unrevised", train=2, test=5)
     >>> row["failed"], row["kept"], row["mean_change"]
     (5, 1.0, 0.0)
@@ -484,12 +442,9 @@ class Judges(Study):
     def shortened(self) -> Self:
         """One seed, one controller of each system, no part taken away."""
         return replace(
-            self,
+            self.smaller(seeds=1, train=30, test=20),
             without="none" if self.without == ALL else self.without,
             controllers=FIRST if self.controllers == ALL else self.controllers,
-            seeds=1,
-            train=min(self.train or 30, 30),
-            test=min(self.test, 20),
         )
 
     @property
@@ -542,7 +497,7 @@ class Judges(Study):
         """What fails, what each part is worth, and where it loses."""
         rows = found["rows"]
         if self.quick:
-            return benchmark.page(rows, self.facts)
+            return benchmark.page(self, rows)
         whole = summary(rows.filter(_WHOLE))
         parts = [
             Table(
@@ -577,11 +532,9 @@ class Judges(Study):
         told = (pl.col("rate") < pl.col("rate_ours")) | (
             pl.col("score") > pl.col("score_ours") + 0.01
         )
-        return Page(
-            name=self.name,
-            about=_ABOUT_JUDGES,
-            parts=parts,
-            command=lib.command_line(),
+        return self.shown(
+            _ABOUT_JUDGES,
+            parts,
             lost=[
                 Table(
                     "Harm: less than 0.9 of the controller's own steps, held out or while learning",
@@ -602,7 +555,7 @@ class Judges(Study):
                     "The kinematic judge against the learnt one.",
                 ),
             ],
-            facts=self.facts | _present(self._wanted)[1],
+            facts=_present(self._wanted)[1],
             packages=("scipy", "gymnasium"),
         )
 
@@ -645,14 +598,9 @@ class Tasks(Study):
     def shortened(self) -> Self:
         """One seed of 20 training episodes on three tasks."""
         return replace(
-            self,
+            self.smaller(seeds=1, train=20, test=10, acc_seeds=1, rounds=100),
             tasks=self.tasks or ("" if self.task else "acc,cartpole,pendulum"),
             controllers=FIRST if self.controllers == ALL else self.controllers,
-            seeds=1,
-            train=min(self.train or 20, 20),
-            test=min(self.test, 10),
-            acc_seeds=1,
-            rounds=100,
         )
 
     @property
@@ -696,10 +644,9 @@ class Tasks(Study):
         above = (pl.col("best") > 0) & (pl.col("score") > 0)
         lines = lines.with_columns(of_told=pl.when(above).then(pl.col("score") / pl.col("best")))
         who, ours = {**_WHO, "told": "{told}"}, rows.filter(pl.col("judge").is_in(OURS))
-        return Page(
-            name=self.name,
-            about=_ABOUT_TASKS,
-            parts=[
+        return self.shown(
+            _ABOUT_TASKS,
+            [
                 Table("What fails", lines, who | _FAILS, _NOTE, _MARK),
                 Table(
                     "What it costs",
@@ -722,10 +669,9 @@ class Tasks(Study):
                     "ten up to episode 50, or up to half of fewer than 100.",
                 ),
             ],
-            command=lib.command_line(),
-            lost=list(_lost(lines)),
-            targets=frame_of([*_of_acc(ours), *_of_crashes(rows)]),
-            facts=self.facts | _present(self._wanted)[1],
+            lost=_lost(lines),
+            targets=[*_of_acc(ours), *_of_crashes(rows)],
+            facts=_present(self._wanted)[1],
             packages=("scipy", "gymnasium"),
             sources={
                 "ACC: G. Anderson et al., Guiding Safe Exploration with Weakest Preconditions, "

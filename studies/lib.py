@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import partial
 from importlib.util import find_spec
 from multiprocessing import get_context
@@ -34,7 +34,7 @@ from scipy.stats import beta
 
 from evofsm.cli import print_json
 from evofsm.extras import install
-from evofsm.paper import Page, print_page, write_page
+from evofsm.paper import Figure, Page, Table, print_page, write_page
 
 #: Rows of a study by name; those of its main table are called ``"rows"``.
 Frames = Mapping[str, pl.DataFrame]
@@ -60,19 +60,21 @@ class Study(ABC):
         """The same in a minute or a few: too small for conclusions."""
         return self
 
+    def smaller(self, **most: float) -> Self:
+        """The same, with at most so much of each of these amounts."""
+        own = {name: getattr(self, name) for name in most}
+        few: dict[str, Any] = {
+            name: n if own[name] is None else min(own[name], n) for name, n in most.items()
+        }
+        return replace(self, **few)
+
     @abstractmethod
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
-        """Do it.
-
-        Parameters
-        ----------
-        workers : int, optional
-            Processes; one per core if not given. The numbers do not depend on it.
-        """
+        """Do it, with one process per core if not given; the numbers do not depend on that."""
 
     @abstractmethod
     def page(self, found: Frames) -> Page:
-        """The tables and figures that show what `run` returned."""
+        """The tables and figures that show what `run` returned; see `shown`."""
 
     def write(self, found: Frames, folder: Path) -> None:  # noqa: B027
         """Write further files of one's own beside the rows."""
@@ -85,6 +87,21 @@ class Study(ABC):
             for one in fields(self)
             if (value := getattr(self, one.name)) not in (None, "")
         }
+
+    def shown(
+        self,
+        about: str,
+        parts: Iterable[Table | Figure],
+        *,
+        lost: Iterable[Table] = (),
+        targets: Iterable[Target] = (),
+        facts: Mapping[str, str] | None = None,
+        **others: Any,
+    ) -> Page:
+        """A `Page` of these, which also says all settings, and what was typed."""
+        told = {"lost": list(lost), "targets": frame_of(targets), **others}
+        facts = self.facts | dict(facts or {})
+        return Page(self.name, about, list(parts), command_line(), facts=facts, **told)
 
 
 def command(study: type[Study]) -> Callable[..., None]:
@@ -153,13 +170,7 @@ def refused() -> Iterator[None]:
 
 
 def require(packages: Mapping[str, str]) -> None:
-    """Refuse before the long work what lacks a package after it.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        That names all that is lacking, and the command that installs it.
-    """
+    """Refuse before the long work what lacks a package after it, with what installs it."""
     if lacks := absent(packages):
         extras = dict.fromkeys(packages[package] for package in lacks)
         raise ModuleNotFoundError(f"this needs {' and '.join(lacks)}: {install(*extras)}")
@@ -188,18 +199,10 @@ def parallel(
 ) -> list[R]:
     """Results of all tasks, in the order of the tasks, with a progress bar on standard error.
 
-    Parameters
-    ----------
-    tasks : sequence of functools.partial
-        Of functions of modules. Each should take a second or more, for it crosses a process
-        boundary.
-    workers : int, optional
-        Processes, one per core if not given; with 1 the tasks are run in this very process.
-    doing : str
-        What the bar says.
+    Tasks are partials of functions of modules; each should take a second or more, for it crosses a
+    process boundary. With one of ``workers`` they are run in this very process; one per core is
+    usual.
 
-    Examples
-    --------
     >>> parallel([partial(pow, x, 2) for x in range(4)], workers=1)
     [0, 1, 4, 9]
     """
@@ -248,16 +251,8 @@ def frame_of(rows: Iterable[Any]) -> pl.DataFrame:
 def with_share(frame: pl.DataFrame, held: str, tried: str, name: str) -> pl.DataFrame:
     """Add a share and its exact 95 % interval (C. Clopper, E. Pearson, Biometrika 26, 1934).
 
-    Parameters
-    ----------
-    frame : polars.DataFrame
-    held, tried : str
-        Columns: so many of so many.
-    name : str
-        Columns ``name``, ``name_low`` and ``name_high`` are added; of none tried the share is null.
+    ``held`` of ``tried`` become ``name``, null of none, with ``name_low`` and ``name_high``.
 
-    Examples
-    --------
     >>> frame = pl.DataFrame({"failed": [0, 3], "episodes": [1000, 10]})
     >>> with_share(frame, "failed", "episodes", "rate")["rate_high"].round(4).to_list()
     [0.0037, 0.6525]
@@ -281,16 +276,8 @@ def exact_interval(
 def compared(frame: pl.DataFrame, ours: pl.Expr, by: Sequence[str]) -> pl.DataFrame:
     """Every other row together with ours of the same question, whose columns end in ``_ours``.
 
-    Parameters
-    ----------
-    frame : polars.DataFrame
-    ours : polars.Expr
-        Whether a row is ours; one for each question.
-    by : sequence of str
-        Columns that say what was asked.
+    The columns ``by`` say what was asked; of each question one row is ours.
 
-    Examples
-    --------
     >>> frame = pl.DataFrame({"task": ["a"] * 3, "who": ["ours", "ttc", "rss"], "x": [1, 2, 0]})
     >>> both = compared(frame, pl.col("who") == "ours", ["task"])
     >>> both.filter(pl.col("x") > pl.col("x_ours"))["who"].to_list()
@@ -335,7 +322,7 @@ class Interval(NamedTuple):
 
 
 def interval(values: ArrayLike) -> Interval:
-    """95 % interval of bootstrap values; NaN is left out."""
+    """That of bootstrap values, of which NaN is left out."""
     found = np.asarray(values, dtype=np.float64)
     found = found[~np.isnan(found)]
     if found.size == 0:
@@ -356,8 +343,6 @@ def bootstrap(
 ) -> Interval:
     """95 % interval of a number that a function makes of the indices of episodes.
 
-    Examples
-    --------
     >>> lasted = np.array([3.0, 4.0, 5.0, 6.0])
     >>> low, high = bootstrap(lambda chosen: float(lasted[chosen].mean()), len(lasted))
     >>> bool(low < lasted.mean() < high)
@@ -381,22 +366,9 @@ class Areas(NamedTuple):
 class Ranked:
     """Scores in falling order: both areas for many weightings, sorted once.
 
-    Parameters
-    ----------
-    score : (n,) array_like
-        Higher is more dangerous. Infinite scores have a rank like any others.
-    truth : (n,) array_like of bool
-        Whether it was dangerous.
-    episode : (n,) array_like of int, optional
-        Which episode each case is of, from 0; without it each is one of its own.
+    A higher ``score`` is more dangerous, and may be infinite; ``truth`` says whether it was, and
+    ``episode`` which one each case is of, from 0. Without it each is one of its own.
 
-    Raises
-    ------
-    ValueError
-        If they are not equally long, or a score is NaN, which has no rank.
-
-    Examples
-    --------
     >>> ranked = Ranked([0.1, 0.4, 0.4, 0.8], [False, False, True, True])
     >>> ranked.areas().auroc, round(ranked.areas().auprc, 4)
     (0.875, 0.8333)
@@ -449,28 +421,11 @@ class Ranked:
         return interval(found[:, 0]), interval(found[:, 1])
 
 
-class Calibration(NamedTuple):
-    """Turns a score into a probability that never falls as the score rises; see `isotonic`."""
-
-    scores: NDArray[np.float64]  #: (k,) in rising order
-    probabilities: NDArray[np.float64]  #: (k,) from each of them on
-
-    def __call__(self, score: ArrayLike) -> NDArray[np.float64]:
-        """(n,) ndarray: probability of each score."""
-        place = np.searchsorted(self.scores, np.asarray(score, dtype=np.float64), side="right") - 1
-        return np.asarray(self.probabilities[np.maximum(place, 0)])
-
-
-def isotonic(score: ArrayLike, truth: ArrayLike) -> Calibration:
+def isotonic(score: ArrayLike, truth: ArrayLike) -> Callable[[ArrayLike], NDArray[np.float64]]:
     """Calibrate scores, infinite ones too, by isotonic regression (B. Zadrozny, C. Elkan, 2002).
 
-    Raises
-    ------
-    ValueError
-        If there is no case, or a score is NaN.
+    What it returns turns scores into probabilities, which never fall as the score rises.
 
-    Examples
-    --------
     >>> calibrate = isotonic([1.0, 2.0, 3.0, 4.0], [False, True, False, True])
     >>> calibrate([0.0, 2.5, 9.0])
     array([0. , 0.5, 1. ])
@@ -481,7 +436,13 @@ def isotonic(score: ArrayLike, truth: ArrayLike) -> Calibration:
     scores, which, cases = np.unique(values, return_inverse=True, return_counts=True)
     came = np.bincount(which, weights=np.asarray(truth, dtype=np.float64)) / cases
     fitted = isotonic_regression(came, weights=cases.astype(np.float64)).x
-    return Calibration(scores, np.clip(fitted, 0.0, 1.0))
+    probabilities = np.clip(fitted, 0.0, 1.0)
+
+    def calibrate(score: ArrayLike) -> NDArray[np.float64]:
+        place = np.searchsorted(scores, np.asarray(score, dtype=np.float64), side="right") - 1
+        return np.asarray(probabilities[np.maximum(place, 0)])
+
+    return calibrate
 
 
 def logistic(rows: ArrayLike, came: ArrayLike, ridge: ArrayLike) -> NDArray[np.float64]:

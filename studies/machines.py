@@ -5,8 +5,8 @@ A row for each machine, seed, rate of false alarms that was stated, and alarm.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain, product
 from typing import Annotated, Any, NamedTuple
@@ -175,7 +175,7 @@ class Machines(lib.Study):
 
     def shortened(self) -> Machines:
         """One short log of each machine."""
-        return replace(self, days=min(self.days, 40.0), seeds=1)
+        return self.smaller(days=40.0, seeds=1)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Learn from the first part of each log, and judge the rest."""
@@ -208,17 +208,14 @@ class Machines(lib.Study):
             targets.append(
                 lib.at_least(f"{name}: minutes beyond thresholds", worst, -0.5, "{:.1f}")
             )
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[
+        return self.shown(
+            _ABOUT,
+            [
                 Table("At the rates that were stated", rivals, compared, _AT_AS_MANY),
                 Table("The states of an e-FSM alone", pooled.filter(alarm=STATES), shown),
             ],
-            command=lib.command_line(),
-            targets=lib.frame_of(targets),
+            targets=targets,
             lost=[Table("Rows in which thresholds warn longer", rivals.filter(fewer), compared)],
-            facts=self.facts,
         )
 
 
@@ -268,19 +265,15 @@ def judged(name: str, days: float, seed: int) -> list[dict[str, Any]]:
         THRESHOLDS: (known, then, True),
         STATES: (counted, Foresight.runs(risks[first:], failed[first:]), True),
     }
-
-    def told() -> Iterator[dict[str, Any]]:
-        for (alarm, (judge, log, plain)), rate in product(
-            alarms.items(), range(len(Foresight.rates))
-        ):
+    told = []
+    for alarm, (judge, log, plain) in alarms.items():
+        for rate, stated in enumerate(Foresight.rates):
             found, _ = judge.tally(log, rate, plain=plain)
-            limits = judge.words(rate, plain=plain)
-            who = {"machine": name, "seed": seed, "alarm": alarm, "stated": Foresight.rates[rate]}
+            who = {"machine": name, "seed": seed, "alarm": alarm, "stated": stated}
             came = {"failures": found.failures, "seen": found.foreseen, "false": found.false}
             warned = {"warned": found.lead * found.failures, "days": found.days}
-            yield {**who, **came, **warned, "limits": limits}
-
-    return list(told())
+            told.append({**who, **came, **warned, "limits": judge.words(rate, plain=plain)})
+    return told
 
 
 def risks_of(values: list[Floats], failed: list[bool], first: int) -> list[Floats]:

@@ -51,13 +51,8 @@ def envelope(name: str, group: Group, measure: RiskMeasure) -> Policy:
     )
 
 
-def oracle(family: Family, draw: Draw) -> Reviser:
-    """Ours, told how hard this very leader will brake and how well the own brakes work."""
-    return _told(family, draw.scenario.leader.brake_decel)
-
-
 def _told(family: Family, leader_decel: float) -> Reviser:
-    """Ours, told limits instead of learning them."""
+    """Ours, told limits instead of learning them; the oracle, those of this very leader."""
     risk = LatentRisk.given(family.actions.low, family.decel, leader_decel, family.interval)
     return ActionReviser(risk, family.actions)
 
@@ -102,7 +97,7 @@ def fixed_policies(family: Family) -> list[Policy]:
     return [
         Policy("unrevised", Group.BOUND, lambda family, draw: Unrevised(family.actions)),
         Policy("always-brake", Group.BOUND, lambda family, draw: AlwaysBrake(family.actions)),
-        Policy("oracle", Group.BOUND, oracle),
+        Policy("oracle", Group.BOUND, lambda f, draw: _told(f, draw.scenario.leader.brake_decel)),
         *(envelope(name, Group.FIXED, measure) for name, measure in fixed),
         envelope("rss-matched", Group.MATCHED, rss),
         Policy("evofsm-told", Group.MATCHED, lambda f, draw: _told(f, f.leader_decel)),

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -101,8 +101,6 @@ class Coming(NamedTuple):
 def coming(happens: Bools, steps: int) -> Coming:
     """Look so many rows ahead from each row, that row itself left out.
 
-    Examples
-    --------
     >>> came, known = coming(np.array([False, False, True, False, False]), steps=2)
     >>> came.tolist(), known.tolist()
     ([True, True, False, False, False], [True, True, False, False, False])
@@ -126,13 +124,7 @@ class Case(NamedTuple):
 
 
 def case_of(episode: Episode) -> Case:
-    """Decisions of an episode; what came is looked up in all its rows.
-
-    Raises
-    ------
-    ValueError
-        If its rows do not fall on decisions.
-    """
+    """Decisions of an episode; what came is looked up in all its rows."""
     stride = round(INTERVAL / episode.dt)
     if stride < 1 or abs(stride * episode.dt - INTERVAL) > 0.02 * INTERVAL:
         raise ValueError(
@@ -156,8 +148,6 @@ def case_of(episode: Episode) -> Case:
 def recent_acceleration(speed: Floats) -> Floats:
     """(T,) mean acceleration over the latest 0.4 s [m/s²]; 0 where too little was seen.
 
-    Examples
-    --------
     >>> recent_acceleration(np.array([10.0, 10.0, 9.0, 8.0]))
     array([ 0. ,  0. , -2.5, -5. ])
     """
@@ -227,13 +217,10 @@ def as_they_are(case: Case) -> Floats:
 
 
 def approach(case: Case) -> Floats:
-    """How the follower approaches: three quantities that danger hangs on, from what was seen.
+    """(T, 3) what danger hangs on: how the follower approaches.
 
-    Returns
-    -------
-    (T, 3) ndarray
-        Closing speed over gap [1/s], the inverse of the time to collision; the leader's
-        acceleration over the latest 0.4 s [m/s²]; the natural logarithm of the time headway [s].
+    Closing speed over gap [1/s], the inverse of the time to collision; the leader's acceleration
+    over the latest 0.4 s [m/s²]; the natural logarithm of the time headway [s].
     """
     gap, speed, leader = case.observations.T
     headway = np.log(gap / np.maximum(speed, _SLOWEST))
@@ -344,19 +331,10 @@ class Real(Study):
 
     def shortened(self) -> Self:
         """Ten runs: too few for conclusions."""
-        return replace(self, folds=2, rounds=100, most_runs=10)
+        return self.smaller(folds=2, rounds=100, most_runs=10)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
-        """Learn on some runs of ``data``, or on those of ``train``, and judge on the others.
-
-        Raises
-        ------
-        NotADirectoryError
-            If there is no such folder.
-        ValueError
-            If there are fewer runs than folds, a file is not what it should be, or a recording is
-            in both folders.
-        """
+        """Learn on some runs of ``data``, or on those of ``train``, and judge on the others."""
         cases = self.cases_in(self.data, dealt=self.train is None)
         if self.train is not None:
             parts = [_apart(self.cases_in(self.train), cases)]
@@ -445,10 +423,9 @@ class Real(Study):
             "AUPRC (95 %)": "{auprc:.3f} ({auprc_low:.2f}–{auprc_high:.2f})",
         }
         counted = ["events", "runs_with_events", "runs", "decisions", "prevalence", "enough"]
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[
+        return self.shown(
+            _ABOUT,
+            [
                 Table(
                     "What was asked",
                     rows.select("target", "horizon", *counted).unique(maintain_order=True),
@@ -468,7 +445,6 @@ class Real(Study):
                     pl.when(is_ours).then(pl.lit("ours")),
                 ),
             ],
-            command=lib.command_line(),
             lost=[
                 Table(
                     "Measures that rank better than evofsm-approach",
@@ -484,8 +460,8 @@ class Real(Study):
                     asked | columns,
                 ),
             ],
-            targets=frame_of(_targets(shown)) if len(shown) else pl.DataFrame(),
-            facts=self.facts | {"checksums": f"{len(checksums_in(self.data))} in the list"},
+            targets=_targets(shown) if len(shown) else [],
+            facts={"checksums": f"{len(checksums_in(self.data))} in the list"},
             verdict="" if len(shown) else "Too few events in these runs to compare anything",
         )
 
@@ -526,8 +502,6 @@ def fold_of_runs(runs: Sequence[str], folds: int, seed: int) -> dict[str, int]:
 
     The source of a run is its name up to the first underscore.
 
-    Examples
-    --------
     >>> folds = fold_of_runs(["a_1", "a_2", "b_1", "b_2"], folds=2, seed=0)
     >>> [len({folds[f"{source}_1"], folds[f"{source}_2"]}) for source in "ab"]
     [2, 2]
@@ -605,16 +579,10 @@ class Leaders(Study):
 
     def shortened(self) -> Self:
         """Alarms in three runs."""
-        return replace(self, first=min(self.first or 3, 3))
+        return self.smaller(first=3)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
-        """Count hard brakes in all runs, and alarms in the first ones.
-
-        Raises
-        ------
-        ValueError
-            If the folder holds no runs, or a file is not what it should be.
-        """
+        """Count hard brakes in all runs, and alarms in the first ones."""
         paths = runs_in(self.data)
         runs = lib.parallel([partial(watch_leaders, path) for path in paths], workers, "Watching")
         asked = [(k, told) for k in range(len(paths[: self.first])) for told in TOLD]
@@ -653,10 +621,9 @@ class Leaders(Study):
         )
         share = (pl.col("alarms") / pl.col("decisions")).alias("share")
         alarms = found["alarms"].with_columns(share).pivot("told", index="source", values="share")
-        return Page(
-            name=self.name,
-            about=_ABOUT_LEADERS,
-            parts=[
+        return self.shown(
+            _ABOUT_LEADERS,
+            [
                 Table(
                     "Hard brakes of leaders, 2.5 m/s² and more",
                     rows,
@@ -687,8 +654,6 @@ class Leaders(Study):
                     "leave out the run that is judged.",
                 ),
             ],
-            command=lib.command_line(),
-            facts=self.facts,
         )
 
 

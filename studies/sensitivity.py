@@ -106,8 +106,6 @@ class Setting:
 def recovered() -> Setting:
     """The setting with which all claims of the paper come out.
 
-    Examples
-    --------
     >>> recovered().initial_gap, recovered().order, recovered().noise
     (5.0, '1234', 0.0)
     """
@@ -142,8 +140,6 @@ class Parameter:
 
     Places run from 0, the lower end, to 1, the upper end; values are spaced by the scale.
 
-    Examples
-    --------
     >>> radius = Parameter("radius", "radius ε", STATED, "a factor of ten", 0.1, 10.0, LOG)
     >>> round(radius.value_at(0.5), 6), round(radius.place_of(10.0), 6)
     (1.0, 1.0)
@@ -182,8 +178,6 @@ class Parameter:
     def levels(self, number: int) -> list[Any]:
         """About so many values over the range, the recovered one exactly among them; all choices.
 
-        Examples
-        --------
         >>> Parameter("initial_gap", "", OPEN, "", 3.0, 11.0).levels(5)
         [3.0, 5.0, 7.0, 9.0, 11.0]
         """
@@ -293,8 +287,6 @@ class Remembering(KinematicWorld):
 def evaluate(trial: Trial, world: KinematicWorld, rounds: int = 20) -> dict[str, Any]:
     """A row: the paper's own verdicts on one setting.
 
-    Examples
-    --------
     >>> row = evaluate(Trial("recovered", "", recovered()), Remembering())
     >>> row["held"], row["n_states"]
     (10, 7)
@@ -330,10 +322,8 @@ def find_edges(
     one: Parameter, sweep: Sequence[Mapping[str, Any]], halvings: int, rounds: int
 ) -> list[dict[str, Any]]:
     """Halve the steps of a sweep between which the first claim breaks, below and above."""
-    here = [row[one.name] for row in sweep].index(one.recovered)
     world, tried = Remembering(), []
-    for outward in (sweep[here::-1], sweep[here:]):
-        bad = next((place for place, row in enumerate(outward) if not row["holds"]), 0)
+    for outward, bad in _outward(sweep, one):
         if bad == 0:  # all hold to the end of the range, or not even here
             continue
         inner, outer = (one.place_of(outward[place][one.name]) for place in (bad - 1, bad))
@@ -367,12 +357,7 @@ class Sensitivity(Study):
 
     def shortened(self) -> Self:
         """About a twentieth of everything: a look, not evidence."""
-        return replace(
-            self,
-            settings=min(self.settings, 80),
-            levels=min(self.levels, 7),
-            halvings=min(self.halvings, 2),
-        )
+        return self.smaller(settings=80, levels=7, halvings=2)
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Try all settings."""
@@ -401,10 +386,9 @@ class Sensitivity(Study):
             space: f"{{{space}:%}} ({{{space}_low:p}}–{{{space}_high:p}})" for space in _COLUMNS
         }
         reaches = lib.frame_of(reach(rows, one) for one in PARAMETERS.values())
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[
+        return self.shown(
+            _ABOUT,
+            [
                 Table(
                     "In what share of settings each claim holds",
                     shares,
@@ -426,7 +410,6 @@ class Sensitivity(Study):
                     + ".",
                 ),
             ],
-            command=lib.command_line(),
             lost=[
                 Table(
                     "Claims that hold in less than half of what is left open",
@@ -434,8 +417,8 @@ class Sensitivity(Study):
                     {"claim": "{claim}", **cells},
                 ),
             ],
-            targets=lib.frame_of(_targets(shares)),
-            facts=self.facts | {"settings in all": f"{len(rows):,}"},
+            targets=_targets(shares),
+            facts={"settings in all": f"{len(rows):,}"},
             packages=("scipy",),
         )
 
@@ -493,14 +476,18 @@ def reach(rows: pl.DataFrame, one: Parameter) -> dict[str, Any]:
         held = [row[one.name] for row in alone if row["holds"]]
         only = f" ({held[0]})" if len(held) == 1 else ""
         return told | {"all_hold": f"{len(held)} of {len(alone)}{only}"}
-    here = [row[one.name] for row in alone].index(one.recovered)
-    if not alone[here]["holds"]:
+    (down, lower), (up, upper) = _outward(alone, one)
+    if not up[0]["holds"]:
         return told | {"all_hold": None}
-    ends, all_hold = [], []
-    for outward in (alone[here::-1], alone[here:]):
-        bad = next((place for place, row in enumerate(outward) if not row["holds"]), 0)
-        ends.append(outward[bad - 1][one.name])
-        all_hold.append(bad == 0)
-    at_low, at_high = all_hold[0] and ends[0] > 0.0, all_hold[1]
-    text = f"{'≤' * at_low}{ends[0]:.4g} to {'≥' * at_high}{ends[1]:.4g}"
-    return told | {"all_hold": text}
+    least, most = down[lower - 1][one.name], up[upper - 1][one.name]
+    at_low, at_high = lower == 0 and least > 0.0, upper == 0
+    return told | {"all_hold": f"{'≤' * at_low}{least:.4g} to {'≥' * at_high}{most:.4g}"}
+
+
+def _outward(
+    sweep: Sequence[Mapping[str, Any]], one: Parameter
+) -> Iterator[tuple[Sequence[Mapping[str, Any]], int]]:
+    """From the recovered value down, and up, each with the first place where not all hold, or 0."""
+    here = [row[one.name] for row in sweep].index(one.recovered)
+    for rows in (sweep[here::-1], sweep[here:]):
+        yield rows, next((place for place, row in enumerate(rows) if not row["holds"]), 0)

@@ -18,7 +18,7 @@ from studies.systems import Action, Box, Controllers, Discrete, Start, System, V
 
 
 class Careless(System):
-    """One of whose controllers wanders: an action is drawn now and then, and held meanwhile."""
+    """One of whose controllers wanders, from the first action on."""
 
     train = 40
 
@@ -28,11 +28,6 @@ class Careless(System):
     def _within(self, wanted: Any) -> Vector:
         given: Vector = np.clip(np.asarray(wanted, np.float64), self.actions.low, self.actions.high)
         return given
-
-    def _wander(self, often: float = 0.1) -> Action:
-        if self.whim.random() < often:
-            self._wanted = self.actions.drawn(self.whim)
-        return self._wanted
 
 
 # -- Shapes ---------------------------------------------------------------------------------------
@@ -382,9 +377,6 @@ class Peer(Careless):
         self._seen, _ = self._env.reset(seed=int(self.chance.integers(2**31)))
         self._whim = self.whim.uniform(-1.0, 1.0)
         self._ended = False
-
-    def _observation(self) -> Vector:
-        return np.asarray(self._seen, dtype=np.float64)
 
     def _advance(self, action: Action) -> tuple[float, bool]:
         given = int(action) if isinstance(self.actions, Discrete) else np.atleast_1d(action)

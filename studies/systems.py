@@ -42,8 +42,6 @@ Controllers = Mapping[str, Callable[[Vector], Action]]
 class Start(NamedTuple):
     """Which episode: the same is drawn for the same start, whoever controls the system.
 
-    Examples
-    --------
     >>> Start.held_out(seed=0, episode=3) == Start.training(seed=0, learning_seed=0, episode=3)
     False
     """
@@ -113,18 +111,7 @@ class Discrete:
 
 
 class System(ABC):
-    """A system with one of its controllers.
-
-    Parameters
-    ----------
-    controller : str, optional
-        Without it the first of `controllers`.
-
-    Raises
-    ------
-    ValueError
-        If it has no such controller.
-    """
+    """A system with one of its `controllers`: the first, unless another one is named."""
 
     name: str
     variables: tuple[str, ...]  #: of an observation, with their units
@@ -139,6 +126,8 @@ class System(ABC):
     rivals: Mapping[str, Callable[[], Any]] = {}
     #: Whether an observation is a failure; None where it does not show.
     has_failed: Any = None
+    _seen: Any  #: by environments of others
+    _wanted: Action | None = None  #: by who wanders
 
     def __init__(self, controller: str | None = None) -> None:
         self.controller = self.chosen(FIRST if controller is None else controller)[0]
@@ -204,13 +193,19 @@ class System(ABC):
     def _begin(self, start: Start) -> None:
         """Draw the first state from ``chance``."""
 
-    @abstractmethod
     def _observation(self) -> Vector:
-        """What is seen now."""
+        """What is seen now; of environments of others, as they said it."""
+        return np.asarray(self._seen, dtype=np.float64).ravel()
 
     @abstractmethod
     def _advance(self, action: Action) -> tuple[float, bool]:
         """Reward, and whether it failed."""
+
+    def _wander(self, often: float = 0.1) -> Action:
+        """Any action, drawn anew so often and held meanwhile."""
+        if self._wanted is None or self.whim.random() < often:
+            self._wanted = self.actions.drawn(self.whim)
+        return self._wanted
 
     def _has_arrived(self) -> bool:
         """Whether a goal was reached, which ends the episode."""
@@ -324,9 +319,6 @@ class CartPole(System):
         self._seen, _ = self._env.reset(seed=int(self.chance.integers(2**31)))
         self._push, self._push_left = 0.0, 0
 
-    def _observation(self) -> Vector:
-        return np.asarray(self._seen, dtype=np.float64)
-
     def _advance(self, action: Action) -> tuple[float, bool]:
         push = self._pushed() if self._gusts else 0.0
         self._env.force_mag = self._force + (1.0 if action == 1 else -1.0) * push
@@ -375,11 +367,6 @@ class Pendulum(System):
             "badpd": lambda z: self._bad_feedback(),
         }
 
-    def _wander(self) -> float:
-        if self.whim.random() < 0.1:
-            self._torque = float(self.whim.uniform(-2.0, 2.0))
-        return self._torque
-
     def _bad_feedback(self) -> float:
         """That of the rate has the wrong sign."""
         angle, rate = self._state
@@ -394,7 +381,7 @@ class Pendulum(System):
     def _begin(self, start: Start) -> None:
         self._env.reset(seed=0)
         self._env.state = self.chance.uniform(-self._FIRST, self._FIRST)
-        self._torque = 0.0
+        self._wanted = 0.0
 
     def _observation(self) -> Vector:
         angle, rate = self._state
@@ -438,11 +425,11 @@ class Tanks(System):
         """Each by itself fails in all but every episode; the last has its sensors exchanged."""
         return {
             "full": lambda z: np.ones(2),
-            "wander": lambda z: self._wander(),
+            "wander": lambda z: self._sets_pumps(),
             "exchanged": lambda z: np.clip(0.5 - 2.0 * (z[1::-1] - self._MIDDLE), 0.0, 1.0),
         }
 
-    def _wander(self) -> Vector:
+    def _sets_pumps(self) -> Vector:
         for pump in range(2):
             if self.whim.random() < 0.05:
                 self._set[pump] = self.whim.uniform()
@@ -626,7 +613,6 @@ class Masa(System):
     # Where the curious one goes: to and fro between places drawn from here, some in the obstacle.
     _PLACES = np.array([[-0.4, 2.0], [0.0, 3.4]])
     _goes_to: Vector
-    _wanted: Action | None
 
     def __init__(self, controller: str | None = None) -> None:
         try:
@@ -644,12 +630,7 @@ class Masa(System):
     @property
     def controllers(self) -> Controllers:
         """Each by itself fails in most episodes."""
-        return {"curious": self._curious, "wander": self._wander}
-
-    def _wander(self, observation: Vector) -> Action:
-        if self._wanted is None or self.whim.random() < 0.1:
-            self._wanted = self.actions.drawn(self.whim)
-        return self._wanted
+        return {"curious": self._curious, "wander": lambda z: self._wander()}
 
     def _curious(self, observation: Vector) -> Action:
         place, speed = observation[:2], observation[2:]
@@ -663,9 +644,6 @@ class Masa(System):
         self._wanted = None
         self._goes_to = self.whim.uniform(*self._PLACES.T)
         self._seen_goal = False
-
-    def _observation(self) -> Vector:
-        return np.asarray(self._seen, dtype=np.float64)
 
     def _advance(self, action: Action) -> tuple[float, bool]:
         space = self._env.action_space
@@ -742,9 +720,6 @@ class Highway(System):
         self._driven = _habits_now()
         self._ended = False
         self._speeds: list[float] = []
-
-    def _observation(self) -> Vector:
-        return np.asarray(self._seen, dtype=np.float64).ravel()
 
     def _advance(self, action: Action) -> tuple[float, bool]:
         _set_habits(self._driven)
@@ -834,26 +809,12 @@ def lacking(name: str) -> str:
 
 
 def make_system(name: str, controller: str | None = None) -> System:
-    """A system by its name.
+    """A system by its name, with its first controller unless another one is named.
 
-    Parameters
-    ----------
-    name : str
-        One of `SYSTEMS`, `TASKS`, `SHAPES` or `PEERS`, a family of scenarios (``emergency+noise``
-        with a switch), or ``module:Name`` of a class derived from `System`, which is looked for in
-        the present folder too.
-    controller : str, optional
-        One of its controllers; without it the first.
+    It is one of `SYSTEMS`, `TASKS`, `SHAPES` or `PEERS`, a family of scenarios (``emergency+noise``
+    with a switch), or ``module:Name`` of a class derived from `System`, which is looked for in the
+    present folder too.
 
-    Raises
-    ------
-    ValueError
-        If there is no such system, or it has no such controller.
-    TypeError
-        If what is named makes no system.
-
-    Examples
-    --------
     >>> system = make_system("acc")
     >>> list(system.controllers), system.interval, system.steps
     (['full throttle'], 0.02, 300)

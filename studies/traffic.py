@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain, product
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -155,13 +155,13 @@ def simulate(
     drivers: str,
     policy: str,
     seed: int,
-    shares: Sequence[str] = ("all",),
+    share: str = "all",
     seconds: float = 180.0,
     **settings: Any,
-) -> list[dict[str, Any]]:
-    """Rows of one simulation: one for each share of cars that is looked at, or guarded.
+) -> dict[str, Any]:
+    """The row of one simulation, of which a share of the cars is looked at, or guarded.
 
-    ``settings`` are those of `attach`. Of shares that are guarded there is one.
+    ``settings`` are those of `attach`.
     """
     import libsumo
 
@@ -175,7 +175,7 @@ def simulate(
             everyone = attach(libsumo, "all", mode="watch")
             mode = "watch" if policy == ALONE else "act"
             given = {**settings, "guard": _formula(policy, libsumo.simulation.getDeltaT())}
-            chosen = {share: attach(libsumo, share, mode=mode, **given) for share in shares}
+            chosen = attach(libsumo, share, mode=mode, **given)
             until = libsumo.simulation.getTime() + seconds
             while (
                 libsumo.simulation.getTime() < until and libsumo.simulation.getMinExpectedNumber()
@@ -183,8 +183,9 @@ def simulate(
                 libsumo.simulationStep()
             libsumo.close()
         emergencies = log.read_text().count("performs emergency braking")
-    told = everyone.summary()
-    row = {
+    told, of_chosen = everyone.summary(), chosen.summary()
+    asked = ("of_guarded", "into_guarded", "decisions", "limited", "revised")
+    return {
         **{"world": world, "drivers": drivers, "policy": policy, "seed": seed, **settings},
         **{name: told[name] for name in ("cars", "collisions", "speed", "jerk")},
         "seconds": told["car_seconds"],
@@ -192,13 +193,9 @@ def simulate(
         "hard": told["hard_brakes"],
         "lost": told["time_lost"] / told["car_seconds"],
         "emergencies": emergencies,
+        "share": share,
+        **{name: of_chosen.get(name) for name in asked},
     }
-    asked = ("of_guarded", "into_guarded", "decisions", "limited", "revised")
-    theirs = {share: one.summary() for share, one in chosen.items()}
-    return [
-        {**row, "share": share, **{name: one.get(name) for name in asked}}
-        for share, one in theirs.items()
-    ]
 
 
 @contextmanager
@@ -282,7 +279,7 @@ class Traffic(Study):
             one = partial(simulate, world, drivers, seed=self.seed + k, seconds=seconds)
             # As many look at it alone as guarded: in `ramp`, who merges first hangs on that.
             for policy, share in product((ALONE, OURS), SHARES):
-                tasks.append(partial(one, policy, shares=(share,)))
+                tasks.append(partial(one, policy, share=share))
             tasks += [partial(one, formula) for formula in FORMULAS]
             if k == 0 and world in {DRIVERS[0]: _HARM, DRIVERS[2]: _RISK}.get(drivers, ()):
                 curve += [partial(one, OURS, regain=regain) for regain in self.regains]
@@ -292,7 +289,7 @@ class Traffic(Study):
             for regain, k in product(self.regains, range(self.seeds))
         ]
         parts = found[: len(tasks)], found[len(tasks) :]
-        rows, points = (frame_of(chain.from_iterable(part)) for part in parts)
+        rows, points = map(frame_of, parts)
         driven = frame_of(lib.parallel(families, workers, "Learning"))
         return {"rows": rows, "curve": points, "cut_in": driven}
 
@@ -312,25 +309,20 @@ class Traffic(Study):
         late: Any = risky.filter(ours & (pl.col("share") == "all"))["collisions"].sum()
         pairs = lib.compared(risky, ours, ["world", "drivers", "share"])
         fewer = pairs.filter(pl.col("collisions") < pl.col("collisions_ours"))
-        return Page(
-            name=self.name,
-            about=_ABOUT if demos() else f"{_ABOUT}\n\n{_SKIPPED}",
-            parts=[
+        return self.shown(
+            _ABOUT if demos() else f"{_ABOUT}\n\n{_SKIPPED}",
+            [
                 Table("Calm traffic", calm, _COLUMNS, mark=mark),
                 Table("Hasty drivers", risky, _COLUMNS, mark=mark),
                 Table("By what is to be regained", curve, _CURVE_COLUMNS),
                 Table("cut_in, held out", lib.with_share(driven, *_RATE), _CUT_IN_COLUMNS),
             ],
-            command=lib.command_line(),
-            targets=frame_of(
-                [
-                    at_most("emergency brakings more than alone in calm traffic", harm[0], 2),
-                    at_least("mean speed against alone in calm traffic", harm[1], 0.995, "{:.3f}"),
-                    at_most("collisions of hasty drivers, all guarded", late, 0),
-                ]
-            ),
+            targets=[
+                at_most("emergency brakings more than alone in calm traffic", harm[0], 2),
+                at_least("mean speed against alone in calm traffic", harm[1], 0.995, "{:.3f}"),
+                at_most("collisions of hasty drivers, all guarded", late, 0),
+            ],
             lost=[Table("Fewer collisions under a formula", fewer, _COLUMNS)],
-            facts=self.facts,
             packages=("libsumo",),
         )
 

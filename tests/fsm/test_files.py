@@ -96,18 +96,6 @@ MACHINES = [
     ("rule", {"name": "novelty", "scales": [1.0]}, "scales"),
 ]
 
-
-@pytest.mark.parametrize(("name", "value", "words"), MACHINES)
-def test_a_machine_that_no_learning_could_have_left_is_refused(
-    grown, forge, tmp_path, name, value, words
-):
-    path = tmp_path / "machine"
-    grown.save(path)
-    forge(path, {name: value})
-    with pytest.raises(ValueError, match=f"{path}.*{words}"):
-        EvolvingFSM.load(path)
-
-
 MODELS = [
     ("visits", -1.0, "visits of -1"),
     ("actions", {"low": -1e308, "high": 0.0, "width": 1e308}, "actions.low of -1e"),
@@ -119,12 +107,15 @@ MODELS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "value", "words"), MODELS)
-def test_a_model_that_no_learning_could_have_left_is_refused(
-    grown, forge, tmp_path, name, value, words
+@pytest.mark.parametrize(
+    ("kind", "name", "value", "words"),
+    [*((EvolvingFSM, *one) for one in MACHINES), *((FSMModel, *one) for one in MODELS)],
+)
+def test_what_no_learning_could_have_left_is_refused(
+    grown, forge, tmp_path, kind, name, value, words
 ):
-    path = tmp_path / "model"
-    full_model(grown).save(path)
+    path = tmp_path / "file"
+    (grown if kind is EvolvingFSM else full_model(grown)).save(path)
     forge(path, {name: value})
     with pytest.raises(ValueError, match=f"{re.escape(str(path))}.*{words}"):
-        FSMModel.load(path)
+        kind.load(path)

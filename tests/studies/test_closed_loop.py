@@ -16,11 +16,6 @@ TINY = ClosedLoop(
     machine_train=10,
     rule_train=4,
     check_test=10,
-    before=10,
-    after=4,
-    shift_test=4,
-    machine_shift_seeds=1,
-    machine_shift_test=2,
 )
 
 

@@ -16,7 +16,6 @@ TINY = Detection(
     since=3,
     seeds=2,
     hours=0.05,
-    long_hours=0.05,
     rounds=5,
     seed_hours=0.02,
     grid=(2.0,),
@@ -75,7 +74,7 @@ def test_what_would_have_come_after_the_end_is_left_out():
 
 
 @pytest.mark.parametrize("name", ["emergency", "emergency+noise"])
-def test_scores_know_nothing_of_what_comes_later_and_ours_tells_dead_ends(name, monkeypatch):
+def test_scores_know_nothing_of_what_comes_later_and_ours_tells_dead_ends(name):
     here = detection.world(name)
     watcher = detection.Watcher(here.watched).watch(here.training(0, 0, 6))
     some = detection.expose(here.family, detection.held_out_draws(here.family, 0), 0.02)
@@ -92,9 +91,6 @@ def test_scores_know_nothing_of_what_comes_later_and_ours_tells_dead_ends(name, 
         np.testing.assert_allclose(score(half), score(some)[rows], atol=1e-12, err_msg=measure)
     truth = some.cases(Danger.DEAD_END).truth
     assert lib.Ranked(scores[OURS](some), truth).areas().auroc > 0.98
-    monkeypatch.setattr(detection, "_estimates", lambda _, one: (one.seen, 0.0 * one.commands))
-    surely = detection._scores(watcher.risk, some)  # without doubt nothing is averaged
-    assert scores[OURS](some) == pytest.approx(np.tanh(surely) if "noise" in name else surely)
 
 
 @pytest.fixture(scope="module")
