@@ -216,9 +216,7 @@ class Course(NamedTuple):
 
     def scored(self, drives: Iterable[Episode]) -> list[Outcome]:
         """Outcomes of the driven draws, against the controller alone."""
-        interval = self.family.interval
-        pairs = zip(self.alone, drives, strict=True)
-        return [outcome_of(driven, alone, interval) for alone, driven in pairs]
+        return [outcome_of(driven, alone) for alone, driven in zip(self.alone, drives, strict=True)]
 
     def by(self, guard: Guard) -> list[Outcome]:
         """What comes of the draws by what a guard has learnt so far."""

@@ -574,9 +574,7 @@ class Cars(System):
     @property
     def score(self) -> float:
         """Mobility."""
-        return outcome_of(
-            self.road.episode(), _alone(self.name, self._start), self.interval
-        ).mobility
+        return outcome_of(self.road.episode(), _alone(self.name, self._start)).mobility
 
 
 def _draw(family: Family, start: Start) -> Draw:

@@ -4,9 +4,10 @@ Rooms are the folders and files at the top of the package; their order stands in
 under ``tool.importlinter``, their budgets under ``tool.house``. It fails where a room imports from
 one above it or uses its private names, where modules import in a circle, where a class name stands
 in three rooms or a private constant's in three modules, where a local is named by a pronoun or a
-participle, and where a room has more lines, files or public names than its budget. With ``--draw``
-the picture in CONTRIBUTING.md is drawn anew; with ``--lower`` budgets fall to what is there and
-2 %, as at each release.
+participle, where what a face offers takes three parameters or more and does not say what they are,
+and where a room has more lines, files or public names than its budget. With ``--draw`` the picture
+in CONTRIBUTING.md is drawn anew; with ``--lower`` budgets fall to what is there and 2 %, as at each
+release.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ PROJECT = ROOT / "pyproject.toml"
 BEGIN, END = "<!-- house: begin -->", "<!-- house: end -->"
 SLACK = 1.02
 
+# Parameters from which on a docstring says what each is.
+_MANY = 3
 # Of named tuples; with an underscore lest they hide a field.
 _PUBLIC = {"_asdict", "_fields", "_make", "_replace"}
 _PRONOUN = re.compile(
@@ -241,6 +244,66 @@ def locals_named(pattern: re.Pattern[str], trees: Trees) -> Iterator[str]:
         yield from (f"{module}, line {line}: {name}" for line, name in sorted(names))
 
 
+def offered(package: Path = PACKAGE) -> set[tuple[str, str]]:
+    """Module and name of what the faces of a package offer; a whole module as that and ``*``."""
+    pairs = set()
+    for face in package.rglob("__init__.pyi"):
+        room = ".".join(face.parent.relative_to(package.parent).parts)
+        for node in ast.walk(ast.parse(face.read_text("utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module is None:
+                pairs |= {(f"{room}.{alias.name}", "*") for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                pairs |= {(f"{room}.{node.module}", alias.name) for alias in node.names}
+    return pairs
+
+
+def unexplained(faces: set[tuple[str, str]], trees: Trees) -> Iterator[str]:
+    """Functions and methods that faces offer, of three parameters or more and no word of them.
+
+    What takes the place of a base's method is explained where that is. Commands are offered by no
+    face: their options have a help.
+    """
+    classes = {name: node for tree in trees.values() for name, node in _public(tree).items()}
+    for module, tree in trees.items():
+        for name, node in _public(tree).items():
+            if not {(module, name), (module, "*")} & faces:
+                continue
+            parts = {name: node} if isinstance(node, ast.FunctionDef) else _public(node)
+            for part, function in parts.items():
+                places = [function, *_of_bases(node, part, classes)]
+                if _n_parameters(function) >= _MANY and not any(map(_explains, places)):
+                    full_name = name if function is node else f"{name}.{part}"
+                    yield f"{module}, line {function.lineno}: {full_name}"
+
+
+def _public(node: ast.AST) -> dict[str, ast.FunctionDef | ast.ClassDef]:
+    """What a module or a class defines, by name; of overloads the last one, which is called."""
+    parts = [p for p in getattr(node, "body", ()) if isinstance(p, ast.FunctionDef | ast.ClassDef)]
+    return {part.name: part for part in parts if not part.name.startswith("_")}
+
+
+def _of_bases(node: ast.AST, method: str, classes: Mapping[str, ast.AST]) -> Iterator[ast.AST]:
+    """The methods of that name in all classes that one is derived from, near or far."""
+    for base in getattr(node, "bases", ()):
+        owner = classes.get(getattr(base, "id", ""))
+        if owner is not None and owner is not node:
+            yield from [part for name, part in _public(owner).items() if name == method]
+            yield from _of_bases(owner, method, classes)
+
+
+def _n_parameters(node: ast.AST) -> int:
+    if not isinstance(node, ast.FunctionDef):
+        return 0
+    every = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+    return sum(parameter.arg not in ("self", "cls") for parameter in every)
+
+
+def _explains(node: ast.AST) -> bool:
+    return isinstance(node, ast.FunctionDef) and "Parameters\n---" in (
+        ast.get_docstring(node) or ""
+    )
+
+
 def imports_past_a_face(trees: Trees) -> Iterator[str]:
     """Imports of studies from within a room: they see what users see."""
     for module, tree in trees.items():
@@ -376,6 +439,7 @@ def main() -> int:
         report("constants' names in three modules", repeated_constants(trees)),
         report("locals named by pronouns", locals_named(_PRONOUN, trees)),
         report("locals named by participles", locals_named(_PARTICIPLE, trees)),
+        report("functions that do not say what they take", unexplained(offered(), trees)),
         report("imports of studies past a face", imports_past_a_face(studies), faults["past"]),
         report("pictures that are out of date", stale),
     ]

@@ -69,7 +69,7 @@ def test_outcomes_compare_with_the_controller_alone():
         until = one.time <= one.time[base.until]
         way = np.trapezoid(one.observations[until, 1], one.time[until])
         assert base.distance == pytest.approx(way, rel=0.01)
-    found = [outcome_of(*pair, EMERGENCY.interval) for pair in zip(same, alone, strict=True)]
+    found = [outcome_of(*pair) for pair in zip(same, alone, strict=True)]
     assert [one.mobility for one in found] == [1.0, 1.0, 1.0]
     assert [one.changed for one in found] == [0, 0, 0]
     learnt = {"learning_seed": 3, "train_episodes": 7, "train_collisions": 2}

@@ -115,22 +115,6 @@ def test_what_was_told_of_failures_before_the_first_observation_holds():
     assert machine.failures_told
 
 
-def test_an_onset_is_counted_in_the_state_before_the_latest_observations():
-    machine = EvolvingFSM(1, rule=Novelty(radius=1.0), max_states=3)
-    machine.observe([0.0])
-    machine.onset()  # nothing came before
-    assert machine.onsets.tolist() == [0.0]
-    machine.observe([4.0])
-    machine.onset()
-    machine.onset()
-    assert machine.onsets.tolist() == [2.0, 0.0]
-    machine.start_episode()
-    for z in ([9.0], [20.0]):  # the latest takes the place of another state
-        machine.observe(z)
-    machine.onset()
-    assert machine.onsets.sum() == 3.0
-
-
 def test_a_question_changes_nothing_and_its_answer_is_the_askers_own(grown, snapshot):
     before = snapshot(grown)
     for name in ("belief", "centers", "visits", "state_ids", "decisions", "transition_matrices"):

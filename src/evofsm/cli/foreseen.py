@@ -97,7 +97,7 @@ def show_foreseen(
     judge.stated = judge.stated if asked[-1] is None else asked[-1]
     runs = judge.runs([e.observations for e in episodes], [e.failed for e in episodes])
     times = np.concatenate([e.times for e in episodes])
-    columns = judge.columns(runs.rows, runs.starts)
+    columns = judge.columns(runs)
     document = {**_document(judge, runs, times, columns), "failures_at_once": at_once}
     if plot is not None:
         _draw(judge, guard.machine, runs, times, document, plot)
@@ -166,7 +166,7 @@ def _listed(
             limits = judge.passed(columns[:, onset])
             row = {"episode": k, "row": onset, "time": times[onset], "failed": right}
             row |= {"lasts": (stop - onset) * judge.dt, "false": int(false)}
-            yield {**row, "reason": judge.reason(rate, runs.rows[onset], limits)}
+            yield {**row, "reason": judge.reason(runs.rows[onset], limits)}
         if not foreseen:
             row = {"episode": k, "row": fails, "time": times[fails]}
             yield {**row, "reason": f"no alarm within {span(horizon * judge.dt)} before it{why}"}

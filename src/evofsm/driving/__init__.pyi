@@ -17,7 +17,6 @@ from .family import training as training
 from .judge import LatentRisk as LatentRisk
 from .judge import assess_states as assess_states
 from .leaders import REAL_DRIVES as REAL_DRIVES
-from .leaders import BrakeWatch as BrakeWatch
 from .leaders import LeaderBrakes as LeaderBrakes
 from .naming import WORDS as WORDS
 from .revisers import AlwaysBrake as AlwaysBrake

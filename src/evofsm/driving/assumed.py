@@ -22,10 +22,8 @@ LEADERS = REAL_DRIVES._replace(counts=(*REAL_DRIVES.counts, *(0,) * 14, 4))
 
 def guard_of_monitor(interval: float, brakes: float, tolerance: float = TOLERANCE) -> Guard:
     """A guard of car following that is given how hard its car brakes, in shadow mode."""
-    judge = _ahead(interval, brakes)
-    return guard_for_cars(
-        -brakes, HIGHEST, interval, judge=judge, tolerance=tolerance, mode=Mode.SHADOW
-    )
+    settings: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW}
+    return guard_for_cars(-brakes, HIGHEST, interval, judge=_ahead(interval, brakes), **settings)
 
 
 def guard_of_traffic(interval: float, brakes: float, tolerance: float = TOLERANCE) -> Guard:

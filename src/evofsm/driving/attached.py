@@ -595,16 +595,12 @@ class Attachment:
     def listen(self) -> None:
         """Have SUMO call `step` after each of its own."""
         base = getattr(self._sumo, "StepListener", None) or import_module("traci").StepListener
-
-        def step(_: Any, __: float) -> bool:
-            return self.step()
-
         if getattr(self._sumo, "__name__", "") == "libsumo":
             # It keeps listeners where a simulation is closed. Whoever attaches anew is not guarded
             # twice, once by what was attached to the one before.
             for stale in [a for a in _ATTACHED if a._sumo is self._sumo and a._is_new()]:
                 stale._listen_no_more()
-        listener = type("Listener", (base,), {"step": step})()
+        listener = type("Listener", (base,), {"step": lambda *_: self.step()})()
         self._listener = self._sumo.addStepListener(listener)
         self._sumo.simulation.setParameter("", self._key, "1")
         _ATTACHED.add(self)

@@ -35,12 +35,8 @@ def idm_kernel(
     now = 0
     while now + 1 < len(phases) and phases[now + 1, 0] <= time:
         now += 1
-    accel = phases[now, 1]
-    desired_speed = phases[now, 2]
-    min_gap = phases[now, 3]
-    time_headway = phases[now, 4]
-    decel = phases[now, 5]
-    exponent = phases[now, 6]
+    accel, desired_speed, min_gap = phases[now, 1], phases[now, 2], phases[now, 3]
+    time_headway, decel, exponent = phases[now, 4], phases[now, 5], phases[now, 6]
     approach_gap = speed * (speed - leader_speed) / (2.0 * math.sqrt(accel * decel))
     desired_gap = min_gap + max(0.0, speed * time_headway + approach_gap)
     # A gap of 0 or less is a collision, beyond the model: brake as hard as the bounds allow.

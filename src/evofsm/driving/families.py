@@ -64,16 +64,14 @@ def _emergency(
     return Scenario(leader, gap, body=Body(-decel, 2.5)), _aggressive(low)
 
 
-def emergency(
-    low: float = -2.5, decel: float = 2.5, leader_decel: float = 4.5, softest: float = 2.5
-) -> Family:
+def emergency(low: float = -2.5, decel: float = 2.5, leader_decel: float = 4.5) -> Family:
     """From rest; the leader brakes to a standstill at a random time, brakes are weak.
 
     ``low`` is the hardest braking that can be commanded [m/s²], ``decel`` what the follower's
-    brakes bring at most; a leader's full brake lies between ``softest`` and ``leader_decel``.
+    brakes bring at most; a leader's full brake lies between 2.5 m/s² and ``leader_decel``.
     Unrevised, 97 % collide, 78 % of the time is a dead end.
     """
-    return _emergency_as(emergency, low, decel, leader_decel, softest)
+    return _emergency_as(emergency, low, decel, leader_decel)
 
 
 def _emergency_as(
@@ -177,15 +175,8 @@ def _ncap(numbers: Numbers) -> tuple[Scenario, IDM]:
 
 
 # Speeds of both cars [m/s], and the time headways [s] that the regulation allows at them.
-_R157 = {
-    "7.2 km/h": (2.0000, 1.0),
-    "10 km/h": (2.7778, 1.1),
-    "20 km/h": (5.5556, 1.2),
-    "30 km/h": (8.3333, 1.3),
-    "40 km/h": (11.1111, 1.4),
-    "50 km/h": (13.8889, 1.5),
-    "60 km/h": (16.6667, 1.6),
-}
+_HEADWAYS = {7.2: 1.0, 10: 1.1, 20: 1.2, 30: 1.3, 40: 1.4, 50: 1.5, 60: 1.6}
+_R157 = {f"{v:g} km/h": (round(v / 3.6, 4), headway) for v, headway in _HEADWAYS.items()}
 
 
 def _r157(numbers: Numbers) -> tuple[Scenario, IDM]:

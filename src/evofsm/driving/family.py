@@ -67,7 +67,15 @@ class Numbers:
         self._key = [SPLITS.index(split), int(seed), int(index)]
 
     def between(self, place: str, low: float, high: float) -> float:
-        """A number from a range, evenly distributed."""
+        """A number from a range, evenly distributed.
+
+        Parameters
+        ----------
+        place : str
+            What it is for, such as ``"scenario.initial_gap"``.
+        low, high : float
+            Ends of the range.
+        """
         return float(self._stream(place).uniform(low, high))
 
     def below(self, place: str, n: int) -> int:
@@ -157,8 +165,12 @@ class Family:
     def draw(self, seed: int, index: int, split: str = "train") -> Draw:
         """One scenario: always the same for the same arguments.
 
-        Each pair of ``seed`` and ``index``, from 0, is another draw; draws of the splits
-        ``"train"`` and ``"test"`` never are the same.
+        Parameters
+        ----------
+        seed, index : int
+            From 0; each pair is another draw.
+        split : {"train", "test"}
+            Draws of one are never those of the other.
         """
         numbers = Numbers(seed, index, split)
         return self.draw_by(numbers, index % self.cases if self.cases > 1 else None)
@@ -224,13 +236,28 @@ def read_family(path: str | Path, switches: Iterable[str] = ()) -> Family:
 def training(
     family: Family, seed: int, learning_seed: int, episodes: int, first: int = 0
 ) -> Iterator[Draw]:
-    """Draws to learn from, other ones for every learning seed."""
+    """Draws to learn from, other ones for every learning seed.
+
+    Parameters
+    ----------
+    family : Family
+    seed, learning_seed : int
+        Of the draws; the second is from 0 to 999.
+    episodes, first : int
+        How many, and the index of the first.
+    """
     for index in range(first, first + episodes):
         yield family.draw(seed * 1000 + learning_seed, index, split="train")
 
 
 def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
-    """Draws that nothing learns from."""
+    """Draws that nothing learns from.
+
+    Parameters
+    ----------
+    family, seed, episodes
+        As in `training`.
+    """
     return [family.draw(seed, index, split="test") for index in range(episodes)]
 
 

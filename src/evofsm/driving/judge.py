@@ -40,7 +40,7 @@ from evofsm.fsm.sharing import Retraced, Rollback, step
 from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import Action, nearest_bounds
-from evofsm.guard.api import Trial
+from evofsm.guard.api import LearningJudge, Trial
 from evofsm.store import COUNT, FLAG, LARGEST_OBSERVATION, SIZE, SMALLEST, Kind, Numbers, Place
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def _refuse_other_brakes(dt: float, arrays: Mapping[str, NDArray[Any]]) -> None:
     short.refuse_others("doubts_shortfalls", arrays["doubts_shortfalls"])
 
 
-class LatentRisk(Retraced):
+class LatentRisk(Retraced, LearningJudge):
     """Learns online what an action leads to if the leader brakes and one is cautious from then on.
 
     Parameters
@@ -173,9 +173,13 @@ class LatentRisk(Retraced):
     ) -> Self:
         """Given the limits instead of learning them: the best that could be learnt.
 
-        ``decel`` and ``leader_decel`` are the hardest braking of the follower and of leaders
-        [m/s²], positive; with a table of ``leaders``, not each is taken to be the hardest. Other
-        ``settings`` are those of the class.
+        Parameters
+        ----------
+        lowest, dt, **settings
+            As in the class.
+        decel, leader_decel : float
+            The hardest braking of the follower and of leaders [m/s²], positive; with a table of
+            ``leaders``, not each is taken to be the hardest.
         """
         risk = cls(lowest, dt, leader_decel=leader_decel, **settings)
         risk.brakes.trust(positive("decel", decel))
@@ -184,20 +188,15 @@ class LatentRisk(Retraced):
     # -- Learning -------------------------------------------------------------------------------
 
     def learn(
-        self,
-        observation: ArrayLike,
-        acceleration: float,
-        belief: ArrayLike = (1.0,),
-        *,
-        watched: bool = False,
+        self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
     ) -> None:
         """Take in an observation and the acceleration commanded after it [m/s²].
 
         Where one of gap [m] and both speeds [m/s] is NaN nothing is learnt, and what is under way
         is not gone on with; a TypeError or ValueError leaves what was learnt as it was. It learns
-        alike in all states, whatever the ``belief``. ``watched`` is as `watch` says.
+        alike in all states, whatever the ``belief``.
         """
-        self._take_in(observation, acceleration, learn=True, watched=watched)
+        self._take_in(observation, acceleration, learn=True)
 
     def watch(
         self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
@@ -206,7 +205,7 @@ class LatentRisk(Retraced):
 
         Hard braking shows what the brakes can do; ordinary braking not what they cannot.
         """
-        self.learn(observation, acceleration, watched=True)
+        self._take_in(observation, acceleration, learn=True, watched=True)
 
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
         """Keep up with what happens, as `learn`, without learning from it."""
@@ -341,10 +340,10 @@ class LatentRisk(Retraced):
         here = self._cautious(situation.observation)
         if not is_whole(here):
             return None
-        foreseen = self.foreseen(here, self._leader_braking(situation), options, tolerances[-1])
+        foreseen = self._foreseen(here, self._leader_braking(situation), options, tolerances[-1])
         return in_proportion(options, judged.risk, tolerances, self.comfort, *foreseen)
 
-    def foreseen(
+    def _foreseen(
         self,
         observation: Three,
         braking: float,
@@ -398,18 +397,14 @@ class LatentRisk(Retraced):
         triple = _three_finite(observation, whole=False)
         return self.perception.estimate(triple, self._expected, sure=self.brakes.known)
 
-    def critical(
-        self, observation: ArrayLike, accelerations: ArrayLike, margin: float | None = None
-    ) -> NDArray[np.float64]:
+    def critical(self, observation: ArrayLike, accelerations: ArrayLike) -> NDArray[np.float64]:
         """(k,) ndarray: hardest braking of the leader, from now on, that is survived [m/s²].
 
-        0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where none is. Another
-        ``margin`` may be asked for [m].
+        0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where none is.
         """
         triple, actions = _three_finite(observation), _finite("accelerations", accelerations)
-        body = self.body if margin is None else self.body._replace(margin=margin)
         critical = np.empty(len(actions))
-        critical_decelerations(triple, actions, self._commands[1], body, self.dt, critical)
+        critical_decelerations(triple, actions, self._commands[1], self.body, self.dt, critical)
         return critical
 
     @property
@@ -417,18 +412,18 @@ class LatentRisk(Retraced):
         """What the follower is able to do, as far as was learnt."""
         return Body(self.brakes.decel, self.brakes.lag, self.margin)
 
-    def score(
-        self, observations: NDArray[np.float64], dt: float = 0.25, tolerance: float = TOLERANCE
-    ) -> NDArray[np.float64]:
+    def score(self, observations: NDArray[np.float64], dt: float = 0.25) -> NDArray[np.float64]:
         """How surely each row is a dead end if the leader brakes now, as a `RiskMeasure` [m/s²].
 
         By how much the hardest braking of a leader that is survived by braking in full now falls
-        short of the one that leaders exceed with a probability of ``tolerance``. No margin is kept:
-        a dead end is a collision, however small the gap that is left.
+        short of the one that 2 % of leaders exceed. No margin is kept: a dead end is a collision,
+        however small the gap that is left.
         """
-        rows = np.asarray(observations, dtype=np.float64)
-        critical = [self.critical(row, [self.lowest], margin=0.0)[0] for row in rows]
-        return self.manoeuvres.exceeded_by(tolerance) - np.array(critical)
+        rows, critical = np.asarray(observations, np.float64), np.empty((len(observations), 1))
+        settings = np.array([self.lowest]), self._commands[1], self.body._replace(margin=0.0)
+        for row, outcome in zip(rows, critical, strict=True):
+            critical_decelerations(_three_finite(row), *settings, self.dt, outcome)
+        return self.manoeuvres.exceeded_by(TOLERANCE) - critical[:, 0]
 
     def in_c99(self, reviser: ActionReviser) -> Part:
         """What it decides by, frozen, for `evofsm.guard.export`."""
@@ -484,8 +479,7 @@ class LatentRisk(Retraced):
 
     @property
     def _settings(self) -> dict[str, float]:
-        names = ("lowest", "dt", "leader_decel", "own_brakes", "margin", "comfort", "regain")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in _RISK.settings}
 
     def _learnt(self) -> dict[str, NDArray[np.float64]]:
         return {

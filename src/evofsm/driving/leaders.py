@@ -59,7 +59,15 @@ class LeaderBrakes(NamedTuple):
 
     @classmethod
     def counted(cls, decels: Sequence[float], gentle: int, hours: float, source: str) -> Self:
-        """Count decelerations of at least 2.5 m/s²."""
+        """Count decelerations of at least 2.5 m/s².
+
+        Parameters
+        ----------
+        decels : sequence of float
+            Hard ones [m/s²], in any order.
+        gentle, hours, source
+            As in the class.
+        """
         bins = [int((decel - _HARD) / _BIN_WIDTH) for decel in decels]
         counts = np.bincount(np.array(bins, dtype=np.int64)).tolist()
         return cls(_HARD, tuple(counts), gentle, positive("hours", hours), source)

@@ -239,11 +239,9 @@ class ResponsibilitySensitiveSafety(_Measure):
         return cls(response=0.75, accel=3.0, decel=6.0, leader_decel=6.0)
 
     @classmethod
-    def matched(
-        cls, decel: float, leader_decel: float, response: float = 0.25, accel: float = 2.5
-    ) -> Self:
-        """Given what both cars can truly do [m/s²]; responding at the next decision [s]."""
-        return cls(response, accel, decel, leader_decel)
+    def matched(cls, decel: float, leader_decel: float) -> Self:
+        """Given what both cars can truly do [m/s²]; responding at the next decision, in 0.25 s."""
+        return cls(0.25, 2.5, decel, leader_decel)
 
     def score(self, observations: Floats, dt: float) -> Floats:
         """Safe distance − gap [m]; infinite where the cars have met."""
@@ -417,6 +415,13 @@ def is_dead_end(observations: Floats, decel: float, leader_decel: float) -> NDAr
     """Whether the cars collide if both brake in full from now until standstill.
 
     Only a simulation knows both limits. It scores what was learnt; nothing learns from it.
+
+    Parameters
+    ----------
+    observations : (..., 3) ndarray
+        As in all of these.
+    decel, leader_decel : float
+        The hardest braking of the follower and of the leader [m/s²], positive.
 
     Examples
     --------

@@ -60,15 +60,12 @@ class EnvelopeReviser:
         action, remark = make_usable(proposal, self.actions, self.fallback)
         self._seen = [*self._seen[-1:], situation.observation.copy()]
         danger = float(self.measure.score(np.array(self._seen), self.dt)[-1])
-        if math.isnan(danger):
-            return unjudged_revision(
-                self.actions.low, proposal, unseen_text(situation, VARIABLES) or "danger unknown"
-            )
         if danger <= 0.0:
             return unjudged_revision(action, proposal, remark or "measure calls for nothing")
-        return unjudged_revision(
-            self.actions.low, proposal, remark or f"measure calls for it: {danger:.3g}"
-        )
+        reason = remark or f"measure calls for it: {danger:.3g}"
+        if math.isnan(danger):
+            reason = unseen_text(situation, VARIABLES) or "danger unknown"
+        return unjudged_revision(self.actions.low, proposal, reason)
 
     def described(self) -> dict[str, Any] | None:
         """What it takes to make it again; None where its measure is someone's own."""

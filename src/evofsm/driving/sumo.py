@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from evofsm.driving.scenarios import Scenario
 from evofsm.driving.world import (
@@ -62,7 +62,7 @@ _ROUTES = f"""<routes>
 """
 
 
-class SumoWorld(World):
+class SumoWorld(World, AbstractContextManager["SumoWorld"]):
     """The world that is SUMO itself. Close it after use, or use it in a ``with`` statement.
 
     Parameters
@@ -101,9 +101,6 @@ class SumoWorld(World):
                 self._sumo.close()
             self._folder.cleanup()
             self._folder = None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

@@ -246,7 +246,7 @@ class TrafficRisk(ActionJudge):
                 limit = min(limit, self._survived(pair))
                 continue
             pair_arguments = pair[2:5], pair.braking, options, tolerances[-1]
-            two = self.ahead.foreseen(*pair_arguments, hardest=-float(options.min()))
+            two = self.ahead._foreseen(*pair_arguments, hardest=-float(options.min()))
             avoids, regains = avoids & two[0], regains & two[1]
         avoids &= options <= options[0]
         bearable = options >= -limit
@@ -313,14 +313,6 @@ def guard_for_traffic(
     tolerance : float
         Highest risk that is accepted, in (0, 1).
     mode : Mode
-
-    Examples
-    --------
-    >>> from evofsm.driving import Object, Scene
-    >>> guard = guard_for_traffic(low=-9.0, high=2.6, decel=4.5, interval=0.1)
-    >>> alone = Scene(Object("me", 0.0, 0.0, 14.0))
-    >>> guard.decide(alone.rows(most=4), proposal=1.0).executed
-    1.0
     """
     judge = judge or TrafficRisk(LatentRisk.given(-decel, decel, LEADER_DECEL, interval))
     actions = IntervalActions(low, high, _INTERVAL_WIDTH, outside="clip")

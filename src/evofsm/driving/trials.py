@@ -51,16 +51,11 @@ def drive(
 
     Examples
     --------
-    >>> from evofsm.driving import IDM, Leader, Scenario, Unrevised, guard_for_cars
-    >>> guard = guard_for_cars(low=-2.5, high=2.5)
-    >>> hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
-    >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
-    >>> scenario = Scenario(leader, initial_gap=10.0)
-    >>> alone = Guard.of(Unrevised(guard.actions), interval=0.25)
-    >>> drive(alone, scenario, controller=hasty).collided
-    True
-    >>> drive(guard, scenario, controller=hasty).collided
-    False
+    >>> from evofsm.driving import guard_for_family, load_family
+    >>> family = load_family("emergency")
+    >>> draw = family.draw(seed=0, index=0)
+    >>> [drive(make(family), draw).collided for make in (unrevised_guard, guard_for_family)]
+    [True, False]
     """
     scenario = what.scenario if isinstance(what, Draw) else what
     if controller is None and isinstance(what, Draw):
@@ -89,6 +84,7 @@ class Reference(NamedTuple):
 
     distance: float  #: [m]
     until: int  #: row of the leader's brake, or of the run's end
+    interval: float  #: time between decisions [s]
 
 
 class Outcome(NamedTuple):
@@ -110,19 +106,25 @@ def unrevised_guard(family: Family) -> Guard:
 
 
 def reference_of(family: Family, draw: Draw, world: World | None = None) -> Reference:
-    """How far the controller comes by itself in a draw, up to the leader's full brake."""
+    """How far the controller comes by itself in a draw, up to the leader's full brake.
+
+    Parameters
+    ----------
+    family, draw, world
+        Of whom, where, and in which world, as in `drive`.
+    """
     alone = drive(unrevised_guard(family), draw, world)
     brake = -draw.scenario.leader.brake_decel
     braking = np.flatnonzero(alone.record[:, LEADER_ACCELERATION] == brake)
     until = int(braking[0]) if len(braking) else len(alone.time) - 1
-    return Reference(_distance(alone, until), until)
+    return Reference(_distance(alone, until), until, family.interval)
 
 
-def outcome_of(episode: Episode, unrevised: Reference, interval: float) -> Outcome:
+def outcome_of(episode: Episode, unrevised: Reference) -> Outcome:
     """What came of an episode, against the unrevised controller in the same draw."""
     change = np.abs(episode.executed - episode.proposed)
     accelerations = [d.realised for d in episode.decisions if math.isfinite(d.realised)]
-    jerk = np.diff(accelerations) / interval
+    jerk = np.diff(accelerations) / unrevised.interval
     return Outcome(
         episode.collided,
         episode.rear_ended,
@@ -161,8 +163,15 @@ def try_out(
 ) -> list[Outcome]:
     """What comes of draws under a frozen copy of a guard, against the controller alone.
 
-    The copy has no machine: the same is decided, and nothing is recognised. Without the references
-    ``alone`` of these draws the controller is driven alone first.
+    The copy has no machine: the same is decided, and nothing is recognised.
+
+    Parameters
+    ----------
+    guard : Guard
+    family : Family
+    draws : sequence of Draw
+    alone : sequence of Reference, optional
+        `reference_of` each draw; without them the controller is driven alone first.
 
     Examples
     --------
@@ -175,10 +184,7 @@ def try_out(
     frozen = guard.copy(states=False)
     frozen.freeze()
     alone = alone or [reference_of(family, draw) for draw in draws]
-    return [
-        outcome_of(episode, base, family.interval)
-        for base, episode in zip(alone, teach(frozen, draws), strict=True)
-    ]
+    return [outcome_of(*pair) for pair in zip(teach(frozen, draws), alone, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -197,7 +203,7 @@ class Trial:
         draw = self.family.draw(self.seed, number, split=self.split)
         alone = reference_of(self.family, draw, world)
         episode = drive(self.guard, draw, world)
-        outcome = outcome_of(episode, alone, self.family.interval)
+        outcome = outcome_of(episode, alone)
         tolerance = getattr(self.guard.reviser, "tolerance", TOLERANCE)
         return episode, {
             "episode": number,
@@ -261,9 +267,17 @@ def summarise(
     interval: float,
     **learning: Any,
 ) -> Row:
-    """One line for the outcomes of a policy, deciding every ``interval`` [s].
+    """One line for the outcomes of a policy.
 
-    How it learnt is told by fields of `Row`: ``train_episodes`` and others.
+    Parameters
+    ----------
+    family, policy, group : str
+        What stands in the line; a group is such as ``"learnt"``.
+    outcomes : sequence of Outcome
+    interval : float
+        Time between two decisions [s].
+    **learning
+        Fields of `Row` that say how it learnt: ``train_episodes`` and others.
     """
     with needs("scipy", "study", "the interval of a share"):
         from scipy.stats import binomtest

@@ -225,7 +225,10 @@ class Road:
         self.every = 1  #: steps from one decision to the next, for `step`
         self._plan = Plan.of(scenario)
         self._record = np.zeros((len(self._plan.times), len(RUN_COLUMNS)))
-        self._noise = _noise(scenario, len(self._record))
+        sensors, size = scenario.sensors, (len(self._record), 3)
+        deviation = np.array([sensors.gap_noise, sensors.speed_noise, sensors.speed_noise])
+        noise = np.random.default_rng(sensors.seed)  # what the sensors add
+        self._noise = noise.normal(scale=deviation, size=size) if deviation.any() else None
         self._delay = scenario.steps(scenario.sensors.delay)
         behind, start = scenario.behind, self._record[0]
         start[GAP], start[GAP_BEHIND] = scenario.initial_gap, behind.gap if behind else math.inf
@@ -321,30 +324,11 @@ class World(ABC):
             return road.episode()
 
 
-def _noise(scenario: Scenario, rows: int) -> NDArray[np.float64] | None:
-    """(rows, 3) what the sensors add; None for nothing."""
-    sensors = scenario.sensors
-    if sensors.gap_noise == 0.0 and sensors.speed_noise == 0.0:
-        return None
-    deviation = np.array([sensors.gap_noise, sensors.speed_noise, sensors.speed_noise])
-    return np.random.default_rng(sensors.seed).normal(scale=deviation, size=(rows, 3))
-
-
 # -- In closed form -------------------------------------------------------------------------------
 
 
 class KinematicWorld(World):
-    """The closed-form world: points on a line, by SUMO's ballistic update.
-
-    Examples
-    --------
-    >>> from evofsm.driving import IDM, Leader, Scenario
-    >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=9.0, brake_speed=24.2)
-    >>> hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
-    >>> episode = KinematicWorld().run(Scenario(leader, initial_gap=5.0), hasty)
-    >>> episode.collided, round(float(episode.time[-1]), 2)
-    (True, 31.49)
-    """
+    """The closed-form world: points on a line, by SUMO's ballistic update."""
 
     def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
         """Put the cars on a road, for use in a ``with`` statement."""

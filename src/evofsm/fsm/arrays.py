@@ -42,7 +42,6 @@ NOW = np.dtype(
         ("action", np.int64),  # after the latest observation, or NO_ACTION
         ("chained", np.int64),  # 1: `belief` is of the present episode
         ("state", np.int64),  # the most probable one at the latest observation
-        ("before", np.int64),  # at the one before it; -1 where none is left
         ("clock", np.int64),  # observations so far, with those that lacked something
         ("began", np.int64),  # the clock at the present episode's first observation
         ("n_observations", np.int64),
@@ -51,8 +50,8 @@ NOW = np.dtype(
     ]
 )
 #: Counts of each state, which add up where two states become one; and their rows.
-SUMS: tuple[str, ...] = ("visits", "endings", "episodes", "failed_soon", "onsets")
-VISITS, ENDINGS, EPISODES, FAILED_SOON, ONSETS = range(len(SUMS))
+SUMS: tuple[str, ...] = ("visits", "endings", "episodes", "failed_soon")
+VISITS, ENDINGS, EPISODES, FAILED_SOON = range(len(SUMS))
 #: Counts of each state by action.
 OF_ACTIONS = ("decisions", "failures", "tried", "failed_after")
 #: Of a state: the number of its creation (from 0) and of the observation that created it (from 1),
@@ -123,7 +122,6 @@ def blank(m: int, q: int, capacity: int, places: int) -> Learnt:
         records((places, capacity), TRY),
     )
     learnt.now["action"] = NO_ACTION
-    learnt.now["before"] = -1
     learnt.actions["place"] = NOT_OPEN
     return learnt
 
@@ -175,7 +173,6 @@ def _refuse_impossible(learnt: Learnt) -> None:
         ("n_places", range(s, s + 1)),
         ("action", range(NO_ACTION, q)),
         ("state", range(max(n, 1))),
-        ("before", range(-1, n)),
     ):
         if int(now[name]) not in limits:
             raise ValueError(
@@ -254,7 +251,7 @@ MACHINE = Kind(
     "machine",
     {
         **dict.fromkeys(_COUNTERS, COUNT._replace(dtype=np.int64).of(1)),
-        **dict.fromkeys(("action", "before"), _INDEX.of(1)),
+        "action": _INDEX.of(1),
         **dict.fromkeys(("chained", "failures_told"), FLAG._replace(dtype=np.int64).of(1)),
         "scatter": _PRODUCT.of(1),
         **dict.fromkeys(("first", "latest"), _OBSERVED.of("m")),

@@ -109,7 +109,6 @@ def explain(
         _of_place(known, belief, state, labels),
         _of_episodes(here, visits, soon, tally, "" if action is None else labels.action(action)),
         "" if better is None else f"Better after {labels.action(better)}: {after_better}",
-        _of_onsets(known, state, labels),
         "" if is_exact else "States were joined here, so an episode may count twice",
         ""
         if origin is None
@@ -167,13 +166,3 @@ def _of_episodes(here: Tally, visits: int, soon: str, asked: Tally | None, actio
     if not asked.episodes:
         return f"{text}; none of them is known to have tried {action} here"
     return f"{text}, and {asked} after {action}"
-
-
-def _of_onsets(known: Any, state: int, labels: Labels) -> str:
-    if not known.visits[state] or not known.onsets.any():  # or nobody tells of them
-        return ""
-    number, while_there = int(known.onsets[state]), labels.duration(int(known.visits[state]))
-    if not number:
-        return f"No disturbance was noticed to begin here, in {while_there}"
-    times = "once" if number == 1 else f"{number:,} times"
-    return f"A disturbance began here {times} in {while_there}"

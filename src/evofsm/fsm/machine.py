@@ -270,16 +270,6 @@ class EvolvingFSM(Retraced):
 
     @alone
     @step
-    def onset(self) -> None:
-        """Count that something unexpected began in the state before the latest observation's.
-
-        Whoever has a model of how the system moves says so.
-        """
-        if (before := self._learnt.now["before"][0]) >= 0:
-            self._learnt.sums[arrays.ONSETS, before] += 1.0
-
-    @alone
-    @step
     def tell_of_failures(self) -> None:
         """Say that failures are told: an episode that ends without one is known to have had none.
 

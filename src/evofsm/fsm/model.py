@@ -95,7 +95,6 @@ class FSMModel:
     joined: Floats = _BLANK  #: (n,) 1 where states were joined, so that an episode may count twice
     tried: Floats = _BLANK  #: (q, n) episodes that took each action in each state
     failed_after: Floats = _BLANK  #: (q, n) those of `tried` that failed soon after they did
-    onsets: Floats = _BLANK  #: (n,) times that something unexpected began there, as it was told
 
     def __post_init__(self) -> None:
         m, q, n = self.n_variables, self.n_actions, self.n_states

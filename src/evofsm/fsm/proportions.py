@@ -22,7 +22,15 @@ _BISECTIONS = 60
 
 @compiled
 def wilson_bounds(share: float, count: float, quantile: float = _QUANTILE) -> tuple[float, float]:
-    """Interval, by default of 90 %, of a share of ``count`` cases (Wilson 1927)."""
+    """Interval of a share (Wilson 1927).
+
+    Parameters
+    ----------
+    share, count : float
+        The share, in [0, 1], and of how many cases.
+    quantile : float
+        Of a standard normal variable, at the upper end; that of 90 % unless told otherwise.
+    """
     spread = quantile * quantile / count
     centre = (share + 0.5 * spread) / (1.0 + spread)
     reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)

@@ -157,7 +157,6 @@ def _create(
 @inner_kernel
 def _tick(now: Any) -> None:
     now.clock += 1
-    now.before = now.state if now.chained else -1
     now.began = now.began if now.chained else now.clock
 
 

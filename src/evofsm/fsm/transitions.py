@@ -159,7 +159,6 @@ def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> No
         record.failed_after += addition.failed_after
         record.latest_try = max(record.latest_try, addition.latest_try)
     now.state = kept if now.state == given else now.state
-    now.before = kept if now.before == given else now.before
     _forget(learnt, given, n)
     # The latest observation, from centres of which one has moved.
     latest = learnt.variables["latest"]

@@ -110,8 +110,13 @@ class BoxActions:
 
     @cached_property
     def levels(self) -> tuple[int, ...]:
-        """Cells along each component."""
-        return _levels(len(self.low))
+        """Cells along each component, which make few enough in all."""
+        d = len(self.low)
+        if d == 1:
+            return (_LEVELS,)
+        count = max(2, int(_CELLS ** (1.0 / d) + 1e-9))
+        n_components = min(d, int(math.log2(_CELLS)))
+        return (count,) * n_components + (1,) * (d - n_components)
 
     @cached_property
     def n_actions(self) -> int:
@@ -296,12 +301,3 @@ def _finite(name: str, values: Sequence[float]) -> tuple[float, ...]:
     if not np.isfinite(array).all():
         raise ValueError(f"{name} is {tuple(array.tolist())}; it must be finite")
     return tuple(array.tolist())
-
-
-def _levels(dimensions: int) -> tuple[int, ...]:
-    """Cells along each component that make few enough in all."""
-    if dimensions == 1:
-        return (_LEVELS,)
-    count = max(2, int(_CELLS ** (1.0 / dimensions) + 1e-9))
-    n_components = min(dimensions, int(math.log2(_CELLS)))
-    return (count,) * n_components + (1,) * (dimensions - n_components)

@@ -177,8 +177,17 @@ class ActionJudge(Protocol):
     ) -> tuple[int, str] | None:
         """Index of the best option where the first, the proposal, is not tolerable, and why it is.
 
-        None leaves it to the reviser: the closest that is tolerable, else the least risky. Of the
-        ``tolerances`` the first is asked for before the second is.
+        None leaves it to the reviser: the closest that is tolerable, else the least risky.
+
+        Parameters
+        ----------
+        situation : Situation
+        options : (k,) or (k, d) ndarray
+            Actions of the set, the proposal first.
+        judged : Judgement
+            What `judge` said of them.
+        tolerances : (float, float)
+            Highest risks that are accepted; the first is asked for before the second is.
         """
         return None
 
@@ -202,10 +211,19 @@ class SearchingJudge(ActionJudge, Protocol):
     def search(
         self, situation: Situation, wanted: Action, /, *, tolerance: float, revising: bool
     ) -> Search:
-        """The action closest to ``wanted``, one of the set, that is within the tolerance.
+        """The action closest to ``wanted`` that is within the tolerance.
 
-        ``revising`` says that the proposal before, in this episode, was not kept. One of `Choices`
-        takes ``mask`` too, which is given where not all of them are allowed; ``wanted`` is.
+        Parameters
+        ----------
+        situation : Situation
+        wanted : action
+            The proposal, one of the set.
+        tolerance : float
+            Highest risk that is accepted.
+        revising : bool
+            Whether the proposal before, in this episode, was not kept.
+        mask : (n,) ndarray of bool
+            Which of `Choices` are allowed, ``wanted`` among them; only given where not all are.
         """
 
 
@@ -222,10 +240,26 @@ class LearningJudge(ActionJudge, Protocol):
     dt: float  #: time between decisions [s]
 
     def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike, /) -> None:
-        """Take in an observation, recognised as ``belief``, and the action executed after it."""
+        """Take in an observation, and the action executed after it.
+
+        Parameters
+        ----------
+        observation : (m,) array_like
+            In the judge's units; NaN where not seen.
+        action : action
+            One of the set.
+        belief : (n,) array_like
+            Distribution over states, as the machine recognised it.
+        """
 
     def watch(self, observation: ArrayLike, action: Action, belief: ArrayLike, /) -> None:
-        """Learn where someone else acts."""
+        """Learn where someone else acts.
+
+        Parameters
+        ----------
+        observation, action, belief
+            As in `learn`.
+        """
 
     def follow(self, observation: ArrayLike, action: Action, /) -> None:
         """Keep up with what happens, without learning from it."""

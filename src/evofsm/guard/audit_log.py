@@ -35,7 +35,7 @@ from evofsm import store
 from evofsm.fsm.sharing import Rollback
 from evofsm.guard.actions import written
 from evofsm.guard.api import Proposal, Revision, Situation
-from evofsm.guard.guard import Guard
+from evofsm.guard.guard import DecisionLogger, Guard
 from evofsm.guard.loop import Decision
 from evofsm.guard.parts import can_be_made_again, settings_of
 from evofsm.guard.record import RECORD
@@ -250,7 +250,7 @@ def _against(kept: Head, head: Head) -> Finding:
 # -- Logging --------------------------------------------------------------------------------------
 
 
-class AuditLog(AbstractContextManager["AuditLog"]):
+class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
     """Logs what a guard decides, so that nobody can change it unnoticed: ``Guard(..., audit=log)``.
 
     Where the disk fails while driving, the log is broken off there, which is logged, and raised as

@@ -209,10 +209,23 @@ class Foresight(LearningJudge):
         names: Sequence[str] = (),
         units: Sequence[str] = (),
     ) -> Self:
-        """Learn from episodes, (T,) or (T, m) each; failed are those that ended with a failure.
+        """Learn from the episodes of a log.
 
-        ``horizon`` and ``hold`` are in seconds: how long before a failure an alarm is true (by
-        default a twentieth of the median episode), and how long a limit has to be passed.
+        Parameters
+        ----------
+        episodes : sequence of (T,) or (T, m) array_like
+            Rows of each, a column a variable.
+        failed : (E,) array_like
+            Which of them ended with a failure; a ValueError if none.
+        dt : float
+            Time between two rows [s].
+        horizon : float, optional
+            How long before a failure an alarm is right [s]; without it a twentieth of the median
+            episode, 10 rows at least.
+        hold : float
+            How long a limit has to be passed [s].
+        names, units : sequence of str
+            Of the variables.
         """
         if not np.any(failed):
             raise ValueError("no episode failed, so there is nothing to foresee")
@@ -225,7 +238,13 @@ class Foresight(LearningJudge):
     def from_zero(
         cls, *, dt: float, names: Sequence[str], horizon: float | None = None, hold: float = 0.0
     ) -> Self:
-        """One that has seen nothing, and learns as it goes; all as in `learn_log`."""
+        """One that has seen nothing, and learns as it goes.
+
+        Parameters
+        ----------
+        dt, names, horizon, hold
+            As in `learn_log`.
+        """
         tables = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((len(RATES), 4))
         tables[2][:, 3] = _NO_KIND
         keywords: dict[str, Any] = {"log": _nothing(len(names)), "asked": horizon}
@@ -253,7 +272,7 @@ class Foresight(LearningJudge):
             if not (number == k).any() or not log.failed[number != k].any():
                 continue
             judge, rest = fresh._fitted(log.part(number != k)), log.part(number == k)
-            columns = judge.columns(rest.rows, rest.starts)
+            columns = judge.columns(rest)
             for n, z in enumerate((rest.failures, rest.rows)):
                 there[n] += failure.inside(judge.forms, z).any(0).sum(), len(z)
             for side, price in np.ndindex(2, len(_PRICES)):
@@ -292,7 +311,7 @@ class Foresight(LearningJudge):
         survival = failure.Survived(sample, box[:2], box[:-3:-1], unit, rows.std(0), rows[:0])
         forms = failure.explain(FAILS, failed, survival)
         judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
-        columns = judge.columns(log.rows, log.starts)
+        columns = judge.columns(log)
         judge.limits = np.vstack([judge._searched(columns, log, plain=k) for k in (False, True)])
         return judge
 
@@ -349,13 +368,13 @@ class Foresight(LearningJudge):
         """The horizon, how long a limit has to be passed, and how long an alarm stays on [rows]."""
         return np.array([self.horizon, self.hold, max(round(_STAYS * self.horizon), 1)])
 
-    def columns(self, rows: Floats, starts: Ints, memory: Floats | None = None) -> Floats:
+    def columns(self, log: Runs, memory: Floats | None = None) -> Floats:
         """(3 v, T) variables and nearness to forms: now, and as far ahead as `_AHEAD` says."""
-        x = np.vstack([rows.T, -failure.distances(self.forms, rows)])
+        x = np.vstack([log.rows.T, -failure.distances(self.forms, log.rows)])
         memory = np.full((2, len(x)), np.nan) if memory is None else memory
         keeps, ahead = np.exp(-1.0 / (_SMOOTHED * self.horizon)), np.empty((len(_AHEAD), *x.shape))
-        _look_ahead(x, starts, keeps, np.array(_AHEAD) * self.horizon, memory, ahead)
-        columns: Floats = ahead.reshape(-1, len(rows))
+        _look_ahead(x, log.starts, keeps, np.array(_AHEAD) * self.horizon, memory, ahead)
+        columns: Floats = ahead.reshape(-1, len(log.rows))
         return columns
 
     def _passed(self, columns: Floats, limits: Floats, *, soon: bool = False) -> Flags:
@@ -412,7 +431,7 @@ class Foresight(LearningJudge):
             How much sooner than its row each failure came [rows].
         """
         limits = self.of_rate(rate, plain=plain)
-        columns = self.columns(log.rows, log.starts) if columns is None else columns
+        columns = self.columns(log) if columns is None else columns
         above, on = (np.any(self._passed(columns, limits, soon=k), axis=0) for k in (False, True))
         leads = np.zeros(len(log.starts))
         rows = np.flatnonzero(on)
@@ -445,8 +464,10 @@ class Foresight(LearningJudge):
         """(n, 6) the limits that a row passes, of which this is the one of `columns`."""
         return self._limits[self._passed(column[:, None], self._limits)[:, 0]]
 
-    def reason(self, rate: int, z: Floats, passed: Floats) -> str:
-        """Why an alarm is on at an observation (m,), with the limits (n, 6) that are passed."""
+    def reason(self, z: Floats, passed: Floats) -> str:
+        """Why the alarm is on at an observation (m,), with the limits (n, 6) that are passed."""
+        rate = self.alarm
+        assert rate is not None
         right, false, *_ = self.held_out[rate].tolist()
         limits, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
         if len(limits):
@@ -544,7 +565,7 @@ class Foresight(LearningJudge):
         """Which limits are passed, and the state after an observation (m,)."""
         memory, up, down, on = self._now
         memory = np.full((2, len(z) + len(self.forms)), np.nan) if memory is None else memory.copy()
-        columns = self.columns(z[None], np.empty(0, np.int64), memory)
+        columns = self.columns(_nothing(0)._replace(rows=z[None]), memory)
         is_passed, soon = (self._passed(columns, self._limits, soon=k)[:, 0] for k in (False, True))
         rates = (self._limits[flags, _RATE].astype(int) for flags in (is_passed, soon))
         above, near = (np.bincount(rate, minlength=len(up)) > 0 for rate in rates)
@@ -559,7 +580,7 @@ class Foresight(LearningJudge):
         evidence = 0.0 if rate is None else float(self.held_out[rate, :2].sum())
         if rate is not None and on[rate]:
             risk = float(self.shares[rate])
-            reason = self.reason(rate, situation.observation, self._limits[is_passed])
+            reason = self.reason(situation.observation, self._limits[is_passed])
         low, high = wilson_bounds(risk, evidence) if risk else (0.0, 1.0)
         risks, lows, highs, slack = np.array([[risk], [low], [high], [np.nan]])
         judgement = Judgement(risks, lows, highs, slack, evidence)
@@ -575,7 +596,7 @@ class Foresight(LearningJudge):
         """Why it is dangerous."""
         return "an alarm is on"
 
-    def follow(self, observation: ArrayLike, action: Action, belief: ArrayLike = (), /) -> None:
+    def follow(self, observation: ArrayLike, action: Action, /) -> None:
         """Keep up with what happens; it learns from whole logs alone."""
         self._now = self._next(np.asarray(observation, np.float64))[1]
 

@@ -112,12 +112,26 @@ class DecisionLogger(Protocol):
         """An observation came in, at ``time`` [s]."""
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
-        """A decision was made."""
+        """A decision was made.
+
+        Parameters
+        ----------
+        situation, proposal, revision
+            Where the system was, what was proposed there, and what was made of it.
+        """
 
     def ended(
         self, observation: Any, *, failed: bool, terminated: bool, score: float | None
     ) -> None:
-        """The episode ended."""
+        """The episode ended.
+
+        Parameters
+        ----------
+        observation : (m,) ndarray or None
+            The last one, if nothing was decided on it any more.
+        failed, terminated, score
+            As in `Guard.end`.
+        """
 
 
 # Settings that stand in a file as they are.

@@ -79,6 +79,12 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
     A proposal outside an interval is put at its edge; NaN, infinity or an index of no action
     becomes the fallback, and so does one that is not allowed; or else the first that is.
 
+    Parameters
+    ----------
+    proposal : Proposal
+    actions : IntervalActions, Choices or BoxActions
+    fallback : Fallback
+
     Examples
     --------
     >>> from evofsm import IntervalActions

@@ -30,7 +30,7 @@ from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import positive, whole
 from evofsm.guard.actions import Action, Mask
-from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
+from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, SearchingJudge, Situation
 from evofsm.store import COUNT, FLAG, FROM_1, MOST_COUNTED, SIZE, Kind, Numbers, Place
 
 _Floats = NDArray[np.float64]
@@ -94,7 +94,7 @@ _KIND = Kind(
 )
 
 
-class SceneRisk(ActionJudge):
+class SceneRisk(LearningJudge, SearchingJudge):
     """Judges one of a few actions among any number of objects; given only which episodes failed.
 
     The risk of an action is the probability to meet an object within five decisions, if the best

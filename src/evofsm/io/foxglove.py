@@ -24,7 +24,7 @@ from evofsm.driving import Episode
 from evofsm.driving.naming import VARIABLES
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel
-from evofsm.guard import Decision, Guard, Proposal, Revision, Situation
+from evofsm.guard import Decision, DecisionLogger, Guard, Proposal, Revision, Situation
 from evofsm.guard.actions import same_action
 from evofsm.io.runs import (
     FORMAT,
@@ -243,7 +243,7 @@ class RunWriter:
 # -- Live -----------------------------------------------------------------------------------------
 
 
-class FoxgloveSink(AbstractContextManager["FoxgloveSink"]):
+class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
     """Shows what a guard sees and decides: ``guard.audit = FoxgloveSink()``.
 
     Every decision is a message on ``/observation``, ``/belief``, ``/risk`` and ``/decision``; what

@@ -207,7 +207,14 @@ def write_page(path: Path, pages: Sequence[Page], title: str = "", about: str = 
     """Draw all figures and write one file that holds all it shows.
 
     Figures are put into ``figures`` beside it as well, as PNG and SVG; those of each of many pages
-    into a folder of its name. Many pages have a ``title`` and an ``about`` together.
+    into a folder of its name.
+
+    Parameters
+    ----------
+    path : Path
+    pages : sequence of Page
+    title, about : str
+        Of many pages together; of one its own are taken.
 
     Raises
     ------
@@ -257,11 +264,10 @@ def _drawn(page: Page, folder: Path) -> dict[str, str]:
 
 
 def _summary(pages: Sequence[Page]) -> Table:
-    loss_counts = [sum(len(table.frame) for table in page.losses) for page in pages]
     rows = {
         "question": [page.title for page in pages],
         "answer": [page.answer for page in pages],
-        "rows lost": loss_counts,
+        "rows lost": [sum(len(table.frame) for table in page.losses) for page in pages],
     }
     holds = pl.Series([page.holds for page in pages], dtype=pl.Boolean)
     mark = pl.when(holds).then(pl.lit("holds")).when(~holds).then(pl.lit("fails"))

@@ -59,14 +59,13 @@ class Reproduction:
         world = _WORLDS.get(study.world, study.world)
         n_holds = sum(claim.holds for claim in self.claims)
         first, *rest = figures(study)
-        targets = pl.DataFrame(self.claims).select("claim", "paper", "measured", "holds")
         return Page(
             name="paper",
             about=_ABOUT,
             parts=[first, *_tables(study), *rest, _table_of_settings(study.settings)],
             command=command,
             lost=[_table_of_losses(study)],
-            targets=targets,
+            targets=pl.DataFrame(self.claims).select("claim", "paper", "measured", "holds"),
             facts={
                 "world": world,
                 "runs": f"{len(study.runs)}: the four cases, round by round",
@@ -203,13 +202,9 @@ def _table_of_states(study: PaperStudy) -> Table:
     rows = []
     for state, center in enumerate(study.model.centers.tolist()):
         here = states == state
-        row = {
-            "state": state + 1,
-            **dict(zip(VARIABLES, center, strict=True)),
-            "share": float(here.mean()),
-            "dead end": float(hopeless[here].mean()) if here.any() else None,
-            "collisions": ends.count(state),
-        }
+        share = float(hopeless[here].mean()) if here.any() else None
+        row = {"state": state + 1, **dict(zip(VARIABLES, center, strict=True))}
+        row |= {"share": float(here.mean()), "dead end": share, "collisions": ends.count(state)}
         rows.append(row)
     centers = zip(VARIABLES, UNITS, strict=True)
     return Table(

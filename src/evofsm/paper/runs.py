@@ -69,14 +69,10 @@ class Settings:
         Parameters
         ----------
         changes : mapping
-            Tables of ``settings.toml``, with what is changed in them.
+            Tables of ``settings.toml``, with what is changed in them; a ValueError says which name
+            or kind of value is not known.
         where : str
             What they are called in error messages.
-
-        Raises
-        ------
-        ValueError
-            If there is a name or a kind of value that is not known.
 
         Examples
         --------
@@ -220,8 +216,7 @@ def run_paper(
         raise ValueError(f"order is {list(order)}; it must hold each of the cases once")
     machine = EvolvingFSM(settings.actions.n_actions, **settings.machine)
     total = rounds * len(CASES) + len(settings.brake_at) + 2
-    runs: list[Run] = []
-    extra_runs: list[Run] = []
+    runs, extra_runs = list[Run](), list[Run]()
 
     def learn(machine: EvolvingFSM, name: str, case: int, round_: int, scenario: Scenario) -> Run:
         """Drive a run and show it to the machine, row by row."""

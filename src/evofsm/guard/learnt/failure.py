@@ -129,19 +129,10 @@ def nearer(table: Floats, failures: Floats, share: float) -> Floats:
 def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
     """Fit the smallest forms that still hold all failures, to try whether larger ones are true.
 
-    Parameters
-    ----------
-    table : (r, SIZE) ndarray
-    failures : (k, m) ndarray
-    survived : Survived
-
-    Returns
-    -------
-    (s, SIZE) ndarray
-        In place of a bent form ellipses around its failures. In place of a threshold that it
-        *ends* there, and fails only nearer to its failures than to what ended; where nothing ended
-        there, only beyond the innermost failure in another variable in which that is rare among
-        what was survived; and so where a form says that it crashes, as few endings tell little.
+    In place of a bent form ellipses around its failures, of all (k, m). In place of a threshold
+    that it *ends* there, and fails only nearer to its failures than to what ended; where nothing
+    ended there, only beyond the innermost failure in another variable in which that is rare among
+    what was survived; and so where a form says that it crashes, as few endings tell little.
     """
     rows: list[Floats] = []
     # What crashes is told of the ends just before it: others come behind.
@@ -258,27 +249,12 @@ def explain(
     *,
     bends: bool = True,
 ) -> Floats:
-    """Fit the fewest forms that hold what failed, or ended.
+    """Fit the fewest forms (r, SIZE) that hold what failed, or ended (k, m), as it ``says``.
 
-    Parameters
-    ----------
-    says : int
-        What they say.
-    failures : (k, m) ndarray
-    survived : Survived
-        What is to be outside.
-    blur : (m, 2) ndarray, optional
-        Scales by which noise blurs the lowest and the highest that was survived.
-    least : float
-        Sides that some failures are beyond by so much come first [typical steps].
-    bends : bool
-        Whether there may be bent forms.
-
-    Returns
-    -------
-    (r, SIZE) ndarray
-        Sides that explain few may go if bent forms explain the same failures; and all of them, if
-        bent forms alone explain all and are fewer.
+    What was survived is outside; noise may ``blur`` the lowest and the highest of it by scales
+    (m, 2). Sides that some failures are beyond by ``least`` [typical steps] come first. Where forms
+    may be bent (``bends``), sides that explain few may go if bent forms explain the same failures;
+    and all of them, if bent forms alone explain all and are fewer.
     """
     blur = np.zeros((len(survived.unit), 2)) if blur is None else blur
     stay = _sides(says, failures, survived, blur, least)

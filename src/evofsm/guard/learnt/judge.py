@@ -23,7 +23,7 @@ from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import action_name, function, positive, whole
 from evofsm.guard.actions import BoxActions, Mask
-from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
+from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, SearchingJudge, Situation
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import words
 from evofsm.guard.learnt.backups import basis
@@ -97,7 +97,7 @@ class Parts(NamedTuple):
         return cls(model, daring_model, rest, scale, few, n_tried, n_backups, most)
 
 
-class LearntRisk(ActionJudge):
+class LearntRisk(LearningJudge, SearchingJudge):
     """Judges actions by what it has learnt of how the system moves and fails.
 
     It is told neither what variables mean nor how they move. Before the first failure of an episode
@@ -576,7 +576,15 @@ class LearntRisk(ActionJudge):
             self._forget()
 
     def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
-        """Learn from an episode; its last observation was taken in (`observe`)."""
+        """Learn from an episode.
+
+        Parameters
+        ----------
+        observation : (m,) ndarray or None
+            The last one; it was taken in already (`observe`).
+        failed, terminated : bool
+            How it ended, as in `Guard.end`.
+        """
         self.state = self.state._replace(n_failed=self.state.n_failed + int(failed))
         self._study(failed=failed, terminated=terminated and not failed)
         self._forget()

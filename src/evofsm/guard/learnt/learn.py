@@ -36,21 +36,7 @@ _ONSET = 0.5
 
 
 def learn(state: State, episode: Episode, given: Given) -> State:
-    """Learn from an episode, or from a part of a long one.
-
-    Parameters
-    ----------
-    state : State
-        What was known before it.
-    episode : Episode
-    given : Given
-        What need not be learnt alone.
-
-    Returns
-    -------
-    State
-        What is known now.
-    """
+    """Learn from an episode, or from a part of a long one, and from what the user said."""
     decisions, before, settings, without = episode, state, given.settings, given.without
     episode = decisions.every(state.stride)
     random = np.random.default_rng([given.seed, state.n_episodes])

@@ -75,18 +75,9 @@ def solve(
     Bends, products and, last of all, latest changes are asked only if they have to be, else the
     first episodes say that one's own throttle speeds others up.
 
-    Parameters
-    ----------
-    squares : (p, p) ndarray
-        Sums of products of features.
-    products : (p, m) ndarray
-        And of features with changes.
-    noisy : (m,) ndarray
-        Share of a variable's changes that is noise: the less, the less evidence its weights need.
-    a : int
-        How many numbers an action has.
-    prior : tuple of float
-        `LearntSettings.prior`, ``shy`` and ``lags``.
+    Given are sums of products of features (p, p), and of features with changes (p, m); the share of
+    each variable's changes that is noise (m,): the less, the less evidence its weights need; how
+    many numbers an action has; and ``prior``, ``shy`` and ``lags`` of `LearntSettings`.
     """
     n, size, m = max(1.0, float(squares[0, 0])), np.diag(squares), len(noisy)
     variance = np.maximum(size - squares[0] ** 2 / n, _LEAST * size)

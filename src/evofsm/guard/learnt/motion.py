@@ -129,18 +129,9 @@ def misled(
 ) -> State:
     """Ask whether more had been foreseen without lags, where failure did not come as foreseen.
 
-    A feature may help one step ahead, and mislead over many.
-
-    Parameters
-    ----------
-    state : State
-    z : (T + 1, m) ndarray
-    u : (T, a) ndarray
-    starts : (k,) ndarray
-        Steps from which it went on for the whole horizon although nothing seemed to help.
-    settings : LearntSettings
-    failed : bool
-        Whether it failed in the end: then lags are not exonerated.
+    A feature may help one step ahead, and mislead over many. From each step of ``starts`` an
+    episode z (T + 1, m), u (T, a) went on for the whole horizon although nothing seemed to help. If
+    it failed in the end, lags are not exonerated.
     """
     begins = starts[np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))]
     ahead = begins[:, None] + np.arange(-1, state.horizon + 1)
@@ -164,14 +155,7 @@ def misled(
 def told(state: State, known: Model, z: Floats, move: Move, random: Generator) -> State:
     """Learn what a given model says of observations (T + 1, m), each under an action that is drawn.
 
-    Parameters
-    ----------
-    state : State
-    known : Model
-        For its features.
-    z : (T + 1, m) ndarray
-    move : callable
-    random : numpy.random.Generator
+    ``known`` says which features there are.
     """
     latest = np.diff(z, axis=0)
     rows = np.flatnonzero(np.isfinite(latest).all(1))

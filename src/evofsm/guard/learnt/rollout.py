@@ -408,25 +408,12 @@ def rollout(
     scale: float = 1.0,
     plan: Floats | None = None,
 ) -> Ends:
-    """Roll out each of K disturbances from each of S situations.
+    """Roll out each of K disturbances from each of S situations (S, 2m + a).
 
-    Parameters
-    ----------
-    model : Model
-    situations : (S, 2m + a) ndarray
-    policy : (a, 1 + m) ndarray
-        A backup, which is followed after the plan.
-    residuals : (H, m, K) or (H, 2m, K) ndarray
-        Of each disturbance; number 0 is none at all. Then where variables land that jump, else inf.
-    scale : float
-        How much harder than they were disturbances are taken to be.
-    plan : (T, a) ndarray, optional
-        Actions that are taken first.
-
-    Returns
-    -------
-    Ends
-        A rollout ends where it fails or, survived, where the system ends by itself.
+    After a plan (T, a) a backup is followed, the policy (a, 1 + m). Disturbances, number 0 of which
+    is none at all, have residuals (H, m, K), or (H, 2m, K), where the rest is where variables land
+    that jump, else inf; they are taken to be ``scale`` times as hard as they were. A rollout ends
+    where it fails or, survived, where the system ends by itself.
     """
     count = len(situations) * residuals.shape[2]
     ends = Ends(np.empty(count), np.empty(count))

@@ -280,13 +280,8 @@ def _spread(state: State) -> Floats:
 def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) -> Floats:
     """(r, 13) forms as rollouts take them (`failure.prepared`).
 
-    Parameters
-    ----------
-    state : State
-    settings : LearntSettings
-    daring : bool
-        Whether rivals of what is doubted are tried, and it comes closer to where it crashes: so
-        while it learns.
+    Where they are ``daring``, as while it learns, rivals of what is doubted are tried, and it comes
+    closer to where it crashes.
     """
     table = state.forms
     if daring:
@@ -391,10 +386,7 @@ def unpacked(
 ) -> State:
     """Make a state of what `packed` gave.
 
-    Raises
-    ------
-    ValueError
-        If sizes or indices contradict each other, or the actions: kernels take them on trust.
+    A ValueError if sizes or indices contradict each other, or the actions: kernels trust them.
     """
     fields: dict[str, Any] = {**numbers, **{name: arrays[name] for name in _ARRAYS}}
     state = State(**fields)
