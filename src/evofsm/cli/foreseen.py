@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 # Less than the share of alarms of any kind that are right: which alarm it is the judge says.
 _ANY_ALARM = 1e-6
+# From here on no year has four digits [s].
+_NO_DATE = 253_402_300_799.0
 # Alarms that are listed.
 _LISTED = 12
 _CAME = ("ahead", "false/day")
@@ -235,12 +237,12 @@ def _last(hits: Sequence[Any], what: str) -> str:
     return f"\n{what}: {'all' if n <= _LISTED else f'the last {_LISTED} of'} {n:,}"
 
 
-def date(time: float) -> str:
-    """A time [s], as people read it."""
-    if time < DATES:
-        return f"{time:.10g}"
-    text = f"{datetime.fromtimestamp(round(time), UTC):%Y-%m-%d %H:%M:%S}"
-    return text.removesuffix(":00")
+def date(time: float, unit: str = "") -> str:
+    """A time [s], as people read it; with its unit, where it is no date."""
+    if not DATES <= time < _NO_DATE:
+        return f"{time:.13g}{unit}"
+    text = f"{datetime.fromtimestamp(round(time, 3), UTC):%Y-%m-%d %H:%M:%S.%f}"
+    return text[:-3].removesuffix(".000").removesuffix(":00")
 
 
 def _draw(
