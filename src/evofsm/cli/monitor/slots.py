@@ -181,18 +181,19 @@ class CsvRows:
                 raise MessageError("line", fault)
             return
         above, self._above = self._above, Dialect(text, ()).columns
-        folded = {name.casefold() for name in self._above}
+        needs, lower_case = ([x.casefold() for x in xs] for xs in (self._needs, self._above))
         if not (is_row := _begins_row(self._above)):  # it may name the columns itself
-            above = self._above if any(name.casefold() in folded for name in self._needs) else ()
+            above = self._above if {*needs} & {*lower_case} else ()
         omissions = [name for name in self._needs if name not in above]
         if len(above) < 2 or len(above) != len(self._above) or not omissions:
             return
         about, self.unread, self._n_unread = "line", NO_ROW, int(is_row)
         if not _begins_row(above):
-            about, folded = omissions[0], {name.casefold() for name in omissions}
-            fault = ", nor is ".join([f"{about} is no column", *omissions[1:]])
-            near = ", ".join(name for name in above if name.casefold() in folded)
-            self.unread = f"{fault}; there are {', '.join(above)}" + f" ({near}? case counts)" * bool(near)
+            about, *others = omissions
+            fault = ", nor is ".join([f"{about} is no column", *others])
+            near = ", ".join(x for x in above if x not in self._needs and x.casefold() in needs)
+            near = f" ({near}? case counts)" if near else ""
+            self.unread = f"{fault}; there are {', '.join(above)}{near}"
         raise MessageError(about, self.unread.removeprefix(f"{about} "))
 
     def _has_units(self, text: str) -> bool:
