@@ -219,11 +219,8 @@ def _tables(
     title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
     yield table(title, _HEADER, rows, bold=bold)
     yield from alarms_of(judge, units, worse)
-    if fails := found["fails"]:
-        rows = [
-            [in_units(x["where"], judge, units), f"{x['came']:,}", f"{x['failed']:,}"]
-            for x in fails
-        ]
+    if rows := [[x["where"], f"{x['came']:,}", f"{x['failed']:,}"] for x in found["fails"]]:
+        rows = [[in_units(where, judge, units), *counts] for where, *counts in rows]
         header = "it fails where", "judged episodes that came there", "of them failed"
         yield table("\nWhere it fails, as it was learnt", header, rows)
     rows = []
@@ -249,21 +246,16 @@ def alarms_of(
     for rates, rate in judge.alarms.items():
         plain = "" if rate in worse or judge.is_plain(rate) else judge.words(rate, plain=True)
         beside = f"; plain thresholds would be {plain}" * bool(plain)
-        text = judge.of(rate) if _validated(judge) else why_none(judge)
+        text = why_none(judge) if judge.held_out[0, 2] == 1.0 else judge.of(rate)
         places.append((rates, in_units(f"{text}{beside}", judge, units)))
     yield facts("\nWhere they alarm, by false alarms a day", places)
 
 
 def why_none(judge: Foresight) -> str:
     """Why there is no alarm."""
-    if _validated(judge):
-        return "cross-validated, no alarm was better than chance"
-    return "with one failure nothing can be cross-validated"
-
-
-def _validated(judge: Foresight) -> bool:
-    """Whether there were failures to learn from, and others to judge by."""
-    return bool(judge.held_out[0, 2] != 1.0)
+    one = "with one failure nothing can be cross-validated"
+    several = "cross-validated, no alarm was better than chance"
+    return one if judge.held_out[0, 2] == 1.0 else several
 
 
 def in_units(text: str, judge: Foresight, units: Mapping[str, str]) -> str:

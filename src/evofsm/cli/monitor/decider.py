@@ -380,14 +380,10 @@ def _begins_anew(told: Message, before: Message | None, latest: Message | None) 
 
 def _refuse_stale(row: Row, latest: Row) -> None:
     """Raise if it is no newer than the latest one, unless its sender began anew."""
-    here, there = date(row.time, " s"), date(latest.time, " s")
-    if row.time == latest.time:
-        fault = f"{here} was decided on before, with other values"
-    elif latest.time - _LATE <= row.time < latest.time:
-        fault = f"{here} comes after {there}: late rows are left out"
-    else:
-        return
-    raise MessageError("time", fault, row.time)
+    if latest.time - _LATE <= row.time <= latest.time:
+        text = f"comes after {date(latest.time, ' s')}: late rows are left out"
+        text = text if row.time < latest.time else "was decided on before, with other values"
+        raise MessageError("time", f"{date(row.time, ' s')} {text}", row.time)
 
 
 def _accelerating(row: Row, before: Row | None) -> NDArray[np.float64]:
