@@ -92,8 +92,8 @@ def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, wri
     asked = [word for name in READ if name in asked for word in (name, asked[name])]
     summed = evofsm("monitor", path, "--summary", "--guard", "guard.evofsm", *asked)
     assert " 7 of 7 " in summed.stdout
-    unit = r"\s+mm/s" * (form == "units")
-    limit = re.search(rf"{VIBRATION}\s+above\s+([0-9.]+){unit}\s", summed.stdout)
+    limit = re.search(rf"{VIBRATION}\s+above\s+([0-9.]+)", summed.stdout)
+    assert bool(re.search(r"\d\s+mm/s\s", summed.stdout)) == (form == "units")
     assert 5.0 < float(limit[1]) < 7.1
     assert "warning" not in summed.stderr
     if form in ("titles", "units"):  # the export itself, row by row
@@ -230,9 +230,9 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     assert (bad["about"], bad["error"][:27]) == ("heat", "line 13: 'Bad' is no number")
     assert "line 14: 2 fields, but the header names 4" in short["error"]
     assert "not seen: heat" in unseen["reason"]
-    wrong = [one.get("error", "") for one in answers("zeit;trip;heat;runs", *lines, *lines)]
-    assert [at for at, fault in enumerate(wrong) if fault] == [0, 10]
-    assert "is no column; there are zeit, trip, heat, runs (zeit? case counts)" in wrong[0]
+    wrong = answers("zeit;trip;heat;runs", *lines, *lines)
+    first, _ = [one["error"] for one in wrong if "error" in one]
+    assert "is no column; there are zeit, trip, heat, runs (zeit? case counts)" in first
     faults = {
         "'1'; it is compared with the number 1.0 (--failed)": {"trip": "1"},
         "'TRIP'; it must be a truth value": {"runs": "TRIP"},
@@ -245,9 +245,9 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     rows = ({k: v for k, v in row.items() if v is not ...} for row in rows)
     found = answers(*rows, "10.03.2025 06:00:00;6;0", {"time": 0, "heat": 6, "runs": 1})
     assert found.pop()["note"] == "no trip in the row, which --failed or --where names"
-    text = evofsm("monitor", "rows.jsonl", *begun, "--text").stdout  # whatever the row
+    text = evofsm("monitor", "rows.jsonl", *begun, "--text").stdout
     for one, fault in zip(found, [*faults, "rows are JSON, one per line"], strict=True):
-        assert {fault in one["error"], fault in text} == {True}
+        assert fault in one["error"] in text
 
 
 @pytest.mark.parametrize(
