@@ -230,8 +230,7 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     assert (bad["about"], bad["error"][:27]) == ("heat", "line 13: 'Bad' is no number")
     assert "line 14: 2 fields, but the header names 4" in short["error"]
     assert "not seen: heat" in unseen["reason"]
-    wrong = answers("zeit;trip;heat;runs", *lines, *lines)
-    first, _ = [one["error"] for one in wrong if "error" in one]
+    first, _ = (a["error"] for a in answers("zeit;trip;heat;runs", *lines, *lines) if "error" in a)
     assert "is no column; there are zeit, trip, heat, runs (zeit? case counts)" in first
     faults = {
         "'1'; it is compared with the number 1.0 (--failed)": {"trip": "1"},
