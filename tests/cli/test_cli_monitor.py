@@ -155,7 +155,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
     assert 0 < len(worst) <= 10
     assert worst[0][-2] == f"{max(map(max, risks)):.1%}"
     by_lines = evofsm(lines, *made)
-    assert "refused   1 messages, the first because line: is no JSON" in by_lines.stdout
+    assert "refused   1 messages, the first because line: line 1: is no JSON" in by_lines.stdout
     assert "failures  2; 1 in alarm by then, for " in by_lines.stdout
     assert [one[1] for one in numbers_of(by_lines.stdout)[:6]] == [one[1] for one in by_risk]
 
@@ -178,6 +178,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         (("--action", "", "--interval", 1), "say what is observed, the keys of rows: --observe"),
         (("--observe", "heat", "--low", 0, "--interval", 1), "give either low and high"),
         (("--n-actions", 2, "--traffic"), "--traffic is of cars"),
+        (("a.csv", "b.csv", "--summary"), "one FILE is read; cat joins several"),
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(refused, arguments, said, tmp_path, monkeypatch):

@@ -92,7 +92,8 @@ def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, wri
     asked = [word for name in READ if name in asked for word in (name, asked[name])]
     summed = evofsm("monitor", path, "--summary", "--guard", "guard.evofsm", *asked)
     assert " 7 of 7 " in summed.stdout
-    limit = re.search(f"{VIBRATION} above ([0-9.]+)", summed.stdout)
+    limit = re.search(rf"{VIBRATION}\s+above\s+([0-9.]+)", summed.stdout)
+    assert bool(re.search(r"\d\s+mm/s\s", summed.stdout)) == (form == "units")
     assert 5.0 < float(limit[1]) < 7.1
     assert "warning" not in summed.stderr
     if form in ("titles", "units"):  # the export itself, row by row
@@ -125,12 +126,13 @@ def test_what_a_log_seems_to_need_is_said_before_the_work(evofsm, refused, writt
     told = evofsm(*asked, *needs, "--resample", "30s", "--guard", "guard.evofsm")
     assert told.stderr == ""
     of_guard = "monitor", path, "--summary", "--guard", "guard.evofsm"
+    assert "nobody acts" in refused("export", of_guard[-1], "--to", "c99", "--out", "c")
     as_learnt = evofsm(*of_guard, "--json", "--false-a-day", 1)  # the rest the guard's file knows
     assert (as_learnt.exit_code, as_learnt.stderr) == (0, "")
     stated = {row["stated"]: row["is_own"] for row in json.loads(as_learnt.stdout)["alarms"]}
     assert stated == {0.1: False, 0.3: False, 1.0: True, 3.0: False}
     by_half = "--summary", "--observe", f'"{VIBRATION}"', *asked[4:], *needs, "--resample", "30s"
-    assert "the last 50% of the rows" in evofsm("monitor", path, *by_half, "--split", 0.5).stdout
+    assert "the last 5" in evofsm("monitor", path, *by_half, "--split", 0.5).stdout
     other = evofsm(*of_guard, "--resample", "1min")
     assert "a row every 60 s, and guard.evofsm decides each 30 s: --resample 30s" in other.stderr
     hint = refused(*asked[:3], VIBRATION, *asked[4:])
@@ -228,6 +230,8 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     assert (bad["about"], bad["error"][:27]) == ("heat", "line 13: 'Bad' is no number")
     assert "line 14: 2 fields, but the header names 4" in short["error"]
     assert "not seen: heat" in unseen["reason"]
+    first, _ = (a["error"] for a in answers("zeit;trip;heat;runs", *lines, *lines) if "error" in a)
+    assert "is no column; there are zeit, trip, heat, runs (zeit? case counts)" in first
     faults = {
         "'1'; it is compared with the number 1.0 (--failed)": {"trip": "1"},
         "'TRIP'; it must be a truth value": {"runs": "TRIP"},
@@ -240,8 +244,9 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     rows = ({k: v for k, v in row.items() if v is not ...} for row in rows)
     found = answers(*rows, "10.03.2025 06:00:00;6;0", {"time": 0, "heat": 6, "runs": 1})
     assert found.pop()["note"] == "no trip in the row, which --failed or --where names"
+    text = evofsm("monitor", "rows.jsonl", *begun, "--text").stdout
     for one, fault in zip(found, [*faults, "rows are JSON, one per line"], strict=True):
-        assert fault in one["error"]
+        assert fault in one["error"] in text
 
 
 @pytest.mark.parametrize(

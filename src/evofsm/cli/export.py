@@ -30,13 +30,16 @@ def export(
     """Write what was learnt, or driven, in the formats of other tools."""
     _refuse_learnt(out)
     if to in ("c99", "fmu"):
-        from evofsm.guard import Guard, Mode
+        from evofsm.guard import Foresight, Guard, Mode
         from evofsm.guard.export import write_c99, write_fmu
 
         if out is None:
             raise ValueError(f"--to {to} prints nothing: name a file, of c99 a folder, by --out")
         path = file / "guard.evofsm" if file.is_dir() else file
         guard = Guard.load(path, failed=lambda seen: False)
+        if isinstance(guard.judge, Foresight):
+            why = "a guard where nobody acts (--action '') cannot be exported"
+            raise ValueError(f"{file}: {why}; run `evofsm monitor` beside the machine")
         if mode and hasattr(guard.reviser, "mode"):
             guard.reviser.mode = Mode(mode)
         return write_c99(guard, out, prefix) if to == "c99" else write_fmu(guard, out)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -14,9 +15,11 @@ from evofsm.cli.options import picture
 from evofsm.cli.show import facts, print_json, show, table
 from evofsm.fsm import EvolvingFSM, Labels
 from evofsm.fsm.proportions import poisson_bounds
+from evofsm.fsm.validation import counted
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
 from evofsm.guard.foresight import DATES, RATE, RATES, Runs, false_times, span
 from evofsm.io import Chunk
+from evofsm.io.tables import SI, UNITS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,9 +29,15 @@ if TYPE_CHECKING:
 
 # Less than the share of alarms of any kind that are right: which alarm it is the judge says.
 _ANY_ALARM = 1e-6
+# From here on no year has four digits [s].
+_NO_DATE = 253_402_300_799.0
 # Alarms that are listed.
 _LISTED = 12
 _CAME = ("ahead", "false/day")
+# What a judge says of a variable: its weight, if there are several, its name, and its limits.
+_NUMBER = r"-?\d[\d.]*(?:e[+-]?\d+)?"
+_LIMIT = r"([+-] N )?(?<!\w)({})((?: N:)?(?: is)? (?:above|below|near|between) N"
+_LIMIT = f"{_LIMIT}(?: (?:and|or above) N)?)".replace("N", _NUMBER)
 _HEADER = ("stated", "foreseen", *_CAME, "thresholds", *_CAME)
 
 
@@ -69,7 +78,8 @@ def show_foreseen(
     file: Path,
     episodes: Sequence[Chunk],
     guard: Guard | None,
-    labels: Labels,
+    names: Sequence[str],
+    units: Mapping[str, str],
     asked: tuple[float | None, float, float | None],
     split: float,
     plot: Path | None,
@@ -78,7 +88,8 @@ def show_foreseen(
 ) -> None:
     """Say what came of the alarms of a guard, or of one that learns from the log's first part.
 
-    What is asked for are the horizon, the hold time and false alarms a day.
+    Units are those that the log told of its columns. What is asked for are the horizon, the hold
+    time and false alarms a day.
     """
     title, held_out = str(file), "; not held out, if this guard learnt from them"
     if guard is None:
@@ -87,9 +98,12 @@ def show_foreseen(
         first_part, episodes = _of_two_rows(episodes[:first]), episodes[first:]
         if not (first_part and _of_two_rows(episodes)):
             raise ValueError(f"{file}: it takes two episodes at least, to learn and to judge")
+        si_units = [SI.get(unit, unit) for unit in (units.get(name, "") for name in names)]
+        labels = Labels(names=tuple(names), units=tuple(si_units))
         guard = guard_where_nobody_acts(first_part, labels, *asked)
-        title += f": learnt from its first {len(first_part):,} episodes, judged by the rest"
-        held_out = f", held out (the last {1.0 - split:.0%} of the rows)"
+        learnt_from = "episode" if first == 1 else f"{len(first_part):,} episodes"
+        title += f": learnt from its first {learnt_from}, judged by the rest"
+        held_out = f", held out (the last {1.0 - rows[first - 1] / rows[-1]:.0%} of the rows)"
     at_once = sum(e.failed for e in episodes if len(e.times) == 1)
     episodes = _of_two_rows(episodes)
     judge = guard.judge
@@ -104,7 +118,7 @@ def show_foreseen(
     if as_json:
         print_json({"file": file, **document})
     else:
-        show(*_tables(document, judge, title, held_out))
+        show(*_tables(document, judge, units, title, held_out))
 
 
 def _of_two_rows(episodes: Sequence[Chunk]) -> Sequence[Chunk]:
@@ -173,16 +187,19 @@ def _listed(
 
 
 def _tables(
-    found: dict[str, Any], judge: Foresight, title: str, held_out: str
+    found: dict[str, Any], judge: Foresight, units: Mapping[str, str], title: str, held_out: str
 ) -> Iterator[RenderableType]:
     days = found["seconds"] / 86400.0
     soon = f"an alarm is right if one comes within {span(found['horizon'])}"
-    text, rows, bold = "none: cross-validated, no alarm was better than chance", [], []
+    text, rows, bold, worse = f"none: {why_none(judge)}", [], [], []
     for k, alarm in enumerate(found["alarms"]):
         row = [f"{alarm['stated']:g}"]
         for tally in (alarm["learnt"], alarm["plain"]):
             share, ahead = f"{tally['foreseen']} of {tally['failures']}", span(tally["lead"])
             row += [share, ahead, f"{tally['false_a_day']:.2g}"]
+        if poisson_bounds(alarm["plain"]["false"])[0] > days * alarm["stated"]:
+            worse.append(k)  # they are no choice at this rate
+            row[4:6] = "-", "-"
         rows.append(row)
         if alarm["is_own"]:
             text = f"{row[1]} failures foreseen, {row[2]} ahead (mean; not foreseen: 0)"
@@ -191,23 +208,26 @@ def _tables(
                 text += f": more than the {row[0]} a day that were stated, from too short a log"
                 text += ", or one that changed"
             bold = [k]
-    rows_read = f"{found['rows']:,} in {found['episodes']:,} episodes, {days:.3g} days of rows"
+    episodes = counted(found["episodes"], "episode")
+    rows_read = f"{found['rows']:,} in {episodes}, {days:.3g} days of rows"
     pairs = [("rows", rows_read + held_out)]
     at_once = f", and {found['failures_at_once']:,} right after a hole or standstill"
+    soon = soon if found["failures"] else "of alarms nothing is judged here but how many are false"
     failures = f"{found['failures']:,}{at_once * (found['failures_at_once'] > 0)}; {soon}"
     pairs += [("failures", failures), ("alarms", text)]
     yield facts(title, pairs)
     title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
     yield table(title, _HEADER, rows, bold=bold)
-    yield from alarms_of(judge)
+    yield from alarms_of(judge, units, worse)
     if rows := [[x["where"], f"{x['came']:,}", f"{x['failed']:,}"] for x in found["fails"]]:
-        header = "it fails where", "episodes that came there", "of them failed"
+        rows = [[in_units(where, judge, units), *counts] for where, *counts in rows]
+        header = "it fails where", "judged episodes that came there", "of them failed"
         yield table("\nWhere it fails, as it was learnt", header, rows)
     rows = []
     for hit in found["listed"][-_LISTED:]:
         false = {0: [], 1: ["no"]}.get(hit["false"], [f"{hit['false']} times no"])
         failed = ", then ".join([*false, *["yes"] * hit["failed"]])
-        why = hit["reason"].partition("; after")[0]
+        why = in_units(hit["reason"].partition("; after")[0], judge, units)
         rows.append([f"{hit['episode'] + 1}", date(hit["time"]), span(hit["lasts"]), failed, why])
     if rows:
         title = _last(found["listed"], "Alarms")
@@ -218,16 +238,47 @@ def _tables(
         yield table(_last(misses, "Failures that were not foreseen"), header, rows, left=(0, 2))
 
 
-def alarms_of(judge: Foresight) -> Iterator[RenderableType]:
-    """What each alarm is, and how often it was right, beside plain thresholds."""
+def alarms_of(
+    judge: Foresight, units: Mapping[str, str], worse: Collection[int] = ()
+) -> Iterator[RenderableType]:
+    """What each alarm is, and how often it was right, beside plain thresholds but the worse."""
     places = []
     for rates, rate in judge.alarms.items():
-        plain = judge.words(rate, plain=True)
-        beside = (
-            f"; plain thresholds would be {plain}" if plain and not judge.is_plain(rate) else ""
-        )
-        places.append((rates, f"{judge.of(rate)}{beside}"))
+        plain = "" if rate in worse or judge.is_plain(rate) else judge.words(rate, plain=True)
+        beside = f"; plain thresholds would be {plain}" * bool(plain)
+        text = why_none(judge) if judge.held_out[0, 2] == 1.0 else judge.of(rate)
+        places.append((rates, in_units(f"{text}{beside}", judge, units)))
     yield facts("\nWhere they alarm, by false alarms a day", places)
+
+
+def why_none(judge: Foresight) -> str:
+    """Why there is no alarm."""
+    one = "with one failure nothing can be cross-validated"
+    several = "cross-validated, no alarm was better than chance"
+    return one if judge.held_out[0, 2] == 1.0 else several
+
+
+def in_units(text: str, judge: Foresight, units: Mapping[str, str]) -> str:
+    """Words of a judge, with numbers in the units that were told, not in those of the SI.
+
+    Of a discrete variable they say whether it has the value.
+    """
+    si_units = dict(zip(judge.labels.names, judge.labels.units, strict=False))
+
+    def words(match: re.Match[str]) -> str:
+        weight, name, limits = match.groups()
+        column, is_discrete, value = name.partition("=")
+        unit = units.get(name, si_units.get(name, ""))
+        if weight or (is_discrete and text.startswith(" in ", match.end())):
+            return match[0]  # of several variables, or what is to come
+        if is_discrete:
+            return f"{column} is {'not ' * ('below' in limits)}{value}"
+        factor = UNITS.get(unit, 1.0)
+        amounts = re.sub(_NUMBER, lambda number: f"{float(number[0]) / factor:.4g}", limits)
+        return f"{name}{amounts} {unit}".rstrip()
+
+    anyone = "|".join(map(re.escape, sorted(judge.labels.names, key=len, reverse=True)))
+    return re.sub(_LIMIT.format(anyone), words, text) if anyone else text
 
 
 def _last(hits: Sequence[Any], what: str) -> str:
@@ -235,12 +286,12 @@ def _last(hits: Sequence[Any], what: str) -> str:
     return f"\n{what}: {'all' if n <= _LISTED else f'the last {_LISTED} of'} {n:,}"
 
 
-def date(time: float) -> str:
-    """A time [s], as people read it."""
-    if time < DATES:
-        return f"{time:.10g}"
-    text = f"{datetime.fromtimestamp(round(time), UTC):%Y-%m-%d %H:%M:%S}"
-    return text.removesuffix(":00")
+def date(time: float, unit: str = "") -> str:
+    """A time [s], as people read it; with its unit, where it is no date."""
+    if not DATES <= time < _NO_DATE:
+        return f"{time:.13g}{unit}"
+    text = f"{datetime.fromtimestamp(round(time, 3), UTC):%Y-%m-%d %H:%M:%S.%f}"
+    return text[:-3].removesuffix(".000").removesuffix(":00")
 
 
 def _draw(

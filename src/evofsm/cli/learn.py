@@ -165,7 +165,9 @@ def learn(
     if lengths.seen:
         pairs.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
     learner = new_guard and new_guard.judge
-    tables = alarms_of(learner) if isinstance(learner, Foresight) else tables_of(lesson.model)
+    tables = tables_of(lesson.model)
+    if isinstance(learner, Foresight):
+        tables = alarms_of(learner, notes.units)
     show(facts("What was read", pairs), *tables)
     say("")
     if out is None and new_guard is None:
@@ -333,6 +335,7 @@ def _saying(chunks: Iterable[Chunk], lines: list[str], kept: list[Chunk] | None)
 
 def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
     """Where it is, what it takes, and what it reckons with."""
+    from evofsm.cli.foreseen import why_none
     from evofsm.guard import Foresight, LearntRisk
     from evofsm.guard.foresight import span
 
@@ -345,7 +348,7 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     if isinstance(guard.judge, Foresight):
         soon = f"up to {span(guard.judge.horizon * guard.judge.dt)} before a failure (--horizon)"
         if guard.judge.alarm is None:
-            why = "cross-validated, no alarm was better than chance"
+            why = why_none(guard.judge)
             yield f"It never alarms: {why} (fewer columns, or a longer --horizon?)."
         else:
             yield f"{guard.judge.alarm_in_words.capitalize()} (--false-a-day), {soon}."

@@ -184,13 +184,18 @@ def _contradictions(noted: Noted, columns: LogColumns) -> Iterator[str]:
 
 
 def episodes_read(
-    path: str, reading: Reading, *, dated: bool = False, most: int | None = None, fewest: int = 2
+    path: str,
+    reading: Reading,
+    notes: Noted,
+    *,
+    dated: bool,
+    most: int | None = None,
+    fewest: int = 2,
 ) -> Iterator[Chunk]:
     """The episodes of a log that have so many rows, of ``most`` in all; then what was noticed.
 
     They have dates where these are wanted, and where the log has some.
     """
-    notes = Noted()
     chunks = reading.traces([path], notes)
     for episode in episodes_of(chunks if most is None else _first(chunks, most)):
         if len(episode.times) >= fewest:

@@ -71,6 +71,7 @@ def test_time_that_stands_or_goes_backward():
     assert (anew["kind"], anew["n"]) == ("decision", 2)
     assert anew["note"] == "time went back from 50 s: a new episode"
     assert "note" not in decider.answer(line(row | {"time": 0.1}))
+    assert decider.answer(line(row))["n"] == 4  # newer than the latest, it is not sent again
 
 
 def test_gaps_in_time_and_rows_that_come_too_often_are_noted():

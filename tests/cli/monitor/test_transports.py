@@ -87,8 +87,8 @@ def test_lines_are_the_same_however_they_are_cut(plain, size):
     data = ROWS[0][:-1] + b"\r\n\n" + b"x" * 90_000 + b"\n" + ROWS[1][:-1]
     first, empty, long, last = answered(data, size)
     assert [first, last] == plain[:2]
-    assert empty["error"] == "is empty"
-    assert long["error"] == f"is longer than {LONGEST} bytes"
+    assert empty["error"] == "line 2: is empty"
+    assert long["error"] == f"line 3: is longer than {LONGEST} bytes"
 
 
 def test_it_ends_after_the_message_under_way_however_many_came_at_once(monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from hashlib import sha256
 from itertools import chain
@@ -51,8 +51,11 @@ _SAVED = b'{"__metadata__"'
 
 @reads_logs
 def monitor(
-    file: Annotated[
-        Path | None, argument("Rows in JSON or CSV; a log; or a guard. [default: standard input]")
+    files: Annotated[
+        list[Path] | None,
+        argument(
+            "Rows in JSON or CSV; a log; a guard. [default: standard input]", metavar="[FILE]"
+        ),
     ] = None,
     guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
     low: Annotated[
@@ -119,10 +122,15 @@ def monitor(
     Where nobody acts, alarms stand beside plain thresholds; without --guard the log's first part
     is learnt from (--split).
     """
-    if file is not None and file.is_file() and guard is None:
-        with file.open("rb") as stream:
-            if _SAVED in stream.read(64):  # rows then come from elsewhere
-                file, guard = None, file
+    file = None
+    for path in files or ():
+        with path.open("rb") if path.is_file() and guard is None else nullcontext() as stream:
+            if stream is not None and _SAVED in stream.read(64):
+                guard = path  # rows then come from elsewhere
+            elif file is not None:
+                raise ValueError(f"one FILE is read; cat joins several, names and all: {path}")
+            else:
+                file = path
     if sum(source is not None for source in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
     if plot is not None:
@@ -176,7 +184,7 @@ def monitor(
         if summary and file is not None and is_log:
             from evofsm.cli.foreseen import show_foreseen
             from evofsm.cli.learning import episodes_read
-            from evofsm.fsm import Labels
+            from evofsm.io.logs import Noted
 
             sentry = fresh() if guard else None
             alone = not reader.keywords["action"] or isinstance(sentry and sentry.judge, Foresight)
@@ -187,7 +195,8 @@ def monitor(
                 reader = partial(reader, action="")
             log_format = reader(observe=observe, episode=episode)
             fewest = 1 if alone else 2  # a failure that comes at once counts as well
-            episodes = episodes_read(str(file), log_format, dated=alone, fewest=fewest)
+            notes = Noted()
+            episodes = episodes_read(str(file), log_format, notes, dated=alone, fewest=fewest)
             if (first := next(episodes, None)) is None:
                 raise ValueError(f"{file}: no episode has two rows")
             chunks, interval = chain([first], episodes), first.dt
@@ -195,10 +204,9 @@ def monitor(
                 warning = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
                 warn(f"warning: {warning} {sentry.interval:g} s: --resample {sentry.interval:g}s")
             if alone:
-                labels = Labels(names=log_format.columns.observe.names)
                 refuse_other_limit(False, false_a_day, tolerance)
-                to = split, plot
-                show_foreseen(file, list(chunks), sentry, labels, alarms, *to, as_json=as_json)
+                about = log_format.columns.observe.names, notes.units, alarms, split, plot
+                show_foreseen(file, list(chunks), sentry, *about, as_json=as_json)
                 return None
         if summary and (as_json or plot):
             raise ValueError("--json and --plot are for logs where nobody acts: --action ''")

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.cli.foreseen import date, in_units
 from evofsm.cli.monitor.messages import (
     NO_ROW,
     SCHEMA,
@@ -102,7 +103,8 @@ class Decider:
         """
         try:
             if (json_line := self._csv.read(line)) is None:
-                return self._of("waiting", alarm=self._alarm, reason=NO_ROW)
+                self.refused += bool(self._csv.unread)
+                return self._of("waiting", alarm=self._alarm, reason=self._csv.unread or NO_ROW)
             message = self.form.read(json_line)
             beyond = self.guard.beyond(np.array(message.observation or (), np.float64))
             if beyond is not None:
@@ -122,7 +124,8 @@ class Decider:
                 if not message.time < message.time + self.guard.interval:
                     raise MessageError("time", "is too large to tell rows apart", message.time)
         except MessageError as error:
-            return self.error(error.about, f"{self._csv.place}{error}", error.time)
+            place = self._csv.place if self._csv.in_csv or error.about == "line" else ""
+            return self.error(error.about, f"{place}{error}", error.time)
         try:
             answer = self.act(message)
         except Exception as error:  # an end that the guard cannot take
@@ -134,7 +137,8 @@ class Decider:
         """Where among the recent messages one is that is sent again; None if it is a new one.
 
         Who plays a recording once more begins with its first row, or does what was done before
-        after the same: that is no repetition.
+        after the same: that is no repetition. Nor is a row that is newer than the latest, where
+        time went back meanwhile, as clocks do once a year.
         """
         recent, latest = self._recent, self.latest
         next_place = len(recent) if self._next is None else self._next + 1
@@ -144,10 +148,12 @@ class Decider:
             return len(recent) - 1
         if isinstance(told, End) and told.time is None:
             return None  # it says of no episode in particular that it ended
+        is_newer = isinstance(told, Row) and isinstance(latest, Row) and told.time > latest.time
         for place in range(len(recent) - 2, -1, -1):
+            is_newer &= not isinstance(recent[place][0], End)  # before which are other times
             if recent[place][0] == told:
                 before = recent[place - 1][0] if place else None
-                return None if _begins_anew(told, before, latest) else place
+                return None if is_newer or _begins_anew(told, before, latest) else place
         return None
 
     def error(self, about: str, what: str, time: float | None = None) -> Answer:
@@ -266,7 +272,10 @@ class Decider:
         parts = {**revision._asdict(), "risk_low": low, "risk_high": high}
         body = {name: plain(parts[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
         self._alarm = self._is_alarm(revision)
-        body |= {"reason": revision.reason, "alarm": self._alarm, "mode": self.mode.value}
+        reason = revision.reason
+        if isinstance(judge := self.guard.judge, Foresight):
+            reason = in_units(reason, judge, self.slots.columns.units)
+        body |= {"reason": reason, "alarm": self._alarm, "mode": self.mode.value}
         return self._of("decision", time=row.time, **leader, **self._worst(row), **body, **note)
 
     def _worst(self, row: Row) -> Answer:
@@ -286,7 +295,7 @@ class Decider:
         step = row.time - latest.time
         if step < 0.0:
             self._end_unasked()
-            return [f"time went back from {latest.time:g} s: a new episode"]
+            return [f"time went back from {date(latest.time, ' s')}: a new episode"]
         if row.ahead != latest.ahead:
             self._end_unasked()
             return ["another one is ahead: a new episode"] if row.observation else []
@@ -371,12 +380,10 @@ def _begins_anew(told: Message, before: Message | None, latest: Message | None) 
 
 def _refuse_stale(row: Row, latest: Row) -> None:
     """Raise if it is no newer than the latest one, unless its sender began anew."""
-    if row.time == latest.time:
-        text = f"{row.time:g} s was decided on before, with other values"
-        raise MessageError("time", text, row.time)
-    if latest.time - _LATE <= row.time < latest.time:
-        text = f"{row.time:g} s comes after {latest.time:g} s: late rows are left out"
-        raise MessageError("time", text, row.time)
+    if latest.time - _LATE <= row.time <= latest.time:
+        text = f"comes after {date(latest.time, ' s')}: late rows are left out"
+        text = text if row.time < latest.time else "was decided on before, with other values"
+        raise MessageError("time", f"{date(row.time, ' s')} {text}", row.time)
 
 
 def _accelerating(row: Row, before: Row | None) -> NDArray[np.float64]:

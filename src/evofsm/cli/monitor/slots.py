@@ -15,11 +15,13 @@ from typing import Any
 
 import msgspec
 
-from evofsm.cli.monitor.messages import Message, MessageError, Row
+from evofsm.cli.monitor.messages import NO_ROW, Message, MessageError, Row
 from evofsm.io import LogColumns
 from evofsm.io.logs import Condition, units_of
 from evofsm.io.tables import MISSING, UNITS, Dialect, decoded, explained, is_date, is_number
 
+# Lines that are no rows are told of as the first came, and then as so many had.
+_SAID_AT = [10**k for k in range(1, 10)]
 _BECOME: dict[str, Any] = {"mean": fmean, "last": itemgetter(-1), "max": max, "min": min}
 
 
@@ -127,12 +129,17 @@ class CsvRows:
         self._header, self._count, self._factors = "", 0, dict[str, float]()
         self._dialect: Dialect | None = None
         self._below: list[str] = []  # lines below the names, to the first row
-        self._may_be_title = not acts  # who drives along sends no log
-        self.place = ""  #: of a line of CSV, as what is said of it begins
+        self._acts, self._may_be_title = acts, not acts  # who drives along sends no log
+        self._needs = *variables, *columns.time.split(",")
+        self._above: Sequence[str] = ()  # fields of the line before
+        self.unread = ""  #: why lines are no rows, as names are missing
+        self._n_unread = 0
+        self.place, self.in_csv = "", False  #: of a line, as what is said of it begins
 
     def read(self, line: bytes) -> bytes | None:
         """The message on a line; None where it names the columns, or is a title or units."""
-        self.place, self._count = "", self._count + 1
+        self._count += 1
+        self.place, self.in_csv = f"line {self._count}: ", False
         begin = line.lstrip(b"\xef\xbb\xbf \t")[:1]
         self._may_be_title &= begin != b"{" and self._count < Dialect.most_above
         if begin in (b"{", b""):
@@ -141,12 +148,13 @@ class CsvRows:
             text = decoded(line, "").removeprefix("\ufeff")
         except ValueError:
             return line
+        self.in_csv = True
         if is_header := self._names_columns(text):
             self._header, self._dialect, self._below = text, None, []
-            self._may_be_title = False
+            self._may_be_title, self.unread = False, ""
         if not self._header:
-            return None if self._may_be_title else line
-        self.place = f"line {self._count}: "
+            self._refuse_unnamed(text)
+            return None if self._may_be_title or self.unread else line
         try:
             if is_header or self._has_units(text):
                 return None
@@ -156,14 +164,37 @@ class CsvRows:
             raise MessageError("line", f"{error} (an unclosed quote?)") from None
 
     def _names_columns(self, text: str) -> bool:
-        """Whether it names those of all variables; of some alone is an error."""
+        """Whether it names the time and all variables; what names some alone is no header more."""
         if not any(name in text for name in self._variables):
             return False
         columns = Dialect(text, ()).columns
-        omissions = [name for name in self._variables if name not in columns]
-        if 0 < len(omissions) < len(self._variables):
-            raise MessageError(omissions[0], f"is no column; there are {', '.join(columns)}")
-        return not omissions
+        if {*self._variables} & {*columns} and not {*self._needs} <= {*columns}:
+            self._header = ""
+        return {*self._needs} <= {*columns}
+
+    def _refuse_unnamed(self, text: str) -> None:
+        """Raise where a line tells that names are missing above the rows; then now and then."""
+        if self.unread:
+            self._n_unread += 1
+            if self._acts or self._n_unread in _SAID_AT:
+                fault = f"is one of {self._n_unread:,} that were not read: {self.unread}"
+                raise MessageError("line", fault)
+            return
+        above, self._above = self._above, Dialect(text, ()).columns
+        needs, lower_case = ([x.casefold() for x in xs] for xs in (self._needs, self._above))
+        if not (is_row := _begins_row(self._above)):  # it may name the columns itself
+            above = self._above if {*needs} & {*lower_case} else ()
+        omissions = [name for name in self._needs if name not in above]
+        if len(above) < 2 or len(above) != len(self._above) or not omissions:
+            return
+        about, self.unread, self._n_unread = "line", NO_ROW, int(is_row)
+        if not _begins_row(above):
+            about, *others = omissions
+            fault = ", nor is ".join([f"{about} is no column", *others])
+            near = ", ".join(x for x in above if x not in self._needs and x.casefold() in needs)
+            near = f" ({near}? case counts)" if near else ""
+            self.unread = f"{fault}; there are {', '.join(above)}{near}"
+        raise MessageError(about, self.unread.removeprefix(f"{about} "))
 
     def _has_units(self, text: str) -> bool:
         """Whether a line below the names tells units, or the like; the first row tells the dialect.
@@ -175,8 +206,7 @@ class CsvRows:
         self._below.append(text)
         dialect, log_units = Dialect(self._header, self._below), self._columns.units
         fields = next(csv.reader([text], delimiter=dialect.separator, strict=True))
-        is_row = any(is_number(field.replace(",", ".")) or is_date(field) for field in fields)
-        if not is_row and len(self._below) <= Dialect.most_below:
+        if not any(map(_is_value, fields)) and len(self._below) <= Dialect.most_below:
             return True
         numbers = [name for name in dialect.columns if name in self._numbers]
         units = {name: unit for name, unit in log_units.items() if "%" not in unit}
@@ -204,6 +234,14 @@ class CsvRows:
             raise MessageError(name, explained(text))
         number = float(plain) * self._factors[name]
         return int(number) if self._called[name] == "proposal" and number.is_integer() else number
+
+
+def _is_value(text: str) -> bool:
+    return is_number(text.replace(",", ".")) or is_date(text)
+
+
+def _begins_row(fields: Sequence[str]) -> bool:
+    return _is_value(next(filter(None, fields), ""))
 
 
 def _joined(how: str | None, values: Sequence[Any]) -> Any:

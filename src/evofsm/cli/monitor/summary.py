@@ -44,6 +44,8 @@ class Text:
 
     def _said(self, part: Answer) -> Iterator[str]:
         time, since = part.get("time"), self._since
+        if time is not None and since is not None and time < since:  # a clock that was set back
+            since = self._since = None
         when = "" if time is None else f"{date(time)}  "
         after = "" if time is None or since is None else f" {span(time - since)}"
         if part["kind"] == "error":

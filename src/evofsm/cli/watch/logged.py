@@ -18,7 +18,7 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
 from evofsm.guard import Foresight, Guard
 from evofsm.guard.foresight import DATES
-from evofsm.io.logs import LONGEST_STEP, Chunk
+from evofsm.io.logs import LONGEST_STEP, Chunk, Noted
 
 # Intervals of an action.
 _INTERVALS = 17
@@ -49,7 +49,7 @@ def watched_log(
     is_kinematic = reading.acts and judge == "kinematic" and len(names) == len(VARIABLES)
     of_cars = is_kinematic or (reading.acts and names == VARIABLES)
     most = _ROWS_OF_CARS if of_cars else None
-    episodes = episodes_read(path, reading, dated=not of_cars, most=most)
+    episodes = episodes_read(path, reading, Noted(), dated=not of_cars, most=most)
     stretches = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
     if not stretches:
         why = f"nobody follows anybody for {_FEWEST_ROWS}" if of_cars else "no episode has two"
