@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -19,7 +18,7 @@ from evofsm.fsm.validation import counted
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
 from evofsm.guard.foresight import DATES, RATE, RATES, Runs, false_times, span
 from evofsm.io import Chunk
-from evofsm.io.tables import SI, UNITS
+from evofsm.io.tables import SI
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,10 +33,6 @@ _NO_DATE = 253_402_300_799.0
 # Alarms that are listed.
 _LISTED = 12
 _CAME = ("ahead", "false/day")
-# What a judge says of a variable: its weight, if there are several, its name, and its limits.
-_NUMBER = r"-?\d[\d.]*(?:e[+-]?\d+)?"
-_LIMIT = r"([+-] N )?(?<!\w)({})((?: N:)?(?: is)? (?:above|below|near|between) N"
-_LIMIT = f"{_LIMIT}(?: (?:and|or above) N)?)".replace("N", _NUMBER)
 _HEADER = ("stated", "foreseen", *_CAME, "thresholds", *_CAME)
 
 
@@ -118,7 +113,7 @@ def show_foreseen(
     if as_json:
         print_json({"file": file, **document})
     else:
-        show(*_tables(document, judge, units, title, held_out))
+        show(*_tables(document, judge, title, held_out))
 
 
 def _of_two_rows(episodes: Sequence[Chunk]) -> Sequence[Chunk]:
@@ -187,7 +182,7 @@ def _listed(
 
 
 def _tables(
-    found: dict[str, Any], judge: Foresight, units: Mapping[str, str], title: str, held_out: str
+    found: dict[str, Any], judge: Foresight, title: str, held_out: str
 ) -> Iterator[RenderableType]:
     days = found["seconds"] / 86400.0
     soon = f"an alarm is right if one comes within {span(found['horizon'])}"
@@ -218,16 +213,15 @@ def _tables(
     yield facts(title, pairs)
     title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
     yield table(title, _HEADER, rows, bold=bold)
-    yield from alarms_of(judge, units, worse)
+    yield from alarms_of(judge, worse)
     if rows := [[x["where"], f"{x['came']:,}", f"{x['failed']:,}"] for x in found["fails"]]:
-        rows = [[in_units(where, judge, units), *counts] for where, *counts in rows]
         header = "it fails where", "judged episodes that came there", "of them failed"
         yield table("\nWhere it fails, as it was learnt", header, rows)
     rows = []
     for hit in found["listed"][-_LISTED:]:
         false = {0: [], 1: ["no"]}.get(hit["false"], [f"{hit['false']} times no"])
         failed = ", then ".join([*false, *["yes"] * hit["failed"]])
-        why = in_units(hit["reason"].partition("; after")[0], judge, units)
+        why = hit["reason"].partition("; after")[0]
         rows.append([f"{hit['episode'] + 1}", date(hit["time"]), span(hit["lasts"]), failed, why])
     if rows:
         title = _last(found["listed"], "Alarms")
@@ -238,16 +232,14 @@ def _tables(
         yield table(_last(misses, "Failures that were not foreseen"), header, rows, left=(0, 2))
 
 
-def alarms_of(
-    judge: Foresight, units: Mapping[str, str], worse: Collection[int] = ()
-) -> Iterator[RenderableType]:
+def alarms_of(judge: Foresight, worse: Collection[int] = ()) -> Iterator[RenderableType]:
     """What each alarm is, and how often it was right, beside plain thresholds but the worse."""
     places = []
     for rates, rate in judge.alarms.items():
         plain = "" if rate in worse or judge.is_plain(rate) else judge.words(rate, plain=True)
         beside = f"; plain thresholds would be {plain}" * bool(plain)
         text = why_none(judge) if judge.held_out[0, 2] == 1.0 else judge.of(rate)
-        places.append((rates, in_units(f"{text}{beside}", judge, units)))
+        places.append((rates, f"{text}{beside}"))
     yield facts("\nWhere they alarm, by false alarms a day", places)
 
 
@@ -256,29 +248,6 @@ def why_none(judge: Foresight) -> str:
     one = "with one failure nothing can be cross-validated"
     several = "cross-validated, no alarm was better than chance"
     return one if judge.held_out[0, 2] == 1.0 else several
-
-
-def in_units(text: str, judge: Foresight, units: Mapping[str, str]) -> str:
-    """Words of a judge, with numbers in the units that were told, not in those of the SI.
-
-    Of a discrete variable they say whether it has the value.
-    """
-    si_units = dict(zip(judge.labels.names, judge.labels.units, strict=False))
-
-    def words(match: re.Match[str]) -> str:
-        weight, name, limits = match.groups()
-        column, is_discrete, value = name.partition("=")
-        unit = units.get(name, si_units.get(name, ""))
-        if weight or (is_discrete and text.startswith(" in ", match.end())):
-            return match[0]  # of several variables, or what is to come
-        if is_discrete:
-            return f"{column} is {'not ' * ('below' in limits)}{value}"
-        factor = UNITS.get(unit, 1.0)
-        amounts = re.sub(_NUMBER, lambda number: f"{float(number[0]) / factor:.4g}", limits)
-        return f"{name}{amounts} {unit}".rstrip()
-
-    anyone = "|".join(map(re.escape, sorted(judge.labels.names, key=len, reverse=True)))
-    return re.sub(_LIMIT.format(anyone), words, text) if anyone else text
 
 
 def _last(hits: Sequence[Any], what: str) -> str:

@@ -165,9 +165,7 @@ def learn(
     if lengths.seen:
         pairs.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
     learner = new_guard and new_guard.judge
-    tables = tables_of(lesson.model)
-    if isinstance(learner, Foresight):
-        tables = alarms_of(learner, notes.units)
+    tables = alarms_of(learner) if isinstance(learner, Foresight) else tables_of(lesson.model)
     show(facts("What was read", pairs), *tables)
     say("")
     if out is None and new_guard is None:

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli.foreseen import date, in_units
+from evofsm.cli.foreseen import date
 from evofsm.cli.monitor.messages import (
     NO_ROW,
     SCHEMA,
@@ -272,10 +272,7 @@ class Decider:
         parts = {**revision._asdict(), "risk_low": low, "risk_high": high}
         body = {name: plain(parts[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
         self._alarm = self._is_alarm(revision)
-        reason = revision.reason
-        if isinstance(judge := self.guard.judge, Foresight):
-            reason = in_units(reason, judge, self.slots.columns.units)
-        body |= {"reason": reason, "alarm": self._alarm, "mode": self.mode.value}
+        body |= {"reason": revision.reason, "alarm": self._alarm, "mode": self.mode.value}
         return self._of("decision", time=row.time, **leader, **self._worst(row), **body, **note)
 
     def _worst(self, row: Row) -> Answer:
