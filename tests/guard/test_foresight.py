@@ -26,6 +26,13 @@ def surging(rng):
     return z[: fails.argmax() + 1], fails.argmax() < n
 
 
+def shaking(rng):
+    """It shakes more and more in the last 40 min."""
+    z = rng.normal(3.0, 0.15, (rng.integers(300, 1500), 2))
+    z[-40:, 1] += 0.1 * np.arange(40)
+    return z, True
+
+
 def random(rng):
     """Nothing foresees it."""
     z = rng.normal(0.5, 0.1, (rng.integers(200, 600), 2))
@@ -43,7 +50,9 @@ def learnt(machine, count):
 
 @pytest.fixture(scope="module")
 def surge():
-    return learnt(surging, 40)
+    judge = learnt(surging, 40)
+    judge.stated = 1.0
+    return judge
 
 
 def test_where_one_limit_depends_on_another_it_foresees_more_than_thresholds(surge):
@@ -61,21 +70,21 @@ def test_it_finds_which_two_of_many_variables_limit_each_other(surge):
     wide = [np.column_stack([rng.normal(size=(len(z), 7)).cumsum(0), z]) for z in runs]
     names = *map(str, range(7)), *NAMES
     judge = Foresight.learn_log(wide, failed, dt=DT, horizon=HORIZON, names=names)
-    assert {*re.findall("[a-z]+", judge.words(2))} == {*NAMES, "above"}
+    assert {*NAMES, "above"} <= {*re.findall("[a-z]+", judge.words(2))}
     assert judge.held_out[2, 0] >= 0.95 * sum(failed)
 
 
-def test_as_few_are_false_as_stated_cross_validated_and_more_warn_no_later(surge):
-    log = Runs.of(*log_of(surging, 0, 40))
-    right, false, failures, _ = surge.held_out.T
-    days = len(log.rows) * DT / 86400.0
-    assert (false <= np.multiply(RATES, days) + 2.0 * np.sqrt(np.multiply(RATES, days)) + 1).all()
+@pytest.mark.parametrize("machine", [surging, shaking])
+def test_as_few_are_false_as_stated_held_out_and_where_it_learnt(machine):
+    judge, log = learnt(machine, 40), Runs.of(*log_of(machine, 0, 40))
+    right, false, failures, _ = judge.held_out.T
+    assert (false <= np.multiply(RATES, len(log.rows) * DT / 86400.0)).all()
     assert sorted(false) == list(false)
     assert (failures == sum(log.failed)).all()
-    came = [surge.tally(log, rate)[0].foreseen for rate in range(len(RATES))]
-    assert right[-1] - 4 <= came[-1]  # the alarm that it tells of, not another
-    for rate in range(len(RATES)):
-        of = surge.of_rate(rate)[:, 2:5].tolist()
+    for rate in np.flatnonzero(judge.shares):
+        came, _ = judge.tally(log, rate)  # of the alarm that it tells of, not another
+        assert min(came.foreseen - right[rate], false[rate] - came.false) >= 0
+        of = judge.of_rate(rate)[:, 2:5].tolist()
         assert len({*map(tuple, of)}) == len(of)  # no part of it implies another one
 
 
@@ -86,7 +95,7 @@ def test_a_warning_of_one_row_is_found_where_the_horizon_is_long():
     told, _ = judge.tally(Runs.of(runs, [True] * 12), 0, plain=True)
     assert told.foreseen > 8
     assert told.false == 0
-    assert "plain thresholds do as well: variable 1 above 5.3" in judge.told_by_experience
+    assert re.search(r"as well: variable 1 above (6\.[5-9]|7\.[0-5])", judge.told_by_experience)
 
 
 def test_one_failure_is_learnt_from_and_of_alarms_the_closest_that_there_is_counts(surge):
@@ -110,8 +119,6 @@ def test_where_nothing_foresees_a_failure_there_is_no_alarm():
 
 
 def test_a_guard_alarms_row_by_row_as_the_log_was_judged_also_from_its_file(surge, reloaded):
-    surge = copy.deepcopy(surge)
-    surge.stated = 1.0
     reviser = ActionReviser(surge, Choices(1), tolerance=1e-6)
     guard = reloaded(Guard.of(reviser, interval=DT, learn=False))
     episodes, failed = log_of(surging, 2, 8)

@@ -200,8 +200,7 @@ def _tables(
             text = f"{row[1]} failures foreseen, {row[2]} ahead (mean; not foreseen: 0)"
             text += f", {(false := alarm['learnt']['false']):,} false"
             if poisson_bounds(false)[0] > days * alarm["stated"]:
-                text += f": more than the {row[0]} a day that were stated, from too short a log"
-                text += ", or one that changed"
+                text += f": more than the {row[0]} a day that were stated, beyond what is by chance"
             bold = [k]
     episodes = counted(found["episodes"], "episode")
     rows_read = f"{found['rows']:,} in {episodes}, {days:.3g} days of rows"

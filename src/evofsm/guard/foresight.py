@@ -8,10 +8,10 @@ within the horizon after it began, on by then or not. Where it stays on, it says
 horizon, and is false as often as no failure came. A failure is foreseen by the first before it.
 
 An alarm is of at most so many limits. Those are searched for that warn longest on average (none
-counts as 0), less a price for each false alarm, and beside them plain thresholds in the same way.
-For each rate of false alarms that may be stated the price is the one with the longest warning at no
-more of them by cross-validation: of each third of the log, as it was learnt from the others. So it
-is told how many failures it foresees, and how many alarms are false.
+counts as 0), less a price for each false alarm, and beside them plain thresholds in the same way;
+each is then moved, with room to what is usual, or to the middle where it makes no difference. The
+price is the highest with nearly the longest warning at no more false alarms than are stated, both
+cross-validated (each third of a log, learnt from the others) and on all of it; the worse is told.
 """
 
 from __future__ import annotations
@@ -42,16 +42,17 @@ RATES, RATE = (0.1, 0.3, 1.0, 3.0), 0.3
 DATES = 1e8
 # In horizons: how far ahead limits look, over what the rate is taken, how long an alarm stays on.
 _AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.25
-# Limits of an alarm, thresholds of each that are tried, prices of a false alarm, parts of a log.
-_MOST_LIMITS, _TRIED, _PRICES, _PARTS = 4, 24, np.geomspace(0.02, 50.0, 24), 3
+# Limits of an alarm, prices of a false alarm, parts of a log; thresholds that are tried, and as
+# many about the best, of which each is as often false as one that is so many steps nearer.
+_MOST_LIMITS, _PRICES, _PARTS, _TRIED, _ROOM = 4, np.geomspace(0.02, 50.0, 24), 3, 24, 2
 # Of a log of more rows some episodes are learnt from, if so many failures are left.
 _MOST_ROWS, _FAILURES = 500_000, 100
 # Blocks of rows in a horizon, as limits are searched for; of a long log fewer, but so many, where
 # there would be more than that in all.
 _BLOCKS, _FEWEST_BLOCKS, _MOST_BLOCKS = 15, 5, 100_000
-# Kinds of alarms; plain thresholds are taken unless others, as often false, warn for longer.
+# Kinds of alarms; plain ones, and of prices the highest, if others warn for so little longer.
 _LEARNT, _PLAIN, _NO_KIND = range(3)
-_BETTER = 0.8
+_BETTER, _LONG = 0.8, 0.97
 # What a limit has to add to the share of the horizon that is warned before; survived rows of which
 # forms of failure are learnt.
 _WORTH, _ROWS = 2e-3, 4000
@@ -66,8 +67,9 @@ _SHORT, _FEWEST, _HELD_ROWS, _MORE = 0.05, 10, 20_000, (1.1, 1.5)
 #: which of `_AHEAD`, whether above (1) or below (-1), and the threshold.
 _RATE, _KIND, _OF, _WHEN, _SIGN, _AT = range(6)
 _DAY = 86400.0
-# Limits by their places, each with that of its threshold.
-_Rule = tuple[tuple[int, int], ...]
+_COUNTED = "cross-validated, and no better than on what it learnt from"
+# Limits by their places, each with its threshold.
+_Rule = tuple[tuple[int, float], ...]
 #: The file of such a judge.
 KIND = Kind(
     "foresight",
@@ -76,8 +78,7 @@ KIND = Kind(
         "limits": Numbers(("limits", 6)),
         "held_out": COUNT.of("rates", 4),
         "rows": Numbers(("rows", "variables")),
-        "starts": COUNT.of("episodes"),
-        "failed": COUNT.of("episodes"),
+        **dict.fromkeys(("starts", "failed"), COUNT.of("episodes")),
     },
     {
         **{"dt": SIZE, "horizon": FROM_1, "hold": FROM_1, "names": list[str], "units": list[str]},
@@ -146,9 +147,9 @@ class Foresight(LearningJudge):
     It learns from a whole log (`learn_log`), or with ``log``, the episodes so far, as it goes: of
     the latest 20,000 rows (half of them of episodes that failed), where enough has come since.
 
-    The risk is the share of such alarms that a failure followed, cross-validated; 0 while none is
-    on. ``stated`` says which alarm it is, of those for several rates of false ones: the one for
-    most of them a day that are no more; if there is none, the one for fewest.
+    The risk is the share of such alarms that were right, by `held_out`; 0 while none is on. Of the
+    alarms for several rates it is the one for most false ones a day that are no more than
+    ``stated``; if there is none, the one for fewest.
 
     Examples
     --------
@@ -184,8 +185,8 @@ class Foresight(LearningJudge):
         self.horizon, self.hold = horizon, hold  #: [rows]
         self.bridges = 0.0  #: longest hole in time that it goes on across, as in a log [s]
         self.forms, self.limits = forms, limits
-        #: (rates, 4) of each of `RATES`, cross-validated: failures foreseen, false alarms,
-        #: failures; and its kind
+        #: (rates, 4) of each of `RATES`, the worse of cross-validated and of what it learnt from:
+        #: failures foreseen, false alarms, failures; and its kind
         self.held_out = held_out
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=dt)
         self.log = log  #: what it learns from, if it does as it goes
@@ -263,48 +264,45 @@ class Foresight(LearningJudge):
             horizon = max(float(np.median(log.lengths)) * _SHORT, _FEWEST) * dt
         ahead = max(round(positive("horizon", horizon) / dt), 1)
         names = labels.names or [f"variable {k + 1}" for k in range(log.rows.shape[1])]
-        empty_tables = np.empty((0, failure.SIZE)), np.empty((0, 6)), np.zeros((0, 4))
-        fresh = cls(dt, ahead, held, *empty_tables)
+        fresh = cls(dt, ahead, held, *np.empty((3, 0, failure.SIZE)))
         number = np.arange(len(log.failed)) * _PARTS // len(log.failed)
-        tallies = np.zeros((2, len(_PRICES), 3))  # warned, foreseen, false
+        tallies = np.zeros((2, 2, len(_PRICES), 3))  # cross-validated, and of all of the log
         there = np.zeros((2, 2))  # of failures, and rows: how many are where others failed, and all
         for k in range(_PARTS):
             if not (number == k).any() or not log.failed[number != k].any():
                 continue
-            judge, rest = fresh._fitted(log.part(number != k)), log.part(number == k)
-            columns = judge.columns(rest)
+            judge, rest = fresh._fitted(log.part(number != k))[0], log.part(number == k)
             for n, z in enumerate((rest.failures, rest.rows)):
                 there[n] += failure.inside(judge.forms, z).any(0).sum(), len(z)
-            for side, price in np.ndindex(2, len(_PRICES)):
-                tally, _ = judge.tally(rest, price, plain=bool(side), columns=columns)
-                tallies[side, price] += tally.lead * tally.failures, tally.foreseen, tally.false
-        judge, days = fresh._fitted(log), there[1, 1] * dt / _DAY
+            tallies[0] += judge._tallies(rest, judge.columns(rest))
+        judge, columns = fresh._fitted(log)
+        tallies[1] = judge._tallies(log, columns)
+        worst = np.dstack([tallies[..., :2].min(0), tallies[..., 2].max(0)])
+        days = np.array([there[1, 1], len(log.rows)])[:, None, None] * dt / _DAY
         holds, shares = judge.forms[:, failure.HELD], there[:, 0] / np.maximum(there[:, 1], 1.0)
         is_known = not there[0, 1] or shares[0] - shares[1] >= _KNOWN
         holds[holds < (_SAID * log.failed.sum() if is_known else np.inf)] = 0.0
         chance, limits = log.failed.sum() * ahead / len(log.rows), [np.empty((0, 6))]
-        latest, scores = limits[0], list[Any]()
+        score_of, scores = dict[Any, Any](), list[Any]()
         for rate, daily_rate in enumerate(RATES):
-            fit = tallies[..., 2] <= daily_rate * days
-            best = np.where(fit, tallies[..., 0], -1.0).argmax(1)
+            fit = (tallies[..., 2] <= daily_rate * days).all(0) & (tallies[1, ..., 1] > 0)
+            counts = worst * fit[..., None]
+            best = [np.flatnonzero(leads >= _LONG * leads.max())[-1] for leads in counts[..., 0]]
             parts = [judge.of_rate(int(best[k]), plain=k > 0)[:, 1:] for k in range(2)]
-            usable = fit[[0, 1], best] & [len(part) > 0 for part in parts]
-            learnt, plain = tallies[[0, 1], best] * usable[:, None]
-            limits += [np.insert(parts[k], 0, rate, 1) for k in np.flatnonzero(usable)]
-            as_many = min((plain[2] + 1.0) / (learnt[2] + 1.0), 1.0)
-            kind = int(plain[0] >= _BETTER * as_many * learnt[0])
+            learnt, plain = counts[[0, 1], best]
+            limits += [np.insert(parts[k], 0, rate, 1) for k in range(2) if fit[k, best[k]]]
+            as_many = np.minimum((plain[2] + 1.0) / (worst[0, :, 2] + 1.0), 1.0)
+            kind = int(plain[0] >= _BETTER * (as_many * counts[0, :, 0]).max())
             _, right, false = (learnt, plain)[kind]
-            n = right + false
-            low = wilson_bounds(right / n, n, _NO_CHANCE)[0] if right else 0.0
+            low = wilson_bounds(right / (n := right + false), n, _NO_CHANCE)[0] if right else 0.0
             kind = kind if low > chance else _NO_KIND  # no better than an alarm at any time
-            before, latest = latest, parts[kind % 2]  # limits of the rate before, and of this one
-            is_same = bool(scores) and scores[-1][3] == kind and np.array_equal(latest, before)
-            scores.append(scores[-1] if is_same else (right, false, float(log.failed.sum()), kind))
+            score = right, false, float(log.failed.sum()), kind  # one of each limits
+            scores.append(score_of.setdefault((kind, parts[kind % 2].tobytes()), score))
         tables = judge.forms, np.concatenate(limits), np.array(scores, np.float64)
         return cls(dt, ahead, held, *tables, names, labels.units)
 
-    def _fitted(self, log: Runs) -> Self:
-        """With forms and limits of both kinds, for all rates."""
+    def _fitted(self, log: Runs) -> tuple[Self, Floats]:
+        """With forms and limits of both kinds, for all prices; and the `columns` of the log."""
         rows, failed = np.delete(log.rows, log.last[log.failed], 0), log.failures
         unit = np.median(np.abs(np.diff(log.rows, axis=0)), axis=0) + 1e-12
         box, sample = np.sort(rows, axis=0), rows[:: max(len(rows) // _ROWS, 1)]
@@ -313,7 +311,18 @@ class Foresight(LearningJudge):
         judge = type(self)(self.dt, self.horizon, self.hold, forms, self.limits, self.held_out)
         columns = judge.columns(log)
         judge.limits = np.vstack([judge._searched(columns, log, plain=k) for k in (False, True)])
-        return judge
+        return judge, columns
+
+    def _tallies(self, log: Runs, columns: Floats) -> Floats:
+        """(2, prices, 3) of both kinds of limits: time warned, failures foreseen, false alarms."""
+        tables, tallies = dict[bytes, Tally](), list[tuple[float, ...]]()
+        for side, price in np.ndindex(2, len(_PRICES)):
+            table = self.of_rate(price, plain=bool(side))[:, _OF:].tobytes()
+            if table not in tables:
+                tables[table], _ = self.tally(log, price, plain=bool(side), columns=columns)
+            n, foreseen, lead, false, _ = tables[table]
+            tallies.append((lead * n, foreseen, false))
+        return np.reshape(tallies, (2, -1, 3))
 
     def _searched(self, columns: Floats, log: Runs, *, plain: bool) -> Floats:
         """The limits that warn longest, of each rate."""
@@ -330,20 +339,27 @@ class Foresight(LearningJudge):
         series = [sign * columns[v + of * when] for v, when, sign in limits]
         thresholds = np.array([np.quantile(x, shares) for x in series])
         x = np.array([np.maximum.reduceat(x, blocks) for x in series])
-        spans = np.maximum(self._spans // size, 1)
-        starts = np.searchsorted(blocks, log.starts)
+        spans, starts = np.maximum(self._spans // size, 1), np.searchsorted(blocks, log.starts)
         most = spans[0] * log.failed.sum(), len(log.rows) * self.dt / _DAY
+
+        def beyond(rule: _Rule) -> Flags:
+            return np.asarray(np.any([x[0] > np.inf, *(x[k] > at for k, at in rule)], axis=0))
 
         @cache
         def more(rule: _Rule) -> Floats:
             """(limits, thresholds, 2) share that is warned, and false alarms a day, of one more."""
-            above = np.zeros(len(blocks), np.bool_)
-            for k, j in rule:
-                above |= x[k] > thresholds[k, j]
-            return _one_more(x, thresholds, above, starts, log.failed, spans) / most
+            return _one_more(x, thresholds, beyond(rule), starts, log.failed, spans) / most
+
+        @cache
+        def near(k: int, at: float, rest: _Rule) -> tuple[Floats, Floats]:
+            """(steps,) thresholds about one of those, and (steps, 2) what comes of each of them."""
+            j, rise = int(np.searchsorted(thresholds[k], at)), (*thresholds[k], x[k].max())
+            steps = np.linspace(rise[max(j - 1, 0)], rise[j + 1], _TRIED)
+            sums = _one_more(x[k, None], steps[None], beyond(rest), starts, log.failed, spans)
+            return steps, sums[0] / most
 
         # What one failure alone speaks for is no further limit.
-        table, alone = [], max(_WORTH, 1.0 / log.failed.sum())
+        table, alone = list[Any](), max(_WORTH, 1.0 / log.failed.sum())
         for number, price in enumerate(_PRICES):
             rule, worth = _Rule(), 0.0
             while len(rule) < _MOST_LIMITS:
@@ -351,14 +367,16 @@ class Foresight(LearningJudge):
                 best = divmod(int(gain.argmax()), _TRIED)
                 if gain[best] <= worth + (alone if rule else _WORTH):
                     break
-                worth, rule = gain[best], (*rule, best)
-            parts = [series[k] > thresholds[k, j] for k, j in rule]
-            for n, (k, j) in enumerate(rule):  # what others imply is no part of it
-                rest = [part for m, part in enumerate(parts) if m != n]
-                if not rest or (parts[n] & ~np.logical_or.reduce(rest)).any():
-                    table.append((number, plain, *limits[k], limits[k][2] * thresholds[k, j]))
-                else:
-                    parts[n] = np.zeros_like(parts[n])
+                worth, rule = gain[best], (*rule, (best[0], float(thresholds[best])))
+            for k, at in rule:
+                rest = tuple(limit for limit in rule if limit != (k, at))
+                steps, sums = near(k, at, rest)
+                gain = sums[_ROOM:, 0] - price * sums[:-_ROOM, 1]
+                equals = np.flatnonzero(gain >= gain.max() - 1e-9)
+                middle = k, float(steps[_ROOM + equals[len(equals) // 2]])
+                is_more = not rest or (beyond((middle,)) & ~beyond(rest)).any()
+                rule = (*rest, middle) if is_more else rest  # what others imply is no part of it
+            table += [(number, plain, *limits[k], limits[k][2] * at) for k, at in rule]
         return np.array(table, np.float64).reshape(-1, 6)
 
     # -- Telling --------------------------------------------------------------------------------
@@ -374,8 +392,7 @@ class Foresight(LearningJudge):
         memory = np.full((2, len(x)), np.nan) if memory is None else memory
         keeps, ahead = np.exp(-1.0 / (_SMOOTHED * self.horizon)), np.empty((len(_AHEAD), *x.shape))
         _look_ahead(x, log.starts, keeps, np.array(_AHEAD) * self.horizon, memory, ahead)
-        columns: Floats = ahead.reshape(-1, len(log.rows))
-        return columns
+        return np.reshape(ahead, (-1, len(log.rows)))
 
     def _passed(self, columns: Floats, limits: Floats, *, soon: bool = False) -> Flags:
         """(n, T) which limits are passed; or ``soon``, within the horizon at the present rate."""
@@ -419,22 +436,13 @@ class Foresight(LearningJudge):
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,).
 
-        Parameters
-        ----------
-        log : Runs
-        rate : int
-        plain : bool, optional
-            Whether it is that of plain thresholds; by default of the kind that did better.
-        columns : ndarray, optional
-            The `columns` of the log, if they are known.
-        early : (E,) array_like, optional
-            How much sooner than its row each failure came [rows].
+        ``plain`` is whether it is that of plain thresholds, as in `of_rate`; ``columns`` are those
+        of the log, if known; ``early`` is how much sooner than its row each failure came [rows].
         """
         limits = self.of_rate(rate, plain=plain)
         columns = self.columns(log) if columns is None else columns
         above, on = (np.any(self._passed(columns, limits, soon=k), axis=0) for k in (False, True))
-        leads = np.zeros(len(log.starts))
-        rows = np.flatnonzero(on)
+        leads, rows = np.zeros(len(log.starts)), np.flatnonzero(on)
         false = _tally(above, on, rows, log.starts, log.failed, self._spans, leads)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
         lead = float(np.maximum(leads - np.asarray(early), 0.0).sum()) / max(n, 1) * self.dt
@@ -474,8 +482,7 @@ class Foresight(LearningJudge):
             name, there = self._words(limits[0])
             why = f"{name} {self._value(limits[0], z):.4g}: {there}"
         came = f"after {right:.0f} of {right + false:.0f} such alarms it failed"
-        within = span(self.horizon * self.dt)
-        return f"{why}; {came} within {within} (cross-validated on what it learnt from)"
+        return f"{why}; {came} within {span(self.horizon * self.dt)} ({_COUNTED})"
 
     def _value(self, limit: Floats, z: Floats) -> float:
         """What is compared with a limit, at an observation (m,), as `_words` has it."""
@@ -530,8 +537,7 @@ class Foresight(LearningJudge):
         """Where it fails; what each alarm is, and how often it was right."""
         there = " or ".join(map(self._region, self._said))
         texts = [f"it fails where {there}"] if there else []
-        for rates, last in self.alarms.items():
-            texts.append(f"for {rates} false alarms a day {self.of(last)}")
+        texts += [f"for {name} false alarms a day {self.of(k)}" for name, k in self.alarms.items()]
         return "; ".join(texts)
 
     @property
@@ -547,7 +553,7 @@ class Foresight(LearningJudge):
             return "no alarm is false so seldom and better than chance"
         plain = "plain thresholds do as well: " * (kind == _PLAIN)
         record = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
-        return f"{plain}{self.words(rate)} ({record}, cross-validated)"
+        return f"{plain}{self.words(rate)} ({record}, {_COUNTED})"
 
     # -- Beside a machine -----------------------------------------------------------------------
 
@@ -691,8 +697,7 @@ def _look_ahead(
 ) -> None:
     """(h, v, T) what x (v, T) is in so many rows at its rate; memory (2, v) is smoothed x."""
     for v in range(x.shape[0]):
-        once, twice = memory[0, v], memory[1, v]
-        place = 0
+        once, twice, place = memory[0, v], memory[1, v], 0
         for t in range(x.shape[1]):
             if place < len(starts) and starts[place] == t:
                 once, twice = np.nan, np.nan
@@ -726,8 +731,7 @@ def _tally(
     for e in range(len(starts)):
         end = starts[e + 1] if e + 1 < len(starts) else len(above)
         fails = end - 1 if failed[e] else end + horizon
-        up, onset, latest = 0, -1, starts[e] - 1
-        leads[e] = 0.0
+        up, onset, latest, leads[e] = 0, -1, starts[e] - 1, 0.0
         while True:
             t = rows[place] if place < len(rows) and rows[place] < end else end
             up = up if t == latest + 1 else 0
@@ -745,8 +749,7 @@ def _tally(
             up = up + 1 if above[t] else 0
             onset = t if onset < 0 and up >= hold else onset
             on[t] = onset >= 0
-            latest = t
-            place += 1
+            latest, place = t, place + 1
     return false
 
 
@@ -761,9 +764,7 @@ def _one_more(
     sums, leads = np.zeros((*thresholds.shape, 2)), np.zeros(len(starts))
     on, rows = np.zeros(len(above), np.bool_), np.zeros(len(above), np.int64)
     for k in range(len(thresholds)):
-        n = len(rows)
-        for t in range(n):
-            rows[t] = t
+        n, rows[:] = len(rows), np.arange(len(rows))
         for j in range(thresholds.shape[1]):
             count, n = n, 0
             for t in rows[:count]:
