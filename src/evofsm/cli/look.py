@@ -74,10 +74,16 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     group = group or blend
     segments = _numbered(frame[group]) if group else np.zeros(len(frame))
     order = np.argsort(segments, kind="stable") if blend else np.arange(len(frame))
-    segments = segments[order]
-    ends = [order[np.append(np.flatnonzero(np.diff(segments)), -1)], *(rows for *_, rows in rare)]
-    last = np.concatenate(ends[:2])  # of an episode, or a failure's first
-    columns = {name: _range(name, z, runs | (name == still), last) for name, z in values.items()}
+    if is_reversed := bool(clock and not group and (np.diff(frame[clock]) < 0.0).mean() > 0.5):
+        order = order[::-1]
+    segments, places = segments[order], np.argsort(order)
+    ends = [np.append(np.flatnonzero(np.diff(segments)), -1)]
+    ends += [places[rows] for *_, rows in rare[:1]]
+    last = np.concatenate(ends)  # of an episode, or a failure's first
+    columns = {
+        name: _range(name, z[order], (runs | (name == still))[order], last)
+        for name, z in values.items()
+    }
     columns |= {name: _told(frame[name]) for name in texts}
     facts = [*columns.items()][:_COLUMNS_SHOWN]
     if more := len(columns) - len(facts):
@@ -86,16 +92,12 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     facts += [("incomplete", f"{n_partial:,} rows, in which a number is missing")] * (n_partial > 0)
     facts += [("bad fields", f"{n:,} {text}") for text, n in odd.items()]
     facts += [(f"bad {kind}s", f"{n:,}, the first: {first}") for kind, (n, first) in skips.items()]
+    asides += [("time runs", "backwards; turn the rows round first, as below")] * is_reversed
     facts += [*asides, ("rows looked at", f"{len(frame):,}")]
     options = [("--time", clock) if clock else ("--dt", "1"), *([("--unit", form)] if form else [])]
-    bad, before = max(n_partial, sum(n for n, _ in skips.values()) + sum(odd.values())), ""
+    bad = max(n_partial, sum(n for n, _ in skips.values()) + sum(odd.values()))
     if clock:
-        at = frame[clock].to_numpy()[order]
-        if not group and (np.diff(at) < 0.0).mean() > 0.5:
-            before, at = ".reverse()", at[::-1]
-            asides = [("time runs", "backwards; turn the rows round first, as below")]
-            facts[-1:] = [*asides, facts[-1]]
-        further, n_late = _of_steps(at, segments, facts, n_partial)
+        further, n_late = _of_steps(frame[clock].to_numpy()[order], segments, facts, n_partial)
         options, bad = options + further, bad + n_late
     if bad > SKIPPED:
         options.append(("--skip-bad", f"{_round(2.0 * bad):.0f}"))
@@ -108,6 +110,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
         mend = f", but mixed: sort rows by {group} and then by {clock} first, as below"
         facts.append(("an episode?", f"each {group}{mend if blend else ''}"))
         options.append(("--episode", _named(group, ",")))
+    before = ".reverse()" if is_reversed else ""
     if blend:
         before = f".sort({group!r}, maintain_order=True)"
     spans = {n: z[runs] for n, z in values.items() if n not in {group, *markers}}
@@ -350,7 +353,7 @@ def _range(name: str, z: NDArray[np.float64], runs: NDArray[np.bool_], ends: Row
     if not high > low or not n_far:
         return text
     text += f"; 99 % in {low:.5g} to {high:.5g}, {n_far:,} far outside"
-    near = np.unique(np.clip(np.add.outer(ends, np.arange(-_NEAR, 1)), 0, len(z) - 1))
+    near = np.add.outer(ends % len(z), np.arange(-_NEAR, 1)).clip(0)
     parts = [part for part, far in sides.items() if far.any() and not far[near].any()]
     if not parts:
         return f"{text}, right before failures or the end: what is to be foreseen"
