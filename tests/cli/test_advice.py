@@ -143,20 +143,23 @@ def test_rows_are_sorted_and_logs_learnt_apart_as_it_is_advised(evofsm):
     assert evofsm("learn", "slow.csv", *asked).exit_code == 0
 
 
-# -- A first look ---------------------------------------------------------------------------------
-
-
 def at(minutes, zone=UTC):
     return (datetime(2025, 10, 25, 20, tzinfo=UTC) + timedelta(minutes=minutes)).astimezone(zone)
 
 
-BERLIN = ZoneInfo("Europe/Berlin")
 LOOKED_AT = {
     "ts,machine": (lambda k: f"{1_700_000_000 + k // 3 * 60},{'ABC'[k % 3]}", "each machine, but"),
     "Date": (lambda k: f"{at(k * 60):%m/%d/%Y %H:%M}", "--unit 'Date=%m/%d/%Y %H:%M'"),
     "Date,Time": (lambda k: f"{at(k):%d/%m/%Y,%H:%M}", "--time Date,Time"),
     "time": (lambda k: 600 - k, "time runs backwards"),
-    "Zeit": (lambda k: f"{at(k, BERLIN):%d.%m.%Y %H:%M}", "summer time ends or begins 2025-10-26"),
+    "t": (
+        lambda k: k + 7200 * (k > 500) + 60 * (k > 550),
+        "holes 2, the longest 2 h, together 2.0",
+    ),
+    "Zeit": (
+        lambda k: f"{at(k, ZoneInfo('Europe/Berlin')):%d.%m.%Y %H:%M}",
+        "summer time ends or begins 2025-10-26",
+    ),
 }
 
 
@@ -168,6 +171,7 @@ def test_what_a_first_look_proposes_reads_all_rows(evofsm, names):
     looked = evofsm("learn", "log.csv").stdout
     assert part in " ".join(looked.split())
     assert "--where" not in looked
+    assert "--resample" not in looked
     before, _, command = looked.partition("to learn from it:\n")[2].rpartition("  evofsm ")
     if before:
         shell(before.strip())

@@ -17,6 +17,7 @@ from evofsm.io.logs import LONGEST_STEP, SKIPPED, USUAL_EPISODE, hours_unsaid
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
 
 Pairs = list[tuple[str, str]]
+Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 # So many fields and rows are looked at; columns of more texts are no list of states.
@@ -216,7 +217,7 @@ def _dates(
     return frame, clock, f"{clock}={day} {hour}"
 
 
-def _odd(steps: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _odd(steps: Floats) -> NDArray[np.bool_]:
     """Which of them are no usual ones: far from the median of those that go on."""
     later = steps[steps > 0.0]
     usual = float(np.median(later)) if len(later) else math.nan
@@ -240,9 +241,7 @@ def _blend(frame: polars.DataFrame, clock: str, names: Sequence[str]) -> str:
     return ""
 
 
-def _of_steps(
-    at: NDArray[np.float64], segments: NDArray[np.float64], facts: Pairs, lacking: int
-) -> tuple[Pairs, int]:
+def _of_steps(at: Floats, segments: Floats, facts: Pairs, lacking: int) -> tuple[Pairs, int]:
     """What makes one clock of these times, if so many rows are left out; and rows that are late."""
     within = np.diff(segments) == 0.0
     steps = np.diff(at)[within]
@@ -298,7 +297,7 @@ def _named(name: str, signs: str) -> str:
     return quoted([name]) if set(name) & {*signs, '"'} else name
 
 
-def _stands(z: NDArray[np.float64]) -> bool:
+def _stands(z: Floats) -> bool:
     """Whether numbers are near 0 for a while, and else far from it."""
     size = np.abs(z[np.isfinite(z)])
     low, mid = (float(np.mean(size < x * np.quantile(size, 0.95))) for x in (0.05, 0.5))
@@ -325,7 +324,7 @@ def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str
                 yield name, f"{_named(name, _SIGNS)}=={value}", frequency, first
 
 
-def _numbered(values: polars.Series) -> NDArray[np.float64]:
+def _numbered(values: polars.Series) -> Floats:
     """Of each row which of the different values it has, as a number."""
     return values.rank("dense").fill_null(0).cast(polars.Float64).to_numpy()
 
@@ -338,7 +337,7 @@ def _is_in_blocks(values: polars.Series) -> bool:
     return 1 < n_values == len(lengths) <= n_rows / 10 and not is_label
 
 
-def _range(name: str, z: NDArray[np.float64], runs: NDArray[np.bool_], ends: Rows) -> str:
+def _range(name: str, z: Floats, runs: NDArray[np.bool_], ends: Rows) -> str:
     """From where to where numbers go; where some that run are far outside, what is to be done.
 
     What leads to one of these ends stays: it is what is to be foreseen.

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from evofsm.io.rosbag import Topics
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 #: Columns that tell episodes apart where nothing else was said and they exist.
 USUAL_EPISODE = ("run", "pair", "segment", "episode")
 #: Steps longer than the usual one times this, or as much shorter, begin a new episode.
@@ -92,9 +93,9 @@ class Chunk(NamedTuple):
     """T consecutive rows of a trace, m variables each."""
 
     source: str  #: file they come from
-    observations: NDArray[np.float64]  #: (T, m)
-    actions: NDArray[np.float64]  #: (T,) action taken after each, NaN where none is known
-    times: NDArray[np.float64]  #: (T,) [s]
+    observations: Floats  #: (T, m)
+    actions: Floats  #: (T,) action taken after each, NaN where none is known
+    times: Floats  #: (T,) [s]
     starts: NDArray[np.int64]  #: (E,) rows at which an episode begins
     dt: float  #: usual time from a row to the next [s]; NaN while no two rows belong together
     jumps: int = 0  #: episodes that begin because of a hole in time
@@ -109,7 +110,7 @@ class Chunk(NamedTuple):
         return self.failures is not None and len(self.failures) > 0
 
     @property
-    def fails(self) -> NDArray[np.bool_]:
+    def fails(self) -> Bools:
         """(T,) with which rows an episode failed."""
         fails = np.zeros(len(self.times), np.bool_)
         fails[[] if self.failures is None else self.failures] = True
@@ -249,7 +250,7 @@ class Term(NamedTuple):
         """Whether the column is compared with a number."""
         return isinstance(self.value, float)
 
-    def holds(self, piece: Piece) -> NDArray[np.bool_]:
+    def holds(self, piece: Piece) -> Bools:
         """In which rows of a piece it holds; where nothing stands it never does."""
         if self.of_number:
             values = piece.numbers[self.column]
@@ -313,7 +314,7 @@ class Condition(NamedTuple):
         """All of them."""
         return [term for terms in self.either for term in terms]
 
-    def holds(self, piece: Piece) -> NDArray[np.bool_]:
+    def holds(self, piece: Piece) -> Bools:
         """In which rows of a piece it holds."""
         parts = [np.logical_and.reduce([t.holds(piece) for t in terms]) for terms in self.either]
         return np.asarray(np.logical_or.reduce(parts))
@@ -488,7 +489,7 @@ def hours_unsaid(times: Floats, sample: str, before: float = 0.0) -> Floats:
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else math.nan
     hours = np.zeros(len(times))
 
-    def is_usual(steps: Floats) -> NDArray[np.bool_]:
+    def is_usual(steps: Floats) -> Bools:
         return (steps > usual / LONGEST_STEP) & (steps < LONGEST_STEP * usual)
 
     for hour in (1, -1) if not _ZONE.search(sample) else ():
@@ -735,9 +736,7 @@ class _Clock:
         self._path, self.began = path, 0.0  # since 1970, of one with dates
         self._last = self._usual = np.nan
 
-    def holes(
-        self, times: NDArray[np.float64], starts: NDArray[np.bool_], piece: Piece
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def holes(self, times: Floats, starts: Bools, piece: Piece) -> tuple[Bools, Bools]:
         """Mark rows after a hole in time within an episode, and those that bring nothing later."""
         late = np.zeros(piece.rows, np.bool_)
         if self._longest:  # a row without a time costs no more than itself
@@ -761,9 +760,7 @@ class _Clock:
         unusual = (steps > LONGEST_STEP * self._usual) | (steps < self._usual / LONGEST_STEP)
         return np.asarray(unusual), late
 
-    def _late(
-        self, times: NDArray[np.float64], starts: NDArray[np.bool_], piece: Piece
-    ) -> NDArray[np.bool_]:
+    def _late(self, times: Floats, starts: Bools, piece: Piece) -> Bools:
         late, latest, began = np.zeros(piece.rows, np.bool_), self._last, self.began
         for row, (time, begins) in enumerate(zip(times.tolist(), starts.tolist(), strict=True)):
             is_late = time < latest or (time == latest and not self._resampled)
@@ -875,7 +872,7 @@ class _Reader:
         if last_chunk is not None:
             yield last_chunk
 
-    def _fill(self, piece: Piece, times: NDArray[np.float64]) -> NDArray[np.int64] | None:
+    def _fill(self, piece: Piece, times: Floats) -> NDArray[np.int64] | None:
         """Fill in the latest values of each signal, and say which rows count: those with an action.
 
         Nothing where the table has one clock: some row of the first ones has all that is wanted.
@@ -962,7 +959,7 @@ class _Reader:
         request = Wanted(numbers, texts, clock if is_dated else (), form)
         return request, {name: UNITS[unit] for name, unit in column_units.items() if unit in UNITS}
 
-    def _times(self, piece: Piece, *, is_date: bool) -> NDArray[np.float64]:
+    def _times(self, piece: Piece, *, is_date: bool) -> Floats:
         if not self._clock.ticks:
             if self._before == 0:
                 self._compare_dt(piece)
@@ -997,7 +994,7 @@ class _Reader:
                 f"{time!r} goes on by {step:g}: without --dt that column is the clock"
             )
 
-    def _starts(self, piece: Piece) -> NDArray[np.bool_]:
+    def _starts(self, piece: Piece) -> Bools:
         """The rows that begin another episode, of which all rows have to stand together."""
         starts = np.zeros(piece.rows, np.bool_)
         if piece.starts is not None:
@@ -1020,13 +1017,7 @@ class _Reader:
             self._known.add(tuple(episode))
         return starts
 
-    def _sift(
-        self,
-        piece: Piece,
-        anew: NDArray[np.bool_],
-        starts: NDArray[np.bool_],
-        late: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def _sift(self, piece: Piece, anew: Bools, starts: Bools, late: Bools) -> tuple[Bools, Bools]:
         """Which rows are kept, and which of them fail; marks ``starts`` after those that end one.
 
         An episode begins ``anew`` where the log says so, and at ``starts``. A condition that still
@@ -1101,9 +1092,7 @@ class _Reader:
             elif term.sign:
                 entries[:] = sorted({*entries, *piece.texts[term.column].unique()})[:_MANY_TEXTS]
 
-    def _count_unknown(
-        self, piece: Piece, unknown: NDArray[np.bool_], starts: NDArray[np.bool_]
-    ) -> None:
+    def _count_unknown(self, piece: Piece, unknown: Bools, starts: Bools) -> None:
         """Count rows without an action, but the last ones of episodes, which need none."""
         if self._unknown is not None and not starts[0]:
             piece.skips.leave_out("action", self._unknown)
@@ -1118,7 +1107,7 @@ def _moment(time: float, began: float) -> str:
     return f"{datetime.fromtimestamp(began + time, UTC):%F %T}" if began else f"{time:g}"
 
 
-def _encoded(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
+def _encoded(piece: Piece, variable: str | Category) -> Floats:
     if isinstance(variable, str):
         return piece.numbers[variable]
     encoder = ObservationEncoder(variable)
