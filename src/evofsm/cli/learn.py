@@ -310,8 +310,7 @@ def _look_first(files: list[str], reading: Reading) -> list[str] | None:
             title += f", the first of {len(files):,} files; the others were not looked at"
         if not options:
             show(facts(title, contents))
-            columns_of_texts = (name for name in table.columns if table.holds(name) == "text")
-            texts = [explained(table.first(name)) for name in columns_of_texts]
+            texts = (explained(table.first(n)) for n in table.columns if table.holds(n) == "text")
             why = next((f": {text}" for text in texts if "thousands" in text), "")
             raise ValueError(f"{file} has no column of numbers that change{why}")
         to_file = "--guard" if "--failed" in could else "--out"

@@ -70,14 +70,9 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     markers = {name for name, *_ in rare}  # which do not tell episodes apart
     groups = [name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns]
     groups = [name for name in groups if name not in markers and not _FAILURE.search(name)]
-    group = next((name for name in groups if _is_in_blocks(frame[name])), "")
-    blend = "" if group or not clock else _blend(frame, clock, groups)
-    group = group or blend
-    segments = _numbered(frame[group]) if group else np.zeros(len(frame))
-    order = np.argsort(segments, kind="stable") if blend else np.arange(len(frame))
-    if is_reversed := bool(clock and not group and (np.diff(frame[clock]) < 0.0).mean() > 0.5):
-        order = order[::-1]
-    segments, places = segments[order], np.argsort(order)
+    group, order = _episodes(frame, clock, groups)
+    segments = _numbered(frame[group])[order] if group else np.zeros(len(frame))
+    places, is_mixed = np.argsort(order), bool((np.diff(order) != 1).any())
     ends = [np.append(np.flatnonzero(np.diff(segments)), -1)]
     ends += [places[rows] for *_, rows in rare[:1]]
     last = np.concatenate(ends)  # of an episode, or a failure's first
@@ -93,7 +88,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     facts += [("incomplete", f"{n_partial:,} rows, in which a number is missing")] * (n_partial > 0)
     facts += [("bad fields", f"{n:,} {text}") for text, n in odd.items()]
     facts += [(f"bad {kind}s", f"{n:,}, the first: {first}") for kind, (n, first) in skips.items()]
-    asides += [("time runs", "backwards; turn the rows round first, as below")] * is_reversed
+    if is_mixed and not group:
+        asides.append(("time runs", "backwards; turn the rows round first, as below"))
     facts += [*asides, ("rows looked at", f"{len(frame):,}")]
     options = [("--time", clock) if clock else ("--dt", "1"), *([("--unit", form)] if form else [])]
     bad = max(n_partial, sum(n for n, _ in skips.values()) + sum(odd.values()))
@@ -109,18 +105,16 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     options += [("--failed", text) for _, text, *_ in rare[:1]]
     if group:
         mend = f", but mixed: sort rows by {group} and then by {clock} first, as below"
-        facts.append(("an episode?", f"each {group}{mend if blend else ''}"))
+        facts.append(("an episode?", f"each {group}{mend if is_mixed else ''}"))
         options.append(("--episode", _named(group, ",")))
-    before = ".reverse()" if is_reversed else ""
-    if blend:
-        before = f".sort({group!r}, maintain_order=True)"
+    before = f".sort({group!r}, maintain_order=True)" if group else ".reverse()"
     spans = {n: z[runs] for n, z in values.items() if n not in {group, *markers}}
     spans = {n: np.nanquantile(z, (0.02, 0.98)) for n, z in spans.items()}
     if still in spans and spans[still][1] < 1.05 * spans[still][0]:  # it is always the same
         del spans[still]
     # What goes on by the same from row to row is a count of them.
     steady = {n: e.tolist() for n, e in spans.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
-    return facts, _of_numbers(steady, options), before
+    return facts, _of_numbers(steady, options), before if is_mixed else ""
 
 
 def _first_rows(
@@ -224,21 +218,24 @@ def _odd(steps: Floats) -> NDArray[np.bool_]:
     return (steps <= 0.0) | (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
 
 
-def _blend(frame: polars.DataFrame, clock: str, names: Sequence[str]) -> str:
-    """The column whose values each have a clock of their own, where rows of several are mixed."""
-    at = frame[clock].to_numpy()
+def _episodes(frame: polars.DataFrame, clock: str, names: Sequence[str]) -> tuple[str, Rows]:
+    """The column that tells episodes apart, if any, and the order of rows in which time runs on.
+
+    Where rows of several are mixed, each of its values has a clock of its own.
+    """
+    at, rows = frame[clock].to_numpy() if clock else np.zeros(0), np.arange(len(frame))
+    if group := next((name for name in names if _is_in_blocks(frame[name])), ""):
+        return group, rows
     n_odd = int(_odd(np.diff(at)).sum())
-    for name in names:
-        values = frame[name]
-        if not 1 < values.n_unique() <= len(at) / 10:
-            continue
-        places = _numbered(values)
-        order = np.argsort(places, kind="stable")
-        n_within = int(_odd(np.diff(at[order])[np.diff(places[order]) == 0]).sum())
-        takes_turns = _WHO.search(name) and 2 * (np.diff(places) != 0).sum() > len(at)
-        if 10 * n_within < (len(at) if takes_turns else n_odd - _MANY):
-            return name
-    return ""
+    for name in names if clock else ():
+        if 1 < frame[name].n_unique() <= len(at) / 10:
+            places = _numbered(frame[name])
+            order = np.argsort(places, kind="stable")
+            n_within = int(_odd(np.diff(at[order])[np.diff(places[order]) == 0]).sum())
+            takes_turns = _WHO.search(name) and 2 * (np.diff(places) != 0).sum() > len(at)
+            if 10 * n_within < (len(at) if takes_turns else n_odd - _MANY):
+                return name, order
+    return "", rows[::-1] if 2 * (np.diff(at) < 0.0).sum() > len(rows) else rows
 
 
 def _of_steps(at: Floats, segments: Floats, facts: Pairs, lacking: int) -> tuple[Pairs, int]:
