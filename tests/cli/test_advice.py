@@ -8,7 +8,9 @@ import shlex
 import shutil
 import subprocess
 import sys
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
@@ -139,6 +141,49 @@ def test_rows_are_sorted_and_logs_learnt_apart_as_it_is_advised(evofsm):
     assert re.search("slow.csv has a row every 0.3 s.*drive.csv has one every 0.1 s", told)
     assert "or learn them apart" in told
     assert evofsm("learn", "slow.csv", *asked).exit_code == 0
+
+
+def at(minutes, zone=UTC):
+    return (datetime(2025, 10, 25, 20, tzinfo=UTC) + timedelta(minutes=minutes)).astimezone(zone)
+
+
+LOOKED_AT = {
+    "ts,machine": (lambda k: f"{1_700_000_000 + k // 3 * 60},{'ABC'[k % 3]}", "each machine, but"),
+    "Date": (lambda k: f"{at(k * 60):%m/%d/%Y %H:%M}", "--unit 'Date=%m/%d/%Y %H:%M'"),
+    "Date,Time": (lambda k: f"{at(k):%d/%m/%Y,%H:%M}", "--time Date,Time"),
+    "time": (lambda k: 600 - k, "time runs backwards"),
+    "t": (
+        lambda k: k + 7200 * (k > 500) + 60 * (k > 550),
+        "holes 2, the longest 2 h, together 2.0",
+    ),
+    "Zeit": (
+        lambda k: f"{at(k, ZoneInfo('Europe/Berlin')):%d.%m.%Y %H:%M}",
+        "summer time ends or begins 2025-10-26",
+    ),
+}
+
+
+@pytest.mark.parametrize("names", LOOKED_AT)
+def test_what_a_first_look_proposes_reads_all_rows(evofsm, names):
+    clock, part = LOOKED_AT[names]
+    rows = (f"{clock(k)},{k % 7 + 99 * (k in (297, 303))},{k == 300}" for k in range(600))
+    Path("log.csv").write_text("\n".join([f"{names},level,f", *rows]))
+    looked = evofsm("learn", "log.csv").stdout
+    assert part in " ".join(looked.split())
+    assert "--where" not in looked
+    assert "--resample" not in looked
+    before, _, command = looked.partition("to learn from it:\n")[2].rpartition("  evofsm ")
+    if before:
+        shell(before.strip())
+    found = said(evofsm(*shlex.split(command.replace("\\\n", ""))))
+    assert "rows 600, one every" in found
+    assert "1 episode ended with f==True" in found
+
+
+def test_a_first_look_names_the_cause(evofsm):
+    for text, cause in {"": "no rows", '0,"1,200.5"\n1,"1,300.5"\n': "commas between"}.items():
+        Path("log.csv").write_text(f"time,level\n{text}")
+        assert cause in evofsm("learn", "log.csv").stderr
 
 
 # -- Files of other kinds -------------------------------------------------------------------------

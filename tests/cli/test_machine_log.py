@@ -98,10 +98,8 @@ def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, wri
     assert "warning" not in summed.stderr
     if form in ("titles", "units"):  # the export itself, row by row
         live = evofsm("monitor", path, "--guard", "guard.evofsm", "--text").stdout
-        assert (
-            len(re.findall(r"^2025-03-1\d [0-9:]+  failure, \S+ \S+ after the alarm$", live, re.M))
-            == 7
-        )
+        failures = r"^2025-03-1\d [0-9:]+  failure, \S+ \S+ after the alarm$"
+        assert len(re.findall(failures, live, re.M)) == 7
         assert re.findall(rf"  alarm: {VIBRATION} [0-9.]+: above", live)
         assert "refused" not in live
 
@@ -366,14 +364,6 @@ def test_a_guard_from_zero_of_who_acts_learns_what_fails(evofsm, acts):
     assert told.exit_code == 0, told.stderr
     told = " ".join(told.stdout.split())
     assert re.search(r"fails where x is (below -1|above 1) or x is (below -1|above 1);", told)
-
-
-def test_a_few_holes_in_an_even_log_are_said(evofsm):
-    times = [k + 7200 * (k > 500) + 60 * (k > 900) for k in range(2000)]
-    Path("even.csv").write_text("\n".join(["t,heat", *(f"{t},{t % 7 + 0.5}" for t in times)]))
-    found = " ".join(evofsm("learn", "even.csv").stdout.split())
-    assert "holes 2, the longest 2 h, together 2.02 h; each begins an episode (--hole)" in found
-    assert "--resample" not in found
 
 
 def test_a_log_of_any_machine_is_watched(written):

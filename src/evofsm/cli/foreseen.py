@@ -92,7 +92,10 @@ def show_foreseen(
         first = int((rows <= split * rows[-1]).sum())
         first_part, episodes = _of_two_rows(episodes[:first]), episodes[first:]
         if not (first_part and _of_two_rows(episodes)):
-            raise ValueError(f"{file}: it takes two episodes at least, to learn and to judge")
+            why = "it takes two episodes at least, to learn and to judge"
+            if not any(e.failed for e in (*first_part, *episodes)):
+                why = "no episode failed, so there is nothing to foresee (--failed says what did)"
+            raise ValueError(f"{file}: {why}")
         si_units = [SI.get(unit, unit) for unit in (units.get(name, "") for name in names)]
         labels = Labels(names=tuple(names), units=tuple(si_units))
         guard = guard_where_nobody_acts(first_part, labels, *asked)

@@ -106,7 +106,7 @@ def learn(
     _check_out(out)
     _check_out(guard, "--guard")
     columns, lengths, _, acts = read = reading()
-    hints = _look_first(files[0], read)
+    hints = _look_first(files, read)
     if hints is None:
         if out or guard or given_of(reading):
             raise ValueError(f"say what is observed in {files[0]}: --observe; a way stands above")
@@ -291,24 +291,39 @@ def _check_out(out: Path | None, option: str = "--out") -> None:
             raise ValueError(f"{option} {out}: {fault}") from None
 
 
-def _look_first(file: str, reading: Reading) -> list[str] | None:
+def _look_first(files: list[str], reading: Reading) -> list[str] | None:
     """What a log seems to need that was not asked for; None where a way to learn was printed."""
     from evofsm.cli.look import look_at
     from evofsm.driving.naming import VARIABLES
     from evofsm.io.logs import open_table
-    from evofsm.io.tables import CsvTable, ParquetTable, Skips, silent
+    from evofsm.io.tables import CsvTable, ParquetTable, Skips, explained, silent
 
-    columns = reading.columns
+    columns, file = reading.columns, files[0]
     table = open_table(file, columns, reading.lengths, silent, reading.topics, Skips(), [])
     if not isinstance(table, CsvTable | ParquetTable):
         return []
-    contents, options = look_at(table)
+    contents, options, before = look_at(table)
     could = dict(options)
-    if columns.observe.names == VARIABLES and not {*VARIABLES} & {*table.columns} and options:
+    if columns.observe.names == VARIABLES and not {*VARIABLES} & {*table.columns}:
+        title, names = f"What {file} holds", files
+        if len(files) > 1:
+            title += f", the first of {len(files):,} files; the others were not looked at"
+        if not options:
+            show(facts(title, contents))
+            texts = (explained(table.first(n)) for n in table.columns if table.holds(n) == "text")
+            why = next((f": {text}" for text in texts if "thousands" in text), "")
+            raise ValueError(f"{file} has no column of numbers that change{why}")
         to_file = "--guard" if "--failed" in could else "--out"
         options.append((to_file, f"{to_file[2:]}.evofsm"))
-        command = [f"evofsm learn {quote(file)}", *(f"{a} {in_quotes(b)}" for a, b in options)]
-        show(facts(f"What {file} holds", contents), "\nA way to learn from it:")
+        show(facts(title, contents), "\nA way to learn from it:")
+        if before and len(files) == 1:
+            kind = "csv" if isinstance(table, CsvTable) else "parquet"
+            how = f", separator={table.separator!r}, infer_schema=False" * (kind == "csv")
+            names = [f"{Path(file).name.partition('.')[0]}-sorted.{kind}"]
+            code = f"p.read_{kind}({file!r}{how}){before}.write_{kind}({names[0]!r})"
+            print(f"  python -c {in_quotes(f'import polars as p; {code}')}")
+        command = [f"evofsm learn {' '.join(map(quote, names))}"]
+        command += (f"{a} {in_quotes(b)}" for a, b in options)
         print("  " + " \\\n      ".join(command), flush=True)
         return None
     answers = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed

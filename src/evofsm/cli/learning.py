@@ -129,17 +129,20 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         text = ": ".join([f"no row meets --failed {quote(columns.failed)}", *goes])
         warnings.append(text.rstrip())
     is_untold = time in noted.untold and time not in units and not noted.resampled
-    if (step := noted.longest_step) > 0.0 and is_untold:
+    cars, step = columns.observe.names == VARIABLES, noted.longest_step
+    ratio = max(step / 60.0, 60.0 / max(step, 1e-9))  # machines have parts of minutes, or several
+    if step > 0.0 and is_untold and (cars or abs(ratio - round(ratio)) > 0.05):
         unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
         cause = f"is the time in {unit}? --unit {time}={unit} converts it"
         warnings.append(f"there is a row every {step:,.6g} s: {cause}")
+    nobody = " (no leader)" * cars
     constant = [kv for kv in noted.at_once.items() if kv[1] in _NOBODY or noted.failed_at_once > 1]
     if constant and noted.failed_at_once >= noted.failed / 2:
         name, value = min(constant, key=lambda kv: kv[1] not in _NOBODY)
         warnings.append(
             f"{noted.failed_at_once:,} of {noted.failed:,} failed episodes fail with their first "
             f"row, and {name} is {value:g} there each time: does that stand for a missing "
-            f"value (no leader)? --no-leader {quote(f'{name}=={value:g}')} leaves such rows out"
+            f"value{nobody}? --no-leader {quote(f'{name}=={value:g}')} leaves such rows out"
         )
     if noted.failed_at_once:
         warnings.append(
@@ -150,7 +153,7 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         name, value, rows = min(alone, key=lambda entry: entry[1] not in _NOBODY)
         warnings.append(
             f"{name} is {value!r} in {rows:,} rows, and else never below 0: is that a missing "
-            f"value (no leader)? --no-leader {quote(f'{name}=={value!r}')} leaves such rows out"
+            f"value{nobody}? --no-leader {quote(f'{name}=={value!r}')} leaves such rows out"
         )
     warnings += _contradictions(noted, columns)
     if noted.unplaced:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
 
 import numpy as np
 import polars
@@ -12,38 +13,49 @@ from numpy.typing import NDArray
 
 from evofsm.cli.options import in_quotes, quoted, seconds
 from evofsm.guard.foresight import span
-from evofsm.io.logs import LONGEST_STEP, SKIPPED, USUAL_EPISODE
+from evofsm.io.logs import LONGEST_STEP, SKIPPED, USUAL_EPISODE, hours_unsaid
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
 
 Pairs = list[tuple[str, str]]
+Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
 
 # So many fields and rows are looked at; columns of more texts are no list of states.
 _MOST_FIELDS, _ROWS_LOOKED_AT, _MOST_TEXTS = 20_000_000, 500_000, 12
-_EPOCHS = {"ns": 1e17, "us": 1e14, "ms": 1e11}  # times since 1970 are larger
+_EPOCHS = {"ns": 1e9, "us": 1e6, "ms": 1e3, "s": 1.0}  # times since 1970 are larger by far
 _COLUMNS_SHOWN = 40  # columns
 _SIGNS = "<>=! "  # what in a name of a condition is ambiguous
 # Far outside is what lies so many ranges of 99 % of the rows beyond them.
 _FAR = 2.0
+# Rows before a failure that are never proposed to be left out.
+_NEAR = 3
 # A larger share of steps, and so many, that are no usual one make no clock.
 _ODD, _MANY = 0.001, 10
-_TIME = re.compile("(t|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
+_TIME = re.compile("(ts?|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
+# Dates with slashes: the year first, or the day or the month.
+_SLASHES = re.compile(r"(\d{1,4})/\d\d?/(\d\d|\d{4}),? \d\d?:\d\d(:\d\d)?( [AP]M)?$")
 _SET = re.compile("acc|action|valve|ventil|soll|set|^u$|cmd|throttle", re.IGNORECASE)
 _FAILURE = re.compile(
     "st(ö|oe)r|fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|not-?aus|emergency",
     re.IGNORECASE,
 )
+_TRUTH = re.compile("true|false|yes|no|ja|nein|wahr|falsch|", re.IGNORECASE)
+_WHO = re.compile("ma(sch|ch)ine|device|ger(ä|ae)t|asset|unit|anlage|pump|motor|(^|_)id$", re.I)
 _CODE = re.compile(f"{_FAILURE.pattern}|stat|zustand|code", re.IGNORECASE)
 _LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 30min 1h 5h 10h 1d"
 _NICE = [(seconds("", text), text) for text in _LONG.split()]
 
 
-def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
-    """What the first rows hold, by column and in all, and options that could be asked for."""
-    skips, odd = dict[str, tuple[int, str]](), dict[str, int]()
+def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
+    """What the first rows hold, by column and in all, and options that could be asked for.
+
+    Last what is to be done with all rows before, as polars calls it.
+    """
+    skips, odd, asides = dict[str, tuple[int, str]](), dict[str, int](), Pairs()
     table.skips = Skips(1 << 60, skips)
-    frame, clock, form = _first_rows(table, odd)
+    frame, clock, form = _first_rows(table, odd, asides)
     if not len(frame):
-        return [], []
+        table.skips.refuse_nothing(f"{table.path} has a header but no rows")
     numbers = [name for name, kind in frame.schema.items() if kind.is_numeric() and name != clock]
     values = {name: frame[name].to_numpy() for name in numbers}
     values = {name: z for name, z in values.items() if np.isfinite(z).any()}
@@ -51,51 +63,66 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs]:
     runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
     limit = _round(0.1 * float(np.nanquantile(np.abs(values[still]), 0.95))) if still else 0.0
     runs = values[still] > limit if still else runs
-    columns = {name: _range(name, z, z if name == still else z[runs]) for name, z in values.items()}
+    rare = [*_rare(frame, [name for name in (*texts, *values) if name not in USUAL_EPISODE])]
+    likely = [row for row in rare if _FAILURE.search(row[1])]
+    truths = {name for name in texts if all(map(_TRUTH.fullmatch, frame[name].unique()))}
+    rare = likely or [row for row in rare if row[0] in {*values, *truths}]
+    markers = {name for name, *_ in rare}  # which do not tell episodes apart
+    groups = [name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns]
+    groups = [name for name in groups if name not in markers and not _FAILURE.search(name)]
+    group, order = _episodes(frame, clock, groups)
+    segments = _numbered(frame[group])[order] if group else np.zeros(len(frame))
+    places, is_mixed = np.argsort(order), bool((np.diff(order) != 1).any())
+    ends = [np.append(np.flatnonzero(np.diff(segments)), -1)]
+    ends += [places[rows] for *_, rows in rare[:1]]
+    last = np.concatenate(ends)  # of an episode, or a failure's first
+    columns = {
+        name: _range(name, z[order], (runs | (name == still))[order], last)
+        for name, z in values.items()
+    }
     columns |= {name: _told(frame[name]) for name in texts}
     facts = [*columns.items()][:_COLUMNS_SHOWN]
     if more := len(columns) - len(facts):
         facts.append(("...", f"and {more:,} more columns"))
-    n_partial = int(np.isnan([*values.values()]).any(0).sum())
+    n_partial = int(np.isnan([runs, *values.values()]).any(0).sum())
     facts += [("incomplete", f"{n_partial:,} rows, in which a number is missing")] * (n_partial > 0)
     facts += [("bad fields", f"{n:,} {text}") for text, n in odd.items()]
     facts += [(f"bad {kind}s", f"{n:,}, the first: {first}") for kind, (n, first) in skips.items()]
-    facts.append(("the clock", clock or "no column (--dt)"))
-    facts.append(("rows looked at", f"{len(frame):,}"))
+    if is_mixed and not group:
+        asides.append(("time runs", "backwards; turn the rows round first, as below"))
+    facts += [*asides, ("rows looked at", f"{len(frame):,}")]
     options = [("--time", clock) if clock else ("--dt", "1"), *([("--unit", form)] if form else [])]
-    groups = (name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns)
-    group = next((name for name in groups if _is_in_blocks(frame[name])), "")
-    if (bad := max(n_partial, sum(n for n, _ in skips.values()) + sum(odd.values()))) > SKIPPED:
-        options.append(("--skip-bad", f"{_round(2.0 * bad):.0f}"))
+    bad = max(n_partial, sum(n for n, _ in skips.values()) + sum(odd.values()))
     if clock:
-        within = ~np.diff(frame[group].rle_id().to_numpy()).astype(bool) if group else slice(None)
-        options += _of_steps(np.diff(frame[clock].to_numpy())[within], facts, n_partial)
+        further, n_late = _of_steps(frame[clock].to_numpy()[order], segments, facts, n_partial)
+        options, bad = options + further, bad + n_late
+    if bad > SKIPPED:
+        options.append(("--skip-bad", f"{_round(2.0 * bad):.0f}"))
     if still:
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
-    rare = [*_rare(frame, [*texts, *values])]
-    likely = [row for row in rare if _FAILURE.search(row[1])]
-    rare = likely or [row for row in rare if row[0] in values]
-    facts += [("a failure?", f"{text} {frequency}") for _, text, frequency in rare]
-    options += [("--failed", text) for _, text, _ in rare[:1]]
+    facts += [("a failure?", f"{text} {frequency}") for _, text, frequency, _ in rare]
+    options += [("--failed", text) for _, text, *_ in rare[:1]]
     if group:
-        facts.append(("an episode?", f"each {group}"))
+        mend = f", but mixed: sort rows by {group} and then by {clock} first, as below"
+        facts.append(("an episode?", f"each {group}{mend if is_mixed else ''}"))
         options.append(("--episode", _named(group, ",")))
-    markers = {group, *(name for name, *_ in rare)}
-    ends = {n: np.nanquantile(z[runs], (0.02, 0.98)) for n, z in values.items() if n not in markers}
-    if still in ends and ends[still][1] < 1.05 * ends[still][0]:  # as it runs it is always the same
-        del ends[still]
+    before = f".sort({group!r}, maintain_order=True)" if group else ".reverse()"
+    spans = {n: z[runs] for n, z in values.items() if n not in {group, *markers}}
+    spans = {n: np.nanquantile(z, (0.02, 0.98)) for n, z in spans.items()}
+    if still in spans and spans[still][1] < 1.05 * spans[still][0]:  # it is always the same
+        del spans[still]
     # What goes on by the same from row to row is a count of them.
-    spans = {n: e.tolist() for n, e in ends.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
-    return facts, _of_numbers(spans, options)
+    steady = {n: e.tolist() for n, e in spans.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
+    return facts, _of_numbers(steady, options), before if is_mixed else ""
 
 
 def _first_rows(
-    table: CsvTable | ParquetTable, odd: dict[str, int]
+    table: CsvTable | ParquetTable, odd: dict[str, int], asides: Pairs
 ) -> tuple[polars.DataFrame, str, str]:
     """Their columns, the clock in seconds, which one that is, and how it is written if oddly."""
     firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
-    pairs = zip(firsts, [*firsts][1:], strict=False)
+    pairs = [*zip(firsts, [*firsts][1:], strict=False)]
     together = (f"{a},{b}" for a, b in pairs if is_date(f"{firsts[a]} {firsts[b]}"))
     date_columns = [name for name, text in firsts.items() if is_date(text)]
     clock, form = next(iter(date_columns), "") or next(together, ""), ""
@@ -107,7 +134,9 @@ def _first_rows(
         frame.vstack(polars.DataFrame({**piece.numbers, **piece.texts}), in_place=True)
         if len(frame) >= min(_ROWS_LOOKED_AT, _MOST_FIELDS // len(firsts)):
             break
-    for name in texts if len(frame) else ():  # of which the first alone is no number
+    if not len(frame):
+        return frame, clock, form
+    for name in texts:  # of which the first alone is no number
         fields = frame[name].str.strip_chars().replace("", None)
         floats = fields.str.replace(",", ".", literal=True).cast(polars.Float64, strict=False)
         bad = fields.filter(floats.is_null() & fields.is_not_null())
@@ -115,44 +144,128 @@ def _first_rows(
             frame = frame.with_columns(floats.fill_null(math.nan).alias(name))
             if len(bad):
                 odd[f"in column {name!r}, the first: {str(bad.first())!r}"] = len(bad)
-    texts = [name for name in texts if len(frame) and frame[name].dtype == polars.String]
+    texts = [name for name in texts if frame[name].dtype == polars.String]
     numbers = [name for name in firsts if name in frame.columns and frame[name].dtype.is_numeric()]
-    if not clock and (form := next(filter(None, map(_form, map(frame.get_column, texts))), "")):
-        clock, _, pattern = form.partition("=")
-        at = frame[clock].str.to_datetime(pattern, strict=False)
-        frame = frame.with_columns(at.dt.epoch("us").alias(clock))
-    scale = 1e-6
-    if not clock and (clock := next(filter(_TIME.match, numbers), "")) and len(frame):
-        since = frame[clock].abs().max()  # 1970, if it is large
-        unit = next((name for name, least in _EPOCHS.items() if float(str(since)) > least), "s")
-        form, scale = "" if unit == "s" else f"{_named(clock, '=')}={unit}", TIMES[unit]
-    if clock and len(frame):
-        frame = frame.with_columns(frame[clock] * scale)
+    titles = [names for names in [*zip(texts, strict=True), *pairs] if {*names} <= {*texts}]
+    for names in titles if not clock else ():
+        if not clock and (slashes := _dates(frame, names, asides)):
+            dates, (frame, clock, form) = [*names], slashes
+    since = ""
+    if not clock:
+        clock, unit, since = _clock_of(frame, numbers)
+        form = f"{_named(clock, '=')}={unit}" if unit != "s" else ""
+        frame = frame.with_columns(frame[clock] * TIMES[unit]) if clock else frame
+    if dates:
+        at = frame[clock].to_numpy() * 1e-6
+        hours = hours_unsaid(at, table.first(dates[-1]))
+        for row in np.flatnonzero(np.diff(hours))[:1] + 1:
+            when = datetime.fromtimestamp(at[row], UTC)
+            asides.append(("summer time", f"ends or begins {when:%Y-%m-%d}; time runs on there"))
+        frame = frame.with_columns(polars.Series(clock, at + 3600.0 * hours))
+    asides.insert(0, ("the clock", clock + since or "no column (--dt)"))
     return frame, clock, form
 
 
-def _of_steps(steps: NDArray[np.float64], facts: Pairs, lacking: int) -> Pairs:
-    """What makes one clock of such steps within episodes, if so many rows are left out."""
+def _clock_of(frame: polars.DataFrame, names: Sequence[str]) -> tuple[str, str, str]:
+    """The column of numbers that is a clock, by its values or its name; its unit, and since when.
+
+    Times since 1970 are of some years, and go on by little, of each machine at least.
+    """
+    epochs = dict[str, str]()
+    for name in names:
+        z = frame[name].drop_nans().to_numpy()
+        low, high, steps = (z.min(), z.max(), np.diff(z)) if len(z) else (0.0, 0.0, z)
+        if low < high and ((steps >= 0).all() or np.median(np.abs(steps)) < 0.1 * (high - low)):
+            fit = [unit for unit, n in _EPOCHS.items() if 9e8 * n < low < high < 2.6e9 * n]
+            epochs |= zip([name], fit, strict=False)
+    for name in (*filter(_TIME.match, epochs), *epochs):
+        return name, epochs[name], f", {epochs[name]} since 1970"
+    clock = next(filter(_TIME.match, names), "")
+    most = float(str(frame[clock].abs().max())) if clock else 0.0
+    return clock, next((unit for unit, n in _EPOCHS.items() if most > 1e8 * n), "s"), ""
+
+
+def _dates(
+    frame: polars.DataFrame, names: Sequence[str], asides: Pairs
+) -> tuple[polars.DataFrame, str, str] | None:
+    """Rows with dates that are written with slashes, in one column or two; None of others."""
+    texts = frame[names[0]].str.strip_chars()
+    for name in names[1:]:
+        texts = texts + " " + frame[name].str.strip_chars()
+    if not (match := _SLASHES.match(str(texts[0]))):
+        return None
+    year = "%Y" if len(match[1] + match[2]) > 4 else "%y"
+    days = ["%Y/%m/%d"] if len(match[1]) == 4 else [f"%d/%m/{year}", f"%m/%d/{year}"]
+    hour = "%I:%M" if match[4] else "%H:%M"
+    hour += f"{':%S' if match[3] else ''}{' %p' if match[4] else ''}"
+    read = {}
+    for day in days[:: -1 if match[4] else 1]:  # who writes AM and PM has the month first
+        at = texts.str.to_datetime(f"{day} {hour}", strict=False).dt.epoch("us")
+        read[day] = at.null_count(), int(_odd(np.diff(at.drop_nulls())).sum()), at
+    day = min(read, key=lambda day: read[day][:2])
+    if len({faults[:2] for faults in read.values()}) < len(read):
+        text = f"day or month first cannot be told of {texts[0]}; it is read as {day} (--unit)"
+        asides.append(("the dates", text))
+    clock = ",".join(names)
+    frame = frame.drop(names).with_columns(read[day][2].cast(polars.Float64).alias(clock))
+    return frame, clock, f"{clock}={day} {hour}"
+
+
+def _odd(steps: Floats) -> NDArray[np.bool_]:
+    """Which of them are no usual ones: far from the median of those that go on."""
     later = steps[steps > 0.0]
     usual = float(np.median(later)) if len(later) else math.nan
-    odd = (steps == 0.0) | (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
-    facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {usual:.2g} s"
-    holes = steps > LONGEST_STEP * usual
-    if len(late := steps[steps <= 0.0]):
-        twice, earlier = (late == 0.0).sum(), (late < 0.0).sum()
-        text = f"{twice:,} at the time of the row before, {earlier:,} earlier"
+    return (steps <= 0.0) | (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
+
+
+def _episodes(frame: polars.DataFrame, clock: str, names: Sequence[str]) -> tuple[str, Rows]:
+    """The column that tells episodes apart, if any, and the order of rows in which time runs on.
+
+    Where rows of several are mixed, each of its values has a clock of its own.
+    """
+    at, rows = frame[clock].to_numpy() if clock else np.zeros(0), np.arange(len(frame))
+    if group := next((name for name in names if _is_in_blocks(frame[name])), ""):
+        return group, rows
+    n_odd = int(_odd(np.diff(at)).sum())
+    for name in names if clock else ():
+        if 1 < frame[name].n_unique() <= len(at) / 10:
+            places = _numbered(frame[name])
+            order = np.argsort(places, kind="stable")
+            n_within = int(_odd(np.diff(at[order])[np.diff(places[order]) == 0]).sum())
+            takes_turns = _WHO.search(name) and 2 * (np.diff(places) != 0).sum() > len(at)
+            if 10 * n_within < (len(at) if takes_turns else n_odd - _MANY):
+                return name, order
+    return "", rows[::-1] if 2 * (np.diff(at) < 0.0).sum() > len(rows) else rows
+
+
+def _of_steps(at: Floats, segments: Floats, facts: Pairs, lacking: int) -> tuple[Pairs, int]:
+    """What makes one clock of these times, if so many rows are left out; and rows that are late."""
+    within = np.diff(segments) == 0.0
+    steps = np.diff(at)[within]
+    later = steps[steps > 0.0]
+    usual = float(np.median(later)) if len(later) else math.nan
+    if len(later):
+        often = span(float(f"{usual:.2g}")) if usual < 3600.0 else f"{usual / 3600.0:.3g} h"
+        facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {often}"
+    holes, odd = steps > LONGEST_STEP * usual, _odd(steps)
+    parts = np.split(at, np.flatnonzero(~within) + 1)
+    latest = np.concatenate([np.fmax.accumulate(part) for part in parts])
+    n_twice, n_earlier = int((steps == 0.0).sum()), int((at < latest).sum())
+    if n_twice + n_earlier:
+        text = f"{n_twice:,} at the time of the row before, {n_earlier:,} earlier"
         facts.append(("late rows", f"{text} (rows twice, unsorted, or --episode?)"))
     if odd.sum() + lacking < max(_MANY, _ODD * len(steps)):
         if holes.any():
             text = f"{holes.sum():,}, the longest {span(later.max())}, together"
             text += f" {span(float((steps[holes] - usual).sum()))}; each begins an episode (--hole)"
             facts.append(("holes", text))
-        return []
-    facts.append(("other steps", f"{odd.sum():,}, the longest {span(later.max())}"))
+        return [], n_twice + n_earlier
+    if odd.any():
+        facts.append(("other steps", f"{odd.sum():,}, the longest {span(later.max())}"))
     least = max(usual, 3.5 * float(np.median(steps)))  # of few digits many times are the same
     step = next((nice for nice in _NICE if nice[0] >= least), _NICE[-1])
     hole = next((nice for nice in _NICE if nice[0] >= 10.0 * step[0]), _NICE[-1])
-    return [("--resample", step[1]), ("--hole", hole[1])]
+    return [("--resample", step[1]), ("--hole", hole[1])], n_earlier
 
 
 def _of_numbers(ends: dict[str, list[float]], options: Pairs) -> Pairs:
@@ -172,16 +285,6 @@ def _of_numbers(ends: dict[str, list[float]], options: Pairs) -> Pairs:
     return [("--observe", text), *acts, *options, ("--rule", "novelty"), *scales]
 
 
-def _form(texts: polars.Series) -> str:
-    """How dates with slashes are written, as --unit takes it; of others nothing."""
-    match = re.match(r"\d\d?/\d\d?/\d{4} \d\d?:\d\d(:\d\d)?( [AP]M)?$", texts[0] or "")
-    if not match:
-        return ""
-    is_usual = match[2] or int(str(texts.str.extract(r"/(\d\d?)/").cast(polars.Int8).max())) > 12
-    day, hour = "%m/%d" if is_usual else "%d/%m", "%I:%M" if match[2] else "%H:%M"
-    return f"{texts.name}={day}/%Y {hour}{':%S' if match[1] else ''}{' %p' if match[2] else ''}"
-
-
 def _round(number: float) -> float:
     return float(f"{number:.0e}")
 
@@ -191,14 +294,14 @@ def _named(name: str, signs: str) -> str:
     return quoted([name]) if set(name) & {*signs, '"'} else name
 
 
-def _stands(z: NDArray[np.float64]) -> bool:
+def _stands(z: Floats) -> bool:
     """Whether numbers are near 0 for a while, and else far from it."""
     size = np.abs(z[np.isfinite(z)])
     low, mid = (float(np.mean(size < x * np.quantile(size, 0.95))) for x in (0.05, 0.5))
     return 0.01 < low < 0.9 and mid - low < 0.02 and len(np.unique(size)) > 2
 
 
-def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str, str, str]]:
+def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str, str, str, Rows]]:
     """Columns, conditions that hold of few of their rows, and how often: by a text, or a code."""
     for name in columns:
         kinds = frame[name].unique(maintain_order=True)
@@ -210,32 +313,46 @@ def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str
         for kind in kinds if is_code and len(kinds) <= _MOST_TEXTS else ():
             here = (frame[name] == kind).to_numpy()
             if kind and here.mean() < 0.25:
-                times = int((here > np.append(False, here[:-1])).sum())
+                first = np.flatnonzero(here > np.append(False, here[:-1]))
                 text = f"{kind:g}" if is_number else kind
                 value = text if is_number or re.fullmatch(r"[^\W\d]\w*", text) else f"'{text}'"
-                often = "once" if times == 1 else f"{times:,} times"
+                often = "once" if len(first) == 1 else f"{len(first):,} times"
                 frequency = f"({often}, {here.mean():.2%} of rows)"
-                yield name, f"{_named(name, _SIGNS)}=={value}", frequency
+                yield name, f"{_named(name, _SIGNS)}=={value}", frequency, first
+
+
+def _numbered(values: polars.Series) -> Floats:
+    """Of each row which of the different values it has, as a number."""
+    return values.rank("dense").fill_null(0).cast(polars.Float64).to_numpy()
 
 
 def _is_in_blocks(values: polars.Series) -> bool:
     """Whether the rows of each of several values stand together, some of them at least."""
-    blocks = int(str(values.rle_id().max())) + 1
-    return 1 < values.n_unique() == blocks <= len(values) / 10
+    lengths = values.rle().struct.field("len").to_list()
+    n_values, n_rows = values.n_unique(), len(values)
+    is_label = n_values == 2 and min(lengths) < n_rows / 20  # of what comes at the end
+    return 1 < n_values == len(lengths) <= n_rows / 10 and not is_label
 
 
-def _range(name: str, values: NDArray[np.float64], seen: NDArray[np.float64]) -> str:
-    """From where to where numbers go; where some seen are far outside, what leaves those out."""
-    text = f"{np.nanmin(values):.5g} to {np.nanmax(values):.5g}"
-    numbers = seen[np.isfinite(seen)]
+def _range(name: str, z: Floats, runs: NDArray[np.bool_], ends: Rows) -> str:
+    """From where to where numbers go; where some that run are far outside, what is to be done.
+
+    What leads to one of these ends stays: it is what is to be foreseen.
+    """
+    text = f"{np.nanmin(z):.5g} to {np.nanmax(z):.5g}"
+    numbers = z[runs & np.isfinite(z)]
     low, high = np.quantile(numbers, (0.005, 0.995)) if len(numbers) else (0.0, 0.0)
     unit, beyond, column = _round(high - low) or 1.0, _FAR * (high - low), _named(name, _SIGNS)
     least, most = math.floor((low - beyond) / unit) * unit, math.ceil((high + beyond) / unit) * unit
-    below, above = int((numbers < least).sum()), int((numbers > most).sum())
-    if not high > low or not below + above:
+    sides = {f"{column}>{least:.6g}": runs & (z < least), f"{column}<{most:.6g}": runs & (z > most)}
+    n_far = sum(int(far.sum()) for far in sides.values())
+    if not high > low or not n_far:
         return text
-    parts = [f"{column}>{least:.6g}"] * (below > 0) + [f"{column}<{most:.6g}"] * (above > 0)
-    text += f"; 99 % in {low:.5g} to {high:.5g}, {below + above:,} far outside"
+    text += f"; 99 % in {low:.5g} to {high:.5g}, {n_far:,} far outside"
+    near = np.add.outer(ends % len(z), np.arange(-_NEAR, 1)).clip(0)
+    parts = [part for part, far in sides.items() if far.any() and not far[near].any()]
+    if not parts:
+        return f"{text}, right before failures or the end: what is to be foreseen"
     return f"{text} (--where {in_quotes(' and '.join(parts))} leaves them out)"
 
 

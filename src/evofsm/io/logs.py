@@ -7,6 +7,7 @@ import operator
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import partial
 from itertools import chain, pairwise
 from operator import attrgetter
@@ -40,6 +41,8 @@ from evofsm.io.vehicles import ACTION, PairTable, VehicleLengths
 if TYPE_CHECKING:
     from evofsm.io.rosbag import Topics
 
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 #: Columns that tell episodes apart where nothing else was said and they exist.
 USUAL_EPISODE = ("run", "pair", "segment", "episode")
 #: Steps longer than the usual one times this, or as much shorter, begin a new episode.
@@ -61,15 +64,16 @@ _FASTEST, _LONGEST_USUAL = 60.0, 5.0
 _COMPARED, _CORRELATED = 50, 0.9
 _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
 _MICROSECOND = 1e-6
+# A date with a zone; months in which clocks are put on or back.
+_ZONE, _CHANGES = re.compile(r"(Z|UTC|[+-]\d\d:?\d\d)$"), (3, 4, 9, 10, 11)
 _NO_CAR = "{!r} cannot be right (another unit? --unit; a stand-in for nobody? --no-leader); in SI "
 
 # What may be done about a number that is missing.
 _HELD = "signals of several clocks in one table? --hold 0.5 holds the latest values)"
 _NO_ACTION = f" (a missing or failed measurement, or {_HELD}"
-_NO_LEADER = (
-    " (a missing or failed measurement, or no leader? --no-leader end leaves such rows out; or "
-    + _HELD
-)
+_LEFT_OUT = "? --no-leader end leaves such rows out; or " + _HELD
+_MISSING = " (a missing or failed measurement" + _LEFT_OUT
+_NO_LEADER = " (a missing or failed measurement, or no leader" + _LEFT_OUT
 # So many texts of a column are shown.
 _MANY_TEXTS = 10
 #: What the values of a step may become.
@@ -89,9 +93,9 @@ class Chunk(NamedTuple):
     """T consecutive rows of a trace, m variables each."""
 
     source: str  #: file they come from
-    observations: NDArray[np.float64]  #: (T, m)
-    actions: NDArray[np.float64]  #: (T,) action taken after each, NaN where none is known
-    times: NDArray[np.float64]  #: (T,) [s]
+    observations: Floats  #: (T, m)
+    actions: Floats  #: (T,) action taken after each, NaN where none is known
+    times: Floats  #: (T,) [s]
     starts: NDArray[np.int64]  #: (E,) rows at which an episode begins
     dt: float  #: usual time from a row to the next [s]; NaN while no two rows belong together
     jumps: int = 0  #: episodes that begin because of a hole in time
@@ -106,7 +110,7 @@ class Chunk(NamedTuple):
         return self.failures is not None and len(self.failures) > 0
 
     @property
-    def fails(self) -> NDArray[np.bool_]:
+    def fails(self) -> Bools:
         """(T,) with which rows an episode failed."""
         fails = np.zeros(len(self.times), np.bool_)
         fails[[] if self.failures is None else self.failures] = True
@@ -246,7 +250,7 @@ class Term(NamedTuple):
         """Whether the column is compared with a number."""
         return isinstance(self.value, float)
 
-    def holds(self, piece: Piece) -> NDArray[np.bool_]:
+    def holds(self, piece: Piece) -> Bools:
         """In which rows of a piece it holds; where nothing stands it never does."""
         if self.of_number:
             values = piece.numbers[self.column]
@@ -310,7 +314,7 @@ class Condition(NamedTuple):
         """All of them."""
         return [term for terms in self.either for term in terms]
 
-    def holds(self, piece: Piece) -> NDArray[np.bool_]:
+    def holds(self, piece: Piece) -> Bools:
         """In which rows of a piece it holds."""
         parts = [np.logical_and.reduce([t.holds(piece) for t in terms]) for terms in self.either]
         return np.asarray(np.logical_or.reduce(parts))
@@ -473,6 +477,30 @@ def read_traces(
             f"{kind!r}): is it narrower than {width:g} m? --vehicle-length "
             f"{quote(f'{kind}={length:g}x0.8')} says its length and width"
         )
+
+
+def hours_unsaid(times: Floats, sample: str, before: float = 0.0) -> Floats:
+    """(T,) how many hours more went by than dates [s] of a clock say that is put back and on.
+
+    So is one without a zone, as the sample shows, in the night of some Sundays; a step is taken for
+    that if it is a usual one but for the hour. Before the first row so many hours were unsaid.
+    """
+    steps = np.diff(times)
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else math.nan
+    hours = np.zeros(len(times))
+
+    def is_usual(steps: Floats) -> Bools:
+        return (steps > usual / LONGEST_STEP) & (steps < LONGEST_STEP * usual)
+
+    for hour in (1, -1) if not _ZONE.search(sample) else ():
+        for row in np.flatnonzero(is_usual(steps + 3600.0 * hour) & ~is_usual(steps)) + 1:
+            at = datetime.fromtimestamp(times[row], UTC)
+            if at.weekday() == 6 and at.hour < 4 and at.month in _CHANGES:
+                hours[row] = hour
+    hours = before + np.cumsum(hours)
+    anew = np.append(False, steps < -86400.0)  # of another machine, perhaps
+    latest = np.maximum.accumulate(np.where(anew, np.arange(len(times)), 0))
+    return hours - np.where(latest > 0, hours[latest], 0.0)
 
 
 def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
@@ -705,12 +733,10 @@ class _Clock:
         self._first_path = ""
 
     def open(self, path: str) -> None:
-        self._path = path
+        self._path, self.began = path, 0.0  # since 1970, of one with dates
         self._last = self._usual = np.nan
 
-    def holes(
-        self, times: NDArray[np.float64], starts: NDArray[np.bool_], piece: Piece
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def holes(self, times: Floats, starts: Bools, piece: Piece) -> tuple[Bools, Bools]:
         """Mark rows after a hole in time within an episode, and those that bring nothing later."""
         late = np.zeros(piece.rows, np.bool_)
         if self._longest:  # a row without a time costs no more than itself
@@ -734,20 +760,21 @@ class _Clock:
         unusual = (steps > LONGEST_STEP * self._usual) | (steps < self._usual / LONGEST_STEP)
         return np.asarray(unusual), late
 
-    def _late(
-        self, times: NDArray[np.float64], starts: NDArray[np.bool_], piece: Piece
-    ) -> NDArray[np.bool_]:
-        late, latest = np.zeros(piece.rows, np.bool_), self._last
+    def _late(self, times: Floats, starts: Bools, piece: Piece) -> Bools:
+        late, latest, began = np.zeros(piece.rows, np.bool_), self._last, self.began
         for row, (time, begins) in enumerate(zip(times.tolist(), starts.tolist(), strict=True)):
             is_late = time < latest or (time == latest and not self._resampled)
             late[row] = not begins and is_late and not piece.bad[row]
             if late[row]:
+                summer = "summer time that ends? a larger --skip-bad leaves its hour out; or "
+                cause = summer if began and 1800.0 < latest - time <= 3600.0 else ""
+                step = f"from {_moment(latest, began)} to {_moment(time, began)}"
                 piece.skips.leave_out(
                     "time",
-                    f"{piece.at(row)}: time goes from {latest:g} to {time:g} within an episode; it "
-                    "must run forward (a row twice, rows not sorted by time, a clock of too few "
-                    "digits, summer time that ends, or several episodes mixed? --episode names the "
-                    "columns that tell them apart, and --dt stands in for a clock)",
+                    f"{piece.at(row)}: time goes {step} within an episode; it must run forward "
+                    f"({cause}a row twice, rows not sorted by time, a clock of too few digits, or "
+                    "several episodes mixed? --episode names the columns that tell them apart, and "
+                    "--dt stands in for a clock)",
                 )
             latest = latest if late[row] else time
         return late
@@ -783,7 +810,8 @@ class _Reader:
         self._conditions = {o: Condition.parse(t, o) for o, t in texts.items() if t is not None}
         self._failed = self._conditions.get("--failed")
         self._before = 0  # rows
-        self._first_date = np.nan
+        self._first_date = self._last_date = np.nan
+        self._hours = 0.0  # that went by unsaid, as summer time ended
         # How long values are held, 0 for not at all; and those held, with their times.
         self._hold = columns.hold
         self._held_numbers: dict[str, tuple[float, float]] = {}
@@ -844,7 +872,7 @@ class _Reader:
         if last_chunk is not None:
             yield last_chunk
 
-    def _fill(self, piece: Piece, times: NDArray[np.float64]) -> NDArray[np.int64] | None:
+    def _fill(self, piece: Piece, times: Floats) -> NDArray[np.int64] | None:
         """Fill in the latest values of each signal, and say which rows count: those with an action.
 
         Nothing where the table has one clock: some row of the first ones has all that is wanted.
@@ -931,7 +959,7 @@ class _Reader:
         request = Wanted(numbers, texts, clock if is_dated else (), form)
         return request, {name: UNITS[unit] for name, unit in column_units.items() if unit in UNITS}
 
-    def _times(self, piece: Piece, *, is_date: bool) -> NDArray[np.float64]:
+    def _times(self, piece: Piece, *, is_date: bool) -> Floats:
         if not self._clock.ticks:
             if self._before == 0:
                 self._compare_dt(piece)
@@ -942,8 +970,17 @@ class _Reader:
             return times
         if np.isnan(self._first_date):
             self._first_date = times[np.argmin(np.isnan(times))]
-            self._noted.began = float(self._first_date) * _MICROSECOND
-        return (times - self._first_date) * _MICROSECOND
+            self._noted.began = self._clock.began = float(self._first_date) * _MICROSECOND
+        dates = np.append(self._last_date, times) * _MICROSECOND
+        sample = self._table.first(self._columns.time.rpartition(",")[2])
+        hours = hours_unsaid(dates, sample, self._hours)
+        for row in np.flatnonzero(np.diff(hours))[: not self._hours]:
+            self._noted.told.append(
+                f"{piece.at(int(row))}: summer time ends or begins; hours run on there, and what "
+                "is said of later rows is as if the clock had not been changed"
+            )
+        self._last_date, self._hours = times[-1], hours[-1]
+        return (times - self._first_date) * _MICROSECOND + 3600.0 * hours[1:]
 
     def _compare_dt(self, piece: Piece) -> None:
         """Say where a clock that is not read says something else than --dt."""
@@ -957,7 +994,7 @@ class _Reader:
                 f"{time!r} goes on by {step:g}: without --dt that column is the clock"
             )
 
-    def _starts(self, piece: Piece) -> NDArray[np.bool_]:
+    def _starts(self, piece: Piece) -> Bools:
         """The rows that begin another episode, of which all rows have to stand together."""
         starts = np.zeros(piece.rows, np.bool_)
         if piece.starts is not None:
@@ -980,13 +1017,7 @@ class _Reader:
             self._known.add(tuple(episode))
         return starts
 
-    def _sift(
-        self,
-        piece: Piece,
-        anew: NDArray[np.bool_],
-        starts: NDArray[np.bool_],
-        late: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def _sift(self, piece: Piece, anew: Bools, starts: Bools, late: Bools) -> tuple[Bools, Bools]:
         """Which rows are kept, and which of them fail; marks ``starts`` after those that end one.
 
         An episode begins ``anew`` where the log says so, and at ``starts``. A condition that still
@@ -1006,13 +1037,13 @@ class _Reader:
         is_left_out = is_incomplete | elsewhere
         cars = VARIABLES if self._observed == [*VARIABLES] else ()
         for name in self._observed:
-            piece.leave_out_unusable(name, ~is_left_out, _NO_LEADER)
+            piece.leave_out_unusable(name, ~is_left_out, _NO_LEADER if cars else _MISSING)
         for name, span in zip(cars, RANGES, strict=False):
             why = f"{_NO_CAR}it lies between {span[0]:g} and {span[1]:g}"
             piece.leave_out_unusable(name, ~is_left_out, "", span, why)
         unknown = np.isnan(piece.numbers[action])
         piece.leave_out_unusable(action, ~is_left_out & ~unknown)
-        if not (self._table.derives or columns.resample):
+        if not (self._table.derives or columns.resample or action in self._observed):
             self._count_unknown(piece, unknown & ~is_left_out, starts)
         for term in failed.terms if failed else ():
             if term.of_number and term.column not in self._observed:
@@ -1061,9 +1092,7 @@ class _Reader:
             elif term.sign:
                 entries[:] = sorted({*entries, *piece.texts[term.column].unique()})[:_MANY_TEXTS]
 
-    def _count_unknown(
-        self, piece: Piece, unknown: NDArray[np.bool_], starts: NDArray[np.bool_]
-    ) -> None:
+    def _count_unknown(self, piece: Piece, unknown: Bools, starts: Bools) -> None:
         """Count rows without an action, but the last ones of episodes, which need none."""
         if self._unknown is not None and not starts[0]:
             piece.skips.leave_out("action", self._unknown)
@@ -1073,7 +1102,12 @@ class _Reader:
         self._unknown = partial(message, piece.rows - 1) if unknown[-1] else None
 
 
-def _encoded(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
+def _moment(time: float, began: float) -> str:
+    """A time for a message [s], as a date where they are some."""
+    return f"{datetime.fromtimestamp(began + time, UTC):%F %T}" if began else f"{time:g}"
+
+
+def _encoded(piece: Piece, variable: str | Category) -> Floats:
     if isinstance(variable, str):
         return piece.numbers[variable]
     encoder = ObservationEncoder(variable)

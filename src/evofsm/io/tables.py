@@ -397,6 +397,7 @@ class Table:
     path: str
     columns: Sequence[str]
     skips: Skips
+    separator = ""  #: of fields in a line
     #: As a row below the names says; empty of a column of which it does not.
     units: Mapping[str, str] = {}
     #: Whether an action is what the rows say of the next one, and unknown where none follows.
@@ -491,6 +492,7 @@ class CsvTable(Table):
         at = self._header(lines, set(names))
         self._dialect = dialect = Dialect(lines[at], lines[at + 1 : at + 1 + Dialect.most_below])
         self.columns, self.units, header = dialect.columns, dialect.units, lines[at]
+        self.separator = dialect.separator
         self._above = at + 1 + dialect.n_told  # lines before the first row
         # With nothing in it that has a meaning; polars is not to be left alone with others.
         pattern = f'"[^"{dialect.separator}\\r\\n]*"(?=[{dialect.separator}\\r\\n])'
@@ -768,6 +770,8 @@ def explained(text: str, hint: str = "") -> str:
         return f"{text[:40]} cannot be learnt{hint or ' (a missing or failed measurement?)'}"
     if is_number(text.replace(",", ".")):
         return f"{text[:40]!r} is no number (a decimal comma? write 1.5)"
+    if is_number(text.replace(",", "")):
+        return f"{text[:40]!r} is no number (commas between thousands? leave them out)"
     if _DATE_LIKE.match(text):
         return f"{text[:40]!r} is no number (a date? it has to be {_ISO}{_SAYS_HOW})"
     return f"{text[:40]!r} is no number (a text, a date, or a unit behind the number?)"
