@@ -247,9 +247,9 @@ def alarms_of(judge: Foresight, worse: Collection[int] = ()) -> Iterator[Rendera
 
 def why_none(judge: Foresight) -> str:
     """Why there is no alarm."""
-    one = "with one failure nothing can be cross-validated"
-    several = "cross-validated, no alarm was better than chance"
-    return one if judge.held_out[0, 2] == 1.0 else several
+    if judge.held_out[0, 2] == 1.0:
+        return "with one failure nothing can be cross-validated"
+    return "cross-validated, no alarm was better than chance"
 
 
 def _last(hits: Sequence[Any], what: str) -> str:

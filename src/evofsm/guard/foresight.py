@@ -43,7 +43,8 @@ DATES = 1e8
 # In horizons: how far ahead limits look, over what the rate is taken, how long an alarm stays on.
 _AHEAD, _SMOOTHED, _STAYS = (0.0, 0.5, 1.0), 0.125, 0.25
 # Limits of an alarm, prices of a false alarm, parts of a log; thresholds that are tried, and as
-# many about the best, of which each is as often false as one that is so many steps nearer.
+# many about the best, of which each is taken to be as often false as one some steps nearer: one
+# step more for so many higher prices.
 _MOST_LIMITS, _PRICES, _PARTS, _TRIED, _ROOM = 4, np.geomspace(0.02, 50.0, 24), 3, 24, 2
 # Of a log of more rows some episodes are learnt from, if so many failures are left.
 _MOST_ROWS, _FAILURES = 500_000, 100
@@ -361,7 +362,7 @@ class Foresight(LearningJudge):
         # What one failure alone speaks for is no further limit.
         table, alone = list[Any](), max(_WORTH, 1.0 / log.failed.sum())
         for number, price in enumerate(_PRICES):
-            rule, worth = _Rule(), 0.0
+            rule, worth, room = _Rule(), 0.0, number // _ROOM
             while len(rule) < _MOST_LIMITS:
                 gain = more(rule) @ (1.0, -price)
                 best = divmod(int(gain.argmax()), _TRIED)
@@ -371,9 +372,9 @@ class Foresight(LearningJudge):
             for k, at in rule:
                 rest = tuple(limit for limit in rule if limit != (k, at))
                 steps, sums = near(k, at, rest)
-                gain = sums[_ROOM:, 0] - price * sums[:-_ROOM, 1]
+                gain = sums[room:, 0] - price * sums[: _TRIED - room, 1]
                 equals = np.flatnonzero(gain >= gain.max() - 1e-9)
-                middle = k, float(steps[_ROOM + equals[len(equals) // 2]])
+                middle = k, float(steps[room + equals[len(equals) // 2]])
                 is_more = not rest or (beyond((middle,)) & ~beyond(rest)).any()
                 rule = (*rest, middle) if is_more else rest  # what others imply is no part of it
             table += [(number, plain, *limits[k], limits[k][2] * at) for k, at in rule]
@@ -436,8 +437,16 @@ class Foresight(LearningJudge):
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,).
 
-        ``plain`` is whether it is that of plain thresholds, as in `of_rate`; ``columns`` are those
-        of the log, if known; ``early`` is how much sooner than its row each failure came [rows].
+        Parameters
+        ----------
+        log : Runs
+        rate : int
+        plain : bool, optional
+            Whether it is that of plain thresholds; by default of the kind that did better.
+        columns : ndarray, optional
+            The `columns` of the log, if they are known.
+        early : (E,) array_like, optional
+            How much sooner than its row each failure came [rows].
         """
         limits = self.of_rate(rate, plain=plain)
         columns = self.columns(log) if columns is None else columns
@@ -457,7 +466,8 @@ class Foresight(LearningJudge):
         soon = f" in {span(_AHEAD[when] * self.horizon * self.dt)} at its rate" * (when > 0)
         names, m = self.labels.names, len(self.labels.names)
         if v < m:
-            return names[v], f"{'above' if sign > 0.0 else 'below'} {at:.4g}{soon}"
+            unit = f" {units[v]}" if (units := self.labels.units) and units[v] else ""
+            return names[v], f"{'above' if sign > 0.0 else 'below'} {at:.4g}{unit}{soon}"
         row = self.forms[v - m].copy()
         is_flat = not row[failure.P : failure.HELD].any()
         if is_flat:  # then a limit of nearness is one of the form

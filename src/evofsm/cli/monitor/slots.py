@@ -189,8 +189,8 @@ class CsvRows:
             return
         about, self.unread, self._n_unread = "line", NO_ROW, int(is_row)
         if not _begins_row(above):
-            about, *others = omissions
-            fault = ", nor is ".join([f"{about} is no column", *others])
+            about, *rest = omissions
+            fault = ", nor is ".join([f"{about} is no column", *rest])
             near = ", ".join(x for x in above if x not in self._needs and x.casefold() in needs)
             near = f" ({near}? case counts)" if near else ""
             self.unread = f"{fault}; there are {', '.join(above)}{near}"
