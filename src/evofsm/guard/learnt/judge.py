@@ -304,8 +304,8 @@ class LearntRisk(LearningJudge, SearchingJudge):
         here, options, parts = self._here(situation.observation), np.array([wanted]), self.parts
         if parts is None or here is None or not len(self.state.forms):
             self._certified = False
-            why = words.NOTHING_LEARNT if parts is None else words.NOTHING_SEEN
-            why = why if parts is None or here is None else self._no_threshold
+            why = words.NOTHING_SEEN if parts and here is None else self._no_threshold
+            why = why if parts or self.state.n_failed else words.NOTHING_LEARNT
             return Search(options, _unjudged(1), 0, why)
         model = parts.daring if self.learning else parts.model
         n_asked = parts.n_tried if self.learning else parts.n_asked
@@ -653,6 +653,8 @@ class LearntRisk(LearningJudge, SearchingJudge):
     @property
     def _no_threshold(self) -> str:
         """Why nothing is refused."""
+        if self.parts is None and self.state.n_failed:
+            return words.NEVER_WHOLE
         return words.no_threshold(self.state.n_failed, is_given=self.failed is not None)
 
     @property

@@ -21,7 +21,8 @@ from evofsm.guard.learnt.state import (
     residuals_of,
 )
 
-# Actions of an episode that says how a system moves, at least; situations from which on
+# Actions of an episode that says how a system moves, at least, if three observations in a row were
+# whole; situations from which on
 # disturbances are looked for and backups evolve; those that are drawn to look for some;
 # disturbances that mutants are tried on, besides none.
 _FEWEST_STEPS, _ENOUGH, _TRIED_IN, _TRIED_ON = 3, 3, 8, 5
@@ -55,7 +56,8 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     )
     # Model
     state = motion.steps(state, safe)
-    moves = len(u) >= _FEWEST_STEPS
+    whole = np.isfinite(safe).all(1)
+    moves = len(u) >= _FEWEST_STEPS and bool((whole[:-2] & whole[1:-1] & whole[2:]).any())
     if moves:
         state = motion.dynamics(state, model_of(state, settings), safe, u, settings)
         if given.model is not None:

@@ -36,6 +36,7 @@ from evofsm.guard.learnt.state import State, sizes
 
 #: Said as long as there is nothing to judge by.
 NOTHING_LEARNT = "nothing was learnt yet"
+NEVER_WHOLE = "nothing was learnt: no episode had three observations in a row without NaN"
 NOTHING_SEEN = "nothing of this episode was observed yet"
 NO_FAILURE = "no failure is known yet, so nothing is refused"
 #: What is done where all backups look alike and another action was hardly used.
