@@ -524,7 +524,7 @@ def test_two_that_feed_one_guard_by_turns_are_told_and_one_after_the_other_may()
 @pytest.mark.parametrize(
     ("guard", "row", "says"),
     [
-        (Guard(low=-1.0, high=1.0, interval=DT), [0.1, 0.2], "failure: nothing was learnt: no episode"),
+        (Guard(low=-1.0, high=1.0, interval=DT), [0.1, 0.2], "failure: nothing was learnt"),
         (
             Guard(n_actions=3, interval=DT, judge=SceneRisk(DT, 3)),
             [1.0] * 5,

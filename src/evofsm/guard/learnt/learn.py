@@ -56,7 +56,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     )
     # Model
     state = motion.steps(state, safe)
-    whole = np.isfinite(safe).all(1)
+    whole: Flags = np.asarray(np.isfinite(safe).all(1))
     moves = len(u) >= _FEWEST_STEPS and bool((whole[:-2] & whole[1:-1] & whole[2:]).any())
     if moves:
         state = motion.dynamics(state, model_of(state, settings), safe, u, settings)
