@@ -521,6 +521,13 @@ def test_two_that_feed_one_guard_by_turns_are_told_and_one_after_the_other_may()
     assert (second - first, guard.n_episodes) == (1, 2)
 
 
+def test_an_action_may_be_an_array_of_one_number_as_policies_predict_it():
+    guard = Guard(low=-1.0, high=1.0, interval=DT)
+    assert guard.decide([0.1, 0.0], np.array([0.5])).executed == 0.5
+    with pytest.raises(ValueError, match="proposal has 2 numbers; it must be a single one"):
+        guard.decide([0.1, 0.0], [0.5, 0.5])
+
+
 @pytest.mark.parametrize(
     ("guard", "row", "says"),
     [

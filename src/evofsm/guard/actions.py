@@ -182,7 +182,7 @@ class BoxActions:
 
     def checked(self, name: str, action: ArrayLike) -> NDArray[np.float64]:
         """A new (d,) array of an action, whatever its values; another length is refused."""
-        values = real_array(name, action, 1)
+        values = real_array(name, np.atleast_1d(action), 1)
         if len(values) != len(self.low):
             raise ValueError(f"{name} has {len(values)} components; it must have {len(self.low)}")
         return values

@@ -550,6 +550,10 @@ class Guard:
         """An action of the right type, whatever its values."""
         if isinstance(self.actions, BoxActions):
             return self.actions.checked("proposal", action)
+        if isinstance(action, np.ndarray | list):  # of one number, as policies predict it
+            if np.size(action) != 1:
+                raise ValueError(f"proposal has {np.size(action)} numbers; it must be a single one")
+            action = np.ravel(action)[0]
         return float(action)  # type: ignore[arg-type]
 
     @transaction
