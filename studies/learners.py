@@ -286,12 +286,7 @@ def rival(kind: str, task: str, env: Env, seed: int) -> Rival:
 
 def learning_guard(kind: str, task: str, actions: Any, seed: int) -> Guard:
     """A guard that is told nothing but failures, or of cars how they follow each other."""
-    told: dict[str, Any] = {"interval": TASKS[task].interval, "seed": seed}
-    if isinstance(actions, gymnasium.spaces.Discrete):
-        return Guard(n_actions=int(actions.n), **told)
-    for name in ("low", "high"):
-        end = getattr(actions, name).astype(np.float64)
-        told[name] = end if len(end) > 1 else end.item()
+    told = {"interval": TASKS[task].interval, "seed": seed, **actions_of(actions).settings}
     return guard_for_cars(**told) if kind == "cars" else Guard(**told)
 
 

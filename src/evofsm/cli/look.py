@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from evofsm.cli.options import in_quotes, quoted, seconds
 from evofsm.guard.foresight import span
-from evofsm.io.logs import LONGEST_STEP, SKIPPED, USUAL_EPISODE, hours_unsaid
+from evofsm.io.logs import LONGEST_STEP, SKIPPED, USUAL_EPISODE, are_unusual, hours_unsaid
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
 
 Pairs = list[tuple[str, str]]
@@ -215,7 +215,7 @@ def _odd(steps: Floats) -> NDArray[np.bool_]:
     """Which of them are no usual ones: far from the median of those that go on."""
     later = steps[steps > 0.0]
     usual = float(np.median(later)) if len(later) else math.nan
-    return (steps <= 0.0) | (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
+    return (steps <= 0.0) | are_unusual(steps, usual)
 
 
 def _episodes(frame: polars.DataFrame, clock: str, names: Sequence[str]) -> tuple[str, Rows]:
@@ -247,7 +247,7 @@ def _of_steps(at: Floats, segments: Floats, facts: Pairs, lacking: int) -> tuple
     if len(later):
         often = span(float(f"{usual:.2g}")) if usual < 3600.0 else f"{usual / 3600.0:.3g} h"
         facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {often}"
-    holes, odd = steps > LONGEST_STEP * usual, _odd(steps)
+    holes, odd = steps > LONGEST_STEP * usual, (steps <= 0.0) | are_unusual(steps, usual)
     parts = np.split(at, np.flatnonzero(~within) + 1)
     latest = np.concatenate([np.fmax.accumulate(part) for part in parts])
     n_twice, n_earlier = int((steps == 0.0).sum()), int((at < latest).sum())

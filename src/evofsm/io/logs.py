@@ -479,24 +479,27 @@ def read_traces(
         )
 
 
+def are_unusual(steps: Floats, usual: float) -> Bools:
+    """(T,) which steps are much longer or shorter than the usual one."""
+    return np.asarray((steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP))
+
+
 def hours_unsaid(times: Floats, sample: str, before: float = 0.0) -> Floats:
     """(T,) how many hours more went by than dates [s] of a clock say that is put back and on.
 
     So is one without a zone, as the sample shows, in the night of some Sundays; a step is taken for
     that if it is a usual one but for the hour. Before the first row so many hours were unsaid.
     """
-    steps = np.diff(times)
+    steps, hours = np.diff(times), np.zeros(len(times))
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else math.nan
-    hours = np.zeros(len(times))
-
-    def is_usual(steps: Floats) -> Bools:
-        return (steps > usual / LONGEST_STEP) & (steps < LONGEST_STEP * usual)
-
+    odd = np.flatnonzero(are_unusual(steps, usual))
     for hour in (1, -1) if not _ZONE.search(sample) else ():
-        for row in np.flatnonzero(is_usual(steps + 3600.0 * hour) & ~is_usual(steps)) + 1:
+        for row in odd[~are_unusual(steps[odd] + 3600.0 * hour, usual)] + 1:
             at = datetime.fromtimestamp(times[row], UTC)
             if at.weekday() == 6 and at.hour < 4 and at.month in _CHANGES:
                 hours[row] = hour
+    if not (before or hours.any()):  # nearly always
+        return hours
     hours = before + np.cumsum(hours)
     anew = np.append(False, steps < -86400.0)  # of another machine, perhaps
     latest = np.maximum.accumulate(np.where(anew, np.arange(len(times)), 0))
@@ -631,7 +634,7 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
         last, first = first[-1], first[is_whole]
         starts = np.searchsorted(first, whole.starts)
         steps = np.diff(places[first])
-        holes = (steps > LONGEST_STEP * usual) | (steps < usual / LONGEST_STEP)
+        holes = are_unusual(steps, usual)
         holes[starts[starts > 0] - 1] = False
         actions[:-1][holes] = np.nan
         step_rows = whole._replace(
@@ -757,8 +760,7 @@ class _Clock:
             self._settle(round(float(np.nanmedian(first)), min(9, int(exact))))
         if self._longest:
             return np.asarray(steps > self._longest), late
-        unusual = (steps > LONGEST_STEP * self._usual) | (steps < self._usual / LONGEST_STEP)
-        return np.asarray(unusual), late
+        return are_unusual(steps, self._usual), late
 
     def _late(self, times: Floats, starts: Bools, piece: Piece) -> Bools:
         late, latest, began = np.zeros(piece.rows, np.bool_), self._last, self.began
