@@ -287,6 +287,20 @@ def test_what_is_not_seen_now_and_then_does_not_keep_it_from_deciding(point):
     assert "was observed" in nothing.reason
 
 
+def test_a_sensor_that_comes_every_third_row_is_learnt_of(point):
+    def seen(k, z):
+        return np.where([*[False] * point.places, *[k % 3 > 0] * point.places], math.nan, z)
+
+    def failures(guard, episodes):
+        return sum(point.play(guard, episode, seen=seen)[1] for episode in episodes)
+
+    guard = point.guard()
+    alone = failures(point.guard(mode=Mode.OFF), range(100, 110))
+    failures(guard, range(20))
+    guard.freeze()
+    assert failures(guard, range(100, 110)) == 0 < 8 <= alone
+
+
 def test_after_a_gap_in_time_nothing_follows_from_what_was(points):
     frozen, learning = points["box"].taught(3), points["box"].taught(3)
     frozen.freeze()

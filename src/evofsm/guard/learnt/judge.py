@@ -38,6 +38,7 @@ from evofsm.guard.learnt.rollout import (
     Floats,
     Ints,
     Model,
+    expected,
     pairs,
     rollout,
     search,
@@ -164,8 +165,9 @@ class LearntRisk(LearningJudge, SearchingJudge):
     PARTS = ("margin", "backups", "dead-ends", "stretches", "regions", "rivals")
 
     # Of the present episode.
-    _past: list[Floats]  # latest observations, a step and one, unseen ones as they were taken to be
-    _done: list[Floats]  # actions of the last step
+    _past: list[Floats]  # observations of the last step, unseen ones as they were taken to be
+    _done: list[Floats]  # and actions
+    _before: tuple[Floats, Floats] | None  # situation and action of the decision before
     _z: list[Floats]  # observations that are to be learnt from
     _u: list[Floats]  # and actions after them
     # Of each decision: a proposal was refused, nothing helped even undisturbed, some backup held.
@@ -451,22 +453,24 @@ class LearntRisk(LearningJudge, SearchingJudge):
         return allowance
 
     def _here(self, z: Floats) -> Floats | None:
-        """The situation, if that is seen; what was not is taken to have gone on as before."""
-        row, stride, n = self._filled(z), self.state.stride, len(self._done)
+        """The situation, if that is seen; what was not is taken to be as was expected."""
+        row, n = self._filled(z), len(self._done)
         if not n or row is None:
             return None if row is None else np.append(row, np.zeros(len(z) + self.size))
-        change = (row - self._past[-n]) * (stride / n)
+        change = (row - self._past[0]) * (self.state.stride / n)
         return np.concatenate([row, change, sum(self._done) / n])
 
     def _filled(self, z: Floats) -> Floats | None:
-        """An observation, in which what was not seen has gone on as before; None at first."""
-        history, n, stride = self._past, len(self._past) - 1, self.state.stride
+        """An observation, in which what was not seen is as was expected; None at first."""
         if not math.isnan(z.dot(z)):
             return z
-        if n < 0:
+        if self._before is None:
             return None
-        change = (history[-1] - history[0]) * (stride / n) if n else np.zeros(len(z))
-        return np.where(np.isnan(z), history[-1] + change / stride, z)
+        situation, action = self._before
+        row = situation[: len(z)]
+        if self.parts is not None:
+            row = row + (expected(self.parts.model, situation, action) - row) / self.state.stride
+        return np.where(np.isnan(z), row, z)
 
     def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
@@ -563,10 +567,12 @@ class LearntRisk(LearningJudge, SearchingJudge):
 
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
-        z, stride = self._filled(np.array(observation, np.float64)), self.state.stride
-        if z is not None:
-            self._past = [*self._past, z][-stride - 1 :]
-            self._done = [*self._done, self.encode(action)][-stride:]
+        here, stride = self._here(np.array(observation, np.float64)), self.state.stride
+        if here is not None:
+            inner = self.encode(action)
+            self._past = [*self._past, here[: np.size(observation)]][-stride:]
+            self._done = [*self._done, inner][-stride:]
+            self._before = here, inner
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; the episode before is learnt from."""
@@ -642,7 +648,7 @@ class LearntRisk(LearningJudge, SearchingJudge):
 
     def _forget(self) -> None:
         """Begin an episode."""
-        self._past, self._done = [], []
+        self._past, self._done, self._before = [], [], None
         self._z, self._u, self._notes = [], [], []
         self._certified = self._holds = self._refused = self._lost = False
         self._unsurvived, self._fails_after = 0, 0.0

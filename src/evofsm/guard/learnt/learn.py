@@ -39,6 +39,7 @@ _ONSET = 0.5
 def learn(state: State, episode: Episode, given: Given) -> State:
     """Learn from an episode, or from a part of a long one, and from what the user said."""
     decisions, before, settings, without = episode, state, given.settings, given.without
+    decisions = decisions._replace(observations=model.interpolated(episode.observations))
     episode = decisions.every(state.stride)
     random = np.random.default_rng([given.seed, state.n_episodes])
     is_seen = np.isfinite(episode.observations).all(1)

@@ -23,6 +23,8 @@ FLOOR = 1e-3
 # The least variance of a feature, and what all weights are held to 0 by, of its mean square: far
 # more than rounding, so that features that did not vary yet share what they explain alike.
 _LEAST, _ALL_ALIKE = 1e-6, 1e-10
+# Rows from one in which a variable was seen to the next, at most, between which it is interpolated.
+_MAX_GAP = 5
 # What leaves a feature out.
 _NEVER = 1e15
 # From so many features on BLAS would call threads, which wait where other processes are busy.
@@ -65,6 +67,20 @@ def without_glitches(z: Floats, unit: Floats) -> Floats:
     bad = np.abs(z - around) > JUMP * np.maximum(unit, pace)
     bad[[0, -1]] = False
     return np.where(bad.any(1, keepdims=True), np.nan, z)
+
+
+def interpolated(z: Floats) -> Floats:
+    """Observations (T, m) in which a variable that was not seen in few rows lies on a line."""
+    if np.isfinite(z).all():
+        return z
+    rows, index = z.copy(), np.arange(len(z))
+    for column in rows.T:
+        at = np.flatnonzero(np.isfinite(column))
+        if len(at) > 1:
+            after = np.searchsorted(at, index).clip(1, len(at) - 1)
+            within = (index > at[0]) & (index < at[-1]) & (at[after] - at[after - 1] <= _MAX_GAP)
+            column[within] = np.interp(index, at, column[at])[within]
+    return rows
 
 
 def solve(

@@ -3,8 +3,8 @@
    Rollouts of all disturbances lie side by side: loops over them (l) have EVOFSM_LANES turns. Sums
    are in the order of Python, so that a compiler that contracts nothing comes to the same bits. */
 /* ==== state ==== */
-  /* Observation, its change, and the action before: of the decision before, and now. */
-  double at[2 * EVOFSM_VARIABLES + EVOFSM_NUMBERS], here[2 * EVOFSM_VARIABLES + EVOFSM_NUMBERS];
+  /* Observation, its change, and the action before; the observation that is expected next. */
+  double here[2 * EVOFSM_VARIABLES + EVOFSM_NUMBERS], next[EVOFSM_VARIABLES];
   /* Observations of the last step, the oldest first, and what was done there. */
   double past[EVOFSM_STRIDE][EVOFSM_VARIABLES], acted[EVOFSM_STRIDE][EVOFSM_NUMBERS];
   int n_past, is_placed;         /* how many there are; and whether one knows where one is now */
@@ -235,12 +235,9 @@ static void step(evofsm_state *s, int t, double harder) {
   copy(s->before[0], s->now[0], A * L);
 }
 
-/* _rollout, of one situation: an action first, if there is one, then a backup. Returns how many
-   disturbances are not survived; into left the least distance of the others. At most STEPS steps. */
-static int rollout(evofsm_state *s, const double *action, const double policy[A][1 + M],
-                   double harder, double enough, int allowed, double *left) {
-  const double end = 1.0 - RESERVE * enough;
-  int i, j, l, t, lost = 0, ended = 0;
+/* Where one is now, as all rollouts begin. */
+static void place(evofsm_state *s) {
+  int i, j, l;
   for (l = 0; l < L; l++) {
     for (j = 0; j < M; j++) {
       s->z[j][l] = s->here[j];
@@ -249,15 +246,35 @@ static int rollout(evofsm_state *s, const double *action, const double policy[A]
     for (i = 0; i < A; i++) {
       s->before[i][l] = s->here[2 * M + i];
     }
+  }
+}
+
+static void act(evofsm_state *s, const double action[A]) {
+  int i, l;
+  for (i = 0; i < A; i++) {
+    for (l = 0; l < L; l++) {
+      s->now[i][l] = action[i];
+    }
+  }
+}
+
+/* _rollout, of one situation: an action first, if there is one, then a backup. Returns how many
+   disturbances are not survived; into left the least distance of the others. At most STEPS steps. */
+static int rollout(evofsm_state *s, const double *action, const double policy[A][1 + M],
+                   double harder, double enough, int allowed, double *left) {
+  const double end = 1.0 - RESERVE * enough;
+  int l, t, lost = 0, ended = 0;
+  place(s);
+  for (l = 0; l < L; l++) {
     s->near[l] = INFINITY;
     s->survived[l] = l < K ? STEPS : -1;
   }
 #if EVOFSM_DEAD_ENDS > 0
-  for (i = 0; i < EVOFSM_DEAD_ENDS; i++) { /* those in which it begins may not count */
-    from_centre(s, i);
+  for (t = 0; t < EVOFSM_DEAD_ENDS; t++) { /* those in which it begins may not count */
+    from_centre(s, t);
     for (l = 0; l < L; l++) {
-      const int within = s->square[l] < dead_ends[i][M] * dead_ends[i][M];
-      s->aside[i][l] = within && allowed >= K ? INFINITY : 0.0;
+      const int within = s->square[l] < dead_ends[t][M] * dead_ends[t][M];
+      s->aside[t][l] = within && allowed >= K ? INFINITY : 0.0;
     }
   }
 #endif
@@ -265,11 +282,7 @@ static int rollout(evofsm_state *s, const double *action, const double policy[A]
     int fails = 0;
     s->done++;
     if (t == 0 && action != NULL) {
-      for (i = 0; i < A; i++) {
-        for (l = 0; l < L; l++) {
-          s->now[i][l] = action[i];
-        }
-      }
+      act(s, action);
     } else {
       follow_policy(s, policy, end);
     }
@@ -454,14 +467,14 @@ static int foresee(evofsm_state *s, const double action[A]) {
   return best[0] < 0.0 ? -1 : count;
 }
 
-/* _here: where one is; what was not seen is taken to have gone on as before. */
+/* _here: where one is; what was not seen is taken to be as was expected. */
 static void situate(evofsm_state *s) {
   const int n = s->n_past;
   int i, j, t;
   s->is_placed = 1;
   for (j = 0; j < M; j++) {
     const double z = s->observation[j], times = n > 0 ? (double)EVOFSM_STRIDE / n : 0.0;
-    s->here[j] = n > 0 && isnan(z) ? s->at[j] + s->at[M + j] / EVOFSM_STRIDE : z;
+    s->here[j] = n > 0 && isnan(z) ? s->next[j] : z;
     s->here[M + j] = n > 0 ? (s->here[j] - s->past[0][j]) * times : 0.0;
     s->is_placed &= !isnan(s->here[j]);
   }
@@ -524,17 +537,22 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   out->risk_high = risks[1 + unsurvived][2];
 }
 
-/* LearntRisk.follow: keep up with what is executed. */
+/* LearntRisk.follow: keep up with what is executed, and what is expected then, undisturbed. */
 static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
-  int t;
+  int j, t;
   if (s->is_placed) {
     for (t = 1; t < EVOFSM_STRIDE && s->n_past == EVOFSM_STRIDE; t++) {
       copy(s->past[t - 1], s->past[t], M);
       copy(s->acted[t - 1], s->acted[t], A);
     }
     s->n_past += s->n_past < EVOFSM_STRIDE;
-    copy(s->at, s->here, 2 * M + A);
     copy(s->past[s->n_past - 1], s->here, M);
     encode(executed, s->acted[s->n_past - 1]);
+    place(s);
+    act(s, s->acted[s->n_past - 1]);
+    step(s, 0, 1.0);
+    for (j = 0; j < M; j++) {
+      s->next[j] = s->here[j] + (s->z[j][0] - s->here[j]) / EVOFSM_STRIDE;
+    }
   }
 }

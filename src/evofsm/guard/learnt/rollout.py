@@ -138,6 +138,15 @@ def features(model: Model, z: Floats, change: Floats, before: Floats, action: Fl
     return np.concatenate([*parts, off[:, i] * off[:, j]], axis=1)
 
 
+def expected(model: Model, situation: Floats, action: Floats) -> Floats:
+    """(m,) the observation that is expected a step after a situation (2m + a,) and an action."""
+    z, change, before = np.split(situation[None], np.cumsum([len(model.origin)] * 2), axis=1)
+    phi = features(model, z, change, before, action[None])[0]
+    move = sum(row * weights for row, weights in zip(phi, model.weights, strict=True))
+    after = z[0] + np.minimum(np.maximum(move, model.least), model.most)
+    return np.asarray(np.minimum(np.maximum(after, model.lowest), model.highest))
+
+
 @spliced_kernel
 def _fill_features(
     model: Model,
