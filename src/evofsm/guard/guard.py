@@ -471,7 +471,7 @@ class Guard:
         """Begin an episode; one that is under way is broken off, and nothing follows from it.
 
         Returns its number, from 1, by which `decide` and `end` know whose episode they are asked
-        of. Where it is only taken in (`take_in`), ``twin`` is the guard that decided it already.
+        of. Where it was decided elsewhere (`revise`), ``twin`` is the guard that did.
         """
         self._begun += 1
         self._begin(twin)
@@ -666,41 +666,29 @@ class Guard:
         return Situation(z, belief, state, surprise, time, intake, state_time)
 
     @transaction
-    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+    def revise(
+        self, situation: Situation, proposal: Proposal, executed: Action | None = None
+    ) -> Revision:
         """The second half of `decide`: what to execute; machine and judge learn from it.
 
         Parameters
         ----------
         situation, proposal
             What `recognise` returned, and what the controller wants.
+        executed : float or (d,) array_like, optional
+            An action of the set, where it was decided elsewhere: that is learnt from. Not for a
+            guard with an audit log, which could not be replayed then.
         """
         revision = self.reviser.revise(situation, proposal)
         if self.explaining or self.audit is not None:
             revision = self._explained(situation, revision)
         if self.audit is not None:
             self.audit.decided(situation, proposal, revision)
-        self._take_in(situation, revision.executed)
+        self._take_in(situation, revision.executed if executed is None else fixed(executed))
         if isinstance(self.actions, Choices):
-            executed, advice = int(revision.executed), int(revision.advised)
-            revision = revision._replace(executed=executed, advised=advice)
+            choice, advice = int(revision.executed), int(revision.advised)
+            revision = revision._replace(executed=choice, advised=advice)
         return revision
-
-    @transaction
-    def take_in(self, situation: Situation, proposal: Proposal, executed: Action) -> None:
-        """Instead of `revise`, where it was decided elsewhere: learn from what was executed.
-
-        The reviser is asked all the same, as a judge may learn from that too. Not for a guard with
-        an audit log, which could not be replayed then.
-
-        Parameters
-        ----------
-        situation, proposal
-            As in `revise`.
-        executed : float or (d,) array_like
-            An action of the set.
-        """
-        self.reviser.revise(situation, proposal)
-        self._take_in(situation, fixed(executed))
 
     def _take_in(self, situation: Situation, executed: Action) -> None:
         """Machine and judge learn what was executed."""

@@ -418,7 +418,7 @@ class Lane:
             self._episode = guard.begin(decider)
             for step, (observation, proposal, executed) in enumerate(self._past):
                 situation = guard.recognise(observation, step * guard.interval)
-                guard.take_in(situation, proposal, executed)
+                guard.revise(situation, proposal, executed)
         if decider is guard or (decider is not None and guard.learn):
             episode = self._episode
             guard.end(failed, self._seen, terminated=terminated, score=score, episode=episode)
