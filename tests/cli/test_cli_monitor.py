@@ -165,7 +165,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
     [
         (("--summary",), "--summary needs FILE"),
         (("--episode", "trip"), "is a number of rows, or columns of a log"),
-        (("--mode", "drive"), "'drive' is not one of 'off', 'shadow', 'advise', 'act'"),
+        (("--mode", "drive"), "'drive' is not one of 'off', 'shadow', 'act'"),
         (("--udp", 0, "--socket", "x"), "give one of FILE, --socket, --udp and --zenoh"),
         (("--guard", "nowhere"), "nowhere: no such file or directory"),
         (("nowhere.jsonl",), "nowhere.jsonl: no such file or directory"),

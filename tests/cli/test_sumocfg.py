@@ -62,7 +62,7 @@ def test_guards_act_where_they_are_told_to(evofsm, configuration):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--mode", "advise"], "act or shadow"),
+        (["--mode", "off"], "act or shadow"),
         (["--vehicles", "lots%"], "vehicles is"),
         (["--out", "folder"], "--out is for families"),
         (["--vehicles", "type:hatsy"], "nothing was guarded; types are calm, hasty"),

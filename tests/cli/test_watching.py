@@ -174,7 +174,6 @@ def test_a_recording_shows_what_was_decided(tmp_path):
 MODES = [
     ("act", "least-risk", "", True),
     ("shadow", "least-risk", "only watched, in shadow mode", True),
-    ("advise", "least-risk", "only advised", True),
     ("off", "least-risk", "was off", False),
     ("act", "none", "was off", False),
     ("act", "rss", "", False),
@@ -240,7 +239,7 @@ def test_every_sentence_says_what_was_so(tmp_path, mode, reviser, idle, is_judge
     assert intro.startswith("This was recorded.") == ("Recorded" in learning) == (mode != "live")
     assert ("replaced actions" in intro) == (mode == "act" and reviser != "none")
     assert ("was off" in intro) == (idle == "was off")
-    assert ("did not act" in intro) == (mode in ("shadow", "advise"))
+    assert ("did not act" in intro) == (mode == "shadow")
 
 
 # -- A log of others ------------------------------------------------------------------------------

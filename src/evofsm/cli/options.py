@@ -30,7 +30,7 @@ World = Literal["sumo", "kinematic"]
 #: What a judge was given.
 Judge = Literal["kinematic", "learnt"]
 #: How far a guard goes, as `evofsm.guard.Mode`.
-ModeName = Literal["off", "shadow", "advise", "act"]
+ModeName = Literal["off", "shadow", "act"]
 
 
 def option(about: str, *names: str, **limits: Any) -> Any:

@@ -62,7 +62,6 @@ class Mode(Enum):
 
     OFF = "off"  #: proposals are executed, nothing is judged
     SHADOW = "shadow"  #: proposals are executed, what it would have done is recorded
-    ADVISE = "advise"  #: as shadow, and the driver is told
     ACT = "act"  #: what it decides is executed
 
 

@@ -29,7 +29,6 @@ _LABELS = Labels(names=VARIABLES, units=UNITS)
 _IDLE = {
     "off": "the reviser was off",
     "shadow": "the reviser only watched, in shadow mode",
-    "advise": "the reviser only advised",
 }
 _ACTIONS = ("proposed", "executed", "advised")
 _PASSED = "the guard was not shown to help, so what was proposed passed"
