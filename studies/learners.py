@@ -211,9 +211,7 @@ class SafetyCritic(Rival):
         self._last = observation, self._coded([proposal])[0]
         return proposal
 
-    def end(
-        self, failed: bool = False, observation: Vector | None = None, *, terminated: bool = False
-    ) -> None:
+    def end(self, failed: bool = False, observation: Vector | None = None, **how: Any) -> None:
         """End the episode."""
         assert observation is not None
         self._note(observation, failed)

@@ -50,13 +50,15 @@ class Rival(ABC):
     def begin(self) -> None:  # noqa: B027
         """Begin an episode."""
 
-    def decide(self, observation: Vector, proposal: Any, time: float | None = None) -> Executed:
+    def decide(
+        self, observation: Vector, proposal: Any, time: float = 0.0, *, episode: Any = None
+    ) -> Executed:
         """What to execute instead of a proposal."""
         wanted = proposal.action if isinstance(proposal, Proposal) else proposal
         return Executed(self.action(observation, wanted))
 
     def end(  # noqa: B027
-        self, failed: bool = False, observation: Vector | None = None, *, terminated: bool = False
+        self, failed: bool = False, observation: Vector | None = None, **how: Any
     ) -> None:
         """End the episode."""
 
@@ -407,9 +409,7 @@ class Counted(Rival):
         self._done.append(action)
         return executed
 
-    def end(
-        self, failed: bool = False, observation: Vector | None = None, *, terminated: bool = False
-    ) -> None:
+    def end(self, failed: bool = False, observation: Vector | None = None, **how: Any) -> None:
         """Count the episode, and what it says of all others."""
         if not (self._learn and self._done):
             return

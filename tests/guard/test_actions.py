@@ -66,14 +66,13 @@ def test_every_cell_is_encoded_by_its_middle_and_beyond_lies_the_edge():
         ({"low": (0.0,), "high": (1.0, 2.0)}, "1 components and high has 2"),
         ({"low": (0.0, 2.0), "high": (1.0, 2.0)}, "in component 1; low must be below high"),
         ({"low": (-math.inf,), "high": (1.0,)}, "low is .* must be finite"),
-        ({"low": (-1.7e308,), "high": (1.7e308,)}, "too large"),
         ({"low": (), "high": ()}, "not empty"),
         ({"low": 0.0, "high": 1.0}, "low has shape"),
         ({"low": ("a",), "high": (1.0,)}, "low"),
     ],
 )
 def test_what_is_no_box_is_refused(settings, message):
-    with np.errstate(over="ignore"), pytest.raises((TypeError, ValueError), match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         BoxActions(**settings)
 
 

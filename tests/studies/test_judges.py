@@ -29,7 +29,7 @@ class Timid(Rival):
         self.decisions += 1
         return self.given.get("low", 0) if self.afraid else proposal
 
-    def end(self, failed=False, observation=None, *, terminated=False):
+    def end(self, failed=False, observation=None, **how):
         self.ended.append((failed, self.decisions, self.frozen))
         self.afraid = self.afraid or (failed and not self.frozen)
 

@@ -55,7 +55,7 @@ _OPENING = b'{"about":"evofsm audit log",'
 _TOLD = tuple(name for name in RECORD if name not in ("time", "n_states", "risk_low", "risk_high"))
 #: The names in a record of each kind, beside ``kind`` and ``clock``.
 FIELDS: Mapping[str, set[str]] = {
-    "start": {"about", "cut_off", "guard", "made_by", "reviser", "told_failures", "version"},
+    "start": {"about", "guard", "made_by", "reviser", "told_failures", "version"},
     "begin": {"settings"},
     "decision": {"before", "belief", "interval", "mask", "observation", "time", *_TOLD},
     "quiet": {"before"},
@@ -344,7 +344,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         self._seen = []
         parts = (guard.reviser, guard.machine, guard.judge, guard.failed)
         if list(map(id, parts)) != list(map(id, self._who)) or self._learnt != sums_of(guard):
-            self._write("start", cut_off=self.cut_off, **_start(guard))
+            self._write("start", **_start(guard))
         self._guard, self._who, self._learnt = guard, parts, None
         self._settings = settings_now(guard)
         self._write("begin", settings=self._settings)
@@ -407,11 +407,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
 
     # -- Writing ----------------------------------------------------------------------------------
 
-    def _refuse_child(self) -> None:
-        if os.getpid() != self._owner:
-            why = "the log belongs to the process that opened it; a child of that needs its own"
-            raise PermissionError(errno.EPERM, why, str(self.path))
-
     def _find_end(self) -> None:
         """Where the last whole record ends; a part of one after it is cut off."""
         chain = Chain(self.path)
@@ -429,8 +424,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
                 raise ValueError(f"{self.path} is no audit log; it was left alone")
             self._file.truncate(chain.size)
             _log.warning("%s: a half-written record was cut off", self.path)
-        #: What was cut off from a half-written end [byte].
-        self.cut_off = chain.half_written
         self._head, self._size = chain.head, chain.size
 
     def _cut(self) -> None:
@@ -459,7 +452,9 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         clock = datetime.now(UTC).isoformat()
         line, head = seal({"kind": kind, "clock": clock, **content}, self._head)
         try:
-            self._refuse_child()
+            if os.getpid() != self._owner:
+                why = "the log belongs to the process that opened it; a child of that needs its own"
+                raise PermissionError(errno.EPERM, why, str(self.path))
             self._cut()  # what could not be cut off then
             data = line
             while data:  # a disk that gets full takes a part of it first

@@ -248,11 +248,6 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         self._lanes = [Lane(terms, shared=True, env=inner) for inner in envs]
         warn_of(env, guard, failed)
 
-    @property
-    def revisions(self) -> list[Revision | None]:
-        """The latest decision in each environment."""
-        return [lane.revision for lane in self._lanes]
-
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:

@@ -88,8 +88,6 @@ def run_episode(
     propose = getattr(controller, "propose", None) or (lambda seen, time: controller(seen))  # type: ignore[operator]
     observation, info = environment.reset(seed=seed, options=options)
     number, mask_of = guard.begin(), action_masks(environment)
-    # Who else has a guard's methods may not count episodes.
-    arguments: Any = {} if number is None else {"episode": number}
     latest_row, count, score, is_over, failed = _whole(observation, None), 0, 0.0, False, False
     while not is_over:
         time = info.get("time", count * guard.interval)
@@ -97,15 +95,15 @@ def run_episode(
         if isinstance(guard.actions, Choices) and proposal.mask is None:
             proposal = proposal._replace(mask=mask_of(observation, info))
         begin = perf_counter()
-        revision = guard.decide(np.ravel(observation), proposal, time, **arguments)
+        revision = guard.decide(np.ravel(observation), proposal, time, episode=number)
         seconds, situation = perf_counter() - begin, guard.situation
         observation, reward, terminated, truncated, info = environment.step(revision.executed)
         latest_row, count, score = _whole(observation, latest_row), count + 1, score + float(reward)
         is_over, failed = bool(terminated or truncated), bool(info.get("failed", terminated))
         if is_over:
-            if arguments:
-                arguments["score"] = score if math.isfinite(score) else None
-            guard.end(failed, np.ravel(observation), terminated=bool(terminated), **arguments)
+            how: Any = {"terminated": bool(terminated), "episode": number}
+            how["score"] = score if math.isfinite(score) else None
+            guard.end(failed, np.ravel(observation), **how)
         effect = float(info.get("realised", math.nan))
         yield Decision(situation, revision, effect, float(reward), failed, seconds)
 

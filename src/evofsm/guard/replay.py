@@ -280,12 +280,8 @@ class _Player:
 
     def _end(self, guard: Guard, content: Mapping[str, Any]) -> None:
         last = content["observation"]
-        how = {name: content[name] for name in ("failed", "terminated")}
-        for name, flag in how.items():
-            if not isinstance(flag, bool):
-                raise ValueError(f"{name} is {flag!r}")
-        score = None if content["score"] is None else _number(content["score"])
-        guard.end(observation=None if last is None else _floats(last), score=score, **how)
+        how = {name: content[name] for name in ("failed", "terminated", "score")}
+        guard.end(observation=None if last is None else _floats(last), **how)
         self._is_under_way = False
         if fields := _differing(content["learnt"], sums_of(guard)):
             raise _DiffersError("something else was learnt until its end", fields)

@@ -152,8 +152,6 @@ class SceneRisk(LearningJudge, SearchingJudge):
         self.relative = relative
         #: What was learnt.
         self.memory = Memory(operator.index(n_actions), self.columns - 1 - _P)
-        if n_actions > _MOST_ACTIONS:
-            raise ValueError(f"n_actions is {n_actions}; it must be at most {_MOST_ACTIONS:,}")
         self._seen, self._actions = [], []
 
     def refuse_unfit(self, low: Action, high: Action) -> None:
