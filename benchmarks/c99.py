@@ -328,10 +328,9 @@ def _asked(learnt: Learnt, decisions: int, chance: np.random.Generator) -> Itera
         row = np.concatenate([[begins, time], z, wanted])
         try:
             situation = guard.recognise(z, time)
-        except ValueError as error:
-            code = 2.0 if "are missing" in str(error) else 1.0
+        except ValueError:
             none = np.full(len(NUMBERS) - 1, math.nan), np.concatenate([nothing, nothing])
-            yield row, (code, 0.0, 0.0), *none, ("", "")
+            yield row, (1.0, 0.0, 0.0), *none, ("", "")
             continue
         revision = guard.revise(situation, Proposal(proposal))
         state = -1 if situation.state is None else situation.state

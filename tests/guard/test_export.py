@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import c99
-from evofsm import Guard, Missing
+from evofsm import Guard
 from evofsm.driving import LatentRisk, guard_for_cars
 from evofsm.guard import Mode
 from evofsm.guard.export import write_c99, write_fmu
@@ -85,7 +85,7 @@ def test_where_no_macro_tells_of_that_it_decides_nothing(wall, flags, tmp_path):
     untold = [f"-U__{name}__" for name in UNTOLD]
     program = c99.build(wall.guard, tmp_path, "-O2", *flags.split(), *untold, "-w")
     told = subprocess.run([program], input=bytes(8 * 5 * 3), capture_output=True, check=True)
-    assert np.frombuffer(told.stdout).reshape(3, -1)[:, 0].tolist() == [3.0] * 3
+    assert np.frombuffer(told.stdout).reshape(3, -1)[:, 0].tolist() == [2.0] * 3
 
 
 @pytest.mark.parametrize(
@@ -148,8 +148,6 @@ def test_decisions_are_the_same_and_sanitizers_silent(name, tmp_path):
 SETTINGS = {
     "mode": lambda guard: setattr(guard.reviser, "mode", Mode.SHADOW),
     "tolerance": lambda guard: setattr(guard.reviser, "tolerance", 0.6),
-    "hold": lambda guard: setattr(guard, "missing", Missing.HOLD),
-    "reject": lambda guard: setattr(guard, "missing", Missing.REJECT),
 }
 
 

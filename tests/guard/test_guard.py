@@ -332,7 +332,6 @@ def test_a_damaged_file_is_refused(tmp_path):
     guard_for_cars(-4.0, 2.5).save(path)
     content, arrays = store.read(path, KIND)
     for spoilt, files in (
-        ({**content, "missing": "guess"}, arrays),
         ({**content, "reviser": {**content["reviser"], "class": "Nobody"}}, arrays),
         (content, {**arrays, "machine": arrays["machine"][:-7]}),
         (content, {**arrays, "judge": arrays["machine"]}),
@@ -422,7 +421,6 @@ def test_a_judge_that_wants_to_know_is_told_whether_it_may_learn(tmp_path):
         ({"n_actions": 4, "judge": Balance(index=True)}, "5 pushes"),
         ({"low": -1.0, "high": 1.0, "judge": Balance(dt=0.2)}, r"every 0\.2 s"),
         ({"low": -1.0, "high": 1.0, "horizon": -1.0}, "horizon"),
-        ({"n_actions": 5, "machine": EvolvingFSM(4)}, "4 actions"),
         ({"low": -2.5, "high": 1.0, "judge": LatentRisk(-4.5, DT)}, "set of actions ends at -2.5"),
         ({"low": -1.0, "high": 1.0, "judge": Half()}, r"it lacks \['end'\]"),
         *(({"low": -1.0, "high": 1.0, "tolerance": p}, "tolerance") for p in (0.0, math.nan)),
@@ -433,6 +431,11 @@ def test_a_judge_that_wants_to_know_is_told_whether_it_may_learn(tmp_path):
 def test_what_makes_no_guard_is_refused(settings, message):
     with pytest.raises((TypeError, ValueError), match=message):
         Guard(**({"interval": DT, "judge": Balance()} | settings))
+
+
+def test_a_machine_of_other_actions_is_refused():
+    with pytest.raises(ValueError, match="the machine has 4 actions, but the set has 17"):
+        guard_for_cars(-2.5, 2.5, machine=EvolvingFSM(4))
 
 
 @pytest.mark.parametrize(

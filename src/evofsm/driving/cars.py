@@ -73,7 +73,7 @@ def guard_for_cars(
     seed : int
         Of the judge that is made, where that is a `LearntRisk`.
     **settings
-        As in `Guard.of`: ``failed``, ``learn``, ``audit``, ``explaining``, ``missing``.
+        As in `Guard.of`: ``failed``, ``learn``, ``audit``, ``explaining``, ``shadow``.
 
     Examples
     --------

@@ -41,14 +41,13 @@ class Intake(IntFlag):
 
     WHOLE = 0  #: nothing
     PARTIAL = 1  #: variables are missing: recognised by the others, and not learnt from
-    HELD = 2  #: the same, but recognised by the values of before
     GAP = 4  #: it came long after the one before: no transition is learnt to it
     REPEATED = 8  #: as old as the one before: nothing new is known, or learnt
     LATE = 16  #: older than the one before: left out
 
 
-#: Observations that bring nothing new, and such as lack something.
-STALE, INCOMPLETE = Intake.REPEATED | Intake.LATE, Intake.PARTIAL | Intake.HELD
+#: Observations that bring nothing new.
+STALE = Intake.REPEATED | Intake.LATE
 
 
 class Situation(NamedTuple):

@@ -524,7 +524,6 @@ def settings_now(guard: Guard) -> dict[str, Any]:
         "explaining": guard.explaining,
         "interval": guard.interval,
         "learn": guard.learn,
-        "missing": guard.missing.value,
         "reviser": settings_of(guard.reviser),
         "shadow": guard.shadow,
     }

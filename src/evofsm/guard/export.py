@@ -213,7 +213,6 @@ def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any
     }
     constants: dict[str, Any] = {
         "ACTS": reviser.acts,
-        "LACKING": int(looping._LACKING.get(guard.missing, 0)),
         "LONGEST_GAP": looping._GAP * guard.interval,
         "TOLERANCE": reviser.tolerance,
         **{name: getattr(revising, f"_{name}") for name in ("NEW", "RELEASE", "TRIAL")},

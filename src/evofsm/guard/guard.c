@@ -17,8 +17,7 @@ extern "C" {
 enum {
   EVOFSM_OK = 0,
   EVOFSM_UNUSABLE = 1, /* an entry of the observation is infinite, or cannot be so */
-  EVOFSM_MISSING = 2,  /* one is NaN, and the guard rejects that */
-  EVOFSM_MISCOMPILED = 3 /* it does not compute as IEEE 754 says, so that nothing is decided */
+  EVOFSM_MISCOMPILED = 2 /* it does not compute as IEEE 754 says, so that nothing is decided */
 };
 
 /* Why something is executed. */
@@ -40,7 +39,6 @@ enum { EVOFSM_AS_PROPOSED = 0, EVOFSM_OUTSIDE = 1, EVOFSM_NO_PROPOSAL = 2 };
 /* What was wrong with an observation: a sum. */
 enum {
   EVOFSM_PARTIAL = 1,  /* entries are NaN */
-  EVOFSM_HELD = 2,     /* the same, where the guard holds values */
   EVOFSM_GAP = 4,      /* it came long after the one before */
   EVOFSM_REPEATED = 8, /* as old as the one before: that one stands */
   EVOFSM_LATE = 16     /* older than that */
@@ -212,27 +210,22 @@ static void recognise(evofsm_state *s) {
 
 /* -- Input: InputMonitor of guard.py, make_usable of reviser.py ------------------------------- */
 
-/* What is wrong with an observation; a negative number: it is refused. */
+/* What is wrong with an observation. */
 static int take(evofsm_state *s, const double observation[EVOFSM_VARIABLES], double time) {
-  int j, found = 0, lacks = 0;
+  int j, found = 0;
   if (time <= s->time) {
     return time < s->time ? EVOFSM_LATE : EVOFSM_REPEATED;
   }
-  for (j = 0; j < EVOFSM_VARIABLES; j++) {
-    lacks |= isnan(observation[j]);
-  }
-  if (lacks) {
-    if (LACKING == 0) {
-      return -1;
-    }
-    found = LACKING;
-  }
   if (time - s->time > LONGEST_GAP) {
-    found |= EVOFSM_GAP;
+    found = EVOFSM_GAP;
   }
   for (j = 0; j < EVOFSM_VARIABLES; j++) {
-    s->held[j] = isnan(observation[j]) ? s->held[j] : observation[j];
     s->observation[j] = observation[j];
+    if (isnan(observation[j])) {
+      found |= EVOFSM_PARTIAL;
+    } else {
+      s->held[j] = observation[j];
+    }
   }
   s->time = time;
   return found;
@@ -299,9 +292,6 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
     }
   }
   intake = take(state, observation, time);
-  if (intake < 0) {
-    return EVOFSM_MISSING;
-  }
   if ((intake & (EVOFSM_REPEATED | EVOFSM_LATE)) == 0) {
     if ((intake & EVOFSM_GAP) != 0) {
       forget(state); /* what comes does not follow from what was */
@@ -453,7 +443,6 @@ EXPORT fmi2Status fmi2DoStep(void *c, double time, double step, int no_return) {
   const double *proposal = of->values + PROPOSAL, steps = floor(EVOFSM_INTERVAL / step + 0.5);
   static const char *const why[] = {
       "", "an observation is infinite, or cannot be so; NaN says not seen",
-      "an observation is NaN, which this guard rejects",
       "this unit was compiled to compute otherwise than IEEE 754 says"};
   evofsm_decision decision;
   int i, rc;

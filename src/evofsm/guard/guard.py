@@ -40,7 +40,6 @@ from evofsm.guard.actions import (
 )
 from evofsm.guard.api import (
     BELIEF_TOLERANCE,
-    INCOMPLETE,
     STALE,
     TOLERANCE,
     ActionJudge,
@@ -61,13 +60,12 @@ from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
 
 # Intervals that a range of actions is divided into for the machine.
 _INTERVALS = 17
-# States of the machine that is made where none is given.
+# States of the machine that is made.
 _MOST_STATES = 200
 # So many observations on end that lack something are told of.
 _MANY = 100
 # Longer than so many intervals is a gap in time.
 _GAP = 1.5
-_LACKING = {Missing.PARTIAL: Intake.PARTIAL, Missing.HOLD: Intake.HELD}
 # Fourth powers of larger observations, summed over a long run, would lose all others.
 _LARGEST_VALUE = 1e30
 
@@ -78,7 +76,6 @@ class InputMonitor(NamedTuple):
     They are due every ``interval`` [s].
     """
 
-    missing: Missing
     interval: float
     #: The latest value of each variable; NaN of one that was never seen.
     held: NDArray[np.float64] = np.empty(0)
@@ -90,16 +87,12 @@ class InputMonitor(NamedTuple):
             return Intake.REPEATED if time == self.time else Intake.LATE, self
         intake, latest_row = Intake.WHOLE, observation
         if math.isnan(observation.dot(observation)):  # the quickest way to ask for NaN
-            absent = np.isnan(observation)
-            if self.missing is Missing.REJECT:
-                holes = np.flatnonzero(absent).tolist()
-                raise ValueError(f"variables {holes} of the observation at {time:g} s are missing")
+            intake = Intake.PARTIAL
             if len(self.held) == len(observation):  # what was seen of them before is still held
-                latest_row = np.where(absent, self.held, observation)
-            intake = _LACKING[self.missing]
+                latest_row = np.where(np.isnan(observation), self.held, observation)
         if time - self.time > _GAP * self.interval:
             intake |= Intake.GAP
-        return intake, InputMonitor(self.missing, self.interval, latest_row.copy(), time)
+        return intake, InputMonitor(self.interval, latest_row.copy(), time)
 
 
 class DecisionLogger(Protocol):
@@ -152,7 +145,6 @@ KIND = Kind(
         **dict.fromkeys(("explaining", "failed", "learn", "shadow"), bool),
         **dict.fromkeys(("n_episodes", "n_failed"), COUNT),
         "interval": SIZE,
-        "missing": str,
         "judge": str | None,
     },
 )
@@ -203,15 +195,11 @@ class Guard:
         Whether what it decides is executed, or only recorded.
     seed : int
         Of the judge that is made where none is given.
-    machine : EvolvingFSM, optional
-        Recognises and learns; without it one with recommended settings is made.
     audit : DecisionLogger, optional
         Records what is decided: an `AuditLog`, or `evofsm.io.FoxgloveSink`, which shows it.
     explaining : bool
         Whether `Revision.explanation` holds the machine's experience for every decision; with an
         audit log it does for those that change a proposal or warn.
-    missing : Missing
-        What to do where a variable was not observed (NaN).
     shadow : bool
         Whether proposals pass in some episodes while a learnt judge learns, as long as it was not
         shown to help, and in all where it is frozen so (`evofsm.guard.harm`). Without it, one that
@@ -221,7 +209,7 @@ class Guard:
     ------
     ValueError
         If there is neither a range of actions nor a number of them (or both), a number is out of
-        its range, or judge and machine were made for other actions or another interval.
+        its range, or the judge was made for other actions or another interval.
 
     Notes
     -----
@@ -267,10 +255,8 @@ class Guard:
         tolerance: float = TOLERANCE,
         mode: Mode = Mode.ACT,
         seed: int = 0,
-        machine: EvolvingFSM | None = None,
         audit: DecisionLogger | None = None,
         explaining: bool = False,
-        missing: Missing = Missing.PARTIAL,
         shadow: bool = True,
     ) -> None:
         actions = _actions(low, high, n_actions)
@@ -283,13 +269,12 @@ class Guard:
         elif any(arguments.values()):
             asks = "asks no model, no backup and no names: leave them out"
             raise ValueError(f"{type(judge).__name__} {asks}")
-        if machine is None:
-            machine = EvolvingFSM(
-                actions.n_actions,
-                max_states=_MOST_STATES,
-                belief_tolerance=BELIEF_TOLERANCE,
-                failure_horizon=soon,
-            )
+        machine = EvolvingFSM(
+            actions.n_actions,
+            max_states=_MOST_STATES,
+            belief_tolerance=BELIEF_TOLERANCE,
+            failure_horizon=soon,
+        )
         self._set_up(
             ActionReviser(judge, actions, tolerance=tolerance, mode=mode),
             interval=interval,
@@ -297,7 +282,6 @@ class Guard:
             failed=failed,
             audit=audit,
             explaining=explaining,
-            missing=missing,
             shadow=shadow,
         )
 
@@ -318,7 +302,7 @@ class Guard:
             Learns from what happens; without it the reviser's own, if it has one that learns.
         learn : bool
             Whether machine and judge learn.
-        failed, audit, explaining, missing, shadow
+        failed, audit, explaining, shadow
             As in `Guard`.
 
         Examples
@@ -345,7 +329,6 @@ class Guard:
         failed: Callable[[NDArray[np.float64]], bool] | None = None,
         audit: DecisionLogger | None = None,
         explaining: bool = False,
-        missing: Missing = Missing.PARTIAL,
         shadow: bool = True,
         n_episodes: int = 0,
         n_failed: int = 0,
@@ -389,7 +372,6 @@ class Guard:
         self.failed = failed
         self.audit: DecisionLogger | None = audit
         self.explaining = explaining
-        self.missing = missing
         #: What the judge calls the variables of an observation; empty where it does not say.
         self.variables: tuple[str, ...] = () if action_judge is None else action_judge.labels.names
         #: What is done without a usable proposal where nothing is judged.
@@ -400,7 +382,7 @@ class Guard:
         #: Episodes that it learnt from, and those of them that failed.
         self.n_episodes, self.n_failed = n_episodes, n_failed
         self._frozen: FSMModel | None = None
-        self._monitor = InputMonitor(missing, interval)
+        self._monitor = InputMonitor(interval)
         self._latest: Situation | None = None
         self._under_way, self._passing, self._learn = False, "", True
         self._begun = self._decisions = self._acted = self._watched = self._kept = 0
@@ -479,7 +461,7 @@ class Guard:
 
     def _begin(self, twin: Self | None = None) -> None:
         """Begin the episode of that number."""
-        self._monitor = InputMonitor(self.missing, self.interval)
+        self._monitor = InputMonitor(self.interval)
         self._latest = None
         self._decisions = self._acted = self._watched = self._kept = 0
         self.reviser.start_episode()
@@ -647,15 +629,13 @@ class Guard:
         machine, model, latest_row = self.machine, self._frozen, self._monitor.held
         belief, surprise, state_time = np.ones(1), math.nan, math.nan
         state: int | None = None
-        is_incomplete = bool(intake) and bool(intake & INCOMPLETE)
+        is_incomplete = bool(intake) and bool(intake & Intake.PARTIAL)
         if model is not None:
             if model.n_states and not math.isnan(latest_row.dot(latest_row)):
                 belief = model.recognise(latest_row)
                 state = int(belief.argmax())
         elif machine is not None and not (is_incomplete and machine.n_states == 0):
-            policy = Missing.REJECT
-            if is_incomplete:
-                policy = self.missing if machine.state is not None else Missing.PARTIAL
+            policy = Missing.PARTIAL if is_incomplete else Missing.REJECT
             step = machine.observe(z, missing=policy)
             belief, state, surprise = step.belief, step.state, step.surprise
         if self._observing is not None and self._learn:
@@ -866,7 +846,7 @@ class Guard:
         reviser, judge = copy.deepcopy(
             (self.reviser, self.judge), {} if self.machine is None else {id(self.machine): machine}
         )
-        names = (*_PLAIN_SETTINGS, "failed", "missing")
+        names = (*_PLAIN_SETTINGS, "failed")
         settings = {name: getattr(self, name) for name in names}
         return type(self).of(reviser, judge=judge, machine=machine if states else None, **settings)
 
@@ -875,7 +855,7 @@ class Guard:
         """Write all of it to one file: machine, judge and settings.
 
         An episode under way is not kept: whoever loads the file begins a new one. Neither are the
-        audit log and the function `failed`, which is code; `load` takes them again.
+        audit log and the function `failed`, which is code: `load` takes that again.
 
         Parameters
         ----------
@@ -895,7 +875,6 @@ class Guard:
             raise ValueError(f"a {type(self.reviser).__name__} is no reviser that a file can hold")
         settings = {
             **parts,
-            "missing": self.missing.value,
             "failed": self.failed is not None,
             **{name: getattr(self, name) for name in _PLAIN_SETTINGS},
         }
@@ -909,7 +888,6 @@ class Guard:
         *,
         judge: ActionJudge | type[LearningJudge] | None = None,
         failed: Callable[[NDArray[np.float64]], bool] | None = None,
-        audit: DecisionLogger | None = None,
     ) -> Self:
         """Read a guard, as it was between two episodes.
 
@@ -921,7 +899,6 @@ class Guard:
             an entry point of ``evofsm.participants``.
         failed : callable, optional
             As in `Guard`; needed where the guard had one.
-        audit : DecisionLogger, optional
 
         Raises
         ------
@@ -947,8 +924,6 @@ class Guard:
             return cls.of(
                 **rebuild(settings, *_loaded(settings, files, judge), instance),
                 failed=failed,
-                audit=audit,
-                missing=Missing(settings["missing"]),
                 **{name: settings[name] for name in _PLAIN_SETTINGS},
             )
 

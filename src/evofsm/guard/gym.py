@@ -92,9 +92,8 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         `RevisedVectorActions` does.
     observe : callable, optional
         From an observation of ``env`` to the guard's; to None where there is nothing to judge,
-        such as no car ahead: then nothing is revised or learnt. NaN is what was not observed, and
-        the guard's ``missing`` says what comes of it. Without it a box is flattened, and each value
-        of ``Discrete`` is a variable that is 1 or 0.
+        such as no car ahead: then nothing is revised or learnt. NaN is what was not observed.
+        Without it a box is flattened, and each value of ``Discrete`` is a variable that is 1 or 0.
     failed : callable or "terminated"
         From a step to whether it ended in failure: of ``step.observation``, ``step.reward``,
         ``step.terminated``, ``step.truncated`` and ``step.info``. ``"terminated"`` says that every

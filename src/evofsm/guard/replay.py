@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.observations import Missing
 from evofsm.guard.actions import Action, checked_mask
 from evofsm.guard.api import Proposal
 from evofsm.guard.audit_log import (
@@ -233,12 +232,12 @@ class _Player:
             self.not_replayed.append(_NO_FUNCTION)
         else:
             file = BytesIO(base64.b64decode(content["guard"], validate=True))
-            self._guard = Guard.load(file, failed=self._failed if needs_code else None, audit=_DEAF)
+            self._guard = Guard.load(file, failed=self._failed if needs_code else None)
+            self._guard.audit = _DEAF
 
     @staticmethod
     def _set(guard: Guard, settings: Mapping[str, Any]) -> None:
         guard.explaining = bool(settings["explaining"])
-        guard.missing = Missing(settings["missing"])
         guard.interval, guard.shadow = settings["interval"], settings["shadow"]
         if guard.learn != settings["learn"]:
             guard.learn = settings["learn"]
