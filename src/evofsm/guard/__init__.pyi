@@ -16,7 +16,6 @@ from .api import Search as Search
 from .api import Situation as Situation
 from .audit_log import AuditLog as AuditLog
 from .audit_log import Head as Head
-from .check import check_contract as check_contract
 from .foresight import Foresight as Foresight
 from .guard import DecisionLogger as DecisionLogger
 from .guard import Guard as Guard

@@ -47,39 +47,13 @@ class Result(NamedTuple):
     message: str = ""  #: what is wrong, and the likely cause
 
 
-def check_contract(part: object) -> None:
-    """Check a part of your own against the contract of its kind; call it in a test.
-
-    Parameters
-    ----------
-    part : object
-        A class that is made without arguments, an instance (copied before each check), or a
-        function that makes one. Its methods tell of which kind it is.
-
-    Raises
-    ------
-    AssertionError
-        If a check fails; it names every one that does.
-    TypeError
-        If it has the methods of no kind, or a class needs arguments.
-
-    Examples
-    --------
-    >>> class Follower:
-    ...     def propose(self, observation, time=0.0):
-    ...         return Proposal(0.1 * (float(observation[0]) - 20.0))
-    >>> check_contract(Follower())  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-        ...
-    AssertionError: proposes_numbers: it proposes inf at gap inf m, 20.0 and 0.0 m/s ...
-    """
-    failures = [f"{r.check}: {r.message}" for r in check_results(part) if not r.passed]
-    if failures:
-        raise AssertionError("\n".join(failures))
-
-
 def check_results(part: object) -> list[Result]:
-    """What each check of its contract finds, in order."""
+    """What each check of its contract finds, in order.
+
+    The part is a class that is made without arguments, an instance (copied before each check), or a
+    function that makes one. A TypeError if it has the methods of no kind, or a class needs
+    arguments.
+    """
     make = _maker(part)
     return [_result(clause, make) for clause in _CONTRACTS[kind_of(part)]]
 
