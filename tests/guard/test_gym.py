@@ -238,10 +238,12 @@ def test_a_sensor_that_is_silent_is_named():
         drive(env, lambda seen, info: np.array([0.0]))
 
 
-@pytest.mark.parametrize("seen", [[1.0, 2.0], [np.inf, 2.0, 3.0]])
-def test_an_observation_that_is_not_the_guards_is_refused(seen):
-    with pytest.raises(ValueError, match="v_leader"):
-        of_cars(Script(seen)).reset()
+@pytest.mark.parametrize(("seen", "why"), [([1.0, 2.0], "v_leader"), ([np.inf, 2.0, 3.0], "gap")])
+def test_an_observation_that_is_not_the_guards_is_refused(seen, why):
+    env = of_cars(Script(seen))
+    env.reset()
+    with pytest.raises(ValueError, match=why):
+        env.step(np.array([0.0]))
 
 
 def test_a_guard_whose_actions_go_beyond_the_environments_is_refused():
@@ -379,7 +381,7 @@ def test_who_does_not_say_which_episodes_failed_is_told_both_ways_to():
 @pytest.mark.parametrize("failed", ["failed", {"failed": True}])
 def test_what_is_no_function_is_refused(failed):
     for name in ("failed", "observe"):
-        with pytest.raises(TypeError, match=f"{name} is .* it must be a function of a"):
+        with pytest.raises(TypeError, match=f"{name} is .* it must be a function, such as"):
             RevisedActions(Script(FAR), guard_for(ONE), **{name: failed})
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.extras import needs
+from evofsm.fsm.validation import function
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -423,12 +424,7 @@ class Lane:
 _LANES: WeakKeyDictionary[Guard, WeakSet[Lane]] = WeakKeyDictionary()
 _SHARED: WeakSet[Guard] = WeakSet()
 
-_SUCH_AS = {
-    "observe": "n observation, such as observe=lambda seen: seen['state']",
-    "failed": " step: its observation, reward, terminated, truncated and info, such as "
-    "failed=lambda step: step.info['failed'] or failed=lambda step: step.reward <= -100, or "
-    "'terminated'",
-}
+_FAILED = "lambda step: step.info['failed'], lambda step: step.reward <= -100 or 'terminated'"
 
 
 class Terms:
@@ -445,9 +441,9 @@ class Terms:
     ) -> None:
         if not 0.0 <= penalty < math.inf:
             raise ValueError(f"penalty is {penalty}; it must be 0 or above, and finite")
-        for name, term in (("observe", observe), ("failed", failed)):
-            if not (term is None or callable(term) or (name, term) == ("failed", "terminated")):
-                raise TypeError(f"{name} is {term!r}; it must be a function of a{_SUCH_AS[name]}")
+        function("observe", observe, "lambda observation: observation['state']")
+        if failed != "terminated":
+            function("failed", failed, _FAILED)
         self.guard = guard
         self.penalty = penalty
         self._silent, self._has_decided = 0, False
@@ -494,7 +490,8 @@ class Terms:
         try:
             reply = self._failed(step)
         except (AttributeError, KeyError, TypeError) as error:
-            error.add_note(f"failed was called with a{_SUCH_AS['failed']}")
+            about = "a step: its observation, reward, terminated, truncated and info"
+            error.add_note(f"failed was called with {about}, such as failed={_FAILED}")
             raise
         if np.size(reply) != 1 or np.asarray(reply).dtype.kind not in "biu":
             raise TypeError(f"failed returned {reply!r}; it must be True or False")
@@ -503,16 +500,7 @@ class Terms:
     def look(self, observation: Any) -> _Seen:
         """What the guard observes; None where there is nothing to judge."""
         reply = None if observation is None else self._observe(observation)
-        if reply is None:
-            return None
-        vector, names = np.array(reply, dtype=np.float64), self.guard.variables
-        if vector.ndim != 1 or len(vector) != (len(names) or len(vector)) or np.isinf(vector).any():
-            form = f"{' and '.join(names)}, {len(names)} finite numbers" if names else "finite"
-            raise ValueError(
-                f"observe returned {reply}; it must be {form}, with NaN for what was not observed, "
-                "or None where there is nothing to judge"
-            )
-        return vector
+        return None if reply is None else np.array(reply, dtype=np.float64)
 
 
 def _flat(space: Space[Any]) -> Observe:
