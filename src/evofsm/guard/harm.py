@@ -11,29 +11,13 @@ episodes the better one is found by rank, which assumes nothing about how failur
    else what ended by itself, as at a goal, is better than what was cut off.
 
 While it learns, who drives an episode is drawn by Thompson sampling with a Bayesian bootstrap
-(Eckles & Kaptein 2014): each episode of an arm gets a random weight, of the gamma distribution, and
-the guard drives if then it wins no fewer pairs than it loses. What is older weighs less, as guards
-change, and of the controller alone much less where episodes may end by themselves without failing:
-it may be another one by now, and be kept from an end. Each arm begins with a part of an episode
-that did not fail, and ended by itself if any did, so that it is tried. The controller drives alone,
-in *shadow*, only where that costs little: after an episode that failed, where it does better by
-what is known, or every tenth time, as it may have become better; and in the first case three draws
-have to agree, unless the latest three guarded episodes failed, or less than three are known of the
-controller alone.
-
-A guard of which the latest three episodes failed may stand before a controller that became good:
-then the controller drives until it fails, and after two guarded episodes at the latest. If its own
-latest three failed, too, there is little to lose, and the guard, which learns, drives the others,
-twelve at most.
+(Eckles & Kaptein 2014), and only where it costs little that the controller drives alone, in
+*shadow*; frozen, the guard acts unless its record says that it harms, or does not help.
+docs/machine-that-saves.md ("Who drives") has the rules.
 
 Where in an episode a guard that has not failed of late keeps a quarter more of the proposals than
 before, another controller seems to have come: what is known of the controller alone is of the other
 one, and it drives the next episode, to show it. If that one fails, it is the same.
-
-Frozen, it acts unless its record, of which then both arms fade alike, says that it harms, or does
-not help: it loses more pairs than it wins or, of three episodes at least, all failed, however late,
-or it prevents less than half of the failures per step, nine of ten if it replaces nearly every
-proposal. A guard, or a controller, that was never tried has no record: then it acts.
 """
 
 from __future__ import annotations
