@@ -386,7 +386,7 @@ class Guard:
         self._latest: Situation | None = None
         self._under_way, self._passing, self._learn = False, "", True
         self._begun = self._decisions = self._acted = self._watched = self._kept = 0
-        self._lacking: NDArray[Any] | None = None  # since an observation was whole
+        self._lacking = 0  # observations since one was whole
         #: Whether proposals pass in some or all episodes where it was not shown to help.
         self.shadow = bool(shadow)
         self.learn = learn
@@ -609,18 +609,12 @@ class Guard:
 
     def _count_missing(self, z: NDArray[np.float64]) -> None:
         """Warn where no observation is whole for long: nothing is learnt from such."""
-        if not math.isnan(z.dot(z)):
-            self._lacking = None
-            return
-        if self._lacking is None or len(self._lacking) != 1 + len(z):
-            self._lacking = np.zeros(1 + len(z), np.int64)
-        self._lacking = self._lacking + np.append(1, np.isnan(z))  # the first counts them all
-        if self._lacking[0] == _MANY:
-            sums = enumerate(self._lacking[1:].tolist())
-            text = ", ".join(f"{self._labels.variable(k)} in {count}" for k, count in sums if count)
+        self._lacking = self._lacking + 1 if math.isnan(z.dot(z)) else 0
+        if self._lacking == _MANY:
+            names = ", ".join(map(self._labels.variable, np.flatnonzero(np.isnan(z)).tolist()))
             warnings.warn(
                 f"none of {_MANY} observations on end was whole, and nothing is learnt from such: "
-                f"missing (NaN) was {text}. Leave it out of what is observed, or see to the sensor",
+                f"missing (NaN) is {names}. Leave it out of what is observed, or see to the sensor",
                 stacklevel=4,
             )
 
