@@ -43,10 +43,8 @@ def test_parts_of_ours_keep_their_contract(part):
 
 
 class Driver:
-    lowest, highest = -3.0, 3.0
-
     def propose(self, observation, time=0.0):
-        return Proposal(float(np.clip(0.1 * (observation[0] - 20.0), self.lowest, self.highest)))
+        return Proposal(float(np.clip(0.1 * (observation[0] - 20.0), -3.0, 3.0)))
 
 
 def driver(answer):
@@ -156,7 +154,6 @@ BROKEN = {
     "proposes_numbers": [
         A_NUMBER,
         driver(lambda seen: Proposal(seen[0] * -1.0)),
-        driver(lambda seen: Proposal(4.0 if seen[0] < 1.0 else 0.0)),
     ],
     "revises_what_is_proposed": [
         reviser(lambda revision, action: revision._replace(executed=action)),
