@@ -298,7 +298,6 @@ def evaluate(trial: Trial, world: KinematicWorld, rounds: int = 20) -> dict[str,
         rounds,
         order=[int(case) for case in trial.setting.order],
         observe=trial.setting.observe,
-        beliefs=False,
     )
     verdicts = {claim.id: bool(claim.holds) for claim in check_claims(study)}
     return {

@@ -1,10 +1,9 @@
-"""The figures of the paper's study: runs over time, states in space, and what leads to what."""
+"""The figures of the paper's study: runs over time, and what leads to what."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -12,23 +11,20 @@ from evofsm import plot
 from evofsm.extras import needs
 from evofsm.paper.claims import LARGEST_DIVERGENCE
 from evofsm.paper.page import Figure
-from evofsm.paper.runs import CASES, PaperStudy, Run
+from evofsm.paper.runs import PaperStudy, Run
 from evofsm.plot import COLORS, Look
 
 with needs("matplotlib", "plot", "drawing figures"):
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawn
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
 #: Width of a figure [inch]: that of a page's text.
 WIDTH = 7.2
 _LEADER_LINE: Look = {"color": COLORS["leader"], "linestyle": (0, (4, 1.6))}
 _FOLLOWER: Look = {"color": COLORS["follower"]}
-# What tints time, and what tints a trajectory.
+# What tints time.
 _TINT: Look = {"color": COLORS["dead end"], "alpha": 0.09, "linewidth": 0.0, "zorder": 0.4}
-_VEIL: Look = {"color": COLORS["dead end"], "alpha": 0.4, "linewidth": 5.0}
-_END_MARK: Look = {"marker": "s", "markerfacecolor": "none", "color": COLORS["ink"]}
 
 
 def figures(study: PaperStudy) -> Iterator[Figure]:
@@ -49,19 +45,9 @@ def figures(study: PaperStudy) -> Iterator[Figure]:
         "Divergence of forecast and recognised state",
         "Jensen–Shannon divergence of the one-step forecast and the distribution over states "
         "recognised then, in the last round: 0 bit where they are equal, 1 bit where they have "
-        "nothing in common. A run's first forecast is set apart, as in the paper: it starts from "
-        "the uniform distribution. It may jump where the action changes, for each action has a "
-        "matrix of its own.",
+        "nothing in common. It may jump where the action changes, for each action has a matrix of "
+        "its own.",
         partial(draw_divergence, study),
-    )
-    yield Figure(
-        "space",
-        "States and trajectories in the space of observations",
-        "The last round over the gap: the follower's speed above (solid), the leader's below "
-        "(dashed). Discs are the states' centres; where two would overlap they are moved apart and "
-        "point to their place. A state is recognised by the distance in all three variables, so "
-        "that no plane alone decides. The gap is drawn by its root.",
-        partial(draw_space, study),
     )
     yield Figure(
         "graph",
@@ -70,12 +56,6 @@ def figures(study: PaperStudy) -> Iterator[Figure]:
         "step, over all actions as often as each was used; staying is written beside the state.",
         partial(draw_graph, study),
     )
-
-
-def _panels(rows: int, columns: int, height: float, **others: bool) -> tuple[Drawn, Any]:
-    figure = Drawn(figsize=(WIDTH, height), layout="constrained")
-    look: Look = {"sharex": True, "squeeze": False, **others}
-    return figure, figure.subplots(rows, columns, **look)
 
 
 def _letter(panels: Iterable[Axes], offset: plot.Point = (-14.0, 9.0)) -> None:
@@ -181,17 +161,14 @@ def _draw_moments(axes: Axes, moments: Sequence[tuple[float, str, str]]) -> None
 
 def draw_divergence(study: PaperStudy) -> Drawn:
     """Divergence of forecast and recognised state over time, a panel for each case."""
-    figure, grid = _panels(2, 2, 4.2, sharey=True)
+    figure = Drawn(figsize=(WIDTH, 4.2), layout="constrained")
+    grid = figure.subplots(2, 2, sharex=True, sharey=True)
     bound: Look = {"color": COLORS["ink"], "linestyle": "--", "linewidth": 0.8}
-    first: Look = {"marker": "D", "markersize": 5, "markerfacecolor": COLORS["third"], "zorder": 4}
     for axes, run in zip(grid.flat, study.last_round, strict=True):
         time, surprise = run.episode.time, run.surprise
         name = f"the paper's bound, {LARGEST_DIVERGENCE:g} bit"
         axes.axhline(LARGEST_DIVERGENCE, label=name, **bound)
         axes.plot(time, surprise, linewidth=0.8, label="one-step forecasts", **_FOLLOWER)
-        name = "the run's first forecast"
-        edge: Look = {"markeredgecolor": COLORS["ink"], "markeredgewidth": 0.6, "label": name}
-        plot.mark(axes, time[0], run.first_surprise, **edge, **first)
         _draw_moments(axes, _moments(study, run))
         axes.set_title(_title_of(study, run))
     highest = [float(np.nanmax(run.surprise)) for run in study.last_round]
@@ -205,49 +182,7 @@ def draw_divergence(study: PaperStudy) -> Drawn:
     return figure
 
 
-# -- In the space of observations, and as a graph -------------------------------------------------
-
-
-def draw_space(study: PaperStudy) -> Drawn:
-    """States and trajectories in (gap, speed), a column for each case."""
-    figure, grid = _panels(2, len(CASES), 5.2, sharey=True)
-    observations = np.concatenate([run.episode.observations for run in study.last_round])
-    widest, fastest = float(observations[:, 0].max()), float(observations[:, 1:].max())
-    # By its root the gap has most room where it is small.
-    root = (lambda x: np.sign(x) * np.sqrt(np.abs(x)), lambda x: np.sign(x) * x**2)
-    grid[0, 0].set_xscale("function", functions=root)
-    grid[0, 0].set(xlim=(-0.12, 1.08 * widest), ylim=(-0.07 * fastest, 1.1 * fastest))
-    grid[0, 0].set_xticks([tick for tick in (0, 2, 5, 10, 20, 40, 80, 160, 320) if tick <= widest])
-    figure.supxlabel("gap [m], root scale", fontsize=8.0)
-    grid[0, 0].set_ylabel("follower's speed [m/s]")
-    grid[1, 0].set_ylabel("leader's speed [m/s]")
-    looks = {
-        "centre of a state": {**_END_MARK, "marker": "o"},
-        "end of a run": _END_MARK,
-        "collision": {"marker": "X", "color": COLORS["ink"]},
-        "recognised as the dead end": {**_VEIL, "linestyle": "-"},
-    }
-    handles = [
-        Line2D([], [], label=name, **{"linestyle": "", **look}) for name, look in looks.items()
-    ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=4)
-    _letter(grid.flat)
-    figure.draw_without_rendering()  # discs need to know where everything is
-    for variable, (row, look) in enumerate(zip(grid, (_FOLLOWER, _LEADER_LINE), strict=True), 1):
-        for axes, run in zip(row, study.last_round, strict=True):
-            gap = np.maximum(run.episode.observations[:, 0], 0.0)
-            speed = run.episode.observations[:, variable]
-            axes.plot(gap, speed, **look)
-            dead_end_gap = np.where(run.state == study.dead_end, gap, np.nan)
-            axes.plot(dead_end_gap, speed, zorder=1.8, solid_capstyle="butt", **_VEIL)
-            if run.episode.collided:
-                plot.draw_collision(axes, float(gap[-1]), float(speed[-1]))
-            else:
-                plot.mark(axes, gap[-1], speed[-1], markersize=10, zorder=7, **_END_MARK)
-            centers = study.model.centers[:, (0, variable)]
-            plot.draw_centers(axes, centers, study.dead_ends, 8.5)
-            axes.set_title(run.name.capitalize() if variable == 1 else "")
-    return figure
+# -- As a graph --------------------------------------------------------------------------------
 
 
 def draw_graph(study: PaperStudy) -> Drawn:

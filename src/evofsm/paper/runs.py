@@ -5,7 +5,6 @@ The settings stand, with comments, in ``settings.toml``.
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,6 @@ from evofsm.driving.measures import is_dead_end
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.driving.world import World
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 
@@ -133,14 +131,12 @@ class Run:
 
     name: str
     case: int
-    round: int  #: from 1; 0 for an extra run
     episode: Episode
     action: NDArray[np.int64]  #: (T,) index of the action commanded after each row
     state: NDArray[np.int64]  #: (T,) index of the most probable state
     n_states: NDArray[np.int64]  #: (T,) number of states
-    belief: NDArray[np.float64]  #: (T, n), 0 for states created later
+    belief: NDArray[np.float64]  #: (T, n) in the last round; else without columns
     surprise: NDArray[np.float64]  #: (T,) [bit]
-    first_surprise: float  #: of the first row, against the uniform belief and marginal matrix [bit]
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,11 +167,6 @@ class PaperStudy:
         return is_dead_end(run.episode.observations, self.settings.decel, leader.brake_decel)
 
 
-def _widen(belief: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-    """Beliefs (..., n) over n states, 0 for those created since."""
-    return np.pad(belief, [(0, 0)] * (belief.ndim - 1) + [(0, n - belief.shape[-1])])
-
-
 def run_paper(
     world: World,
     name: str,
@@ -185,7 +176,6 @@ def run_paper(
     *,
     order: Sequence[int] = CASES,
     observe: Callable[[int, Episode], NDArray[np.float64]] | None = None,
-    beliefs: bool = True,
 ) -> PaperStudy:
     """Drive and learn all runs.
 
@@ -206,9 +196,6 @@ def run_paper(
     observe : callable, optional
         What the machine observes of a run, (T, 3), told how many runs came before, and the run;
         without it what truly happened.
-    beliefs : bool
-        Whether to keep every belief. The claims do without, and with hundreds of states they take
-        gigabytes; `Run.belief` then has no columns, and `Run.first_surprise` is NaN.
     """
     if rounds < 1:
         raise ValueError(f"rounds is {rounds}; the cases must be driven at least once")
@@ -218,36 +205,33 @@ def run_paper(
     total = rounds * len(CASES) + len(settings.brake_at) + 2
     runs, extra_runs = list[Run](), list[Run]()
 
-    def learn(machine: EvolvingFSM, name: str, case: int, round_: int, scenario: Scenario) -> Run:
+    def learn(
+        machine: EvolvingFSM, name: str, case: int, scenario: Scenario, *, is_last: bool = False
+    ) -> Run:
         """Drive a run and show it to the machine, row by row."""
         episode = world.run(scenario, settings.drivers[case])
         before = len(runs) + len(extra_runs)
         observations = observe(before, episode) if observe else episode.observations
-        n, action = machine.n_states, settings.actions.encode(episode.accelerations)
-        # Of the first row: the uniform belief through the marginal matrix.
-        prior = np.full(n, 1.0 / max(n, 1)) @ machine.marginal_matrix
+        action = settings.actions.encode(episode.accelerations)
         ends = [len(observations) - 1] if episode.collided else []
-        trace = machine.learn_many(observations, action, [0], ends, belief=beliefs)
+        trace = machine.learn_many(observations, action, [0], ends, belief=is_last)
         belief = np.empty((len(action), 0)) if trace.belief is None else trace.belief
-        is_known = beliefs and n > 0
-        first = jensen_shannon(_widen(prior, machine.n_states), belief[0]) if is_known else math.nan
         progress(before + 1, total)
-        columns = action, trace.state, trace.n_states, belief, trace.surprise, float(first)
-        return Run(name, case, round_, episode, *columns)
+        columns = action, trace.state, trace.n_states, belief, trace.surprise
+        return Run(name, case, episode, *columns)
 
-    for round_ in range(1, rounds + 1):
+    for left in reversed(range(rounds)):
         for case in order:
-            runs.append(learn(machine, f"case {case}", case, round_, settings.scenario))
+            is_last = left == 0
+            runs.append(learn(machine, f"case {case}", case, settings.scenario, is_last=is_last))
     for time in settings.brake_at:
         leader = replace(settings.scenario.leader, brake_time=time)
         scenario = replace(settings.scenario, leader=leader)
-        extra_runs.append(learn(machine.copy(), f"brake at {time:g} s", 1, 0, scenario))
+        extra_runs.append(learn(machine.copy(), f"brake at {time:g} s", 1, scenario))
     longer = replace(settings.scenario, duration=settings.safe_until)
     safe = {case: not world.run(longer, settings.drivers[case]).collided for case in (2, 3)}
     progress(total, total)
     at_collisions = [run.state[-1] for run in runs if run.episode.collided]
-    if beliefs:  # over all the states there are in the end
-        runs = [replace(run, belief=_widen(run.belief, machine.n_states)) for run in runs]
     return PaperStudy(
         world=name,
         settings=settings,
