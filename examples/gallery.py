@@ -20,7 +20,7 @@ from evofsm.driving import (
     LatentRisk,
     Leader,
     Scenario,
-    assess_states,
+    dead_ends_of,
     drive,
     guard_for_family,
     load_family,
@@ -41,8 +41,7 @@ def of_a_machine() -> Iterator[str]:
     learnt = actions.encode(episode.accelerations)
     trace = machine.learn_many(episode.observations, learnt, belief=True)
     model = machine.model(actions=actions, **VARIABLES)
-    assessed = assess_states(model, LatentRisk.given(-4.0, decel=4.0, leader_decel=9.0))
-    dead_ends = [one.state for one in assessed if one.is_dead_end]
+    dead_ends = dead_ends_of(model, LatentRisk.given(-4.0, decel=4.0, leader_decel=9.0))
 
     _, ax = plt.subplots(figsize=(5.0, 3.2))
     ax.plot(*episode.observations[:, :2].T, color=plot.COLORS["follower"])

@@ -83,7 +83,7 @@ def states(
     variables : (int, int)
         Indices of the variables to the right and upward.
     dead_ends : collection of int
-        Indices of states to mark by a hexagon, as `assess_states` finds them.
+        Indices of states to mark by a hexagon, as `dead_ends_of` finds them.
     rows : (T, m) array_like, optional
         What was observed, as dots behind.
     failed : (T,) array_like of bool, optional

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from evofsm import driving
 from evofsm.driving import IDM, Leader, Scenario, guard_for_cars
-from evofsm.driving.judge import LatentRisk, assess_states
+from evofsm.driving.judge import LatentRisk, dead_ends_of
 from evofsm.driving.leaders import REAL_DRIVES
 from evofsm.driving.measures import is_dead_end
 from evofsm.driving.rehearsal import HARDEST, critical_decelerations
@@ -300,10 +300,10 @@ def test_states_are_judged_at_their_centres():
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)))
     machine.learn_many([[80.0, 5.0, 5.0], [3.0, 25.0, 25.0]], [0, 0])
     risk = LatentRisk.given(-4.0, 4.0, 8.0)
-    assert [state.is_dead_end for state in assess_states(machine.model(), risk)] == [False, True]
+    assert dead_ends_of(machine.model(), risk) == [1]
     brink = EvolvingFSM(n_actions=1)
     brink.observe([7.0, 10.0, 10.0])  # full braking saves, keeping the speed does not
-    assert [(state.risk, state.margin) for state in assess_states(brink, risk)] == [(0.0, 1.0)]
+    assert dead_ends_of(brink, risk) == []
 
 
 # -- Sharing, and a table to begin with -------------------------------------------------------

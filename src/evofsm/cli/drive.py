@@ -198,12 +198,11 @@ def _summary(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
 
 
 def _learnt(guard: Guard) -> str:
-    from evofsm.driving import LatentRisk, assess_states, learners_of
+    from evofsm.driving import LatentRisk, dead_ends_of, learners_of
 
     machine, judge = learners_of(guard)
     states = f"{machine.n_states} states"
     if isinstance(judge, LatentRisk):
-        ends = sum(state.is_dead_end for state in assess_states(machine, judge))
-        states += f", {ends} of them dead ends"
+        states += f", {len(dead_ends_of(machine, judge))} of them dead ends"
     experience = getattr(judge, "told_by_experience", "")
     return f"{states}; {experience}" if experience else states

@@ -74,10 +74,10 @@ def _refuse_learnt(out: Path | None) -> None:
 
 def _learnt(file: Path) -> tuple[Any, list[int] | None]:
     """The model, and its dead ends where the risk that was learnt with it is known."""
-    from evofsm.driving import LatentRisk, assess_states
+    from evofsm.driving import LatentRisk, dead_ends_of
 
     model, _, guard = load_model(file)
     judge = guard and guard.judge
     if not isinstance(judge, LatentRisk):
         return model, None
-    return model, [s.state for s in assess_states(model, judge) if s.is_dead_end]
+    return model, dead_ends_of(model, judge)

@@ -15,7 +15,7 @@ from .family import Numbers as Numbers
 from .family import held_out as held_out
 from .family import training as training
 from .judge import LatentRisk as LatentRisk
-from .judge import assess_states as assess_states
+from .judge import dead_ends_of as dead_ends_of
 from .leaders import REAL_DRIVES as REAL_DRIVES
 from .leaders import LeaderBrakes as LeaderBrakes
 from .naming import WORDS as WORDS

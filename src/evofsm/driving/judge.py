@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -526,40 +526,21 @@ def in_proportion(
 # -- Of states ----------------------------------------------------------------------------------
 
 
-class StateRisk(NamedTuple):
-    """How dangerous it is to be in a state."""
+def dead_ends_of(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[int]:
+    """States at whose centre a hard brake of the leader more likely than not ends in failure.
 
-    state: int
-    risk: float  #: latent risk if one brakes in full at once, with the leader: high in a dead end
-    margin: float  #: escape margin: how much lower that is than if speed is kept
-    critical: float  #: hardest braking of a leader that is then survived [m/s²]
-    seconds: float  #: time for which the state was seen [s]
-    failures: float  #: number of failures that ended in it
-
-    @property
-    def is_dead_end(self) -> bool:
-        """Whether a hard brake of the leader now is more likely than not to end in failure."""
-        return self.risk > 0.5
-
-
-def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[StateRisk]:
-    """Latent risk at the centre of every state, in the order of creation.
+    Even if one brakes in full at once, with the leader. They are told by their indices.
 
     Examples
     --------
     >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
     >>> trace = machine.learn_many([[50.0, 5.0, 5.0], [9.0, 20.0, 20.0]], [0, 0])
-    >>> risk = LatentRisk(lowest=-4.0)
-    >>> [state.is_dead_end for state in assess_states(machine, risk)]
-    [False]
+    >>> dead_ends_of(machine, LatentRisk(lowest=-4.0))
+    []
     """
-    actions = np.array([risk.lowest, 0.0])
-    critical = [risk.critical(center, actions) for center in known.centers]
-    brake_risk, keep_risk = risk.manoeuvres.harder(np.reshape(critical, (-1, 2))).T
-    hardest = [decels[0] for decels in critical]
-    columns = brake_risk, keep_risk - brake_risk, hardest, known.visits * risk.dt, known.endings
-    rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
-    return [StateRisk(state, *row) for state, row in enumerate(rows)]
+    critical = [risk.critical(center, [risk.lowest])[0] for center in known.centers]
+    indices: list[int] = np.flatnonzero(risk.manoeuvres.harder(critical) > 0.5).tolist()
+    return indices
 
 
 # -- Numbers ------------------------------------------------------------------------------------

@@ -182,9 +182,6 @@ def draw_divergence(study: PaperStudy) -> Drawn:
     return figure
 
 
-# -- As a graph --------------------------------------------------------------------------------
-
-
 def draw_graph(study: PaperStudy) -> Drawn:
     """What leads to what, as the machine has learnt it."""
     figure = Drawn(figsize=(WIDTH, 3.6), layout="constrained")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import LatentRisk, assess_states
+from evofsm.driving import LatentRisk, dead_ends_of
 from evofsm.driving.measures import TimeHeadway, TimeToCollision, time_headway, time_to_collision
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
@@ -202,7 +202,8 @@ def graph_of(
     """
     marks = [count > 0.5 for count in known.endings.tolist()]
     if isinstance(judge, LatentRisk):
-        marks = [state.is_dead_end for state in assess_states(known, judge)]
+        dead_ends = dead_ends_of(known, judge)
+        marks = [state in dead_ends for state in range(known.n_states)]
     columns = map(tuple, known.centers.tolist()), known.visits.tolist(), marks
     states = map(StateShown, range(known.n_states), *columns)
     changes = known.changes * ~np.eye(known.n_states, dtype=bool)
