@@ -408,7 +408,7 @@ def _estimates(risk: LatentRisk, one: Watched) -> tuple[Floats, Floats]:
 
 
 # Classic measures that are shown, by their name here.
-_UNCHANGED = ("mttc", "drac", "headway", "picud", "rss-r157", "r157-careful", "fuzzy")
+_UNCHANGED = ("mttc", "drac", "headway", "rss-r157", "r157-careful", "fuzzy")
 _SHOWN = {"ttc": "aeb-ttc", **{name: name for name in _UNCHANGED}}
 _RSS = measures.ResponsibilitySensitiveSafety
 

@@ -179,31 +179,6 @@ class DecelerationToAvoidCollision(_Measure):
         return deceleration_to_avoid_collision(observations) - self.threshold
 
 
-@dataclass(frozen=True)
-class Picud(_Measure):
-    """PICUD (Uno et al. 2002): danger where urgent braking of both would end in a collision.
-
-    Both brake by ``decel`` [m/s²], the follower after a ``reaction`` [s], which may be 0. The gap
-    left at standstill is gap + v_leader² / (2·decel) − v·reaction − v² / (2·decel).
-
-    Examples
-    --------
-    >>> Picud(decel=3.0).score(np.array([[30.0, 20.0, 10.0]]), dt=0.1)
-    array([40.])
-    """
-
-    decel: float = 3.3
-    reaction: float = 1.0
-
-    _may_be_zero = ("reaction",)
-
-    def score(self, observations: Floats, dt: float) -> Floats:
-        """Minus the gap left [m]; infinite where the cars have met."""
-        gap, speed, leader_speed = _columns(observations)
-        gain = (leader_speed**2 - speed**2) / (2.0 * self.decel)
-        return _unsafe_once_met(gap, -(gap + gain - speed * self.reaction))
-
-
 # -- Safe distances -------------------------------------------------------------------------------
 
 
@@ -322,9 +297,8 @@ class FuzzySafety(_Measure):
     148; 2022, the same 174).
 
     After a ``reaction`` [s] the follower brakes, comfortably or, not weaker, by ``decel`` [m/s²].
-    The ``margin`` [m] is to be left at standstill, and once more before it must brake. Above the
-    ``threshold`` the degree of danger, from 0 to 1, calls for braking; the model itself brakes from
-    0 on, the harder the more dangerous it is. These three may be 0.
+    The ``margin`` [m] is to be left at standstill, and once more before it must brake. These two
+    may be 0. The model brakes the harder the more dangerous it is.
 
     Examples
     --------
@@ -337,9 +311,8 @@ class FuzzySafety(_Measure):
     decel: float = 6.0
     leader_decel: float = 7.0
     margin: float = 2.0
-    threshold: float = 0.0
 
-    _may_be_zero = ("reaction", "margin", "threshold")
+    _may_be_zero = ("reaction", "margin")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -348,13 +321,10 @@ class FuzzySafety(_Measure):
                 f"FuzzySafety decel is {self.decel}; it must not be below comfortable_decel, "
                 f"which is {self.comfortable_decel}"
             )
-        if self.threshold >= 1.0:
-            raise ValueError(f"FuzzySafety threshold is {self.threshold}; it must be below 1")
 
     def score(self, observations: Floats, dt: float) -> Floats:
-        """The larger one of PFS and CFS − threshold; 1 − threshold where the cars have met."""
-        larger = np.maximum(self.proactive(observations), self.critical(observations, dt))
-        return larger - self.threshold
+        """The larger one of PFS and CFS; 1 where the cars have met."""
+        return np.maximum(self.proactive(observations), self.critical(observations, dt))
 
     def proactive(self, observations: Floats) -> Floats:
         """PFS, how unsafe the gap is should the leader brake in full (Mattas et al. 2020).
@@ -400,7 +370,6 @@ FIXED_MEASURES: Mapping[str, RiskMeasure] = {
     "mttc": ModifiedTimeToCollision(),
     "drac": DecelerationToAvoidCollision(),
     "headway": TimeHeadway(),
-    "picud": Picud(),
     "rss-r157": ResponsibilitySensitiveSafety.r157(),
     "r157-regulation": PerformanceModel.regulation(),
     "r157-careful": PerformanceModel.careful_human(),
