@@ -541,6 +541,8 @@ def foretellable(cases: Sequence[Case], question: Question) -> tuple[int, int]:
 TOLD = ("nothing", "own brakes", "and the shipped table", "and leaders of the other runs")
 # Brakes of one run that are closer in time are of one wave, whoever brakes [s].
 _ONE_WAVE = 10.0
+# As `LeaderBrakes` counts: braking from which on it is hard, and the width of a bin [m/s²].
+_HARD, _BIN_WIDTH = 2.5, 0.25
 # No driver in a car does more [m/s²].
 _HIGHEST, _WIDTH = 12.0, 0.5
 # So many are to be seen until an assumed one weighs no more than the tolerance.
@@ -616,7 +618,7 @@ class Leaders(Study):
         bins = range(max(len(every["counts"]), len(REAL_DRIVES.counts)))
         counts = {"here": every["counts"], "shipped": list(REAL_DRIVES.counts)}
         by_bin = pl.DataFrame(
-            {"harder": [REAL_DRIVES.hard + 0.25 * k for k in bins]}
+            {"harder": [_HARD + _BIN_WIDTH * k for k in bins]}
             | {name: [*some, *[0] * (len(bins) - len(some))] for name, some in counts.items()}
         )
         share = (pl.col("alarms") / pl.col("decisions")).alias("share")
@@ -726,7 +728,9 @@ def _table(runs: Sequence[Watched], k: int, told: str) -> LeaderBrakes | None:
 def _counted(runs: Sequence[Watched]) -> LeaderBrakes:
     decels = [decel for run in runs for _, decel in run.braked]
     gentle, hours = sum(run.gentle for run in runs), sum(run.hours for run in runs)
-    return LeaderBrakes.counted(decels, gentle, hours, f"{len(runs)} runs")
+    bins = ((np.array(decels) - _HARD) / _BIN_WIDTH).astype(np.int64)
+    counts = tuple(np.bincount(bins).tolist())
+    return LeaderBrakes(counts, gentle, hours, f"{len(runs)} runs")
 
 
 def _braked(source: str, runs: Sequence[Watched]) -> dict[str, Any]:

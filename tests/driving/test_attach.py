@@ -78,18 +78,6 @@ def test_a_mesoscopic_simulation_has_nobody_to_see_and_is_refused(road):
         attach(road("--mesosim"), "all")
 
 
-def test_guards_that_never_decide_say_so(road):
-    sumo = road(
-        others='<flow id="car" type="calm" route="along" begin="1" number="12" period="9"/>'
-    )
-    guards = attach(sumo, "all")
-    guards.guarding._seeing.ahead = lambda *_: None  # as where nobody shares a lane
-    with pytest.warns(RuntimeWarning, match="a guard decided in none"):
-        drive(sumo, 115.0, brakes_at=np.inf)
-    assert "microseconds" not in guards.summary()
-    guards.detach()
-
-
 def test_a_type_that_a_script_changed_for_one_car_is_the_type(road):
     sumo = road()
     guards = attach(sumo, "type:hasty")
@@ -388,8 +376,8 @@ IDS = [str(k) for k in range(2000)]
 TYPES = SimpleNamespace(vehicle=SimpleNamespace(getTypeID=lambda car: "bus" if car == "7" else "x"))
 
 
-def chosen(vehicles, seed=0):
-    test = choose(vehicles, seed)
+def chosen(vehicles):
+    test = choose(vehicles)
     return {car for car in IDS if test(TYPES, car)}
 
 
@@ -397,7 +385,7 @@ def test_all_some_those_of_a_type_or_a_share_which_is_the_same_in_every_run():
     assert chosen("all") == chosen(1) == set(IDS)
     assert chosen(["1", "2", "gone"]) == {"1", "2"}
     assert chosen("type:bus") == {"7"}
-    assert chosen(0.1) == chosen("10%") != chosen(0.1, seed=1)
+    assert chosen(0.1) == chosen("10%")
     assert 150 < len(chosen(0.1)) < 250
 
 

@@ -320,8 +320,3 @@ def test_with_a_table_of_real_drives_a_tolerance_can_be_met_at_once():
     assert 0.0 < judged.risk[0] <= 0.02
     assert judged.high[0] > 0.02  # it is not sure
     assert judged.evidence == sum(REAL_DRIVES.counts)
-
-
-def test_a_table_that_lacks_what_is_hard_here_is_refused():
-    with pytest.raises(ValueError, match=r"from 3 m/s² on; a table that begins at 2\.5"):
-        LatentRisk(-8.0, leaders=REAL_DRIVES._replace(hard=3.0))

@@ -60,10 +60,6 @@ _MESOSCOPIC = (
     "this is SUMO's mesoscopic simulation (--mesosim), in which no car has a leader, so that a "
     "guard would see nobody. Attach to a microscopic one, without --mesosim"
 )
-_DEAF = (
-    "{} cars were attached to in {} steps, and a guard decided in none: SUMO told nobody ahead or "
-    "behind of any. Do they share lanes?"
-)
 _NUMBERS = count()
 _ATTACHED: weakref.WeakSet[Attachment] = weakref.WeakSet()
 # Two that touched within this time before still do [s].
@@ -77,8 +73,6 @@ _NEAREST, _MARGIN = 0.05, 0.1
 _COARSE = 0.3
 # Slower than this a car stands, and a speed that differs by no more is the same [m/s].
 _STANDS, _SAME_SPEED = 0.1, 1e-6
-# So many cars in so many steps without a decision are no accident.
-_MANY_CARS, _MANY_STEPS = 10, 2000
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
 # and 1), but braking as hard as it has to (bit 2). Red lights and right of way stay as they were.
 _ON, _OFF = 0b011, 0b100
@@ -456,7 +450,7 @@ def _leaders_of(guard: Guard | None, leader_decel: float) -> Manoeuvres:
 # -- Which cars, and what came of them ------------------------------------------------------------
 
 
-def choose(vehicles: str | float | Iterable[str], seed: int = 0) -> Callable[[Any, str], bool]:
+def choose(vehicles: str | float | Iterable[str]) -> Callable[[Any, str], bool]:
     """A test of whether a vehicle is one of those that are meant, the same in every run."""
     if vehicles == "all":
         return lambda sumo, car: True
@@ -476,7 +470,7 @@ def choose(vehicles: str | float | Iterable[str], seed: int = 0) -> Callable[[An
                 "such as 0.1 or '10%', or a list of ids"
             )
         limit = share * 2.0**32
-        return lambda _, car: zlib.crc32(f"{seed}:{car}".encode()) < limit
+        return lambda _, car: zlib.crc32(f"0:{car}".encode()) < limit
     ids = frozenset(vehicles)
     return lambda _, car: car in ids
 
@@ -580,7 +574,6 @@ class Attachment:
         self._known: set[str] = set()
         self._met: dict[tuple[str, str], float] = {}
         self._listener: int | None = None
-        self._was_deaf = False
         self.collisions: list[Collision] = []  #: of the whole simulation, other cars included
         self.ever: set[str] = set()  #: vehicles that were guarded, or watched, at any time
         self.looked = 0  #: cars that were looked at, summed over the steps
@@ -640,17 +633,8 @@ class Attachment:
         for car in self._cars.cars:
             self._ride.see(car, vehicle.getSpeed(car), vehicle.getAllowedSpeed(car))
         self._cars.step(now)
-        self._say_if_deaf()
         self.seconds += clock.perf_counter() - begin
         return True
-
-    def _say_if_deaf(self) -> None:
-        guards = self.guarding
-        is_many = self.looked > _MANY_STEPS and len(self.ever) >= _MANY_CARS
-        if is_many and not self._was_deaf and guards is not None and not guards.decisions:
-            self._was_deaf = True
-            text = _DEAF.format(len(self.ever), f"{self.looked:,}")
-            warnings.warn(text, RuntimeWarning, stacklevel=4)
 
     def summary(self) -> dict[str, float]:
         """What came of the cars that are, or were, guarded or watched; numbers by name.
@@ -722,7 +706,6 @@ def attach(
     tolerance: float = TOLERANCE,
     leader_decel: float = _LEADER_DECEL,
     regain: float = REGAIN,
-    seed: int = 0,
     report: Callable[[GuardedStep], None] | None = None,
 ) -> Attachment:
     """Guard, or watch, cars of a SUMO simulation that runs.
@@ -754,8 +737,6 @@ def attach(
     regain : float
         Within this time a gap that is not safe, such as after a lane change, is to be safe again
         [s], by no more braking than that takes; see `LatentRisk`.
-    seed : int
-        Of the share.
     report : callable, optional
         Called with each `GuardedStep`: what a car's driver wanted, what it did, and why.
 
@@ -788,7 +769,7 @@ def attach(
         raise ValueError(f"there is no mode {mode!r}; there are {', '.join(_MODES)}")
     if mode == "watch" and guard is not None:
         raise ValueError("mode 'watch' asks no guard; use mode 'shadow'")
-    is_chosen, sight = choose(vehicles, seed), Seeing(sumo)
+    is_chosen, sight = choose(vehicles), Seeing(sumo)
     cars: Guarding | Watching = Watching(sight)
     if mode != "watch":
         settings = {"tolerance": tolerance, "leader_decel": leader_decel, "regain": regain}

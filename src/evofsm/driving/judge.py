@@ -159,7 +159,8 @@ class LatentRisk(Retraced, LearningJudge):
         _RISK.refuse_others(self._settings)
         self.manoeuvres = Manoeuvres(leader_decel)
         if leaders is not None:
-            self.manoeuvres.begin_with(leaders)
+            self.manoeuvres.remember(*leaders.decels)
+            self.manoeuvres.gentle += leaders.gentle
         self.brakes = OwnBrakes(lowest, own_brakes, dt)
         self.perception = Perception(dt)
         self._watch = BrakeWatch(dt)

@@ -11,8 +11,7 @@ be told from the assumption, unless one begins with a table of them (`LeaderBrak
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,42 +46,25 @@ class LeaderBrakes(NamedTuple):
 
     Examples
     --------
-    >>> LeaderBrakes.counted([2.6, 3.1, 2.7], gentle=20, hours=0.5, source="our own cars").decels
+    >>> LeaderBrakes((2, 0, 1), gentle=20, hours=0.5, source="our own cars").decels
     (2.75, 2.75, 3.25)
     """
 
-    hard: float  #: from which deceleration on they count as hard [m/s²]
-    counts: tuple[int, ...]  #: of hard ones, by bins of 0.25 m/s² from there on
+    counts: tuple[int, ...]  #: of hard ones, by bins of 0.25 m/s² from 2.5 m/s² on
     gentle: int  #: number of softer ones
     hours: float  #: of following a leader that they were seen in
     source: str  #: whose drives, for people
 
-    @classmethod
-    def counted(cls, decels: Sequence[float], gentle: int, hours: float, source: str) -> Self:
-        """Count decelerations of at least 2.5 m/s².
-
-        Parameters
-        ----------
-        decels : sequence of float
-            Hard ones [m/s²], in any order.
-        gentle, hours, source
-            As in the class.
-        """
-        bins = [int((decel - _HARD) / _BIN_WIDTH) for decel in decels]
-        counts = np.bincount(np.array(bins, dtype=np.int64)).tolist()
-        return cls(_HARD, tuple(counts), gentle, positive("hours", hours), source)
-
     @property
     def decels(self) -> tuple[float, ...]:
         """Each as hard as its bin may hold, the softest first [m/s²]."""
-        ends = self.hard + _BIN_WIDTH * np.arange(1, len(self.counts) + 1)
+        ends = _HARD + _BIN_WIDTH * np.arange(1, len(self.counts) + 1)
         return tuple(np.repeat(ends, self.counts).tolist())
 
 
 #: Public drives: 46 waves of braking, the hardest 6.1 m/s². Hardly anyone brakes hard in them, and
 #: no one in an emergency: how hard leaders brake then, they do not tell.
 REAL_DRIVES = LeaderBrakes(
-    hard=_HARD,
     counts=(25, 15, 14, 14, 7, 7, 3, 2, 1, 1, 1, 0, 0, 0, 2),
     gentle=977,
     hours=16.1,
@@ -115,16 +97,6 @@ class Manoeuvres:
         if hard:
             self.decels = deque([*self.decels, *hard], self.decels.maxlen)
             self._tabulate()
-
-    def begin_with(self, leaders: LeaderBrakes) -> None:
-        """Take in a table of others' manoeuvres as if they had been seen."""
-        if leaders.hard > _HARD:
-            raise ValueError(
-                f"leaders counts from {leaders.hard:g} m/s² on; a table that begins at {_HARD:g} "
-                "m/s² is needed"
-            )
-        self.remember(*leaders.decels)
-        self.gentle += leaders.gentle
 
     def harder(self, decel: ArrayLike) -> NDArray[np.float64]:
         """Probability that the next hard manoeuvre is harder than these decelerations [m/s²]."""
