@@ -222,9 +222,13 @@ class Course(NamedTuple):
         """What comes of the draws by what a guard has learnt so far."""
         return try_out(guard, self.family, self.draws, self.alone)
 
-    def row(self, policy: str, group: str, outcomes: Sequence[Outcome], **others: Any) -> Any:
-        """A line of the table."""
-        return summarise(self.family.name, policy, group, outcomes, self.family.interval, **others)
+    def row(
+        self, policy: str, group: str, outcomes: Sequence[Outcome], **learning: Any
+    ) -> dict[str, Any]:
+        """A line of the table, and how it learnt."""
+        row = asdict(summarise(self.family.name, policy, outcomes, self.family.interval))
+        untaught = {"learning_seed": None, "train_episodes": 0, "train_collisions": 0}
+        return {"group": group, **row, **untaught, "episodes_until_safe": None, **learning}
 
 
 def _tests(study: ClosedLoop, episodes: int) -> Course:
@@ -354,7 +358,7 @@ def _test_rule(study: ClosedLoop, rule: str, seed: int) -> Found:
         train_episodes=episodes,
         train_collisions=sum(one.collided for one in taught),
     )
-    return {"rules": [asdict(row) | {"states": machine.n_states}]}
+    return {"rules": [row | {"states": machine.n_states}]}
 
 
 # -- Below the table; each learns with one seed ---------------------------------------------------

@@ -228,7 +228,7 @@ def cut_in(regain: float, seed: int, train: int, test: int) -> dict[str, Any]:
     teach(guard, training(family, seed=0, learning_seed=seed, episodes=train))
     guard.freeze()
     outcomes = try_out(guard, family, held_out(family, seed=0, episodes=test))
-    row = summarise(family.name, OURS, "learnt", outcomes, family.interval)
+    row = summarise(family.name, OURS, outcomes, family.interval)
     told = {name: getattr(row, name) for name in ("episodes", "collisions", "mobility", "jerk")}
     return {"regain": regain, "seed": seed, **told}
 

@@ -53,10 +53,10 @@ def test_the_bold_row_is_rebuilt_in_ten_lines():
     exec(few.replace("learning_seed=0", "learning_seed=1"), names)
     (row,) = _test_learner(ClosedLoop(train=4, test=4), OURS, 1)["rows"]
     ours = names["row"]
-    assert ours.collisions == row.collisions == 0
-    assert sum(drive.collided for drive in names["drives"]) == row.train_collisions == 0
+    assert ours.collisions == row["collisions"] == 0
+    assert sum(drive.collided for drive in names["drives"]) == row["train_collisions"] == 0
     for name in ("mobility", "mobility_low", "intervention_rate", "mean_change", "jerk"):
-        assert getattr(ours, name) == getattr(row, name)
+        assert getattr(ours, name) == row[name]
 
 
 def test_our_own_lines_are_the_median_and_the_worst_of_the_seeds():

@@ -72,9 +72,7 @@ def test_outcomes_compare_with_the_controller_alone():
     found = [outcome_of(*pair) for pair in zip(same, alone, strict=True)]
     assert [one.mobility for one in found] == [1.0, 1.0, 1.0]
     assert [one.changed for one in found] == [0, 0, 0]
-    learnt = {"learning_seed": 3, "train_episodes": 7, "train_collisions": 2}
-    row = summarise("emergency", "unrevised", "", found, EMERGENCY.interval, **learnt)
-    assert (row.learning_seed, row.train_episodes, row.train_collisions) == (3, 7, 2)
+    row = summarise("emergency", "unrevised", found, EMERGENCY.interval)
     assert row.collisions == sum(one.collided for one in same) == 3
     assert (row.collision_rate, row.mobility, row.mean_change) == (1.0, 1.0, 0.0)
     assert row.collision_low == pytest.approx(0.025 ** (1.0 / 3.0))  # Clopper and Pearson

@@ -203,7 +203,7 @@ class Results:
         setup, numbers = self.setup, range(self.setup.first, self.setup.first + episodes)
         rows = [self.rows[number] for number in numbers]
         outcomes = [Outcome(*(row[name] for name in Outcome._fields)) for row in rows]
-        row = summarise(setup.family.name, setup.reviser, "", outcomes, setup.family.interval)
+        row = summarise(setup.family.name, setup.reviser, outcomes, setup.family.interval)
         leads = tuple(row["lead_time"] for row in rows if row["lead_time"] is not None)
         if self.folder is not None:
             self._write(self.folder, rows, {**asdict(row), "lead_times": leads})

@@ -226,15 +226,12 @@ def _opened(name: str) -> World:
 # -- What came of many ----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Row:
     """A line of the table: one policy on the held-out draws of a family."""
 
     family: str
     policy: str
-    group: str
-    learning_seed: int | None = None
-    train_episodes: int = 0
     episodes: int
     collisions: int  #: with the leader; not `rear_ends`
     collision_rate: float
@@ -248,10 +245,8 @@ class Row:
     mean_change: float  #: [m/s²]
     jerk: float  #: root mean square [m/s³]
     mean_speed: float  #: [m/s]
-    episodes_until_safe: int | None = None
-    train_collisions: int = 0
-    hours: float = 0.0  #: driven, to complete decisions [h]
-    kilometres: float = 0.0  #: driven by the follower [km]
+    hours: float  #: driven, to complete decisions [h]
+    kilometres: float  #: driven by the follower [km]
 
     @property
     def failures(self) -> FailureRecord:
@@ -259,25 +254,16 @@ class Row:
         return FailureRecord(self.collisions, self.hours, self.kilometres, self.episodes)
 
 
-def summarise(
-    family: str,
-    policy: str,
-    group: str,
-    outcomes: Sequence[Outcome],
-    interval: float,
-    **learning: Any,
-) -> Row:
+def summarise(family: str, policy: str, outcomes: Sequence[Outcome], interval: float) -> Row:
     """One line for the outcomes of a policy.
 
     Parameters
     ----------
-    family, policy, group : str
-        What stands in the line; a group is such as ``"learnt"``.
+    family, policy : str
+        What stands in the line.
     outcomes : sequence of Outcome
     interval : float
         Time between two decisions [s].
-    **learning
-        Fields of `Row` that say how it learnt: ``train_episodes`` and others.
     """
     with needs("scipy", "study", "the interval of a share"):
         from scipy.stats import binomtest
@@ -293,7 +279,6 @@ def summarise(
     return Row(
         family=family,
         policy=policy,
-        group=group,
         episodes=n,
         collisions=collisions,
         collision_rate=collisions / n,
@@ -309,5 +294,4 @@ def summarise(
         mean_speed=float(np.mean([o.speed for o in outcomes])),
         hours=decisions * interval / 3600.0,
         kilometres=sum(o.speed * o.decisions for o in outcomes) * interval / 1000.0,
-        **learning,
     )

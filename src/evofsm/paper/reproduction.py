@@ -60,7 +60,9 @@ class Reproduction:
             name="paper",
             about=_ABOUT,
             parts=[
-                *(first, _table_of_forecasts(forecasts), *rest),
+                first,
+                _table_of_forecasts(forecasts),
+                *rest,
                 _table_of_settings(study.settings),
             ],
             command=command,
