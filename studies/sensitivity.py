@@ -78,7 +78,7 @@ class Setting:
         """The paper's settings with these in their place."""
         limits = {"lowest": -self.bound}
         machine = ("radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
-        return Settings.with_changes(
+        return Settings.load(
             {
                 "scenario": {"initial_gap": self.initial_gap},
                 "leader": {"brake_speed": self.brake_speed, "brake_decel": self.brake_decel},

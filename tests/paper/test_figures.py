@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 
 def study_of(rounds=1, **changes):
-    settings = Settings.with_changes(changes)
+    settings = Settings.load(changes)
     return run_paper(KinematicWorld(), "kinematic", settings, rounds=rounds)
 
 

@@ -15,7 +15,6 @@ def paper(
     world: InWorld = "sumo",
     rounds: Annotated[int, option("How often the four cases are driven.", min=1)] = 20,
     out: Annotated[Path, option("Folder for the page and the model.")] = Path("evofsm-paper"),
-    settings: Annotated[Path | None, option("TOML file in place of the paper's settings.")] = None,
     as_json: Json = False,
 ) -> int:
     """Reproduce the paper: drive its 80 runs, and hold every claim against them.
@@ -28,7 +27,7 @@ def paper(
     from evofsm.paper.reproduction import reproduce
 
     with progress(f"Driving and learning ({world})") as move:
-        reproduction = reproduce(world, rounds, settings, move)
+        reproduction = reproduce(world, rounds, move)
     command = shlex.join(["evofsm", *sys.argv[1:]])
     page = reproduction.write(out, command)
     if as_json:

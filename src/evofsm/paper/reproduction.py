@@ -59,12 +59,7 @@ class Reproduction:
         return Page(
             name="paper",
             about=_ABOUT,
-            parts=[
-                first,
-                _table_of_forecasts(forecasts),
-                *rest,
-                _table_of_settings(study.settings),
-            ],
+            parts=[first, _table_of_forecasts(forecasts), *rest],
             command=command,
             lost=[_table_of_losses(forecasts)],
             targets=pl.DataFrame(self.claims).select("claim", "paper", "measured", "holds"),
@@ -93,13 +88,11 @@ class Reproduction:
 def reproduce(
     world: str = "sumo",
     rounds: int = 20,
-    settings: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Reproduction:
     """Drive the four cases of the paper, round by round, and hold every claim against the runs."""
-    run_settings = Settings.load(settings)
     with open_world(world) as place:
-        study = run_paper(place, world, run_settings, rounds, progress)
+        study = run_paper(place, world, Settings.load(), rounds, progress)
     return Reproduction(study, check_claims(study))
 
 
@@ -166,18 +159,4 @@ def _table_of_losses(forecasts: pl.DataFrame) -> Table:
             "e-FSM": "{ours:.3f}",
         },
         "The largest divergence in a case of the last round, or the mean of all.",
-    )
-
-
-def _table_of_settings(settings: Settings) -> Table:
-    """What was set, as it stands in ``settings.toml``."""
-    rows = [
-        {"table": table, "settings": ", ".join(f"{name} {value}" for name, value in fields.items())}
-        for table, fields in settings.tables.items()
-    ]
-    return Table(
-        "Settings",
-        pl.DataFrame(rows),
-        note="The paper leaves some settings open; those were recovered by search, and "
-        "evofsm/paper/settings.toml marks which, with units.",
     )

@@ -9,7 +9,6 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,6 @@ CASES = (1, 2, 3, 4)
 class Settings:
     """All that the runs can be told; the defaults stand in ``settings.toml``."""
 
-    tables: Mapping[str, Mapping[str, Any]]  #: as they stand there
     scenario: Scenario
     safe_until: float
     drivers: Mapping[int, IDM | ChangingIDM]  #: by case
@@ -44,49 +42,26 @@ class Settings:
     actions: IntervalActions
 
     @classmethod
-    def load(cls, path: Path | None = None) -> Settings:
-        """Read the paper's settings, with those of a TOML file in their place where it has any.
+    def load(cls, changes: Mapping[str, Any] | None = None) -> Settings:
+        """The paper's settings, with others in the place of some.
 
-        Raises
-        ------
-        ValueError
-            If the file is not TOML, or holds a name or a kind of value that is not known.
-        """
-        if path is None:
-            return cls.with_changes({})
-        try:
-            changes = tomllib.loads(path.read_text("utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path} is not TOML: {error}") from error
-        return cls.with_changes(changes, str(path))
-
-    @classmethod
-    def with_changes(cls, changes: Mapping[str, Any], where: str = "changes") -> Settings:
-        """The paper's settings with others in the place of some.
-
-        Parameters
-        ----------
-        changes : mapping
-            Tables of ``settings.toml``, with what is changed in them; a ValueError says which name
-            or kind of value is not known.
-        where : str
-            What they are called in error messages.
+        ``changes`` are tables of ``settings.toml``, with what is changed in them; a ValueError says
+        which name is not known.
 
         Examples
         --------
-        >>> settings = Settings.with_changes({"leader": {"brake_decel": 6.0}})
+        >>> settings = Settings.load({"leader": {"brake_decel": 6.0}})
         >>> settings.scenario.leader.brake_decel, settings.scenario.initial_gap
         (6.0, 5.0)
         """
         tables = tomllib.loads(files(__package__).joinpath("settings.toml").read_text("utf-8"))
-        _merge(tables, changes, where)
+        _merge(tables, changes or {})
         scenario, leader, cases = dict(tables["scenario"]), dict(tables["leader"]), tables["cases"]
         safe_until = scenario.pop("safe_until")
         brake = {name: leader.pop(name) for name in ("brake_speed", "brake_decel")}
         aggressive, normal = IDM(**tables["aggressive"]), IDM(**tables["normal"])
         to_normal, to_aggressive = cases["to_normal_at"], cases["to_aggressive_at"]
         return cls(
-            tables=tables,
             scenario=Scenario(Leader(IDM(**leader), **brake), **scenario),
             safe_until=safe_until,
             drivers={
@@ -103,23 +78,15 @@ class Settings:
         )
 
 
-def _merge(known: dict[str, Any], changes: Mapping[str, Any], where: str) -> None:
-    """Put changes in the place of known values of the same kind."""
+def _merge(known: dict[str, Any], changes: Mapping[str, Any], where: str = "changes") -> None:
+    """Put changes in the place of known values."""
     for name, value in changes.items():
         if name not in known:
             raise ValueError(f"{where}: there is no {name!r}; known are {', '.join(known)}")
-        if _kind(value) != _kind(known[name]):
-            raise ValueError(f"{where}: {name} is {value!r}; it must be like {known[name]!r}")
-        if isinstance(value, dict):
+        if isinstance(known[name], dict):
             _merge(known[name], value, f"{where}, [{name}]")
         else:
             known[name] = value
-
-
-def _kind(value: Any) -> object:
-    if isinstance(value, list):
-        return [*{_kind(item) for item in value}]
-    return float if type(value) is int else type(value)
 
 
 # -- Runs -----------------------------------------------------------------------------------------
