@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from evofsm.driving import LatentRisk, Object, Scene, TrafficRisk, guard_for_traffic
-from evofsm.driving.traffic import Role
+from evofsm.driving.traffic import Role, pairs_of
 from evofsm.guard import Mode, Situation
 
 LOW, HIGH, DECEL, INTERVAL = -9.0, 2.5, 4.5, 0.1
@@ -34,13 +34,13 @@ ACTIONS = np.array([2.5, 0.0, -4.5, -9.0])
     ],
 )
 def test_whom_one_may_meet_is_a_pair(other, pair):
-    found = Scene(ME, [other]).pairs()
+    found = pairs_of(Scene(ME, [other]).rows(most=1))
     assert [one[:5] for one in found] == ([] if pair is None else [pair])
 
 
 def test_rows_hold_the_closest_and_zeros_where_there_is_none():
     far, near = Object("far", 180.0, 0.0, 20.0), Object("near", 120.0, 0.0, 20.0)
-    assert [pair.gap for pair in Scene(ME, [far, near]).pairs()] == [15.0, 75.0]
+    assert [pair.gap for pair in pairs_of(Scene(ME, [far, near]).rows(most=2))] == [15.0, 75.0]
     rows = Scene(ME, [far, near]).rows(most=1).reshape(2, 8)
     assert rows[1].tolist() == [1.0, 120.0, 0.0, 20.0, 0.0, 5.0, 1.8, 0.0]
     assert not Scene(ME).rows(most=3)[8:].any()

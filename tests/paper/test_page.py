@@ -27,7 +27,7 @@ PAGE = Page(
     "Who sees\nit coming?\n\nAsked of <everyone> & of us.\n\nAnd then\nagain.",
     [
         Table("Areas", AREAS, mark=pl.when(pl.col("who") == "ours").then(pl.lit("ours"))),
-        Figure("lines", "Two lines", "What they say.", drawn, "A line that rises."),
+        Figure("lines", "Two lines", "What they say.", drawn),
     ],
     "python -m studies detection",
     lost=[Table("Better", AREAS.filter(pl.col("area") > 1.0)), Table("Worse", AREAS[1:])],
@@ -51,7 +51,7 @@ def test_a_page_holds_all_that_it_shows(written, tmp_path):
     for said in ("Who sees it coming?", "And then again.", "Areas", "Two lines", "−0.25", "numba"):
         assert said in read.text
     assert "&lt;everyone&gt; &amp; of us" in read.html
-    assert read.alts == ["A line that rises."]
+    assert read.alts == ["Two lines"]
     svg = tmp_path / "new" / "figures" / "lines.svg"
     assert base64.b64decode(read.loads[0].split(",")[1]) == svg.read_bytes()
     assert svg.with_suffix(".png").exists()

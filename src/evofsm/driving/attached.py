@@ -257,7 +257,7 @@ class Guarding:
         self.cars: dict[str, _Car] = {}  #: by id
         self._watches: dict[str, BrakeWatch] = {}
         #: How hard they were seen to brake.
-        self.leaders = _leaders_of(guard, settings["leader_decel"])
+        self.leaders = _leaders_of(guard)
         self.begin_anew()
         self.decisions = 0
         #: Steps in which a car braked harder, or accelerated less, than its driver wanted by more
@@ -409,8 +409,8 @@ class Guarding:
         mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
             decel, settings, dt = self._vehicle.getDecel(car), self._settings, self.interval
-            leader_decel, regain = settings["leader_decel"], settings["regain"]
-            risk = LatentRisk.given(-decel, decel, leader_decel, dt, margin=_MARGIN, regain=regain)
+            how = {"margin": _MARGIN, "regain": settings["regain"]}
+            risk = LatentRisk.given(-decel, decel, _LEADER_DECEL, dt, **how)
             risk.manoeuvres = self.leaders
             low, judge = -max(self._vehicle.getEmergencyDecel(car), decel), TrafficRisk(risk)
             limits, tolerance = (low, high, decel, dt), settings["tolerance"]
@@ -434,7 +434,7 @@ def _of_pair(judge: ActionJudge | None) -> ActionJudge | None:
     return judge.ahead if isinstance(judge, TrafficRisk) else judge
 
 
-def _leaders_of(guard: Guard | None, leader_decel: float) -> Manoeuvres:
+def _leaders_of(guard: Guard | None) -> Manoeuvres:
     """What a guard knows of leaders; what is assumed without one."""
     judge = None if guard is None else _of_pair(_judge(guard))
     if judge is not None and judge.labels.names != VARIABLES:
@@ -443,7 +443,7 @@ def _leaders_of(guard: Guard | None, leader_decel: float) -> Manoeuvres:
             f"TrafficRisk, or observe {', '.join(VARIABLES)}"
         )
     # How hard SUMO's cars brake is exactly known, and has an end.
-    assumption = Manoeuvres(leader_decel, width=_SEEN_TO)
+    assumption = Manoeuvres(_LEADER_DECEL, width=_SEEN_TO)
     return copy.deepcopy(judge.manoeuvres if isinstance(judge, LatentRisk) else assumption)
 
 
@@ -704,7 +704,6 @@ def attach(
     guard: Guard | None = None,
     mode: str = "act",
     tolerance: float = TOLERANCE,
-    leader_decel: float = _LEADER_DECEL,
     regain: float = REGAIN,
     report: Callable[[GuardedStep], None] | None = None,
 ) -> Attachment:
@@ -730,10 +729,7 @@ def attach(
         Whether guards act, only say what they would do, or there are none: then only time to
         collision and needed deceleration are measured.
     tolerance : float
-        Highest risk that is accepted. A ``guard`` has its own, and so it has the next two.
-    leader_decel : float
-        Until enough was seen, leaders are assumed to brake so hard [m/s²]. SUMO's cars brake by
-        4.5 m/s² unless in an emergency, in which whoever follows brakes harder, too.
+        Highest risk that is accepted. A ``guard`` has its own, and so it has the next.
     regain : float
         Within this time a gap that is not safe, such as after a lane change, is to be safe again
         [s], by no more braking than that takes; see `LatentRisk`.
@@ -772,7 +768,7 @@ def attach(
     is_chosen, sight = choose(vehicles), Seeing(sumo)
     cars: Guarding | Watching = Watching(sight)
     if mode != "watch":
-        settings = {"tolerance": tolerance, "leader_decel": leader_decel, "regain": regain}
+        settings = {"tolerance": tolerance, "regain": regain}
         cars = Guarding(sumo, sight, guard, mode == "act", settings, report)
     attachment = Attachment(sumo, is_chosen, sight, cars)
     attachment.listen()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
 from pathlib import Path
@@ -65,21 +64,15 @@ _ROUTES = f"""<routes>
 class SumoWorld(World, AbstractContextManager["SumoWorld"]):
     """The world that is SUMO itself. Close it after use, or use it in a ``with`` statement.
 
-    Parameters
-    ----------
-    options : sequence of str
-        Further options of SUMO, such as ``("--fcd-output", "trace.xml")``.
-
     Notes
     -----
     libsumo holds one simulation per process; a second one would silently end the first, and is
     refused here.
     """
 
-    def __init__(self, options: Sequence[str] = ()) -> None:
+    def __init__(self) -> None:
         with needs("libsumo", "sumo", "the world 'sumo'"):
             self._sumo: Any = import_module("libsumo")
-        self._options = list(options)
         self._folder: tempfile.TemporaryDirectory[str] | None = None  # while a simulation is open
         self._dt = 0.0
         self._runs = 0
@@ -115,20 +108,15 @@ class SumoWorld(World, AbstractContextManager["SumoWorld"]):
         net, routes = Path(folder.name) / "road.net.xml", Path(folder.name) / "road.rou.xml"
         net.write_text(_NET)
         routes.write_text(_ROUTES)
-        try:
-            self._sumo.start(
-                [
-                    "sumo",
-                    *("--net-file", str(net), "--route-files", str(routes)),
-                    *("--step-length", repr(dt), "--step-method.ballistic", "true"),
-                    *("--collision.action", "warn", "--collision.mingap-factor", "0"),
-                    *("--time-to-teleport", "-1", "--no-step-log", "true", "--no-warnings", "true"),
-                    *self._options,
-                ]
-            )
-        except BaseException:
-            folder.cleanup()
-            raise
+        self._sumo.start(
+            [
+                "sumo",
+                *("--net-file", str(net), "--route-files", str(routes)),
+                *("--step-length", repr(dt), "--step-method.ballistic", "true"),
+                *("--collision.action", "warn", "--collision.mingap-factor", "0"),
+                *("--time-to-teleport", "-1", "--no-step-log", "true", "--no-warnings", "true"),
+            ]
+        )
         self._folder, self._dt = folder, dt
 
 

@@ -60,7 +60,6 @@ class Object(NamedTuple):
     length: float = 5.0  #: along its heading [m]
     width: float = 1.8  #: [m]
     ax: float = 0.0  #: [m/s²]
-    lane: str | None = None  #: for people; who is in whose way depends on y
 
 
 class Role(Enum):
@@ -93,12 +92,14 @@ class Scene:
 
     Examples
     --------
+    >>> from evofsm.driving import Object, Scene
+    >>> from evofsm.driving.traffic import pairs_of
     >>> own = Object("me", x=0.0, y=0.0, vx=25.0)
     >>> slow = Object("lorry", x=40.0, y=0.0, vx=20.0, length=12.0)
     >>> fast = Object("van", x=-20.0, y=0.0, vx=30.0)
     >>> far = Object("bus", x=0.0, y=3.5, vx=20.0)  # in the next lane
     >>> scene = Scene(own, [slow, fast, far])
-    >>> for pair in scene.pairs():
+    >>> for pair in pairs_of(scene.rows(most=3)):
     ...     print(scene.objects[pair.number].id, pair.role.value, pair.gap)
     van behind 15.0
     lorry ahead 31.5
@@ -108,24 +109,20 @@ class Scene:
         #: Oneself, then the others, the closest along the road first.
         self.objects = (own, *sorted(others, key=lambda obj: abs(obj.x - own.x)))
 
-    def pairs(self) -> list[Pair]:
-        """With whom one may meet, the closest first.
-
-        An object is in one's lane where their sides overlap; it cuts in, or crosses if it moves
-        across more than along the road, where they will within 2 s.
-        """
-        return pairs_of(self.rows(len(self.objects) - 1))
-
     def rows(self, most: int) -> NDArray[np.float64]:
         """((most + 1) * 8,) ndarray: `COLUMNS` of oneself and the closest others; zeros else."""
         rows = np.zeros((most + 1, len(COLUMNS)))
         for row, obj in zip(rows, self.objects, strict=False):
-            row[:] = 1.0, *obj[1:8]
+            row[:] = 1.0, *obj[1:]
         return rows.ravel()
 
 
 def pairs_of(rows: ArrayLike) -> list[Pair]:
-    """With whom one may meet, from a scene's `rows`; rows that hold NaN are left out."""
+    """With whom one may meet, the closest first, from a scene's `Scene.rows`.
+
+    An object is in one's lane where their sides overlap; it cuts in, or crosses if it moves across
+    more than along the road, where they will within 2 s. Rows that hold NaN are left out.
+    """
     flat = real_array("rows", rows, 1)
     if len(flat) % len(COLUMNS):
         raise ValueError(f"{len(flat)} numbers are no rows of {len(COLUMNS)}: {', '.join(COLUMNS)}")

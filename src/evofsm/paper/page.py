@@ -145,7 +145,6 @@ class Figure:
     title: str
     caption: str
     draw: Callable[[], Drawn]
-    alt: str = ""  #: what it shows, for those who cannot see it; without it the title
 
 
 @dataclass(frozen=True, eq=False)
