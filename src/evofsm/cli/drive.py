@@ -7,7 +7,6 @@ from contextlib import closing, nullcontext
 from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import (
@@ -128,7 +127,7 @@ def drive(
             warn(f"stopped after {how_far}; the same command goes on from there")
             return 130
     if as_json:
-        print_json({**asdict(summary.row), "lead_times": summary.lead_times})
+        print_json(asdict(summary.row))
         return None
     show(facts("What came of driving", _summary(summary, setup)))
     if out is not None:
@@ -190,10 +189,6 @@ def _summary(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
     interventions = f"{row.intervention_rate:.1%} of decisions"
     yield "interventions", f"{interventions}; mean change {row.mean_change:.2f} m/s²"
     yield "comfort", f"RMS jerk {row.jerk:.2f} m/s³"
-    if times := driving.lead_times:
-        n_alarms = sum(time > 0.0 for time in times)
-        text = f"{n_alarms} of {len(times)} collisions had an alarm that stayed on"
-        yield "lead time", f"{text}; median {median(times):.1f} s before"
     yield "learnt", _learnt(driving.guard)
 
 

@@ -97,7 +97,6 @@ class Driving(NamedTuple):
     """What came of it."""
 
     row: Row
-    lead_times: tuple[float, ...]  #: from the last alarm that stayed on to the collision [s]
     guard: Guard  #: with what it learnt
 
 
@@ -204,10 +203,9 @@ class Results:
         rows = [self.rows[number] for number in numbers]
         outcomes = [Outcome(*(row[name] for name in Outcome._fields)) for row in rows]
         row = summarise(setup.family.name, setup.reviser, outcomes, setup.family.interval)
-        leads = tuple(row["lead_time"] for row in rows if row["lead_time"] is not None)
         if self.folder is not None:
-            self._write(self.folder, rows, {**asdict(row), "lead_times": leads})
-        return Driving(row, leads, self.guard)
+            self._write(self.folder, rows, asdict(row))
+        return Driving(row, self.guard)
 
     def _write(self, folder: Path, rows: Sequence[Outcomes], summary: dict[str, Any]) -> None:
         self.save_guard(now=True)

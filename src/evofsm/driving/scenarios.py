@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 
 from evofsm.driving.drivers import IDM, refuse_others
 
-#: No scenario has more, so that no file can ask for more memory than there is.
-MOST_STEPS = 2_000_000
-
 
 @dataclass(frozen=True)
 class CutIn:
@@ -121,16 +118,6 @@ class Scenario:
                 f"scenario's duration is {self.duration} and its dt {self.dt}; "
                 "it must last two steps or more"
             )
-        for name, seconds in (
-            ("scenario's duration", self.duration),
-            ("body's delay", self.body.delay),
-            ("sensors' delay", self.sensors.delay),
-        ):
-            if seconds / self.dt > MOST_STEPS:
-                raise ValueError(
-                    f"{name} is {seconds} s, in steps of {self.dt} s; no more than {MOST_STEPS:,} "
-                    "steps are driven"
-                )
 
     @property
     def times(self) -> NDArray[np.float64]:

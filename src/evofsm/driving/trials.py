@@ -21,7 +21,7 @@ from evofsm.driving.sumo import open_world
 from evofsm.driving.world import LEADER_ACCELERATION, SPEED, Drives, Episode, KinematicWorld, World
 from evofsm.extras import needs
 from evofsm.fsm.proportions import FailureRecord
-from evofsm.guard import TOLERANCE, BoxActions, Guard, run_episode
+from evofsm.guard import BoxActions, Guard, run_episode
 
 
 def drive(
@@ -143,21 +143,6 @@ def _distance(episode: Episode, until: int) -> float:
     return float(episode.record[: until + 1, SPEED].sum() * dt)
 
 
-def lead_time(episode: Episode, tolerance: float = TOLERANCE) -> float | None:
-    """From the alarm that stays on to the collision [s], 0 without one.
-
-    None where the episode ended well, or nobody said how likely failure is.
-    """
-    if not episode.collided or math.isnan(episode.decisions[0].revision.risk_proposed):
-        return None
-    start = episode.time[-1]
-    for decision in reversed(episode.decisions):
-        if not decision.revision.risk_proposed > tolerance:
-            break
-        start = decision.situation.time
-    return float(episode.time[-1] - start)
-
-
 def try_out(
     guard: Guard, family: Family, draws: Sequence[Draw], alone: Sequence[Reference] | None = None
 ) -> list[Outcome]:
@@ -198,19 +183,13 @@ class Trial:
     split: str
 
     def drive(self, number: int) -> tuple[Episode, dict[str, Any]]:
-        """An episode, and its row: number, variant, `Outcome`, and `lead_time`."""
+        """An episode, and its row: number, variant and `Outcome`."""
         world = _opened(self.world) if isinstance(self.world, str) else self.world
         draw = self.family.draw(self.seed, number, split=self.split)
         alone = reference_of(self.family, draw, world)
         episode = drive(self.guard, draw, world)
         outcome = outcome_of(episode, alone)
-        tolerance = getattr(self.guard.reviser, "tolerance", TOLERANCE)
-        return episode, {
-            "episode": number,
-            "variant": draw.variant,
-            **outcome._asdict(),
-            "lead_time": lead_time(episode, tolerance),
-        }
+        return episode, {"episode": number, "variant": draw.variant, **outcome._asdict()}
 
     def __call__(self, number: int) -> dict[str, Any]:
         """The row of an episode."""
