@@ -11,7 +11,6 @@ collision before the bumpers touch (``--collision.mingap-factor``), the gap ends
 
 from __future__ import annotations
 
-import copy
 import math
 import time as clock
 import warnings
@@ -240,7 +239,7 @@ class _Car:
 
 
 class Guarding:
-    """Guards each car, by a guard of its own; what leaders do all of them share."""
+    """Guards each car, by a guard of its own; what leaders do they share, unless given a guard."""
 
     def __init__(
         self,
@@ -256,8 +255,11 @@ class Guarding:
         self._template, self._settings = guard, settings
         self.cars: dict[str, _Car] = {}  #: by id
         self._watches: dict[str, BrakeWatch] = {}
+        if guard is not None:
+            _refuse_what_sees_something_else(guard)
+        # How hard SUMO's cars brake is exactly known, and has an end.
         #: How hard they were seen to brake.
-        self.leaders = _leaders_of(guard)
+        self.leaders = Manoeuvres(_LEADER_DECEL, width=_SEEN_TO)
         self.begin_anew()
         self.decisions = 0
         #: Steps in which a car braked harder, or accelerated less, than its driver wanted by more
@@ -419,8 +421,6 @@ class Guarding:
         guard.freeze()
         if isinstance(guard.reviser, ActionReviser):
             guard.reviser.mode = mode
-        if isinstance(latent := _of_pair(_judge(guard)), LatentRisk):
-            latent.manoeuvres = self.leaders
         return guard
 
 
@@ -429,22 +429,14 @@ def _judge(guard: Guard) -> ActionJudge | None:
     return getattr(guard.reviser, "risk", None)
 
 
-def _of_pair(judge: ActionJudge | None) -> ActionJudge | None:
-    """Who judges a pair, in which it is a `LatentRisk` that learns how hard leaders brake."""
-    return judge.ahead if isinstance(judge, TrafficRisk) else judge
-
-
-def _leaders_of(guard: Guard | None) -> Manoeuvres:
-    """What a guard knows of leaders; what is assumed without one."""
-    judge = None if guard is None else _of_pair(_judge(guard))
-    if judge is not None and judge.labels.names != VARIABLES:
-        raise ValueError(
-            f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must be a "
-            f"TrafficRisk, or observe {', '.join(VARIABLES)}"
-        )
-    # How hard SUMO's cars brake is exactly known, and has an end.
-    assumption = Manoeuvres(_LEADER_DECEL, width=_SEEN_TO)
-    return copy.deepcopy(judge.manoeuvres if isinstance(judge, LatentRisk) else assumption)
+def _refuse_what_sees_something_else(guard: Guard) -> None:
+    judge = _judge(guard)
+    if judge is None or isinstance(judge, TrafficRisk) or judge.labels.names == VARIABLES:
+        return
+    raise ValueError(
+        f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must be a "
+        f"TrafficRisk, or observe {', '.join(VARIABLES)}"
+    )
 
 
 # -- Which cars, and what came of them ------------------------------------------------------------
@@ -485,8 +477,6 @@ class Watching:
         self.observations = np.empty((0, 3))  #: of each gap [m], its speed and the other's [m/s]
         self.ttc = np.empty(0)  #: time to collision of each [s]
         self.drac = np.empty(0)  #: deceleration to avoid it, of each [m/s²]
-        self.lowest_ttc: dict[str, float] = {}  #: of each car that ever closed in
-        self.highest_drac: dict[str, float] = {}
 
     def add(self, car: str) -> None:
         """Watch it from now on."""
@@ -503,10 +493,6 @@ class Watching:
         self.observations = np.array(list(observations.values())).reshape(-1, 3)
         self.ttc = time_to_collision(self.observations)
         self.drac = deceleration_to_avoid_collision(self.observations)
-        for k in np.flatnonzero(np.isfinite(self.ttc)).tolist():
-            car, ttc, drac = self.ids[k], float(self.ttc[k]), float(self.drac[k])
-            self.lowest_ttc[car] = min(ttc, self.lowest_ttc.get(car, ttc))
-            self.highest_drac[car] = max(drac, self.highest_drac.get(car, drac))
 
 
 @dataclass
@@ -710,7 +696,8 @@ def attach(
     """Guard, or watch, cars of a SUMO simulation that runs.
 
     From then on each ``simulationStep`` does the rest. SUMO drives a guarded car as before, but no
-    faster than its guard allows, and all guards learn how hard leaders brake from what each sees.
+    faster than its guard allows; guards that are made here learn how hard leaders brake, from what
+    each sees.
     The guard minds who is ahead and behind in its lane; right of way, red lights and lane changes
     stay SUMO's.
 
