@@ -158,7 +158,7 @@ class Family:
 
     def with_switches(self, names: Iterable[str]) -> Family:
         """The family with some of `SWITCHES` on; what it draws is otherwise the same."""
-        on = (names,) if isinstance(names, str) else tuple(names)
+        on = tuple(names)
         after = None if self.shifted is None else self.shifted.with_switches(on)
         return replace(self, switches=(*self.switches, *on), shifted=after)
 

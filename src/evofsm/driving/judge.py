@@ -36,7 +36,7 @@ from evofsm.fsm.kernels import compiled, inner_kernel
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import wilson_bounds
-from evofsm.fsm.sharing import Retraced, Rollback, step
+from evofsm.fsm.sharing import Retraced, step
 from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import Action, nearest_bounds
@@ -251,19 +251,8 @@ class LatentRisk(Retraced, LearningJudge):
         self.perception.clear()
         self._commands = (0.0, 0.0)
 
-    def savepoint(self) -> Rollback:
-        """What takes back all that it learns from now on, of leaders, whom others share, too."""
-        take_back, leaders = super().savepoint(), self.manoeuvres
-        memory = leaders.gentle, leaders.decels, leaders.table
-
-        def rollback() -> None:
-            take_back()
-            leaders.gentle, leaders.decels, leaders.table = memory
-
-        return rollback
-
     def _become(self, again: Self) -> None:
-        vars(self).update({**vars(again), "manoeuvres": self.manoeuvres})
+        vars(self).update(vars(again))
 
     def end(self, observation: ArrayLike | None, *, failed: bool) -> None:
         """What comes is not a consequence of what was; how it ended teaches nothing."""

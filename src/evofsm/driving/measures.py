@@ -314,14 +314,6 @@ class FuzzySafety(_Measure):
 
     _may_be_zero = ("reaction", "margin")
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.decel < self.comfortable_decel:
-            raise ValueError(
-                f"FuzzySafety decel is {self.decel}; it must not be below comfortable_decel, "
-                f"which is {self.comfortable_decel}"
-            )
-
     def score(self, observations: Floats, dt: float) -> Floats:
         """The larger one of PFS and CFS; 1 where the cars have met."""
         return np.maximum(self.proactive(observations), self.critical(observations, dt))

@@ -223,7 +223,6 @@ class Row:
     intervention_rate: float
     mean_change: float  #: [m/s²]
     jerk: float  #: root mean square [m/s³]
-    mean_speed: float  #: [m/s]
     hours: float  #: driven, to complete decisions [h]
     kilometres: float  #: driven by the follower [km]
 
@@ -270,7 +269,6 @@ def summarise(family: str, policy: str, outcomes: Sequence[Outcome], interval: f
         intervention_rate=sum(o.changed for o in outcomes) / decisions,
         mean_change=sum(o.change for o in outcomes) / decisions,
         jerk=float(np.sqrt(sum(o.jerk for o in outcomes) / decisions)),
-        mean_speed=float(np.mean([o.speed for o in outcomes])),
         hours=decisions * interval / 3600.0,
         kilometres=sum(o.speed * o.decisions for o in outcomes) * interval / 1000.0,
     )
