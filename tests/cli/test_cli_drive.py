@@ -107,6 +107,7 @@ def test_a_judge_that_is_given_nothing_but_failures_is_driven_saved_and_gone_on_
         (("emergency", "--tolerance", "2"), "tolerance"),
         (("emergency", "--learn", "a", "--workers", "2"), "one after the other"),
         (("emergency", "--mcap", "a", "--workers", "2"), "workers send no decisions"),
+        (("emergency", "--mcap", "a", "--audit", "b"), "a guard has one log of its decisions"),
         (("emergency", "--learn", "a", "--frozen", "b"), "exclude each other"),
     ],
 )

@@ -6,18 +6,14 @@ from functools import cache
 
 import pytest
 
-from evofsm.cli.driving import Setup, make_guard
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.options import reading_of
 from evofsm.cli.watch.logged import watched_log
 from evofsm.cli.watch.player import Player
-from evofsm.cli.watch.recorded import Recording
 from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_guard
-from evofsm.cli.watch.words import introduce, tell
-from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
+from evofsm.cli.watch.words import tell
+from evofsm.driving import KinematicWorld, load_family, teach
 from evofsm.driving.assumed import guard_of_monitor
-from evofsm.guard import Mode
-from evofsm.io import recording
 from monitor_rows import line, traffic
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -138,95 +134,37 @@ def test_a_file_holds_an_environment_of_ones_own(tmp_path):
         read_simulated(str(path))
 
 
-# -- A recording ----------------------------------------------------------------------------------
-
-
-def test_a_recording_shows_what_was_decided(tmp_path):
-    machine, risk = learners_of(learnt())
-    drives = []
-    for mode in (Mode.ACT, Mode.SHADOW):
-        guard = guard_for_family(PAPER, mode=mode, machine=machine, judge=risk)
-        drives += teach(guard, [PAPER.draw(0, 0)])
-    path = tmp_path / "run.mcap"
-    with recording(path, {"family": "paper"}) as log:
-        for drive_ in drives:
-            log.add(drive_)
-        log.attach(machine.model())
-    shown = Recording(path)
-    for case, drive_ in enumerate(drives):
-        shown.restart(case)
-        frames = drive(shown)
-        assert [frame.executed[0] for frame in frames[:-1]] == drive_.executed.tolist()
-        assert frames[-1].failed == drive_.collided == bool(case)
-        assert frames[-1].time == drive_.time[-1]
-        risks = [decision.revision.risk_proposed for decision in drive_.decisions]
-        assert frames[-1].story.first == next(
-            frame.time for frame, risk in zip(frames, risks, strict=False) if risk > 0.02
-        )
-        assert frames[-1].story.leader_brakes == pytest.approx(29.75, abs=0.3)
-        assert math.isnan(frames[-1].story.danger.dead_end)  # which the log does not hold
-    assert [state.is_dead_end for state in shown.graph().states].count(True) == 1
-    with pytest.raises(ValueError, match="there are 1 to 2"):
-        shown.restart(2)
-
-
-# What a run was: how far which reviser went, why nothing was done, and whether wishes were judged.
+# What the reviser did in a run, and why it did nothing.
 MODES = [
-    ("act", "least-risk", "", True),
-    ("shadow", "least-risk", "only watched, in shadow mode", True),
-    ("off", "least-risk", "was off", False),
-    ("act", "none", "was off", False),
-    ("act", "rss", "", False),
-    ("act", "passing", "was not shown to help, so what was proposed passed", True),
-    ("live", "on", "", True),
-    ("live", "passing", "was not shown to help yet, so what is proposed passes", True),
-    ("live", "off", "the reviser is off", True),
+    ("on", ""),
+    ("passing", "was not shown to help yet, so what is proposed passes"),
+    ("off", "the reviser is off"),
 ]
 
 
-def was_so(tmp_path, mode, reviser):
-    """Frames of such a run, its start, and how often the proposal was not executed."""
-    passes = reviser == "passing"
-    if mode == "live":
-        guard = learnt()
-    else:
-        setup = Setup(PAPER, "least-risk" if passes else reviser, mode=Mode(mode))
-        guard = make_guard(setup)
+@pytest.mark.parametrize(("reviser", "idle"), MODES)
+def test_every_sentence_says_what_was_so(reviser, idle):
+    guard = learnt()
     teach(guard, [PAPER.draw(0, 1)])
-    if passes:  # as one of which is known that it fails sooner than the controller alone
+    if reviser == "passing":  # as one that fails sooner than its controller alone
         guard._why_passing = lambda: "shadow"
-    if mode == "live":
-        with opened(guard=guard, on=reviser != "off") as session:
-            frames = drive(session)
-            return frames, session.start, sum(f.executed != f.proposed for f in frames)
-    (driven,) = teach(guard, [PAPER.draw(0, 0)])
-    with recording(tmp_path / "run.mcap", setup.settings) as log:
-        log.add(driven)
-    shown = Recording(tmp_path / "run.mcap")
-    return drive(shown), shown.start, int((driven.executed != driven.proposed).sum())
-
-
-@pytest.mark.parametrize(("mode", "reviser", "idle", "is_judged"), MODES)
-def test_every_sentence_says_what_was_so(tmp_path, mode, reviser, idle, is_judged):
-    frames, start, changed = was_so(tmp_path, mode, reviser)
+    with opened(guard=guard, on=reviser != "off") as session:
+        frames, start = drive(session), session.start
+    changed = sum(frame.executed != frame.proposed for frame in frames)
     told = [tell(frame, start) for frame in frames]
     told = [one._replace(outcome=one.outcome.replace("\xa0", " ")) for one in told]
     assert bool(changed) == (not idle)
     # What the reviser did, or would have done.
     done = " ".join(one.done for one in told)
-    assert ("The reviser stepped in" in done) == (not idle and is_judged)
-    assert ("The reviser changed" in done) == (not idle and not is_judged)
-    assert ("would have changed" in done) == (bool(idle) and is_judged)
-    assert ("Nothing had to be done" in done) == is_judged
+    assert ("The reviser stepped in" in done) == (not idle)
+    assert ("would have changed" in done) == bool(idle)
+    assert "Nothing had to be done" in done
     assert all(idle in one.done for one in told if "would have" in one.done)
     if not idle:
         assert f"changed {changed} " in told[-1].done
     # What was judged.
-    assert {one.status for one in told[:-1]} <= (
-        {"safe", "danger", "averted", "dead end"} if is_judged else {"unjudged"}
-    )
-    assert ("averted" in {one.status for one in told}) == (not idle and is_judged)
-    assert all(("Nothing was judged, for " in one.why) == (not is_judged) for one in told)
+    assert {one.status for one in told[:-1]} <= {"safe", "danger", "averted", "dead end"}
+    assert ("averted" in {one.status for one in told}) == (not idle)
     # What came of it: truly, and never slower than the leader.
     last = frames[-1]
     hit, closing = last.cars.gap <= 0.0, last.cars.v_follower - last.cars.v_leader
@@ -234,12 +172,6 @@ def test_every_sentence_says_what_was_so(tmp_path, mode, reviser, idle, is_judge
     assert (f"Collision at {last.time:.1f}" in told[-1].outcome) == hit
     assert (f"{closing:.1f} m/s faster than the leader" in told[-1].outcome) == hit
     assert "−" not in told[-1].outcome
-    # What is said before it begins.
-    intro, learning = introduce(start).values()
-    assert intro.startswith("This was recorded.") == ("Recorded" in learning) == (mode != "live")
-    assert ("replaced actions" in intro) == (mode == "act" and reviser != "none")
-    assert ("was off" in intro) == (idle == "was off")
-    assert ("did not act" in intro) == (mode == "shadow")
 
 
 # -- A log of others ------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
@@ -33,6 +33,7 @@ _EXCLUDE = {
     ("learn", "workers"): "whoever learns drives episodes one after the other",
     ("audit", "workers"): "workers send no decisions",
     ("mcap", "workers"): "workers send no decisions",
+    ("audit", "mcap"): "a guard has one log of its decisions",
     ("learn", "frozen"): "whoever is frozen learns nothing",
 }
 
@@ -67,7 +68,7 @@ def drive(
     vehicles: Annotated[
         str, option("Of a SUMO configuration: all, a share, type:NAME, or ids with commas.")
     ] = "10%",
-    mcap: Annotated[Path | None, option("Log every episode for Foxglove and watch.")] = None,
+    mcap: Annotated[Path | None, option("Log every decision for Foxglove.")] = None,
     as_json: Json = False,
 ) -> int | None:
     """Drive scenarios under a safety filter, which learns on the way.
@@ -133,7 +134,7 @@ def drive(
     if out is not None:
         say(f"What was learnt, and every episode: {out}")
     if mcap is not None:
-        say(f"Every episode, for Foxglove: {mcap}")
+        say(f"Every decision, for Foxglove: {mcap}")
     return None
 
 
@@ -144,27 +145,28 @@ def _drive_in_turn(
     results: Results, episodes: int, audit: Path | None, mcap: Path | None
 ) -> Driving:
     from evofsm.cli.driving import drive_in_turn
-    from evofsm.driving import learners_of
     from evofsm.driving.sumo import open_world
-    from evofsm.guard import AuditLog
 
-    if mcap is not None:
-        from evofsm.io.foxglove import recording
-    setup = results.setup
-    about = setup.settings | {"first": setup.first, "episodes": episodes}
     with (
-        AuditLog(audit) if audit else nullcontext() as log,
-        open_world(setup.world) as place,
-        recording(mcap, about) if mcap else nullcontext() as run,
+        _log_of(audit, mcap) as log,
+        open_world(results.setup.world) as place,
         progress("Driving", episodes) as move,
     ):
-        record = None if run is None else run.add
-        summary = drive_in_turn(results, episodes, place, move, log, record)
-        if run is not None:
-            run.attach(learners_of(summary.guard)[0].model(**setup.family.labels._asdict()))
-    if log is not None:
+        summary = drive_in_turn(results, episodes, place, move, log)
+    if audit is not None:
         warn(f"head of {audit}, to be kept elsewhere: {log.head}")
     return summary
+
+
+def _log_of(audit: Path | None, mcap: Path | None) -> AbstractContextManager[Any]:
+    """What records the decisions; None where nobody wants them."""
+    if mcap is not None:
+        from evofsm.io import FoxgloveSink
+
+        return FoxgloveSink(None, mcap)
+    from evofsm.guard import AuditLog
+
+    return AuditLog(audit) if audit else nullcontext()
 
 
 # -- What came of it ------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import math
 import os
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context, parent_process
@@ -253,20 +253,17 @@ def drive_in_turn(
     world: World,
     move: Advance = lambda *_, **__: None,
     audit: DecisionLogger | None = None,
-    record: Callable[[Episode], None] | None = None,
 ) -> Driving:
     """Drive those episodes that the results lack, one after the other."""
     setup, guard, n_episodes = results.setup, results.guard, len(results.rows)
     if setup.learn and n_episodes > episodes:
         raise ValueError(f"{results.folder} has driven {n_episodes} episodes, more than {episodes}")
-    guard.audit, guard.explaining = audit, record is not None
+    guard.audit = audit
     trial = setup.trial(guard, world)
     for number in range(setup.first, setup.first + episodes):
         if number in results.rows:
             continue
         episode, row = trial.drive(number)
-        if record is not None:
-            record(episode)
         results.add({**row, "decided": _decided(episode)})
         if setup.learn:
             results.save_guard()

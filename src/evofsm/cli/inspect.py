@@ -77,13 +77,6 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None, Guard | None]:
         if path is None:
             raise FileNotFoundError(f"{place}: there is neither {' nor '.join(_MODELS)} in it")
         return load_model(path)
-    if place.suffix == ".mcap":
-        from evofsm.io import read_run
-
-        model = read_run(place).model
-        if model is None:
-            raise ValueError(f"{place}: no model is attached to this log")
-        return model, None, None
     header, guard = store.read_header(place), None
     if header.kind == "guard":
         guard = Guard.load(place, failed=lambda seen: False)

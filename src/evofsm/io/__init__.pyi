@@ -1,6 +1,5 @@
 from .foxglove import FOXGLOVE_LAYOUT as FOXGLOVE_LAYOUT
 from .foxglove import FoxgloveSink as FoxgloveSink
-from .foxglove import recording as recording
 from .graphs import to_dot as to_dot
 from .graphs import to_prism as to_prism
 from .logs import Chunk as Chunk
@@ -9,5 +8,4 @@ from .logs import episodes_of as episodes_of
 from .logs import read_traces as read_traces
 from .logs import rows_of as rows_of
 from .rosbag import Topics as Topics
-from .runs import read_run as read_run
 from .vehicles import VehicleLengths as VehicleLengths

@@ -1,7 +1,11 @@
 """Decisions written as MCAP, or shown live in Foxglove or Lichtblick, by Foxglove's own library.
 
-`evofsm.io.runs` says what the channels hold; `FOXGLOVE_LAYOUT` shows files and what is live alike.
-Nothing leaves this computer unless another host is told.
+What was seen (``/observation``), where that is (``/belief``), how dangerous (``/risk``), and what
+was done about it (``/decision``); ``/event``, and ``/log`` for Foxglove's log panel. The messages
+are JSON with schemas that name every unit, those of ``/log`` Foxglove's own type. What is not
+known is left out of a message: JSON has no NaN, and the schemas have one type for each field.
+`FOXGLOVE_LAYOUT` shows files and what is live alike. Nothing leaves this computer unless another
+host is told.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from operator import itemgetter
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,22 +24,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm import __version__, store
-from evofsm.driving import Episode
-from evofsm.driving.naming import VARIABLES
+from evofsm.driving.naming import DECISION_COLUMNS, VARIABLES, observed
 from evofsm.extras import needs
-from evofsm.fsm.model import FSMModel
 from evofsm.guard import Decision, DecisionLogger, Guard, Proposal, Revision, Situation
 from evofsm.guard.actions import same_action
-from evofsm.io.runs import (
-    FORMAT,
-    MODEL,
-    PROFILE,
-    columns_by_topic,
-    columns_of,
-    field_of,
-    schemas_of,
-)
+from evofsm.guard.record import RECORD, Column
 
 with needs("foxglove-sdk", "mcap", "writing MCAP, and a live view in Foxglove"):
     import foxglove
@@ -49,66 +43,67 @@ _SECOND = 1_000_000_000  # [ns]
 _PAUSE = _SECOND  # from the end of an episode to the start of the next
 
 
-class _Channels:
-    """Sends what happens in episodes that follow each other on one axis of time."""
+# -- Channels -------------------------------------------------------------------------------------
 
-    def __init__(self, names: Sequence[str], units: Sequence[str]) -> None:
-        self.names = tuple(names)
-        self.is_of_cars = self.names == VARIABLES
-        self.context = foxglove.Context()  # its channels close with it
-        self.episode = 0
-        self.begin = 0  # of the episode [ns]
-        self.file: _File | None = None
-        self._columns = columns_of(names, units)
-        self._topics = columns_by_topic(names)
-        self._channels = {
-            topic: foxglove.Channel(topic, schema=schema, context=self.context)
-            for topic, schema in schemas_of(names, units).items()
-        }
-        self._log = LogChannel("/log", context=self.context)
 
-    def event(self, kind: str, at: float, observation: NDArray[np.float64]) -> None:
-        where = dict(zip(self.names, observation.tolist(), strict=False))
-        self._send("/event", at, {"kind": kind, "episode": self.episode, "time": at, **where})
+def columns_by_topic(names: Sequence[str] = VARIABLES) -> dict[str, tuple[str, ...]]:
+    """The columns of decisions by channel; the channel of risks has them without ``risk_``."""
+    of_cars = tuple(names) == VARIABLES
+    risks = "risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen"
+    return {
+        "/observation": ("time", *names, "intake"),
+        "/belief": ("state", "belief", "surprise", "n_states"),
+        "/risk": (*risks, *(("time_to_collision", "time_headway") if of_cars else ())),
+        "/decision": ("proposed", "executed", "advised", "reason", "explanation"),
+    }
 
-    def decision(self, decision: Decision) -> None:
-        """A decision, and a line where it was changed, or would have been."""
-        situation, revision = decision.situation, decision.revision
-        belief = situation.belief.tolist() if situation.state is not None else []
-        for topic, names in self._topics.items():
-            read = {name: self._columns[name].read for name in names if name != "belief"}
-            message = {field_of(topic, name): get(decision) for name, get in read.items()}
-            message |= {"belief": belief} if topic == "/belief" else {}
-            self._send(topic, situation.time, message)
-        is_changed = not same_action(revision.executed, revision.proposed)
-        if is_changed or not same_action(revision.advised, revision.executed):
-            verb = "executed" if is_changed else "would advise"
-            instead = revision.executed if is_changed else revision.advised
-            unit = " m/s²" if self.is_of_cars else ""
-            text = f"proposed {_shown(revision.proposed)}, {verb} {_shown(instead)}{unit}"
-            level = LogLevel.Warning if is_changed else LogLevel.Info
-            self.note(level, situation.time, f"{text}: {revision.reason}")
 
-    def note(self, level: LogLevel, at: float, text: str) -> None:
-        now = self.begin + round(at * _SECOND)
-        stamp = Timestamp(*divmod(now, _SECOND))
-        self._log.log(Log(timestamp=stamp, level=level, message=text, name="evofsm"), log_time=now)
+def field_of(topic: str, name: str) -> str:
+    """What a column is called in a channel."""
+    return name.removeprefix("risk_") if topic == "/risk" else name
 
-    def end(self, at: float, observation: NDArray[np.float64], happened: Sequence[str]) -> None:
-        """The episode ended, so long after it began [s], with what happened then."""
-        for kind in happened:
-            self.event(kind, at, observation)
-            self.note(LogLevel.Error, at, kind)
-        self.event("episode ended", at, observation)
-        self.begin += round(at * _SECOND) + _PAUSE
-        self.episode += 1
 
-    def _send(self, topic: str, at: float, message: Mapping[str, Any]) -> None:
-        fields = {name: value for name, value in message.items() if _is_known(value)}
-        data = json.dumps(fields, ensure_ascii=False, allow_nan=False).encode()
-        self._channels[topic].log(data, log_time=self.begin + round(at * _SECOND))
-        if self.file is not None and self.file.error is not None:
-            raise self.file.error
+def columns_of(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[str, Column]:
+    """The columns of decisions by name, for cars or for variables of these names and units."""
+    if tuple(names) == VARIABLES:
+        return DECISION_COLUMNS
+    suffixes = [f" [{unit}]" if unit else "" for unit in units] + [""] * len(names)
+    return dict(RECORD) | {
+        name: observed(f"as observed{unit}; left out where missing", itemgetter(k))
+        for k, (name, unit) in enumerate(zip(names, suffixes, strict=False))
+    }
+
+
+def schemas_of(
+    names: Sequence[str] = VARIABLES, units: Sequence[str] = ()
+) -> dict[str, dict[str, Any]]:
+    """The JSON schema of each channel, by its topic."""
+    columns = columns_of(names, units)
+    fields = {
+        topic: {field_of(topic, name): _schema(columns.get(name)) for name in of_topic}
+        for topic, of_topic in columns_by_topic(names).items()
+    }
+    fields["/event"] = {
+        "kind": _of("string", "episode started, collision or failure, episode ended"),
+        "episode": _of("integer", "number of the episode, from 0"),
+        "time": _of("number", "since the start of the episode [s]"),
+        **{name: _schema(columns[name]) for name in names},
+    }
+    return {
+        topic: {"title": f"evofsm.{topic[1:].capitalize()}", "type": "object", "properties": of_it}
+        for topic, of_it in fields.items()
+    }
+
+
+def _of(kind: str, about: str) -> dict[str, Any]:
+    return {"type": kind, "description": about}
+
+
+def _schema(column: Column | None) -> dict[str, Any]:
+    if column is None:  # the belief, which is no number
+        items = _of("number", "probability")
+        return {**_of("array", "probability of each state, from 0"), "items": items}
+    return _of({float: "number", int: "integer", str: "string"}[column.kind], column.about)
 
 
 def _shown(action: Any) -> str:
@@ -125,16 +120,15 @@ def _is_known(value: Any) -> bool:
 class _File:
     """A file that remembers why it could not be written: Foxglove's library goes on then."""
 
-    def __init__(self, file: BinaryIO, channels: _Channels, profile: str = "") -> None:
+    def __init__(self, file: BinaryIO, context: foxglove.Context) -> None:
         self._file = file
         self.error: OSError | None = None
-        channels.file = self
-        options = MCAPWriteOptions(profile=profile, compression_threads=0)
-        with self.explained():
-            self.mcap = foxglove.open_mcap(self, context=channels.context, writer_options=options)
+        options = MCAPWriteOptions(compression_threads=0)
+        with self._explained():
+            self._mcap = foxglove.open_mcap(self, context=context, writer_options=options)
 
     @contextmanager
-    def explained(self) -> Iterator[None]:
+    def _explained(self) -> Iterator[None]:
         """Raise the error of writing in place of what the library makes of it."""
         try:
             yield
@@ -152,95 +146,11 @@ class _File:
         return getattr(self._file, name)
 
     def close(self) -> None:
-        with self.explained():
-            self.mcap.close()
+        with self._explained():
+            self._mcap.close()
 
 
-# -- Runs -----------------------------------------------------------------------------------------
-
-
-@contextmanager
-def recording(
-    path: str | PathLike[str], about: Mapping[str, Any] | None = None
-) -> Iterator[RunWriter]:
-    """A log that grows episode by episode; the file appears at the end, if all went well.
-
-    Parameters
-    ----------
-    path : str or path-like
-        A file of that name is replaced.
-    about : mapping, optional
-        What is driven: family, controller, reviser and so on. What is no text becomes JSON.
-
-    Yields
-    ------
-    RunWriter
-        ``add(episode)`` writes an episode, ``attach(model)`` what was learnt.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; what was there before is then as it was.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from evofsm.driving import drive, load_family, unrevised_guard
-    >>> from evofsm.io import read_run
-    >>> family = load_family("emergency")
-    >>> driven = drive(unrevised_guard(family), family.draw(seed=0, index=0))
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     with recording(Path(folder) / "run.mcap", {"controller": "hasty"}) as log:
-    ...         log.add(driven)
-    ...     run = read_run(Path(folder) / "run.mcap")
-    >>> run.about["controller"], run.episodes[0].collided
-    ('hasty', True)
-    >>> bool((run.episodes[0].columns["executed"] == driven.executed).all())
-    True
-    """
-    with store.replacing(path) as file:
-        writer = RunWriter(file, about or {})
-        yield writer
-        writer.finish()
-
-
-class RunWriter:
-    """Writes episode after episode of cars; `recording` opens one."""
-
-    def __init__(self, file: BinaryIO, about: Mapping[str, Any]) -> None:
-        self._channels = _Channels(VARIABLES, ())
-        self._file = _File(file, self._channels, PROFILE)
-        facts = {"library": f"evofsm {__version__}", **about, "format": FORMAT}
-        texts = {name: x if isinstance(x, str) else json.dumps(x) for name, x in facts.items()}
-        with self._file.explained():
-            self._file.mcap.write_metadata(PROFILE, texts)
-
-    def add(self, episode: Episode) -> None:
-        """Write the next episode, with its decisions."""
-        channels, observations = self._channels, episode.observations
-        channels.event("episode started", float(episode.time[0]), observations[0])
-        for decision in episode.decisions:
-            channels.decision(decision)
-        outcomes = {"collision": episode.collided, "rear-end collision": episode.rear_ended}
-        kinds = [kind for kind, it_did in outcomes.items() if it_did]
-        channels.end(float(episode.time[-1]), observations[-1], kinds)
-
-    def attach(self, model: FSMModel) -> None:
-        """Attach what was learnt."""
-        file, at = io.BytesIO(), self._channels.begin
-        model.save(file)
-        media = "application/octet-stream"
-        with self._file.explained():
-            self._file.mcap.attach(
-                log_time=at, create_time=at, name=MODEL, media_type=media, data=file.getvalue()
-            )
-
-    def finish(self) -> None:
-        """Write the index, which ends the log."""
-        self._file.close()
-
-
-# -- Live -----------------------------------------------------------------------------------------
+# -- A logger of decisions ------------------------------------------------------------------------
 
 
 class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
@@ -298,23 +208,30 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
     ) -> None:
         if port is None and file is None:
             raise ValueError("a sink needs a port, a file, or both")
-        self._channels = _Channels(names, units)
-        self._open = ExitStack()
+        self._names = tuple(names)
+        self._columns, self._topics = columns_of(names, units), columns_by_topic(names)
+        context = self._context = foxglove.Context()  # its channels close with it
+        self._channels = {
+            topic: foxglove.Channel(topic, schema=schema, context=context)
+            for topic, schema in schemas_of(names, units).items()
+        }
+        self._log = LogChannel("/log", context=context)
+        self._open, self._file = ExitStack(), None
         if file is not None:
             try:
                 writer = self._open.enter_context(io.BufferedWriter(io.FileIO(file, "x")))
             except FileExistsError:
                 raise FileExistsError(f"{fspath(file)} exists; it was left alone") from None
-            self._open.callback(_File(writer, self._channels).close)
+            self._file = _File(writer, context)
+            self._open.callback(self._file.close)
         #: Where it is served; None without a port.
         self.address: str | None = None
+        self._episode = self._start = 0  # its number, and when it began [ns]
         if port is not None:
-            server = foxglove.start_server(
-                name="evofsm", host=host, port=port, context=self._channels.context
-            )
+            server = foxglove.start_server(name="evofsm", host=host, port=port, context=context)
             self._open.callback(server.stop)
             self.address = f"ws://{host}:{server.port}"
-            self._channels.begin = time.time_ns()  # live, a message is now; in a file time is 0
+            self._start = time.time_ns()  # live, a message is now; in a file time is 0
         self._time = 0.0  # of the latest decision, in its episode [s]
         self._observation: NDArray[np.float64] = np.full(len(names), math.nan)
         self._begun = False
@@ -337,11 +254,24 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
         self._time, self._observation = time, observation
         if not self._begun:
             self._begun = True
-            self._channels.event("episode started", time, observation)
+            self._event("episode started")
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
         """A decision was made."""
-        self._channels.decision(Decision(situation, revision))
+        decision = Decision(situation, revision)
+        belief = situation.belief.tolist() if situation.state is not None else []
+        for topic, names in self._topics.items():
+            read = {name: self._columns[name].read for name in names if name != "belief"}
+            message = {field_of(topic, name): get(decision) for name, get in read.items()}
+            self._send(topic, message | ({"belief": belief} if topic == "/belief" else {}))
+        is_changed = not same_action(revision.executed, revision.proposed)
+        if is_changed or not same_action(revision.advised, revision.executed):
+            verb = "executed" if is_changed else "would advise"
+            instead = revision.executed if is_changed else revision.advised
+            unit = " m/s²" if self._names == VARIABLES else ""
+            text = f"proposed {_shown(revision.proposed)}, {verb} {_shown(instead)}{unit}"
+            level = LogLevel.Warning if is_changed else LogLevel.Info
+            self._note(level, f"{text}: {revision.reason}")
 
     def ended(
         self, observation: Any, *, failed: bool, terminated: bool, score: float | None
@@ -349,5 +279,32 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
         """The episode ended."""
         if observation is not None:
             self._observation = observation
-        kind = "collision" if self._channels.is_of_cars else "failure"
-        self._channels.end(self._time, self._observation, [kind] if failed else [])
+        if failed:
+            kind = "collision" if self._names == VARIABLES else "failure"
+            self._event(kind)
+            self._note(LogLevel.Error, kind)
+        self._event("episode ended")
+        self._start = self._now() + _PAUSE
+        self._episode += 1
+
+    # -- Inside -----------------------------------------------------------------------------------
+
+    def _now(self) -> int:
+        return self._start + round(self._time * _SECOND)
+
+    def _event(self, kind: str) -> None:
+        where = dict(zip(self._names, self._observation.tolist(), strict=False))
+        event = {"kind": kind, "episode": self._episode, "time": self._time, **where}
+        self._send("/event", event)
+
+    def _note(self, level: LogLevel, text: str) -> None:
+        stamp = Timestamp(*divmod(self._now(), _SECOND))
+        entry = Log(timestamp=stamp, level=level, message=text, name="evofsm")
+        self._log.log(entry, log_time=self._now())
+
+    def _send(self, topic: str, message: Mapping[str, Any]) -> None:
+        fields = {name: value for name, value in message.items() if _is_known(value)}
+        data = json.dumps(fields, ensure_ascii=False, allow_nan=False).encode()
+        self._channels[topic].log(data, log_time=self._now())
+        if self._file is not None and self._file.error is not None:
+            raise self._file.error

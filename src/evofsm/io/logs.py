@@ -672,11 +672,6 @@ def open_table(
         from evofsm.io.rosbag import BagTable
 
         return BagTable(path, topics, on_read, skips, told)
-    if kind == "run":
-        raise ValueError(
-            f"{path} is a run that evofsm drove and learnt from: evofsm watch replays it, and "
-            "evofsm inspect prints its model"
-        )
     moments = None
     if kind in ("osi", "mcap"):
         read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap

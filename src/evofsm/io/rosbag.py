@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.io.runs import messages
+from evofsm.io.mcap import messages
 from evofsm.io.tables import UNITS, OnRead, Piece, RefusedError, Skips, Table, Wanted, readable
 from evofsm.io.vehicles import ACTION
 

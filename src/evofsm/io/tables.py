@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 Numbers = dict[str, NDArray[np.float64]]
-Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag", "run"]
+Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag"]
 #: Called with the number of bytes each time some were read from a file.
 OnRead = Callable[[int], object]
 #: Place of a row, for a message, and what stands there in a column.
@@ -123,8 +123,8 @@ def file_kind(path: str) -> Kind:
     """What the file holds, judged by how it begins.
 
     A trace of OSI begins with nothing of its own and is known by its name, ``.osi``. The folder of
-    a bag of ROS 2 is ``"bag"``, as its files are; ``"run"`` is a log that evofsm wrote. A
-    ValueError says what a file is that is of a foreign kind, and how it can be read.
+    a bag of ROS 2 is ``"bag"``, as its files are. A ValueError says what a file is that is of a
+    foreign kind, and how it can be read.
     """
     if os.path.isfile(os.path.join(path, "metadata.yaml")):
         return "bag"
@@ -139,9 +139,7 @@ def file_kind(path: str) -> Kind:
     if foreign := next((says for mark, says in _FOREIGN.items() if head.startswith(mark)), ""):
         raise ValueError(f"{path} {foreign.replace('FILE', path)}")
     if head.startswith(_MCAP):
-        profile = head[_PROFILE:]
-        kinds: dict[bytes, Kind] = {b"ros2": "bag", b"evofsm": "run"}
-        return next((kind for mark, kind in kinds.items() if profile.startswith(mark)), "mcap")
+        return "bag" if head[_PROFILE:].startswith(b"ros2") else "mcap"
     marks: dict[bytes, Kind] = {_PARQUET: "parquet", _SQLITE: "bag", b"<": "xml"}
     return next((kind for mark, kind in marks.items() if head.startswith(mark)), "csv")
 

@@ -547,7 +547,7 @@ def scenes_of_osi(path: str, on_read: OnRead, skips: Skips) -> Iterator[Scene]:
 
 def scenes_of_mcap(path: str, on_read: OnRead, skips: Skips) -> Iterator[Scene]:
     """Read OSI in MCAP: the first channel of ground truth or of sensor views."""
-    from evofsm.io.runs import messages
+    from evofsm.io.mcap import messages
 
     osi = _osi(path)
     channel_id, number, kinds = None, 0, set[str]()

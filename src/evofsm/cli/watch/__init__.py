@@ -1,4 +1,4 @@
-"""`evofsm watch`: a run in the browser, while it is driven or as it was recorded."""
+"""`evofsm watch`: a run in the browser, while it is driven, or a log."""
 
 from __future__ import annotations
 
@@ -33,7 +33,6 @@ from evofsm.cli.options import (
 from evofsm.cli.show import progress, say, warn
 
 if TYPE_CHECKING:
-    from evofsm.cli.watch.recorded import Recording
     from evofsm.cli.watch.session import Session
 
 # Of a simulation of somebody else's that are watched [s], and positions of cars in them.
@@ -46,7 +45,7 @@ def watch(
         str,
         argument(
             "Scenarios for cars (paper, emergency, ...), an environment (CartPole-v1, ...), a file "
-            "of Python with one of your own, a run of drive --mcap, a log, or a .sumocfg.",
+            "of Python with one of your own, a log, or a .sumocfg.",
             metavar="FAMILY|ENVIRONMENT|FILE",
         ),
     ] = "paper",
@@ -65,7 +64,7 @@ def watch(
     port: Annotated[int, option("Of the page; 0 for any that is free.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
 ) -> None:
-    """Watch a run in the browser while it is driven, and act on it; or one that was recorded.
+    """Watch a run in the browser while it is driven, and act on it; or a log.
 
     A Python file defines a family of scenarios, called family, or a function environment(), which
     returns an environment of Gymnasium, and if it likes controller, failed and variables
@@ -75,7 +74,6 @@ def watch(
     when it is first opened. Ctrl-C ends it.
     """
     require(websockets="watch")
-    from evofsm.cli.watch.recorded import Recording
     from evofsm.guard import Guard
     from evofsm.store import read_header
 
@@ -85,7 +83,6 @@ def watch(
     defaults = {} if guard is None else read_header(guard).provenance.get("read with", {})
     reader = partial(reading_of, **{**reading.keywords, **defaults, **given_of(reading)})
     with suppress(KeyboardInterrupt), ExitStack() as stack:
-        run: Session | Recording
         if is_log:
             risk = None if tolerance == TOLERANCE else tolerance
             log_guard = None if guard is None else Guard.load(guard)
@@ -97,17 +94,13 @@ def watch(
                 look = f"evofsm learn {quote(what)} says what it holds, and what to name"
                 raise ValueError(f"{error}. Is it no log of cars? {look}") from error
             run = stack.enter_context(run)
-        elif what.endswith(".mcap"):
-            run = Recording(what)
-            if case is not None:
-                run.restart(case - 1)
         else:
             run = _driven(stack, what, case or 1, world, judge, tolerance, seed, learn_first)
         asyncio.run(_serve(run, port, browse=not no_browser))
     say("\nThe page is closed.")
 
 
-async def _serve(watched: Session | Recording, port: int, *, browse: bool) -> None:
+async def _serve(watched: Session, port: int, *, browse: bool) -> None:
     from evofsm.cli.watch.player import Player
     from evofsm.cli.watch.server import LivePage
 
@@ -125,7 +118,6 @@ async def _serve(watched: Session | Recording, port: int, *, browse: bool) -> No
 def _is_log(what: str) -> bool:
     """Whether it is a log that others wrote; what is nothing that can be watched is refused."""
     from evofsm.driving import FAMILIES
-    from evofsm.io.tables import file_kind
 
     place = Path(what)
     if what.partition("+")[0] in FAMILIES or re.search(r"-v\d+$", what):
@@ -137,9 +129,6 @@ def _is_log(what: str) -> bool:
             f"{what} is neither a file nor one of the families {', '.join(FAMILIES)}; an "
             "environment of Gymnasium is named with its version: CartPole-v1"
         )
-    # What is damaged is no kind of MCAP: whoever reads runs says so.
-    if place.suffix == ".mcap":
-        return file_kind(what) in ("mcap", "bag")
     return place.suffix != ".py"
 
 

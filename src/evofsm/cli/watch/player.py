@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from evofsm.cli.watch.shown import Frame
 
 if TYPE_CHECKING:
-    from evofsm.cli.watch.recorded import Recording
     from evofsm.cli.watch.session import Session
 
 # Between two graphs, unless a state was created [decisions].
@@ -42,7 +41,7 @@ class Player:
 
     def __init__(
         self,
-        watched: Session | Recording,
+        watched: Session,
         audience: Callable[[str, Any], object],
         *,
         paused: bool = False,

@@ -96,8 +96,7 @@ class Start(NamedTuple):
     high: tuple[float, ...]
     judge: str  #: by what it was told, a name of `evofsm.driving.cars.TOLD`
     learnt: int = 0  #: episodes learnt from before
-    mode: str = LIVE  #: or how far the reviser went as it was recorded, a name of `Mode`
-    unjudged: str = "no failure was known yet"  #: why nothing is judged, where nothing is
+    mode: str = LIVE  #: or ``"shadow"``, of a log
     fails: str = ""  #: who says that it failed, where a record does
     discrete: bool = False  #: whether an action is an index
     cars: bool = True  #: whether they are cars

@@ -14,14 +14,12 @@ from evofsm.guard.actions import action_text
 
 # Changes of speed that are smaller are "at the same speed" [m/s], and softer accelerations none.
 _EQUAL_SPEED, _HARDLY = 0.5, 0.3
-# What the reviser does in a run, or did in one that was recorded, by its mode.
-_REVISER = "This was recorded. The reviser, a safety filter,"
+# What the reviser does in a run, or in a log, by its mode.
 _INTRODUCED = {
     LIVE: "The reviser, a safety filter that learns on the way, replaces actions that it finds too "
     "risky; switched off, it only watches.",
-    "act": f"{_REVISER} replaced actions that it found too risky.",
-    "off": f"{_REVISER} was off.",
-    "shadow": f"{_REVISER} did not act; it says which actions it would have replaced.",
+    "shadow": "This was recorded. The reviser, a safety filter, did not act; it says which actions "
+    "it would have replaced.",
     "alone": "This was recorded, and nobody acts. A guard that learnt from the log alarms.",
 }
 # Components of an action that are told.
@@ -61,7 +59,7 @@ def introduce(start: Start) -> dict[str, str]:
     if start.mode != LIVE:
         note = "Recorded: the states as they were at its end."
     mode = start.mode if start.acts else "alone"
-    return {"intro": _INTRODUCED.get(mode, _INTRODUCED["shadow"]), "learning": note}
+    return {"intro": _INTRODUCED[mode], "learning": note}
 
 
 def tell(frame: Frame, start: Start) -> Told:
@@ -111,8 +109,8 @@ def _no_danger(frame: Frame, start: Start) -> str:
     if not start.acts:
         return "No limit of its alarm was passed."
     if not frame.story.judged:
-        return f"Nothing was judged, for {start.unjudged}."
-    if math.isnan(frame.needed) or start.judge == "learnt":  # which recordings do not hold
+        return "Nothing was judged, for no failure was known yet."
+    if math.isnan(frame.needed) or start.judge == "learnt":
         return "Nothing that was proposed was judged to be too risky."
     return (
         f"If the leader braked as hard as must be expected (up to {frame.needed:.1f} m/s²), "
@@ -129,9 +127,7 @@ def _quiet(frame: Frame, start: Start) -> str:
         had = "Nothing had to be done" if story.judged else "Nothing was done"
         return f"{had}: all that was proposed was carried out."
     why = ", though the risk was tolerable"
-    if not story.judged:
-        why = ", by a measure that knows no risk"
-    elif start.judge == "learnt":
+    if start.judge == "learnt":
         why = ", to survive all that it remembers by a margin"
     if story.revised:
         return f"The reviser changed {counted(story.revised, 'decision')}{why}."
@@ -170,7 +166,7 @@ def _why(began: Frame, start: Start) -> str:
         text = f"{at}, the driver wanted {_wish(began.proposed[0])}"
     if began.why:
         return f"{text}: a risk of {risk.risk:.0%}. After that {began.why}."
-    if cars is None or math.isnan(risk.critical):  # which recordings do not hold
+    if cars is None or math.isnan(risk.critical):
         return f"{text}: a risk of {risk.risk:.0%}."
     return (
         f"{text}. After that, not even braking in full (by {cars.decel:.1f} m/s²) would avoid "

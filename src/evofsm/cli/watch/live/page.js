@@ -94,8 +94,7 @@ function showControls() {
 
 function showMode() {
   at("live").hidden = run.isLive;
-  const recorded = run.start.mode === "act" ? "recorded" : run.start.mode;
-  const mode = !run.isLive ? "past" : run.clock.over ? "ended" : run.clock.paused ? "paused" : recorded;
+  const mode = !run.isLive ? "past" : run.clock.over ? "ended" : run.clock.paused ? "paused" : run.start.mode;
   if (socket.readyState === WebSocket.OPEN) at("mode").textContent = mode;
   at("time").textContent = clock(run.shown, run.start);
   const scrub = at("scrub");

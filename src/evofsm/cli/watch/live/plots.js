@@ -11,7 +11,7 @@ const LEAST_HEIGHT = 104; // of a panel [px]
 
 /** What is drawn in each panel; `value` answers a frame's value, null where there is none. */
 function panels(run) {
-  const { start } = run, cars = start.cars, acts = start.live || start.mode === "act";
+  const { start } = run, cars = start.cars, acts = start.live;
   const percent = (value) => `${Math.round(100 * value)} %`;
   const { follower, leader, danger, third, soft } = colour;
   const wish = (value) => ({ label: cars ? "driver's wish" : "proposed", ink: danger, width: 2.5, dash: [], value });
