@@ -21,11 +21,6 @@ from evofsm.driving import (
     Leader,
     Scenario,
     dead_ends_of,
-    drive,
-    guard_for_family,
-    load_family,
-    teach,
-    training,
 )
 
 VARIABLES = {"names": ["gap", "v_follower", "v_leader"], "units": ["m", "m/s", "m/s"]}
@@ -39,7 +34,7 @@ def of_a_machine() -> Iterator[str]:
     actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
     machine = EvolvingFSM.paper()
     learnt = actions.encode(episode.accelerations)
-    trace = machine.learn_many(episode.observations, learnt, belief=True)
+    machine.learn_many(episode.observations, learnt)
     model = machine.model(actions=actions, **VARIABLES)
     dead_ends = dead_ends_of(model, LatentRisk.given(-4.0, decel=4.0, leader_decel=9.0))
 
@@ -50,21 +45,6 @@ def of_a_machine() -> Iterator[str]:
     _, ax = plt.subplots(figsize=(4.0, 3.2))
     plot.graph(model, ax, dead_ends=dead_ends)
     yield "graph"
-    _, ax = plt.subplots(figsize=(6.4, 2.6), layout="constrained")
-    plot.belief(trace, ax, time=episode.time)
-    yield "belief"
-
-
-def of_a_drive() -> Iterator[str]:
-    """A held-out drive of `emergency` under a guard that learnt from 20 others."""
-    family = load_family("emergency")
-    guard = guard_for_family(family)
-    teach(guard, training(family, 0, 0, 20))
-    guard.freeze()
-    driven = drive(guard, family.draw(0, 0, "test"))
-    _, ax = plt.subplots(figsize=(6.4, 2.6), layout="constrained")
-    plot.risk(driven, ax, tolerance=guard.reviser.tolerance)
-    yield "risk"
 
 
 def of_the_notebook() -> Iterator[str]:
@@ -82,7 +62,7 @@ def of_the_notebook() -> Iterator[str]:
 def main(folder: Path) -> None:
     """Write all pictures."""
     plt.style.use("evofsm.paper.house")
-    for name in chain(of_a_machine(), of_a_drive(), of_the_notebook()):
+    for name in chain(of_a_machine(), of_the_notebook()):
         plt.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
         plt.close()
 

@@ -1,4 +1,4 @@
-"""The plots show what models, beliefs and drives hold, on any axes, and set no style."""
+"""The plots show what models, guards and logs hold, on any axes, and set no style."""
 
 import importlib
 from pathlib import Path
@@ -13,8 +13,8 @@ from studies.judges import run
 from studies.systems import Start, make_system
 
 from evofsm import EvolvingFSM, IntervalActions, Novelty, plot
-from evofsm.driving import drive, guard_for_family, load_family
-from evofsm.guard import Foresight, Guard, LearntRisk, Mode
+from evofsm.driving import guard_for_family, load_family
+from evofsm.guard import Foresight, Guard, LearntRisk
 
 OF_A_MODEL = (plot.states, plot.graph)
 
@@ -28,35 +28,19 @@ def texts(ax):
 
 
 @pytest.fixture(scope="module")
-def machine():
+def model():
     """Three states in the plane; the last one is where an episode failed."""
     machine = EvolvingFSM(n_actions=2, rule=Novelty(radius=1.0))
     machine.learn_many([[0, 0], [3, 0], [0, 0], [3, 4], [0, 0], [3, 4]], [0, 0, 0, 1, 0, 0])
-    return machine
-
-
-@pytest.fixture(scope="module")
-def model(machine):
     actions = IntervalActions(low=-1.0, high=1.0, width=1.0)
     return machine.model(names=["gap", "speed"], units=["m", "m/s"], actions=actions)
 
 
-def driven(mode):
-    family = load_family("emergency")
-    return drive(guard_for_family(family, mode=mode), family.draw(0, 1))
-
-
-@pytest.fixture(scope="module")
-def saved():
-    return driven(Mode.ACT)
-
-
-def test_they_answer_with_the_axes_they_were_given_and_leave_the_style(machine, model, saved):
+def test_they_answer_with_the_axes_they_were_given_and_leave_the_style(model):
     before = dict(matplotlib.rcParams)
-    given = [*((draw, model) for draw in OF_A_MODEL), (plot.belief, [machine.belief])]
-    for draw, what in (*given, (plot.risk, saved)):
+    for draw in OF_A_MODEL:
         ax = new()
-        assert draw(what, ax) is ax
+        assert draw(model, ax) is ax
     assert dict(matplotlib.rcParams) == before
 
 
@@ -138,56 +122,9 @@ def test_what_a_model_does_not_have_is_named(model):
 def test_many_states_can_be_drawn():
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=0.5))
     Z = np.column_stack([np.arange(30), np.arange(30) ** 2])
-    trace = machine.learn_many(Z, np.zeros(30, np.int64), belief=True)
-    axes = [draw(machine.model(), new(), dead_ends=[0]) for draw in OF_A_MODEL]
-    for ax in (*axes, plot.belief(trace, new())):
-        FigureCanvasAgg(ax.figure).draw()
-
-
-def test_beliefs_over_time_are_a_map_and_a_line():
-    rows = np.array([[1.0, 0.0], [0.4, 0.6], [0.3, 0.7]])
-    ax = plot.belief(rows, new(), time=[0.0, 0.5, 2.0], dead_ends=[1])
-    assert np.array_equal(ax.collections[0].get_array(), rows.T)
-    assert np.array_equal(ax.lines[0].get_data(), [[0.0, 0.5, 2.0], [0, 1, 1]])
-    assert [tick.get_text() for tick in ax.get_yticklabels()] == ["#1", "#2"]
-    assert texts(ax) == ["dead end"]
-    assert ax.get_xlabel() == "time [s]"
-
-
-def test_beliefs_that_do_not_fit_are_refused(machine):
-    with pytest.raises(ValueError, match=r"holds no beliefs \(learn_many\(..., belief=True\)"):
-        plot.belief(machine.copy().learn_many([[0.0, 0.0]], [0]), new())
-    with pytest.raises(ValueError, match=r"belief has shape \(1,\); it must be \(T, n\)"):
-        plot.belief([1.0], new())
-    with pytest.raises(ValueError, match=r"time has shape \(1,\); 2 beliefs need \(2,\)"):
-        plot.belief([[1.0], [1.0]], new(), time=[0.0])
-
-
-def lines(ax):
-    return {line.get_label(): line for line in ax.lines}
-
-
-def test_risk_is_that_of_the_decisions_and_holds_until_the_end(saved):
-    ax = plot.risk(saved, new(), tolerance=0.02)
-    revisions, drawn = [decision.revision for decision in saved.decisions], lines(ax)
-    assert drawn["proposed"].get_ydata()[:-1].tolist() == [r.risk_proposed for r in revisions]
-    assert drawn["executed"].get_ydata()[:-1].tolist() == [r.risk_executed for r in revisions]
-    assert drawn["executed"].get_xdata()[-1] == saved.time[-1]
-    assert set(drawn["tolerance, 0.02"].get_ydata()) == {0.02}
-    highest = max(revision.interval[1] for revision in revisions)
-    assert ax.collections[0].get_paths()[0].vertices[:, 1].max() == highest
-
-
-def test_a_collision_is_marked_where_there_was_one(saved):
-    lost = driven(Mode.SHADOW)
-    assert (saved.collided, lost.collided) == (False, True)
-    assert lines(plot.risk(lost, new()))["collision"].get_xdata()[0] == lost.time[-1]
-    assert "collision" not in lines(plot.risk(saved, new()))
-
-
-def test_a_drive_that_nobody_judged_is_refused(saved):
-    with pytest.raises(ValueError, match="no decision of this drive was judged"):
-        plot.risk(driven(Mode.OFF), new())
+    machine.learn_many(Z, np.zeros(30, np.int64))
+    for draw in OF_A_MODEL:
+        FigureCanvasAgg(draw(machine.model(), new(), dead_ends=[0]).figure).draw()
 
 
 @pytest.fixture(scope="module")

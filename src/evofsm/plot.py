@@ -1,4 +1,4 @@
-"""Plots of a model, a guard, beliefs and a drive, on axes given or new, which they return.
+"""Plots of a model, a guard and a log, on axes given or new, which they return.
 
 They set no style. Data on the axes count states and actions from 0, labels from 1. Nothing rests on
 colour alone. The same colours stand in ``io/graphs.py`` and ``cli/watch/live/page.css``.
@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving import Episode
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import usual_range
 from evofsm.fsm.rules import Novelty
-from evofsm.fsm.step import Trace
 from evofsm.fsm.validation import check_index
 from evofsm.guard import Guard, LearntRisk
 from evofsm.guard.foresight import DATES
@@ -27,10 +25,9 @@ from evofsm.guard.learnt.rollout import FAILS
 
 with needs("matplotlib", "plot", "plotting"):
     import matplotlib
-    from matplotlib.colors import Normalize, to_hex, to_rgb
+    from matplotlib.colors import to_hex, to_rgb
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
     from matplotlib.patches import Ellipse, FancyArrowPatch
-    from matplotlib.patheffects import withStroke
     from matplotlib.transforms import Bbox
 
 if TYPE_CHECKING:
@@ -38,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.text import Annotation
 
-__all__ = ["COLORS", "belief", "experience", "graph", "risk", "states"]
+__all__ = ["COLORS", "experience", "graph", "states"]
 
 Look = dict[str, Any]  # how something is drawn, as matplotlib is told
 States = Collection[int]  # indices
@@ -292,104 +289,7 @@ def _tint(ax: Axes, pair: list[int], table: NDArray[np.float64], label: str) -> 
     ax.plot([], [], "s", label=label, **look)
 
 
-# -- Of beliefs and drives ------------------------------------------------------------------------
-
-
-def belief(
-    belief: ArrayLike | Trace,
-    ax: Axes | None = None,
-    *,
-    time: ArrayLike | None = None,
-    dead_ends: States = (),
-) -> Axes:
-    """Beliefs over time, darker where more probable, with the most probable state as a line.
-
-    Parameters
-    ----------
-    belief : (T, n) array_like, or Trace
-        A distribution over states in each row; or a trace that holds beliefs.
-    ax, dead_ends
-        As in `states`; a colour bar takes some of the axes' place.
-    time : (T,) array_like, optional
-        When each row was observed [s], in rising order; without it rows are counted from 0.
-
-    Raises
-    ------
-    ValueError
-        If the trace holds no beliefs, or shapes do not fit.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from evofsm import EvolvingFSM, plot
-    >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
-    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0] * 4, belief=True)
-    >>> plot.belief(trace, Figure().subplots()).lines[0].get_ydata()  # from 0: #2 at last
-    array([0, 0, 0, 1])
-    """
-    beliefs = belief.belief if isinstance(belief, Trace) else belief
-    if beliefs is None:
-        raise ValueError("the trace holds no beliefs (learn_many(..., belief=True) keeps them)")
-    rows = np.asarray(beliefs, dtype=np.float64)
-    if rows.ndim != 2 or rows.size == 0:
-        raise ValueError(f"belief has shape {rows.shape}; it must be (T, n), not empty")
-    n = rows.shape[1]
-    _refuse_unknown(n, dead_ends)
-    when = np.arange(1.0 * len(rows)) if time is None else np.asarray(time, dtype=np.float64)
-    if when.shape != (len(rows),):
-        raise ValueError(f"time has shape {when.shape}; {len(rows)} beliefs need ({len(rows)},)")
-    ax = _given_or_new(ax)
-    look: Look = {"cmap": "Blues", "norm": Normalize(0.0, 1.0), "shading": "nearest"}
-    mesh = ax.pcolormesh(when, range(n), rows.T, rasterized=True, **look)
-    ax.grid(False)
-    if n <= _DISCS:  # among more it would hide the belief
-        look = {"where": "mid", "color": COLORS["ink"], "label": "most probable state"}
-        look["path_effects"] = [withStroke(linewidth=3.0, foreground="white")]
-        ax.step(when, rows.argmax(axis=1), **look)
-        _explain(ax)
-    label_states(ax.yaxis, n, dead_ends, called="dead end")
-    ax.set(ylabel="state", xlabel="observation" if time is None else "time [s]")
-    # Below, for the words beside the rows stand to the right.
-    ax.figure.colorbar(mesh, ax=ax, label="belief", location="bottom", aspect=40)
-    return ax
-
-
-def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = None) -> Axes:
-    """Latent risk over time: of what was proposed, and of what was executed, with its interval.
-
-    The drive was under a reviser that judges actions; its ``tolerance`` is drawn as a line.
-
-    Raises
-    ------
-    ValueError
-        If no decision of the drive was judged.
-    """
-    revisions = [decision.revision for decision in drive.decisions]
-    proposed = np.array([revision.risk_proposed for revision in revisions])
-    executed = np.array([revision.risk_executed for revision in revisions])
-    if not np.isfinite(executed).any():
-        why = "was there a reviser, and was its mode not OFF?"
-        raise ValueError(f"no decision of this drive was judged ({why})")
-    ax = _given_or_new(ax)
-    times = [decision.situation.time for decision in drive.decisions]
-    when = np.array([*times, float(drive.time[-1])])
-    bounds = np.array([revision.interval for revision in revisions]).T
-    until_the_end = (np.append(row, row[-1]) for row in (*bounds, proposed, executed))
-    low, high, proposed, executed = until_the_end
-    band: Look = {"step": "post", "alpha": 0.25, "linewidth": 0.0, "label": "90 % interval"}
-    ax.fill_between(when, low, high, color=COLORS["follower"], **band)
-    dashes: Look = {"color": COLORS["dead end"], "linestyle": "--", "label": "proposed"}
-    ax.step(when, proposed, where="post", **dashes)
-    ax.step(when, executed, where="post", color=COLORS["follower"], label="executed")
-    if tolerance is not None:
-        look: Look = {"linestyle": ":", "linewidth": 1.0, "label": f"tolerance, {tolerance:g}"}
-        ax.axhline(tolerance, color=ink(), **look)
-    if drive.collided:
-        draw_collision(ax, when[-1], 0.0)
-        ax.lines[-1].set_label("collision")
-    ax.set(ylim=(-0.03, 1.03), xlabel="time [s]", ylabel="latent risk")
-    _explain(ax)
-    return ax
+# -- Of a log -------------------------------------------------------------------------------------
 
 
 def history(
