@@ -49,7 +49,7 @@ from evofsm.driving import (
     try_out,
     unrevised_guard,
 )
-from evofsm.fsm import Edges, Novelty, StateRule
+from evofsm.fsm import Novelty, StateRule
 from evofsm.guard import TOLERANCE, ActionReviser, Guard, Reviser
 from evofsm.paper import Figure, Page, Table
 from evofsm.plot import COLORS
@@ -71,7 +71,6 @@ AFTER = {UNCHANGED: (0,), OURS: (0, 1, 2, 5, 10, 20, 30), MACHINE: (0, 10, 30)}
 #: State rules that are compared, by name.
 RULES: dict[str, StateRule | None] = {
     "paper": None,
-    "edges": Edges(),
     "novelty": Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)),
 }
 #: Times of the leader's full brake in two runs that are not learnt from [s], as in the paper.

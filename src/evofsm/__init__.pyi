@@ -1,5 +1,4 @@
 from .fsm import Category as Category
-from .fsm import Edges as Edges
 from .fsm import Event as Event
 from .fsm import EvolvingFSM as EvolvingFSM
 from .fsm import Forecasts as Forecasts

@@ -8,7 +8,7 @@ import re
 import pytest
 
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.rules import Edges, Novelty, Paper
+from evofsm.fsm.rules import Novelty, Paper
 from evofsm.io import tables
 
 
@@ -307,7 +307,6 @@ def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, refused, tmp_
     ("options", "rule"),
     [
         ([], Paper()),
-        (["--rule", "edges"], Edges()),
         (["--rule", "novelty"], Novelty(1.0, (4.0, 2.0, 2.0))),
         (
             ["--rule", "novelty", "--radius", "2", "--spread", "0.5", "--scale", "gap=8"],
@@ -337,11 +336,9 @@ def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "coarse_rule.py").write_text(RULE)
-    said = "'coarse'; it must be one of paper, edges, novelty"
+    said = "'coarse'; it must be one of paper, novelty"
     assert said in refused("learn", crashes, "--rule", "coarse")
-    monkeypatch.setattr(
-        "evofsm.fsm.rules._RULES", {"paper": Paper, "edges": Edges, "novelty": Novelty}
-    )
+    monkeypatch.setattr("evofsm.fsm.rules._RULES", {"paper": Paper, "novelty": Novelty})
     for name in ("coarse_rule:Coarse", "coarse"):  # which its module has registered
         text = " ".join(evofsm("learn", crashes, "--rule", name, "--out", "m").stdout.split())
         assert "rule coarse (--rule), radius 3.0" in text

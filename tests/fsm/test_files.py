@@ -90,7 +90,7 @@ MACHINES = [
     ("latest_visit", 1e9, "latest_visit is after"),
     ("n_actions", 10**6, r"has shape \(3,\), not \(1000000,\)"),
     ("failures_told", 2, "failures_told of 2"),
-    ("rule", {"name": "magic"}, "rule is .*magic.*; it must be one of paper, edges"),
+    ("rule", {"name": "magic"}, "rule is .*magic.*; it must be one of paper, novelty"),
     ("rule", None, "rule"),
     ("rule", {"name": "novelty", "gain": 1.0}, "gain"),
     ("rule", {"name": "novelty", "scales": [1.0]}, "scales"),

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.rules import Edges, Novelty
+from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Event
 
 
@@ -24,8 +24,7 @@ def machines(draw, m, n_actions):
     if draw(st.booleans()):
         scales = draw(st.sampled_from([(), (0.5, 3.0, 1.0)[:m]]))
         return EvolvingFSM(n_actions, rule=Novelty(radius, scales, spread), **told)
-    rule = draw(st.sampled_from([None, Edges()]))
-    return EvolvingFSM(n_actions, radius, spread=spread, rule=rule, **told)
+    return EvolvingFSM(n_actions, radius, spread=spread, **told)
 
 
 @st.composite

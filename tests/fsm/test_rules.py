@@ -10,12 +10,11 @@ from hypothesis import strategies as st
 
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.rules import Edges, Novelty, Paper, describe_rule, register_rule
+from evofsm.fsm.rules import Novelty, Paper, describe_rule, register_rule
 from evofsm.fsm.step import Event
 
 RULES = {
     "paper": Paper(),
-    "edges": Edges(),
     "novelty": Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7),
 }
 
@@ -49,39 +48,20 @@ def test_the_names_and_settings_in_a_file_are_these():
     novelty = {"name": "novelty", "radius": 2.0, "scales": (1.0, 4.0), "spread": 1.0}
     assert describe_rule(Novelty(2.0, (1.0, 4.0))) == novelty
     assert describe_rule(Paper()) == {"name": "paper"}
-    assert describe_rule(Edges()) == {"name": "edges"}
 
 
 @pytest.mark.parametrize("rule", [Novelty, "novelty", 1, object()])
 def test_what_is_no_rule_is_refused(rule):
-    with pytest.raises(TypeError, match=r"rule is .*; it must be an object: Paper\(...\), Edges"):
+    with pytest.raises(TypeError, match=r"rule is .*; it must be an object: Paper\(...\), Novelty"):
         EvolvingFSM(1, rule=rule)
 
 
 def test_a_rule_is_registered_once_under_its_name():
     register_rule("novelty", Novelty)
     with pytest.raises(ValueError, match="a state rule 'novelty' already: Novelty"):
-        register_rule("novelty", Edges)
+        register_rule("novelty", Paper)
     with pytest.raises(TypeError, match="is no state rule"):
         register_rule("something", int)
-
-
-# -- Edges -----------------------------------------------------------------------------------------
-
-
-def outward(rule):
-    """A dense cloud, and then observations farther and farther out."""
-    machine = EvolvingFSM(n_actions=1, radius=1.0, rule=rule)
-    cloud = np.random.default_rng(0).normal(0.0, 0.1, size=(200, 2))
-    machine.learn_many(cloud, [0] * 200)
-    return machine, [machine.observe([x, 0.0]).event for x in (3.0, 6.0, 9.0)]
-
-
-def test_a_state_is_created_at_the_edges_where_the_papers_rule_creates_none():
-    assert outward(None)[1] == [Event.NONE] * 3
-    machine, events = outward(Edges())
-    assert events == [Event.CREATED] * 3
-    assert machine.centers[-3:].tolist() == [[3.0, 0.0], [6.0, 0.0], [9.0, 0.0]]
 
 
 # -- Novelty ---------------------------------------------------------------------------------------
@@ -212,8 +192,7 @@ def test_the_papers_rule_decides_ties_as_exact_arithmetic_does(grid):
 def test_exactly_a_radius_away_is_not_farther():
     pairs = [(k / 10, (k + 3) / 10) for k in range(-40, 200)]
     assert len({np.sign(abs(a - b) - 0.3) for a, b in pairs}) == 3  # by rounding it is all three
-    for rule in (Novelty(radius=0.3), Edges()):
-        for a, b in pairs:
-            machine = EvolvingFSM(1, rule=rule)
-            machine.learn_many([[a], [b]], [0, 0])
-            assert machine.n_states == 1
+    for a, b in pairs:
+        machine = EvolvingFSM(1, rule=Novelty(radius=0.3))
+        machine.learn_many([[a], [b]], [0, 0])
+        assert machine.n_states == 1

@@ -10,7 +10,7 @@ import pytest
 from evofsm.driving import IDM, AlwaysBrake, EnvelopeReviser, LatentRisk, Unrevised
 from evofsm.driving.measures import ModifiedTimeToCollision
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.rules import Edges, Novelty, Paper
+from evofsm.fsm.rules import Novelty, Paper
 from evofsm.guard import ActionReviser, Mode, Proposal
 from evofsm.guard.check import check_results, kind_of
 
@@ -19,7 +19,6 @@ CALM = IDM(1.0, 25.0, 2.0, 1.5, 2.0, lowest=-5.0)
 
 OURS = [
     Paper,
-    Edges(),
     Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7),
     LatentRisk(lowest=-2.5),
     ActionReviser(LatentRisk(lowest=-2.5), ACTIONS),

@@ -60,7 +60,7 @@ def learn(
         str, option("Intervals of --action, LOW:HIGH:WIDTH; the end ones take what lies beyond.")
     ] = "-2.5:2.5:0.3",
     rule: Annotated[
-        str, option("Rule of states: paper, edges, novelty (for logs), or module:Name.")
+        str, option("Rule of states: paper, novelty (for logs), or module:Name.")
     ] = "paper",
     radius: Annotated[
         float | None, option("How far states lie apart. [default: 0.3; of novelty 1.0, in --scale]")

@@ -10,7 +10,6 @@ from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder
 from .proportions import FailureRecord as FailureRecord
 from .proportions import wilson_bounds as wilson_bounds
-from .rules import Edges as Edges
 from .rules import Novelty as Novelty
 from .rules import Paper as Paper
 from .rules import StateRule as StateRule

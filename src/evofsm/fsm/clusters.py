@@ -27,8 +27,7 @@ CREATED: int = 2
 MERGED: int = 4
 #: Which rule judges an observation.
 PAPER: int = 0
-EDGES: int = 1
-NOVELTY: int = 2
+NOVELTY: int = 1
 
 # A share that no rounding comes to, and that no two observations tell apart either.
 _ROUNDING = 1e-12
@@ -55,7 +54,7 @@ def determine(learnt: Learnt, settings: Settings, z: Floats) -> tuple[int, int, 
         highest = _update_potentials(learnt, settings, n)
         measure_distances(learnt.centers, weights, lanes(n), z, learnt.squared_distances)
         nearest = nearest_center(learnt.squared_distances, n)
-        event = _judge(learnt, settings, n, potential, highest, nearest)
+        event = _judge(learnt, settings, potential, highest, nearest)
         if event == MOVED:
             for j in range(len(z)):
                 learnt.centers[j, nearest] = z[j]
@@ -67,7 +66,7 @@ def determine(learnt: Learnt, settings: Settings, z: Floats) -> tuple[int, int, 
 
 @inner_kernel
 def _judge(
-    learnt: Learnt, settings: Settings, n: int, potential: float, highest: float, nearest: int
+    learnt: Learnt, settings: Settings, potential: float, highest: float, nearest: int
 ) -> int:
     """Leave the states as they are, move the nearest, or create one."""
     squared_distance, limit = learnt.squared_distances[nearest], settings.radius**2
@@ -75,11 +74,6 @@ def _judge(
         return CREATED if exceeds(squared_distance, limit) else UNCHANGED
     if exceeds(potential, highest):
         return MOVED if exceeds(limit, squared_distance) else CREATED
-    if settings.rule == EDGES and exceeds(squared_distance, limit):
-        for i in range(n):
-            if not exceeds(learnt.potentials[i], potential):
-                return UNCHANGED
-        return CREATED
     return UNCHANGED
 
 

@@ -59,8 +59,8 @@ class EvolvingFSM(Retraced):
     n_actions : int
         Number q of discrete actions; each has a transition matrix of its own.
     radius : float, optional
-        The paper's epsilon: how close the nearest state must be to be moved. 0.3 for `Paper` and
-        `Edges`; other rules have their own.
+        The paper's epsilon: how close the nearest state must be to be moved. 0.3 for `Paper`;
+        other rules have their own.
     distance_weight : float
         The paper's rho, how fast distance to new data lowers a centre's potential.
     learning_rate : float
@@ -68,10 +68,10 @@ class EvolvingFSM(Retraced):
     prior_frequency : float
         The paper's epsilon-bar, the frequency given to every transition of a new state.
     spread : float, optional
-        Width of recognition, in total variances of all observations. 3 for `Paper` and `Edges`;
-        other rules have their own.
+        Width of recognition, in total variances of all observations. 3 for `Paper`; other rules
+        have their own.
     rule : StateRule, optional
-        How states are determined: `Paper` (without it), `Edges`, `Novelty`.
+        How states are determined: `Paper` (without it) or `Novelty`.
     max_states : int, optional
         Number of states at which, before another one, the two that are closest are merged.
     belief_tolerance : float

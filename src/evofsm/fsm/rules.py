@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
 
-from evofsm.fsm.clusters import EDGES, NOVELTY, PAPER
+from evofsm.fsm.clusters import NOVELTY, PAPER
 from evofsm.fsm.validation import Floats, positive
 
 # Squares of observations over the scales, summed over a long run, must not overflow.
@@ -55,30 +55,11 @@ class Paper:
     """
 
     scales: ClassVar[Sequence[float]] = ()
-    _rule: ClassVar[int] = PAPER
 
     @property
     def table(self) -> Mapping[str, float]:
         """What the kernel judges by."""
-        return {"rule": self._rule}
-
-
-@dataclass(frozen=True)
-class Edges(Paper):
-    """The paper's rule, and a state at each edge of the data.
-
-    The paper's condition never gives a rare corner a state. Here an observation also creates one
-    where its potential lies below every centre's and it is farther than ``radius`` from each.
-
-    Examples
-    --------
-    >>> from evofsm import EvolvingFSM
-    >>> machine = EvolvingFSM(n_actions=1, radius=0.5, rule=Edges())
-    >>> machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0]).n_states
-    array([1, 1, 2, 3])
-    """
-
-    _rule: ClassVar[int] = EDGES
+        return {"rule": PAPER}
 
 
 @dataclass(frozen=True)
@@ -126,7 +107,7 @@ class Novelty:
 
 
 # By name in files.
-_RULES: dict[str, Any] = {"paper": Paper, "edges": Edges, "novelty": Novelty}
+_RULES: dict[str, Any] = {"paper": Paper, "novelty": Novelty}
 
 
 def register_rule(name: str, rule: type) -> None:
