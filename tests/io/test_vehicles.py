@@ -365,7 +365,7 @@ def test_who_stands_points_where_it_moved_last_or_where_it_is_said_to(tmp_path):
     [
         ([("a", 0, 0, 0, 1, 0, 4, ""), ("b", 0, 9, 0, 1, 0, 4, "")], "no object is on a lane"),
         ([("a", 0, 0, 0, 1, 0, 4, 1), ("a", 0, 9, 0, 1, 0, 4, 1)], "'a' is there twice"),
-        ([("a", 0, 0, 0, 1, 0, 0, 1)], "line 2: the length is 0"),
+        ([("a", 0, 0, 0, 1, 0, 0, 1)], "line 2: object a is 0 m long"),
         ([("a", 0, "x", 0, 1, 0, 4, 1)], "column 'x'"),
         ([("a", 0, 0, 0, 1, 0, 4, 1)], "no vehicle ever follows another one"),
     ],
@@ -465,7 +465,7 @@ def test_osi_that_cannot_be_right_is_refused_in_words(tmp_path, osi):
         (b"\xff\xff\xff\xff", "no trace of OSI"),
         (b"\2\0\0\0\x0b\0", "is not ground truth"),
         (next(osi.osi_traces(length=0.0)), "object 2 is 0 m long, at (50, 0) m"),
-        (next(osi.osi_traces(x=math.nan)), "it needs a length, and numbers"),
+        (next(osi.osi_traces(x=math.nan)), "it needs a length and numbers"),
         (beside, "no vehicle ever follows another one"),
         (next(osi.osi_traces(lane=0, length=0.0, x=math.nan)), "no vehicle ever follows"),
         (b"", "no object is on a lane"),

@@ -77,36 +77,28 @@ class Forecasts:
         self._moving = [np.array([1.0 - _MOVED, _MOVED]) for _ in self.steps]
         self._counts: list[dict[int, Floats]] = [{} for _ in self.steps]
 
-    def learn(
-        self,
-        model: FSMModel,
-        Z: ArrayLike,
-        I: ArrayLike,
-        episode_starts: Sequence[int] | NDArray[np.integer] = (),
-    ) -> None:
-        """Learn an episode, or many, from each row to those that come after it in this call.
+    def learn(self, model: FSMModel, Z: ArrayLike, I: ArrayLike) -> None:
+        """Learn an episode, from each row to those that come after it.
 
         Parameters
         ----------
         model : FSMModel
             Snapshot of the machine that has learnt these rows, ``machine.model()``.
-        Z, I, episode_starts
-            As `EvolvingFSM.learn_many` takes them; the first row begins an episode anyway.
+        Z, I
+            As `EvolvingFSM.learn_many` takes them.
         """
         beliefs = np.atleast_2d(model.recognise(valid.real_rows("observations", Z)))
         actions = valid.check_actions(I, len(beliefs), self.n_actions)
-        starts = valid.check_rows("episode_starts", episode_starts, len(beliefs))
         self.n_states = self._check_states(model.n_states)
         near = model.recognise(model.centers)
         self._elsewhere = (1.0 - _ANYWHERE) * near + _ANYWHERE / self.n_states
-        begins = np.maximum.accumulate(np.where(starts, np.arange(len(beliefs)), 0))
         states = [np.flatnonzero(belief > _LEAST_BELIEF) for belief in beliefs]
         for horizon, steps in enumerate(self.steps):
             self._make_room(horizon, actions)
             for row in range(steps, len(beliefs)):
-                if (before := row - steps) >= begins[row]:
-                    arguments = beliefs[before], states[before], beliefs[row], states[row]
-                    self._learn(horizon, int(actions[before]), *arguments)
+                before = row - steps
+                arguments = beliefs[before], states[before], beliefs[row], states[row]
+                self._learn(horizon, int(actions[before]), *arguments)
 
     def predict(self, belief: ArrayLike, i: ArrayLike | None, steps: int) -> Floats:
         """(n,) forecast of the state, or (T, n) of many; nothing is changed by asking.

@@ -280,9 +280,6 @@ class FSMModel:
         content, arrays = store.read(path, MODEL)
         with store.explained(path):
             if (actions := content.get("actions")) is not None:
-                q = len(arrays["uses"])  # as many as there are matrices
-                if (actions["high"] - actions["low"]) > (q + 1) * actions["width"]:
-                    raise ValueError(f"actions has more than {q} intervals, for {q} matrices")
                 content["actions"] = IntervalActions(**actions)
             content |= {name: tuple(content[name]) for name in ("names", "units")}
             content["rule"] = restore_rule(content["rule"])

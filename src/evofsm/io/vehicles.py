@@ -415,6 +415,15 @@ class Object(NamedTuple):
     heading: float = math.nan
     width: float = math.nan  #: [m], where it is known
 
+    def refuse_unfit(self, place: Place) -> None:
+        """Raise where it has no length, or lacks a number."""
+        numbers = self.x, self.y, self.vx, self.vy, self.length
+        if not (all(abs(x) <= LARGEST_OBSERVATION for x in numbers) and self.length > 0.0):
+            raise ValueError(
+                f"{place()}: object {self.id[:40]} is {self.length:g} m long, at ({self.x:g}, "
+                f"{self.y:g}) m, with ({self.vx:g}, {self.vy:g}) m/s; it needs a length and numbers"
+            )
+
 
 class Scene(NamedTuple):
     """All objects at one time."""
@@ -435,14 +444,8 @@ def scenes_of_table(table: Table) -> Iterator[Scene]:
                 if not lane:  # whoever follows nobody may lack anything
                     continue
                 fields = dict(zip([*numbers, *optional], values, strict=True))
-                for column in numbers:
-                    if not abs(fields[column]) <= LARGEST_OBSERVATION:
-                        reason = explained(f"{fields[column]:g}")
-                        raise ValueError(f"{place()}, column {column!r}: {reason}")
-                if not fields["length"] > 0.0:
-                    length = f"{fields['length']:g}"
-                    raise ValueError(f"{place()}: the length is {length}; it must be positive")
                 objects.append(Object(name, lane, **fields))
+                objects[-1].refuse_unfit(place)
             yield Scene(time, rows[0][0], objects)
 
 
@@ -618,12 +621,8 @@ def _object(place: str, moving: Any, lane: str) -> Object:
     x, y = (base.position.x, base.position.y) if base.position else (math.nan, math.nan)
     vx, vy = (base.velocity.x, base.velocity.y) if base.velocity else (math.nan, math.nan)
     length = base.dimension.length if base.dimension else math.nan
-    largest = np.abs([x, y, vx, vy, length]).max()
-    if not (largest <= LARGEST_OBSERVATION and length > 0.0):
-        raise ValueError(
-            f"{place}: object {name} is {length:g} m long, at ({x:g}, {y:g}) m, with "
-            f"({vx:g}, {vy:g}) m/s; it needs a length, and numbers"
-        )
     heading = base.orientation.yaw if base.orientation else math.nan
-    width = base.dimension.width or math.nan
-    return Object(name, lane, x, y, vx, vy, length, heading, width)
+    width = base.dimension.width if base.dimension else math.nan
+    obj = Object(name, lane, x, y, vx, vy, length, heading, width or math.nan)
+    obj.refuse_unfit(lambda: place)
+    return obj
