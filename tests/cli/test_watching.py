@@ -11,7 +11,7 @@ from evofsm.cli.options import reading_of
 from evofsm.cli.watch.logged import watched_log
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_guard
-from evofsm.cli.watch.words import tell
+from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, load_family, teach
 from evofsm.driving.assumed import guard_of_monitor
 from monitor_rows import line, traffic
@@ -134,7 +134,7 @@ def test_a_file_holds_an_environment_of_ones_own(tmp_path):
         read_simulated(str(path))
 
 
-# What the reviser did in a run, and why it did nothing.
+# What a run was: whether it acts, or passes all, or is switched off, and why nothing is done.
 MODES = [
     ("on", ""),
     ("passing", "was not shown to help yet, so what is proposed passes"),
@@ -142,13 +142,13 @@ MODES = [
 ]
 
 
-@pytest.mark.parametrize(("reviser", "idle"), MODES)
-def test_every_sentence_says_what_was_so(reviser, idle):
+@pytest.mark.parametrize(("how", "idle"), MODES)
+def test_every_sentence_says_what_was_so(how, idle):
     guard = learnt()
     teach(guard, [PAPER.draw(0, 1)])
-    if reviser == "passing":  # as one that fails sooner than its controller alone
+    if how == "passing":  # as one of which is known that it fails sooner than the controller alone
         guard._why_passing = lambda: "shadow"
-    with opened(guard=guard, on=reviser != "off") as session:
+    with opened(guard=guard, on=how != "off") as session:
         frames, start = drive(session), session.start
     changed = sum(frame.executed != frame.proposed for frame in frames)
     told = [tell(frame, start) for frame in frames]
@@ -165,6 +165,7 @@ def test_every_sentence_says_what_was_so(reviser, idle):
     # What was judged.
     assert {one.status for one in told[:-1]} <= {"safe", "danger", "averted", "dead end"}
     assert ("averted" in {one.status for one in told}) == (not idle)
+    assert not any("Nothing was judged" in one.why for one in told)
     # What came of it: truly, and never slower than the leader.
     last = frames[-1]
     hit, closing = last.cars.gap <= 0.0, last.cars.v_follower - last.cars.v_leader
@@ -172,6 +173,10 @@ def test_every_sentence_says_what_was_so(reviser, idle):
     assert (f"Collision at {last.time:.1f}" in told[-1].outcome) == hit
     assert (f"{closing:.1f} m/s faster than the leader" in told[-1].outcome) == hit
     assert "−" not in told[-1].outcome
+    # What is said before it begins.
+    intro, learning = introduce(start).values()
+    assert "replaces actions" in intro
+    assert "goes on learning" in learning
 
 
 # -- A log of others ------------------------------------------------------------------------------

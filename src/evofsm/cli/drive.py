@@ -68,7 +68,7 @@ def drive(
     vehicles: Annotated[
         str, option("Of a SUMO configuration: all, a share, type:NAME, or ids with commas.")
     ] = "10%",
-    mcap: Annotated[Path | None, option("Log every decision for Foxglove.")] = None,
+    mcap: Annotated[Path | None, option("Log every episode for Foxglove.")] = None,
     as_json: Json = False,
 ) -> int | None:
     """Drive scenarios under a safety filter, which learns on the way.

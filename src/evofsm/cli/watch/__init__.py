@@ -1,4 +1,4 @@
-"""`evofsm watch`: a run in the browser, while it is driven, or a log."""
+"""`evofsm watch`: a run in the browser, while it is driven, or a log of others."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ async def _serve(watched: Session, port: int, *, browse: bool) -> None:
 
     async with LivePage(port) as page:
         page.player = Player(watched, page, awaits=True)
-        may = "steer the run" if watched.start.mode == "live" else "look on"
+        may = "steer the run" if watched.start.live else "look on"
         say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
         print(f"  {page.address}", flush=True)
         if browse:

@@ -7,12 +7,10 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from evofsm.cli.watch.session import Session
 from evofsm.cli.watch.shown import Frame
-
-if TYPE_CHECKING:
-    from evofsm.cli.watch.session import Session
 
 # Between two graphs, unless a state was created [decisions].
 _GRAPH_EVERY = 8

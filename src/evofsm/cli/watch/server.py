@@ -21,7 +21,7 @@ from typing import Any, Self
 import msgspec
 
 from evofsm.cli.watch.player import Player
-from evofsm.cli.watch.shown import LIVE, Frame, Start
+from evofsm.cli.watch.shown import Frame, Start
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.extras import needs
 
@@ -59,7 +59,7 @@ def message(kind: str, what: Any, start: Start | None = None) -> str:
     """
     body: dict[str, Any] = what._asdict() if hasattr(what, "_asdict") else {"text": what}
     if isinstance(what, Start):
-        body |= {"live": what.mode == LIVE, **introduce(what)}
+        body |= introduce(what)
     elif isinstance(what, Frame):
         assert start is not None
         story, danger = what.story, what.story.danger
@@ -191,7 +191,7 @@ class LivePage:
                 self.player.set(paused=True, steps=True)
             case ("speed", float(speed)) if speed in self._start.speeds:
                 self.player.set(speed=speed)
-            case ("revise", bool(on)) if self._start.mode == LIVE:
+            case ("revise", bool(on)) if self._start.live:
                 self.player.revise(on)
             case ("restart", None):
                 self.player.restart()

@@ -419,7 +419,7 @@ class Logged:
         self._played = [played[number] for number in order]
         self.places = {number + 1: place for place, number in enumerate(order)}
         self.cases = tuple(part.called for part in self._played)
-        self.told: dict[str, Any] = {"mode": "shadow", "acts": acts}
+        self.told: dict[str, Any] = {"live": False, "acts": acts}
         if not of_cars:  # which move in real time
             pace = _A_SECOND * self.interval
             every = np.concatenate([part.rows.observations for part in played])

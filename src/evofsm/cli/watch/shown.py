@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from evofsm.driving import LatentRisk, dead_ends_of
 from evofsm.driving.measures import TimeHeadway, TimeToCollision, time_headway, time_to_collision
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.model import FSMModel
 from evofsm.guard import Foresight, LearningJudge, LearntRisk
 from evofsm.guard.learnt.failure import SAYS, SIZE, B, I, J, are_sides, inside, telling
 from evofsm.guard.learnt.rollout import FAILS
@@ -28,8 +27,6 @@ _MOST_WAYS, _LEAST_SHARE = 3, 0.02
 # Observations of what was survived that are shown.
 _MOST_SURVIVED = 500
 
-#: A run that is driven now (`Start.mode`).
-LIVE = "live"
 #: What is observed of cars.
 OF_CARS = ("gap [m]", "follower's speed [m/s]", "leader's speed [m/s]")
 #: Danger is over once wishes were tolerable for so long [s].
@@ -96,7 +93,7 @@ class Start(NamedTuple):
     high: tuple[float, ...]
     judge: str  #: by what it was told, a name of `evofsm.driving.cars.TOLD`
     learnt: int = 0  #: episodes learnt from before
-    mode: str = LIVE  #: or ``"shadow"``, of a log
+    live: bool = True  #: whether it is driven now; a log only is looked on at
     fails: str = ""  #: who says that it failed, where a record does
     discrete: bool = False  #: whether an action is an index
     cars: bool = True  #: whether they are cars
@@ -192,9 +189,7 @@ class Graph(NamedTuple):
     transitions: tuple[tuple[int, int, float], ...] = ()
 
 
-def graph_of(
-    known: EvolvingFSM | FSMModel, judge: LearningJudge | None = None, number: int = 0
-) -> Graph:
+def graph_of(known: EvolvingFSM, judge: LearningJudge | None = None, number: int = 0) -> Graph:
     """The states, and their usual ways out, from a frame on.
 
     Only a `LatentRisk` says which are dead ends; else those are marked in which a failure ended.

@@ -8,20 +8,22 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import NamedTuple
 
-from evofsm.cli.watch.shown import LIVE, Danger, Frame, Start, Story
+from evofsm.cli.watch.shown import Danger, Frame, Start, Story
 from evofsm.fsm.validation import action_name, counted
 from evofsm.guard.actions import action_text
 
 # Changes of speed that are smaller are "at the same speed" [m/s], and softer accelerations none.
 _EQUAL_SPEED, _HARDLY = 0.5, 0.3
-# What the reviser does in a run, or in a log, by its mode.
-_INTRODUCED = {
-    LIVE: "The reviser, a safety filter that learns on the way, replaces actions that it finds too "
-    "risky; switched off, it only watches.",
-    "shadow": "This was recorded. The reviser, a safety filter, did not act; it says which actions "
-    "it would have replaced.",
-    "alone": "This was recorded, and nobody acts. A guard that learnt from the log alarms.",
-}
+# What the reviser does in a run, beside what a log says was done, and where nobody acts.
+_LIVE = (
+    "The reviser, a safety filter that learns on the way, replaces actions that it finds too "
+    "risky; switched off, it only watches."
+)
+_BESIDE = (
+    "This was recorded. The reviser, a safety filter, did not act; it says which actions it would "
+    "have replaced."
+)
+_ALONE = "This was recorded, and nobody acts. A guard that learnt from the log alarms."
 # Components of an action that are told.
 _COMPONENTS = 3
 # A number and its unit stay on one line.
@@ -54,12 +56,11 @@ class Told(NamedTuple):
 
 def introduce(start: Start) -> dict[str, str]:
     """What is said of a run before it begins: what the reviser does in it, and what was learnt."""
-    before = f"Learnt from {start.learnt} episodes before" if start.learnt else "Began from empty"
-    note = f"{before}, and goes on learning."
-    if start.mode != LIVE:
+    if not start.live:
         note = "Recorded: the states as they were at its end."
-    mode = start.mode if start.acts else "alone"
-    return {"intro": _INTRODUCED[mode], "learning": note}
+        return {"intro": _BESIDE if start.acts else _ALONE, "learning": note}
+    before = f"Learnt from {start.learnt} episodes before" if start.learnt else "Began from empty"
+    return {"intro": _LIVE, "learning": f"{before}, and goes on learning."}
 
 
 def tell(frame: Frame, start: Start) -> Told:
@@ -166,7 +167,7 @@ def _why(began: Frame, start: Start) -> str:
         text = f"{at}, the driver wanted {_wish(began.proposed[0])}"
     if began.why:
         return f"{text}: a risk of {risk.risk:.0%}. After that {began.why}."
-    if cars is None or math.isnan(risk.critical):
+    if cars is None:
         return f"{text}: a risk of {risk.risk:.0%}."
     return (
         f"{text}. After that, not even braking in full (by {cars.decel:.1f} m/s²) would avoid "

@@ -94,7 +94,7 @@ function showControls() {
 
 function showMode() {
   at("live").hidden = run.isLive;
-  const mode = !run.isLive ? "past" : run.clock.over ? "ended" : run.clock.paused ? "paused" : run.start.mode;
+  const mode = !run.isLive ? "past" : run.clock.over ? "ended" : run.clock.paused ? "paused" : run.start.live ? "live" : "shadow";
   if (socket.readyState === WebSocket.OPEN) at("mode").textContent = mode;
   at("time").textContent = clock(run.shown, run.start);
   const scrub = at("scrub");
