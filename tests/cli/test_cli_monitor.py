@@ -169,7 +169,6 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         (("--udp", 0, "--socket", "x"), "give one of FILE, --socket, --udp and --zenoh"),
         (("--guard", "nowhere"), "nowhere: no such file or directory"),
         (("nowhere.jsonl",), "nowhere.jsonl: no such file or directory"),
-        (("--heartbeat", 0), "--heartbeat"),
         (("--interval", -1), "interval"),
         (("--tolerance", 2), "tolerance is 2"),
         (("--guard", "nowhere", "--brakes", 5), "nowhere has learnt its own"),
@@ -216,7 +215,7 @@ def test_streams_that_are_closed_or_do_not_wait_end_it_in_a_line_or_not_at_all()
         assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
         assert f"standard {name} is closed" in done.stderr
     (source, feed), (drain, sink) = os.pipe(), os.pipe()
-    with started("--heartbeat", "1e10", stdin=source, stdout=sink) as process:
+    with started(stdin=source, stdout=sink) as process:
         os.write(feed, ROWS[0] + b"\n")
         out = os.read(drain, 1 << 16)
         for shared in (source, sink):  # as who shares them with it may do at any time

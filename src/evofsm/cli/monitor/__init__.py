@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from contextlib import ExitStack, nullcontext
 from functools import partial
@@ -86,9 +85,6 @@ def monitor(
         int | None, option("Listen to this port on 127.0.0.1; 0 for any.", min=0, max=65535)
     ] = None,
     zenoh: Annotated[str | None, option("Rows at KEY/row, answers at KEY/decision.")] = None,
-    heartbeat: Annotated[
-        float | None, option("Send a heartbeat after so long without a row [s].", min=0.001)
-    ] = None,
     text: Annotated[
         bool, option("Print alarms and failures alone, in words, for people.", "--text")
     ] = False,
@@ -251,7 +247,7 @@ def monitor(
             if decider.n:
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
         line = Text().line if text else json_line
-        server = Server(decider, heartbeat or math.inf, keeps=keeper is not None, line=line)
+        server = Server(decider, keeps=keeper is not None, line=line)
         transport, where = _transport(file, socket, udp, zenoh, stack)
         warn(notice)
         if slots is not None and (log_options := given_of(reader)):

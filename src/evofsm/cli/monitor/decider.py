@@ -73,7 +73,6 @@ class Decider:
         self.form = Form(guard, self.slots.keys, *self.slots.clock)
         self.keep: Callable[[Taken], None] = lambda taken: None
         self.n = 0  #: decisions so far
-        self.refused = 0  #: messages that were refused, since the process began
         self.rows = 0  #: decisions of the episode under way; 0 where none is
         self.decided_on: Row | None = None  #: latest
         self._recent: deque[tuple[Message, Answer]] = deque(maxlen=_RECENT)
@@ -103,7 +102,6 @@ class Decider:
         """
         try:
             if (json_line := self._csv.read(line)) is None:
-                self.refused += bool(self._csv.unread)
                 return self._of("waiting", alarm=self._alarm, reason=self._csv.unread or NO_ROW)
             message = self.form.read(json_line)
             beyond = self.guard.beyond(np.array(message.observation or (), np.float64))
@@ -158,16 +156,8 @@ class Decider:
 
     def error(self, about: str, what: str, time: float | None = None) -> Answer:
         """What is answered where a message is refused."""
-        self.refused += 1
         when = {} if time is None else {"time": time}
         return self._of("error", **when, about=about, error=what)
-
-    def heartbeat(self, silent: float) -> Answer:
-        """What is said where nothing came for so long [s]."""
-        time = self.latest.time if isinstance(self.latest, Row) else None
-        return self._of(
-            "heartbeat", time=time, silent=silent, refused=self.refused, mode=self.mode.value
-        )
 
     def _of(self, kind: str, **said: Any) -> Answer:
         return {"schema": SCHEMA, "kind": kind, "n": self.n, **said}

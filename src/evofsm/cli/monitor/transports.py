@@ -42,12 +42,11 @@ def json_line(answer: Answer) -> bytes:
 
 
 class Server:
-    """A decider that threads share: lines in, lines out, a sign of life where nothing comes."""
+    """A decider that threads share: lines in, lines out."""
 
     def __init__(
         self,
         decider: Decider,
-        heartbeat: float = math.inf,
         *,
         keeps: bool = False,
         line: Callable[[Answer], bytes] = json_line,
@@ -55,8 +54,7 @@ class Server:
         self.decider = decider
         self._line = line  # of an answer
         self.keeps = keeps  #: what waits as the input ends, for whoever goes on
-        self.heartbeat = heartbeat  #: where so long nothing came, it says that it is there [s]
-        self._heard = self._said = time.monotonic()
+        self._heard = time.monotonic()
         self._turn = threading.Lock()
         self._over, self._ends = threading.Event(), False
         self._failure: Exception | None = None
@@ -66,7 +64,7 @@ class Server:
         with self._turn:
             going_on = takewhile(lambda _: not self._ends, lines)
             answers = b"".join([self._line(self.decider.answer(line)) for line in going_on])
-            self._heard = self._said = time.monotonic()
+            self._heard = time.monotonic()
         return answers
 
     def converse(self, read: Callable[[int], bytes], write: Callable[[bytes], object]) -> None:
@@ -95,16 +93,14 @@ class Server:
     def run(self, transport: Transport) -> None:
         """Serve until the input ends, or SIGTERM, SIGHUP or Ctrl-C comes; no decision is cut short.
 
-        This thread waits and gives signs of life; another one reads.
+        This thread waits, and decides on what waits; another one reads.
         """
         threading.Thread(target=self._serve, args=(transport,), daemon=True).start()
         try:
             with _stoppable():
-                while not self._over.wait(min(self._patience(), _LONGEST_WAIT)):
+                while not self._over.wait(_LONGEST_WAIT):
                     if time.monotonic() - self._heard > (self.decider.slots.step or math.inf):
                         transport.send(self._lapse())
-                    if self._patience() == 0.0:
-                        transport.send(self._beat())
         finally:
             self._ends = True  # after the message under way
             self._turn.acquire()  # for good: nothing is decided any more
@@ -121,20 +117,11 @@ class Server:
             self._failure = error
         self._over.set()
 
-    def _patience(self) -> float:
-        """Time until a sign of life is due [s]."""
-        return max(0.0, self._said + self.heartbeat - time.monotonic())
-
     def _lapse(self) -> bytes:
         """What is decided on rows that wait, as nothing comes."""
         with self._turn:
             answer = self.decider.lapse()
         return b"" if answer is None else self._line(answer)
-
-    def _beat(self) -> bytes:
-        with self._turn:
-            self._said = time.monotonic()
-            return self._line(self.decider.heartbeat(round(self._said - self._heard, 3)))
 
 
 @contextmanager
