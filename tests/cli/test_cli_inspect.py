@@ -67,13 +67,11 @@ def test_a_far_observation_is_never_seen(evofsm, tmp_path):
     assert json.loads(told)["situations"][0]["never_seen"] is True
 
 
-def test_what_a_guard_has_learnt_is_said_and_drawn(evofsm, refused, tmp_path):
+def test_what_a_guard_has_learnt_is_said_and_drawn(evofsm, tmp_path):
     guard, file, drawn = Guard(-1.0, 1.0, interval=0.1), tmp_path / "guard", tmp_path / "x.svg"
     guard.decide([5.0, 0.3], proposal=1.0)
     guard.end(failed=True, observation=[5.0, 0.6])
     guard.save(file)
-    said = evofsm("inspect", file, "--plot", drawn, "--axes", "variable 2,variable 1").stdout
+    said = evofsm("inspect", file, "--plot", drawn).stdout
     assert "experience    fails where variable 2 is above 0.3" in said
     assert "<svg" in drawn.read_text()
-    evofsm("inspect", file, "--plot", drawn, "--axes", "variable 2 [m],variable 1")  # with units
-    assert "name two of variable 1" in refused("inspect", file, "--plot", drawn, "--axes", "x")

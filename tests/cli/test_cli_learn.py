@@ -65,7 +65,7 @@ def test_options_reach_the_machine_and_the_log(evofsm, tmp_path):
     path.write_text("\n".join(["x,light,u", *rows, ""]))
     result = evofsm(
         *("learn", path, "--observe", "x,light=red/green", "--action", "u", "--dt", "0.5"),
-        *("--action-range", "0:3:1", "--radius", "0.5", "--spread", "0.01", "--max-states", 9),
+        *("--action-range", "0:3:1", "--max-states", 9),
         *("--episode", "", "--out", model),
     )
     assert result.exit_code == 0
@@ -308,10 +308,7 @@ def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, refused, tmp_
     [
         ([], Paper()),
         (["--rule", "novelty"], Novelty(1.0, (4.0, 2.0, 2.0))),
-        (
-            ["--rule", "novelty", "--radius", "2", "--spread", "0.5", "--scale", "gap=8"],
-            Novelty(2.0, (8.0, 2.0, 2.0), 0.5),
-        ),
+        (["--rule", "novelty", "--scale", "gap=8"], Novelty(1.0, (8.0, 2.0, 2.0))),
     ],
 )
 def test_another_rule_is_told_by_its_name(evofsm, crashes, tmp_path, options, rule):
@@ -346,12 +343,12 @@ def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
 
 
 def test_at_most_twenty_states_are_listed(evofsm, log, tmp_path):
-    told = evofsm("learn", log, "--rule", "novelty", "--radius", "0.2", "--out", tmp_path / "m")
+    scales = ("--scale", "gap=0.8", "--scale", "v_follower=0.4", "--scale", "v_leader=0.4")
+    told = evofsm("learn", log, "--rule", "novelty", *scales, "--out", tmp_path / "m")
     states = [line for line in told.stdout.splitlines() if line.startswith("#") and "→" not in line]
     n_states = FSMModel.load(tmp_path / "m").n_states
     assert len(states) == 20 < n_states
     assert f"and {n_states - 20} more states, together" in " ".join(told.stdout.split())
-    assert "rule novelty (--rule), radius 0.2" in " ".join(told.stdout.split())
 
 
 @pytest.mark.parametrize(

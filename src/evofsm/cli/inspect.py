@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from evofsm.cli.options import Json, Saved, option, picture, quoted, reading_of, split_names, typed
+from evofsm.cli.options import Json, Saved, option, picture, quoted, reading_of, typed
 from evofsm.cli.show import facts, print_json, say, show, table
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ _UNTOLD = (
 def inspect(
     file: Saved,
     plot: Annotated[Path | None, option("File for a picture: PNG, PDF, SVG.")] = None,
-    axes: Annotated[str | None, option("Two variables, of --plot.")] = None,
     log: Annotated[str | None, option("A log to show beneath, of --plot.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -49,7 +48,7 @@ def inspect(
     if plot is not None:
         title = f"States of {file.name}" + (f" over {Path(log).name}" if log else "")
         rows = _logged(log, model, provenance.get("read with", {}))
-        _draw(model, guard, plot, axes, rows, title)
+        _draw(model, guard, plot, rows, title)
     experience = getattr(guard and guard.judge, "told_by_experience", None)
     pairs = [] if experience is None else [("experience", str(experience))]
     if as_json:
@@ -112,9 +111,7 @@ def _logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> d
     return {"rows": every[is_shown], "failed": failures[is_shown]}
 
 
-def _draw(
-    model: FSMModel, guard: Guard | None, out: Path, axes: str | None, logged: Any, title: str
-) -> None:
+def _draw(model: FSMModel, guard: Guard | None, out: Path, logged: Any, title: str) -> None:
     """States in the plane of two variables, and what a guard has learnt of failure."""
     import numpy as np
 
@@ -122,11 +119,6 @@ def _draw(
     from evofsm.guard import Foresight, LearntRisk
     from evofsm.guard.learnt.failure import telling
 
-    names = [model.labels.variable(k).split(" [")[0] for k in range(model.n_variables)]
-    requests = [name.split(" [")[0] for name in split_names(axes or "")]
-    pair: Any = [names.index(name) for name in requests if name in names]
-    if len(pair) != 2 * (axes is not None):
-        raise ValueError(f"--axes is {axes}; name two of {', '.join(names)}")
     judge, order = guard and guard.judge, list[int]()
     if isinstance(judge, Foresight):
         rate = judge.alarm
@@ -137,12 +129,12 @@ def _draw(
     with picture(out, 7.2, 5.0) as figure:
         figure.suptitle(title, x=0.01, ha="left")
         if guard is not None and isinstance(judge, LearntRisk):
-            plot.experience(guard, figure.subplots(), variables=pair or None)
+            plot.experience(guard, figure.subplots())
         elif model.n_variables == 1:
             plot.graph(model, figure.subplots())
         else:
-            pair = pair or [*dict.fromkeys(order)][:2]
-            plot.states(model, figure.subplots(), variables=pair, ways=True, **logged)
+            first, second = [*dict.fromkeys(order)][:2]
+            plot.states(model, figure.subplots(), variables=(first, second), ways=True, **logged)
 
 
 # -- As a whole -----------------------------------------------------------------------------------

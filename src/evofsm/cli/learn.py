@@ -24,7 +24,6 @@ from evofsm.cli.options import (
     argument,
     given_of,
     imported,
-    in_quotes,
     option,
     reads_logs,
     refuse_other_limit,
@@ -42,12 +41,6 @@ if TYPE_CHECKING:
 
 
 _MOST_ACTIONS = 1000
-# What is said of an option that a log seems to need.
-_UNASKED = {
-    "--resample": "some steps are longer or shorter, and begin an episode each",
-    "--where": "the machine seems to stand still in some rows",
-    "--failed": "nothing says what failed; perhaps",
-}
 
 
 @reads_logs
@@ -62,14 +55,10 @@ def learn(
     rule: Annotated[
         str, option("Rule of states: paper, novelty (for logs), or module:Name.")
     ] = "paper",
-    radius: Annotated[
-        float | None, option("How far states lie apart. [default: 0.3; of novelty 1.0, in --scale]")
-    ] = None,
     scale: Annotated[
         list[str] | None,
         option("Novelty: the difference that counts as 1, by column: gap=4. May be repeated."),
     ] = None,
-    spread: Annotated[float | None, option("Width of recognition. [default: 3; novelty 1]")] = None,
     max_states: Annotated[
         int | None, option("At so many, two are merged for each new one.")
     ] = None,
@@ -106,8 +95,7 @@ def learn(
     _check_out(out)
     _check_out(guard, "--guard")
     columns, lengths, _, acts = read = reading()
-    hints = _look_first(files, read)
-    if hints is None:
+    if _is_looked_at(files, read):
         if out or guard or given_of(reading):
             raise ValueError(f"say what is observed in {files[0]}: --observe; a way stands above")
         return
@@ -116,7 +104,7 @@ def learn(
     refuse_other_limit(acts, false_a_day, None if tolerance == TOLERANCE else tolerance)
     actions = _actions(action_range if acts else "0:1:1")
     encoder = columns.observe
-    machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
+    machine = _machine(actions.n_actions, rule, scale, max_states, encoder)
     kind = None if guard is None else _judge_of(judge if acts else "learnt", columns)
     notes = Noted()
     sources = [{"name": file, "bytes": _size(file)} for file in files]
@@ -129,7 +117,7 @@ def learn(
     log_chunks: list[Chunk] | None = [] if guard is not None and not acts else None
     with progress("Learning", sum(file["bytes"] for file in sources)) as move:  # type: ignore[misc]
         traces = read.traces(files, notes, lambda count: move(advance=count))
-        chunks = _saying(traces, hints, log_chunks)
+        chunks = traces if log_chunks is None else _kept(traces, log_chunks)
         lesson = learn_traces(chunks, machine, actions, encoder.names, units_read)
     provenance = {"files": sources, "rows": lesson.read.rows, "episodes": lesson.read.episodes}
     provenance |= {"transitions": lesson.transitions, "failures": lesson.read.failures}
@@ -197,8 +185,6 @@ def _actions(text: str) -> IntervalActions:
 def _machine(
     n_actions: int,
     rule: str,
-    radius: float | None,
-    spread: float | None,
     scale: list[str] | None,
     max_states: int | None,
     encoder: ObservationEncoder,
@@ -209,12 +195,11 @@ def _machine(
     if scale and rule != "novelty":
         raise ValueError(f"--scale is for --rule novelty, not {rule}")
     if rule == "novelty":
-        width = {} if spread is None else {"spread": spread}
-        novelty = Novelty(1.0 if radius is None else radius, _scales(scale, encoder), **width)
-        return EvolvingFSM(n_actions, rule=novelty, max_states=max_states)
-    part = imported(rule) if ":" in rule else rule_named(rule)
+        part: Any = Novelty(1.0, _scales(scale, encoder))
+    else:
+        part = imported(rule) if ":" in rule else rule_named(rule)
     state_rule = part() if isinstance(part, type) else part
-    return EvolvingFSM(n_actions, radius, spread=spread, max_states=max_states, rule=state_rule)
+    return EvolvingFSM(n_actions, max_states=max_states, rule=state_rule)
 
 
 def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]:
@@ -291,55 +276,28 @@ def _check_out(out: Path | None, option: str = "--out") -> None:
             raise ValueError(f"{option} {out}: {fault}") from None
 
 
-def _look_first(files: list[str], reading: Reading) -> list[str] | None:
-    """What a log seems to need that was not asked for; None where a way to learn was printed."""
-    from evofsm.cli.look import look_at
+def _is_looked_at(files: list[str], reading: Reading) -> bool:
+    """Whether nobody said what is observed in a log of no cars; then what it holds was printed."""
     from evofsm.driving.naming import VARIABLES
     from evofsm.io.logs import open_table
-    from evofsm.io.tables import CsvTable, ParquetTable, Skips, explained, silent
+    from evofsm.io.tables import CsvTable, ParquetTable, Skips, silent
 
-    columns, file = reading.columns, files[0]
-    table = open_table(file, columns, reading.lengths, silent, reading.topics, Skips(), [])
-    if not isinstance(table, CsvTable | ParquetTable):
-        return []
-    contents, options, before = look_at(table)
-    could = dict(options)
-    if columns.observe.names == VARIABLES and not {*VARIABLES} & {*table.columns}:
-        title, names = f"What {file} holds", files
-        if len(files) > 1:
-            title += f", the first of {len(files):,} files; the others were not looked at"
-        if not options:
-            show(facts(title, contents))
-            texts = (explained(table.first(n)) for n in table.columns if table.holds(n) == "text")
-            why = next((f": {text}" for text in texts if "thousands" in text), "")
-            raise ValueError(f"{file} has no column of numbers that change{why}")
-        to_file = "--guard" if "--failed" in could else "--out"
-        options.append((to_file, f"{to_file[2:]}.evofsm"))
-        show(facts(title, contents), "\nA way to learn from it:")
-        if before and len(files) == 1:
-            kind = "csv" if isinstance(table, CsvTable) else "parquet"
-            how = f", separator={table.separator!r}, infer_schema=False" * (kind == "csv")
-            names = [f"{Path(file).name.partition('.')[0]}-sorted.{kind}"]
-            code = f"p.read_{kind}({file!r}{how}){before}.write_{kind}({names[0]!r})"
-            print(f"  python -c {in_quotes(f'import polars as p; {code}')}")
-        command = [f"evofsm learn {' '.join(map(quote, names))}"]
-        command += (f"{a} {in_quotes(b)}" for a, b in options)
-        print("  " + " \\\n      ".join(command), flush=True)
-        return None
-    answers = columns.longest_hole or columns.dt, columns.where or columns.no_leader, columns.failed
-    questions = zip(_UNASKED.items(), answers, strict=True)
-    return [
-        f"{why}: {a} {in_quotes(could[a])}" for (a, why), b in questions if b is None and a in could
-    ]
+    columns = reading.columns
+    if columns.observe.names != VARIABLES:
+        return False
+    table = open_table(files[0], columns, reading.lengths, silent, reading.topics, Skips(), [])
+    if not isinstance(table, CsvTable | ParquetTable) or {*VARIABLES} & {*table.columns}:
+        return False
+    from evofsm.cli.look import show_look
+
+    show_look(files, table)
+    return True
 
 
-def _saying(chunks: Iterable[Chunk], lines: list[str], kept: list[Chunk] | None) -> Iterator[Chunk]:
-    """The same chunks, kept if asked; lines are said once something can be read."""
+def _kept(chunks: Iterable[Chunk], kept: list[Chunk]) -> Iterator[Chunk]:
+    """The same chunks, which are kept."""
     for chunk in chunks:
-        while lines:
-            warn(lines.pop(0))
-        if kept is not None:
-            kept.append(chunk)
+        kept.append(chunk)
         yield chunk
 
 

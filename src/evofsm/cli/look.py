@@ -6,15 +6,18 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
+from pathlib import Path
+from shlex import quote
 
 import numpy as np
 import polars
 from numpy.typing import NDArray
 
 from evofsm.cli.options import in_quotes, quoted, seconds
+from evofsm.cli.show import facts, show
 from evofsm.guard.foresight import span
 from evofsm.io.logs import LONGEST_STEP, SKIPPED, USUAL_EPISODE, are_unusual, hours_unsaid
-from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, is_date
+from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, explained, is_date
 
 Pairs = list[tuple[str, str]]
 Floats = NDArray[np.float64]
@@ -44,6 +47,31 @@ _WHO = re.compile("ma(sch|ch)ine|device|ger(ä|ae)t|asset|unit|anlage|pump|motor
 _CODE = re.compile(f"{_FAILURE.pattern}|stat|zustand|code", re.IGNORECASE)
 _LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 30min 1h 5h 10h 1d"
 _NICE = [(seconds("", text), text) for text in _LONG.split()]
+
+
+def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
+    """Print what is in the first of some logs, and a way to learn from them."""
+    file, title = files[0], f"What {files[0]} holds"
+    contents, options, before = look_at(table)
+    if len(files) > 1:
+        title += f", the first of {len(files):,} files; the others were not looked at"
+    show(facts(title, contents))
+    if not options:
+        texts = (explained(table.first(n)) for n in table.columns if table.holds(n) == "text")
+        why = next((f": {text}" for text in texts if "thousands" in text), "")
+        raise ValueError(f"{file} has no column of numbers that change{why}")
+    to_file = "--guard" if any(name == "--failed" for name, _ in options) else "--out"
+    options.append((to_file, f"{to_file[2:]}.evofsm"))
+    print("\nA way to learn from it:")
+    if before and len(files) == 1:
+        kind = "csv" if isinstance(table, CsvTable) else "parquet"
+        how = f", separator={table.separator!r}, infer_schema=False" * (kind == "csv")
+        files = [f"{Path(file).name.partition('.')[0]}-sorted.{kind}"]
+        code = f"p.read_{kind}({file!r}{how}){before}.write_{kind}({files[0]!r})"
+        print(f"  python -c {in_quotes(f'import polars as p; {code}')}")
+    command = [f"evofsm learn {' '.join(map(quote, files))}"]
+    command += (f"{name} {in_quotes(value)}" for name, value in options)
+    print("  " + " \\\n      ".join(command), flush=True)
 
 
 def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
