@@ -73,13 +73,13 @@ def shown():
     from evofsm.cli.watch.server import LivePage
 
     @contextmanager
-    def show(opened, port=0, **settings):
+    def show(opened, **settings):
         served = queue.Queue()
 
         async def serve():
             try:
                 with opened() as watched:
-                    async with LivePage(port) as page:
+                    async with LivePage() as page:
                         page.player = Player(watched, page, **settings)
                         stop = asyncio.Event()
                         playing = asyncio.create_task(page.player.play())

@@ -14,10 +14,14 @@ pytest.importorskip("playwright.sync_api")
 
 from playwright import sync_api as playwright
 
+from evofsm.cli.foreseen import guard_where_nobody_acts
+from evofsm.cli.learning import episodes_read
 from evofsm.cli.options import reading_of
 from evofsm.cli.watch.logged import watched_log
 from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_guard
 from evofsm.driving import KinematicWorld, load_family
+from evofsm.fsm import EvolvingFSM, Labels
+from evofsm.io.logs import Noted
 
 PAPER = load_family("paper")
 DISC = str(Path(__file__).parents[2] / "examples/watched_disc.py")
@@ -73,7 +77,10 @@ def logged():
         path.write_text("\n".join(lines))
         failed = '"a variable of a long name">78'
         reading = reading_of("a variable of a long name,load", "", "t", failed=failed)
-        with watched_log(str(path), reading, None) as opened:
+        episodes = [*episodes_read(str(path), reading, Noted(), dated=True)]
+        labels = Labels(names=reading.columns.observe.names)
+        guard = guard_where_nobody_acts(episodes, labels, None, 0.0, None, EvolvingFSM(1))
+        with watched_log(str(path), reading, guard=guard) as opened:
             yield opened
 
 

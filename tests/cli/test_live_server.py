@@ -135,13 +135,11 @@ def test_a_socket_needs_the_token_and_an_origin_of_its_own(page):
         connect(f"ws://127.0.0.1:{page.port}/{page.token}/socket", proxy=None)
 
 
-def test_it_listens_on_this_computer_only_and_a_port_that_is_taken_is_said(page, shown):
+def test_it_listens_on_this_computer_only(page, shown):
     own = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
     for address in {*own, "127.0.0.2"} - {"127.0.0.1", "127.0.1.1"}:
         with pytest.raises(ConnectionRefusedError):
             socket.create_connection((address, page.port), timeout=5).close()
-    with pytest.raises(OSError, match="address already in use"), shown(session, port=page.port):
-        pass
     with shown(session) as other:
         assert page.token != other.token
         assert len(page.token) >= 32

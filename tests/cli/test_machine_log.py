@@ -360,10 +360,13 @@ def test_a_guard_from_zero_of_who_acts_learns_what_fails(evofsm, acts):
     assert re.search(r"fails where x is (below -1|above 1) or x is (below -1|above 1);", told)
 
 
-def test_a_log_of_any_machine_is_watched(written):
+def test_a_log_of_any_machine_is_watched(evofsm, written):
     asked = {"time": "Zeit", "resample": "20s", "hole": "5min", "failed": "Status==Störung"}
     asked |= {"observe": f'"{VIBRATION}",{BEARING}', "where": "Drehzahl>100", "action": ""}
-    with watched_log(written("parquet"), reading_of(**asked), None) as shown:
+    path, reading = written("parquet"), reading_of(**asked)
+    words = [word for name, value in asked.items() for word in (f"--{name}", value)]
+    assert evofsm("learn", path, *words, "--guard", "guard.evofsm").exit_code == 0
+    with watched_log(path, reading, guard=Guard.load("guard.evofsm")) as shown:
         first, second, *_, last = shown.start.cases
         assert first == "episode 1, 2025-03-10 06:00:20 (alarm, failure)"
         assert (second, last[:12]) == ("episode 2, 2025-03-10 06:29", "episode 14, ")
@@ -385,5 +388,5 @@ def test_a_log_of_any_machine_is_watched(written):
         while not (frame := shown.step()).over:
             assert tell(frame, shown.start).headline == "No alarm"
         assert tell(frame, shown.start).why == "No limit of its alarm was passed."
-    with pytest.raises(ValueError, match="no episode failed, so"):
-        watched_log(written("parquet"), reading_of(**asked | {"failed": None}), None)
+    with pytest.raises(ValueError, match="is of no cars: --guard names a guard"):
+        watched_log(path, reading)

@@ -53,15 +53,12 @@ def watch(
     world: InWorld = "kinematic",
     judge: ByJudge = "kinematic",
     tolerance: Tolerance = TOLERANCE,
-    guard: Annotated[
-        Path | None, option("Of a log: a saved guard. [default: one that learns from it]")
-    ] = None,
+    guard: Annotated[Path | None, option("Of a log: a saved guard. [default: of cars]")] = None,
     seed: Seed = 0,
     learn_first: Annotated[int, option("Episodes to learn from before, at most.", min=0)] = 60,
     brakes: Brakes = BRAKES,
     *,
     reading: partial[Reading],
-    port: Annotated[int, option("Of the page; 0 for any that is free.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
 ) -> None:
     """Watch a run in the browser while it is driven, and act on it; or a log.
@@ -87,7 +84,7 @@ def watch(
             risk = None if tolerance == TOLERANCE else tolerance
             log_guard = None if guard is None else Guard.load(guard)
             try:
-                run = _logged(what, reader(), risk, case, log_guard, judge=judge, brakes=brakes)
+                run = _logged(what, reader(), risk, case, log_guard, brakes=brakes)
             except ValueError as error:
                 if given_of(reading) or "has no column" not in str(error):
                     raise
@@ -96,15 +93,15 @@ def watch(
             run = stack.enter_context(run)
         else:
             run = _driven(stack, what, case or 1, world, judge, tolerance, seed, learn_first)
-        asyncio.run(_serve(run, port, browse=not no_browser))
+        asyncio.run(_serve(run, browse=not no_browser))
     say("\nThe page is closed.")
 
 
-async def _serve(watched: Session, port: int, *, browse: bool) -> None:
+async def _serve(watched: Session, *, browse: bool) -> None:
     from evofsm.cli.watch.player import Player
     from evofsm.cli.watch.server import LivePage
 
-    async with LivePage(port) as page:
+    async with LivePage() as page:
         page.player = Player(watched, page, awaits=True)
         may = "steer the run" if watched.start.live else "look on"
         say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")

@@ -1,4 +1,4 @@
-"""A log, played row by row beside a guard: of cars, or one that has learnt from it."""
+"""A log, played row by row beside a guard."""
 
 from __future__ import annotations
 
@@ -7,21 +7,18 @@ from types import MappingProxyType
 
 import numpy as np
 
-from evofsm.cli.foreseen import date, guard_where_nobody_acts
-from evofsm.cli.learning import decided_on, episodes_read, guard_of_log, learn_chunk, teach
+from evofsm.cli.foreseen import date
+from evofsm.cli.learning import decided_on, episodes_read, learn_chunk
 from evofsm.cli.options import BRAKES, TOLERANCE, Reading, refuse_other_limit
 from evofsm.cli.show import progress, warn
-from evofsm.cli.watch.session import Logged, Played, Session, system_machine
+from evofsm.cli.watch.session import Logged, Played, Session
 from evofsm.driving.assumed import assumptions, guard_of_monitor
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
 from evofsm.guard import Foresight, Guard
 from evofsm.guard.foresight import DATES
 from evofsm.io.logs import LONGEST_STEP, Chunk, Noted
 
-# Intervals of an action.
-_INTERVALS = 17
 # Share by which the step of a log may differ from that of a guard.
 _OTHER_STEP = 0.1
 # More rows of cars are not watched, and fewer of an episode; times that differ by less are one [s].
@@ -35,19 +32,19 @@ def watched_log(
     case: int | None = None,
     guard: Guard | None = None,
     *,
-    judge: str = "kinematic",
     brakes: float = BRAKES,
     collisions: Mapping[str, Sequence[float]] = MappingProxyType({}),
 ) -> Session:
-    """The episodes of a log, with a guard; without one with one that learnt from all of them.
+    """The episodes of a log, with a guard; of cars without one with what `evofsm monitor` has.
 
     Of cars an episode is over with a contact; where they come apart again, another one begins. So
     it is with ``collisions`` that a simulation counted [s], by the name of who follows whom.
     ``case`` is the number of the episode to begin with, in the log and from 1.
     """
     names = reading.columns.observe.names
-    is_kinematic = reading.acts and judge == "kinematic" and len(names) == len(VARIABLES)
-    of_cars = is_kinematic or (reading.acts and names == VARIABLES)
+    of_cars = reading.acts and len(names) == len(VARIABLES) and (not guard or names == VARIABLES)
+    if guard is None and not of_cars:
+        raise ValueError(f"{path} is of no cars: --guard names a guard (evofsm learn --guard)")
     most = _ROWS_OF_CARS if of_cars else None
     episodes = episodes_read(path, reading, Noted(), dated=not of_cars, most=most)
     stretches = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
@@ -56,33 +53,23 @@ def watched_log(
         raise ValueError(f"{path}: {why} rows")
     if case is not None and not 1 <= case <= len(stretches):
         raise ValueError(f"episode is {case}; there are 1 to {len(stretches)}")
-    if guard is None and not (of_cars or any(stretch.fails for stretch in stretches)):
-        why = "no episode failed, so there is nothing to foresee; --failed says what did"
-        raise ValueError(f"{path}: {why}")
     labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
     rows = [stretch.rows for stretch in stretches]
     refuse_other_limit(reading.acts, None, tolerance)
-    risk = TOLERANCE if tolerance is None else tolerance
-    if guard is not None:
-        if tuple(names) != guard.variables or abs(rows[0].dt / guard.interval - 1.0) > _OTHER_STEP:
-            holds = f"{', '.join(names)} every {rows[0].dt:.4g} s"
-            wants = f"{', '.join(guard.variables)} every {guard.interval:.4g} s"
-            raise ValueError(f"{path} is read as {holds}; this guard decides on {wants}")
-        if tolerance is not None and not isinstance(guard.judge, Foresight):
-            guard.reviser.tolerance = tolerance  # type: ignore[attr-defined]
-    elif not reading.acts:
-        machine = system_machine(1, np.concatenate([chunk.observations for chunk in rows]))
-        for chunk in rows:
-            learn_chunk(machine, chunk, IntervalActions(0.0, 1.0, 1.0))
-        guard = guard_where_nobody_acts(rows, labels, None, 0.0, None, machine)
-    elif is_kinematic:
+    if guard is None:
+        risk = TOLERANCE if tolerance is None else tolerance
         guard = guard_of_monitor(rows[0].dt, brakes, risk)
         assert guard.machine is not None
         for chunk in rows:
             learn_chunk(guard.machine, chunk, guard.actions)
         warn(assumptions(brakes, risk))
     else:
-        guard = _learnt_guard(rows, labels, risk)
+        if tuple(names) != guard.variables or abs(rows[0].dt / guard.interval - 1.0) > _OTHER_STEP:
+            holds = f"{', '.join(names)} every {rows[0].dt:.4g} s"
+            wants = f"{', '.join(guard.variables)} every {guard.interval:.4g} s"
+            raise ValueError(f"{path} is read as {holds}; this guard decides on {wants}")
+        if tolerance is not None:
+            guard.reviser.tolerance = tolerance  # type: ignore[attr-defined]
     guard.learn = False
     if of_cars:
         stretches = list(_judged(guard, stretches))
@@ -143,16 +130,3 @@ def _judged(guard: Guard, found: Sequence[Played]) -> Iterator[Played]:
             risks = [revision.risk_proposed for revision in decided_on(guard, stretch.rows)]
             move(number)
             yield stretch._replace(risks=risks)
-
-
-def _learnt_guard(episodes: Sequence[Chunk], labels: Labels, tolerance: float) -> Guard:
-    deeds = np.concatenate([e.actions for e in episodes])
-    numbers = deeds[np.isfinite(deeds)]
-    low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (0.0, 1.0)
-    high = high if high > low else low + 1.0
-    actions = IntervalActions(low, high, (high - low) / _INTERVALS, outside="clip")
-    machine = system_machine(_INTERVALS, np.concatenate([e.observations for e in episodes]))
-    of = actions, machine, labels.names, labels.units
-    guard = guard_of_log("learnt", episodes[0].dt, BRAKES, tolerance, *of)
-    teach(guard, episodes, lambda done: None)
-    return guard

@@ -82,15 +82,12 @@ def _rounded(value: Any) -> Any:
 
 
 class LivePage:
-    """Serves a run to browsers on this computer, in ``async with``; the audience of a `Player`.
+    """Serves a run to browsers on this computer, in ``async with``; the audience of a `Player`."""
 
-    ``port`` may be 0, for any that is free.
-    """
-
-    def __init__(self, port: int = 0) -> None:
+    def __init__(self) -> None:
         self.token = secrets.token_urlsafe(24)
         self.player: Player | None = None  #: does what pages ask for
-        self.port = port  #: where it listens
+        self.port = 0  #: where it listens
         self._latest: dict[str, str] = {}  # messages of the present run, for who comes later
         self._frames: deque[str] = deque(maxlen=_MOST_FRAMES)
         self._clients: set[ServerConnection] = set()
@@ -107,7 +104,7 @@ class LivePage:
         self._server = await serve(
             self._attend,
             _HOST,
-            self.port,
+            0,  # any port that is free
             process_request=self._answer,
             compression=None,
             max_size=_LONGEST_COMMAND,
