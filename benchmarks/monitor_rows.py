@@ -53,13 +53,13 @@ def scenes(count: int, dt: float = 0.01, objects: int = 50, seed: int = 0) -> It
         gap = max(2.0, 60.0 - 3.0 * k * dt)
         others = [
             {
-                **{"id": f"vehicle {n:03}", "s": round(float(place) + 0.5 * k * dt, 3)},
+                **{"id": f"vehicle {n:03}", "x": round(float(place) + 0.5 * k * dt, 3)},
                 **{"lane": 1 + n % 2, "vx": 20.5, "vy": 0.0, "length": 4.6, "width": 1.9},
             }
             for n, place in enumerate(places)
         ]
-        ahead = {"id": "ahead", "s": gap + 4.6, "lane": 0, "vx": 17.0, "length": 4.6}
-        ego = {"s": 0.0, "lane": 0, "vx": 20.0, "length": 4.6}
+        ahead = {"id": "ahead", "x": gap + 4.6, "lane": 0, "vx": 17.0, "length": 4.6}
+        ego = {"x": 0.0, "lane": 0, "vx": 20.0, "length": 4.6}
         yield line(
             {"time": round(k * dt, 6), "ego": ego, "objects": [*others, ahead], "proposal": 0.0}
         )

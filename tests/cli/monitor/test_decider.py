@@ -184,8 +184,8 @@ def test_an_episode_ends_by_itself_while_there_is_no_alarm():
 
 def test_a_scene_names_who_is_ahead_and_a_change_begins_anew():
     decider = Decider(made())
-    ego = {"s": 0.0, "lane": 0, "vx": 20.0, "length": 5.0}
-    car = {"id": "a", "s": 40.0, "lane": 0, "vx": 20.0, "length": 5.0}
+    ego = {"x": 0.0, "lane": 0, "vx": 20.0, "length": 5.0}
+    car = {"id": "a", "x": 40.0, "lane": 0, "vx": 20.0, "length": 5.0}
 
     def seen(time, *objects):
         told = {"time": time, "ego": ego, "objects": objects, "proposal": 0.5}
@@ -193,7 +193,7 @@ def test_a_scene_names_who_is_ahead_and_a_change_begins_anew():
 
     assert seen(0.0, car)["ahead"] == "a"
     assert "note" not in seen(0.1, car)
-    other = seen(0.2, car, car | {"id": "b", "s": 15.0})
+    other = seen(0.2, car, car | {"id": "b", "x": 15.0})
     assert (other["ahead"], other["note"]) == ("b", "another one is ahead: a new episode")
     gone = seen(0.3)
     assert (gone["ahead"], gone["alarm"], gone["executed"]) == (None, False, 0.5)

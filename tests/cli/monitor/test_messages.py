@@ -14,8 +14,8 @@ from monitor_rows import JUNK
 
 FORM = Form(guard_for_cars(-6.0, 2.5))
 ROW = {"time": 1.0, "gap": 30.0, "v_follower": 20.0, "v_leader": 18.0, "proposal": 0.5}
-EGO = {"s": 100.0, "lane": 0, "vx": 20.0, "length": 5.0}
-TRUCK = {"id": "truck", "s": 150.0, "lane": 0, "vx": 15.0, "length": 15.0}
+EGO = {"x": 100.0, "lane": 0, "vx": 20.0, "length": 5.0}
+TRUCK = {"id": "truck", "x": 150.0, "lane": 0, "vx": 15.0, "length": 15.0}
 
 
 def line(**changed):
@@ -119,9 +119,9 @@ def test_actions_that_are_vectors_or_indices():
 
 
 def test_a_scene_is_the_nearest_object_ahead_in_the_lane():
-    beside = TRUCK | {"id": 2, "s": 120.0, "lane": 1}
-    behind = TRUCK | {"id": 3, "s": 80.0}
-    further = TRUCK | {"id": 4, "s": 190.0}
+    beside = TRUCK | {"id": 2, "x": 120.0, "lane": 1}
+    behind = TRUCK | {"id": 3, "x": 80.0}
+    further = TRUCK | {"id": 4, "x": 190.0}
     row = FORM.read(scene(beside, behind, further, TRUCK))
     assert row == Row(2.0, (40.0, 20.0, 15.0), 0.0, "truck")
     assert FORM.read(scene()) == Row(2.0, None, 0.0)
@@ -134,7 +134,7 @@ def test_a_scene_is_the_nearest_object_ahead_in_the_lane():
 @pytest.mark.parametrize(
     ("changed", "about"),
     [
-        ({"s": ...}, "objects[1].s"),
+        ({"x": ...}, "objects[1].x"),
         ({"id": [1]}, "objects[1].id"),
         ({"id": "x" * 99}, "objects[1].id"),
         ({"vx": "fast"}, "objects[1].vx"),
@@ -151,7 +151,7 @@ def test_what_is_wrong_with_an_object_is_named(changed, about):
 
 def test_what_is_wrong_with_a_scene_is_named():
     assert refused(FORM, b'{"time": 0, "objects": [], "proposal": 0}')[0] == "ego"
-    assert refused(FORM, b'{"time": 0, "ego": {}, "objects": {}, "proposal": 0}')[0] == "ego.vx"
+    assert refused(FORM, b'{"time": 0, "ego": {}, "objects": {}, "proposal": 0}')[0] == "ego.x"
     assert refused(FORM, scene(3)) == ("objects[0]", "is 3; it must be object")
     assert refused(Form(Guard(low=-1.0, high=1.0, interval=0.1)), scene(TRUCK))[0] == "objects"
 

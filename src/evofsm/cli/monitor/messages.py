@@ -89,11 +89,10 @@ Taken = Message | Pause
 class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     """Ego or an object of a scene, as it is sent."""
 
+    x: _Place
     vx: _Speed
     length: _Size
     id: _Name | UnsetType = UNSET
-    s: _Place | UnsetType = UNSET
-    x: _Place | UnsetType = UNSET
     y: _Place | UnsetType = UNSET
     lane: _Number | _Name | UnsetType = UNSET
     vy: _Speed = 0.0
@@ -212,11 +211,11 @@ class Form:
             raise MessageError(
                 "objects", "are for guards of car following; send a row of this guard's variables"
             )
-        ego, along = told.ego, "x" if told.ego.s is UNSET else "s"
-        _refuse_nowhere(ego, "ego", along)
+        ego = told.ego
+        _refuse_nowhere(ego, "ego")
         for k, car in enumerate(told.objects):
             where = f"objects[{k}]"
-            _refuse_nowhere(car, where, along)
+            _refuse_nowhere(car, where)
             if car.id is UNSET:
                 raise MessageError(f"{where}.id", "is missing; it must be an int or a text")
             in_lanes = car.lane is not UNSET and ego.lane is not UNSET
@@ -225,12 +224,12 @@ class Form:
                 raise MessageError(f"{where}.lane", fault)
         proposal = _frozen(told.proposal)
         if self.scenes:
-            objects = [_object(car, f"objects[{k}]", along) for k, car in enumerate(told.objects)]
-            scene = Scene(_object(ego, "ego", along), objects)
+            objects = [_object(car, f"objects[{k}]") for k, car in enumerate(told.objects)]
+            scene = Scene(_object(ego, "ego"), objects)
             names = tuple(obj.id for obj in scene.objects[1 : _MOST_OBJECTS + 1])
             rows = (None if math.isnan(z) else z for z in scene.rows(_MOST_OBJECTS).tolist())
             return Row(told.time, tuple(rows), proposal, objects=names)
-        if (ahead := _nearest_ahead(ego, told.objects, along)) is None:
+        if (ahead := _nearest_ahead(ego, told.objects)) is None:
             return Row(told.time, None, proposal)
         gap, car = ahead
         return Row(told.time, (gap, ego.vx, car.vx), proposal, None if car.id is UNSET else car.id)
@@ -280,34 +279,26 @@ def _frozen(proposal: Any) -> Any:
 # -- Scenes ---------------------------------------------------------------------------------------
 
 
-def _refuse_nowhere(car: _Vehicle, where: str, along: str) -> None:
-    if getattr(car, along) is UNSET:
-        raise MessageError(f"{where}.{along}", "is missing; it must be a finite number")
-    if along == "s" and car.lane is UNSET:
-        fault = "is missing: without it s does not say who follows whom"
-        raise MessageError(f"{where}.lane", fault)
+def _refuse_nowhere(car: _Vehicle, where: str) -> None:
     if car.lane is UNSET and car.y is UNSET:
         raise MessageError(f"{where}.y", "is missing, and so is lane; one of them is needed")
 
 
-def _object(car: _Vehicle, where: str, along: str) -> Object:
+def _object(car: _Vehicle, where: str) -> Object:
     """An object whose sides are known, so that it is known who is in whose way."""
     if car.y is UNSET:
         raise MessageError(f"{where}.y", "is missing; it says who is in whose way")
     name = where if car.id is UNSET else str(car.id)
-    place: float = getattr(car, along)
     ax = math.nan if car.ax is UNSET else car.ax
-    return Object(name, place, car.y, car.vx, car.vy, car.length, car.width, ax)
+    return Object(name, car.x, car.y, car.vx, car.vy, car.length, car.width, ax)
 
 
-def _nearest_ahead(
-    ego: _Vehicle, objects: list[_Vehicle], along: str
-) -> tuple[float, _Vehicle] | None:
+def _nearest_ahead(ego: _Vehicle, objects: list[_Vehicle]) -> tuple[float, _Vehicle] | None:
     """The closest object in the own lane whose middle is ahead, after the gap to it [m]."""
     ahead = [
         (away - 0.5 * (ego.length + car.length), car)
         for car in objects
-        if (away := getattr(car, along) - getattr(ego, along)) > 0.0 and _in_lane(ego, car)
+        if (away := car.x - ego.x) > 0.0 and _in_lane(ego, car)
     ]
     return min(ahead, key=itemgetter(0), default=None)
 
