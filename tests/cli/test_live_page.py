@@ -158,7 +158,7 @@ def test_switched_on_the_reviser_prevents_the_collision_that_happens_with_it_off
     shows(page, "headline", "No collision")
     began = re.search(r"Danger began at (\d+\.\d)", text(page, "when"))
     assert began
-    assert "would have hit the leader" in text(page, "alone")  # which is folded
+    assert "would have failed" in text(page, "alone")  # which is folded
     assert "The reviser stepped in" in text(page, "done")
 
     page.keyboard.press("r")

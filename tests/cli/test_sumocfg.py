@@ -95,8 +95,6 @@ def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tm
     assert frames[-1].time == pytest.approx(met - 0.1 * (afterwards == "teleport"), abs=0.01)
     told = tell(frames[-1], recorded.start)
     assert told.headline == "Collision (by SUMO)"
-    closing = frames[-1].cars.v_follower - 8.0
-    assert f"{closing:.1f}\xa0m/s faster than the leader, 0." in told.outcome
     assert "only watched, in shadow mode" in told.done
     assert "The reviser" not in told.done
     assert _is_log(str(configuration))

@@ -152,7 +152,6 @@ def test_every_sentence_says_what_was_so(how, idle):
         frames, start = drive(session), session.start
     changed = sum(frame.executed != frame.proposed for frame in frames)
     told = [tell(frame, start) for frame in frames]
-    told = [one._replace(outcome=one.outcome.replace("\xa0", " ")) for one in told]
     assert bool(changed) == (not idle)
     # What the reviser did, or would have done.
     done = " ".join(one.done for one in told)
@@ -166,13 +165,10 @@ def test_every_sentence_says_what_was_so(how, idle):
     assert {one.status for one in told[:-1]} <= {"safe", "danger", "averted", "dead end"}
     assert ("averted" in {one.status for one in told}) == (not idle)
     assert not any("Nothing was judged" in one.why for one in told)
-    # What came of it: truly, and never slower than the leader.
-    last = frames[-1]
-    hit, closing = last.cars.gap <= 0.0, last.cars.v_follower - last.cars.v_leader
+    # What came of it.
+    hit = frames[-1].cars.gap <= 0.0
     assert told[-1].headline == ("Collision" if hit else "No collision")
-    assert (f"Collision at {last.time:.1f}" in told[-1].outcome) == hit
-    assert (f"{closing:.1f} m/s faster than the leader" in told[-1].outcome) == hit
-    assert "−" not in told[-1].outcome
+    assert (f"Collision at {frames[-1].time:.1f}" in told[-1].outcome) == hit
     # What is said before it begins.
     intro, learning = introduce(start).values()
     assert "replaces actions" in intro
@@ -232,7 +228,7 @@ def test_episodes_of_a_log_end_with_a_contact_are_sorted_and_begin_where_it_is_w
     assert frames[-1].failed
     assert shown.start.begins == pytest.approx(frames[-1].time - 10.0)
     told = tell(frames[-1], shown.start)
-    assert "Collision at 26.7\xa0s, 3.0\xa0m/s faster than the leader." in told.outcome
+    assert "Collision at 26.7\xa0s." in told.outcome
     assert "only watched, in shadow mode" in told.done
     assert watched_log(path, reading_of(), case=4).start.case == 2  # the fourth in the log
 
@@ -245,7 +241,7 @@ def test_a_failure_that_a_log_tells_of_is_no_collision_but_a_failure(tmp_path):
     assert shown.start.cases == ("episode 1 (failure)",)
     told = tell(drive(shown)[-1], shown.start)
     assert told.headline == "Failure (by the log)"
-    assert "at 2.5\xa0s, 10.0\xa0m/s faster than the leader, 5.0\xa0m behind it." in told.outcome
+    assert "Failure (by the log) at 2.5\xa0s." in told.outcome
 
 
 def test_a_log_is_watched_by_its_own_columns_and_units(tmp_path, capsys):

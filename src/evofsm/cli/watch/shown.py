@@ -61,7 +61,6 @@ class Story(NamedTuple):
     time_headway: float = math.nan  #: the same of time headway [s]
     leader_brakes: float = math.nan  #: when the leader first braked hard [s]
     leader_decel: float = 0.0  #: how hard it has braked since, at most [m/s²]
-    closing: float = math.nan  #: how fast the gap closes; after a contact, as it did then [m/s]
     revised: int = 0  #: decisions that the reviser changed, in danger or not
     advised: int = 0  #: decisions that it changed, or would have
     alone: float = math.nan  #: when the controller alone fails [s]; infinite if it does not
@@ -332,12 +331,9 @@ def _on_the_road(story: Story, frame: Frame, cars: Cars) -> Story:
         return frame.time if math.isnan(at) and holds else at
 
     warns = cars.time_to_collision < _TTC.threshold
-    # A record may hold the speeds after the impact.
-    closing_speed = cars.v_follower - cars.v_leader
     return story._replace(
         time_to_collision=first(story.time_to_collision, moves and warns),
         time_headway=first(story.time_headway, moves and cars.time_headway < near),
-        closing=closing_speed if closing_speed > 0.0 or not frame.failed else story.closing,
         leader_brakes=first(story.leader_brakes, brakes),
         leader_decel=max(story.leader_decel, -cars.a_leader if brakes else 0.0),
     )

@@ -12,8 +12,6 @@ from evofsm.cli.watch.shown import Danger, Frame, Start, Story
 from evofsm.fsm.validation import action_name, counted
 from evofsm.guard.actions import action_text
 
-# Changes of speed that are smaller are "at the same speed" [m/s], and softer accelerations none.
-_EQUAL_SPEED, _HARDLY = 0.5, 0.3
 # What the reviser does in a run, beside what a log says was done, and where nobody acts.
 _LIVE = (
     "The reviser, a safety filter that learns on the way, replaces actions that it finds too "
@@ -156,19 +154,9 @@ def _why(began: Frame, start: Start) -> str:
     risk, cars = began.proposed_risk, began.cars
     if not start.acts:
         return f"At {began.here}: {began.reason}."
-    if cars is None:
-        text = f"At {began.here}, the controller wanted {_action(began.proposed, start)}"
-    else:
-        excess_speed = cars.v_follower - cars.v_leader
-        pace = f"{abs(excess_speed):.1f} m/s {'faster' if excess_speed > 0.0 else 'slower'} than it"
-        if abs(excess_speed) <= _EQUAL_SPEED:
-            pace = "as fast as it"
-        at = f"{cars.gap:.1f} m behind the leader at {cars.v_follower:.0f} m/s, {pace}"
-        text = f"{at}, the driver wanted {_wish(began.proposed[0])}"
-    if began.why:
+    text = f"At {began.here}, the controller wanted {_action(began.proposed, start)}"
+    if cars is None or start.judge == "learnt":
         return f"{text}: a risk of {risk.risk:.0%}. After that {began.why}."
-    if cars is None:
-        return f"{text}: a risk of {risk.risk:.0%}."
     return (
         f"{text}. After that, not even braking in full (by {cars.decel:.1f} m/s²) would avoid "
         f"a collision if the leader braked harder than {risk.critical:.1f} m/s² – and leaders "
@@ -198,51 +186,32 @@ def _done(danger: Danger, frame: Frame, start: Start) -> str:
     )
 
 
-def _wish(acceleration: float) -> str:
-    if math.isnan(acceleration):
-        return "what is not known"
-    if abs(acceleration) <= _HARDLY:
-        return f"to keep about its speed ({_signed(acceleration)})"
-    return f"to {'accelerate' if acceleration > 0.0 else 'brake'} by {abs(acceleration):.1f} m/s²"
-
-
-def _signed(acceleration: float) -> str:
-    return f"{acceleration:+.1f} m/s²".replace("-", "−")
-
-
 def _instead(better: Sequence[float], wished: Sequence[float], start: Start) -> str:
-    if not start.cars:
-        return f"{_action(better, start)} instead of {_action(wished, start)}"
-    instead = "what is not known" if math.isnan(wished[0]) else _signed(wished[0])
-    return f"{_wish(better[0])} instead of {instead}"
+    return f"{_action(better, start)} instead of {_action(wished, start)}"
 
 
 def _action(action: Sequence[float], start: Start) -> str:
+    if not math.isfinite(action[0]):
+        return "what is not known"
     if start.discrete:
-        return action_name(int(action[0])) if math.isfinite(action[0]) else "nothing"
+        return action_name(int(action[0]))
     components = [float(f"{value:.2g}") for value in action[:_COMPONENTS]]
     text = action_text(components[0] if len(action) == 1 else components)
-    return text if len(action) <= _COMPONENTS else f"{text[:-1]}, ...)"
+    text = text if len(action) <= _COMPONENTS else f"{text[:-1]}, ...)"
+    return f"{text} m/s²" if start.cars else text
 
 
 def _outcome(frame: Frame, start: Start) -> str:
-    story, parts, when, cars = frame.story, [], clock(frame.time, start), frame.cars
-    if cars is None:
-        text = f"Failed at {when}." if frame.failed else f"It ended at {when} without failure."
-        return text if frame.over else ""
+    story, parts, when = frame.story, [], clock(frame.time, start)
     if not math.isnan(story.leader_brakes):
         since = clock(story.leader_brakes, start)
         parts.append(f"The leader braked from {since} on, by up to {story.leader_decel:.1f} m/s².")
     if frame.failed:
-        pace = f", {story.closing:.1f} m/s faster than the leader" if story.closing > 0.0 else ""
-        where = f", {cars.gap:.1f} m behind it" if cars.gap > 0.0 else ""
-        parts.append(f"{start.fails or 'Collision'} at {when}{pace}{where}.")
-    elif cars.rear_ended:
+        parts.append(f"{start.fails or ('Collision' if start.cars else 'Failed')} at {when}.")
+    elif frame.cars and frame.cars.rear_ended:
         parts.append(f"The car behind ran into the follower at {when}.")
-    elif frame.over and cars.v_follower == 0.0:
-        parts.append(f"No collision: stopped {cars.gap:.1f} m behind the leader.")
     elif frame.over:
-        parts.append(f"No collision: {cars.gap:.1f} m behind the leader at the end.")
+        parts.append(f"It ended at {when} without failure.")
     return " ".join(parts)
 
 
@@ -251,10 +220,8 @@ def _alone(frame: Frame, start: Start) -> str:
     as_alone = frame.failed and math.isclose(alone, frame.time)
     if not math.isfinite(alone) or as_alone or frame.time == 0.0:
         return ""
-    driver, fails, failed = "The controller alone", "would fail", "would have failed"
-    if frame.cars:
-        driver, fails, failed = "This driver", "would hit the leader", "would have hit the leader"
-    return f"{driver} {failed if frame.time >= alone else fails} at {clock(alone, start)}."
+    fails = "would have failed" if frame.time >= alone else "would fail"
+    return f"The controller alone {fails} at {clock(alone, start)}."
 
 
 def clock(time: float, start: Start) -> str:
