@@ -7,6 +7,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import pytest
 
 pytest.importorskip("websockets")
@@ -15,12 +16,19 @@ pytest.importorskip("playwright.sync_api")
 from playwright import sync_api as playwright
 
 from evofsm.cli.foreseen import guard_where_nobody_acts
-from evofsm.cli.learning import episodes_read
+from evofsm.cli.learning import episodes_read, learn_chunk
 from evofsm.cli.options import reading_of
 from evofsm.cli.watch.logged import watched_log
-from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_guard
+from evofsm.cli.watch.session import (
+    OnRoads,
+    Session,
+    learn_first,
+    read_simulated,
+    system_machine,
+    watched_guard,
+)
 from evofsm.driving import KinematicWorld, load_family
-from evofsm.fsm import EvolvingFSM, Labels
+from evofsm.fsm import IntervalActions, Labels
 from evofsm.io.logs import Noted
 
 PAPER = load_family("paper")
@@ -79,7 +87,10 @@ def logged():
         reading = reading_of("a variable of a long name,load", "", "t", failed=failed)
         episodes = [*episodes_read(str(path), reading, Noted(), dated=True)]
         labels = Labels(names=reading.columns.observe.names)
-        guard = guard_where_nobody_acts(episodes, labels, None, 0.0, None, EvolvingFSM(1))
+        machine = system_machine(1, np.concatenate([part.observations for part in episodes]))
+        for part in episodes:
+            learn_chunk(machine, part, IntervalActions(0.0, 1.0, 1.0))
+        guard = guard_where_nobody_acts(episodes, labels, None, 0.0, None, machine)
         with watched_log(str(path), reading, guard=guard) as opened:
             yield opened
 

@@ -20,7 +20,6 @@ from evofsm.cli.options import (
     option,
     require,
     require_world,
-    split_names,
 )
 from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
@@ -30,17 +29,14 @@ if TYPE_CHECKING:
 
 # Options that exclude each other, and why.
 _EXCLUDE = {
-    ("learn", "workers"): "whoever learns drives episodes one after the other",
     ("audit", "workers"): "workers send no decisions",
     ("mcap", "workers"): "workers send no decisions",
-    ("audit", "mcap"): "a guard has one log of its decisions",
-    ("learn", "frozen"): "whoever is frozen learns nothing",
 }
 
 
 def drive(
     family: Annotated[
-        str, argument("Scenarios (emergency, paper, ...), a file with your own, or a .sumocfg.")
+        str, argument("Scenarios (emergency, paper+noise, ...), your own file, or a .sumocfg.")
     ],
     episodes: Annotated[int, option("How many are driven.", min=1, max=2**32)] = 100,
     world: InWorld = "kinematic",
@@ -50,11 +46,7 @@ def drive(
     judge: ByJudge = "kinematic",
     mode: Annotated[ModeName, option("How far least-risk goes.")] = "act",
     tolerance: Tolerance = 0.02,
-    switches: Annotated[
-        str, option("noise, delay, actuator, jerk, third_car; with commas.", "--with")
-    ] = "",
     seed: Seed = 0,
-    learn: Annotated[Path | None, option("Go on learning from a folder of --out.")] = None,
     frozen: Annotated[
         Path | None, option("Drive held-out draws with what this folder holds; learn nothing.")
     ] = None,
@@ -83,8 +75,7 @@ def drive(
     A SUMO configuration (my.sumocfg) is run as it is, once, with guards in the cars that --vehicles
     names; of all else only --mode (act or shadow), --tolerance and --json hold then.
     """
-    options = {"learn": learn, "frozen": frozen, "workers": workers}
-    options |= {"out": out, "audit": audit, "mcap": mcap}
+    options = {"frozen": frozen, "workers": workers, "out": out, "audit": audit, "mcap": mcap}
     options = {name: value for name, value in options.items() if value is not None}
     if family.endswith(".sumocfg"):
         if options:
@@ -103,14 +94,13 @@ def drive(
     from evofsm.driving import load_family
     from evofsm.guard import Mode
 
-    scenarios = load_family(family).with_switches(split_names(switches))
-    before, n_learnt, digest = None, 0, ""
-    if (start := learn or frozen) is not None:
-        before, n_learnt = load_guard(start)
-        digest = sha256((start / GUARD).read_bytes()).hexdigest()
+    before, digest = None, ""
+    if frozen is not None:
+        before, _ = load_guard(frozen)
+        digest = sha256((frozen / GUARD).read_bytes()).hexdigest()
     learns = frozen is None and workers is None
-    choices = scenarios, reviser, judge, Mode(mode), tolerance, seed, world
-    setup = Setup(*choices, learns, n_learnt, digest)
+    choices = load_family(family), reviser, judge, Mode(mode), tolerance, seed, world
+    setup = Setup(*choices, learns, digest)
     with closing(Results(setup, make_guard(setup, before), out)) as results:
         if mcap is not None and results.rows:
             fault = f"{out} has {len(results.rows):,} episodes already; name another folder"
@@ -147,6 +137,10 @@ def _drive_in_turn(
     from evofsm.cli.driving import drive_in_turn
     from evofsm.driving.sumo import open_world
 
+    if mcap is not None:
+        from evofsm.io.foxglove import recording
+    setup = results.setup
+    about = setup.settings | {"episodes": episodes}
     with (
         _log_of(audit, mcap) as log,
         open_world(results.setup.world) as place,

@@ -72,13 +72,7 @@ class Setup:
     seed: int = 0
     world: str = "kinematic"
     learn: bool = True
-    learnt: int = 0  #: episodes that were learnt from before
-    digest: str = ""  #: of the guard that learnt from them
-
-    @property
-    def first(self) -> int:
-        """Number of the first episode: training draws are not driven again."""
-        return self.learnt if self.learn else 0
+    digest: str = ""  #: of the guard that learnt before
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -164,7 +158,7 @@ class Results:
                 if (folder / GUARD).exists():
                     guard, n_learnt = load_guard(folder)
                     self.guard = make_guard(setup, guard)
-                for number in self.rows.keys() - range(setup.first, n_learnt):
+                for number in self.rows.keys() - range(n_learnt):
                     del self.rows[number]  # it came after what was learnt
         except BaseException:
             self._journal.close()
@@ -189,9 +183,9 @@ class Results:
             return
         setup = self.setup
         provenance = {"family": setup.family.name, "seed": setup.seed, "reviser": setup.reviser}
-        n_learnt = setup.learnt + len(self.rows) * setup.learn
+        learnt_from = {"episodes": len(self.rows)} if setup.learn else {}
         try:
-            self.guard.save(self.folder / GUARD, {**provenance, "episodes": n_learnt})
+            self.guard.save(self.folder / GUARD, {**provenance, **learnt_from})
         except OSError as error:
             error.add_note("what was driven is kept: make room, and run the same command again")
             raise
@@ -199,8 +193,7 @@ class Results:
 
     def summed_up(self, episodes: int) -> Driving:
         """What came of so many episodes; written to the folder, if there is one."""
-        setup, numbers = self.setup, range(self.setup.first, self.setup.first + episodes)
-        rows = [self.rows[number] for number in numbers]
+        setup, rows = self.setup, [self.rows[number] for number in range(episodes)]
         outcomes = [Outcome(*(row[name] for name in Outcome._fields)) for row in rows]
         row = summarise(setup.family.name, setup.reviser, outcomes, setup.family.interval)
         if self.folder is not None:
@@ -260,7 +253,7 @@ def drive_in_turn(
         raise ValueError(f"{results.folder} has driven {n_episodes} episodes, more than {episodes}")
     guard.audit = audit
     trial = setup.trial(guard, world)
-    for number in range(setup.first, setup.first + episodes):
+    for number in range(episodes):
         if number in results.rows:
             continue
         episode, row = trial.drive(number)

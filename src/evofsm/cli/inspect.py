@@ -44,7 +44,7 @@ def inspect(
     evofsm explain says what came of one situation.
     """
     model, header, guard = load_model(file)
-    provenance = {} if header is None else header.provenance
+    provenance = header.provenance
     if plot is not None:
         title = f"States of {file.name}" + (f" over {Path(log).name}" if log else "")
         rows = _logged(log, model, provenance.get("read with", {}))
@@ -56,13 +56,12 @@ def inspect(
         print_json({**head, **model_document(model)})
         return
     of_file = [("file", str(file))]
-    if header is not None:
-        of_file.append(("holds", f"a {header.kind}, written by evofsm {header.library}"))
+    of_file += [("holds", f"a {header.kind}, written by evofsm {header.library}")]
     of_file += [*_learnt_from(provenance), *_model_facts(model), *pairs]
     show(facts("Model", of_file), *tables_of(model))
 
 
-def load_model(place: Path) -> tuple[FSMModel, Header | None, Guard | None]:
+def load_model(place: Path) -> tuple[FSMModel, Header, Guard | None]:
     """A model from wherever one was left, what its file says of itself, and the guard it is of."""
     from evofsm import store
     from evofsm.driving import FAMILIES, load_family

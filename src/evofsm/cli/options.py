@@ -47,7 +47,7 @@ Json = Annotated[
     bool, option("Print one JSON document; states and actions count from 0.", "--json")
 ]
 Saved = Annotated[
-    Path, argument("A saved machine, model or guard, or a folder or log that evofsm drive wrote.")
+    Path, argument("A saved machine, model or guard, or a folder that evofsm drive wrote.")
 ]
 Seed = Annotated[int, option("Seed of all random draws.", min=0)]
 InWorld = Annotated[World, option("SUMO itself, or the same motion in closed form.")]
