@@ -41,7 +41,7 @@ def test_it_ends_with_1_and_says_what_is_wrong(evofsm, folder):
     ("arguments", "message"),
     [
         (["own_driver"], "names nothing; write module:Name"),
-        (["own_driver:Calm"], "own_driver has no 'Calm'"),
+        (["own_driver:Calm"], "has no attribute 'Calm'"),
         (["not_there:Calm"], "is it in this folder, or installed?"),
         (["own_driver:Proposal"], "has the methods of no kind"),
         (["own_driver:Hasty", "--kind", "judge"], "No such option: --kind"),

@@ -192,30 +192,17 @@ def episodes_read(
     notes: Noted,
     *,
     dated: bool,
-    most: int | None = None,
     fewest: int = 2,
 ) -> Iterator[Chunk]:
-    """The episodes of a log that have so many rows, of ``most`` in all; then what was noticed.
+    """The episodes of a log that have so many rows; then what was noticed.
 
     They have dates where these are wanted, and where the log has some.
     """
-    chunks = reading.traces([path], notes)
-    for episode in episodes_of(chunks if most is None else _first(chunks, most)):
+    for episode in episodes_of(reading.traces([path], notes)):
         if len(episode.times) >= fewest:
             yield episode._replace(times=episode.times + notes.began) if dated else episode
     for warning in warnings_of(notes, reading.columns):
         warn(f"warning: {warning}")
-
-
-def _first(chunks: Iterable[Chunk], most: int) -> Iterator[Chunk]:
-    remainder = most
-    for chunk in chunks:
-        if remainder:
-            yield chunk.rows(0, remainder)
-        remainder -= len(chunk.times)
-        if remainder < 0:
-            warn(f"watched are the first {most:,} rows; there are more")
-            return
 
 
 # -- A guard --------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -11,6 +10,7 @@ from functools import partial, wraps
 from importlib.util import find_spec
 from inspect import Parameter, Signature, signature
 from pathlib import Path
+from pkgutil import resolve_name
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -92,20 +92,16 @@ def require_world(world: World, **extras: str) -> None:
 
 def imported(name: str) -> Any:
     """A class, function or instance by its name ``module:Name``; found in this folder, too."""
-    module, _, path = name.partition(":")
-    if not (module and path):
+    if not re.fullmatch("[^:]+:[^:]+", name):
         raise ValueError(f"{name!r} names nothing; write module:Name")
     if "" not in sys.path:
         sys.path.insert(0, "")  # as `python -m` does
     try:
-        target: Any = importlib.import_module(module)
+        return resolve_name(name)
     except ModuleNotFoundError as error:
-        raise ValueError(f"{module}: {error} (is it in this folder, or installed?)") from error
-    for part in path.split("."):
-        if not hasattr(target, part):
-            raise ValueError(f"{module} has no {path!r}")
-        target = getattr(target, part)
-    return target
+        raise ValueError(f"{name}: {error} (is it in this folder, or installed?)") from error
+    except AttributeError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def in_quotes(text: str) -> str:

@@ -17,35 +17,17 @@ from evofsm.extras import needs
 def run_configuration(
     file: Path, vehicles: str, mode: str, tolerance: float, *, as_json: bool
 ) -> None:
-    """Run it to its end, or until all cars have arrived, and print what came of it."""
+    """Run it to its end, or until all cars have arrived, and print what came of it.
+
+    That is as `Attachment.summary` has it; where guards act, without them as well.
+    """
     if mode not in ("act", "shadow"):
         raise ValueError(f"--mode is {mode!r}; for a configuration it is act or shadow")
-    with progress("Driving") as move:
-        outcome = drive_configuration(file, vehicles, mode, tolerance, move)
-    if as_json:
-        print_json(outcome)
-        return
-    title, alone = f"What came of {outcome['seconds']:,.0f} s", outcome["alone"]
-    runs = (outcome,) if alone is None else (alone, outcome)
-    rows = [(name, *map(tell, runs)) for name, tell in _TOLD.items()]
-    rows = [row for row in rows if any(row[1:])]
-    header = ("", "in shadow") if alone is None else ("", "alone", "guarded")
-    show(table(title, header, rows))
-
-
-def drive_configuration(
-    file: Path,
-    vehicles: str,
-    mode: str,
-    tolerance: float,
-    move: Callable[..., None] = lambda **_: None,
-) -> dict[str, Any]:
-    """What came of it, as `Attachment.summary` has it; where guards act, without them as well."""
     by_ids = not (vehicles == "all" or vehicles.startswith("type:") or vehicles.endswith("%"))
     choice = split_names(vehicles) if by_ids else vehicles
 
     def driven(how: str) -> dict[str, Any]:
-        with _running(file) as (sumo, steps):
+        with progress("Driving") as move, _running(file) as (sumo, steps):
             cars = attach(sumo, choice, mode=how, tolerance=tolerance)
             for seconds in steps:
                 if seconds == int(seconds):
@@ -61,8 +43,17 @@ def drive_configuration(
         return {"seconds": seconds, **cars.summary()}
 
     alone = driven("watch") if mode == "act" else None
-    settings = {"configuration": str(file), "vehicles": vehicles, "mode": mode}
-    return {**settings, **driven(mode), "alone": alone}
+    outcome = driven(mode)
+    if as_json:
+        settings = {"configuration": str(file), "vehicles": vehicles, "mode": mode}
+        print_json({**settings, **outcome, "alone": alone})
+        return
+    title = f"What came of {outcome['seconds']:,.0f} s"
+    runs = (outcome,) if alone is None else (alone, outcome)
+    rows = [(name, *map(tell, runs)) for name, tell in _TOLD.items()]
+    rows = [row for row in rows if any(row[1:])]
+    header = ("", "in shadow") if alone is None else ("", "alone", "guarded")
+    show(table(title, header, rows))
 
 
 def _share(what: str) -> Callable[[Mapping[str, Any]], str]:

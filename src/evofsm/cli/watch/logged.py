@@ -21,8 +21,8 @@ from evofsm.io.logs import LONGEST_STEP, Chunk, Noted
 
 # Share by which the step of a log may differ from that of a guard.
 _OTHER_STEP = 0.1
-# More rows of cars are not watched, and fewer of an episode; times that differ by less are one [s].
-_ROWS_OF_CARS, _FEWEST_ROWS, _TICK = 20_000, 10, 5e-4
+# Fewer rows of cars are not watched; times that differ by less are one [s].
+_FEWEST_ROWS, _TICK = 10, 5e-4
 
 
 def watched_log(
@@ -45,8 +45,7 @@ def watched_log(
     of_cars = reading.acts and len(names) == len(VARIABLES) and (not guard or names == VARIABLES)
     if guard is None and not of_cars:
         raise ValueError(f"{path} is of no cars: --guard names a guard (evofsm learn --guard)")
-    most = _ROWS_OF_CARS if of_cars else None
-    episodes = episodes_read(path, reading, Noted(), dated=not of_cars, most=most)
+    episodes = episodes_read(path, reading, Noted(), dated=not of_cars)
     stretches = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
     if not stretches:
         why = f"nobody follows anybody for {_FEWEST_ROWS}" if of_cars else "no episode has two"
