@@ -158,7 +158,7 @@ LOOKED_AT = {
     ),
     "Zeit": (
         lambda k: f"{at(k, ZoneInfo('Europe/Berlin')):%d.%m.%Y %H:%M}",
-        "summer time ends or begins 2025-10-26",
+        "rows looked at 600, one every 60 s",
     ),
 }
 

@@ -97,7 +97,6 @@ def test_a_judge_that_is_given_nothing_but_failures_is_driven_saved_and_gone_on_
     [
         (("nowhere",), "nowhere"),
         (("emergency", "--reviser", "magic"), "magic"),
-        (("emergency", "--mode", "shadow", "--reviser", "rss"), "rss"),
         (("emergency+rain",), "rain"),
         (("emergency", "--frozen", "nothing-here"), "nothing-here"),
         (("emergency", "--tolerance", "2"), "tolerance"),
@@ -149,7 +148,7 @@ def test_learning_that_is_stopped_goes_on_bit_for_bit(tmp_path, snapshot, monkey
     ("changes", "says"),
     [
         ({"seed": 1}, "seed was 0 and is now 1;"),
-        ({"reviser": "rss"}, 'reviser was "none" and is now "rss";'),
+        ({"reviser": "least-risk"}, 'reviser was "none" and is now "least-risk";'),
         ({"family": EMERGENCY.with_switches(["noise"])}, "switches was [] and is now"),
         ({"learn": True}, "learn was false and is now true"),
     ],
@@ -238,7 +237,7 @@ def is_alive(process):
 def test_it_is_what_driving_in_turn_makes_of_the_same_episodes(tmp_path, world):
     if world == "sumo":
         pytest.importorskip("libsumo")
-    asked = {"family": load_family("rare"), "reviser": "aeb", "seed": 3, "world": world}
+    asked = {"family": load_family("rare"), "seed": 3, "world": world}
     with open_world(world) as place:
         plain = in_turn(place=place, learn=False, **asked)
     driven = at_once(tmp_path, **asked)

@@ -7,7 +7,8 @@ from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from statistics import median
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from evofsm.cli.options import (
     ByJudge,
@@ -41,7 +42,7 @@ def drive(
     episodes: Annotated[int, option("How many are driven.", min=1, max=2**32)] = 100,
     world: InWorld = "kinematic",
     reviser: Annotated[
-        str, option("least-risk (ours), none, rss, aeb, or a measure.")
+        Literal["least-risk", "none"], option("The filter, or none.")
     ] = "least-risk",
     judge: ByJudge = "kinematic",
     mode: Annotated[ModeName, option("How far least-risk goes.")] = "act",

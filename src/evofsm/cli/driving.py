@@ -25,7 +25,6 @@ from evofsm import store
 from evofsm.cli.journal import Journal
 from evofsm.cli.show import Advance
 from evofsm.driving import (
-    EnvelopeReviser,
     Episode,
     Family,
     Outcome,
@@ -35,15 +34,12 @@ from evofsm.driving import (
     summarise,
 )
 from evofsm.driving.cars import name_judge
-from evofsm.driving.measures import FIXED_MEASURES
 from evofsm.driving.naming import DECISION_COLUMNS
 from evofsm.driving.trials import Row, Trial
 from evofsm.driving.world import World
 from evofsm.extras import needs
-from evofsm.guard import TOLERANCE, DecisionLogger, Guard, Mode, Reviser
+from evofsm.guard import TOLERANCE, DecisionLogger, Guard, Mode
 
-#: Revisers by name: none, ours, and the classic measures.
-REVISERS = ("least-risk", "none", "rss", "aeb", *FIXED_MEASURES)
 #: The columns of ``decisions.parquet`` after ``episode``; `driving/naming.py` says which they are.
 DECISION_TABLE = tuple(name for name, column in DECISION_COLUMNS.items() if column.in_table)
 #: The guard in a folder of results.
@@ -51,7 +47,6 @@ GUARD = "guard.evofsm"
 
 _JOURNAL, _DECISIONS, _EPISODES = "episodes.jsonl", "decisions.parquet", "episodes.csv"
 _SUMMARY = "summary.json"
-_ALIASES = {"rss": "rss-r157", "aeb": "aeb-ttc"}
 # The guard is saved so often while it learns [s].
 _EVERY = 60.0
 # So many episodes are one task of a worker: some 500 ms.
@@ -102,9 +97,7 @@ def load_guard(folder: Path) -> tuple[Guard, int]:
 
 def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     """A guard whose reviser and judge have the setup's names, with what was learnt before."""
-    family, name = setup.family, _ALIASES.get(setup.reviser, setup.reviser)
-    if name not in ("least-risk", "none", *FIXED_MEASURES):
-        raise ValueError(f"there is no reviser {name!r}; there are {', '.join(REVISERS)}")
+    family = setup.family
     machine, judge = (None, None) if before is None else learners_of(before)
     if judge is not None and (kind := name_judge(judge)) != setup.judge:
         raise ValueError(f"what was learnt is of the judge {kind!r}, not of {setup.judge!r}")
@@ -117,14 +110,10 @@ def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
         seed=setup.seed,
         learn=setup.learn,
     )
-    if name == "least-risk":
+    if setup.reviser == "least-risk":
         return guard
-    reviser: Reviser = Unrevised(family.actions)
-    if name != "none":
-        if setup.mode is not Mode.ACT:
-            raise ValueError(f"reviser {setup.reviser!r} can only act; modes are for least-risk")
-        reviser = EnvelopeReviser(FIXED_MEASURES[name], family.actions, family.interval)
     learners: dict[str, Any] = {"machine": guard.machine, "judge": guard.judge}
+    reviser = Unrevised(family.actions)
     return Guard.of(reviser, interval=family.interval, learn=setup.learn, **learners)
 
 
@@ -144,7 +133,6 @@ class Results:
         self._saved = time.monotonic()
         if folder is not None:
             self._begin(folder)
-        self._collisions = sum(row["collided"] for row in self.rows.values())
 
     def _begin(self, folder: Path) -> None:
         setup = self.setup
@@ -167,15 +155,8 @@ class Results:
     def add(self, row: Outcomes) -> None:
         """Take in what came of an episode."""
         self.rows[row["episode"]] = row
-        self._collisions += row["collided"]
         if self._journal is not None:
             self._journal.append(row)
-
-    def show(self, move: Advance) -> None:
-        """Tell how many were driven, and with how many collisions."""
-        n_episodes, collisions = len(self.rows), self._collisions
-        rate = f" ({collisions} collisions, {collisions / n_episodes:.1%})" if n_episodes else ""
-        move(n_episodes, description=f"Driving{rate}")
 
     def save_guard(self, *, now: bool = False) -> None:
         """Write what was learnt from all rows, if it was not for a while."""
@@ -260,7 +241,7 @@ def drive_in_turn(
         results.add({**row, "decided": _decided(episode)})
         if setup.learn:
             results.save_guard()
-        results.show(move)
+        move(len(results.rows))
     return results.summed_up(episodes)
 
 
@@ -279,13 +260,13 @@ def drive_at_once(
     trial = results.setup.trial(guard, results.setup.world)
     numbers = [number for number in range(episodes) if number not in results.rows]
     size = max(1, min(_BATCH, len(numbers) // (8 * workers)))
-    results.show(move)
+    move(len(results.rows))
     # Forking a process that has started threads may hang; a fresh one costs a second.
     pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_work)
     try:
         for row in pool.map(trial, numbers, chunksize=size):
             results.add(row)
-            results.show(move)
+            move(len(results.rows))
         return results.summed_up(episodes)
     except BrokenExecutor:
         raise ChildProcessError(
