@@ -17,7 +17,7 @@ from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode, Revision
+from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
 from evofsm.io import Chunk, episodes_of
 from evofsm.io.logs import LogColumns, Noted
 from evofsm.io.tables import SI, TIMES, UNITS
@@ -226,20 +226,16 @@ def guard_of_log(
     return Guard.of(reviser, interval=dt, machine=machine.copy())
 
 
-def decided_on(guard: Guard, episode: Chunk) -> Iterator[Revision]:
-    """What a guard says of each row of an episode but the last one, with which it ends."""
-    rows, times = episode.observations, episode.times - episode.times[0]
-    for row, proposal, at in zip(rows[:-1], episode.actions, times, strict=False):
-        yield guard.decide(row, proposal, at)
-    guard.end(episode.failed, rows[-1])
-
-
 def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) -> float:
     """The share in which a guard refuses, of the later half of a log; ``show`` is told of rows."""
     n_rows, refusals, reviser = 0, bytearray(), guard.reviser
     assert isinstance(reviser, ActionReviser)
     for episode in episodes_of(chunks):
-        refusals.extend(reviser.refuses for _ in decided_on(guard, episode))
+        rows, times = episode.observations, episode.times - episode.times[0]
+        for row, proposal, at in zip(rows[:-1], episode.actions, times, strict=False):
+            guard.decide(row, proposal, at)
+            refusals.append(reviser.refuses)
+        guard.end(episode.failed, rows[-1])  # with its last row
         show(n_rows := n_rows + len(episode.times))
     return float(np.mean(np.array(refusals[len(refusals) // 2 :])))
 

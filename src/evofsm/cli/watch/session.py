@@ -523,8 +523,6 @@ class Session(AbstractContextManager["Session"]):
     def step(self) -> Frame:
         """One decision, and what came of the one before."""
         observation, cars = self.system.observation, self.system.cars()
-        if cars is not None and isinstance(self.judge, LatentRisk):
-            cars = cars._replace(decel=self.judge.brakes.decel)
         frame = Frame(
             number=self._number,
             time=self.system.time,
@@ -611,13 +609,13 @@ class Session(AbstractContextManager["Session"]):
 
     def _needed(self, judged: Judgement) -> dict[str, Any]:
         judge = self.judge
-        if isinstance(judge, LatentRisk):
-            quantile = judge.manoeuvres.exceeded_by
-            return {"needed": quantile(self._tolerance), "usual": quantile(0.5)}
         if isinstance(judge, Foresight):
             return {}
-        assert isinstance(judge, LearntRisk)
         why = judge.why(judged) if judged.risk[0] > self._tolerance else ""
+        if isinstance(judge, LatentRisk):
+            quantile = judge.manoeuvres.exceeded_by
+            return {"needed": quantile(self._tolerance), "usual": quantile(0.5), "why": why}
+        assert isinstance(judge, LearntRisk)
         return {"needed": judge.margin, "why": why}
 
     def _end(self, frame: Frame) -> Frame:

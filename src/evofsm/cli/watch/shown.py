@@ -119,7 +119,6 @@ class Cars(NamedTuple):
     time_headway: float  #: [s]
     gap_behind: float = math.inf  #: to the car behind [m]; infinite where there is none
     rear_ended: bool = False  #: by the car behind
-    decel: float = math.nan  #: of the follower if it brakes in full, as far as is known [m/s²]
 
 
 def cars_of(times: NDArray[np.float64], observed: NDArray[np.float64]) -> Iterator[Cars]:
@@ -157,7 +156,7 @@ class Frame(NamedTuple):
     #: what `Judged.critical` has to be; of leaders' hard brakes but a tolerated share are softer
     needed: float = math.nan
     usual: float = math.nan  #: and half of them [m/s²]
-    why: str = ""  #: why a learnt judge finds dangerous what is proposed; empty of another
+    why: str = ""  #: why what is proposed is found dangerous; empty where it is not
     proposed: tuple[float, ...] = ()
     executed: tuple[float, ...] = ()
     advised: tuple[float, ...] = ()  #: what the reviser would execute, on or off

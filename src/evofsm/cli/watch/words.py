@@ -109,12 +109,7 @@ def _no_danger(frame: Frame, start: Start) -> str:
         return "No limit of its alarm was passed."
     if not frame.story.judged:
         return "Nothing was judged, for no failure was known yet."
-    if math.isnan(frame.needed) or start.judge == "learnt":
-        return "Nothing that was proposed was judged to be too risky."
-    return (
-        f"If the leader braked as hard as must be expected (up to {frame.needed:.1f} m/s²), "
-        "full braking would still avoid a collision."
-    )
+    return "Nothing that was proposed was judged to be too risky."
 
 
 def _quiet(frame: Frame, start: Start) -> str:
@@ -151,17 +146,10 @@ def _when(start: Start, story: Story, danger: Danger, knows_leaders: bool) -> st
 
 def _why(began: Frame, start: Start) -> str:
     """Where it was, and what could not be survived there."""
-    risk, cars = began.proposed_risk, began.cars
     if not start.acts:
         return f"At {began.here}: {began.reason}."
-    text = f"At {began.here}, the controller wanted {_action(began.proposed, start)}"
-    if cars is None or start.judge == "learnt":
-        return f"{text}: a risk of {risk.risk:.0%}. After that {began.why}."
-    return (
-        f"{text}. After that, not even braking in full (by {cars.decel:.1f} m/s²) would avoid "
-        f"a collision if the leader braked harder than {risk.critical:.1f} m/s² – and leaders "
-        f"must be expected to brake by up to {began.needed:.1f} m/s²."
-    )
+    wish = _action(began.proposed, start)
+    return f"At {began.here}, the controller wanted {wish}: {began.why}."
 
 
 def _done(danger: Danger, frame: Frame, start: Start) -> str:
