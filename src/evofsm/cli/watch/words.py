@@ -149,7 +149,7 @@ def _why(began: Frame, start: Start) -> str:
     if not start.acts:
         return f"At {began.here}: {began.reason}."
     wish = _action(began.proposed, start)
-    return f"At {began.here}, the controller wanted {wish}: {began.why}."
+    return f"Situation: {began.here}. The controller wanted {wish}: {began.why}."
 
 
 def _done(danger: Danger, frame: Frame, start: Start) -> str:
