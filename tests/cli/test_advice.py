@@ -154,7 +154,7 @@ LOOKED_AT = {
     "time": (lambda k: 600 - k, "time runs backwards"),
     "t": (
         lambda k: k + 7200 * (k > 500) + 60 * (k > 550),
-        "holes 2, the longest 2 h, together 2.0",
+        "rows looked at 600, one every 1 s",
     ),
     "Zeit": (
         lambda k: f"{at(k, ZoneInfo('Europe/Berlin')):%d.%m.%Y %H:%M}",

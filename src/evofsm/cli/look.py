@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from evofsm.cli.options import in_quotes, quoted, seconds
 from evofsm.cli.show import facts, show
 from evofsm.guard.foresight import span
-from evofsm.io.logs import LONGEST_STEP, SKIPPED, USUAL_EPISODE, are_unusual, hours_unsaid
+from evofsm.io.logs import SKIPPED, USUAL_EPISODE, are_unusual, hours_unsaid
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, explained, is_date
 
 Pairs = list[tuple[str, str]]
@@ -275,18 +275,11 @@ def _of_steps(at: Floats, segments: Floats, facts: Pairs, lacking: int) -> tuple
     if len(later):
         often = span(float(f"{usual:.2g}")) if usual < 3600.0 else f"{usual / 3600.0:.3g} h"
         facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {often}"
-    holes, odd = steps > LONGEST_STEP * usual, (steps <= 0.0) | are_unusual(steps, usual)
+    odd = (steps <= 0.0) | are_unusual(steps, usual)
     parts = np.split(at, np.flatnonzero(~within) + 1)
     latest = np.concatenate([np.fmax.accumulate(part) for part in parts])
     n_twice, n_earlier = int((steps == 0.0).sum()), int((at < latest).sum())
-    if n_twice + n_earlier:
-        text = f"{n_twice:,} at the time of the row before, {n_earlier:,} earlier"
-        facts.append(("late rows", f"{text} (rows twice, unsorted, or --episode?)"))
     if odd.sum() + lacking < max(_MANY, _ODD * len(steps)):
-        if holes.any():
-            text = f"{holes.sum():,}, the longest {span(later.max())}, together"
-            text += f" {span(float((steps[holes] - usual).sum()))}; each begins an episode (--hole)"
-            facts.append(("holes", text))
         return [], n_twice + n_earlier
     if odd.any():
         facts.append(("other steps", f"{odd.sum():,}, the longest {span(later.max())}"))

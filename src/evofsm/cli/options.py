@@ -351,8 +351,6 @@ def units_given(texts: Iterable[str]) -> dict[str, str]:
         name, _, unit = ("".join(quoted_name(part.strip())) for part in text.rpartition("="))
         if not (name and (unit in UNITS or "%" in unit)):
             raise ValueError(f"--unit is {text!r}; write NAME=UNIT with one of {', '.join(UNITS)}")
-        if name in units:
-            raise ValueError(f"--unit names {name!r} twice")
         units[name] = unit
     return units
 

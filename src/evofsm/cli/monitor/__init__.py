@@ -211,12 +211,7 @@ def monitor(
         decider = Decider(sentry, episode=rows, slots=slots)
         notice = assumptions(brakes, accepted_risk)
         if guard is not None:
-            risk, accepts = getattr(sentry.reviser, "tolerance", None), ""
-            if isinstance(sentry.judge, Foresight):
-                accepts = f"; {sentry.judge.alarm_in_words} (--false-a-day)"
-            elif risk is not None:
-                accepts = f"; a risk of {risk:.3g} is accepted (--tolerance)"
-            notice = f"assumed: what {guard} was given and has learnt{accepts}"
+            notice = f"assumed: what {guard} was given and has learnt"
         if new_guard:
             notice = f"a guard of {', '.join(sentry.variables)} begins, and learns from what comes"
         if summary and file is not None:
