@@ -59,7 +59,7 @@ def test_it_learns_saves_and_drives_frozen(evofsm, tmp_path):
     assert first.exit_code == 0, first.stderr
     assert "0 of 12" in first.stdout
     assert {path.name for path in learnt.iterdir()} == {
-        *("guard.evofsm", "episodes.jsonl", "episodes.csv", "summary.json", "decisions.parquet"),
+        *("guard.evofsm", "episodes.jsonl", "episodes.csv", "decisions.parquet"),
     }
     table = polars.read_parquet(learnt / "decisions.parquet")
     assert table.columns == ["episode", *DECISION_TABLE]
@@ -112,7 +112,7 @@ def test_what_cannot_be_driven_is_refused_in_one_line(refused, words, says):
 
 def results_of(folder):
     """What does not depend on the order in which episodes were done."""
-    return [(folder / name).read_bytes() for name in ("episodes.csv", "summary.json")]
+    return (folder / "episodes.csv").read_bytes()
 
 
 class StoppedError(Exception):

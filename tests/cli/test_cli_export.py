@@ -73,7 +73,7 @@ def test_options_choose_what_is_drawn(evofsm, driven):
     ("arguments", "word"),
     [
         (("export", "nothing", "--to", "dot"), "nothing"),
-        (("export", "{out}/summary.json", "--to", "dot"), "summary.json"),
+        (("export", "{out}/episodes.csv", "--to", "dot"), "episodes.csv"),
         (("export", "{out}/..", "--to", "dot"), "neither guard.evofsm"),
         (("export", "{out}", "--to", "prism", "--evidence", 0), "evidence"),
         (("export", "{out}", "--to", "dot", "--out", "{out}/guard.evofsm"), "left alone"),

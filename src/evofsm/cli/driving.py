@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 import os
 import signal
 import time
 from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from threading import Thread
@@ -46,7 +45,6 @@ DECISION_TABLE = tuple(name for name, column in DECISION_COLUMNS.items() if colu
 GUARD = "guard.evofsm"
 
 _JOURNAL, _DECISIONS, _EPISODES = "episodes.jsonl", "decisions.parquet", "episodes.csv"
-_SUMMARY = "summary.json"
 # The guard is saved so often while it learns [s].
 _EVERY = 60.0
 # So many episodes are one task of a worker: some 500 ms.
@@ -178,10 +176,10 @@ class Results:
         outcomes = [Outcome(*(row[name] for name in Outcome._fields)) for row in rows]
         row = summarise(setup.family.name, setup.reviser, outcomes, setup.family.interval)
         if self.folder is not None:
-            self._write(self.folder, rows, asdict(row))
-        return Driving(row, self.guard)
+            self._write(self.folder, rows)
+        return Driving(row, leads, self.guard)
 
-    def _write(self, folder: Path, rows: Sequence[Outcomes], summary: dict[str, Any]) -> None:
+    def _write(self, folder: Path, rows: Sequence[Outcomes]) -> None:
         self.save_guard(now=True)
         names = [name for name in rows[0] if name != "decided"]
         text = io.StringIO()
@@ -189,8 +187,6 @@ class Results:
         table.writerows([names, *([row[name] for name in names] for row in rows)])
         with store.replacing(folder / _EPISODES) as file:
             file.write(text.getvalue().encode())
-        with store.replacing(folder / _SUMMARY) as file:
-            file.write(json.dumps(summary, indent=2).encode())
         if all("decided" in row for row in rows):
             _write_decisions(folder / _DECISIONS, rows)
         else:  # workers send none
