@@ -28,12 +28,6 @@ if TYPE_CHECKING:
     from evofsm.cli.driving import Driving, Results, Setup
     from evofsm.guard import Guard
 
-# Options that exclude each other, and why.
-_EXCLUDE = {
-    ("audit", "workers"): "workers send no decisions",
-    ("mcap", "workers"): "workers send no decisions",
-}
-
 
 def drive(
     family: Annotated[
@@ -86,9 +80,8 @@ def drive(
 
         run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
-    for (a, b), reason in _EXCLUDE.items():
-        if a in options and b in options:
-            raise ValueError(f"--{a} and --{b} exclude each other: {reason}")
+    if workers is not None and (audit or mcap):
+        raise ValueError("--audit and --mcap go with no --workers: workers send no decisions")
     require_world(world, **({"polars": "tables"} if out is not None and workers is None else {}))
     require(**({} if mcap is None else {"mcap": "mcap"}))
     from evofsm.cli.driving import GUARD, Results, Setup, drive_at_once, load_guard, make_guard

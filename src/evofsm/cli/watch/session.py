@@ -477,7 +477,6 @@ class Session(AbstractContextManager["Session"]):
         self, system: System | Logged, guard: Guard, *, case: int = 0, on: bool = True
     ) -> None:
         self.system, self.case = system, case
-        self._is_log = isinstance(system, Logged)
         self.machine, self.judge = learners_of(guard)
         self._guard, self._reviser = guard, guard.reviser
         self._tolerance = float(self._reviser.tolerance)  # type: ignore[attr-defined]
@@ -501,7 +500,7 @@ class Session(AbstractContextManager["Session"]):
     def _idle(self) -> str:
         if not self.revising:
             text = "the reviser only watched, in shadow mode"
-            return text if self._is_log else "the reviser is off"
+            return text if isinstance(self.system, Logged) else "the reviser is off"
         reason: str = self._reviser.passing  # type: ignore[attr-defined]
         why = "was not shown to help yet" if reason == "shadow" else reason
         return reason and f"the guard {why}, so what is proposed passes"

@@ -113,7 +113,7 @@ def _no_danger(frame: Frame, start: Start) -> str:
 
 
 def _quiet(frame: Frame, start: Start) -> str:
-    """What was done where the judge saw no danger; classic measures may have."""
+    """What was done where the judge saw no danger."""
     if not start.acts:
         return "No alarm: nobody acts here."
     story = frame.story
