@@ -205,12 +205,10 @@ def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
     assert found == pytest.approx((0.0, -5.0, 158.0))
 
 
-def test_episodes_of_a_log_end_with_a_contact_are_sorted_and_begin_where_it_is_worth_a_look(
-    tmp_path,
-):
+def test_episodes_of_a_log_end_with_a_contact_and_it_opens_on_one(tmp_path):
     lines = ["pair,time,gap,v_follower,v_leader,a_follower"]
     for pair, (far, closing) in enumerate([(90, 0), (20, 1), (4, 0)]):
-        for k in range(300):
+        for k in range(500):
             # Contact after 26.7 s; the impact slows the follower, and the leader drives off.
             gap, crashed = far - max(0, k - 200) * 0.3 * closing, False
             if gap <= 0.0:
@@ -220,17 +218,16 @@ def test_episodes_of_a_log_end_with_a_contact_are_sorted_and_begin_where_it_is_w
     (tmp_path / "log.csv").write_text("\n".join([*lines, ""]))
     path = str(tmp_path / "log.csv")
     shown = watched_log(path, reading_of())
-    worst, second, *rest = shown.start.cases
-    assert worst == "episode 2 (collision)"
-    assert second.startswith("episode 2 (risk ")  # after they came apart
-    assert [name.partition(" (")[0] for name in rest] == ["episode 3", "episode 1"]
+    # It begins anew where they came apart.
+    assert shown.start.cases == ("episode 1", "episode 2 (collision)", "episode 2", "episode 3")
     frames = drive(shown)
     assert frames[-1].failed
-    assert shown.start.begins == pytest.approx(frames[-1].time - 10.0)
+    assert shown.start.begins == 0.0
     told = tell(frames[-1], shown.start)
     assert "Collision at 26.7\xa0s." in told.outcome
     assert "only watched, in shadow mode" in told.done
-    assert watched_log(path, reading_of(), case=4).start.case == 2  # the fourth in the log
+    fourth = watched_log(path, reading_of(), case=4).start
+    assert (fourth.case, fourth.begins) == (3, pytest.approx(10.0))  # of 50 s the last 40 s
 
 
 def test_a_failure_that_a_log_tells_of_is_no_collision_but_a_failure(tmp_path):

@@ -8,9 +8,9 @@ from types import MappingProxyType
 import numpy as np
 
 from evofsm.cli.foreseen import date
-from evofsm.cli.learning import decided_on, episodes_read, learn_chunk
+from evofsm.cli.learning import episodes_read, learn_chunk
 from evofsm.cli.options import BRAKES, TOLERANCE, Reading, refuse_other_limit
-from evofsm.cli.show import progress, warn
+from evofsm.cli.show import warn
 from evofsm.cli.watch.session import Logged, Played, Session
 from evofsm.driving.assumed import assumptions, guard_of_monitor
 from evofsm.driving.naming import UNITS, VARIABLES
@@ -39,7 +39,7 @@ def watched_log(
 
     Of cars an episode is over with a contact; where they come apart again, another one begins. So
     it is with ``collisions`` that a simulation counted [s], by the name of who follows whom.
-    ``case`` is the number of the episode to begin with, in the log and from 1.
+    ``case`` is the number of the episode to begin with, from 1.
     """
     names = reading.columns.observe.names
     of_cars = reading.acts and len(names) == len(VARIABLES) and (not guard or names == VARIABLES)
@@ -50,8 +50,6 @@ def watched_log(
     if not stretches:
         why = f"nobody follows anybody for {_FEWEST_ROWS}" if of_cars else "no episode has two"
         raise ValueError(f"{path}: {why} rows")
-    if case is not None and not 1 <= case <= len(stretches):
-        raise ValueError(f"episode is {case}; there are 1 to {len(stretches)}")
     labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
     rows = [stretch.rows for stretch in stretches]
     refuse_other_limit(reading.acts, None, tolerance)
@@ -70,12 +68,10 @@ def watched_log(
         if tolerance is not None:
             guard.reviser.tolerance = tolerance  # type: ignore[attr-defined]
     guard.learn = False
-    if of_cars:
-        stretches = list(_judged(guard, stretches))
     if isinstance(guard.judge, Foresight):
         stretches = list(_alarmed(guard.judge, guard.judge.alarm, stretches))
     system = Logged(path, stretches, labels, acts=reading.acts, of_cars=of_cars)
-    return Session(system, guard, case=system.places.get(case or 0, system.first), on=False)
+    return Session(system, guard, case=system.first if case is None else case - 1, on=False)
 
 
 def _alarmed(judge: Foresight, rate: int | None, found: Sequence[Played]) -> Iterator[Played]:
@@ -121,11 +117,3 @@ def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Ch
         rows = episode.rows(first, last + 1)
         failures = np.array([last - first] if fails else [], np.int64)
         yield rows._replace(starts=np.zeros(1, np.int64), failures=failures), fails
-
-
-def _judged(guard: Guard, found: Sequence[Played]) -> Iterator[Played]:
-    with progress("Judging", len(found)) as move:
-        for number, stretch in enumerate(found, 1):
-            risks = [revision.risk_proposed for revision in decided_on(guard, stretch.rows)]
-            move(number)
-            yield stretch._replace(risks=risks)

@@ -87,9 +87,8 @@ _APART = 1_000_000
 # Episodes from which is known how far variables spread; states are so many spreads apart, times the
 # root of the number of variables, and there are at most so many.
 _LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
-# So many rows of a long episode are played one by one, and so many in a second; of cars so much
-# before what is worst [s].
-_PLAYED, _A_SECOND, _BEFORE = 400, 10.0, 10.0
+# So many rows of a long episode are played one by one, and so many in a second.
+_PLAYED, _A_SECOND = 400, 10.0
 # Rows of an episode that shows something.
 _SHOWS = 10
 # What a file may define besides its environment.
@@ -384,25 +383,18 @@ class Played(NamedTuple):
     name: str
     rows: Chunk
     fails: str  #: who says that it failed; empty where it did not
-    risks: Sequence[float] = ()  #: of what was done, where that was judged before
     alarms: bool = False  #: whether one comes in it
-
-    @property
-    def highest(self) -> float:
-        """The highest risk."""
-        return float(np.nanmax([0.0, *self.risks]))
 
     @property
     def called(self) -> str:
         """Its name, with what is worst in it."""
-        risk = f"risk {self.highest:.1%}" if self.risks else ""
-        worst = self.fails.partition(" ")[0].lower() or risk
-        worst = ", ".join(filter(None, ["alarm" * self.alarms, worst]))
+        failure = self.fails.partition(" ")[0].lower()
+        worst = ", ".join(filter(None, ["alarm" * self.alarms, failure]))
         return f"{self.name} ({worst})" if worst else self.name
 
 
 class Logged:
-    """What a log says happened, whoever asks; of cars what failed first, then the riskiest."""
+    """What a log says happened, whoever asks."""
 
     alone, terminated = math.nan, True
 
@@ -412,13 +404,10 @@ class Logged:
         self.name, self.interval = Path(path).name, float(played[0].rows.dt)
         self.about = "row by row."
         self.labels, self.of_cars = labels._replace(dt=self.interval), of_cars
-        ranks = [(not part.fails, -part.highest) for part in played]
-        order = sorted(range(len(played)), key=ranks.__getitem__ if of_cars else None)
         shows = [(len(p.rows.times) >= _SHOWS, p.alarms, bool(p.fails)) for p in played]
-        self.first = 0 if of_cars else shows.index(max(shows))  #: that is worth a look
-        self._played = [played[number] for number in order]
-        self.places = {number + 1: place for place, number in enumerate(order)}
-        self.cases = tuple(part.called for part in self._played)
+        self.first = shows.index(max(shows))  #: that is worth a look
+        self._played = played
+        self.cases = tuple(part.called for part in played)
         self.told: dict[str, Any] = {"live": False, "acts": acts}
         if not of_cars:  # which move in real time
             pace = _A_SECOND * self.interval
@@ -429,14 +418,11 @@ class Logged:
 
     def begin(self, case: int) -> None:
         """Go to the first row of an episode."""
-        _, self._rows, fails, risks, _ = self._played[case]
+        self._rows, fails = self._played[case].rows, self._played[case].fails
         times = self._rows.times - self._rows.times[0]
         self._times, self._fails = times.tolist(), fails
         self._cars = list(cars_of(times, self._rows.observations)) if self.of_cars else None
         begins = self._times[max(len(times) - _PLAYED, 0)]
-        if self.of_cars:
-            has_risk = not fails and np.isfinite(risks).any()
-            begins = self._times[int(np.nanargmax(risks)) if has_risk else -1] - _BEFORE
         began = float(self._rows.times[0])
         clock = math.nan if self.of_cars or self.interval < 1.0 else 0.0
         clock = began if began >= DATES else clock
