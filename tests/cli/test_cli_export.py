@@ -23,7 +23,7 @@ def driven(evofsm, tmp_path_factory):
 
 @pytest.mark.parametrize(("to", "begins"), [("dot", "digraph"), ("prism", "// A machine of")])
 def test_folder_and_guard_give_the_same_states(evofsm, driven, to, begins, tmp_path):
-    out, log = driven
+    out, _ = driven
     printed = {}
     for file in (out, out / "guard.evofsm"):
         result = evofsm("export", file, "--to", to)

@@ -7,8 +7,7 @@ from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
-from statistics import median
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from evofsm.cli.options import (
     ByJudge,
@@ -131,10 +130,6 @@ def _drive_in_turn(
     from evofsm.cli.driving import drive_in_turn
     from evofsm.driving.sumo import open_world
 
-    if mcap is not None:
-        from evofsm.io.foxglove import recording
-    setup = results.setup
-    about = setup.settings | {"episodes": episodes}
     with (
         _log_of(audit, mcap) as log,
         open_world(results.setup.world) as place,

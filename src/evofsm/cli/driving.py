@@ -177,7 +177,7 @@ class Results:
         row = summarise(setup.family.name, setup.reviser, outcomes, setup.family.interval)
         if self.folder is not None:
             self._write(self.folder, rows)
-        return Driving(row, leads, self.guard)
+        return Driving(row, self.guard)
 
     def _write(self, folder: Path, rows: Sequence[Outcomes]) -> None:
         self.save_guard(now=True)
