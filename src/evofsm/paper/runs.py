@@ -187,9 +187,9 @@ def run_paper(
         columns = action, trace.state, trace.n_states, belief, trace.surprise
         return Run(name, case, episode, *columns)
 
-    for left in reversed(range(rounds)):
+    for n_left in reversed(range(rounds)):
         for case in order:
-            is_last = left == 0
+            is_last = n_left == 0
             runs.append(learn(machine, f"case {case}", case, settings.scenario, is_last=is_last))
     for time in settings.brake_at:
         leader = replace(settings.scenario.leader, brake_time=time)
