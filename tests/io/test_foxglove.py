@@ -19,7 +19,6 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from evofsm.driving import IDM, Leader, Scenario, drive, guard_for_cars
-from evofsm.fsm.observations import Missing
 from evofsm.guard import Guard
 from evofsm.guard.reviser import Mode
 from evofsm.io.foxglove import FOXGLOVE_LAYOUT, FoxgloveSink, schemas_of
@@ -110,7 +109,7 @@ def test_schemas_are_such_as_foxglove_takes_and_name_what_the_messages_hold(driv
 
 
 def test_what_is_not_known_is_left_out(tmp_path):
-    guard = guard_for_cars(low=-4.0, high=2.5, missing=Missing.PARTIAL)
+    guard = guard_for_cars(low=-4.0, high=2.5)
     with FoxgloveSink(None, tmp_path / "run.mcap") as guard.audit:
         guard.decide([math.nan, 20.0, 20.0], proposal=1.0)
         guard.decide([9.0, 0.0, 3.0], proposal=1.0)

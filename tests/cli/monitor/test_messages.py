@@ -140,7 +140,7 @@ def test_a_scene_is_the_nearest_object_ahead_in_the_lane():
         ({"vx": "fast"}, "objects[1].vx"),
         ({"length": -4.0}, "objects[1].length"),
         ({"vx": 1e18}, "objects[1].vx"),
-        ({"lane": ...}, "objects[1].lane"),
+        ({"lane": ...}, "objects[1].y"),
         ({"colour": "red"}, "objects[1].colour"),
     ],
 )
