@@ -306,7 +306,7 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
         watched_log(path, reading_of(**told | {"observe": BEARING, "resample": "20s"}), guard=guard)
     assert "as in a log: --" in live.stderr
     assert "--hole 5min" in live.stderr
-    beside = evofsm("monitor", "--guard", "guard.evofsm")
+    beside = evofsm("monitor", "guard.evofsm")
     assert (beside.exit_code, "ready: reads standard input" in beside.stderr) == (0, True)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from hashlib import sha256
 from itertools import chain
@@ -44,12 +44,17 @@ _SAME_STEP = 0.05
 _INTERVAL = 0.1
 # What other files end with holds live rows; so does CSV without --summary.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
+# In the beginning of what was saved.
+_SAVED = b'{"__metadata__"'
 
 
 @reads_logs
 def monitor(
-    file: Annotated[
-        Path | None, argument("Rows in JSON or CSV; a log. [default: standard input]")
+    files: Annotated[
+        list[Path] | None,
+        argument(
+            "Rows in JSON or CSV; a log; a guard. [default: standard input]", metavar="[FILE]"
+        ),
     ] = None,
     guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
     low: Annotated[
@@ -113,6 +118,15 @@ def monitor(
     Where nobody acts, alarms stand beside plain thresholds; without --guard the log's first part
     is learnt from (--split).
     """
+    file = None
+    for path in files or ():
+        with path.open("rb") if path.is_file() and guard is None else nullcontext() as stream:
+            if stream is not None and _SAVED in stream.read(64):
+                guard = path  # rows then come from elsewhere
+            elif file is not None:
+                raise ValueError(f"one FILE is read; cat joins several, names and all: {path}")
+            else:
+                file = path
     if sum(source is not None for source in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
     if plot is not None:
