@@ -415,11 +415,14 @@ class Guard:
 
         The same episode is then decided the same again, bit for bit. An episode that is under way
         is broken off: nothing more is learnt from it. Where it steps back, or guarded episodes seem
-        to fail sooner than those of the controller alone, proposals pass, of which it warns.
+        to fail sooner than those of the controller alone, proposals pass. It warns of that, and of
+        a guard that refuses nearly everything.
         """
         self.learn = False
         if why := self._why_passing():
             warnings.warn(f"this guard {why}: frozen so, proposals pass", stacklevel=3)
+        elif self._observing is not None and (why := self._observing.harm.replacing):
+            warnings.warn(f"this guard {why}; learn on, or look at print(guard)", stacklevel=3)
 
     def _why_passing(self) -> str:
         """Why proposals pass in the episode to come; empty where they need not."""

@@ -115,9 +115,12 @@ class Harm(NamedTuple):
         return [outcome for outcome in self.outcomes if outcome.guarded]
 
     @property
-    def replaces(self) -> bool:
-        """Whether hardly a proposal is kept."""
-        return self.decided >= _FEWEST_DECISIONS and self.kept < 0.05 * self.decided
+    def replacing(self) -> str:
+        """What is said of a guard that keeps hardly a proposal; empty of one that keeps more."""
+        if self.decided < _FEWEST_DECISIONS or self.kept >= 0.05 * self.decided:
+            return ""
+        share = f"{self.kept / self.decided:.0%}"
+        return f"refuses nearly everything: {share} of proposals pass; that is no filter"
 
     def helps(self, *, learning: bool) -> bool:
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
@@ -134,7 +137,7 @@ class Harm(NamedTuple):
         weights, rates = zip(
             *(self._record(arm, learning) for arm in (guarded, alone)), strict=True
         )
-        most = _LEFT_BY_ITSELF if self.replaces else _LEFT
+        most = _LEFT_BY_ITSELF if self.replacing else _LEFT
         if len(guarded) >= _CAREFUL and rates[0] > most * rates[1]:
             return False
         return bool(weights[0] @ better(guarded, alone) @ weights[1] >= 0.0)

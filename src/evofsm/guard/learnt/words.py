@@ -253,10 +253,7 @@ def harm(known: Harm, *, learning: bool) -> str:
     """What is said of a guard that was not shown to help, or that is no filter any more."""
     text = known.told(learning=learning)
     text = f"; {text}" if text else ""
-    if known.replaces:
-        share = f"{known.kept / known.decided:.0%}"
-        text += f"; it refuses nearly everything: {share} of proposals pass; that is no filter"
-    return text
+    return f"{text}; it {known.replacing}" if known.replacing else text
 
 
 def constant(values: Sequence[float]) -> str:
