@@ -52,6 +52,14 @@ def survived_as(rows, unit, ended=()):
     return Survived(rows, lowest, highest, unit, rows.std(0), ended)
 
 
+@pytest.mark.parametrize(("typical", "holds"), [(0.1, True), (2.0, False)])
+def test_a_form_that_would_refuse_most_of_what_was_survived_is_none(typical, holds):
+    failures, survived = seen("disc")
+    forms = explain(FAILS, failures, survived_as(survived, np.full(3, typical)))
+    assert inside(forms, failures).any(0).all() == holds
+    assert len(forms) == holds
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_forms_explain_failures_and_nothing_that_was_survived_is_inside(shape):
     failures, survived = seen(shape)

@@ -47,7 +47,7 @@ _SCREENED, _COUPLED, _IN_TWO, _ROUNDS = 6, 3, 3, 3
 _ALIKE = 1e-6
 # An ellipse may be moved inwards by so much [standard deviations].
 _INWARDS = 0.1 * 1.5 ** np.arange(8)
-# A rival of a threshold holds less than so much of what was survived.
+# A rival of a threshold, and a bent form once it is grown, hold less of what was survived.
 _RARE = 0.5
 # Which of x, y, x x, x y, y y a form of one variable has, a line, and a form of two variables.
 _KINDS = np.array([[1, 0, 1, 0, 0], [1, 1, 0, 0, 0], [1, 1, 1, 1, 1]], np.float64)
@@ -331,7 +331,8 @@ def _bent(
     says: int, failures: Floats, survived: Survived, fewer: float = np.inf
 ) -> tuple[Floats, bool]:
     """Bent forms that explain failures, and whether these are ``fewer`` and explain all of them."""
-    candidates = _asked(failures, survived)
+    candidates, n = _asked(failures, survived), len(survived.rows)
+    sample = survived.rows[np.linspace(0, n - 1, min(n, _FIT_ROWS)).astype(int)]
     bent_rows: list[Floats] = []
     groups, whole = [np.arange(len(failures))], True
     while groups and len(candidates) and len(bent_rows) < _MAX_FORMS:  # or nothing ever moved
@@ -342,6 +343,8 @@ def _bent(
         group = groups.pop(0)
         F = failures[group]
         rows, within, score = _fitted(F, candidates, survived)
+        if says == FAILS:  # one that is grown, and would refuse most of what was survived
+            within[(distances(rows, sample) < GROWN).mean(1) > _RARE] = False
         count = within.sum(1)
         best = max(range(len(candidates)), key=lambda n: (count[n], score[n]))
         if 2 < len(group) and count[best] < len(group):
