@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from evofsm.guard.learnt.backups import regulator
 from evofsm.guard.learnt.rollout import (
     CHANGED,
     CRASHES,
@@ -227,3 +228,16 @@ def test_so_many_disturbances_need_not_be_survived_but_that_none_begins():
         found = search_for(model, [0.0], [[[0.0, 0.0]]], allowed=allowed, **asked)
         assert found[0] == how
         assert how != KEPT or found[-1] == pytest.approx(3.0)  # of those that are survived
+
+
+def test_a_regulator_holds_two_unstable_axes_at_a_place_and_ends_where_costs_are_endless():
+    A, B = np.eye(5), np.zeros((5, 2))
+    A[[1, 3], [2, 4]], A[[2, 4], [1, 3]], B[[2, 4], [0, 1]] = 0.1, 0.2, 0.1
+    away = np.eye(5)[1:]
+    away[[0, 2], 0] = -1.0, 2.0  # at 1 and -2
+    K = regulator(A, B, away.T @ away, 0.01, 200)
+    x = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+    for _ in range(400):
+        x = A @ x + B @ K @ x
+    assert np.allclose(x, [1.0, 1.0, 0.0, -2.0, 0.0], atol=0.3)
+    assert np.isfinite(regulator(1e9 * A, B, away.T @ away, 0.01, 200)).all()

@@ -1,13 +1,13 @@
-"""Backups: constant actions, and linear feedback that evolves by mutation (`rollout`).
+"""Backups: constant actions, and linear feedback that evolves (`rollout`).
 
 With the share v_q(s) of the horizon that backup q survives from situation s, over some
 disturbances, and a little for the distance to failure, backups Q together are worth
 
     F(Q) = mean_s max_q v_q(s) + 0.01 sum_q mean_s v_q(s).
 
-A mutant takes the place of the linear backup for which F grows most, if it grows. They are asked in
-the order in which each adds most to F of those before it, the greedy order for a submodular
-function (Nemhauser, Wolsey & Fisher 1978).
+A mutant, or a linear-quadratic regulator of drawn costs, takes the place of the linear backup for
+which F grows most, if it grows. They are asked in the order in which each adds most to F of those
+before it, the greedy order for a submodular function (Nemhauser, Wolsey & Fisher 1978).
 """
 
 from __future__ import annotations
@@ -18,12 +18,16 @@ from itertools import product
 import numpy as np
 from numpy.random import Generator
 
-from evofsm.guard.learnt.rollout import Floats, Ints, Model, rollout
-from evofsm.guard.learnt.state import State
+from evofsm.guard.learnt.model import ridge
+from evofsm.guard.learnt.rollout import Floats, Ints, Model, features, rollout
+from evofsm.guard.learnt.state import LearntSettings, State
 
 # Of mutants the share that are of the best, the share of numbers that differ, by a size of 10 to a
 # power between these.
 _OF_BEST, _CHANGED, _SIZES = 0.8, 0.6, (-1.5, 0.7)
+# Of regulators the powers of 10 between which costs of variables and of actions are drawn, what
+# counts of a cost a step later, and one that is too large; what their model is held to 0 by.
+_COSTS, _EFFORTS, _LATER, _TOO_LARGE, _TO_0 = (-1.0, 1.0), (-2.0, 1.0), 0.99, 1e12, 1e-6
 # What a backup is worth by itself counts so much, compared with what it adds to the others.
 _BY_ITSELF = 0.01
 # Decimals beyond which numbers are equal; what a choice is preferred by to the next one.
@@ -81,8 +85,62 @@ def basis(rows: Floats, choices: int = 0) -> tuple[Ints, Floats]:
     return np.lexsort((*exact[::-1], exact.mean(0).round(_ROUNDED))), turns
 
 
+def linearised(state: State, model: Model) -> tuple[Floats, Floats, Floats]:
+    """Fit linear dynamics to what is expected in all situations, of all ends of actions.
+
+    Of x = [1, (z - mean) / spread] the next one is A x + B u: A (1 + m, 1 + m), B (1 + m, a), and
+    the situations (S, 1 + m) as such x.
+    """
+    a, m = state.policies.shape[1], len(model.origin)
+    ends = np.eye(a) if model.choices else np.vstack([-np.eye(a), np.zeros(a), np.eye(a)])
+    rows = np.repeat(state.situations, len(ends), axis=0)
+    z, u = rows[:, :m], np.tile(ends, (len(state.situations), 1))
+    phi = features(model, z, rows[:, m : 2 * m], rows[:, 2 * m :], u)
+    x = np.column_stack([np.ones(len(z)), (z - model.mean) * model.inverse])
+    inputs, changes = np.hstack([x, u]), phi @ model.weights * model.inverse
+    penalty = np.full(1 + m + a, _TO_0 * len(x))
+    weights = ridge(inputs.T @ inputs, inputs.T @ changes, penalty).T
+    A, B = np.eye(1 + m), np.zeros((1 + m, a))
+    A[1:] += weights[:, : 1 + m]
+    B[1:] = weights[:, 1 + m :]
+    return A, B, x[:: len(ends)]
+
+
+def regulator(A: Floats, B: Floats, cost: Floats, effort: float, steps: int) -> Floats:
+    """(a, 1 + m) linear feedback u = -K x of the least sum of x'Qx + effort u'u over the steps.
+
+    By Riccati's recursion (Kalman, "Contributions to the theory of optimal control", Boletin de la
+    Sociedad Matematica Mexicana 5, 1960). Where mutants alone rarely hit on feedback of many
+    variables, it begins there.
+
+    Parameters
+    ----------
+    A, B : (1 + m, 1 + m) and (1 + m, a) ndarray
+        Linear dynamics.
+    cost : (1 + m, 1 + m) ndarray
+        Q.
+    effort : float
+        What actions cost.
+    steps : int
+        How far ahead; it ends where what is to come costs too much to be told.
+    """
+    K: Floats = np.zeros(B.T.shape)
+    P = cost
+    for _ in range(steps):
+        K = np.asarray(np.linalg.solve(effort * np.eye(B.shape[1]) + B.T @ P @ B, B.T @ P @ A))
+        P = cost + _LATER * A.T @ P @ (A - B @ K)
+        if np.abs(P).max() > _TOO_LARGE:
+            break
+    return -K
+
+
 def evolved(
-    state: State, model: Model, residuals: Floats, scale: float, n_mutants: int, random: Generator
+    state: State,
+    model: Model,
+    residuals: Floats,
+    scale: float,
+    settings: LearntSettings,
+    random: Generator,
 ) -> State:
     """Take backups that are worth more, in the order in which they are asked."""
     policies, situations = state.policies.copy(), state.situations
@@ -99,13 +157,28 @@ def evolved(
     actions, turns = basis(situations[:, 2 * m :], model.choices)
     cells = np.ix_(np.argsort(actions), np.argsort(np.append(0, 1 + variables)))
     signs = np.append(1.0, flips) * turns[:, None]
-    for _ in range(n_mutants if len(parents) else 0):
+    A, B, x = linearised(state, model)
+
+    def mutant() -> Floats:
+        """Change some numbers of the best backup, or of any."""
         parent = parents[values[parents].mean(1).round(_ROUNDED).argmax()]
         if random.random() >= _OF_BEST:
             parent = int(random.integers(len(policies)))
         size = 10.0 ** random.uniform(*_SIZES)
         mutation = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
-        child = policies[parent] + mutation[cells] * signs
+        return np.asarray(policies[parent] + mutation[cells] * signs)
+
+    def drawn_regulator() -> Floats:
+        """Lead to the middle of what was survived, or to a situation."""
+        costs = 10.0 ** random.uniform(*_COSTS, m)[np.argsort(variables)]
+        place = x[random.integers(len(x))] if random.random() < 0.5 else np.eye(1 + m)[0]
+        away = np.eye(1 + m)[1:] - np.outer(place[1:], np.eye(1 + m)[0])
+        effort = 10.0 ** random.uniform(*_EFFORTS)
+        return regulator(A, B, (away.T * costs) @ away, effort, state.horizon)
+
+    n_tried = settings.n_mutants + settings.n_regulators
+    for k in range(n_tried if len(parents) else 0):
+        child = mutant() if k < settings.n_mutants else drawn_regulator()
         child_values = worth(child)
         variants = np.repeat(values[None], 1 + len(parents), 0)  # as they are, and with the child
         variants[1 + np.arange(len(parents)), parents] = child_values

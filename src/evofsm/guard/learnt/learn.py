@@ -96,7 +96,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
         numbers = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
         rest, scale = np.ascontiguousarray(rest[:, :, numbers]), disturbance_scale(state, settings)
-        state = evolved(state, motion_model, rest, scale, settings.n_mutants, random)
+        state = evolved(state, motion_model, rest, scale, settings, random)
     return state._replace(n_episodes=state.n_episodes + 1)
 
 

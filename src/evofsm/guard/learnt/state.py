@@ -41,8 +41,8 @@ class LearntSettings:
         Disturbances that are remembered, and situations on which these and backups are tried.
     n_asked : int
         Backups that are asked in a decision; of more than 12 variables 2.
-    n_linear, n_mutants : int
-        Linear backups, and mutants of them that are tried after an episode.
+    n_linear, n_mutants, n_regulators : int
+        Linear backups, and mutants and regulators that are tried after an episode.
     n_starts : int
         Steps of an episode in which a disturbance may begin, at most.
     max_failures, max_survived : int
@@ -102,6 +102,7 @@ class LearntSettings:
     n_asked: int = 3
     n_linear: int = 3
     n_mutants: int = 40
+    n_regulators: int = 4
     n_starts: int = 100
     max_failures: int = 200
     max_survived: int = 8000
