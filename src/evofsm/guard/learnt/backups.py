@@ -92,7 +92,7 @@ def linearised(state: State, model: Model) -> tuple[Floats, Floats, Floats]:
     the situations (S, 1 + m) as such x.
     """
     a, m = state.policies.shape[1], len(model.origin)
-    ends = np.eye(a) if model.choices else np.vstack([-np.eye(a), np.zeros(a), np.eye(a)])
+    ends = np.vstack([-np.eye(a), np.zeros(a), np.eye(a)])
     rows = np.repeat(state.situations, len(ends), axis=0)
     z, u = rows[:, :m], np.tile(ends, (len(state.situations), 1))
     phi = features(model, z, rows[:, m : 2 * m], rows[:, 2 * m :], u)
@@ -157,7 +157,6 @@ def evolved(
     actions, turns = basis(situations[:, 2 * m :], model.choices)
     cells = np.ix_(np.argsort(actions), np.argsort(np.append(0, 1 + variables)))
     signs = np.append(1.0, flips) * turns[:, None]
-    A, B, x = linearised(state, model)
 
     def mutant() -> Floats:
         """Change some numbers of the best backup, or of any."""
@@ -170,13 +169,15 @@ def evolved(
 
     def drawn_regulator() -> Floats:
         """Lead to the middle of what was survived, or to a situation."""
+        A, B, x = linearised(state, model)
         costs = 10.0 ** random.uniform(*_COSTS, m)[np.argsort(variables)]
         place = x[random.integers(len(x))] if random.random() < 0.5 else np.eye(1 + m)[0]
         away = np.eye(1 + m)[1:] - np.outer(place[1:], np.eye(1 + m)[0])
         effort = 10.0 ** random.uniform(*_EFFORTS)
         return regulator(A, B, (away.T * costs) @ away, effort, state.horizon)
 
-    n_tried = settings.n_mutants + settings.n_regulators
+    # Indices of actions are no input that a regulator could weigh.
+    n_tried = settings.n_mutants + (0 if model.choices else settings.n_regulators)
     for k in range(n_tried if len(parents) else 0):
         child = mutant() if k < settings.n_mutants else drawn_regulator()
         child_values = worth(child)

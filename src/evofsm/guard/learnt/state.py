@@ -42,7 +42,8 @@ class LearntSettings:
     n_asked : int
         Backups that are asked in a decision; of more than 12 variables 2.
     n_linear, n_mutants, n_regulators : int
-        Linear backups, and mutants and regulators that are tried after an episode.
+        Linear backups, and mutants and, where actions are a box, regulators that are tried after an
+        episode.
     n_starts : int
         Steps of an episode in which a disturbance may begin, at most.
     max_failures, max_survived : int
