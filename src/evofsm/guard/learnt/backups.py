@@ -12,7 +12,7 @@ before it, the greedy order for a submodular function (Nemhauser, Wolsey & Fishe
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import product
 
 import numpy as np
@@ -167,19 +167,21 @@ def evolved(
         mutation = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
         return np.asarray(policies[parent] + mutation[cells] * signs)
 
-    def drawn_regulator() -> Floats:
+    def drawn_regulators() -> Iterator[Floats]:
         """Lead to the middle of what was survived, or to a situation."""
         A, B, x = linearised(state, model)
-        costs = 10.0 ** random.uniform(*_COSTS, m)[np.argsort(variables)]
-        place = x[random.integers(len(x))] if random.random() < 0.5 else np.eye(1 + m)[0]
-        away = np.eye(1 + m)[1:] - np.outer(place[1:], np.eye(1 + m)[0])
-        effort = 10.0 ** random.uniform(*_EFFORTS)
-        return regulator(A, B, (away.T * costs) @ away, effort, state.horizon)
+        while True:
+            costs = 10.0 ** random.uniform(*_COSTS, m)[np.argsort(variables)]
+            place = x[random.integers(len(x))] if random.random() < 0.5 else np.eye(1 + m)[0]
+            away = np.eye(1 + m)[1:] - np.outer(place[1:], np.eye(1 + m)[0])
+            effort = 10.0 ** random.uniform(*_EFFORTS)
+            yield regulator(A, B, (away.T * costs) @ away, effort, state.horizon)
 
+    regulators = drawn_regulators()
     # Indices of actions are no input that a regulator could weigh.
     n_tried = settings.n_mutants + (0 if model.choices else settings.n_regulators)
     for k in range(n_tried if len(parents) else 0):
-        child = mutant() if k < settings.n_mutants else drawn_regulator()
+        child = mutant() if k < settings.n_mutants else next(regulators)
         child_values = worth(child)
         variants = np.repeat(values[None], 1 + len(parents), 0)  # as they are, and with the child
         variants[1 + np.arange(len(parents)), parents] = child_values
