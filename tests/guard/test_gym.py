@@ -14,7 +14,15 @@ import pytest
 gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium import wrappers  # noqa: E402
-from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete  # noqa: E402
+from gymnasium.spaces import (  # noqa: E402
+    Box,
+    Dict,
+    Discrete,
+    MultiBinary,
+    MultiDiscrete,
+    Text,
+    Tuple,
+)
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper  # noqa: E402
 
@@ -259,7 +267,8 @@ def test_a_guard_whose_actions_go_beyond_the_environments_is_refused():
 @pytest.mark.parametrize(
     ("space", "guarded"),
     [
-        (MultiDiscrete([2, 2]), Discrete(4)),
+        (MultiDiscrete([2, 2]), Discrete(2)),
+        (MultiBinary(3), Discrete(3)),
         (Discrete(3), Discrete(2)),
         (Box(-1.0, 1.0, (2,)), Box(-1.0, 1.0, (3,))),
         (Box(-1.0, 1.0, (1,)), Discrete(2)),
@@ -302,6 +311,32 @@ def test_a_change_is_executed_and_can_cost_reward(space, proposed, executed, siz
     assert reward == pytest.approx(1.5 - penalty * size)
 
 
+@pytest.mark.parametrize(
+    ("space", "proposed", "executed"),
+    [
+        (MultiDiscrete([2, 3]), [0, 1], [1, 2]),
+        (MultiDiscrete([2, 3], start=[1, -1]), [1, 0], [2, 1]),
+        (MultiDiscrete([2, 3]), [0, 3], [0, 0]),  # no action: the fallback
+        (MultiBinary((1, 2)), [[0, 1]], [[1, 1]]),
+    ],
+)
+def test_combinations_of_choices_are_choices(space, proposed, executed):
+    n_actions = int(np.prod(getattr(space, "nvec", 4)))
+    last = float(n_actions - 1)
+
+    class Last(Spy):
+        def search(self, situation, wanted, *, tolerance, revising, mask=None):
+            options = np.array([wanted, last if wanted else wanted])
+            return Search(options, self.judge(situation, options), int(wanted > 0.0), "the last")
+
+    script = Script(FAR, FAR, FAR, action_space=space)
+    env = RevisedActions(script, guard_for(Discrete(n_actions), Last()))
+    env.reset()
+    *_, info = env.step(np.array(proposed, space.dtype))
+    assert np.array_equal(info["reviser/executed_action"], executed)
+    assert info["reviser/executed_action"] in space
+
+
 def test_a_penalty_is_no_reward():
     for penalty in (-1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="penalty"):
@@ -315,7 +350,13 @@ def test_a_penalty_is_no_reward():
         (Box(0.0, 9.0, ()), np.array(2.0), None, (2.0,)),
         (Discrete(3), 2, None, (0.0, 0.0, 1.0)),
         (Discrete(3, start=5), 5, None, (1.0, 0.0, 0.0)),
-        (Dict({"a": Box(0.0, 9.0, ())}), {"a": 3.0}, lambda given: [given["a"]], (3.0,)),
+        (
+            Dict({"a": Box(0.0, 9.0, ()), "b": Tuple([Discrete(2), MultiBinary(2)])}),
+            {"a": 3.0, "b": (1, np.array([1, 0])), "action_mask": None},
+            None,
+            (3.0, 0.0, 1.0, 1.0, 0.0),
+        ),
+        (Dict({"a": Text(9)}), {"a": "3.0"}, lambda given: [float(given["a"])], (3.0,)),
     ],
 )
 def test_observations_become_a_vector(space, observation, observe, seen):

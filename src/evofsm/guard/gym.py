@@ -35,7 +35,7 @@ from evofsm.guard.reviser import make_usable, unjudged_revision
 
 with needs("gymnasium", "gym", "a wrapper for Gymnasium"):
     import gymnasium
-    from gymnasium.spaces import Box, Dict, Discrete, Space
+    from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
     from gymnasium.utils import RecordConstructorArgs
     from gymnasium.vector import VectorEnv, VectorWrapper
     from gymnasium.vector.utils import concatenate, create_empty_array, iterate
@@ -94,7 +94,8 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
     observe : callable, optional
         From an observation of ``env`` to the guard's; to None where there is nothing to judge,
         such as no car ahead: then nothing is revised or learnt. NaN is what was not observed.
-        Without it a box is flattened, and each value of ``Discrete`` is a variable that is 1 or 0.
+        Without it a box is flattened, each value of ``Discrete`` is a variable that is 1 or 0, and
+        parts of ``Dict`` and ``Tuple`` follow each other, but for an ``action_mask``.
     failed : callable or "terminated"
         From a step to whether it ended in failure: of ``step.observation``, ``step.reward``,
         ``step.terminated``, ``step.truncated`` and ``step.info``. ``"terminated"`` says that every
@@ -115,7 +116,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         If ``env`` is none of Gymnasium, or ``observe`` or ``failed`` no function.
     ValueError
         If actions of ``env`` are not the guard's or do not reach as far, its observations are
-        neither a box nor ``Discrete`` of at most 64 values and ``observe`` is missing, or the
+        neither boxes nor ``Discrete`` of at most 64 values and ``observe`` is missing, or the
         penalty is negative.
 
     Notes
@@ -504,11 +505,12 @@ class Terms:
 
 
 def _flat(space: Space[Any]) -> Observe:
-    if isinstance(space, Box):
+    if isinstance(space, Box | MultiBinary):
         return lambda observation: np.reshape(observation, -1)
-    if isinstance(space, Dict) and space.keys() == {"observation", "action_mask"}:
-        inner = _flat(space["observation"])
-        return lambda observation: inner(observation["observation"])
+    if isinstance(space, Dict | Tuple):
+        keys: Any = range(len(space)) if isinstance(space, Tuple) else space.keys()
+        parts = {key: _flat(space[key]) for key in keys if key != "action_mask"}
+        return lambda seen: np.concatenate([part(seen[key]) for key, part in parts.items()])
     if isinstance(space, Discrete):
         if space.n > _MOST_VALUES:
             raise ValueError(
@@ -519,8 +521,8 @@ def _flat(space: Space[Any]) -> Observe:
         first, unit = int(space.start), np.eye(int(space.n))
         return lambda observation: unit[int(observation) - first]
     raise ValueError(
-        f"the environment's observations are {space}, neither a Box nor Discrete; give observe, "
-        "which makes a vector of them"
+        f"the environment's observations are {space}, neither Box, MultiBinary nor Discrete, nor "
+        "a Dict or Tuple of these; give observe, which makes a vector of them"
     )
 
 
@@ -529,13 +531,29 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
     if isinstance(space, Discrete) and actions == Choices(int(space.n)):
         first = int(space.start)
         return lambda action: float(action) - first, lambda action: first + int(action)
+    if isinstance(space, MultiDiscrete | MultiBinary):
+        sizes: Any = getattr(space, "nvec", np.full(space.shape, 2))
+        start = getattr(space, "start", 0)
+        if actions == Choices(math.prod(sizes.flat)):
+            flat_sizes = sizes.ravel()
+
+            def index(action: Any) -> float:
+                row = np.ravel(action - start)
+                return float(np.ravel_multi_index(row, flat_sizes)) if action in space else -1.0
+
+            def combination(index: Action) -> NDArray[Any]:
+                row = np.array(np.unravel_index(int(index), flat_sizes), space.dtype)
+                return np.asarray(row.reshape(space.shape) + start, space.dtype)
+
+            return index, combination
     shape = actions.half.shape if isinstance(actions, BoxActions) else ()
     is_range = not isinstance(actions, Choices)
     if not (isinstance(space, Box) and is_range and math.prod(space.shape) == math.prod(shape)):
         raise ValueError(
             f"the environment's actions are {space}, but the guard's are {actions}: make a guard "
-            "of such actions, n_actions of Discrete and arrays low and high of Box, or wrap the "
-            "environment first (RescaleAction, TransformAction of gymnasium.wrappers)"
+            "of such actions, n_actions of Discrete (of MultiDiscrete and MultiBinary all their "
+            "combinations) and arrays low and high of Box, or wrap the environment first "
+            "(RescaleAction, TransformAction of gymnasium.wrappers)"
         )
 
     low, high = (np.reshape(end, space.shape) for end in (actions.low, actions.high))
