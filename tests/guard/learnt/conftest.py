@@ -58,7 +58,7 @@ class Point:
         while proposal is not None:
             said.append(guard.decide(seen(len(said), z), proposal))
             z, proposal, failed = walk.send(said[-1].executed)
-        guard.end(failed, z)
+        guard.end(failed, seen(len(said), z))
         return said, failed
 
     def taught(self, count=3, **others):

@@ -23,13 +23,13 @@ def play(guard, road, episode, see=lambda z: z):
     return said, place >= fails
 
 
-def taught(see=lambda z: z):
-    """A guard that knows the wall, and met the trap twice."""
+def taught(see=lambda z: z, times=2):
+    """A guard that knows the wall, and met the trap some times."""
     judge = LearntRisk(0.1, -1.0, 1.0, without=["regions"])
     guard = Guard(low=-1.0, high=1.0, interval=0.1, judge=judge, explaining=True)
     for episode in range(4):
         play(guard, episode % 2, episode, see)
-    for episode in range(10, 12):
+    for episode in range(10, 10 + times):
         play(guard, ICE, episode, see)
     return guard
 
@@ -51,6 +51,16 @@ def test_where_a_certificate_was_refuted_is_a_dead_end_that_is_named_and_kept_aw
     said = [one for episode in range(30, 33) for one in play(guard, ICE, episode)[0]]
     explained = [one.explanation for one in said if "from a dead end" in one.explanation]
     assert "that had been certified failed. Its centre is in #" in explained[-1]
+
+
+@pytest.mark.parametrize(("held", "learns"), [(0, True), (-1, False)])
+def test_a_failure_while_a_rival_is_tried_refutes_that_and_no_certificate(held, learns):
+    guard = taught(times=0)
+    guard.judge.state = before = guard.judge.state._replace(held=held)
+    guard.judge.remake()
+    assert play(guard, ICE, 10)[1]
+    after = guard.judge.state
+    assert (len(after.centres) > 0, after.too_short > before.too_short) == (learns, learns)
 
 
 def test_what_is_survived_there_takes_it_back(wary):

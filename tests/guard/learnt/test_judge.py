@@ -287,8 +287,11 @@ def test_what_is_not_seen_now_and_then_does_not_keep_it_from_deciding(point):
     assert "was observed" in nothing.reason
 
 
-def test_a_sensor_that_comes_every_third_row_is_learnt_of(point):
+@pytest.mark.parametrize("how", ["every third row", "until it fails"])
+def test_what_sensors_do_not_tell_of_a_failure_is_learnt_of(point, how):
     def seen(k, z):
+        if how == "until it fails":
+            return z * math.nan if z[0] >= 1.0 else z
         return np.where([*[False] * point.places, *[k % 3 > 0] * point.places], math.nan, z)
 
     def failures(guard, episodes):

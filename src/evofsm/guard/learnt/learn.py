@@ -39,7 +39,10 @@ _ONSET = 0.5
 def learn(state: State, episode: Episode, given: Given) -> State:
     """Learn from an episode, or from a part of a long one, and from what the user said."""
     decisions, before, settings, without = episode, state, given.settings, given.without
-    decisions = decisions._replace(observations=model.interpolated(episode.observations))
+    rows = model.filled(episode.observations, failed=episode.failed)
+    decisions = decisions._replace(observations=rows)
+    if -settings.settled <= state.held < 0:  # what a rival certified says nothing of the model
+        decisions = decisions._replace(certified=np.zeros(len(decisions.certified)))
     episode = decisions.every(state.stride)
     random = np.random.default_rng([given.seed, state.n_episodes])
     is_seen = np.isfinite(episode.observations).all(1)

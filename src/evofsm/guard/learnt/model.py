@@ -23,7 +23,7 @@ FLOOR = 1e-3
 # The least variance of a feature, and what all weights are held to 0 by, of its mean square: far
 # more than rounding, so that features that did not vary yet share what they explain alike.
 _LEAST, _ALL_ALIKE = 1e-6, 1e-10
-# Rows from one in which a variable was seen to the next, at most, between which it is interpolated.
+# Rows from one in which a variable was seen to the next, at most, between which it is filled in.
 _MAX_GAP = 5
 # What leaves a feature out.
 _NEVER = 1e15
@@ -69,17 +69,25 @@ def without_glitches(z: Floats, unit: Floats) -> Floats:
     return np.where(bad.any(1, keepdims=True), np.nan, z)
 
 
-def interpolated(z: Floats) -> Floats:
-    """Observations (T, m) in which a variable that was not seen in few rows lies on a line."""
+def filled(z: Floats, *, failed: bool) -> Floats:
+    """Observations (T, m) in which a variable that was not seen in few rows lies on a line.
+
+    Where it ``failed`` in the last row it is as it was last seen; of a row of which nothing was
+    seen, a step farther.
+    """
     if np.isfinite(z).all():
         return z
-    rows, index = z.copy(), np.arange(len(z))
+    rows, index, end = z.copy(), np.arange(len(z)), len(z) - 1
+    if failed and len(z) > 2 and not np.isfinite(z[-1]).any():
+        rows[-1] = 2.0 * z[-2] - z[-3]
     for column in rows.T:
         at = np.flatnonzero(np.isfinite(column))
         if len(at) > 1:
             after = np.searchsorted(at, index).clip(1, len(at) - 1)
             within = (index > at[0]) & (index < at[-1]) & (at[after] - at[after - 1] <= _MAX_GAP)
             column[within] = np.interp(index, at, column[at])[within]
+        if failed and len(at) and 0 < end - at[-1] < _MAX_GAP:
+            column[-1] = column[at[-1]]
     return rows
 
 
