@@ -304,6 +304,33 @@ def test_what_sensors_do_not_tell_of_a_failure_is_learnt_of(point, how):
     assert failures(guard, range(100, 110)) == 0 < 8 <= alone
 
 
+@pytest.mark.slow
+def test_actions_that_act_late_are_learnt_of_where_the_latest_are_observed():
+    """The pole falls soon: an action that comes three decisions late has to be known of."""
+
+    def failures(guard, episodes):
+        return sum(fly(guard, np.random.default_rng(episode)) for episode in episodes)
+
+    def fly(guard, rng):
+        angle, rate = rng.normal(0.0, 0.05, 2)
+        to_come = [0.0] * 3
+        for _ in range(150):
+            action = guard.decide([angle, rate, *to_come], rng.uniform(-1.0, 1.0)).executed
+            rate += 0.05 * (5.0 * np.sin(angle) + 6.0 * to_come[0]) + 0.001 * rng.normal()
+            angle += 0.05 * rate
+            to_come = [*to_come[1:], float(action)]
+            if abs(angle) > 0.5:
+                break
+        guard.end(abs(angle) > 0.5, [angle, rate, *to_come])
+        return abs(angle) > 0.5
+
+    guard = Guard(-1.0, 1.0, interval=0.05)
+    assert failures(Guard(-1.0, 1.0, interval=0.05, mode=Mode.OFF), range(100, 110)) == 10
+    failures(guard, range(40))
+    guard.freeze()
+    assert failures(guard, range(100, 110)) == 0
+
+
 def test_after_a_gap_in_time_nothing_follows_from_what_was(points):
     frozen, learning = points["box"].taught(3), points["box"].taught(3)
     frozen.freeze()
