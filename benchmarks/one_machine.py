@@ -211,7 +211,7 @@ DEEDS = {
         full, lambda machine: machine.observe([np.nan, 4.0], missing=Missing.PARTIAL)
     ),
     "missing, failed": at_once(
-        full, lambda machine: machine.observe([9.0, np.nan], missing=Missing.HOLD, failed=True)
+        full, lambda machine: machine.observe([9.0, np.nan], missing=Missing.PARTIAL, failed=True)
     ),
     "fail": at_once(full, lambda machine: machine.fail()),
     "start_episode": at_once(full, lambda machine: machine.start_episode()),

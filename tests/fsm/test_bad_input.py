@@ -146,12 +146,11 @@ HIDDEN = {
 }
 
 
-@pytest.mark.parametrize("missing", [Missing.HOLD, Missing.PARTIAL])
 @pytest.mark.parametrize("z", HIDDEN.values(), ids=HIDDEN)
-def test_a_masked_entry_is_treated_as_nan_is(grown, z, missing):
+def test_a_masked_entry_is_treated_as_nan_is(grown, z):
     twin = grown.copy()
-    step = grown.observe(z, missing=missing)
-    expected = twin.observe([float(z[0]), NAN], missing=missing)
+    step = grown.observe(z, missing=Missing.PARTIAL)
+    expected = twin.observe([float(z[0]), NAN], missing=Missing.PARTIAL)
     assert step.missing == expected.missing == (1,)
     assert step.belief.tobytes() == expected.belief.tobytes()
 

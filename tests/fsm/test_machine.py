@@ -119,8 +119,7 @@ def test_a_question_changes_nothing_and_its_answer_is_the_askers_own(grown, snap
     before = snapshot(grown)
     for name in ("belief", "centers", "visits", "state_ids", "decisions", "transition_matrices"):
         getattr(grown, name)[...] = 7
-    for policy in ("marginal", "hold", "observed"):
-        grown.predict(0, 50, policy)[...] = 7
+    grown.predict(0, 50)[...] = 7
     model = grown.model()
     model.recognise([0.1, 0.2])
     model.propagate(grown.belief, 0, 3)

@@ -73,7 +73,7 @@ def assert_sound(machine, trace):
     for rows in (model.transition_matrices, model.marginal_matrix, machine.belief, trace.belief):
         assert_distribution(rows)
     for i in range(machine.n_actions):
-        assert_distribution(machine.predict(i, 3, "observed"))
+        assert_distribution(machine.predict(i, 3))
     assert (np.diff(trace.n_states, prepend=0) == (trace.event == Event.CREATED)).all()
     assert (model.origin_frequency >= 0.0).all()
     assert ((model.potentials > 0.0) & (model.potentials <= 1.0)).all()

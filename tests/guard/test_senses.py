@@ -50,12 +50,11 @@ def guard(learn=True, **options):
     return Guard.of(reviser, machine=machine(), learn=learn, interval=0.25, **options)
 
 
-@pytest.mark.parametrize("missing", [Missing.PARTIAL, Missing.HOLD])
-def test_an_incomplete_observation_teaches_nothing_but_that_it_failed(missing):
+def test_an_incomplete_observation_teaches_nothing_but_that_it_failed():
     taught = machine()
     centers, matrices, visits = taught.centers, taught.transition_matrices, taught.model().visits
     taught.act(1)
-    step = taught.observe([NAN, 15.0, 15.0], missing=missing)
+    step = taught.observe([NAN, 15.0, 15.0], missing=Missing.PARTIAL)
     assert step.missing == (0,)
     assert step.belief.sum() == pytest.approx(1.0, abs=1e-12)
     assert not np.isnan(step.surprise)  # it was foreseen, or not
@@ -64,7 +63,7 @@ def test_an_incomplete_observation_teaches_nothing_but_that_it_failed(missing):
     np.testing.assert_array_equal(taught.model().visits, visits)
     np.testing.assert_array_equal(taught.belief, step.belief)
     failures = taught.endings.sum()
-    taught.observe([NAN, 15.0, 15.0], missing=missing, failed=True)
+    taught.observe([NAN, 15.0, 15.0], missing=Missing.PARTIAL, failed=True)
     assert taught.endings.sum() == failures + 1
     assert taught.state is None
 
@@ -84,23 +83,9 @@ def test_it_is_recognised_by_the_variables_that_are_there_and_else_by_the_foreca
     assert step.surprise == 0.0
 
 
-def test_held_is_as_if_the_value_of_before_had_come_again():
-    taught, twin = machine(), machine()
-    latest = np.array([40.0, 15.0, 14.0])
-    taught.observe(latest)
-    twin.observe(latest)
-    held = taught.observe([NAN, 16.0, 14.5], missing=Missing.HOLD).belief
-    np.testing.assert_allclose(held, twin.model().recognise([40.0, 16.0, 14.5]), rtol=1e-12)
-
-
-@pytest.mark.parametrize("missing", [Missing.PARTIAL, Missing.HOLD])
-def test_a_first_observation_must_be_whole_and_none_is_held_from_another_episode(missing):
+def test_a_first_observation_must_be_whole():
     with pytest.raises(ValueError, match="first observation"):
-        EvolvingFSM(1).observe([NAN, 1.0], missing=missing)
-    taught = machine()
-    taught.start_episode()
-    with pytest.raises(ValueError, match="nothing to hold"):
-        taught.observe([NAN, 1.0, 1.0], missing=Missing.HOLD)
+        EvolvingFSM(1).observe([NAN, 1.0], missing=Missing.PARTIAL)
 
 
 def test_the_less_is_seen_the_more_careful_it_gets():

@@ -3,7 +3,6 @@ from .divergence import jensen_shannon as jensen_shannon
 from .forecast import Forecasts as Forecasts
 from .machine import EvolvingFSM as EvolvingFSM
 from .model import FSMModel as FSMModel
-from .model import Policy as Policy
 from .naming import Labels as Labels
 from .observations import Category as Category
 from .observations import Missing as Missing

@@ -28,7 +28,7 @@ from evofsm.fsm.clusters import PAPER, width_of
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.explanation import Explanation, Nearest, explain
 from evofsm.fsm.kernels import LINE, Entry, uncompiled
-from evofsm.fsm.model import FSMModel, Policy, believed, check_forecast
+from evofsm.fsm.model import FSMModel, believed
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import StateRule
@@ -174,7 +174,7 @@ class EvolvingFSM(Retraced):
         if missing is not Missing.REJECT:
             vector = valid.real_array("observation", z, ndim=1)
             if (absent := np.isnan(vector)).any():
-                return self._observe_partly(vector, absent, missing, failed)
+                return self._observe_partly(vector, absent, failed)
         return self._step(self._checked(z), NO_ACTION, failed)
 
     @alone
@@ -280,7 +280,7 @@ class EvolvingFSM(Retraced):
     # -- Asking ---------------------------------------------------------------------------------
 
     @alone
-    def predict(self, i: SupportsIndex, horizon: int = 1, policy: Policy = "marginal") -> Floats:
+    def predict(self, i: SupportsIndex, horizon: int = 1) -> Floats:
         """(n,) forecast of the state, ``belief @ P[i] @ P*^(horizon - 1)``: Section 2.3.2.
 
         At the start of an episode the belief is uniform; before any observation it is empty.
@@ -290,14 +290,11 @@ class EvolvingFSM(Retraced):
         i : int
             Index of the action taken now, from 0.
         horizon : int
-            Number of steps, at least 1.
-        policy : {"marginal", "hold", "observed"}
-            Actions after the first step: each alike, as in the paper; ``i`` again; or each as often
-            as it was used.
+            Number of steps, at least 1; after the first all actions count alike.
         """
         action, n = valid.check_action(i, self.n_actions), self.n_states
-        if check_forecast(horizon, policy) > 1:
-            return self.model().propagate(self.belief, action, horizon, policy)
+        if whole("horizon", horizon) > 1:
+            return self.model().propagate(self.belief, action, horizon)
         place = self._learnt.actions["place"][action]
         if place == NOT_OPEN:
             return np.full(n, 1.0 / max(n, 1))
@@ -558,28 +555,22 @@ class EvolvingFSM(Retraced):
         return Step(trace.state.item(), belief, event, forecast, surprise)
 
     @step
-    def _observe_partly(
-        self, z: Floats, absent: NDArray[np.bool_], missing: Missing, failed: bool | None
-    ) -> Step:
+    def _observe_partly(self, z: Floats, absent: NDArray[np.bool_], failed: bool | None) -> Step:
         """Recognise what some variables are missing of; only the belief changes."""
         now, n = self._learnt.now[0], self.n_states
         gaps = tuple(np.flatnonzero(absent).tolist())
         if n == 0:
             raise ValueError(f"variables {gaps} of a machine's first observation are missing")
-        if missing is Missing.HOLD and not now["chained"]:
-            raise ValueError(f"variables {gaps} are missing, and nothing to hold since the start")
         self._refuse_other_length(len(z))
-        vector = np.where(absent, self._learnt.variables["latest"], z)
+        vector = np.where(absent, 0.0, z)
         valid.refuse_unusable("observation", vector)
         action = int(now["action"])
         forecast = self.predict(action) if now["chained"] and action >= 0 else np.empty(0)
-        if missing is Missing.PARTIAL and absent.all():
+        if absent.all():
             belief = forecast if len(forecast) else self.belief
         else:
-            weights = self._settings.weights
-            effective_weights = weights * ~absent if missing is Missing.PARTIAL else weights
-            centers = self._learnt.centers[:, :n]
-            belief = believed(centers, effective_weights, vector[None], self.width)[0]
+            centers, weights = self._learnt.centers[:, :n], self._settings.weights * ~absent
+            belief = believed(centers, weights, vector[None], self.width)[0]
         surprise = jensen_shannon(forecast, belief) if len(forecast) else np.nan
         # In a copy, which takes the place of what there was as a whole.
         learnt = arrays.resized(self._learnt, *room_for(self._learnt, self._settings))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any, Literal, Self, SupportsIndex, get_args
+from typing import Any, Literal, Self, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,9 +30,6 @@ from evofsm.fsm.validation import (
     whole,
 )
 from evofsm.store import Place
-
-#: Which actions are taken, each alike, the first one again, or each as often as it was used.
-Policy = Literal["marginal", "hold", "observed"]
 
 # In place of counts that are not given.
 _BLANK: Any = None
@@ -65,8 +62,8 @@ class FSMModel:
     >>> model.recognise([[0.0], [0.5]]).round(3)
     array([[0.625, 0.375],
            [0.5  , 0.5  ]])
-    >>> model.propagate([1.0, 0.0], 0, horizon=20, policy="hold").round(3)
-    array([0.686, 0.314])
+    >>> model.propagate([1.0, 0.0], 0, horizon=20).round(3)
+    array([0.578, 0.422])
     """
 
     centers: Floats  #: (n, m) the observation at the centre of each state
@@ -170,7 +167,6 @@ class FSMModel:
         belief: ArrayLike,
         action: SupportsIndex | None = None,
         horizon: int = 1,
-        policy: Policy = "marginal",
     ) -> Floats:
         """(n,) distribution over states some steps later: the paper's Section 2.3.2.
 
@@ -179,21 +175,17 @@ class FSMModel:
         belief : (n,) array_like
             Present distribution over states.
         action : int, optional
-            Index of the first step's action, from 0; without it ``policy`` rules that step too.
-        horizon, policy
-            As `EvolvingFSM.predict` takes them.
+            Index of the first step's action, from 0; without it all count alike there, too.
+        horizon : int
+            Number of steps, at least 1.
         """
-        there, steps = self._belief(belief), check_forecast(horizon, policy)
-        if action is None and policy == "hold":
-            raise ValueError("policy 'hold' needs the action that is held")
+        there, steps = self._belief(belief), whole("horizon", horizon)
         if action is not None:
-            there, steps = there @ self._matrix(action), steps - 1
-        if steps:
-            later_action = action if policy == "hold" else None
-            there = there @ np.linalg.matrix_power(self._matrix(later_action, policy), steps)
-        return there
+            there = there @ self.transition_matrices[check_action(action, self.n_actions)]
+            steps -= 1
+        return np.asarray(there @ np.linalg.matrix_power(self.marginal_matrix, steps))
 
-    def averaged_matrix(self, policy: Policy = "observed") -> Floats:
+    def averaged_matrix(self, policy: Literal["marginal", "observed"] = "observed") -> Floats:
         """(n, n) transition probabilities from state (row) to state (column), over all actions.
 
         Each action counts as often as it was used ("observed"), or all alike ("marginal", the
@@ -301,12 +293,6 @@ class FSMModel:
         """Centres (m, n), as kernels take them, and 1 / scale of each variable."""
         return np.array(self.centers.T, order="C"), weights_of(self.rule, self.n_variables)
 
-    def _matrix(self, action: SupportsIndex | None, policy: Policy = "observed") -> Floats:
-        """Of an action; without one, of all as a policy weighs them."""
-        if action is None:
-            return self.averaged_matrix(policy)
-        return np.asarray(self.transition_matrices[check_action(action, self.n_actions)])
-
     def _observations(self, z: ArrayLike) -> tuple[Floats, Floats]:
         """One observation or many, as given and row by row; refused where it is none."""
         array = real_array("z", z, ndim=np.ndim(z))
@@ -336,10 +322,3 @@ def believed(centers: Floats, weights: Floats, rows: Floats, width: float) -> Fl
     arguments = np.ascontiguousarray(centers), weights, np.ascontiguousarray(rows)
     recognise_rows(*arguments, float(width), n, belief)
     return belief[:, :n].copy()
-
-
-def check_forecast(horizon: SupportsIndex, policy: str) -> int:
-    """A number of steps, if there is such a policy."""
-    if policy not in get_args(Policy):
-        raise ValueError(f"policy is {policy!r}; it must be one of {', '.join(get_args(Policy))}")
-    return whole("horizon", horizon)

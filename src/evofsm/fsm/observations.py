@@ -21,8 +21,7 @@ from evofsm.fsm.validation import Floats, positive
 class Missing(Enum):
     """What is done where some variables were not observed; they hold NaN.
 
-    ``REJECT`` is an error, ``HOLD`` takes the value of the observation before, and ``PARTIAL``
-    recognises from the variables that are there.
+    ``REJECT`` is an error, and ``PARTIAL`` recognises from the variables that are there.
 
     Examples
     --------
@@ -34,7 +33,6 @@ class Missing(Enum):
     """
 
     REJECT = "reject"
-    HOLD = "hold"
     PARTIAL = "partial"
 
 
