@@ -19,6 +19,16 @@ static double expected(const evofsm_state *s) {
   return LAG * last + (1.0 - LAG) * asked;
 }
 
+/* Where it is seen to be, and how sure that is. */
+static void begin_at(evofsm_state *s, const double now[3], int is_sure) {
+  int j;
+  memcpy(s->here, now, sizeof s->here);
+  memset(s->around, 0, sizeof s->around);
+  for (j = 0; j < 3 && !is_sure; j++) {
+    s->around[j][j] = noise[j] * noise[j];
+  }
+}
+
 /* One step of the Kalman filter, from s->mean and s->spread. */
 static void filter(evofsm_state *s, const double now[3]) {
   const double gap = s->mean[0], own = s->mean[1], leader = s->mean[2], dt = EVOFSM_INTERVAL;
@@ -46,23 +56,14 @@ static void filter(evofsm_state *s, const double now[3]) {
   for (i = 0; i < 3; i += 2) { /* it belongs to another leader */
     const double off = now[i] - at[i], variance = s->around[i][i] + noise[i] * noise[i];
     if (is_whole(now) && off * off > ANOTHER * ANOTHER * variance) {
-      for (j = 0; j < 3; j++) {
-        at[j] = now[j];
-        for (k = 0; k < 3; k++) {
-          s->around[j][k] = j == k ? noise[j] * noise[j] : 0.0;
-        }
-      }
+      begin_at(s, now, 0);
       return;
     }
   }
   for (i = 0; i < 3; i++) {
     if (!isnan(now[i])) {
-      double total, off;
-      for (j = 0; j < 3; j++) {
-        row[j] = s->around[i][j];
-      }
-      total = row[i] + noise[i] * noise[i];
-      off = (now[i] - at[i]) / total;
+      const double total = s->around[i][i] + noise[i] * noise[i], off = (now[i] - at[i]) / total;
+      memcpy(row, s->around[i], sizeof row);
       for (j = 0; j < 3; j++) {
         const double gain = row[j] / total;
         at[j] += row[j] * off;
@@ -77,16 +78,11 @@ static void filter(evofsm_state *s, const double now[3]) {
 }
 
 static void locate(evofsm_state *s, const double now[3]) {
-  int j, k;
-  if (s->is_located && !(EXACT && is_whole(now))) {
+  const int is_sure = EXACT && is_whole(now);
+  if (s->is_located && !is_sure) {
     filter(s, now);
   } else {
-    for (j = 0; j < 3; j++) {
-      s->here[j] = now[j];
-      for (k = 0; k < 3; k++) {
-        s->around[j][k] = j == k && !(EXACT && is_whole(now)) ? noise[j] * noise[j] : 0.0;
-      }
-    }
+    begin_at(s, now, is_sure);
   }
   s->is_located_now = is_whole(s->here);
 }
@@ -307,8 +303,6 @@ static void forget(evofsm_state *s) {
   s->is_located = 0;
 }
 
-static void start_revising(evofsm_state *s) { s->revising = s->tries = 0; }
-
 /* What to execute of s->proposal, into s->best, and how risky that is. */
 static void revise(evofsm_state *s, evofsm_decision *out) {
   const int stands = !ACTS && s->observation[1] < STANDS;
@@ -343,8 +337,8 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
 static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
   if (s->is_located_now) {
     s->is_located = 1;
-    copy(s->mean, s->here, 3);
-    copy(s->spread[0], s->around[0], 9);
+    memcpy(s->mean, s->here, sizeof s->mean);
+    memcpy(s->spread, s->around, sizeof s->spread);
   }
   s->before = s->commanded;
   s->commanded = executed[0];

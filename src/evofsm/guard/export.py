@@ -40,8 +40,6 @@ from evofsm.guard.reviser import ActionReviser, Mode
 _LANES, _MOST_DISTURBANCES = 4, 128
 # Bytes of the stack, but for what numbers of actions and lanes add; a test holds it to compilers.
 _STACK = 2048
-# In place of 1 / width of recognition where that would overflow.
-_SHARPEST = 1e300
 # How libraries in an FMU end, by system; and how they are compiled here.
 _LIBRARIES = {"darwin": "dylib", "win32": "dll"}
 _FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-fvisibility=hidden", "-shared")
@@ -220,10 +218,8 @@ def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any
         "fallback": np.atleast_1d(put_into(actions, reviser.fallback.action)),
     }
     if model is not None and model.n_states:
-        sharp = model.width * _SHARPEST > 1.0
         constants |= {
-            "SHARPNESS": 1.0 / model.width if sharp else _SHARPEST,
-            "centers": model.centers.T,
+            "centers": model.centers,
             "centre_weights": weights_of(model.rule, m),
             "time_seen": model.visits * guard.interval,
         }

@@ -64,7 +64,6 @@ typedef struct {
 typedef struct {
   double held[EVOFSM_VARIABLES], observation[EVOFSM_VARIABLES];
   double time, decisions, seen;
-  double belief[EVOFSM_STATES > 0 ? EVOFSM_STATES : 1]; /* distribution over states */
   double proposal[EVOFSM_ACTIONS], best[EVOFSM_ACTIONS];
   int state;
 UNIT_STATE} evofsm_state;
@@ -111,9 +110,7 @@ class Guard {
 
   // What to execute; empty where the observation cannot be used: then nothing has changed.
   std::optional<Decision> decide(const Observation& observation, const Action& proposal) noexcept {
-    Decision decision;
-    const int rc = evofsm_decide(&state_, observation.data(), proposal.data(), &decision);
-    return rc == EVOFSM_OK ? std::optional<Decision>(decision) : std::nullopt;
+    return decide_at(observation, proposal, state_.decisions * EVOFSM_INTERVAL);
   }
 
   // The same of an observation at a time [s] since the episode began.
@@ -136,7 +133,7 @@ class Guard {
 
 #include <float.h>
 #include <math.h>
-#include <stddef.h>
+#include <string.h>
 
 /* NaN is "not seen" and "nothing proposed", and decisions are the same to the bit. */
 #if defined __FAST_MATH__ || __FINITE_MATH_ONLY__ || defined __ASSOCIATIVE_MATH__ || \
@@ -159,52 +156,28 @@ UNIT_CONSTANTS
 static double lesser(double one, double other) { return other < one ? other : one; }
 static double greater(double one, double other) { return other > one ? other : one; }
 
-static void copy(double *to, const double *from, int count) {
-  int i;
-  for (i = 0; i < count; i++) {
-    to[i] = from[i];
-  }
-}
-
 UNIT_SOURCE
-/* -- States: recognise of clusters.py --------------------------------------------------------- */
+/* -- States: nearest_center of clusters.py, the most probable one ------------------------------ */
 
-/* Where it is by all that is held, if that is whole. At most EVOFSM_STATES exponentials. */
+/* Where it is by all that is held, if that is whole: NaN is not nearer. */
 static void recognise(evofsm_state *s) {
   s->state = -1;
   s->seen = NAN;
 #if EVOFSM_STATES > 0
-  double *belief = s->belief, smallest, total = 0.0;
-  int i, j, nearest = 0;
-  for (j = 0; j < EVOFSM_VARIABLES; j++) {
-    if (isnan(s->held[j])) {
-      return;
+  double smallest = INFINITY;
+  int i, j;
+  for (i = 0; i < EVOFSM_STATES; i++) {
+    double square = 0.0;
+    for (j = 0; j < EVOFSM_VARIABLES; j++) {
+      const double offset = (s->held[j] - centers[i][j]) * centre_weights[j];
+      square += offset * offset;
+    }
+    if (square < smallest) {
+      smallest = square;
+      s->state = i;
+      s->seen = time_seen[i];
     }
   }
-  for (i = 0; i < EVOFSM_STATES; i++) {
-    belief[i] = 0.0;
-  }
-  for (j = 0; j < EVOFSM_VARIABLES; j++) {
-    for (i = 0; i < EVOFSM_STATES; i++) {
-      const double offset = (s->held[j] - centers[j][i]) * centre_weights[j];
-      belief[i] += offset * offset;
-    }
-  }
-  for (i = 1; i < EVOFSM_STATES; i++) {
-    nearest = belief[i] < belief[nearest] ? i : nearest;
-  }
-  smallest = belief[nearest];
-  for (i = 0; i < EVOFSM_STATES; i++) {
-    const double exponent = (smallest - belief[i]) * SHARPNESS;
-    belief[i] = exponent > -690.0 ? exp(exponent) : 0.0;
-    total += belief[i];
-  }
-  s->state = 0;
-  for (i = 0; i < EVOFSM_STATES; i++) {
-    belief[i] /= total;
-    s->state = belief[i] > belief[s->state] ? i : s->state;
-  }
-  s->seen = time_seen[s->state];
 #endif
 }
 
@@ -261,18 +234,15 @@ static int is_exact(void) {
   return (one + small) - one == 0.0 && parts == 6.0 && isnan(none) && !(none <= one);
 }
 
-static void begin(evofsm_state *s) {
+void evofsm_reset(evofsm_state *state) {
   int j;
+  memset(state, 0, sizeof *state);
   for (j = 0; j < EVOFSM_VARIABLES; j++) {
-    s->held[j] = NAN;
+    state->held[j] = NAN;
   }
-  s->time = NAN;
-  s->decisions = 0.0;
-  forget(s);
-  start_revising(s);
+  state->time = NAN;
+  forget(state);
 }
-
-void evofsm_reset(evofsm_state *state) { begin(state); }
 
 int evofsm_decide(evofsm_state *state, const double observation[EVOFSM_VARIABLES],
                   const double proposal[EVOFSM_ACTIONS], evofsm_decision *out) {
@@ -307,8 +277,8 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
   out->unsurvived = 0;
   revise(state, out);
   out->is_new = out->seen < NEW;
-  copy(out->advised, state->best, EVOFSM_ACTIONS);
-  copy(out->executed, ACTS ? state->best : state->proposal, EVOFSM_ACTIONS);
+  memcpy(out->advised, state->best, sizeof out->advised);
+  memcpy(out->executed, ACTS ? state->best : state->proposal, sizeof out->executed);
   state->decisions += 1.0;
   if ((intake & (EVOFSM_REPEATED | EVOFSM_LATE)) == 0) {
     follow(state, out->executed);

@@ -58,13 +58,18 @@ static void decode(const double inner[A], double action[EVOFSM_ACTIONS]) {
 
 /* -- A rollout ---------------------------------------------------------------------------------- */
 
+static void fill(double lanes[L], double value) {
+  int l;
+  for (l = 0; l < L; l++) {
+    lanes[l] = value;
+  }
+}
+
 /* _fill_features: those of situations and actions side by side, into s->found. */
 static void fill_features(evofsm_state *s, double harder) {
   static const double knots[3] = {-0.5, 0.0, 0.5};
   int i, j, k, l;
-  for (l = 0; l < L; l++) {
-    s->found[0][l] = 1.0;
-  }
+  fill(s->found[0], 1.0);
   for (j = 0; j < M; j++) {
     const double largest = harder * reach[j];
     for (l = 0; l < L; l++) {
@@ -74,10 +79,8 @@ static void fill_features(evofsm_state *s, double harder) {
   }
   k = 1 + 2 * M;
   for (i = 0; i < A; i++) {
-    for (l = 0; l < L; l++) {
-      s->found[k + i][l] = s->now[i][l];
-      s->found[k + A + i][l] = s->before[i][l];
-    }
+    memcpy(s->found[k + i], s->now[i], sizeof s->now[i]);
+    memcpy(s->found[k + A + i], s->before[i], sizeof s->before[i]);
   }
   k += 2 * A;
   for (i = 0; i < (EVOFSM_CHOICES > 0 ? 0 : A); i++) {
@@ -124,9 +127,7 @@ static void follow_policy(evofsm_state *s, const double policy[A][1 + M], double
   int i, j, l;
   for (i = 0; i < A; i++) {
     double *now = s->now[i];
-    for (l = 0; l < L; l++) {
-      now[l] = policy[i][0];
-    }
+    fill(now, policy[i][0]);
     for (j = 0; j < M; j++) {
       const double slope = policy[i][1 + j], middle_of = mean[j], over = inverse[j];
       for (l = 0; l < L; l++) {
@@ -169,9 +170,9 @@ static void from_centre(evofsm_state *s, int end) {
    s->over. */
 static void measure(evofsm_state *s) {
   int f, l;
-  for (l = 0; l < L; l++) {
-    s->far[l] = s->over[l] = s->last[l] = INFINITY;
-  }
+  fill(s->far, INFINITY);
+  fill(s->over, INFINITY);
+  fill(s->last, INFINITY);
   for (f = 0; f < FORMS; f++) {
     const double says = forms[f][0], *z = s->z[(int)forms[f][1]], *other_z = s->z[(int)forms[f][2]];
     const double at = forms[f][3], to = forms[f][4], one = forms[f][5], other = forms[f][6];
@@ -232,29 +233,25 @@ static void step(evofsm_state *s, int t, double harder) {
       s->z[j][l] = after;
     }
   }
-  copy(s->before[0], s->now[0], A * L);
+  memcpy(s->before, s->now, sizeof s->before);
 }
 
 /* Where one is now, as all rollouts begin. */
 static void place(evofsm_state *s) {
-  int i, j, l;
-  for (l = 0; l < L; l++) {
-    for (j = 0; j < M; j++) {
-      s->z[j][l] = s->here[j];
-      s->change[j][l] = s->here[M + j];
-    }
-    for (i = 0; i < A; i++) {
-      s->before[i][l] = s->here[2 * M + i];
-    }
+  int i, j;
+  for (j = 0; j < M; j++) {
+    fill(s->z[j], s->here[j]);
+    fill(s->change[j], s->here[M + j]);
+  }
+  for (i = 0; i < A; i++) {
+    fill(s->before[i], s->here[2 * M + i]);
   }
 }
 
 static void act(evofsm_state *s, const double action[A]) {
-  int i, l;
+  int i;
   for (i = 0; i < A; i++) {
-    for (l = 0; l < L; l++) {
-      s->now[i][l] = action[i];
-    }
+    fill(s->now[i], action[i]);
   }
 }
 
@@ -265,8 +262,8 @@ static int rollout(evofsm_state *s, const double *action, const double policy[A]
   const double end = 1.0 - RESERVE * enough;
   int l, t, lost = 0, ended = 0;
   place(s);
+  fill(s->near, INFINITY);
   for (l = 0; l < L; l++) {
-    s->near[l] = INFINITY;
     s->survived[l] = l < K ? STEPS : -1;
   }
 #if EVOFSM_DEAD_ENDS > 0
@@ -343,12 +340,8 @@ static int passes(evofsm_state *s, const double action[A], int backup, double *l
 
 /* action_of: what a backup does here. */
 static void action_of(evofsm_state *s, int backup, double action[A]) {
-  int i, j, l;
-  for (j = 0; j < M; j++) {
-    for (l = 0; l < L; l++) {
-      s->z[j][l] = s->here[j];
-    }
-  }
+  int i;
+  place(s);
   follow_policy(s, policies[backup], 1.0);
   for (i = 0; i < A; i++) {
     action[i] = s->now[i][0];
@@ -391,7 +384,7 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
   double longest = -INFINITY, wanted = -INFINITY;
   int i, r, step_of;
   s->done = 0;
-  copy(action, proposal, A);
+  memcpy(action, proposal, sizeof own);
   for (r = 0; r < ASKED && s->done < MOST_DONE; r++) {
     *backup = s->ranks[r];
     if (passes(s, proposal, *backup, left)) {
@@ -410,7 +403,7 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
     if (are_same(own, proposal) || !passes(s, own, *backup, left)) {
       continue;
     }
-    copy(action, own, A);
+    memcpy(action, own, sizeof own);
     for (step_of = 0; step_of < (EVOFSM_CHOICES > 0 ? 0 : HALVINGS); step_of++) {
       const double part = 0.5 * (refused + share);
       for (i = 0; i < A; i++) {
@@ -419,7 +412,7 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
       if (passes(s, closer, *backup, &distance)) {
         share = part;
         *left = distance;
-        copy(action, closer, A);
+        memcpy(action, closer, sizeof closer);
       } else {
         refused = part;
       }
@@ -451,9 +444,7 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
 static int foresee(evofsm_state *s, const double action[A]) {
   double best[L], left;
   int l, r, count = 0, all = 0;
-  for (l = 0; l < K; l++) {
-    best[l] = -INFINITY;
-  }
+  fill(best, -INFINITY);
   for (r = 0; r < JUDGED && !all; r++) {
     rollout(s, action, policies[s->ranks[r]], 1.0, 0.0, K, &left);
     all = 1;
@@ -496,13 +487,11 @@ static void forget(evofsm_state *s) {
   }
 }
 
-static void start_revising(evofsm_state *s) { (void)s; }
-
 /* LearntRisk.search: what to execute of s->proposal, into s->best, and how risky that is. */
 static void revise(evofsm_state *s, evofsm_decision *out) {
   double proposal[A], action[A];
   int r, unsurvived = 0;
-  copy(s->best, s->proposal, EVOFSM_ACTIONS);
+  memcpy(s->best, s->proposal, sizeof s->best);
   situate(s);
   if (!s->is_placed) {
     out->reason = EVOFSM_NOTHING_SEEN;
@@ -542,11 +531,11 @@ static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
   int j, t;
   if (s->is_placed) {
     for (t = 1; t < EVOFSM_STRIDE && s->n_past == EVOFSM_STRIDE; t++) {
-      copy(s->past[t - 1], s->past[t], M);
-      copy(s->acted[t - 1], s->acted[t], A);
+      memcpy(s->past[t - 1], s->past[t], sizeof s->past[t]);
+      memcpy(s->acted[t - 1], s->acted[t], sizeof s->acted[t]);
     }
     s->n_past += s->n_past < EVOFSM_STRIDE;
-    copy(s->past[s->n_past - 1], s->here, M);
+    memcpy(s->past[s->n_past - 1], s->here, sizeof s->past[0]);
     encode(executed, s->acted[s->n_past - 1]);
     place(s);
     act(s, s->acted[s->n_past - 1]);
