@@ -89,11 +89,9 @@ static void locate(evofsm_state *s, const double now[3]) {
 
 /* LatentRisk._cautious: closer by what is not sure about it. */
 static void be_cautious(const evofsm_state *s, double cautious[3]) {
-  double weights[3], variance = 0.0;
+  const double weights[3] = {1.0, -s->here[1] / DECEL, s->here[2] / DECEL};
+  double variance = 0.0;
   int i, j;
-  weights[0] = 1.0;
-  weights[1] = -s->here[1] / DECEL;
-  weights[2] = s->here[2] / DECEL;
   for (i = 0; i < 3; i++) {
     cautious[i] = s->here[i];
     for (j = 0; j < 3; j++) {
@@ -161,18 +159,13 @@ static double critical_of(const double here[3], double acceleration, double befo
 /* foresee: whether full braking after an acceleration avoids what is seen, and whether it, held for
    a time, has regained a safe gap. */
 static int avoids(const double here[3], double acceleration, double before, double braking) {
-  double near[3];
-  near[0] = greater(here[0], TOUCHING);
-  near[1] = here[1];
-  near[2] = here[2];
+  const double near[3] = {greater(here[0], TOUCHING), here[1], here[2]};
   return survives(near, acceleration, before, braking, lesser(CLEARANCE, 0.5 * near[0]));
 }
 
 static int regains(const double here[3], double acceleration, double braking) {
-  double then[3];
-  then[1] = greater(here[1], 0.0);
-  then[2] = greater(here[2], 0.0);
-  then[0] = here[0] + drive_on(&then[2], -braking, REGAIN);
+  double then[3] = {here[0], greater(here[1], 0.0), greater(here[2], 0.0)};
+  then[0] += drive_on(&then[2], -braking, REGAIN);
   then[0] -= drive_on(&then[1], acceleration, REGAIN);
   return survives(then, 0.0, acceleration, WORST, CLEARANCE);
 }

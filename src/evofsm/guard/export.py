@@ -254,6 +254,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "EVIDENCE": float(memory.number),
         **{name.strip("_"): getattr(rollout, name) for name in _OF_ROLLOUTS},
         **{name: getattr(model, name) for name in _OF_MODEL},
+        "dead_ends": model.dead_ends if len(model.dead_ends) else np.zeros((1, m + 2)),
         "residuals": rest[:, :, [*range(count), *[0] * (lanes - count)]],  # others are undisturbed
         "policies": state.policies,
         "risks": [risk._risk(n, soon) for n in (math.inf, *map(float, range(count)))],
@@ -276,7 +277,7 @@ def _learnt(reviser: ActionReviser) -> Part:
 _OF_ROLLOUTS = ["_RESERVE", "_DISTANCE", "_FAR", "_HALVINGS", "_EQUAL", "NO_LONGER"]
 _OF_ROLLOUTS += ["FLAT", "GROWN", "SHRUNK", "FAILS", "ENDS", "CRASHES"]
 _OF_MODEL = (
-    *("weights", "origin", "reach", "lowest", "highest", "least", "most", "forms", "dead_ends"),
+    *("weights", "origin", "reach", "lowest", "highest", "least", "most", "forms"),
     *("mean", "inverse"),
 )
 

@@ -18,9 +18,7 @@
   double near[EVOFSM_LANES], far[EVOFSM_LANES], value[EVOFSM_LANES], worth[EVOFSM_LANES];
   double over[EVOFSM_LANES], last[EVOFSM_LANES], square[EVOFSM_LANES];
   int survived[EVOFSM_LANES];
-#if EVOFSM_DEAD_ENDS > 0
-  double aside[EVOFSM_DEAD_ENDS][EVOFSM_LANES];
-#endif
+  double aside[EVOFSM_DEAD_ENDS + 1]; /* infinite of dead ends that do not count */
 /* ==== source ==== */
 #define M EVOFSM_VARIABLES
 #define A EVOFSM_NUMBERS
@@ -153,7 +151,6 @@ static void follow_policy(evofsm_state *s, const double policy[A][1 + M], double
   }
 }
 
-#if EVOFSM_DEAD_ENDS > 0
 /* _from_centre: squared distances from the centre of a dead end, in spreads, into s->square. */
 static void from_centre(evofsm_state *s, int end) {
   int j, l;
@@ -164,7 +161,6 @@ static void from_centre(evofsm_state *s, int end) {
     }
   }
 }
-#endif
 
 /* _measure: distances to the nearest failure, into s->far, and to where it ends by itself, into
    s->over. */
@@ -203,16 +199,14 @@ static void measure(evofsm_state *s) {
       }
     }
   }
-#if EVOFSM_DEAD_ENDS > 0
   for (f = 0; f < EVOFSM_DEAD_ENDS; f++) {
     from_centre(s, f);
     for (l = 0; l < L; l++) {
       const double off = sqrt(s->square[l]) - dead_ends[f][M];
-      const double left = off * dead_ends[f][M + 1] + s->aside[f][l];
+      const double left = off * dead_ends[f][M + 1] + s->aside[f];
       s->far[l] = left < s->far[l] ? left : s->far[l];
     }
   }
-#endif
 }
 
 /* A step of a rollout: what is expected, what disturbs it, and where that leads. */
@@ -266,15 +260,12 @@ static int rollout(evofsm_state *s, const double *action, const double policy[A]
   for (l = 0; l < L; l++) {
     s->survived[l] = l < K ? STEPS : -1;
   }
-#if EVOFSM_DEAD_ENDS > 0
   for (t = 0; t < EVOFSM_DEAD_ENDS; t++) { /* those in which it begins may not count */
+    int within;
     from_centre(s, t);
-    for (l = 0; l < L; l++) {
-      const int within = s->square[l] < dead_ends[t][M] * dead_ends[t][M];
-      s->aside[t][l] = within && allowed >= K ? INFINITY : 0.0;
-    }
+    within = s->square[0] < dead_ends[t][M] * dead_ends[t][M];
+    s->aside[t] = within && allowed >= K ? INFINITY : 0.0;
   }
-#endif
   for (t = 0; t < STEPS; t++) {
     int fails = 0;
     s->done++;
@@ -503,10 +494,8 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   out->reason = search(s, proposal, action, &out->backup, &out->left);
   for (r = 0; s->ranks[r] != out->backup; r++) { /* at most EVOFSM_BACKUPS: it is one of them */
   }
-  for (; r > 0; r--) { /* what passed now is asked first the next time */
-    s->ranks[r] = s->ranks[r - 1];
-  }
-  s->ranks[0] = out->backup;
+  memmove(s->ranks + 1, s->ranks, (size_t)r * sizeof *s->ranks);
+  s->ranks[0] = out->backup; /* what passed now is asked first the next time */
   out->evidence = EVIDENCE;
   if (out->reason != EVOFSM_KEPT) {
     out->unsurvived = foresee(s, proposal);
@@ -528,11 +517,11 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
 
 /* LearntRisk.follow: keep up with what is executed, and what is expected then, undisturbed. */
 static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
-  int j, t;
+  int j;
   if (s->is_placed) {
-    for (t = 1; t < EVOFSM_STRIDE && s->n_past == EVOFSM_STRIDE; t++) {
-      memcpy(s->past[t - 1], s->past[t], sizeof s->past[t]);
-      memcpy(s->acted[t - 1], s->acted[t], sizeof s->acted[t]);
+    if (s->n_past == EVOFSM_STRIDE) {
+      memmove(s->past, s->past + 1, sizeof s->past - sizeof s->past[0]);
+      memmove(s->acted, s->acted + 1, sizeof s->acted - sizeof s->acted[0]);
     }
     s->n_past += s->n_past < EVOFSM_STRIDE;
     memcpy(s->past[s->n_past - 1], s->here, sizeof s->past[0]);
