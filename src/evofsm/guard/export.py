@@ -36,8 +36,8 @@ from evofsm.guard.learnt import rollout
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.reviser import ActionReviser, Mode
 
-# Rollouts of disturbances lie side by side by so many; NumPy sums so many numbers as the C does.
-_LANES, _MOST_DISTURBANCES = 4, 128
+# Rollouts of disturbances lie side by side by so many.
+_LANES = 4
 # Bytes of the stack, but for what numbers of actions and lanes add; a test holds it to compilers.
 _STACK = 2048
 # How libraries in an FMU end, by system; and how they are compiled here.
@@ -233,8 +233,6 @@ def _learnt(reviser: ActionReviser) -> Part:
         raise ValueError(f"there is nothing to export yet: {risk.told_by_experience}")
     model, rest = parts.model, parts.residuals  # frozen, it doubts nothing
     (steps, rows, count), (p, m), a = rest.shape, model.weights.shape, risk.size
-    if count > _MOST_DISTURBANCES:
-        raise ValueError(f"at most {_MOST_DISTURBANCES} disturbances are exported, not {count}")
     lanes = -(-count // _LANES) * _LANES
     memory, soon = risk.remembered, risk._soon(risk.remembered.seconds)
     names = [f"{q}: {risk.backup_text(q)}" for q in range(len(state.policies))]

@@ -15,8 +15,9 @@
   double move[EVOFSM_VARIABLES][EVOFSM_LANES];
   double before[EVOFSM_NUMBERS][EVOFSM_LANES], now[EVOFSM_NUMBERS][EVOFSM_LANES];
   double found[EVOFSM_FEATURES][EVOFSM_LANES];
-  double near[EVOFSM_LANES], far[EVOFSM_LANES], value[EVOFSM_LANES], worth[EVOFSM_LANES];
+  double near[EVOFSM_LANES], far[EVOFSM_LANES], value[EVOFSM_LANES];
   double over[EVOFSM_LANES], last[EVOFSM_LANES], square[EVOFSM_LANES];
+  double worth; /* mean of how well it ended */
   int survived[EVOFSM_LANES];
   double aside[EVOFSM_DEAD_ENDS + 1]; /* infinite of dead ends that do not count */
 /* ==== source ==== */
@@ -304,6 +305,7 @@ static int rollout(evofsm_state *s, const double *action, const double policy[A]
     }
   }
   *left = INFINITY;
+  s->worth = 0.0;
   for (l = 0; l < K; l++) {
     const double share = (double)(s->survived[l] < STEPS ? s->survived[l] : STEPS) / (double)STEPS;
     double distance = s->near[l];
@@ -316,8 +318,9 @@ static int rollout(evofsm_state *s, const double *action, const double policy[A]
     } else if (s->survived[l] < STEPS) {
       s->value[l] = (double)(s->survived[l] - STEPS) - 1.0;
     }
-    s->worth[l] = share + DISTANCE * lesser(1.0, greater(-1.0, FAR * distance));
+    s->worth += share + DISTANCE * lesser(1.0, greater(-1.0, FAR * distance));
   }
+  s->worth /= (double)K;
   return lost;
 }
 
@@ -345,27 +348,6 @@ static int are_same(const double one[A], const double other[A]) {
     same &= one[i] == other[i];
   }
   return same;
-}
-
-/* Mean of how well rollouts ended, summed as NumPy sums up to 128 numbers. */
-static double mean_worth(const evofsm_state *s) {
-  double sums[8], total = 0.0;
-  int k = 0, l;
-  if (K >= 8) {
-    for (l = 0; l < 8; l++) {
-      sums[l] = s->worth[l];
-    }
-    for (k = 8; k + 7 < K; k += 8) {
-      for (l = 0; l < 8; l++) {
-        sums[l] += s->worth[k + l];
-      }
-    }
-    total = ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]));
-  }
-  for (; k < K; k++) {
-    total += s->worth[k];
-  }
-  return total / (double)K;
 }
 
 /* From the proposal (inner) to the action: at most 2 ASKED + HALVINGS rollouts, or 4 ASKED. */
@@ -413,13 +395,12 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
   *backup = s->ranks[0];
   for (r = 0; r < ASKED; r++) {
     rollout(s, NULL, policies[s->ranks[r]], SCALE, 0.0, K, &distance);
-    distance = mean_worth(s);
-    if (distance > longest + EQUAL) {
+    if (s->worth > longest + EQUAL) {
       *backup = s->ranks[r];
-      longest = distance;
+      longest = s->worth;
     }
     rollout(s, proposal, policies[s->ranks[r]], SCALE, 0.0, K, &distance);
-    wanted = greater(wanted, mean_worth(s));
+    wanted = greater(wanted, s->worth);
   }
   if (wanted < longest - NO_LONGER) {
     action_of(s, *backup, action);
