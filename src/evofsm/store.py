@@ -167,12 +167,6 @@ def write(
         return
     with replacing(place) as file:
         file.writelines(parts)
-        try:
-            read(file, kind)
-        except ValueError as error:
-            raise OSError(
-                f"{os.fspath(place)} was left as it was: what was written cannot be read: {error}"
-            ) from error
 
 
 def _packed(kind: Kind, header: Header, arrays: Mapping[str, NDArray[Any]]) -> list[Any]:

@@ -43,10 +43,10 @@ _LIMITS = {"max_states": None, "failure_horizon": None}
 _OPTIONS = {**_LIMITS, "belief_tolerance": 0.0}
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
 # Arrays of a snapshot that a machine answers with.
-_ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers", "visits"}
+_ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers"}
 _FLOAT64 = np.dtype(np.float64)
-# Compiled code of a step, with and without a limit to the states.
-_LIMITED, _UNLIMITED = Entry(stepping.learn_rows), Entry(stepping.learn_rows)
+# Compiled code of a step.
+_LEARN_ROWS = Entry(stepping.learn_rows)
 
 
 class EvolvingFSM(Retraced):
@@ -245,7 +245,7 @@ class EvolvingFSM(Retraced):
         beliefs = np.zeros((rows if belief else 0, self._capacity))
         self._known = None
         while row < rows:
-            arguments = self._learnt, self._settings, self._limit, observations, actions, starts
+            arguments = self._learnt, self._settings, observations, actions, starts
             is_told, scratch = failures is not None, np.empty((3, self._capacity))
             row = stepping.learn_rows(*arguments, ends, is_told, scratch, row, trace, beliefs)
             if row < rows:
@@ -427,12 +427,6 @@ class EvolvingFSM(Retraced):
 
     @property
     @alone
-    def visits(self) -> Floats:
-        """(n,) ndarray: observations in which each state was the most probable."""
-        return self._learnt.sums[arrays.VISITS, : self.n_states].copy()
-
-    @property
-    @alone
     def width(self) -> float:
         """Width of recognition, a squared distance; 0 before the first observation."""
         now = self._learnt.now[0]
@@ -525,7 +519,6 @@ class EvolvingFSM(Retraced):
         """Be ready for threads. They wait for whoever steps, grows, or takes a copy."""
         share(self)
         self._known = None
-        self._limit = self.max_states
         # Room for a single row.
         flags = np.zeros((2, 1), np.bool_)
         self._one = np.empty(1, np.int64), *flags, blank_trace(1), np.empty((0, 0))
@@ -543,9 +536,8 @@ class EvolvingFSM(Retraced):
         actions, starts, failures, trace, beliefs = self._one
         actions[0], failures[0] = action, bool(failed)
         scratch = np.empty((3, len(self._learnt.belief)))
-        arguments = self._settings, self._limit, row, actions, starts, failures, failed is not None
-        learn_row = (_UNLIMITED if self._limit is None else _LIMITED).call
-        while not learn_row(self._learnt, *arguments, scratch, 0, trace, beliefs):
+        arguments = self._settings, row, actions, starts, failures, failed is not None
+        while not _LEARN_ROWS.call(self._learnt, *arguments, scratch, 0, trace, beliefs):
             self._make_room()
             scratch = np.empty((3, len(self._learnt.belief)))
         n, surprise = trace.n_states.item(), trace.surprise.item()

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
-from typing import SupportsFloat
 
 import numpy as np
 
-from evofsm.fsm.validation import Floats, positive
+from evofsm.fsm.validation import Floats, number, positive
 
 
 class Missing(Enum):
@@ -98,17 +96,10 @@ class ObservationEncoder:
                 raise ValueError(f"observation lacks {name!r}; it has {', '.join(values)}")
             value = values[name]
             if not isinstance(variable, Category):
-                vector.append(_number(name, value))
+                vector.append(number(name, value))
             elif value in variable.values:
                 height = variable.distance / math.sqrt(2.0)
                 vector += [height * (value == category) for category in variable.values]
             else:
                 raise ValueError(f"{name} is {value!r}; it may be {', '.join(variable.values)}")
         return np.array(vector)
-
-
-def _number(name: str, value: object) -> float:
-    if isinstance(value, SupportsFloat):  # a text is none, though `float` would read "1.5"
-        with suppress(TypeError, ValueError):
-            return float(value)
-    raise TypeError(f"{name} is {value!r}; it must be a number")

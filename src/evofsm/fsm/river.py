@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from typing import Any, SupportsFloat
+from typing import Any
 
 import numpy as np
 
@@ -12,13 +12,14 @@ from evofsm.extras import needs
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import StateRule
-from evofsm.fsm.validation import Floats
+from evofsm.fsm.validation import Floats, number
 
 with needs("River", "river", "a clusterer of River"):
     from river import base
 
 # A clusterer acts on nothing: there is one action, and it is always taken.
 _ACTION = 0
+_HINT = " (river.preprocessing.OneHotEncoder makes numbers of categories)"
 
 
 class RiverClusterer(base.Clusterer):
@@ -103,18 +104,10 @@ class RiverClusterer(base.Clusterer):
 
     def _vector(self, x: Mapping[Hashable, Any]) -> Floats:
         """The features in their order, NaN for those that were not observed."""
-        return np.array([_number(name, x.get(name)) for name in self._observed])
-
-
-def _number(name: Hashable, value: object) -> float:
-    if value is None:
-        return math.nan
-    if not isinstance(value, SupportsFloat):
-        raise TypeError(
-            f"feature {name!r} is {value!r}; it must be a number "
-            "(river.preprocessing.OneHotEncoder makes numbers of categories)"
-        )
-    number = float(value)
-    if math.isinf(number):
-        raise ValueError(f"feature {name!r} is {number}; it must be finite (None: not observed)")
-    return number
+        values = [math.nan if x.get(name) is None else x[name] for name in self._observed]
+        names = [f"feature {name!r}" for name in self._observed]
+        z = np.array([number(*pair, _HINT) for pair in zip(names, values, strict=True)])
+        if np.isinf(z).any():
+            name = names[np.isinf(z).argmax()]
+            raise ValueError(f"{name} is infinite; it must be finite (None: not observed)")
+        return z

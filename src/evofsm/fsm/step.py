@@ -8,7 +8,7 @@ episode may end, is no state of the machine: it is counted.
 from __future__ import annotations
 
 from enum import IntFlag
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,16 +20,13 @@ from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced
 from evofsm.fsm.transitions import expand, forecast_and_identify, merge_closest, place_of, room_for
 from evofsm.fsm.validation import Floats
 
-#: The most states, or None: without a limit a kernel is compiled in half of the time.
-Limit: TypeAlias = int | None
-
 #: Rows of the room in which a step works, (3, capacity).
 RECOGNISED, PREDICTED, TERMS = 0, 1, 2
 
 
 @spliced_kernel
 def step(
-    learnt: Learnt, settings: Settings, limit: Limit, scratch: Floats, z: Floats, failed: bool
+    learnt: Learnt, settings: Settings, scratch: Floats, z: Floats, failed: bool
 ) -> tuple[int, int, float]:
     """Take in one observation; returns event, state and surprise. There must be room for it.
 
@@ -41,7 +38,7 @@ def step(
     # Section 2.2.1: does the observation move a state, or create one?
     event, nearest, potential = determine(learnt, settings, z)
     if event == CREATED:
-        event, nearest = _create(learnt, settings, limit, nearest, potential)
+        event, nearest = _create(learnt, settings, nearest, potential)
     n = now.n_states
 
     # Section 2.2.2: which state is this?
@@ -76,7 +73,6 @@ def step(
 def learn_rows(
     learnt: Learnt,
     settings: Settings,
-    limit: Limit,
     observations: Floats,
     actions: NDArray[np.int64],
     starts: NDArray[np.bool_],
@@ -95,9 +91,7 @@ def learn_rows(
     while row < len(observations) and room_for(learnt, settings) == room:
         now.chained = 0 if starts[row] else now.chained
         now.failures_told = 1 if told else now.failures_told
-        event, state, surprise = step(
-            learnt, settings, limit, scratch, observations[row], failures[row]
-        )
+        event, state, surprise = step(learnt, settings, scratch, observations[row], failures[row])
         now.action = NO_ACTION if failures[row] else actions[row]
         trace.state[row], trace.n_states[row] = state, now.n_states
         trace.event[row], trace.surprise[row] = event, surprise
@@ -128,13 +122,11 @@ def believe(learnt: Learnt, belief: Floats) -> None:
 
 
 @rare_kernel
-def _create(
-    learnt: Learnt, settings: Settings, limit: Limit, nearest: int, potential: float
-) -> tuple[int, int]:
+def _create(learnt: Learnt, settings: Settings, nearest: int, potential: float) -> tuple[int, int]:
     """Create a state, at the limit by merging two; returns what happened and the nearest."""
     now, n = learnt.now[0], learnt.now[0].n_states
     new, event = n, CREATED
-    if limit is None or n < limit:  # None is known as this is compiled: the rest is left out then
+    if n < settings.max_states:
         now.n_states += 1
     else:
         new, event = merge_closest(learnt, settings, nearest), CREATED | MERGED

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, SupportsFloat, SupportsIndex, TypeAlias, TypeVar
 
 import numpy as np
@@ -77,6 +78,14 @@ def positive(name: str, value: SupportsFloat) -> float:
     if not 0.0 < number < float("inf"):
         raise ValueError(f"{name} is {value!r}; it must be a positive, finite number")
     return number
+
+
+def number(name: str, value: object, hint: str = "") -> float:
+    """A number, whatever its size; a text is none, though `float` would read "1.5"."""
+    if isinstance(value, SupportsFloat):
+        with suppress(TypeError, ValueError):
+            return float(value)
+    raise TypeError(f"{name} is {value!r}; it must be a number{hint}")
 
 
 def probability(name: str, value: float) -> float:

@@ -363,7 +363,7 @@ class Guard:
             action_judge.failed = failed
             warm_judge()
         if machine is not None:
-            warm_machine(limited=machine.max_states is not None)
+            warm_machine()
         self._observing = judge if isinstance(judge, LearntRisk) else None
         self.reviser = reviser
         self.machine = machine

@@ -22,18 +22,17 @@ def warm() -> None:
     >>> from evofsm import warm
     >>> warm()
     """
-    for is_limited in (False, True):
-        warm_machine(limited=is_limited)
+    warm_machine()
     warm_judge()
 
 
 @cache
-def warm_machine(*, limited: bool) -> None:
-    """Compile what machines need, with a limit to the number of states or without."""
+def warm_machine() -> None:
+    """Compile what machines need."""
     if not COMPILES:
         return
     announce_compiling()
-    machine = EvolvingFSM(1, max_states=1 if limited else None)
+    machine = EvolvingFSM(1)
     machine.learn_many([[0.0, 0.0], [9.0, 0.0]], [0, 0])
     machine.observe([np.nan, 0.0], missing=Missing.PARTIAL, failed=True)
 
