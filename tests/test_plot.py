@@ -102,7 +102,7 @@ def test_discs_that_would_meet_move_apart():
 
 
 def test_the_graph_says_how_likely_states_stay_and_dead_ends_have_another_shape(model):
-    stays = np.diag(model.averaged_matrix("observed"))
+    stays = np.diag(model.averaged_matrix)
     ax = plot.graph(model, new(), dead_ends=[2])
     assert f"stays {100 * stays[0]:.0f} %" in texts(ax)
     assert f"dead end\nstays {100 * stays[2]:.0f} %" in texts(ax)

@@ -171,7 +171,7 @@ def graph(model: FSMModel, ax: Axes | None = None, *, dead_ends: States = ()) ->
     """
     _refuse_unknown(model.n_states, dead_ends)
     ax = _given_or_new(ax)
-    matrix, n = model.averaged_matrix("observed"), model.n_states
+    matrix, n = model.averaged_matrix, model.n_states
     angle = 0.5 * np.pi - 2.0 * np.pi * np.arange(n) / n
     places = np.column_stack([np.cos(angle), np.sin(angle)])  # from the top, clockwise
     has_numbers = n <= _DISCS

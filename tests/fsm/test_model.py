@@ -107,7 +107,7 @@ def test_a_model_of_a_machine_that_saw_nothing_says_so():
 def test_without_an_action_all_count_alike_from_the_first_step_on():
     model = chain(SWITCH, STAY, uses=[3.0, 1.0])
     np.testing.assert_allclose(model.propagate([1.0, 0.0]), [0.95, 0.05])
-    np.testing.assert_allclose([1.0, 0.0] @ model.averaged_matrix("observed"), [0.925, 0.075])
+    np.testing.assert_allclose([1.0, 0.0] @ model.averaged_matrix, [0.925, 0.075])
 
 
 @pytest.mark.parametrize(
@@ -124,12 +124,6 @@ def test_without_an_action_all_count_alike_from_the_first_step_on():
 def test_a_forecast_that_makes_no_sense_is_refused(arguments, words):
     with pytest.raises(ValueError, match=words):
         chain(SWITCH, STAY).propagate(**{"belief": [1.0, 0.0], "action": 0, **arguments})
-
-
-@pytest.mark.parametrize("policy", ["hold", "nonsense"])
-def test_an_average_over_actions_takes_only_policies_that_average(grown, policy):
-    with pytest.raises(ValueError, match="an average is 'marginal' or 'observed'"):
-        grown.model().averaged_matrix(policy)
 
 
 def test_models_and_steps_are_shown_in_a_line():

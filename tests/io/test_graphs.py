@@ -44,7 +44,7 @@ def read_back(model, **how):
 
 
 def test_graphviz_draws_every_state_and_every_edge_that_was_asked_for(model):
-    drawn = (model.averaged_matrix("observed") > 0.0) & (model.changes >= 1.0)
+    drawn = (model.averaged_matrix > 0.0) & (model.changes >= 1.0)
     assert len(read_back(model, least=0.0, evidence=1.0).edges()) == drawn.sum()
     graph = read_back(model, least=0.0, evidence=0.0)
     assert len(graph.edges()) == model.n_states**2

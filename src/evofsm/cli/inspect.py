@@ -155,7 +155,7 @@ def passages(model: FSMModel) -> list[Passage]:
 
     counts = model.changes - np.diag(np.diag(model.changes))
     steps = model.changes.sum(axis=1)
-    learnt = model.averaged_matrix("observed")
+    learnt = model.averaged_matrix
     most_first = np.argsort(-counts, axis=None, kind="stable")[:_PASSAGES].tolist()
     places = (divmod(place, model.n_states) for place in most_first)
     return [

@@ -26,7 +26,7 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.arrays import MACHINE, NO_ACTION, NOT_OPEN, OF_ACTIONS, OF_MODEL, Learnt, Settings
 from evofsm.fsm.clusters import PAPER, width_of
 from evofsm.fsm.divergence import jensen_shannon
-from evofsm.fsm.explanation import Explanation, Nearest, explain
+from evofsm.fsm.explanation import Explanation, explain
 from evofsm.fsm.kernels import LINE, Entry, uncompiled
 from evofsm.fsm.model import FSMModel, believed
 from evofsm.fsm.naming import Labels
@@ -316,8 +316,10 @@ class EvolvingFSM(Retraced):
         index = None if action is None else valid.check_action(action, self.n_actions)
         if self.state is None:
             return Explanation("Nothing was observed yet in this episode.")
-        labels = Labels() if labels is None else labels
-        return explain(self.model(), self.belief, index, labels, self._nearest(self.state))
+        model, learnt = self.model(), self._learnt
+        is_whole = learnt.states["latest_visit"][self.state] == learnt.now["clock"][0]
+        nearest = model.nearest(learnt.variables["latest"]) if is_whole else None
+        return explain(model, self.belief, index, labels or Labels(), nearest)
 
     @alone
     def model(
@@ -608,13 +610,6 @@ class EvolvingFSM(Retraced):
         room = room_for(self._learnt, self._settings)
         if room != (self._capacity, len(self._learnt.matrices)):
             self._learnt = arrays.resized(self._learnt, *room)
-
-    def _nearest(self, state: int) -> Nearest | None:
-        learnt = self._learnt
-        if learnt.states["latest_visit"][state] != learnt.now["clock"][0]:
-            return None
-        distance = float(np.sqrt(learnt.squared_distances[state]))
-        return Nearest(state, distance, rules.reach(self._rule, self.width))
 
 
 def opened(machine: EvolvingFSM) -> tuple[Learnt, Settings]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any, Literal, Self, SupportsIndex
+from typing import Any, Self, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -144,7 +144,7 @@ class FSMModel:
     @property
     def marginal_matrix(self) -> Floats:
         """(n, n) the paper's P*, transition probabilities if all actions are alike."""
-        return self.averaged_matrix("marginal")
+        return np.asarray(self.transition_matrices.mean(axis=0))
 
     def recognise(self, z: ArrayLike) -> Floats:
         """(n,) belief of an observation (m,), or (N, n) of many: the paper's Section 2.2.2."""
@@ -185,18 +185,12 @@ class FSMModel:
             steps -= 1
         return np.asarray(there @ np.linalg.matrix_power(self.marginal_matrix, steps))
 
-    def averaged_matrix(self, policy: Literal["marginal", "observed"] = "observed") -> Floats:
-        """(n, n) transition probabilities from state (row) to state (column), over all actions.
-
-        Each action counts as often as it was used ("observed"), or all alike ("marginal", the
-        paper's P* of Section 2.3.2).
-        """
-        if policy not in ("marginal", "observed"):
-            raise ValueError(f"policy is {policy!r}; an average is 'marginal' or 'observed'")
-        if policy == "observed" and self.uses.sum() > 0.0:
-            shares = self.uses / self.uses.sum()
-            return np.asarray(np.tensordot(shares, self.transition_matrices, axes=1))
-        return np.asarray(self.transition_matrices.mean(axis=0))
+    @property
+    def averaged_matrix(self) -> Floats:
+        """(n, n) transition probabilities, each action counted as often as it was used."""
+        if not self.uses.any():
+            return self.marginal_matrix
+        return np.asarray(np.tensordot(self.uses / self.uses.sum(), self.transition_matrices, 1))
 
     def explain(
         self,

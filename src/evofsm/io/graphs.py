@@ -91,7 +91,7 @@ def to_dot(
         width = 0.75 + _LARGEST_NODE * (model.visits[state] / most) ** 0.5
         mark = _DOT_MARK if state in marked_states else ""
         lines.append(f'  s{state + 1} [label="{label}", width={width:.2f}{mark}];')
-    matrix = model.averaged_matrix("observed")
+    matrix = model.averaged_matrix
     is_drawn = (matrix >= least) & (model.changes >= evidence) & (matrix > 0.0)
     for i, j in np.argwhere(is_drawn).tolist():
         chance, count = matrix[i, j], model.changes[i, j]
