@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 import evofsm
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import Novelty
 
 _PACKAGE = str(Path(evofsm.__file__).parent)
@@ -207,11 +206,9 @@ DEEDS = {
     "observe": at_once(full, lambda machine: machine.observe(_NEXT)),
     "learn_one": at_once(full, lambda machine: machine.learn_one(_NEXT, 2)),
     "failed": at_once(full, lambda machine: machine.observe(_NEXT, failed=True)),
-    "missing": at_once(
-        full, lambda machine: machine.observe([np.nan, 4.0], missing=Missing.PARTIAL)
-    ),
+    "missing": at_once(full, lambda machine: machine.observe([np.nan, 4.0], partial=True)),
     "missing, failed": at_once(
-        full, lambda machine: machine.observe([9.0, np.nan], missing=Missing.PARTIAL, failed=True)
+        full, lambda machine: machine.observe([9.0, np.nan], partial=True, failed=True)
     ),
     "fail": at_once(full, lambda machine: machine.fail()),
     "start_episode": at_once(full, lambda machine: machine.start_episode()),

@@ -5,7 +5,6 @@ from .fsm import Forecasts as Forecasts
 from .fsm import FSMModel as FSMModel
 from .fsm import IntervalActions as IntervalActions
 from .fsm import Labels as Labels
-from .fsm import Missing as Missing
 from .fsm import Novelty as Novelty
 from .fsm import ObservationEncoder as ObservationEncoder
 from .fsm import Paper as Paper

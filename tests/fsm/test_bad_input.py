@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.observations import Missing
 
 NAN, INF = float("nan"), float("inf")
 RAGGED = [[1.0, 2.0], [3.0]]
@@ -149,8 +148,8 @@ HIDDEN = {
 @pytest.mark.parametrize("z", HIDDEN.values(), ids=HIDDEN)
 def test_a_masked_entry_is_treated_as_nan_is(grown, z):
     twin = grown.copy()
-    step = grown.observe(z, missing=Missing.PARTIAL)
-    expected = twin.observe([float(z[0]), NAN], missing=Missing.PARTIAL)
+    step = grown.observe(z, partial=True)
+    expected = twin.observe([float(z[0]), NAN], partial=True)
     assert step.missing == expected.missing == (1,)
     assert step.belief.tobytes() == expected.belief.tobytes()
 

@@ -62,7 +62,7 @@ def test_editing_a_kernel_takes_effect_in_the_kernels_that_call_it(package):
 WARMED = """
 import numpy as np
 from numba.core import event
-from evofsm import EvolvingFSM, Guard, Missing, warm
+from evofsm import EvolvingFSM, Guard, warm
 
 class Listener(event.Listener):
     def on_start(self, event): ...
@@ -74,7 +74,7 @@ for most in (None, 2):
     machine = EvolvingFSM(2, max_states=most)
     machine.learn_many(np.random.default_rng(0).normal(size=(50, 3)), [0] * 50)
     machine.act(1)
-    machine.observe([np.nan, 1.0, 2.0], missing=Missing.PARTIAL)
+    machine.observe([np.nan, 1.0, 2.0], partial=True)
     machine.fail()
     machine.model().recognise([0.0, 1.0, 2.0])
 guard = Guard(n_actions=3, interval=0.1)

@@ -6,7 +6,6 @@ import pytest
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Event
 
@@ -135,5 +134,5 @@ def test_models_and_steps_are_shown_in_a_line():
     machine.start_episode()
     step = machine.observe([3.2])
     assert repr(step) == "Step(state=500, belief=1 of 501 states, event=CREATED, surprise=nan)"
-    step = machine.observe([np.nan], missing=Missing.PARTIAL)
+    step = machine.observe([np.nan], partial=True)
     assert repr(step).endswith("event=NONE, surprise=nan, missing=(0,))")

@@ -11,7 +11,6 @@ from river import checks, datasets, evaluate, metrics, stream
 from river.checks import common
 
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.observations import Missing
 from evofsm.fsm.river import RiverClusterer
 from evofsm.fsm.rules import Novelty
 
@@ -72,7 +71,7 @@ def test_what_is_absent_was_not_observed(absent):
     clusterer = RiverClusterer()
     for x in as_features(Z):
         clusterer.learn_one(x)
-    step = machine.observe([0.5, np.nan, -1.0], missing=Missing.PARTIAL)
+    step = machine.observe([0.5, np.nan, -1.0], partial=True)
     x = {"a": 0.5, "c": -1.0, **absent}
     before = pickle.dumps(clusterer)
     assert np.array_equal(list(clusterer.predict_proba_one(x).values()), step.belief)

@@ -17,7 +17,6 @@ from evofsm.driving.scenarios import Leader, Scenario
 from evofsm.driving.trials import drive
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import Novelty
 from evofsm.guard.api import Intake, Proposal
 from evofsm.guard.guard import Guard
@@ -54,7 +53,7 @@ def test_an_incomplete_observation_teaches_nothing_but_that_it_failed():
     taught = machine()
     centers, matrices, visits = taught.centers, taught.transition_matrices, taught.model().visits
     taught.act(1)
-    step = taught.observe([NAN, 15.0, 15.0], missing=Missing.PARTIAL)
+    step = taught.observe([NAN, 15.0, 15.0], partial=True)
     assert step.missing == (0,)
     assert step.belief.sum() == pytest.approx(1.0, abs=1e-12)
     assert not np.isnan(step.surprise)  # it was foreseen, or not
@@ -63,7 +62,7 @@ def test_an_incomplete_observation_teaches_nothing_but_that_it_failed():
     np.testing.assert_array_equal(taught.model().visits, visits)
     np.testing.assert_array_equal(taught.belief, step.belief)
     failures = taught.endings.sum()
-    taught.observe([NAN, 15.0, 15.0], missing=Missing.PARTIAL, failed=True)
+    taught.observe([NAN, 15.0, 15.0], partial=True, failed=True)
     assert taught.endings.sum() == failures + 1
     assert taught.state is None
 
@@ -71,21 +70,21 @@ def test_an_incomplete_observation_teaches_nothing_but_that_it_failed():
 def test_it_is_recognised_by_the_variables_that_are_there_and_else_by_the_forecast():
     taught = EvolvingFSM(1, rule=Novelty(radius=1.0))
     taught.learn_many([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]], [0, 0, 0])
-    belief = taught.observe([NAN, 10.0], missing=Missing.PARTIAL).belief
+    belief = taught.observe([NAN, 10.0], partial=True).belief
     assert belief[2] > 0.99
-    belief = taught.observe([10.0, NAN], missing=Missing.PARTIAL).belief
+    belief = taught.observe([10.0, NAN], partial=True).belief
     assert belief[1] == pytest.approx(belief[2])
     assert belief[0] < 0.01
     taught.act(0)
     expected = taught.predict(0)
-    step = taught.observe([NAN, NAN], missing=Missing.PARTIAL)
+    step = taught.observe([NAN, NAN], partial=True)
     np.testing.assert_array_equal(step.belief, expected)
     assert step.surprise == 0.0
 
 
 def test_a_first_observation_must_be_whole():
     with pytest.raises(ValueError, match="first observation"):
-        EvolvingFSM(1).observe([NAN, 1.0], missing=Missing.PARTIAL)
+        EvolvingFSM(1).observe([NAN, 1.0], partial=True)
 
 
 def test_the_less_is_seen_the_more_careful_it_gets():

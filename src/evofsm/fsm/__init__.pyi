@@ -5,7 +5,6 @@ from .machine import EvolvingFSM as EvolvingFSM
 from .model import FSMModel as FSMModel
 from .naming import Labels as Labels
 from .observations import Category as Category
-from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder
 from .proportions import FailureRecord as FailureRecord
 from .proportions import wilson_bounds as wilson_bounds

@@ -30,7 +30,6 @@ from evofsm.fsm.explanation import Explanation, explain
 from evofsm.fsm.kernels import LINE, Entry, uncompiled
 from evofsm.fsm.model import FSMModel, believed
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import StateRule
 from evofsm.fsm.sharing import Retraced, alone, share, step
 from evofsm.fsm.step import EVENTS, PREDICTED, Event, Step, Trace, blank_trace
@@ -147,9 +146,7 @@ class EvolvingFSM(Retraced):
     # -- Learning -------------------------------------------------------------------------------
 
     @alone
-    def observe(
-        self, z: ArrayLike, *, failed: bool | None = None, missing: Missing = Missing.REJECT
-    ) -> Step:
+    def observe(self, z: ArrayLike, *, failed: bool | None = None, partial: bool = False) -> Step:
         """Take in one observation: determine states, recognise, and learn the transition to it.
 
         One step of the paper's Sections 2.2.1, 2.2.2 and 2.3.2, in that order.
@@ -161,9 +158,9 @@ class EvolvingFSM(Retraced):
         failed : bool, optional
             Whether the episode ended in failure with this observation, so that the next one begins
             an episode. Without it nothing is said of failures: see `failures_told`.
-        missing : Missing
-            What to do where entries are NaN or masked: that they were not observed. No state moves,
-            and no transition is learnt; `Step.missing` tells the variables.
+        partial : bool
+            Whether entries may be NaN or masked: that they were not observed. It is then recognised
+            by the others, no state moves, and no transition is learnt; `Step.missing` tells which.
 
         Raises
         ------
@@ -171,7 +168,7 @@ class EvolvingFSM(Retraced):
             If ``z`` holds no real numbers of at most 1e100, or has another length than before. The
             machine is then as it was.
         """
-        if missing is not Missing.REJECT:
+        if partial:
             vector = valid.real_array("observation", z, ndim=1)
             if (absent := np.isnan(vector)).any():
                 return self._observe_partly(vector, absent, failed)

@@ -9,29 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
 from evofsm.fsm.validation import Floats, number, positive
-
-
-class Missing(Enum):
-    """What is done where some variables were not observed; they hold NaN.
-
-    ``REJECT`` is an error, and ``PARTIAL`` recognises from the variables that are there.
-
-    Examples
-    --------
-    >>> from evofsm import EvolvingFSM, Missing
-    >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
-    >>> step = machine.observe([1.0, 2.0])
-    >>> machine.observe([float("nan"), 2.5], missing=Missing.PARTIAL).missing
-    (0,)
-    """
-
-    REJECT = "reject"
-    PARTIAL = "partial"
 
 
 @dataclass(frozen=True)

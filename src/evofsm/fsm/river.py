@@ -10,7 +10,6 @@ import numpy as np
 
 from evofsm.extras import needs
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import StateRule
 from evofsm.fsm.validation import Floats, number
 
@@ -72,10 +71,8 @@ class RiverClusterer(base.Clusterer):
         if not self._observed:
             return
         z = self._vector(x)
-        if not np.isnan(z).any():
-            self.machine.learn_one(z, _ACTION)
-        elif self.machine.n_states:
-            self.machine.observe(z, missing=Missing.PARTIAL)
+        if self.machine.n_states or not np.isnan(z).any():
+            self.machine.observe(z, partial=True)
             self.machine.act(_ACTION)
 
     @property
@@ -99,7 +96,7 @@ class RiverClusterer(base.Clusterer):
             return np.empty(0)
         z = self._vector(x)
         if np.isnan(z).any():  # a machine learns nothing from these, but its belief changes
-            return self.machine.copy().observe(z, missing=Missing.PARTIAL).belief
+            return self.machine.copy().observe(z, partial=True).belief
         return self.machine.model().recognise(z)
 
     def _vector(self, x: Mapping[Hashable, Any]) -> Floats:

@@ -26,7 +26,6 @@ from evofsm.fsm.explanation import explain
 from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.observations import Missing
 from evofsm.fsm.sharing import Rollback, alone, share, transaction
 from evofsm.fsm.validation import function, positive, real_array, refuse_unusable
 from evofsm.guard.actions import (
@@ -632,8 +631,7 @@ class Guard:
                 belief = model.recognise(latest_row)
                 state = int(belief.argmax())
         elif machine is not None and not (is_incomplete and machine.n_states == 0):
-            policy = Missing.PARTIAL if is_incomplete else Missing.REJECT
-            step = machine.observe(z, missing=policy)
+            step = machine.observe(z, partial=is_incomplete)
             belief, state, surprise = step.belief, step.state, step.surprise
         if self._observing is not None and self._learn:
             self._observing.observe(z)
@@ -766,8 +764,7 @@ class Guard:
         if machine is not None:
             has_gaps = z is not None and math.isnan(z.dot(z))
             if z is not None and (machine.n_states or not has_gaps):
-                policy = Missing.PARTIAL if has_gaps else Missing.REJECT
-                machine.observe(z, failed=failed, missing=policy)
+                machine.observe(z, failed=failed, partial=has_gaps)
             elif failed and machine.state is not None:
                 machine.fail()
             machine.tell_of_failures()

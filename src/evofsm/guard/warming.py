@@ -6,7 +6,6 @@ import numpy as np
 
 from evofsm.fsm.kernels import COMPILES, announce_compiling
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.observations import Missing
 from evofsm.guard.api import TOLERANCE, Situation
 from evofsm.guard.learnt.judge import LearntRisk
 
@@ -34,7 +33,7 @@ def warm_machine() -> None:
     announce_compiling()
     machine = EvolvingFSM(1)
     machine.learn_many([[0.0, 0.0], [9.0, 0.0]], [0, 0])
-    machine.observe([np.nan, 0.0], missing=Missing.PARTIAL, failed=True)
+    machine.observe([np.nan, 0.0], partial=True, failed=True)
 
 
 @cache
