@@ -135,4 +135,4 @@ def test_models_and_steps_are_shown_in_a_line():
     step = machine.observe([3.2])
     assert repr(step) == "Step(state=500, belief=1 of 501 states, event=CREATED, surprise=nan)"
     step = machine.observe([np.nan], partial=True)
-    assert repr(step).endswith("event=NONE, surprise=nan, missing=(0,))")
+    assert repr(step).endswith("event=NONE, surprise=nan)")

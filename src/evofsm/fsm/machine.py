@@ -160,7 +160,7 @@ class EvolvingFSM(Retraced):
             an episode. Without it nothing is said of failures: see `failures_told`.
         partial : bool
             Whether entries may be NaN or masked: that they were not observed. It is then recognised
-            by the others, no state moves, and no transition is learnt; `Step.missing` tells which.
+            by the others, no state moves, and no transition is learnt.
 
         Raises
         ------
@@ -549,8 +549,8 @@ class EvolvingFSM(Retraced):
     def _observe_partly(self, z: Floats, absent: NDArray[np.bool_], failed: bool | None) -> Step:
         """Recognise what some variables are missing of; only the belief changes."""
         now, n = self._learnt.now[0], self.n_states
-        gaps = tuple(np.flatnonzero(absent).tolist())
         if n == 0:
+            gaps = np.flatnonzero(absent).tolist()
             raise ValueError(f"variables {gaps} of a machine's first observation are missing")
         self._refuse_other_length(len(z))
         vector = np.where(absent, 0.0, z)
@@ -571,7 +571,7 @@ class EvolvingFSM(Retraced):
         if failed is not None:
             learnt.now["failures_told"] = 1
         self._learnt = learnt
-        return Step(int(belief.argmax()), belief, Event.NONE, forecast, surprise, gaps)
+        return Step(int(belief.argmax()), belief, Event.NONE, forecast, surprise)
 
     def _checked(self, z: ArrayLike) -> Floats:
         """An observation as a vector of its own, of as many variables as the first one had."""

@@ -223,14 +223,11 @@ class Step(NamedTuple):
     event: Event  #: what happened to the states
     predicted: Floats  #: (n,) forecast made one step before; empty where none was
     surprise: float  #: divergence of `predicted` and `belief` [bit]; NaN where none was
-    missing: tuple[int, ...] = ()  #: variables that were not observed, so that nothing was learnt
 
     def __repr__(self) -> str:
-        suffix = f", missing={self.missing}" if self.missing else ""
         return (
             f"Step(state={self.state}, belief={self.belief[self.state]:.3g} of "
-            f"{len(self.belief)} states, event={self.event.name}, surprise={self.surprise:.3g}"
-            f"{suffix})"
+            f"{len(self.belief)} states, event={self.event.name}, surprise={self.surprise:.3g})"
         )
 
 

@@ -83,8 +83,8 @@ class BoxActions:
     >>> actions = BoxActions((-1.0, 0.0), (1.0, 4.0))
     >>> actions.n_actions, actions.encode([-1.0, 0.0]), actions.encode([1.0, 4.0])
     (81, 0, 80)
-    >>> [0.0, 5.0] in actions, actions.clip([0.0, 5.0])
-    (False, array([0., 4.]))
+    >>> actions.clip([0.0, 5.0])
+    array([0., 4.])
     """
 
     low: tuple[float, ...]
@@ -152,11 +152,6 @@ class BoxActions:
         cells = np.ascontiguousarray(np.moveaxis(np.array(boxes), 2, 0))
         cells.setflags(write=False)
         return cells
-
-    def __contains__(self, action: ArrayLike) -> bool:
-        values = np.asarray(action, dtype=np.float64)
-        inside = (self.bounds[0] <= values) & (values <= self.bounds[1])
-        return values.shape == self.half.shape and bool(inside.all())
 
     def clip(self, action: ArrayLike) -> NDArray[np.float64]:
         """(..., d) ndarray: the actions of the set that are closest; NaN stays."""
