@@ -80,18 +80,13 @@ class Decider:
         self._said_often = self._said_fast = self._has_failed = self._alarm = False
         reviser = guard.reviser
         judge = reviser.risk if isinstance(reviser, ActionReviser) else None
+        self._mode = reviser.mode if isinstance(reviser, ActionReviser) else Mode.ACT
         self._units = () if judge is None else judge.labels.units
         self._drives = isinstance(judge, LatentRisk | TrafficRisk)
         self._is_alone = isinstance(judge, Foresight)  # nobody acts
         self._csv = CsvRows(self.slots, self.form.variables, acts=not self._is_alone)
         if isinstance(judge, Foresight):
             judge.bridges = self.slots.hole or 0.0
-
-    @property
-    def mode(self) -> Mode:
-        """How far the guard goes."""
-        reviser = self.guard.reviser
-        return reviser.mode if isinstance(reviser, ActionReviser) else Mode.ACT
 
     # -- Messages -------------------------------------------------------------------------------
 
@@ -248,7 +243,7 @@ class Decider:
         if row.observation is None:  # nothing is ahead: whatever is wanted is done
             body = dict.fromkeys(("proposed", "executed", "advised"), plain(row.proposal))
             body |= dict.fromkeys(_RISKS) | {"reason": "nothing is ahead in the lane"}
-            body |= {"alarm": False, "mode": self.mode.value}
+            body |= {"alarm": False, "mode": self._mode.value}
             return self._of("decision", time=row.time, ahead=None, **body, **note)
         try:
             revision = self._revision(row, before)
@@ -262,7 +257,7 @@ class Decider:
         parts = {**revision._asdict(), "risk_low": low, "risk_high": high}
         body = {name: plain(parts[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
         self._alarm = self._is_alarm(revision)
-        body |= {"reason": revision.reason, "alarm": self._alarm, "mode": self.mode.value}
+        body |= {"reason": revision.reason, "alarm": self._alarm, "mode": self._mode.value}
         return self._of("decision", time=row.time, **leader, **self._worst(row), **body, **note)
 
     def _worst(self, row: Row) -> Answer:
