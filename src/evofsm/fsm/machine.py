@@ -34,7 +34,7 @@ from evofsm.fsm.rules import StateRule
 from evofsm.fsm.sharing import Retraced, alone, share, step
 from evofsm.fsm.step import EVENTS, PREDICTED, Event, Step, Trace, blank_trace
 from evofsm.fsm.transitions import room_for
-from evofsm.fsm.validation import Floats, positive, whole
+from evofsm.fsm.validation import Floats, positive, probability, whole
 from evofsm.store import LARGEST_OBSERVATION, Place
 
 # What a machine does not have to be given, with what holds if it is not.
@@ -114,10 +114,10 @@ class EvolvingFSM(Retraced):
         settings = Settings(
             radius=0.3 if radius is None else positive("radius", radius),
             distance_weight=positive("distance_weight", distance_weight),
-            learning_rate=_below_1("learning_rate", learning_rate),
+            learning_rate=probability("learning_rate", learning_rate),
             prior_frequency=positive("prior_frequency", prior_frequency),
             spread=3.0 if spread is None else positive("spread", spread),
-            belief_tolerance=_below_1("belief_tolerance", belief_tolerance)
+            belief_tolerance=probability("belief_tolerance", belief_tolerance)
             if belief_tolerance
             else 0.0,
             max_states=_or_infinity("max_states", max_states),
@@ -612,12 +612,6 @@ class EvolvingFSM(Retraced):
 def opened(machine: EvolvingFSM) -> tuple[Learnt, Settings]:
     """What a machine has learnt and was given, itself."""
     return machine._learnt, machine._settings
-
-
-def _below_1(name: str, value: float) -> float:
-    if positive(name, value) >= 1.0:
-        raise ValueError(f"{name} is {value}; it must lie below 1")
-    return float(value)
 
 
 def _or_infinity(name: str, most: SupportsIndex | None) -> float:

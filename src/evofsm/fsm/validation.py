@@ -71,13 +71,10 @@ def function(name: str, value: _F, such_as: str) -> _F:
 
 def positive(name: str, value: SupportsFloat) -> float:
     """A positive, finite number."""
-    try:
-        number = float("nan") if isinstance(value, str) else float(value)
-    except (TypeError, ValueError):
-        number = float("nan")
-    if not 0.0 < number < float("inf"):
-        raise ValueError(f"{name} is {value!r}; it must be a positive, finite number")
-    return number
+    with suppress(TypeError, ValueError):
+        if not isinstance(value, str) and 0.0 < float(value) < float("inf"):
+            return float(value)
+    raise ValueError(f"{name} is {value!r}; it must be a positive, finite number")
 
 
 def number(name: str, value: object, hint: str = "") -> float:
@@ -88,11 +85,11 @@ def number(name: str, value: object, hint: str = "") -> float:
     raise TypeError(f"{name} is {value!r}; it must be a number{hint}")
 
 
-def probability(name: str, value: float) -> float:
-    """The value, if it lies between 0 and 1, neither included."""
-    if not 0.0 < value < 1.0:
-        raise ValueError(f"{name} is {value}; it is a probability, between 0 and 1")
-    return value
+def probability(name: str, value: SupportsFloat) -> float:
+    """A number between 0 and 1, neither included."""
+    if positive(name, value) >= 1.0:
+        raise ValueError(f"{name} is {value}; it must lie below 1")
+    return float(value)
 
 
 def whole(name: str, value: SupportsIndex) -> int:
