@@ -1,9 +1,11 @@
-"""The references are writings of the same machine, and the harness judges as it says."""
+"""The harness judges as it says, and what soaks for long holds for a while."""
 
 import json
 
 import pytest
 
+import monitor_soak
+import soak
 import speed
 from timing import Row, judged, worsened
 
@@ -58,8 +60,10 @@ def absent(repeats, short):
 
 def test_the_harness_writes_what_it_prints_and_says_what_is_missed_or_worse(harness, tmp_path):
     good, bad = made_up(">=", 5.0, 1.0), made_up("<=", 0.5, 6.0)
-    status, out, written = harness({"good": good, "bad": bad})
-    assert status == 0
+    assert harness({"good": good})[0] == 0
+    status, out, written = harness({"good": good, "absent": Row(absent, ">="), "bad": bad})
+    assert status == 1
+    assert "No module named 'river'" in out
     found = [(result["id"], result["ratio"], result["reached"]) for result in written]
     assert found == [("good", 10.0, True), ("bad", 0.6, False)]
     assert {"id", "ours_s", "reference", "reference_s", "ratio"} <= written[0].keys()
@@ -69,14 +73,6 @@ def test_the_harness_writes_what_it_prints_and_says_what_is_missed_or_worse(harn
     status, out, _ = harness({"good": good, "bad": bad}, "--only", "good", "--against", str(last))
     assert status == 1
     assert "WORSE" in out
-
-
-def test_one_row_that_fails_leaves_the_others(harness):
-    good = made_up(">=", 5.0, 1.0)
-    status, out, written = harness({"absent": Row(absent, ">="), "good": good})
-    assert status == 1
-    assert [result["id"] for result in written] == ["good"]
-    assert "No module named 'river'" in out
 
 
 QUICK = "batch_7,call_64,states_1024"
@@ -90,3 +86,23 @@ def test_real_rows_run_and_the_table_is_no_wider_than_100_columns(tmp_path, caps
     assert [result["id"] for result in json.loads(file.read_text())] == QUICK.split(",")
     for result in json.loads(file.read_text()):
         assert result["ours_s"] > 0.0 < result["reference_s"]
+
+
+# -- Soaks: `make soak` takes a thousand million steps, and a monitor for a day --------------------
+
+
+def test_numbers_hold_for_two_million_steps():
+    found = list(soak.soak(2_000_000))
+    assert [health.stream for health in found if not health.holds] == []
+    sizes = {}
+    for health in found:
+        sizes.setdefault(health.stream, []).append(health.kilobytes)
+    assert all(size[-1] == size[0] for size in sizes.values())
+
+
+@pytest.mark.parametrize("learn", [True, False])
+def test_no_decision_of_a_monitor_is_lost_or_wrong(learn):
+    found = monitor_soak.soak(0.15, seed=1, learn=learn, episode=900)
+    assert found.wrong == 0
+    assert found.rows > 2000
+    assert min(found.alarms, found.junk, found.restarts) > 0

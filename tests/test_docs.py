@@ -12,8 +12,8 @@ import shlex
 import subprocess
 import sys
 from functools import partial
-from html.parser import HTMLParser
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 
@@ -178,29 +178,25 @@ def test_commands_that_are_not_run_would_be_understood():
     assert looked_at > 40
 
 
+# -- The glossary ---------------------------------------------------------------------------------
+
+WORDS = [row for row in (DOCS / "glossary.md").read_text().splitlines() if row.startswith("| **")]
+
+
+@pytest.mark.parametrize("word", WORDS, ids=lambda word: word.split("**")[1])
+def test_a_word_has_the_name_in_code_that_the_glossary_gives(word):
+    pytest.importorskip("scipy")
+    name = re.search(r"`((?:evofsm|studies)[\w.]+)` \|$", word)[1]
+    owner, _, last = name.rpartition(".")
+    fields = getattr(resolve_name(owner), "__dataclass_fields__", {})
+    assert last in fields or resolve_name(name) is not None
+
+
 # -- The site -------------------------------------------------------------------------------------
 
 
-class Page(HTMLParser):
-    """What a page of HTML can be linked to by, where it leads, and what it loads."""
-
-    def __init__(self, path):
-        super().__init__()
-        self.anchors, self.links, self.loaded = set(), [], []
-        self.feed(path.read_text())
-
-    def handle_starttag(self, tag, attributes):
-        attributes = dict(attributes)
-        self.anchors |= {attributes[name] for name in ("id", "name") if attributes.get(name)}
-        leads = tag == "link" and attributes.get("rel") in {"index", "search", "next", "prev"}
-        if "href" in attributes and (tag == "a" or leads):
-            self.links.append(attributes["href"])
-        else:
-            self.loaded += [attributes[name] for name in ("src", "href") if attributes.get(name)]
-
-
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
+def site(tmp_path_factory, read_page):
     """All pages of the site, built with warnings as errors, once for all processes of pytest."""
     fcntl = pytest.importorskip("fcntl")
     run = tmp_path_factory.getbasetemp()
@@ -216,7 +212,7 @@ def site(tmp_path_factory):
             )
             assert done.returncode == 0, done.stdout + done.stderr
             built.touch()
-    return folder, {path: Page(path) for path in folder.rglob("*.html")}
+    return folder, {path: read_page(path) for path in folder.rglob("*.html")}
 
 
 def is_elsewhere(address):
@@ -236,7 +232,7 @@ def test_every_link_of_the_site_leads_somewhere(site):
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             assert target.exists(), f"{path}: {link}"
             if parts.fragment and target in pages:
-                assert unquote(parts.fragment) in pages[target].anchors, f"{path}: {link}"
+                assert unquote(parts.fragment) in pages[target].ids, f"{path}: {link}"
             looked_at += 1
     assert looked_at > 1000
 
@@ -245,7 +241,7 @@ def test_every_link_of_the_site_leads_somewhere(site):
 def test_the_site_loads_nothing_from_elsewhere(site):
     folder, pages = site
     for path, page in pages.items():
-        assert not [one for one in page.loaded if is_elsewhere(one)], path
+        assert not [one for one in page.loads if is_elsewhere(one)], path
     for style in folder.rglob("*.css"):
         assert not re.search(r"(url\(|@import )['\"]?(https?:)?//", style.read_text()), style
 

@@ -31,23 +31,6 @@ def count(own):
     assert participles == [f"{module}, line 8: last_seen" for module in "ab"]
 
 
-def test_functions_of_a_face_that_do_not_say_what_they_take_are_found(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "tools")
-    text = r"""def silent(a, b, *, c): ...
-def few(a, b, *rest, **others): ...
-def told(a, b, c): "Do.\n\nParameters\n---"
-def hidden(a, b, c): ...
-class Base:
-    def act(self, a, b, c): "Do.\n\nParameters\n---"
-    def end(self, a, b): ...
-class Part(Base):
-    def act(self, a, b, c): ...
-    def end(self, a, b, c): ..."""
-    faces = {("m", name) for name in ("silent", "few", "told", "Part")}
-    found = ["m, line 1: silent", "m, line 10: Part.end"]
-    assert [*import_module("house").unexplained(faces, {"m": ast.parse(text)})] == found
-
-
 @pytest.mark.parametrize("face", FACES, ids=lambda face: face.parent.name)
 def test_a_face_offers_each_name_once_in_order_and_no_module_hides_it(face):
     lines = [line for line in face.read_text("utf-8").splitlines() if line.startswith("from ")]

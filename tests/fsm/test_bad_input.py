@@ -13,6 +13,7 @@ RAGGED = [[1.0, 2.0], [3.0]]
 OBSERVATIONS = {
     "NaN": ([0.0, NAN], ValueError, "observation, variable 1: nan .*finite"),
     "too large": ([0.0, 1e200], ValueError, r"observation, variable 1: 1e\+200 .*at most 1e\+100"),
+    "NaN in an array": (np.array([0.0, NAN]), ValueError, "observation, variable 1: nan .*finite"),
     "texts": (["a", "b"], TypeError, "observation has dtype <U1.*text"),
     "nothing": (None, TypeError, "observation has dtype object.*None"),
     "ragged": (RAGGED, ValueError, "observation: rows have different lengths"),
@@ -75,12 +76,6 @@ def refuses(snapshot):
 def test_an_observation_that_cannot_be_right(machine, refuses, z, error, words):
     refuses(machine, lambda m: m.observe(z), error, words)
     refuses(machine, lambda m: m.learn_one(z, 1), error, words)
-
-
-@pytest.mark.parametrize("name", ["NaN", "too large"])
-def test_an_array_is_looked_at_as_closely_as_a_list(machine, refuses, name):
-    z, error, words = OBSERVATIONS[name]
-    refuses(machine, lambda m: m.observe(np.array(z)), error, words)
 
 
 def test_an_observation_or_a_batch_of_another_length(grown, refuses):

@@ -135,30 +135,6 @@ def test_a_memory_holds_what_was_executed_with_what_it_earned(learners, penalty)
     assert held == [(0.5, 1.0), *proposed, (-1.0, 1.0)]
 
 
-def test_what_is_told_a_pole_lets_no_learner_fail_and_one_that_is_not_learns_from_it(learners):
-    found = {way: learners.trained("pendulum", way, 0, 600, 2) for way in ("alone", "told-1")}
-    assert found["alone"]["failed"] > 10
-    assert found["told-1"]["failed"] == found["told-1"]["under_failed"] == 0
-    json.dumps(found)
-
-
-def test_a_critic_learns_which_action_fails_and_frozen_learns_no_more(learners):
-    critic = learners.SafetyCritic(Box((-1.0,), (1.0,)), 1, seed=0)
-    chance, ahead = np.random.default_rng(0), np.array([0.5])
-    critic.begin()
-    for _ in range(1000):  # whatever is above 0 fails, else it stays where it is
-        if critic.action(ahead, chance.uniform(-1.0, 1.0)) > 0.0:
-            critic.end(True, ahead)
-            critic.begin()
-    critic.freeze()
-    critic.begin()
-    assert critic.action(ahead, -0.9) == -0.9
-    assert all(critic.action(ahead, 0.9) < 0.0 for _ in range(20))
-    weights = [layer.clone() for layer in critic._net.parameters()]
-    critic.end(True, ahead)
-    assert all(map(learners.torch.equal, weights, critic._net.parameters()))
-
-
 def test_a_filter_learns_while_a_learner_does(learners):
     found = learners.trained("cartpole", "filter-1", 0, 600, 1)
     assert 0 < found["failed"] <= found["episodes"]
