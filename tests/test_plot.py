@@ -93,14 +93,6 @@ def test_a_few_spikes_do_not_set_the_axes_and_where_it_alarms_is_tinted():
     assert -20.0 < alone.get_xlim()[0] < alone.get_xlim()[1] < 20.0
 
 
-def test_discs_that_would_meet_move_apart():
-    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=0.01))
-    machine.learn_many([[0.0, 0.0], [0.02, 0.0], [9.0, 9.0]], [0, 0, 0])
-    ax = plot.states(machine.model(), new())
-    drawn = ax.transData.transform([text.xy for text in ax.texts])
-    assert np.hypot(*(drawn[0] - drawn[1])) > 13.0 * ax.figure.dpi / 72.0
-
-
 def test_the_graph_says_how_likely_states_stay_and_dead_ends_have_another_shape(model):
     stays = np.diag(model.averaged_matrix("observed"))
     ax = plot.graph(model, new(), dead_ends=[2])

@@ -8,7 +8,6 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import Novelty
-from evofsm.fsm.step import Event
 
 ACTIONS = IntervalActions(low=-1.0, high=1.0, width=1.0)
 
@@ -34,16 +33,6 @@ STAY = [[1.0, 0.0], [0.0, 1.0]]
 
 
 # -- A snapshot --------------------------------------------------------------------------------
-
-
-def test_it_counts_founding_visits_and_uses(spiral):
-    machine = EvolvingFSM(n_actions=2, radius=0.01)
-    trace = machine.learn_many(spiral(120), [1] * 30 + [0] * 20 + [-1] * 10 + [0] * 60)
-    model = machine.model()
-    assert model.n_states > 32
-    assert model.created.tolist() == (np.flatnonzero(trace.event == Event.CREATED) + 1).tolist()
-    assert model.visits.tolist() == np.bincount(trace.state).tolist()
-    assert model.uses.tolist() == [79, 30]
 
 
 def test_nothing_in_a_snapshot_can_be_changed(grown):
@@ -92,13 +81,6 @@ def test_parts_that_do_not_fit_each_other_are_refused(change, words):
 def test_what_cannot_be_recognised_is_refused(grown, z, words):
     with pytest.raises(ValueError, match=words):
         grown.model().recognise(z)
-
-
-def test_a_model_of_a_machine_that_saw_nothing_says_so():
-    model = EvolvingFSM(n_actions=2).model()
-    assert model.n_states == 0
-    with pytest.raises(ValueError, match=r"no states|variables"):
-        model.recognise([0.0])
 
 
 # -- Forecasts ---------------------------------------------------------------------------------

@@ -78,6 +78,8 @@ def assert_sound(machine, trace):
     assert (model.origin_frequency >= 0.0).all()
     assert ((model.potentials > 0.0) & (model.potentials <= 1.0)).all()
     assert (model.failures <= model.decisions).all()
+    assert model.visits.tolist() == np.bincount(trace.state).tolist()
+    assert model.created.tolist() == (np.flatnonzero(trace.event == Event.CREATED) + 1).tolist()
     surprise = trace.surprise[~np.isnan(trace.surprise)]
     assert ((surprise >= 0.0) & (surprise <= 1.0)).all()
     assert model.decisions.sum() == pytest.approx(len(surprise))

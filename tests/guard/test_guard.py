@@ -392,22 +392,6 @@ def test_what_a_search_finds_outside_is_put_into_the_set():
 # -- What a judge is told -----------------------------------------------------------------------
 
 
-def test_a_judge_that_wants_to_know_is_told_whether_it_may_learn(tmp_path):
-    class Asked(Balance):
-        learning = None
-
-    guard = continuous(judge=Asked())
-    assert guard.judge.learning is True
-    guard.freeze()
-    assert guard.judge.learning is False
-    guard.save(tmp_path / "guard")
-    assert Guard.load(tmp_path / "guard", judge=Asked).judge.learning is False
-    assert guard.copy().judge.learning is False
-    guard.learn = True
-    assert guard.judge.learning is True
-    assert not hasattr(continuous().judge, "learning")
-
-
 # -- What is refused ----------------------------------------------------------------------------
 
 

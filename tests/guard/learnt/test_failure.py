@@ -23,9 +23,7 @@ from evofsm.guard.learnt.failure import (
     inside,
     rivals,
 )
-from evofsm.guard.learnt.learn import doubted
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS
-from evofsm.guard.learnt.state import Episode, LearntSettings, State
 
 SHAPES = {
     "disc": lambda z: np.hypot(z[..., 0], z[..., 2]) < 0.8,
@@ -52,14 +50,6 @@ def survived_as(rows, unit, ended=()):
     return Survived(rows, lowest, highest, unit, rows.std(0), ended)
 
 
-@pytest.mark.parametrize(("typical", "holds"), [(0.1, True), (2.0, False)])
-def test_a_form_that_would_refuse_most_of_what_was_survived_is_none(typical, holds):
-    failures, survived = seen("disc")
-    forms = explain(FAILS, failures, survived_as(survived, np.full(3, typical)))
-    assert inside(forms, failures).any(0).all() == holds
-    assert len(forms) == holds
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_forms_explain_failures_and_nothing_that_was_survived_is_inside(shape):
     failures, survived = seen(shape)
@@ -81,22 +71,6 @@ def test_the_walls_of_a_room_stay_thresholds_of_which_each_explains_a_few():
     forms = explain(FAILS, failures, survived_as(survived, np.full(9, 0.02)))
     held = {(int(row[I]), row[B]) for row in forms[are_sides(forms)]}
     assert held >= {(k, sign) for k in range(4) for sign in (-1.0, 1.0)}
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_order_unit_direction_and_origin_of_variables_make_no_difference(shape):
-    failures, survived = seen(shape)
-    order, times, off = [2, 0, 1], np.array([-3.7, 0.25, 100.0]), np.array([5.0, -2.0, 30.0])
-
-    def written(z):
-        return (z * times + off)[:, order]
-
-    found = explain(FAILS, failures, survived_as(survived, UNIT))
-    unit = (np.abs(times) * UNIT)[order]
-    other = explain(FAILS, written(failures), survived_as(written(survived), unit))
-    far, otherwise = distances(found, survived), distances(other, written(survived))
-    assert len(far) == len(otherwise)
-    np.testing.assert_allclose(far.min(0), otherwise.min(0), rtol=1e-4, atol=1e-4)
 
 
 EXACT = np.zeros((2, 2))
@@ -210,17 +184,6 @@ def test_a_rival_of_a_threshold_asks_each_variable_in_which_failures_are_rare():
     assert crashes(np.vstack([touched[0], failures]), ended=touched[0]) == [False, True, True, True]
 
 
-def test_what_crashes_by_a_rival_is_not_said_of_other_ends():
-    rows = np.random.default_rng(2).uniform([0.0, -1.0], 1.0, (500, 2))
-    failures, known = np.array([[-0.1, -0.9], [-0.1, -0.8]]), survived_as(rows, np.full(2, 0.02))
-    table = explain(FAILS, failures, known, bends=False)
-    ends = table.copy()
-    ends[:, SAYS], ends[:, B] = ENDS, -ends[:, B]
-    tried = rivals(np.vstack([ends, table]), failures, known)
-    assert tried[:, SAYS].tolist() == [ENDS, CRASHES, ENDS]
-    assert tried[[0, 2], B].tolist() == [table[0, B], ends[0, B]]
-
-
 def test_a_rival_of_a_crash_asks_how_far_out_failures_were():
     """Two soft touches with a tilt tell nothing of upright ones."""
     rows = np.random.default_rng(2).uniform([0.0, -2.0, -1.0], [5.0, 2.0, 1.0], (500, 3))
@@ -265,14 +228,6 @@ def test_what_refused_for_long_without_a_failure_is_tried_by_its_smallest_rival(
     assert (guard.judge.state.forms[:, SAYS] == ENDS).any()  # it is known now
     guard.freeze()
     assert sum(fly(softly) for _ in range(9)) == 9
-
-
-def test_an_episode_speaks_for_a_rival_only_where_that_was_tried():
-    settings, none = LearntSettings(), np.zeros(0)
-    state = State.none(1, 1, 0, settings, None)._replace(held=-1)
-    episode = Episode(np.zeros((1, 1)), np.zeros((0, 1)), False, False, none, none, none, 0.0)
-    held = [doubted(state, episode, settings, tried=tried).held for tried in (False, True)]
-    assert held == [-1, -2]
 
 
 def test_frozen_a_threshold_counts_on_for_a_while_that_fewer_took_the_place_of():

@@ -389,12 +389,6 @@ def test_it_says_which_backup_survives_why_a_proposal_is_refused_and_what_fails(
         assert bool(instead) == (not as_proposed)
 
 
-def test_names_are_for_words_alone_and_are_kept(reloaded):
-    named = LearntRisk(0.1, n_actions=2, names=("place", "speed"), units=("m", "m/s"))
-    labels = reloaded(named).labels
-    assert (labels.names, labels.units) == (("place", "speed"), ("m", "m/s"))
-
-
 def test_where_there_is_but_one_action_reasons_name_no_backup():
     rng, guard, said = np.random.default_rng(0), Guard(n_actions=1, interval=1.0), []
     for episode in range(6):

@@ -7,7 +7,6 @@ from evofsm.guard.learnt.backups import regulator
 from evofsm.guard.learnt.rollout import (
     CHANGED,
     CRASHES,
-    CUT_SHORT,
     ENDS,
     FAILS,
     GROWN,
@@ -205,14 +204,6 @@ def test_where_nothing_passes_the_backup_that_lasts_longest_is_told_and_whether_
     how, action, backup, apart = search_for(model, [1.0], [to, still, away], place=WALL - 2.0)
     assert (how, backup, action.tolist()) == (NOTHING_PASSES, 2, [-0.1])
     assert search_for(model, [1.0], [to, to], place=WALL - 2.0)[-1] < 0.02 < apart
-
-
-@pytest.mark.parametrize(("most", "how"), [(0, CUT_SHORT), (2, CUT_SHORT), (3, CHANGED)])
-def test_a_search_is_cut_short_after_so_many_steps_with_the_backup_that_passed_last(most, how):
-    back, still = [[-1.0, 0.0]], [[-0.5, 0.0]]
-    found = search_for(mover(), [1.0], [back, still], place=WALL - 0.2, most=most)
-    assert found[0] == how
-    assert how == CHANGED or (found[1].tolist(), found[2]) == ([-1.0], 0)
 
 
 def test_so_many_disturbances_need_not_be_survived_but_that_none_begins():
