@@ -1,6 +1,6 @@
 """Guards attached to a SUMO simulation of someone else's."""
 
-import runpy
+import importlib
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from types import SimpleNamespace
@@ -396,34 +396,14 @@ def test_anything_else_is_refused(vehicles):
         choose(vehicles)
 
 
-# -- The example: a grid of streets by netgenerate, 600 cars, one in ten hasty --------------------
-
-
-def drive_grid(configuration, mode):
-    """The attachment, mean speed of the hasty cars, and their names."""
-    libsumo.start(["sumo", "-c", str(configuration), "--seed", "0"])
-    guards = attach(libsumo, "type:hasty", mode=mode)
-    distance = cars = 0
-    while libsumo.simulation.getTime() < 150.0:
-        libsumo.simulationStep()
-        distance += sum(map(libsumo.vehicle.getSpeed, guards.cars))
-        cars += len(guards.cars)
-    libsumo.close()
-    return guards, distance / cars
-
-
 @pytest.mark.slow
-def test_collisions_of_hasty_cars_are_prevented_and_none_is_caused_behind_them(tmp_path):
-    made = runpy.run_path(str(EXAMPLE / "make.py"))
-    configuration = made["write_cars"](tmp_path, seed=0)
-    alone, speed_alone = drive_grid(configuration, "shadow")
-    guarded, speed = drive_grid(configuration, "act")
-    hasty = alone.ever
-    before = sum(each.collider in hasty for each in alone.collisions)
-    after = sum(each.collider in hasty for each in guarded.collisions)
-    assert before >= 10
-    assert after <= 0.1 * before
-    assert not any(
-        each.victim in hasty for each in guarded.collisions if each.collider not in hasty
-    )
-    assert speed >= 0.9 * speed_alone
+def test_in_the_example_collisions_of_hasty_cars_are_prevented_and_none_is_caused(monkeypatch):
+    """A grid of streets by netgenerate, 600 cars, one in ten hasty."""
+    monkeypatch.syspath_prepend(EXAMPLE)
+    compare = importlib.import_module("compare")
+    monkeypatch.setattr(compare, "END", 150.0)
+    alone, guarded = (compare.drive(0, guarded=on) for on in (False, True))
+    assert alone.by_hasty >= 10
+    assert guarded.by_hasty <= 0.1 * alone.by_hasty
+    assert guarded.into_hasty == 0
+    assert guarded.speed >= 0.9 * alone.speed

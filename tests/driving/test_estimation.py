@@ -118,15 +118,6 @@ def test_constant_brakes_are_measured_as_they_are(dt, decel, speed):
     assert [one for one in told if one is not None] == [pytest.approx(decel)]
 
 
-def test_a_manoeuvre_under_way_counts_when_the_episode_ends():
-    risk = LatentRisk(lowest=-2.5)
-    for k in range(14):
-        risk.learn([40.0, 20.0, 20.0 - max(0, k - 5) * DT * 5.0], 0.0)
-    assert len(risk.manoeuvres) == 0
-    risk.start_episode()
-    assert list(risk.manoeuvres.decels) == [pytest.approx(5.0)]
-
-
 @pytest.mark.parametrize("dt", [0.1, 0.25])
 @pytest.mark.parametrize("speed", [0.0, 20.0])
 @pytest.mark.parametrize(("deviation", "known"), [(0.2, 0.0), (0.5, 0.7)])

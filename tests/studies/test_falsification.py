@@ -107,16 +107,3 @@ def test_failures_under_a_guard_and_runs_that_disagree_are_among_the_losses(
     assert "scenario.initial_gap [m]" in table.header
     assert not any("sensors.seed" in name for name in table.header)
     read_page(write_page(tmp_path / "index.html", [page])).is_sound()
-
-
-@pytest.mark.parametrize(
-    ("family", "judge", "reason"),
-    [
-        ("nowhere", "none", "no family 'nowhere'"),
-        ("seldom", "mine", "no judge 'mine'"),
-        (",", "none", "no family is named"),
-    ],
-)
-def test_what_is_asked_for_wrongly_is_refused(family, judge, reason):
-    with pytest.raises(ValueError, match=reason):
-        Falsification(family=family, judge=judge).run(workers=1)

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from studies import lib, peers
 from studies.peers import TASKS, WAYS, Job, Peers
-from studies.rivals import pendulum_shield
-from studies.systems import Box
 
 pl = pytest.importorskip("polars")
 
@@ -58,10 +56,7 @@ def test_what_is_finished_is_shown_without_training(tmp_path, finished):
     assert not finished
 
 
-def test_of_each_seed_the_longest_are_begun_first_and_names_are_checked():
-    order = [(job.seed, -job.cost) for job in Peers().jobs]
-    assert order == sorted(order)
-    assert {job.task for job in Peers().jobs} == set(TASKS)
+def test_a_task_that_there_is_not_is_refused():
     with pytest.raises(ValueError, match="there is no task 'kettle'; there are cartpole"):
         _ = Peers(tasks="cartpole,kettle").jobs
 
@@ -80,16 +75,6 @@ def test_the_page_says_where_the_filter_loses(tmp_path):
     assert line[1:3] == ("nothing but failures", "0.0 (0.0–0.0)")
     Peers().write({"rows": lib.frame_of(good)}, tmp_path)
     assert "| filter-1 | nothing but failures | 0.0 (" in (tmp_path / "peers.md").read_text()
-
-
-def test_who_is_told_of_a_pendulum_at_5_ms_holds_it():
-    shield = pendulum_shield(Box((-2.0,), (2.0,)), 0.5, False, 0.005)
-    angle, rate, chance = 0.0, 0.0, np.random.default_rng(0)
-    for _ in range(400):
-        torque = shield.action(np.array([angle, rate]), float(chance.uniform(0.0, 2.0)))
-        rate += 0.005 * (15.0 * np.sin(angle) + 3.0 * torque)
-        angle += 0.005 * rate
-        assert abs(angle) < 0.5
 
 
 # -- With Stable-Baselines3 -----------------------------------------------------------------------

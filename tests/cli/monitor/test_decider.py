@@ -153,18 +153,6 @@ def test_episodes_of_one_length_end_at_the_same_time_and_each_end_counts(length)
         assert guard.n_failed == 3
 
 
-@pytest.mark.parametrize(
-    "end", [b'{"end": true, "observation": [1e100]}', b'{"end": true, "observation": [1, 2, 3]}']
-)
-def test_an_end_that_the_guard_cannot_take_is_answered_and_changes_nothing(end):
-    decider, plain = (Decider(Guard(low=-1.0, high=1.0, interval=0.1)) for _ in range(2))
-    message = b'{"time": %d, "observation": [1, 2], "proposal": 0}'
-    for k in range(3):
-        assert decider.answer(message % k) == plain.answer(message % k)
-        assert decider.answer(end)["kind"] == "error"
-    assert (decider.n, decider.rows) == (3, 3)
-
-
 def test_an_episode_ends_by_itself_while_there_is_no_alarm():
     decider = Decider(made(), episode=10)
     calm = next(iter(rows(1)))
