@@ -705,24 +705,6 @@ def test_what_each_meets_is_learnt_whole_and_nothing_across_a_reset(name, steps,
     assert len(guard.judge.episodes) == before + 3
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_infos_are_arrays_with_masks(mode):
-    envs, _ = recorded("Pendulum-v1", 2, mode, 5)
-    revised = RevisedVectorActions(envs, guard_for(envs.single_action_space, Spy(above_half)))
-    resets = 0
-    for _, infos in drive_all(revised, 13):
-        assert KEYS | {f"_{key}" for key in KEYS} <= infos.keys()
-        resets += not infos["_reviser/reason"].any()
-        assert all(len(set(infos[f"_{key}"].tolist())) == 1 for key in KEYS)
-        for key in ("proposed", "executed"):
-            assert infos[f"reviser/{key}_action"].shape == (2, 1)
-            assert infos[f"reviser/{key}_action"].dtype == np.float32
-        assert infos["reviser/risk"].shape == infos["reviser/penalty"].shape == (2,)
-        assert infos["reviser/reason"].dtype == object
-    assert resets == (2 if mode is NEXT_STEP else 0)
-    assert (infos["reviser/executed_action"] <= 0.5).all()
-
-
 def test_a_step_that_only_resets_is_no_decision_and_costs_nothing():
     envs, _ = recorded("Pendulum-v1", 1, NEXT_STEP, 3)
     guard = guard_for(envs.single_action_space, Spy(above_half))

@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pytest
 from studies import lib, peers
 from studies.peers import TASKS, WAYS, Job, Peers
@@ -87,37 +86,6 @@ def learners():
     from studies import learners
 
     return learners
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_a_task_decides_and_begins_as_it_says(learners, task):
-    env = learners.made(task)
-    first = learners.begin(env, task, 3)
-    assert np.array_equal(first, learners.begin(learners.made(task), task, 3))
-    inner = env.unwrapped
-    clock = inner.family.interval if task == "car-following" else getattr(inner, "tau", None)
-    assert (clock or inner.dt) == pytest.approx(TASKS[task].interval)
-    env.action_space.seed(0)
-    while not env.episodes or not env.episodes[-1].failed:  # drawn actions let all of them fail
-        *_, terminated, truncated, _ = env.step(env.action_space.sample())
-        if terminated or truncated:
-            learners.begin(env, task, len(env.episodes))
-        assert len(env.episodes) < 20
-
-
-@pytest.mark.parametrize("penalty", [0.0, 0.5])
-def test_a_memory_holds_what_was_executed_with_what_it_earned(learners, penalty):
-    space = learners.gymnasium.spaces.Box(-2.0, 2.0, (1,))
-    memory = learners.ExecutedBuffer(8, space, space, penalty=penalty)
-    seen = np.zeros((1, 1))
-    kept = {"reviser/penalty": 0.0, "reviser/executed_action": np.array([1.0])}
-    memory.add(seen, seen, np.array([[0.5]]), np.array([1.0]), np.array([False]), [kept])
-    changed = {"reviser/penalty": 2.0, "reviser/executed_action": np.array([-2.0])}
-    reward = np.array([1.0 - 2.0 * penalty])
-    memory.add(seen, seen, np.array([[1.0]]), reward, np.array([False]), [changed])
-    held = list(zip(memory.actions.ravel(), memory.rewards.ravel(), strict=True))[: memory.pos]
-    proposed = [(1.0, 0.0)] if penalty else []
-    assert held == [(0.5, 1.0), *proposed, (-1.0, 1.0)]
 
 
 def test_a_filter_learns_while_a_learner_does(learners):

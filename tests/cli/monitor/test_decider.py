@@ -83,26 +83,6 @@ def test_gaps_in_time_and_rows_that_come_too_often_are_noted():
     assert notes[4] is None
 
 
-@pytest.mark.parametrize(
-    ("row", "about", "why"),
-    [
-        ({"gap": 1e30, "v_follower": 1e18}, "gap", "is 1e+30; it must lie between -1000 and 1e+06"),
-        ({"v_leader": -151.0}, "v_leader", "is -151; it must lie between -150 and 150 (in another"),
-        ({"v_follower": 180.0, "end": True}, "v_follower", "is 180"),
-    ],
-)
-def test_a_row_that_no_car_can_drive_is_refused_by_name_and_changes_nothing(row, about, why):
-    decider, plain = Decider(made()), Decider(made())
-    first, second = rows(2)
-    base = {name: first[name] for name in ("gap", "v_follower", "v_leader")}
-    whole = base if "end" in row else first
-    assert decider.answer(line(first)) == plain.answer(line(first))
-    refused = decider.answer(line(whole | row))
-    assert (refused["kind"], refused["about"]) == ("error", about)
-    assert why in refused["error"]
-    assert decider.answer(line(second)) == plain.answer(line(second))
-
-
 def in_flight():
     """Two episodes that end alike, the second of which begins at 0 s again; and an end by time."""
     rows_told = [line(row | {"gap": 60.0 + row["time"]}) for row in rows(30)]
