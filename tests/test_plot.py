@@ -78,9 +78,9 @@ def test_a_few_spikes_do_not_set_the_axes_and_where_it_alarms_is_tinted():
     failed = np.arange(len(rows)) >= 400
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=[2.0, 20.0]))
     machine.learn_many(rows, [0] * len(rows), [0], [len(rows) - 1])
-    judge = Foresight.learn_log([rows[:401, 1]] * 9, [True] * 9, dt=60.0, names=["heat"])
+    limits = np.array([[0, 0, 1, 0, 1, 92.0]])  # of the heat, which is the second variable
+    judge = Foresight(60.0, 20, 1, np.empty((0, 14)), limits, np.zeros((1, 4)), ("oil", "heat"))
     table = judge.where(0)
-    table[:, [1, 2]] = 1  # the heat is the second one here
     ax = plot.states(machine.model(), new(), rows=rows, failed=failed, ways=True, alarm=table)
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
     assert -5.0 < left < 2.0 < 7.6 < right < 15.0

@@ -86,6 +86,48 @@ def test_what_cannot_be_recognised_is_refused(grown, z, words):
 # -- Forecasts ---------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def machine():
+    """States at 0 and 1, recognised so sharply that a belief is exactly 0 or 1.
+
+    By hand P is [[1/2, 1/2], [5/6, 1/6]] of action 0, and [[5/14, 9/14], [1/2, 1/2]] of action 1.
+    """
+    machine = EvolvingFSM(
+        n_actions=2, radius=0.5, learning_rate=0.5, prior_frequency=0.25, spread=1e-6
+    )
+    machine.learn_many([[0.0], [0.0], [2.0], [1.0]], [-1, -1, -1, 0])
+    machine.learn_many([[0.0], [0.0], [1.0]], [1, 1, -1])
+    return machine
+
+
+@pytest.mark.parametrize(
+    ("policy", "action", "horizon", "expected"),
+    [
+        *((policy, 0, 1, [5 / 6, 1 / 6]) for policy in ("marginal", "hold", "observed")),
+        ("marginal", 1, 1, [1 / 2, 1 / 2]),
+        ("marginal", 0, 2, [59 / 126, 67 / 126]),
+        ("marginal", 0, 3, [1469 / 2646, 1177 / 2646]),
+        ("marginal", 1, 2, [23 / 42, 19 / 42]),
+        ("hold", 0, 2, [5 / 9, 4 / 9]),
+        ("hold", 0, 3, [35 / 54, 19 / 54]),
+        ("hold", 1, 2, [3 / 7, 4 / 7]),
+        ("observed", 0, 2, [83 / 189, 106 / 189]),  # action 0 was used once, action 1 twice
+        ("observed", 0, 3, [12395 / 23814, 11419 / 23814]),
+    ],
+)
+def test_the_action_decides_the_first_step_and_the_policy_further_ones(
+    machine, policy, action, horizon, expected
+):
+    assert machine.belief.tolist() == [0.0, 1.0]
+    np.testing.assert_allclose(machine.predict(action, horizon, policy), expected, rtol=1e-14)
+
+
+def test_at_the_start_of_an_episode_the_forecast_comes_from_the_uniform_belief(machine):
+    machine.start_episode()
+    assert machine.belief.tolist() == [0.5, 0.5]
+    np.testing.assert_allclose(machine.predict(0), [2 / 3, 1 / 3], rtol=1e-15)
+
+
 def test_without_an_action_the_policy_rules_from_the_first_step_on():
     model = chain(SWITCH, STAY, uses=[3.0, 1.0])
     np.testing.assert_allclose(model.propagate([1.0, 0.0]), [0.95, 0.05])

@@ -164,26 +164,6 @@ def test_a_rival_reaches_inwards_where_failures_lie_on_a_rim_that_was_skimmed():
     assert not inside(tried, far).any()
 
 
-def test_a_rival_of_a_threshold_asks_each_variable_in_which_failures_are_rare():
-    """A craft fails where it touches fast or tilted; once it touched softly that is what counts."""
-    rng = np.random.default_rng(2)
-    rows = np.column_stack([rng.uniform(0.0, 5.0, 500), rng.normal(0.0, [0.6, 0.3], (500, 2))])
-    failures = np.array([[-0.1, -1.4, 0.6], [-0.1, -1.2, -0.7], [-0.1, -1.1, 0.5]])
-
-    def crashes(z, ended=()):
-        known = survived_as(rows, np.full(3, 0.02), ended)
-        tried = rivals(explain(FAILS, failures, known, bends=False), failures, known)
-        says = tried[:, SAYS]
-        assert inside(tried[says == ENDS], z).any(0).all()
-        return inside(tried[says == CRASHES], z).any(0).tolist()
-
-    touched = np.array(
-        [[-0.1, -0.1, 0.0], [-0.1, -1.3, 0.0], [-0.1, -0.1, 0.6], [-0.1, -0.1, -0.6]]
-    )
-    assert crashes(touched) == [False, True, True, True]
-    assert crashes(np.vstack([touched[0], failures]), ended=touched[0]) == [False, True, True, True]
-
-
 def test_a_rival_of_a_crash_asks_how_far_out_failures_were():
     """Two soft touches with a tilt tell nothing of upright ones."""
     rows = np.random.default_rng(2).uniform([0.0, -2.0, -1.0], [5.0, 2.0, 1.0], (500, 3))
