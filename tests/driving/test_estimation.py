@@ -196,12 +196,3 @@ def test_estimates_are_better_than_observations_and_know_how_good_they_are():
     claimed = np.array([[one.deviation(axis) for axis in np.eye(3)] for one in found])
     assert np.all(np.abs(off).mean(axis=0) < claimed.mean(axis=0))
     assert (off[:, 0] > 3.0 * claimed[:, 0]).mean() < 0.01
-
-
-def test_a_cut_in_is_believed_at_once():
-    rows, done = traffic(500)
-    perception = Perception(DT)
-    seen = noisy(rows)
-    estimates(perception, seen, done)
-    cut_in = seen[-1] - [20.0, 0.0, 5.0]
-    assert perception.see(tuple(cut_in), done[-1]).mean == tuple(cut_in)
