@@ -38,11 +38,8 @@ def modules_after(code):
     return {name.split(".")[0] for name in json.loads(run(sys.executable, "-c", program))}
 
 
-def test_importing_the_package_loads_nothing_heavy():
+def test_importing_loads_nothing_heavy_and_learning_numba_alone():
     assert not modules_after("import evofsm") & HEAVY
-
-
-def test_learning_needs_numpy_and_numba_and_nothing_else_that_is_heavy():
     learning = "from evofsm import EvolvingFSM\nEvolvingFSM(2).observe([0.0])"
     # Numba itself loads SciPy where it finds it.
     assert modules_after(learning) & HEAVY <= {"numba", "scipy"}

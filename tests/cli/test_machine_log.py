@@ -350,6 +350,9 @@ def test_a_guard_from_zero_of_who_acts_learns_what_fails(evofsm, acts):
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     ends = [answer for answer in answers if answer["kind"] == "end"]
     assert all("executed" in end for end in ends)
+    refused = [answer for answer in answers if answer.get("advised") != answer.get("proposed")]
+    assert all(one["alarm"] for one in refused)
+    assert any(one["risk_proposed"] <= 0.02 for one in refused)  # for want of the margin alone
     assert [end["time"] for end in ends] == [row["time"] for row in rows if abs(row["x"]) > 1.0]
     told = evofsm("inspect", "cart.evofsm")
     assert told.exit_code == 0, told.stderr

@@ -204,22 +204,6 @@ def test_where_the_audit_log_cannot_be_written_the_decisions_go_on(tmp_path, mon
     assert audit(log.path).is_good  # as far as it goes
 
 
-def test_a_judge_that_searches_alarms_where_it_refuses_whatever_the_risk():
-    guard = Guard(low=-1.0, high=1.0, interval=0.1, mode=Mode.ACT)
-    decider, alarms = Decider(guard), []
-    for _ in range(12):
-        x, v, t = -1.0, 0.0, 0
-        while x < 1.0 and t < 80:
-            row = {"time": 0.1 * decider.n, "observation": [x, v], "proposal": 1.0}
-            answer = decider.answer(json.dumps(row).encode())
-            refused = answer["advised"] != answer["proposed"]
-            assert answer["alarm"] == (refused or (answer["risk_proposed"] or 0.0) > 0.02)
-            alarms += [answer] if refused else []
-            x, v, t = x + 0.1 * v, v + 0.1 * answer["executed"], t + 1
-        decider.answer(json.dumps({"end": True, "failed": x >= 1.0}).encode())
-    assert any(one["risk_proposed"] <= 0.02 for one in alarms)  # for want of the margin alone
-
-
 def test_a_reviser_without_risks_alarms_where_it_differs():
     cars = guard_for_cars(-6.0, 2.5)
     guard = Guard.of(AlwaysBrake(cars.actions), interval=0.1)
