@@ -40,6 +40,9 @@ def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
     assert one["action"]["failed"] == machine.failed_after[11, one["state"]]
     assert "a(12)" in one["text"]
     assert "m/s²" in one["text"]
+    far = "explain", folder, "--observation", "9000,14,14"
+    assert "Never seen" in evofsm(*far).stdout
+    assert json.loads(evofsm(*far, "--json").stdout)["situations"][0]["never_seen"] is True
 
 
 @pytest.mark.parametrize(
