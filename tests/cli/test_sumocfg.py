@@ -1,6 +1,7 @@
 """`evofsm drive my.sumocfg`."""
 
 import json
+import re
 
 import pytest
 
@@ -50,6 +51,8 @@ def test_guards_act_where_they_are_told_to(evofsm, configuration):
     assert found["act"]["speed"] > 0.9 * found["shadow"]["speed"]
     assert found["act"]["alone"]["collisions"] == found["shadow"]["collisions"]
     assert found["shadow"]["revised"] > 0
+    text = evofsm("drive", configuration, "--vehicles", "type:hasty").output
+    assert re.search(r"collisions +[1-9] +0\n", text)
 
 
 @pytest.mark.parametrize(

@@ -26,19 +26,6 @@ def scenario(duration=10.0, **others):
     return Scenario(LEADER, initial_gap=8.0, duration=duration, **others)
 
 
-def script(*lines):
-    """Proposes what is written for a decision; the last for all that follow."""
-    left = list(lines)
-
-    def propose(observation):
-        line = left.pop(0) if len(left) > 1 else left[0]
-        if isinstance(line, Exception):
-            raise line
-        return line
-
-    return propose
-
-
 def driven(controller=HASTY, reviser=None, *, on=None, **others):
     guard = Guard.of(reviser or Unrevised(ACTIONS), interval=0.25, **others)
     return drive(guard, on or scenario(), controller=controller)
@@ -61,9 +48,15 @@ def test_decisions_are_those_of_the_record():
 
 @pytest.mark.parametrize("line", [RuntimeError("lost"), math.nan, math.inf, Proposal(None)])
 def test_a_controller_that_fails_once_is_driven_on_without(line, caplog):
-    risk = LatentRisk(lowest=-2.5)
+    risk, lines = LatentRisk(lowest=-2.5), iter([1.0, 1.0, line])
+
+    def propose(observation):
+        if isinstance(said := next(lines, 1.0), Exception):
+            raise said
+        return said
+
     with caplog.at_level(logging.WARNING, logger="evofsm"):
-        told = driven(script(1.0, 1.0, line, 1.0), Unrevised(ACTIONS), judge=risk, on=scenario(3.0))
+        told = driven(propose, Unrevised(ACTIONS), judge=risk, on=scenario(3.0))
     assert len(caplog.records) == 1
     assert "controller" in caplog.text
     assert "0.5 s" in caplog.text

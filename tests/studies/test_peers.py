@@ -76,19 +76,11 @@ def test_the_page_says_where_the_filter_loses(tmp_path):
     assert "| filter-1 | nothing but failures | 0.0 (" in (tmp_path / "peers.md").read_text()
 
 
-# -- With Stable-Baselines3 -----------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def learners():
+def test_a_filter_learns_while_a_learner_does():
     pytest.importorskip("stable_baselines3")
     pytest.importorskip("mujoco")
     from studies import learners
 
-    return learners
-
-
-def test_a_filter_learns_while_a_learner_does(learners):
     found = learners.trained("cartpole", "filter-1", 0, 600, 1)
     assert 0 < found["failed"] <= found["episodes"]
     assert found["changed_last"] > 0.0

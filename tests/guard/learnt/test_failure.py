@@ -164,6 +164,19 @@ def test_a_rival_reaches_inwards_where_failures_lie_on_a_rim_that_was_skimmed():
     assert not inside(tried, far).any()
 
 
+@pytest.mark.parametrize("ended", [(), [-0.1, -0.1, 0.0]])
+def test_a_rival_of_a_threshold_fails_only_as_failures_did(ended):
+    """A craft fails where it touches fast or tilted, whether or not it touched softly once."""
+    rng = np.random.default_rng(2)
+    rows = np.column_stack([rng.uniform(0.0, 5.0, 500), rng.normal(0.0, [0.6, 0.3], (500, 2))])
+    failures = np.array([[-0.1, -1.4, 0.6], [-0.1, -1.2, -0.7], [-0.1, -1.1, 0.5]])
+    known = survived_as(rows, np.full(3, 0.02), ended)
+    tried = rivals(explain(FAILS, failures, known, bends=False), failures, known)
+    says, touches = tried[:, SAYS], np.array([[-0.1, -0.1, 0.0], *failures])
+    assert inside(tried[says == ENDS], touches).any(0).all()
+    assert inside(tried[says == CRASHES], touches).any(0).tolist() == [False, True, True, True]
+
+
 def test_a_rival_of_a_crash_asks_how_far_out_failures_were():
     """Two soft touches with a tilt tell nothing of upright ones."""
     rows = np.random.default_rng(2).uniform([0.0, -2.0, -1.0], [5.0, 2.0, 1.0], (500, 3))
