@@ -343,6 +343,7 @@ def test_at_most_twenty_states_are_listed(evofsm, log, tmp_path):
         (["--dt", "0"], "--dt is 0.0; it must be a positive"),
         (["--out", "/no/such/folder/model"], "there is no folder"),
         (["--failed", "gap<"], "--failed is 'gap<'"),
+        (["--failed", "gap<0<1"], "--failed is 'gap<0<1'"),
         (["--failed", "crash"], "no column 'crash'; it has pair, time, gap, v_follower, v_leader"),
         (["--unit", "v=warp"], "--unit is 'v=warp'"),
         (["--unit", "speed=km/h"], "no column that is read is called so"),
