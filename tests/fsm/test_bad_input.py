@@ -71,7 +71,6 @@ def refuses(snapshot):
     return check
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("z", "error", "words"), cases(OBSERVATIONS))
 def test_an_observation_that_cannot_be_right(machine, refuses, z, error, words):
     refuses(machine, lambda m: m.observe(z), error, words)
@@ -86,7 +85,6 @@ def test_an_observation_or_a_batch_of_another_length(grown, refuses):
         refuses(grown, lambda m, Z=Z: m.learn_many(Z, [0]), ValueError, words)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("i", "error", "words"), cases(ACTIONS))
 def test_an_action_that_cannot_be_right(machine, refuses, i, error, words):
     refuses(machine, lambda m: m.act(i), error, words)
@@ -94,7 +92,6 @@ def test_an_action_that_cannot_be_right(machine, refuses, i, error, words):
     refuses(machine, lambda m: m.predict(i), error, words)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("Z", "I", "starts", "error", "words"), cases(BATCHES))
 def test_a_batch_that_cannot_be_right(machine, refuses, Z, I, starts, error, words):
     refuses(machine, lambda m: m.learn_many(Z, I, starts), error, words)
