@@ -223,7 +223,7 @@ def stays(beliefs: Floats, actions: NDArray[np.int64]) -> Floats:
 
 def powers(model: FSMModel, steps: int) -> Forecaster:
     """The machine's own matrices: one step under the action, the others under any."""
-    average = model.averaged_matrix("marginal")
+    average = model.marginal_matrix
     then = np.linalg.matrix_power(average, steps - 1)
     first = [*model.transition_matrices, average]  # the last is that of none, -1
 

@@ -171,7 +171,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 class Page(HTMLParser):
-    """What a page loads, links to and says; reading it checks that tags are closed in order."""
+    """What a page loads, links to and says, and whether its tags are closed in order."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -181,14 +181,14 @@ class Page(HTMLParser):
         self.alts: list[str | None] = []
         self.ids: list[str] = []
         self.headers_without_scope = 0
+        self.is_closed = True
         self._open: list[str] = []
         self.feed(html)
-        assert not self._open
 
     def handle_starttag(self, tag, attrs):
         given = dict(attrs)
         if tag == "a":
-            self.links.append(given["href"])
+            self.links.append(given.get("href", ""))
         else:
             self.loads += [given[name] for name in ("src", "href", "data") if name in given]
         if tag == "img":
@@ -201,7 +201,8 @@ class Page(HTMLParser):
             self._open.append(tag)
 
     def handle_endtag(self, tag):
-        assert self._open.pop() == tag
+        self.is_closed &= self._open[-1:] == [tag]
+        del self._open[-1:]
 
     @property
     def text(self) -> str:
@@ -212,7 +213,9 @@ class Page(HTMLParser):
         return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", "", body)))
 
     def is_sound(self) -> None:
-        """Fails where it loads anything, a link leads nowhere, or a name is given twice."""
+        """Fails where it loads anything, a link or tag ends nowhere, or a name is given twice."""
+        assert self.is_closed
+        assert not self._open
         assert all(address.startswith("data:image/svg+xml;base64,") for address in self.loads)
         assert not re.search(r"@import|url\(|<script [^>]", self.html)
         assert len(set(self.ids)) == len(self.ids)

@@ -5,21 +5,24 @@ All others are doctests. A block that is not run says why, in a comment before i
 """
 
 import doctest
+import inspect
 import json
 import os
 import re
 import shlex
 import subprocess
 import sys
+from enum import Enum
 from functools import partial
-from html.parser import HTMLParser
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 
 import pytest
 import typer.testing
 
+import evofsm
 from evofsm.cli.app import application
 
 ROOT = Path(__file__).parents[1]
@@ -178,29 +181,73 @@ def test_commands_that_are_not_run_would_be_understood():
     assert looked_at > 40
 
 
+# -- Docstrings ----------------------------------------------------------------------------------
+
+
+def methods(cls):
+    """Public methods that our own classes define, by name: no property, nothing inherited."""
+    for base in cls.__mro__:
+        if base.__module__.partition(".")[0] == evofsm.__name__:
+            for name in vars(base):
+                method = getattr(cls, name)
+                if not (name.startswith("_") or isinstance(method, Enum)) and callable(method):
+                    yield name, method
+
+
+def sections(thing):
+    return re.findall(r"^([A-Z]\w+)\n-+$", inspect.cleandoc(thing.__doc__ or ""), re.MULTILINE)
+
+
+def missing(thing):
+    """Sections that the docstring of a class, function or method lacks, or leaves empty.
+
+    What it returns stands in its first line, with the shape. A method may leave its example to its
+    class, and tell there of the one thing that it is given.
+    """
+    is_method = not inspect.isclass(thing) and "." in thing.__qualname__
+    lacks = set() if is_method else {"Examples"}
+    given = () if inspect.isclass(thing) else set(inspect.signature(thing).parameters) - {"self"}
+    if len(given) > is_method:
+        lacks.add("Parameters")
+    lacks -= set(sections(thing))
+    if not (is_method or doctest.DocTestParser().get_examples(thing.__doc__ or "")):
+        lacks.add("Examples")
+    return lacks
+
+
+PUBLIC = {name: getattr(evofsm, name) for name in evofsm.__all__}
+DOCUMENTED = PUBLIC | {
+    f"{owner}.{name}": method
+    for owner, cls in PUBLIC.items()
+    if inspect.isclass(cls)
+    for name, method in methods(cls)
+}
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_a_public_name_has_its_sections_and_an_example(name):
+    assert not missing(DOCUMENTED[name])
+
+
+# -- The glossary ---------------------------------------------------------------------------------
+
+WORDS = [row for row in (DOCS / "glossary.md").read_text().splitlines() if row.startswith("| **")]
+
+
+@pytest.mark.parametrize("word", WORDS, ids=lambda word: word.split("**")[1])
+def test_a_word_has_the_name_in_code_that_the_glossary_gives(word):
+    pytest.importorskip("scipy")
+    name = re.search(r"`((?:evofsm|studies)[\w.]+)` \|$", word)[1]
+    owner, _, last = name.rpartition(".")
+    fields = getattr(resolve_name(owner), "__dataclass_fields__", {})
+    assert last in fields or resolve_name(name) is not None
+
+
 # -- The site -------------------------------------------------------------------------------------
 
 
-class Page(HTMLParser):
-    """What a page of HTML can be linked to by, where it leads, and what it loads."""
-
-    def __init__(self, path):
-        super().__init__()
-        self.anchors, self.links, self.loaded = set(), [], []
-        self.feed(path.read_text())
-
-    def handle_starttag(self, tag, attributes):
-        attributes = dict(attributes)
-        self.anchors |= {attributes[name] for name in ("id", "name") if attributes.get(name)}
-        leads = tag == "link" and attributes.get("rel") in {"index", "search", "next", "prev"}
-        if "href" in attributes and (tag == "a" or leads):
-            self.links.append(attributes["href"])
-        else:
-            self.loaded += [attributes[name] for name in ("src", "href") if attributes.get(name)]
-
-
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
+def site(tmp_path_factory, read_page):
     """All pages of the site, built with warnings as errors, once for all processes of pytest."""
     fcntl = pytest.importorskip("fcntl")
     run = tmp_path_factory.getbasetemp()
@@ -216,7 +263,7 @@ def site(tmp_path_factory):
             )
             assert done.returncode == 0, done.stdout + done.stderr
             built.touch()
-    return folder, {path: Page(path) for path in folder.rglob("*.html")}
+    return folder, {path: read_page(path) for path in folder.rglob("*.html")}
 
 
 def is_elsewhere(address):
@@ -236,7 +283,7 @@ def test_every_link_of_the_site_leads_somewhere(site):
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             assert target.exists(), f"{path}: {link}"
             if parts.fragment and target in pages:
-                assert unquote(parts.fragment) in pages[target].anchors, f"{path}: {link}"
+                assert unquote(parts.fragment) in pages[target].ids, f"{path}: {link}"
             looked_at += 1
     assert looked_at > 1000
 
@@ -245,7 +292,7 @@ def test_every_link_of_the_site_leads_somewhere(site):
 def test_the_site_loads_nothing_from_elsewhere(site):
     folder, pages = site
     for path, page in pages.items():
-        assert not [one for one in page.loaded if is_elsewhere(one)], path
+        assert not [one for one in page.loads if is_elsewhere(one)], path
     for style in folder.rglob("*.css"):
         assert not re.search(r"(url\(|@import )['\"]?(https?:)?//", style.read_text()), style
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from importlib import import_module
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "src" / "evofsm"
 HEAVY = {
     *("numba", "scipy", "libsumo", "matplotlib", "jinja2", "river", "sklearn", "mcap"),
     *("polars", "pyarrow", "pandas", "typer", "rich", "gymnasium", "highway_env"),
@@ -36,14 +38,27 @@ def modules_after(code):
     return {name.split(".")[0] for name in json.loads(run(sys.executable, "-c", program))}
 
 
-def test_importing_the_package_loads_nothing_heavy():
+def test_importing_loads_nothing_heavy_and_learning_numba_alone():
     assert not modules_after("import evofsm") & HEAVY
-
-
-def test_learning_needs_numpy_and_numba_and_nothing_else_that_is_heavy():
     learning = "from evofsm import EvolvingFSM\nEvolvingFSM(2).observe([0.0])"
     # Numba itself loads SciPy where it finds it.
     assert modules_after(learning) & HEAVY <= {"numba", "scipy"}
+
+
+@pytest.mark.parametrize(
+    "face", sorted(PACKAGE.rglob("__init__.pyi")), ids=lambda face: face.parent.name
+)
+def test_a_face_offers_each_name_once_in_order_and_no_module_hides_it(face):
+    lines = [line for line in face.read_text("utf-8").splitlines() if line.startswith("from ")]
+    names = [line.rpartition(" as ")[2] for line in lines]
+    assert len(set(names)) == len(names)
+    room = import_module(".".join(face.parent.relative_to(PACKAGE.parent).parts))
+    for name in names:
+        assert getattr(room, name) is not None
+    modules = {path.stem for path in face.parent.iterdir()}
+    offered = {line.rpartition(" as ")[2] for line in lines if not line.startswith("from . ")}
+    assert not offered & modules
+    assert room.__all__ == sorted(names)
 
 
 # -- What is told of it ------------------------------------------------------------------------

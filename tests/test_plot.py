@@ -78,9 +78,9 @@ def test_a_few_spikes_do_not_set_the_axes_and_where_it_alarms_is_tinted():
     failed = np.arange(len(rows)) >= 400
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=[2.0, 20.0]))
     machine.learn_many(rows, [0] * len(rows), [0], [len(rows) - 1])
-    judge = Foresight.learn_log([rows[:401, 1]] * 9, [True] * 9, dt=60.0, names=["heat"])
+    limits = np.array([[0, 0, 1, 0, 1, 92.0]])  # of the heat, which is the second variable
+    judge = Foresight(60.0, 20, 1, np.empty((0, 14)), limits, np.zeros((1, 4)), ("oil", "heat"))
     table = judge.where(0)
-    table[:, [1, 2]] = 1  # the heat is the second one here
     ax = plot.states(machine.model(), new(), rows=rows, failed=failed, ways=True, alarm=table)
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
     assert -5.0 < left < 2.0 < 7.6 < right < 15.0
@@ -91,14 +91,6 @@ def test_a_few_spikes_do_not_set_the_axes_and_where_it_alarms_is_tinted():
     assert tinted.contains_points([[3.0, 99.0], [3.0, 60.0]]).tolist() == [True, False]
     alone = plot.states(machine.model(), new())  # of a model by itself, too
     assert -20.0 < alone.get_xlim()[0] < alone.get_xlim()[1] < 20.0
-
-
-def test_discs_that_would_meet_move_apart():
-    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=0.01))
-    machine.learn_many([[0.0, 0.0], [0.02, 0.0], [9.0, 9.0]], [0, 0, 0])
-    ax = plot.states(machine.model(), new())
-    drawn = ax.transData.transform([text.xy for text in ax.texts])
-    assert np.hypot(*(drawn[0] - drawn[1])) > 13.0 * ax.figure.dpi / 72.0
 
 
 def test_the_graph_says_how_likely_states_stay_and_dead_ends_have_another_shape(model):

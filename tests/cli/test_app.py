@@ -7,10 +7,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import typer
 
 from evofsm.cli import options
-from evofsm.cli.app import group
 from evofsm.extras import OF_COMMANDS
 
 
@@ -68,45 +66,6 @@ def test_help_loads_nothing_heavy(command):
 )
 def test_a_command_that_is_called_wrongly_says_so_in_one_line(refused, words, says):
     assert says in refused(*words)
-
-
-def run(body):
-    app = group("Tests.", body)
-    app.callback()(lambda: None)
-    return typer.testing.CliRunner().invoke(app, ["body"])
-
-
-def test_errors_are_one_line_and_what_a_command_returns_is_the_status(tmp_path):
-    def fails():
-        error = ValueError("a bad\nthing \x1b[2J")
-        error.add_note("in the file")
-        raise error
-
-    def body():
-        return 3
-
-    assert run(body).exit_code == 3
-    fails.__name__ = "body"
-    result = run(fails)
-    assert result.exit_code == 2
-    assert result.stderr == "evofsm: a bad thing \\u001b[2J, in the file\n"
-
-
-# These answer with a page that lives, and in formats of others.
-ELSEWISE = ("watch", "export")
-
-
-def test_every_command_but_two_answers_programs():
-    from evofsm.cli.app import application
-
-    commands = typer.main.get_command(application()).commands
-    lacking = {
-        name
-        for name, command in commands.items()
-        if "--json" not in {option for one in command.params for option in one.opts}
-    }
-    assert lacking == set(ELSEWISE)
-    assert len(commands) <= 10
 
 
 def test_what_programs_are_told_is_strict_json(evofsm):

@@ -285,24 +285,6 @@ def test_a_failure_that_no_row_meets_is_said_with_the_range_of_its_column(evofsm
     assert "no row meets --failed spilt\n" in evofsm(*asked, "spilt").stderr
 
 
-def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, refused, tmp_path):
-    path = tmp_path / "log.csv"
-    rows = [f"p,{100 * k},{'' if k == 9 else 20},54,54,0.1" for k in range(30)]
-    header = "pair,time,gap,v_follower,v_leader,a_follower"
-    path.write_text("\n".join([header, *rows, ""]))
-    assert "no leader? --no-leader end" in refused("learn", path, "--skip-bad", 0)
-    told = evofsm(
-        *("learn", path, "--no-leader", "end", "--unit", "v=km/h", "--unit", "v_l=m/s"),
-        *("--unit", "time=ms", "--out", tmp_path / "model"),
-    )
-    text = " ".join(told.stdout.split())
-    assert "left out 1 rows: a number is missing; there" in text
-    assert "converted v_follower from km/h, time from ms" in text  # the longest name counts
-    assert "rows 29, one every 0.1 s" in text
-    assert told.stderr == ""
-    assert FSMModel.load(tmp_path / "model").centers[0].tolist() == pytest.approx([20, 15, 54])
-
-
 @pytest.mark.parametrize(
     ("options", "rule"),
     [
@@ -361,8 +343,11 @@ def test_at_most_twenty_states_are_listed(evofsm, log, tmp_path):
         (["--dt", "0"], "--dt is 0.0; it must be a positive"),
         (["--out", "/no/such/folder/model"], "there is no folder"),
         (["--failed", "gap<"], "--failed is 'gap<'"),
+        (["--failed", "gap<0<1"], "--failed is 'gap<0<1'"),
         (["--failed", "crash"], "no column 'crash'; it has pair, time, gap, v_follower, v_leader"),
         (["--unit", "v=warp"], "--unit is 'v=warp'"),
+        (["--unit", "speed=km/h"], "no column that is read is called so"),
+        (["--unit", "time=km/h"], "needs a unit of time"),
         (["--scale", "gap=4"], "--scale is for --rule novelty, not paper"),
         (["--rule", "novelty", "--scale", "speed=4"], "--scale names 'speed'; observed are gap"),
         (["--rule", "novelty", "--scale", "gap=0"], "--scale is 'gap=0'; write COLUMN=NUMBER"),

@@ -49,13 +49,9 @@ def test_guards_act_where_they_are_told_to(evofsm, configuration):
     assert found["act"]["collisions"] == 0
     assert found["act"]["cars"] == 1
     assert found["act"]["speed"] > 0.9 * found["shadow"]["speed"]
-    same = "collisions", "speed", "hard_brakes", "jerk", "time_lost"  # nothing is changed in shadow
-    assert [found["act"]["alone"][each] for each in same] == [
-        found["shadow"][each] for each in same
-    ]
+    assert found["act"]["alone"]["collisions"] == found["shadow"]["collisions"]
     assert found["shadow"]["revised"] > 0
     text = evofsm("drive", configuration, "--vehicles", "type:hasty").output
-    assert re.search(r"alone +guarded", text)
     assert re.search(r"collisions +[1-9] +0\n", text)
 
 

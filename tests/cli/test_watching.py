@@ -6,15 +6,12 @@ from functools import cache
 
 import pytest
 
-from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.options import reading_of
 from evofsm.cli.watch.logged import watched_log
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_guard
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, load_family, teach
-from evofsm.driving.assumed import guard_of_monitor
-from monitor_rows import line, traffic
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -230,30 +227,6 @@ def test_episodes_of_a_log_end_with_a_contact_and_it_opens_on_one(tmp_path):
     assert (fourth.case, fourth.begins) == (3, pytest.approx(10.0))  # of 50 s the last 40 s
 
 
-def test_a_failure_that_a_log_tells_of_is_no_collision_but_a_failure(tmp_path):
-    rows = [f"{k / 10:.1f},{30 - k},20,10,0.1,{int(k == 25)}" for k in range(26)]
-    (tmp_path / "log.csv").write_text("\n".join(["time,gap,v,lead,a,failed", *rows, ""]))
-    reading = reading_of("gap,v,lead", "a", failed="failed")
-    shown = watched_log(str(tmp_path / "log.csv"), reading)
-    assert shown.start.cases == ("episode 1 (failure)",)
-    told = tell(drive(shown)[-1], shown.start)
-    assert told.headline == "Failure (by the log)"
-    assert "Failure (by the log) at 2.5\xa0s." in told.outcome
-
-
-def test_a_log_is_watched_by_its_own_columns_and_units(tmp_path, capsys):
-    path = tmp_path / "own.csv"
-    rows = [f"{100 * k},{40 - k},72,{72 - 3 * k},0.1" for k in range(20)]
-    path.write_text("\n".join(["t,dist,ego_kmh,lead_kmh,accel", *rows, ""]))
-    units = "t=ms", "ego_kmh=km/h", "lead_kmh=km/h"
-    reading = reading_of("dist,ego_kmh,lead_kmh", "accel", "t", unit=units)
-    first, second, *_, before, _ = drive(watched_log(str(path), reading, brakes=4.0))
-    assert first.observation == (40.0, 20.0, 20.0)
-    assert second.time == pytest.approx(0.1)
-    assert before.proposed_risk.risk > 0.9
-    assert "the own car brakes with 4 m/s² (--brakes)" in capsys.readouterr().err
-
-
 def test_what_was_before_is_shown_at_once():
     session, told = opened(), []
     session.start = session.start._replace(begins=2.0)
@@ -314,20 +287,3 @@ def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
     for frame, told in frames:  # what it changes where it sees no danger, it changes for the margin
         story = frame.story
         assert ("by a margin" in told.done) == (story.danger is None and story.advised > 0)
-
-
-def test_the_same_rows_get_the_same_risks_as_from_the_monitor(tmp_path):
-    path = tmp_path / "drive.csv"
-    told = ["time,gap,v_follower,v_leader,a_follower"]
-    for k, row in enumerate(traffic(2500)):  # leaders brake hard now and then: it could learn
-        values = (row[name] for name in ("gap", "v_follower", "v_leader", "proposal"))
-        told.append(",".join(map(str, (k / 10, *values))))
-    path.write_text("\n".join([*told, ""]))
-    *decided, _ = drive(watched_log(str(path), reading_of()))
-    watched = [frame.proposed_risk.risk for frame in decided]
-    guard = guard_of_monitor(0.1, 6.0)
-    guard.learn = False
-    decider = Decider(guard)
-    said = [decider.answer(line(row))["risk_proposed"] for row in traffic(2500)][: len(watched)]
-    assert said == pytest.approx(watched, abs=1e-6)
-    assert max(said) > 0.02

@@ -46,24 +46,17 @@ def test_an_episode_is_chosen_exactly():
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [({"idx": 3}, "no option idx"), ({"index": -1}, "-1")],
-)
-def test_an_option_that_there_is_not_is_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        CarFollowing().reset(options=options)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "options", "message"),
     [
-        ({"world": "mars"}, "mars"),
-        ({"collision_cost": np.nan}, "collision_cost"),
+        ({}, {"idx": 3}, "no option idx"),
+        ({}, {"index": -1}, "-1"),
+        ({"world": "mars"}, {}, "mars"),
+        ({"collision_cost": np.nan}, {}, "collision_cost"),
     ],
 )
-def test_an_argument_that_makes_no_sense_is_refused(arguments, message):
+def test_what_makes_no_sense_is_refused(arguments, options, message):
     with pytest.raises(ValueError, match=message):
-        CarFollowing(**arguments)
+        CarFollowing(**arguments).reset(options=options)
 
 
 def test_a_step_is_an_interval_and_pays_the_distance():

@@ -6,17 +6,12 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from evofsm.driving.brakes import OwnBrakes
-from evofsm.driving.judge import LatentRisk
 from evofsm.driving.leaders import BrakeWatch, Manoeuvres
 from evofsm.driving.perception import Perception
 from evofsm.driving.rehearsal import HARDEST
-from evofsm.guard.api import Situation
 
 DT = 0.25
 NOISE = np.array([0.5, 0.3, 0.3])
-ACTIONS = np.linspace(-2.5, 2.5, 11)
-
-
 # -- One's own brakes -------------------------------------------------------------------------
 
 
@@ -118,15 +113,6 @@ def test_constant_brakes_are_measured_as_they_are(dt, decel, speed):
     assert [one for one in told if one is not None] == [pytest.approx(decel)]
 
 
-def test_a_manoeuvre_under_way_counts_when_the_episode_ends():
-    risk = LatentRisk(lowest=-2.5)
-    for k in range(14):
-        risk.learn([40.0, 20.0, 20.0 - max(0, k - 5) * DT * 5.0], 0.0)
-    assert len(risk.manoeuvres) == 0
-    risk.start_episode()
-    assert list(risk.manoeuvres.decels) == [pytest.approx(5.0)]
-
-
 @pytest.mark.parametrize("dt", [0.1, 0.25])
 @pytest.mark.parametrize("speed", [0.0, 20.0])
 @pytest.mark.parametrize(("deviation", "known"), [(0.2, 0.0), (0.5, 0.7)])
@@ -200,10 +186,6 @@ def estimates(perception, seen, done):
     return [perception.see(tuple(row), did) for row, did in zip(seen, before, strict=True)]
 
 
-def situation(row):
-    return Situation(np.asarray(row), np.ones(1), 0, np.nan, 0.0)
-
-
 def test_estimates_are_better_than_observations_and_know_how_good_they_are():
     rows, done = traffic(2000)
     seen = noisy(rows)
@@ -214,29 +196,3 @@ def test_estimates_are_better_than_observations_and_know_how_good_they_are():
     claimed = np.array([[one.deviation(axis) for axis in np.eye(3)] for one in found])
     assert np.all(np.abs(off).mean(axis=0) < claimed.mean(axis=0))
     assert (off[:, 0] > 3.0 * claimed[:, 0]).mean() < 0.01
-
-
-def test_a_cut_in_is_believed_at_once():
-    rows, done = traffic(500)
-    perception = Perception(DT)
-    seen = noisy(rows)
-    estimates(perception, seen, done)
-    cut_in = seen[-1] - [20.0, 0.0, 5.0]
-    assert perception.see(tuple(cut_in), done[-1]).mean == tuple(cut_in)
-
-
-def test_an_episode_begins_afresh_but_knows_its_sensors_and_keeps_more_distance():
-    risk, (rows, done) = LatentRisk(lowest=-2.5), traffic(600)
-    risk.brakes.trust(2.5)
-    for seen, did in zip(noisy(rows), done, strict=True):
-        risk.learn(seen, did)
-    noise, row = risk.perception.noise, (30.0, 15.0, 15.0)
-    assert min(noise) > 0.0
-    risk.start_episode()
-    assert risk.perception.noise == noise
-    assert risk.perception.estimate(row, 0.0).mean == row
-    assert np.all(risk.judge(situation(row), ACTIONS).critical < risk.critical(row, ACTIONS))
-    sharp = LatentRisk(lowest=-2.5)
-    np.testing.assert_array_equal(
-        sharp.judge(situation(row), ACTIONS).critical, sharp.critical(row, ACTIONS)
-    )

@@ -7,7 +7,7 @@ pytest.importorskip("scipy")
 
 from evofsm.driving.cars import TOLD, guard_for_cars, guard_for_family, learners_of, name_judge
 from evofsm.driving.families import load_family
-from evofsm.driving.family import held_out, training
+from evofsm.driving.family import held_out
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.trials import (
     Trial,
@@ -15,22 +15,14 @@ from evofsm.driving.trials import (
     outcome_of,
     reference_of,
     summarise,
-    teach,
     unrevised_guard,
 )
-from evofsm.guard.guard import Guard
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.reviser import Mode
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
 EMERGENCY = load_family("emergency")
-
-
-def taught(episodes, **settings):
-    guard = guard_for_family(EMERGENCY, judge="learnt", **settings)
-    drives = teach(guard, training(EMERGENCY, 0, 0, episodes))
-    return guard, sum(one.collided for one in drives)
 
 
 def test_a_judge_is_made_by_its_name():
@@ -42,19 +34,6 @@ def test_a_judge_is_made_by_its_name():
         assert name_judge(judge) == name
     with pytest.raises(ValueError, match="no judge 'wise'; there are kinematic, learnt"):
         guard_for_family(EMERGENCY, judge="wise")
-
-
-@pytest.mark.slow
-def test_the_same_is_decided_without_states_or_names():
-    """A machine with other states, or none, and a judge that was not told what variables mean."""
-    guard, _ = taught(2)
-    others = taught(2, rule=None)[0], guard.copy(states=False)
-    any_system = Guard(EMERGENCY.actions.low, EMERGENCY.actions.high, interval=EMERGENCY.interval)
-    teach(any_system, training(EMERGENCY, 0, 0, 2))
-    draw = held_out(EMERGENCY, 0, 1)[0]
-    executed = drive(guard, draw).executed.tolist()
-    for other in (*others, any_system):
-        assert drive(other, draw).executed.tolist() == executed
 
 
 # -- What came of episodes ------------------------------------------------------------------------

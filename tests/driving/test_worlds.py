@@ -189,14 +189,6 @@ def test_sensors_see_late_and_with_the_noise_of_their_seed():
     assert late[:, 1].std() == pytest.approx(0.3, rel=0.2)
 
 
-def test_a_car_behind_may_run_into_a_follower_who_brakes():
-    sleepy = IDM(1.25, 25.0, 2.0, 0.1, 2.0, lowest=-1.0)
-    scenario = replace(FULL, behind=Behind(sleepy, gap=4.0), sensors=Sensors())
-    episode = KinematicWorld().run(scenario, lambda z: -6.0)
-    assert episode.rear_ended
-    assert not episode.collided
-
-
 def test_cars_that_begin_close_and_under_way_are_driven_in_sumo():
     """SUMO does not insert a car that is too fast for the one ahead."""
     leader = Leader(IDM_LEADER, brake_decel=6.0, brake_time=0.0, initial_speed=14.0)

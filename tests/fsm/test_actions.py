@@ -11,12 +11,16 @@ PAPER_EDGES = [-2.5, -2.2, -1.9, -1.6, -1.3, -1.0, -0.7, -0.4, -0.1]
 PAPER_EDGES += [0.2, 0.5, 0.8, 1.1, 1.4, 1.7, 2.0, 2.3, 2.5]
 
 
-def test_an_inner_edge_belongs_to_the_interval_that_it_begins():
+def test_intervals_meet_and_an_inner_edge_belongs_to_the_one_that_it_begins():
     actions = IntervalActions(**PAPER)
     assert (actions.n_actions, actions.edges.tolist()) == (17, PAPER_EDGES)
     for k, edge in enumerate(PAPER_EDGES[1:-1]):
         assert actions.encode(edge) == actions.encode([edge])[0] == k + 1
         assert actions.encode(math.nextafter(edge, -math.inf)) == k
+    intervals = [actions.interval(i) for i in range(17)]
+    assert all(a[1] == b[0] for a, b in pairwise(intervals))
+    assert [actions.center(i) for i in (0, 8, 16)] == [-2.35, 0.05, 2.4]
+    assert [actions.encode(actions.center(i)) for i in range(17)] == list(range(17))
 
 
 @pytest.mark.parametrize(
@@ -35,14 +39,6 @@ def test_the_range_is_covered_by_as_many_intervals_as_arithmetic_on_paper_says(
     actions = IntervalActions(low, high, width)
     assert actions.n_actions == count
     assert (actions.edges[0], actions.edges[-1]) == (low, high)
-
-
-def test_intervals_meet_and_their_centers_are_encoded_as_themselves():
-    actions = IntervalActions(**PAPER)
-    intervals = [actions.interval(i) for i in range(17)]
-    assert all(a[1] == b[0] for a, b in pairwise(intervals))
-    assert [actions.center(i) for i in (0, 8, 16)] == [-2.35, 0.05, 2.4]
-    assert [actions.encode(actions.center(i)) for i in range(17)] == list(range(17))
 
 
 def test_values_beyond_the_range_fall_into_the_end_intervals_when_clipped():

@@ -42,7 +42,15 @@ def test_a_loaded_machine_goes_on_bit_for_bit(situation, grown, spiral, snapshot
     assert snapshot(loaded) == snapshot(machine) == snapshot(twin)
 
 
-@pytest.mark.parametrize("make", [full_model, EvolvingFSM.model, lambda _: EvolvingFSM(2).model()])
+def novel_model(grown):
+    machine = EvolvingFSM(3, rule=Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7))
+    machine.learn_many(grown.centers, [0] * grown.n_states, failures=[3])
+    return machine.model()
+
+
+@pytest.mark.parametrize(
+    "make", [full_model, novel_model, EvolvingFSM.model, lambda _: EvolvingFSM(2).model()]
+)
 def test_a_loaded_model_has_every_field_of_the_saved_one(make, grown, tmp_path):
     model = make(grown)
     model.save(tmp_path / "model")

@@ -64,17 +64,10 @@ def test_states_created_later_are_taken_in(walk):
     np.testing.assert_allclose(matrix(forecasts, 0, 1).sum(axis=1), 1.0, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"steps": []}, "one or more"),
-        ({"steps": [2, 2]}, "each once"),
-        ({"steps": [0]}, "a positive integer"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        Forecasts(n_actions=2, **settings)
+def test_steps_that_cannot_be_are_refused():
+    for steps, why in (([], "one or more"), ([2, 2], "each once"), ([0], "a positive integer")):
+        with pytest.raises(ValueError, match=why):
+            Forecasts(n_actions=2, steps=steps)
 
 
 def test_questions_that_cannot_be_are_refused_and_change_nothing(taught, machine, walk):

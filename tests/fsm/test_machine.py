@@ -7,14 +7,6 @@ import pytest
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.rules import Novelty
 
-
-def test_a_step_keeps_its_arrays_when_the_machine_goes_on(grown):
-    first = grown.learn_one([0.5, 0.2], 0)
-    belief, predicted = first.belief.tolist(), first.predicted.tolist()
-    grown.learn_one([-3.0, 1.0], 1)
-    assert (first.belief.tolist(), first.predicted.tolist()) == (belief, predicted)
-
-
 # -- Failure -----------------------------------------------------------------------------------
 
 
@@ -33,18 +25,6 @@ def test_what_led_to_failure_is_counted_by_hand():
     assert machine.failures.tolist() == [[0.0, 1.0], [1.0, 0.0], [0.0, 0.0]]
     assert machine.endings.tolist() == [2.0, 0.0]
     assert machine.model().uses.tolist() == [1.0, 1.0, 1.0]  # `fail` teaches no transition
-
-
-def test_a_failed_observation_is_learnt_like_any_other(grown):
-    twin = grown.copy()
-    a, b = grown.observe([0.3, 0.1], failed=True), twin.observe([0.3, 0.1])
-    for one, other in zip(a, b, strict=True):
-        np.testing.assert_array_equal(one, other)
-    twin.start_episode()
-    for name in ("belief", "centers", "potentials", "transition_matrices", "decisions"):
-        np.testing.assert_array_equal(getattr(grown, name), getattr(twin, name))
-    assert grown.failures.sum() == pytest.approx(1.0)
-    assert grown.endings.tolist() == [float(k == a.state) for k in range(grown.n_states)]
 
 
 @pytest.mark.parametrize("end", [EvolvingFSM.fail, lambda m: m.observe([0.3, 0.1], failed=True)])
@@ -108,13 +88,6 @@ print(failed)
     assert done.stdout == "[]\n", done.stderr
 
 
-def test_what_was_told_of_failures_before_the_first_observation_holds():
-    machine = EvolvingFSM(n_actions=1)
-    machine.tell_of_failures()
-    machine.learn_one([0.0], 0)
-    assert machine.failures_told
-
-
 def test_a_question_changes_nothing_and_its_answer_is_the_askers_own(grown, snapshot):
     before = snapshot(grown)
     for name in ("belief", "centers", "visits", "state_ids", "decisions", "transition_matrices"):
@@ -125,3 +98,7 @@ def test_a_question_changes_nothing_and_its_answer_is_the_askers_own(grown, snap
     model.propagate(grown.belief, 0, 3)
     grown.copy().learn_many(np.ones((4, 2)), [0] * 4)
     assert snapshot(grown) == before
+    step = grown.learn_one([0.5, 0.2], 0)
+    belief, predicted = step.belief.tolist(), step.predicted.tolist()
+    grown.learn_one([-3.0, 1.0], 1)
+    assert (step.belief.tolist(), step.predicted.tolist()) == (belief, predicted)

@@ -7,7 +7,6 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.rules import Novelty
-from evofsm.fsm.step import Event
 
 ACTIONS = IntervalActions(low=-1.0, high=1.0, width=1.0)
 
@@ -33,16 +32,6 @@ STAY = [[1.0, 0.0], [0.0, 1.0]]
 
 
 # -- A snapshot --------------------------------------------------------------------------------
-
-
-def test_it_counts_founding_visits_and_uses(spiral):
-    machine = EvolvingFSM(n_actions=2, radius=0.01)
-    trace = machine.learn_many(spiral(120), [1] * 30 + [0] * 20 + [-1] * 10 + [0] * 60)
-    model = machine.model()
-    assert model.n_states > 32
-    assert model.created.tolist() == (np.flatnonzero(trace.event == Event.CREATED) + 1).tolist()
-    assert model.visits.tolist() == np.bincount(trace.state).tolist()
-    assert model.uses.tolist() == [79, 30]
 
 
 def test_nothing_in_a_snapshot_can_be_changed(grown):
@@ -93,14 +82,44 @@ def test_what_cannot_be_recognised_is_refused(grown, z, words):
         grown.model().recognise(z)
 
 
-def test_a_model_of_a_machine_that_saw_nothing_says_so():
-    model = EvolvingFSM(n_actions=2).model()
-    assert model.n_states == 0
-    with pytest.raises(ValueError, match=r"no states|variables"):
-        model.recognise([0.0])
-
-
 # -- Forecasts ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def machine():
+    """States at 0 and 1, recognised so sharply that a belief is exactly 0 or 1.
+
+    By hand P is [[1/2, 1/2], [5/6, 1/6]] of action 0, and [[5/14, 9/14], [1/2, 1/2]] of action 1.
+    """
+    machine = EvolvingFSM(
+        n_actions=2, radius=0.5, learning_rate=0.5, prior_frequency=0.25, spread=1e-6
+    )
+    machine.learn_many([[0.0], [0.0], [2.0], [1.0]], [-1, -1, -1, 0])
+    machine.learn_many([[0.0], [0.0], [1.0]], [1, 1, -1])
+    return machine
+
+
+@pytest.mark.parametrize(
+    ("action", "horizon", "expected"),
+    [
+        (0, 1, [5 / 6, 1 / 6]),
+        (1, 1, [1 / 2, 1 / 2]),
+        (0, 2, [59 / 126, 67 / 126]),
+        (0, 3, [1469 / 2646, 1177 / 2646]),
+        (1, 2, [23 / 42, 19 / 42]),
+    ],
+)
+def test_the_action_decides_the_first_step_and_all_alike_further_ones(
+    machine, action, horizon, expected
+):
+    assert machine.belief.tolist() == [0.0, 1.0]
+    np.testing.assert_allclose(machine.predict(action, horizon), expected, rtol=1e-14)
+
+
+def test_at_the_start_of_an_episode_the_forecast_comes_from_the_uniform_belief(machine):
+    machine.start_episode()
+    assert machine.belief.tolist() == [0.5, 0.5]
+    np.testing.assert_allclose(machine.predict(0), [2 / 3, 1 / 3], rtol=1e-15)
 
 
 def test_without_an_action_all_count_alike_from_the_first_step_on():

@@ -62,13 +62,13 @@ def learn(snapshot):
         assert trace.state.tolist() == [step.state for step in steps]
         assert trace.event.tolist() == [step.event for step in steps]
         assert trace.surprise.tobytes() == np.array([step.surprise for step in steps]).tobytes()
-        assert_sound(machine, trace)
+        assert_sound(machine, Z, trace)
         assert machine.endings.sum() == len(failures)
 
     return learn
 
 
-def assert_sound(machine, trace):
+def assert_sound(machine, Z, trace):
     model = machine.model()
     for rows in (model.transition_matrices, model.marginal_matrix, machine.belief, trace.belief):
         assert_distribution(rows)
@@ -78,6 +78,9 @@ def assert_sound(machine, trace):
     assert (model.origin_frequency >= 0.0).all()
     assert ((model.potentials > 0.0) & (model.potentials <= 1.0)).all()
     assert (model.failures <= model.decisions).all()
+    assert model.visits.tolist() == np.bincount(trace.state).tolist()
+    assert model.created.tolist() == (np.flatnonzero(trace.event == Event.CREATED) + 1).tolist()
+    assert model.recognise(Z[-1]).tobytes() == trace.belief[-1].tobytes()
     surprise = trace.surprise[~np.isnan(trace.surprise)]
     assert ((surprise >= 0.0) & (surprise <= 1.0)).all()
     assert model.decisions.sum() == pytest.approx(len(surprise))

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.model import FSMModel
 from evofsm.fsm.rules import Novelty, Paper, describe_rule, register_rule
 from evofsm.fsm.step import Event
 
@@ -25,23 +24,6 @@ def rule(request):
 
 
 # -- All rules -------------------------------------------------------------------------------------
-
-
-def test_a_model_keeps_the_rule_and_recognises_by_it(rule, tmp_path):
-    machine, rng = EvolvingFSM(3, rule=rule), np.random.default_rng(0)
-    Z = np.cumsum(rng.normal(size=(300, 2)), axis=0)
-    failures = np.flatnonzero(rng.random(300) < 0.1)
-    machine.learn_many(Z, rng.integers(-1, 3, 300), [100], failures)
-    machine.model().save(tmp_path / "model")
-    model = FSMModel.load(tmp_path / "model")
-    assert model.rule == rule
-    assert model.recognise(Z[-1]).tobytes() == machine.model().recognise(Z[-1]).tobytes()
-    z = machine.centers[0] + 0.1
-    belief = machine.observe(z).belief
-    assert machine.model().recognise(z).tobytes() == belief.tobytes()
-    for name in ("decisions", "failures", "endings"):
-        assert getattr(model, name).any()
-    assert repr(EvolvingFSM(**model.settings, rule=model.rule)) == repr(machine)
 
 
 def test_the_names_and_settings_in_a_file_are_these():

@@ -236,22 +236,6 @@ def test_each_record_is_on_the_disk_before_its_action_is_executed(tmp_path, monk
 # -- Replaying ------------------------------------------------------------------------------------
 
 
-def test_episodes_of_learning_and_of_none_come_out_the_same(tmp_path):
-    path = tmp_path / "log"
-    with AuditLog(path) as log:
-        guard = cars(log)
-        said = drive(guard) + drive(guard, brake=4)
-        guard.reviser.tolerance, guard.explaining = 0.3, True
-        said += drive(guard, brake=12)
-        guard.freeze()
-        said += drive(guard)
-    result = audit(path, log.head)
-    assert result.is_good
-    assert (result.head, result.replayed, result.not_replayed) == (log.head, len(said), ())
-    assert (result.contents.sessions, result.contents.episodes) == (1, 4)
-    assert guard.machine.n_states > 5
-
-
 REVISERS = {
     "always brakes": lambda judge, machine: AlwaysBrake(ACTIONS),
     "measure": lambda judge, machine: EnvelopeReviser(measures.TimeToCollision(4.0), ACTIONS),

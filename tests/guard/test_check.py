@@ -205,9 +205,3 @@ def test_an_error_within_a_part_names_its_place():
     message = check_results(Fails())[0].message
     assert "ZeroDivisionError: by the gap (" in message
     assert "test_check.py, line" in message
-
-
-def test_an_instance_is_copied_before_each_check():
-    reviser = ActionReviser(LatentRisk(lowest=-2.5), ACTIONS)
-    assert not failed(reviser)
-    assert reviser.risk.sums(0) == LatentRisk(lowest=-2.5).sums(0)

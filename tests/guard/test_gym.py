@@ -207,16 +207,6 @@ def test_gymnasium_finds_nothing_to_complain_of(own):
     check_env(env, skip_render_check=True)
 
 
-def test_a_reset_in_mid_episode_ends_it_without_failure():
-    env = of_cars(Script(FAR, NEAR, NEAR))
-    for seed, options in ((1, None), (2, {"a": "b"})):
-        env.reset(seed=seed, options=options)
-        env.step(np.array([0.0]))
-    assert env.env.resets == [(1, None), (2, {"a": "b"})]
-    assert env.guard.machine.model().uses.sum() == 1  # FAR to NEAR, and not NEAR to FAR
-    assert env.guard.machine.endings.sum() == 0
-
-
 def test_where_nothing_is_ahead_a_usable_proposal_is_kept_and_nothing_is_learnt():
     env = of_cars(Script(None, None, FAR, None, FAR, FAR))
     infos = infos_of(drive(env, lambda seen, info: np.array([2.5 if seen is None else 9.0])))
@@ -229,27 +219,11 @@ def test_where_nothing_is_ahead_a_usable_proposal_is_kept_and_nothing_is_learnt(
     assert env.step(np.array([np.nan]))[-1]["reviser/executed_action"] == [-1.0]
 
 
-def test_what_was_not_observed_is_the_guards_to_deal_with():
-    script = Script(FAR, [np.nan, 20.0, 10.0], FAR, NEAR)
-    env = RevisedActions(script, guard_for(ONE))
-    infos = infos_of(drive(env, lambda seen, info: np.array([0.0])))
-    assert [bool(np.isnan(row[0][0])) for row in env.guard.judge.episodes[0][0]] == [0, 1, 0]
-    assert not any(isinstance(it, float) and np.isnan(it) for info in infos for it in info.values())
-
-
 def test_a_sensor_that_is_silent_is_named():
     env = RevisedActions(Script(*[[90.0, np.nan, 10.0]] * 150), guard_for(ONE))
     env.reset()
     with pytest.warns(UserWarning, match=r"none of 100 observations .* is variable 2. .*sensor"):
         drive(env, lambda seen, info: np.array([0.0]))
-
-
-@pytest.mark.parametrize(("seen", "why"), [([1.0, 2.0], "v_leader"), ([np.inf, 2.0, 3.0], "gap")])
-def test_an_observation_that_is_not_the_guards_is_refused(seen, why):
-    env = of_cars(Script(seen))
-    env.reset()
-    with pytest.raises(ValueError, match=why):
-        env.step(np.array([0.0]))
 
 
 def test_a_guard_whose_actions_go_beyond_the_environments_is_refused():
@@ -703,23 +677,6 @@ def test_only_what_the_environment_allows_is_executed(host, how, judge):
     assert {0.0, 2.0} <= set(executed)
 
 
-def test_a_guard_counts_on_nothing_that_is_barred():
-    guard = Guard(n_actions=3, interval=0.1)
-    env = RevisedActions(wrappers.TimeLimit(Barred(), 60), guard)
-    env.action_space.seed(0)
-
-    def propose(seen, info):
-        return env.action_space.sample(info["action_mask"])
-
-    ends = []
-    for k in range(24):
-        if k == 14:
-            guard.freeze()
-        ends.append(drive(env, propose, seed=k)[-1][2])
-    assert 1 <= sum(ends[:14]) <= 4
-    assert not any(ends[14:])
-
-
 # -- Many at once ------------------------------------------------------------------------------
 
 
@@ -787,24 +744,6 @@ def test_what_each_meets_is_learnt_whole_and_nothing_across_a_reset(name, steps,
     before = len(ended)
     revised.reset(seed=9)  # those under way end as they are
     assert len(guard.judge.episodes) == before + 3
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_infos_are_arrays_with_masks(mode):
-    envs, _ = recorded("Pendulum-v1", 2, mode, 5)
-    revised = RevisedVectorActions(envs, guard_for(envs.single_action_space, Spy(above_half)))
-    resets = 0
-    for _, infos in drive_all(revised, 13):
-        assert KEYS | {f"_{key}" for key in KEYS} <= infos.keys()
-        resets += not infos["_reviser/reason"].any()
-        assert all(len(set(infos[f"_{key}"].tolist())) == 1 for key in KEYS)
-        for key in ("proposed", "executed"):
-            assert infos[f"reviser/{key}_action"].shape == (2, 1)
-            assert infos[f"reviser/{key}_action"].dtype == np.float32
-        assert infos["reviser/risk"].shape == infos["reviser/penalty"].shape == (2,)
-        assert infos["reviser/reason"].dtype == object
-    assert resets == (2 if mode is NEXT_STEP else 0)
-    assert (infos["reviser/executed_action"] <= 0.5).all()
 
 
 def test_a_step_that_only_resets_is_no_decision_and_costs_nothing():

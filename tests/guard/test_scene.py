@@ -8,7 +8,7 @@ import pytest
 from evofsm import store
 from evofsm.guard import Guard, Mode, Proposal, SceneRisk
 from evofsm.guard.actions import same_action
-from evofsm.guard.scene import _KIND, Foreseen
+from evofsm.guard.scene import _KIND
 
 LEFT, STAY, RIGHT = range(3)
 THINGS = 3
@@ -165,23 +165,6 @@ def test_what_fails_only_in_one_and_the_same_place_is_learnt():
     guard.freeze()
     assert guard.judge.memory.contact.met == 0.0
     assert guard.decide(row(1, [1.0, 1.0]), STAY).executed != STAY
-
-
-@pytest.mark.parametrize(
-    ("lasting", "executed", "what"),
-    [
-        ([0.6, 0.2, 0.2], LEFT, "the one that lasts longest"),
-        ([0.2, 0.19, 0.2], STAY, "nor does anything last longer"),
-    ],
-)
-def test_where_nothing_can_it_takes_what_lasts_longest(
-    taught, monkeypatch, lasting, executed, what
-):
-    foreseen = Foreseen(np.ones((3, 3)), np.tile(lasting, (3, 1)).T, np.eye(3))
-    monkeypatch.setattr(taught.judge.memory, "foresee", lambda seen: foreseen)
-    revision = taught.decide([1.0, 0, 2.0, 0.0] + [0.0] * 12, STAY)
-    assert revision.executed == executed
-    assert what in revision.reason
 
 
 def test_neither_the_order_of_objects_nor_rows_that_are_not_seen_make_a_difference(taught):

@@ -729,17 +729,3 @@ def test_a_row_of_units_below_the_names_is_none_of_the_log(tmp_path, row):
     assert chunk.observations[0, 1] == pytest.approx(36 * 0.44704)
     bad = write(tmp_path / "b.csv", [*lines, "p,9,9,36,fast,1,0"], SHORT)
     assert "line 6, column 'v_leader'" in refusal(bad)
-
-
-@pytest.mark.parametrize(
-    ("columns", "says"),
-    [
-        *(({"failed": text}, f"--failed is {text!r}") for text in ("", "<0", "gap<0<1", "gap<inf")),
-        ({"units": {"speed": "km/h"}}, "no column that is read is called so"),
-        ({"units": {"time": "km/h"}}, "needs a unit of time"),
-    ],
-)
-def test_what_is_no_condition_and_no_unit_of_a_column_is_refused(tmp_path, columns, says):
-    path = write(tmp_path / "a.csv", short([1, 2]), SHORT)
-    with pytest.raises(ValueError, match=re.escape(says)):
-        read(path, **columns)

@@ -22,20 +22,16 @@ from studies.forecasts import (
     score,
     stays,
 )
+from tests.studies.test_real import drive as drive_of
+from tests.studies.test_real import write_run
 
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
-    """Followers behind leaders whose speed sways, three of one origin and a lonely one."""
+    """Drives, three of one origin and a lonely one."""
     folder = tmp_path_factory.mktemp("logs")
     for k, name in enumerate(("track_0", "track_1", "track_2", "lonely")):
-        rng, t = np.random.default_rng(k), np.round(np.arange(400) * 0.1, 9)
-        leader = 10.0 + 3.0 * np.sin(0.3 * t + rng.uniform(0, 6))
-        follower = 10.0 + 3.0 * np.sin(0.3 * (t - 2.0) + rng.uniform(0, 0.2))
-        gap = 15.0 + np.cumsum(leader - follower) * 0.1
-        columns = {"time": t, "gap": gap, "v_follower": follower, "v_leader": leader}
-        frame = pl.DataFrame(columns | {"a_follower": np.gradient(follower, 0.1)})
-        frame.write_csv(folder / f"{name}.csv")
+        write_run(folder, name, [drive_of(k)[:400]])
     (folder / "MANIFEST.csv").write_text("file,rows\ntrack_0.csv,400\n")
     return folder
 

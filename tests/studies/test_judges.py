@@ -71,22 +71,6 @@ def test_proposals_that_are_kept_change_nothing_and_cars_score_mobility():
     assert row["score"] == pytest.approx(1.0)
 
 
-@pytest.mark.filterwarnings("ignore:this guard refuses nearly everything")  # it saves all the same
-@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
-def test_an_episode_of_ten_decisions_is_enough_to_learn_from(seed):
-    """It fails once, as it must, perhaps again as brakes come late, and then no more."""
-    row = trial("acc-5", train=6, test=4, base=7, seed=seed)
-    assert row["failed_while_learning"] <= 2
-    assert row["failed"] == 0
-
-
-@pytest.mark.filterwarnings("ignore:this guard refuses nearly everything")
-@pytest.mark.slow
-def test_a_reactor_whose_lags_foresee_failure_that_never_comes_is_kept_from_failing():
-    """Else nothing passes any more on the reactor, and what lasts longest is picked blindly."""
-    assert trial("reactor", train=30, test=5, base=7)["failed"] == 0
-
-
 # -- The studies ----------------------------------------------------------------------------------
 
 

@@ -2,12 +2,9 @@
 
 import json
 
-import numpy as np
 import pytest
 from studies import lib, peers
 from studies.peers import TASKS, WAYS, Job, Peers
-from studies.rivals import pendulum_shield
-from studies.systems import Box
 
 pl = pytest.importorskip("polars")
 
@@ -58,10 +55,7 @@ def test_what_is_finished_is_shown_without_training(tmp_path, finished):
     assert not finished
 
 
-def test_of_each_seed_the_longest_are_begun_first_and_names_are_checked():
-    order = [(job.seed, -job.cost) for job in Peers().jobs]
-    assert order == sorted(order)
-    assert {job.task for job in Peers().jobs} == set(TASKS)
+def test_a_task_that_there_is_not_is_refused():
     with pytest.raises(ValueError, match="there is no task 'kettle'; there are cartpole"):
         _ = Peers(tasks="cartpole,kettle").jobs
 
@@ -82,84 +76,11 @@ def test_the_page_says_where_the_filter_loses(tmp_path):
     assert "| filter-1 | nothing but failures | 0.0 (" in (tmp_path / "peers.md").read_text()
 
 
-def test_who_is_told_of_a_pendulum_at_5_ms_holds_it():
-    shield = pendulum_shield(Box((-2.0,), (2.0,)), 0.5, False, 0.005)
-    angle, rate, chance = 0.0, 0.0, np.random.default_rng(0)
-    for _ in range(400):
-        torque = shield.action(np.array([angle, rate]), float(chance.uniform(0.0, 2.0)))
-        rate += 0.005 * (15.0 * np.sin(angle) + 3.0 * torque)
-        angle += 0.005 * rate
-        assert abs(angle) < 0.5
-
-
-# -- With Stable-Baselines3 -----------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def learners():
+def test_a_filter_learns_while_a_learner_does():
     pytest.importorskip("stable_baselines3")
     pytest.importorskip("mujoco")
     from studies import learners
 
-    return learners
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_a_task_decides_and_begins_as_it_says(learners, task):
-    env = learners.made(task)
-    first = learners.begin(env, task, 3)
-    assert np.array_equal(first, learners.begin(learners.made(task), task, 3))
-    inner = env.unwrapped
-    clock = inner.family.interval if task == "car-following" else getattr(inner, "tau", None)
-    assert (clock or inner.dt) == pytest.approx(TASKS[task].interval)
-    env.action_space.seed(0)
-    while not env.episodes or not env.episodes[-1].failed:  # drawn actions let all of them fail
-        *_, terminated, truncated, _ = env.step(env.action_space.sample())
-        if terminated or truncated:
-            learners.begin(env, task, len(env.episodes))
-        assert len(env.episodes) < 20
-
-
-@pytest.mark.parametrize("penalty", [0.0, 0.5])
-def test_a_memory_holds_what_was_executed_with_what_it_earned(learners, penalty):
-    space = learners.gymnasium.spaces.Box(-2.0, 2.0, (1,))
-    memory = learners.ExecutedBuffer(8, space, space, penalty=penalty)
-    seen = np.zeros((1, 1))
-    kept = {"reviser/penalty": 0.0, "reviser/executed_action": np.array([1.0])}
-    memory.add(seen, seen, np.array([[0.5]]), np.array([1.0]), np.array([False]), [kept])
-    changed = {"reviser/penalty": 2.0, "reviser/executed_action": np.array([-2.0])}
-    reward = np.array([1.0 - 2.0 * penalty])
-    memory.add(seen, seen, np.array([[1.0]]), reward, np.array([False]), [changed])
-    held = list(zip(memory.actions.ravel(), memory.rewards.ravel(), strict=True))[: memory.pos]
-    proposed = [(1.0, 0.0)] if penalty else []
-    assert held == [(0.5, 1.0), *proposed, (-1.0, 1.0)]
-
-
-def test_what_is_told_a_pole_lets_no_learner_fail_and_one_that_is_not_learns_from_it(learners):
-    found = {way: learners.trained("pendulum", way, 0, 600, 2) for way in ("alone", "told-1")}
-    assert found["alone"]["failed"] > 10
-    assert found["told-1"]["failed"] == found["told-1"]["under_failed"] == 0
-    json.dumps(found)
-
-
-def test_a_critic_learns_which_action_fails_and_frozen_learns_no_more(learners):
-    critic = learners.SafetyCritic(Box((-1.0,), (1.0,)), 1, seed=0)
-    chance, ahead = np.random.default_rng(0), np.array([0.5])
-    critic.begin()
-    for _ in range(1000):  # whatever is above 0 fails, else it stays where it is
-        if critic.action(ahead, chance.uniform(-1.0, 1.0)) > 0.0:
-            critic.end(True, ahead)
-            critic.begin()
-    critic.freeze()
-    critic.begin()
-    assert critic.action(ahead, -0.9) == -0.9
-    assert all(critic.action(ahead, 0.9) < 0.0 for _ in range(20))
-    weights = [layer.clone() for layer in critic._net.parameters()]
-    critic.end(True, ahead)
-    assert all(map(learners.torch.equal, weights, critic._net.parameters()))
-
-
-def test_a_filter_learns_while_a_learner_does(learners):
     found = learners.trained("cartpole", "filter-1", 0, 600, 1)
     assert 0 < found["failed"] <= found["episodes"]
     assert found["changed_last"] > 0.0

@@ -53,10 +53,6 @@ def served(transport):
     assert not thread.is_alive()
 
 
-def told(data):
-    return [json.loads(one) for one in data.splitlines()]
-
-
 class Pieces(io.BytesIO):
     """A stream that comes in pieces of a size."""
 
@@ -70,7 +66,7 @@ def answered(data, size=1 << 20):
     source, sink = Pieces(data), io.BytesIO()
     source.size = size
     Server(Decider(guard_of_monitor(0.1, 6.0))).run(Stream(source, sink))
-    return told(sink.getvalue())
+    return [json.loads(one) for one in sink.getvalue().splitlines()]
 
 
 def test_a_pipe_is_answered_line_by_line_whatever_comes_between(plain):

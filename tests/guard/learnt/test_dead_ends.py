@@ -90,12 +90,11 @@ def test_however_variables_are_written_it_decides_the_same(wary, reloaded):
     assert any("dead end" in explanation for explanation in told)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_the_end_of_a_rail_is_no_disturbance_that_may_begin_anywhere(seed, reloaded):
+def test_the_end_of_a_rail_is_no_disturbance_that_may_begin_anywhere(reloaded):
     """Whoever touches it shakes ever more: nothing survives that, and it begins nowhere else."""
-    guard, failed = Guard(low=-1.0, high=1.0, interval=0.1, seed=seed), []
+    guard, failed = Guard(low=-1.0, high=1.0, interval=0.1), []
     for episode in range(14):
-        rng, place, shaken, shake = np.random.default_rng([seed, episode]), 0.0, 0.0, 0.0
+        rng, place, shaken, shake = np.random.default_rng([0, episode]), 0.0, 0.0, 0.0
         for _ in range(80):
             wanted = float(np.clip(0.6 + 0.4 * rng.normal(), -1.0, 1.0))
             executed = float(guard.decide([place, shaken, shake], wanted).executed)

@@ -7,10 +7,8 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from evofsm import Guard  # noqa: E402
 from evofsm.guard import LearntRisk, RevisedActions  # noqa: E402
-from evofsm.guard.learnt.danger import fails  # noqa: E402
 from evofsm.guard.learnt.failure import SAYS, are_sides, distances  # noqa: E402
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS  # noqa: E402
-from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State  # noqa: E402
 
 
 class Descent(gymnasium.Env):
@@ -90,24 +88,3 @@ def test_where_something_went_on_or_failed_there_is_none():
     assert not are_sides(said(judge, FAILS)).any()
     walk(judge, [3.0, 0.0])
     assert (distances(said(judge, ENDS), np.array([[1.2, 0.0], [3.0, 0.0]])) > 0.0).all()
-
-
-@pytest.mark.parametrize("elsewhere", [[[2.0, 0.0], [2.0, 0.1]], [[0.3, 0.95], [-0.3, 0.9]]])
-def test_what_fails_as_others_do_elsewhere_does_not_fail_for_how_it_ends(elsewhere):
-    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 40), np.linspace(-1.0, 0.5, 41))
-    rows, none = np.column_stack([x.ravel(), y.ravel()]), np.zeros(0)
-    given = Given(LearntSettings(), 0, set(), None, None, None, None)
-    episode = Episode(rows[:1], np.zeros((0, 1)), False, False, none, none, none, 0.0)
-    state = State.none(2, 1, 0, given.settings, None)._replace(
-        unit=np.full(2, 0.1),
-        survived=rows,
-        lowest=np.array([rows.min(0)] * 2),
-        highest=np.array([rows.max(0)] * 2),
-        failures=np.array([[0.0, 0.89], *elsewhere]),
-    )
-    state = fails(state, rows[:1], episode, given)
-    state = state._replace(ended=np.array([[0.0, -0.51], [0.0, 0.49]]))
-    forms = fails(state, rows[:1], episode, given).forms
-    at_end = distances(forms[forms[:, SAYS] == ENDS], state.failures[:1]) < 0.0
-    is_alike = elsewhere[0][1] > 0.5
-    assert (CRASHES in forms[:, SAYS]) == at_end.all() == (not is_alike)

@@ -23,9 +23,7 @@ from evofsm.guard.learnt.failure import (
     inside,
     rivals,
 )
-from evofsm.guard.learnt.learn import doubted
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS
-from evofsm.guard.learnt.state import Episode, LearntSettings, State
 
 SHAPES = {
     "disc": lambda z: np.hypot(z[..., 0], z[..., 2]) < 0.8,
@@ -52,14 +50,6 @@ def survived_as(rows, unit, ended=()):
     return Survived(rows, lowest, highest, unit, rows.std(0), ended)
 
 
-@pytest.mark.parametrize(("typical", "holds"), [(0.1, True), (2.0, False)])
-def test_a_form_that_would_refuse_most_of_what_was_survived_is_none(typical, holds):
-    failures, survived = seen("disc")
-    forms = explain(FAILS, failures, survived_as(survived, np.full(3, typical)))
-    assert inside(forms, failures).any(0).all() == holds
-    assert len(forms) == holds
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_forms_explain_failures_and_nothing_that_was_survived_is_inside(shape):
     failures, survived = seen(shape)
@@ -81,22 +71,6 @@ def test_the_walls_of_a_room_stay_thresholds_of_which_each_explains_a_few():
     forms = explain(FAILS, failures, survived_as(survived, np.full(9, 0.02)))
     held = {(int(row[I]), row[B]) for row in forms[are_sides(forms)]}
     assert held >= {(k, sign) for k in range(4) for sign in (-1.0, 1.0)}
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_order_unit_direction_and_origin_of_variables_make_no_difference(shape):
-    failures, survived = seen(shape)
-    order, times, off = [2, 0, 1], np.array([-3.7, 0.25, 100.0]), np.array([5.0, -2.0, 30.0])
-
-    def written(z):
-        return (z * times + off)[:, order]
-
-    found = explain(FAILS, failures, survived_as(survived, UNIT))
-    unit = (np.abs(times) * UNIT)[order]
-    other = explain(FAILS, written(failures), survived_as(written(survived), unit))
-    far, otherwise = distances(found, survived), distances(other, written(survived))
-    assert len(far) == len(otherwise)
-    np.testing.assert_allclose(far.min(0), otherwise.min(0), rtol=1e-4, atol=1e-4)
 
 
 EXACT = np.zeros((2, 2))
@@ -190,35 +164,17 @@ def test_a_rival_reaches_inwards_where_failures_lie_on_a_rim_that_was_skimmed():
     assert not inside(tried, far).any()
 
 
-def test_a_rival_of_a_threshold_asks_each_variable_in_which_failures_are_rare():
-    """A craft fails where it touches fast or tilted; once it touched softly that is what counts."""
+@pytest.mark.parametrize("ended", [(), [-0.1, -0.1, 0.0]])
+def test_a_rival_of_a_threshold_fails_only_as_failures_did(ended):
+    """A craft fails where it touches fast or tilted, whether or not it touched softly once."""
     rng = np.random.default_rng(2)
     rows = np.column_stack([rng.uniform(0.0, 5.0, 500), rng.normal(0.0, [0.6, 0.3], (500, 2))])
     failures = np.array([[-0.1, -1.4, 0.6], [-0.1, -1.2, -0.7], [-0.1, -1.1, 0.5]])
-
-    def crashes(z, ended=()):
-        known = survived_as(rows, np.full(3, 0.02), ended)
-        tried = rivals(explain(FAILS, failures, known, bends=False), failures, known)
-        says = tried[:, SAYS]
-        assert inside(tried[says == ENDS], z).any(0).all()
-        return inside(tried[says == CRASHES], z).any(0).tolist()
-
-    touched = np.array(
-        [[-0.1, -0.1, 0.0], [-0.1, -1.3, 0.0], [-0.1, -0.1, 0.6], [-0.1, -0.1, -0.6]]
-    )
-    assert crashes(touched) == [False, True, True, True]
-    assert crashes(np.vstack([touched[0], failures]), ended=touched[0]) == [False, True, True, True]
-
-
-def test_what_crashes_by_a_rival_is_not_said_of_other_ends():
-    rows = np.random.default_rng(2).uniform([0.0, -1.0], 1.0, (500, 2))
-    failures, known = np.array([[-0.1, -0.9], [-0.1, -0.8]]), survived_as(rows, np.full(2, 0.02))
-    table = explain(FAILS, failures, known, bends=False)
-    ends = table.copy()
-    ends[:, SAYS], ends[:, B] = ENDS, -ends[:, B]
-    tried = rivals(np.vstack([ends, table]), failures, known)
-    assert tried[:, SAYS].tolist() == [ENDS, CRASHES, ENDS]
-    assert tried[[0, 2], B].tolist() == [table[0, B], ends[0, B]]
+    known = survived_as(rows, np.full(3, 0.02), ended)
+    tried = rivals(explain(FAILS, failures, known, bends=False), failures, known)
+    says, touches = tried[:, SAYS], np.array([[-0.1, -0.1, 0.0], *failures])
+    assert inside(tried[says == ENDS], touches).any(0).all()
+    assert inside(tried[says == CRASHES], touches).any(0).tolist() == [False, True, True, True]
 
 
 def test_a_rival_of_a_crash_asks_how_far_out_failures_were():
@@ -265,14 +221,6 @@ def test_what_refused_for_long_without_a_failure_is_tried_by_its_smallest_rival(
     assert (guard.judge.state.forms[:, SAYS] == ENDS).any()  # it is known now
     guard.freeze()
     assert sum(fly(softly) for _ in range(9)) == 9
-
-
-def test_an_episode_speaks_for_a_rival_only_where_that_was_tried():
-    settings, none = LearntSettings(), np.zeros(0)
-    state = State.none(1, 1, 0, settings, None)._replace(held=-1)
-    episode = Episode(np.zeros((1, 1)), np.zeros((0, 1)), False, False, none, none, none, 0.0)
-    held = [doubted(state, episode, settings, tried=tried).held for tried in (False, True)]
-    assert held == [-1, -2]
 
 
 def test_frozen_a_threshold_counts_on_for_a_while_that_fewer_took_the_place_of():

@@ -125,36 +125,6 @@ def test_what_was_seen_twice_before_a_decision_is_learnt_of_at_once(points):
     assert "no backup prevents failure" in reason
 
 
-def test_while_a_rival_is_tried_all_backups_are_asked(points):
-    """Those that come first saved by what is doubted; by its rival another one may."""
-    guard = points["box"].taught(4)
-    judge = guard.judge
-    policies = np.zeros((5, *judge.state.policies.shape[1:]))
-    policies[:, 0, 0] = [1.0, 1.0, 1.0, 1.0, -1.0]  # towards the wall, but for the last
-    backups = {"policies": policies, "linear": np.zeros(5)}
-
-    def passes(held):
-        judge.state = judge.state._replace(held=held, **backups)
-        judge.remake()
-        return "survives all" in guard.decide([0.3, 0.02], 0.2).reason
-
-    assert [passes(0), passes(-1)] == [False, True]
-    guard.freeze()
-    assert not passes(-1)
-
-
-def test_where_it_is_switched_off_nothing_counts_as_refused(points):
-    guard = points["box"].taught(4)
-    held = guard.judge.state.held
-    while guard.decide([0.9, 0.05], 1.0).advised == 1.0:
-        pass
-    guard.reviser.mode = Mode.OFF
-    for _ in range(60):
-        guard.decide([0.0, 0.0], 1.0)
-    guard.end(False)
-    assert guard.judge.state.held == held
-
-
 @pytest.mark.parametrize("stride", [1, 2])
 def test_of_a_long_episode_every_change_is_learnt_once(stride):
     guard = Guard(-1.0, 1.0, interval=0.1, horizon=10.0 * stride, mode=Mode.OFF)
@@ -417,12 +387,6 @@ def test_it_says_which_backup_survives_why_a_proposal_is_refused_and_what_fails(
         assert ("no backup " in one.reason) == (not as_proposed)
         instead = re.search("the closest action after which|no action passes; ", one.reason)
         assert bool(instead) == (not as_proposed)
-
-
-def test_names_are_for_words_alone_and_are_kept(reloaded):
-    named = LearntRisk(0.1, n_actions=2, names=("place", "speed"), units=("m", "m/s"))
-    labels = reloaded(named).labels
-    assert (labels.names, labels.units) == (("place", "speed"), ("m", "m/s"))
 
 
 def test_where_there_is_but_one_action_reasons_name_no_backup():

@@ -1,0 +1,38 @@
+"""`evofsm paper`."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from evofsm.paper import Settings
+
+
+@pytest.mark.slow
+def test_all_claims_hold_in_sumo_as_the_docs_show_them_and_the_page_is_named(evofsm, tmp_path):
+    pytest.importorskip("libsumo")
+    folder = tmp_path / "out"
+    run = evofsm("paper", "--out", folder)
+    assert run.exit_code == 0, run.stderr
+    assert "10 of 10 claims of the paper hold" in run.stdout
+    assert f"{folder}/index.html" in run.stdout.replace("\n", "")
+    page = (Path(__file__).parents[2] / "docs" / "paper.md").read_text()
+    for claim in json.loads((folder / "claims.json").read_text()):
+        assert f"| {claim['claim']} | {claim['paper']} | {claim['measured']} | yes |" in page
+
+
+@pytest.mark.slow
+def test_a_claim_that_fails_is_shown_and_ends_with_1(evofsm, tmp_path, monkeypatch):
+    coarse = Settings.load({"machine": {"radius": 30.0}})
+    monkeypatch.setattr(Settings, "load", lambda: coarse)
+    told = "--world", "kinematic", "--rounds", 1
+    run = evofsm("paper", *told, "--json", "--out", tmp_path / "out")
+    assert run.exit_code == 1, run.stderr
+    failing = [claim["id"] for claim in json.loads(run.stdout) if not claim["holds"]]
+    assert "states_final" in failing
+
+
+def test_a_folder_that_cannot_be_is_said_before_anything_is_driven(refused, tmp_path, monkeypatch):
+    monkeypatch.setattr("evofsm.paper.reproduction.run_paper", None)
+    (tmp_path / "file").write_text("in the way")
+    assert "file" in refused("paper", "--world", "kinematic", "--out", tmp_path / "file")
