@@ -29,6 +29,7 @@ GOOD: dict[tuple[str, str], Callable[[Any, Vector], Any]] = {
     ("acc", "full throttle"): lambda s, z: np.clip(-1.5 * (z[0] + 0.7) - 2.5 * z[1], -2.0, 2.0),
     ("cartpole", "random"): lambda s, z: int(z @ [0.1, 0.3, 3.0, 1.0] > 0.0),
     ("pendulum", "random"): lambda s, z: np.clip(-10.0 * z[0] - 2.0 * z[1], -2.0, 2.0),
+    ("pendulum-cos", "random"): lambda s, z: np.clip(-10.0 * _angle(z[1::-1]) - 2.0 * z[2], -2, 2),
     ("tanks", "exchanged"): lambda s, z: np.clip(0.2 - 0.4 * (z[:2] - 1.0), 0.0, 1.0),
     ("reactor", "random"): lambda s, z: int(z[0] < 45.0 and z[1] < 0.3),
     ("disc", "careless"): lambda s, z: s._towards(_around(z[:2], s._goal), 0.7, 1.2, 0.1),

@@ -79,14 +79,11 @@ def test_scores_by_hand():
     assert (still["forecasts"], still["episode"]) == (2, 1)
 
 
-# -- Failures of tasks ----------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_a_page_says_where_others_are_better(logs, monkeypatch):
     monkeypatch.setattr("studies.forecasts.FAMILIES", ("cut_in",))
-    tiny = ForecastStudy(tasks="acc", seeds=1, train=3, test=2, fine_train=1, fine_test=1, parts=2)
-    tiny = replace(tiny, data=logs, task_train=6, task_test=6, calibration=6, rounds=10)
+    tiny = ForecastStudy(seeds=1, train=3, test=2, fine_train=1, fine_test=1, parts=2)
+    tiny = replace(tiny, data=logs, rounds=10)
     one = tiny.run(workers=1)
     rows = one["rows"].with_columns(skill=pl.when(method=BATCH).then(0.9).otherwise("skill"))
     page = tiny.page(one | {"rows": rows})

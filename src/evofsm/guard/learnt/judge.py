@@ -27,12 +27,10 @@ from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, Searchi
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import words
 from evofsm.guard.learnt.backups import basis
-from evofsm.guard.learnt.failure import AT, SAYS, B, I, are_sides
 from evofsm.guard.learnt.learn import disturbance_scale, learn
 from evofsm.guard.learnt.motion import used_at
 from evofsm.guard.learnt.rollout import (
     CUT_SHORT,
-    FAILS,
     KEPT,
     NO_LONGER,
     Floats,
@@ -40,7 +38,6 @@ from evofsm.guard.learnt.rollout import (
     Model,
     expected,
     pairs,
-    rollout,
     search,
     value_of,
 )
@@ -410,24 +407,6 @@ class LearntRisk(LearningJudge, SearchingJudge):
         count = math.inf if ends[0] < 0.0 else float(len(fails))
         steps = len(rest)
         return count, float(ends.min()), float(fails.max(initial=-1.0 - steps)) + 1.0 + steps
-
-    def fails_after(self, situation: Floats, plan: Floats) -> Floats:
-        """(1 + K,) steps after which a plan (T, a) fails, undisturbed and amid each disturbance.
-
-        Infinite where it does not; ``situation`` is an observation, its change, the action before.
-        """
-        assert self.parts is not None
-        model, still = self.parts.model, np.zeros(self.state.policies.shape[1:])
-        rest = residuals_of(self.state, model, len(plan))
-        value = rollout(model, situation[None], still, rest, 1.0, plan).value
-        return np.where(value < 0.0, value + len(plan) + 2.0, np.inf)
-
-    @property
-    def thresholds(self) -> Floats:
-        """(k, 3) variables, on which side they fail (1 or -1), and beyond what."""
-        forms = self.state.forms
-        sides = forms[are_sides(forms) & (forms[:, SAYS] == FAILS)]
-        return np.asarray(sides[:, [I, B, AT]])
 
     def _soon(self, exposure: float) -> float:
         """The horizon, as a share of the time in which all that is remembered was seen."""
