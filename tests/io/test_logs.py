@@ -17,7 +17,7 @@ from evofsm.cli.learning import warnings_of
 from evofsm.cli.options import reading_of
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import tables
-from evofsm.io.logs import LogColumns, Noted, Resample, episodes_of, read_traces, rows_of
+from evofsm.io.logs import LogColumns, Noted, Resample, episodes_of, read_traces
 from evofsm.io.tables import CsvTable, Wanted
 
 polars = pytest.importorskip("polars")
@@ -50,10 +50,11 @@ def read(*paths, noted=None, **columns):
 
 def together(*paths, noted=None, **columns):
     """Of all chunks as one: gaps, starts, failures."""
-    rows = list(rows_of(read(*paths, noted=noted, **columns)))
-    starts = [k for k, row in enumerate(rows) if row.begins]
-    fails = [k for k, row in enumerate(rows) if row.failed]
-    return [row.values["gap"] for row in rows], starts, fails
+    chunks = read(*paths, noted=noted, **columns)
+    gaps = np.concatenate([chunk.observations[:, 0] for chunk in chunks])
+    begins = [np.isin(np.arange(len(chunk.times)), chunk.starts) for chunk in chunks]
+    fails = np.concatenate([chunk.fails for chunk in chunks])
+    return gaps.tolist(), *(np.flatnonzero(x).tolist() for x in (np.concatenate(begins), fails))
 
 
 def refusal(*paths, **columns):

@@ -114,10 +114,9 @@ def learn(
         units = [unit_of.get(name, "") for name in encoder.names]
         return [SI.get(unit, unit) for unit in units]
 
-    log_chunks: list[Chunk] | None = [] if guard is not None and not acts else None
     with progress("Learning", sum(file["bytes"] for file in sources)) as move:  # type: ignore[misc]
-        traces = read.traces(files, notes, lambda count: move(advance=count))
-        chunks = traces if log_chunks is None else _kept(traces, log_chunks)
+        chunks: Iterable[Chunk] = read.traces(files, notes, lambda count: move(advance=count))
+        chunks = list(chunks) if guard is not None and not acts else chunks
         lesson = learn_traces(chunks, machine, actions, encoder.names, units_read)
     provenance = {"files": sources, "rows": lesson.read.rows, "episodes": lesson.read.episodes}
     provenance |= {"transitions": lesson.transitions, "failures": lesson.read.failures}
@@ -131,7 +130,7 @@ def learn(
     if guard is not None:
         assert kind is not None
         assert lesson.model.dt is not None
-        if log_chunks is None:
+        if acts:
             settings = kind, lesson.model.dt, brakes, tolerance
             new_guard = guard_of_log(*settings, actions, machine, encoder.names, lesson.model.units)
             with progress("Teaching the guard", lesson.read.rows) as move:
@@ -140,7 +139,7 @@ def learn(
                 warn(f"warning: in the later half of the log the guard {refusal}")
         else:
             requests = horizon, persist, false_a_day
-            episodes = [chunk for chunk in episodes_of(log_chunks) if len(chunk.times) > 1]
+            episodes = [chunk for chunk in episodes_of(chunks) if len(chunk.times) > 1]
             labels = Labels(names=encoder.names, units=lesson.model.units)
             new_guard = guard_where_nobody_acts(episodes, labels, *requests, lesson.machine)
         new_guard.save(guard, provenance)
@@ -292,13 +291,6 @@ def _is_looked_at(files: list[str], reading: Reading) -> bool:
 
     show_look(files, table)
     return True
-
-
-def _kept(chunks: Iterable[Chunk], kept: list[Chunk]) -> Iterator[Chunk]:
-    """The same chunks, which are kept."""
-    for chunk in chunks:
-        kept.append(chunk)
-        yield chunk
 
 
 # -- What came of it ------------------------------------------------------------------------------

@@ -537,41 +537,6 @@ def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         yield _joined(parts)
 
 
-class LoggedRow(NamedTuple):
-    """A row of a trace, for whoever decides on each."""
-
-    begins: bool  #: an episode
-    time: float  #: [s]
-    values: dict[str, float]  #: of the variables, by their names
-    action: float  #: taken after it, NaN where none is known
-    failed: bool  #: whether the episode ended with it in failure
-
-
-def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterator[LoggedRow]:
-    """The rows of chunks, one by one.
-
-    Parameters
-    ----------
-    chunks : iterable of Chunk
-        As `read_traces` yields them.
-    names : sequence of str
-        Of the variables: ``columns.observe.names``.
-
-    Examples
-    --------
-    >>> z, u = np.array([[9.0, 20.0, 19.0]]), np.array([-1.0])
-    >>> chunk = Chunk("a.csv", z, u, np.zeros(1), np.zeros(1, np.int64), dt=0.1)
-    >>> next(rows_of([chunk])).values
-    {'gap': 9.0, 'v_follower': 20.0, 'v_leader': 19.0}
-    """
-    for chunk in chunks:
-        begins = np.zeros(len(chunk.times), np.bool_)
-        begins[chunk.starts] = True
-        columns = (begins, chunk.times, chunk.observations, chunk.actions, chunk.fails)
-        for first, time, values, *rest in zip(*(a.tolist() for a in columns), strict=True):
-            yield LoggedRow(first, time, dict(zip(names, values, strict=True)), *rest)
-
-
 def _joined(parts: Sequence[Chunk]) -> Chunk:
     """Chunks as one; ``jumps`` are those of the last one."""
     before = np.cumsum([0, *(len(part.times) for part in parts[:-1])])
