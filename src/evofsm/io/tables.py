@@ -9,12 +9,11 @@ import os
 import re
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,6 @@ from evofsm.store import LARGEST_OBSERVATION
 if TYPE_CHECKING:
     import polars
 
-Item = TypeVar("Item")
 Numbers = dict[str, NDArray[np.float64]]
 Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag"]
 #: Called with the number of bytes each time some were read from a file.
@@ -450,15 +448,6 @@ class Dialect:
         return f"{count} fields, but the header names {named} {why}"
 
 
-def _ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """The same, each made by another thread while the one before is in use."""
-    with ThreadPoolExecutor(1) as pool:
-        future = pool.submit(next, items, None)
-        while (item := future.result()) is not None:
-            future = pool.submit(next, items, None)
-            yield item
-
-
 class CsvTable(Table):
     """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
 
@@ -541,11 +530,9 @@ class CsvTable(Table):
             raise ValueError(f"{self.path}, line {self._above}: {fault}")
         columns, behind = self.columns, False
         with Source(self.path, self._on_read, self.skips) as source:
-            for block, lines_before, series in _ahead(self._blocks(source, wanted)):
+            for block, lines_before in self._blocks(source):
                 here = partial(self._odd, block, lines_before, columns, wanted)
-                if columns != self.columns:  # as its blocks were read
-                    series = self._plain(block, columns, wanted)
-                anew = [0] if behind else []
+                series, anew = self._plain(block, columns, wanted), [0] if behind else []
                 if series is None:
                     odd = here()
                     columns, anew = odd.columns, anew + odd.anew
@@ -566,10 +553,8 @@ class CsvTable(Table):
                 if n_rows or anew:
                     yield wanted.piece(series, partial(self._find, here, wanted), self.skips, anew)
 
-    def _blocks(
-        self, source: Source, wanted: Wanted
-    ) -> Iterator[tuple[bytes, int, dict[str, polars.Series] | None]]:
-        """Lines of the file that are not all empty, how many were before, and what is in them."""
+    def _blocks(self, source: Source) -> Iterator[tuple[bytes, int]]:
+        """Lines of the file that are not all empty, and how many were before."""
         lines_before = 0
         while block := source.rows():
             if not block.isascii():
@@ -578,7 +563,7 @@ class CsvTable(Table):
                 block, lines_before = block.partition(b"\n")[2], lines_before + 1
             lines = _count(block, b"\n")
             if lines < len(block):
-                yield block, lines_before, self._plain(block, self.columns, wanted)
+                yield block, lines_before
             lines_before += lines
 
     def _plain(
