@@ -189,7 +189,7 @@ def _tables(
 ) -> Iterator[RenderableType]:
     days = found["seconds"] / 86400.0
     soon = f"an alarm is right if one comes within {span(found['horizon'])}"
-    text, rows, bold, worse = f"none: {why_none(judge)}", [], [], []
+    text, rows, bold, worse = f"none: {judge.alarm_in_words}", [], [], []
     for k, alarm in enumerate(found["alarms"]):
         row = [f"{alarm['stated']:g}"]
         for tally in (alarm["learnt"], alarm["plain"]):
@@ -238,18 +238,11 @@ def alarms_of(judge: Foresight, worse: Collection[int] = ()) -> Iterator[Rendera
     """What each alarm is, and how often it was right, beside plain thresholds but the worse."""
     places = []
     for rates, rate in judge.alarms.items():
-        plain = "" if rate in worse or judge.is_plain(rate) else judge.words(rate, plain=True)
-        beside = f"; plain thresholds would be {plain}" * bool(plain)
-        text = why_none(judge) if judge.held_out[0, 2] == 1.0 else judge.of(rate)
+        text, plain = judge.of(rate), judge.words(rate, plain=True)
+        is_said = rate in worse or text.startswith("plain thresholds do as well")
+        beside = f"; plain thresholds would be {plain}" * bool(plain and not is_said)
         places.append((rates, f"{text}{beside}"))
     yield facts("\nWhere they alarm, by false alarms a day", places)
-
-
-def why_none(judge: Foresight) -> str:
-    """Why there is no alarm."""
-    if judge.held_out[0, 2] == 1.0:
-        return "with one failure nothing can be cross-validated"
-    return "cross-validated, no alarm was better than chance"
 
 
 def _last(hits: Sequence[Any], what: str) -> str:

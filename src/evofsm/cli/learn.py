@@ -298,7 +298,6 @@ def _is_looked_at(files: list[str], reading: Reading) -> bool:
 
 def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
     """Where it is, what it takes, and what it reckons with."""
-    from evofsm.cli.foreseen import why_none
     from evofsm.guard import Foresight, LearntRisk
     from evofsm.guard.foresight import span
 
@@ -310,11 +309,12 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     yield f"The guard was saved to {path}. {takes}"
     if isinstance(guard.judge, Foresight):
         soon = f"up to {span(guard.judge.horizon * guard.judge.dt)} before a failure (--horizon)"
+        words = guard.judge.alarm_in_words
         if guard.judge.alarm is None:
-            why = why_none(guard.judge)
-            yield f"It never alarms: {why} (fewer columns, or a longer --horizon?)."
+            hint = " (fewer columns, or a longer --horizon?)" * ("chance" in words)
+            yield f"It never alarms: {words}{hint}."
         else:
-            yield f"{guard.judge.alarm_in_words.capitalize()} (--false-a-day), {soon}."
+            yield f"{words.capitalize()} (--false-a-day), {soon}."
         judges = "evofsm monitor LOG --summary, with the same options, judges such alarms held out"
         yield f"{judges}; evofsm inspect {path} prints its states."
         return

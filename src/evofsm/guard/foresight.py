@@ -409,10 +409,6 @@ class Foresight(LearningJudge):
         is_of_rate = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
         return np.asarray(self.limits[is_of_rate])
 
-    def is_plain(self, rate: int) -> bool:
-        """Whether plain thresholds do as well."""
-        return bool(self.held_out[rate, 3] == _PLAIN)
-
     def where(self, rate: int) -> Floats:
         """(r, SIZE) forms beyond which an alarm is on while nothing changes; `HELD` is how near."""
         m, forms = len(self.labels.names), []
@@ -519,9 +515,11 @@ class Foresight(LearningJudge):
 
     @property
     def alarm_in_words(self) -> str:
-        """Which alarm it is."""
+        """Which alarm it is, or why there is none."""
+        if self.held_out[0, 2] == 1.0:
+            return "with one failure nothing can be cross-validated"
         if self.alarm is None:
-            return "no alarm was better than chance"
+            return "cross-validated, no alarm was better than chance"
         fewest = ", as none is for fewer" * (RATES[self.alarm] > self.stated)
         return f"it alarms as for {RATES[self.alarm]:g} false alarms a day{fewest}"
 
@@ -560,7 +558,8 @@ class Foresight(LearningJudge):
         """What the alarm for one of `RATES` is, and how often it was right, in words."""
         right, false, failures, kind = self.held_out[rate].tolist()
         if kind == _NO_KIND:
-            return "no alarm is false so seldom and better than chance"
+            few = "no alarm is false so seldom and better than chance"
+            return self.alarm_in_words if failures == 1.0 else few
         plain = "plain thresholds do as well: " * (kind == _PLAIN)
         record = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
         return f"{plain}{self.words(rate)} ({record}, {_COUNTED})"
