@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from evofsm import EvolvingFSM, Guard
+from evofsm import Guard
 from evofsm.driving import Unrevised, guard_for_family, learners_of, load_family, teach
 
 
@@ -55,16 +55,6 @@ def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
 )
 def test_what_is_not_there_is_refused_in_one_line(refused, saved, arguments, says):
     assert says in refused("explain", saved[0], *arguments)
-
-
-def test_a_far_observation_is_never_seen(evofsm, tmp_path):
-    machine = EvolvingFSM(1)
-    machine.learn_many([[0.0], [5.0]] * 20, [0] * 40, range(0, 40, 2))
-    machine.save(tmp_path / "machine")
-    answer = evofsm("explain", tmp_path / "machine", "--observation", "500")
-    assert "Never seen" in answer.stdout
-    told = evofsm("explain", tmp_path / "machine", "--observation", "500", "--json").stdout
-    assert json.loads(told)["situations"][0]["never_seen"] is True
 
 
 def test_what_a_guard_has_learnt_is_said_and_drawn(evofsm, tmp_path):

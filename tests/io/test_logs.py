@@ -161,18 +161,6 @@ def test_any_table_is_read_as_python_s_own_reader_reads_it(
     assert [t for piece in pieces for t in piece.texts["a text"]] == [row[1] for row in wanted]
 
 
-def test_every_file_begins_an_episode_and_columns_that_tell_them_apart_may_be_named(tmp_path):
-    path = write(tmp_path / "a.csv", [*log(3), *log(3, "other", start=0.3)])
-    assert [chunk.starts.tolist() for chunk in read(path, path)] == [[0, 3], [0, 3]]
-    assert read(path, episode=["run"])[0].starts.tolist() == [0]
-
-
-def test_a_hole_in_time_begins_an_episode_and_is_counted(tmp_path):
-    parts = log(5), log(5, start=0.5), log(5, start=1.2), log(5, start=1.65)  # early, after 0.05 s
-    (chunk,) = read(write(tmp_path / "a.csv", [row for part in parts for row in part]))
-    assert (chunk.starts.tolist(), chunk.jumps) == ([0, 10, 15], 2)
-
-
 def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "_CSV_BYTES", 1 << 18)
 

@@ -84,13 +84,11 @@ def learn(
     Of a log whose columns nobody named, evofsm learn LOG prints what is in it, and what to ask.
     """
     from evofsm.cli.foreseen import alarms_of, guard_where_nobody_acts
-    from evofsm.cli.learning import guard_of_log, learn_traces, refusing, teach, warnings_of
-    from evofsm.driving.naming import UNITS, VARIABLES
-    from evofsm.fsm import Labels
-    from evofsm.guard import Foresight
+    from evofsm.cli.learning import learn_traces, refusing, teach, warnings_of
+    from evofsm.driving.assumed import guard_of_monitor
+    from evofsm.guard import ActionReviser, Foresight, Guard, LearntRisk, Mode
     from evofsm.io import episodes_of
     from evofsm.io.logs import Noted
-    from evofsm.io.tables import SI
 
     _check_out(out)
     _check_out(guard, "--guard")
@@ -108,16 +106,11 @@ def learn(
     kind = None if guard is None else _judge_of(judge if acts else "learnt", columns)
     notes = Noted()
     sources = [{"name": file, "bytes": _size(file)} for file in files]
-
-    def units_read() -> list[str]:
-        unit_of = {**dict(zip(VARIABLES, UNITS, strict=True)), **notes.units}
-        units = [unit_of.get(name, "") for name in encoder.names]
-        return [SI.get(unit, unit) for unit in units]
-
     with progress("Learning", sum(file["bytes"] for file in sources)) as move:  # type: ignore[misc]
         chunks: Iterable[Chunk] = read.traces(files, notes, lambda count: move(advance=count))
         chunks = list(chunks) if guard is not None and not acts else chunks
-        lesson = learn_traces(chunks, machine, actions, encoder.names, units_read)
+        units_of = partial(notes.si_units, encoder.names)
+        lesson = learn_traces(chunks, machine, actions, encoder.names, units_of)
     provenance = {"files": sources, "rows": lesson.read.rows, "episodes": lesson.read.episodes}
     provenance |= {"transitions": lesson.transitions, "failures": lesson.read.failures}
     provenance["read with"] = {k: v for k, v in given_of(reading).items() if k != "topics"}
@@ -128,11 +121,16 @@ def learn(
         lesson.model.save(out, provenance)
     new_guard = None
     if guard is not None:
-        assert kind is not None
         assert lesson.model.dt is not None
+        dt, labels = lesson.model.dt, lesson.model.labels
+        names, units = labels.names, labels.units
         if acts:
-            settings = kind, lesson.model.dt, brakes, tolerance
-            new_guard = guard_of_log(*settings, actions, machine, encoder.names, lesson.model.units)
+            if kind == "kinematic":
+                new_guard = guard_of_monitor(dt, brakes, tolerance)
+            else:
+                learnt = LearntRisk(dt, actions.low, actions.high, names=names, units=units)
+                reviser = ActionReviser(learnt, actions, tolerance=tolerance, mode=Mode.SHADOW)
+                new_guard = Guard.of(reviser, interval=dt, machine=machine.copy())
             with progress("Teaching the guard", lesson.read.rows) as move:
                 share = teach(new_guard, read.traces(files), lambda count: move(count))
             if refusal := refusing(share):
@@ -140,7 +138,6 @@ def learn(
         else:
             requests = horizon, persist, false_a_day
             episodes = [chunk for chunk in episodes_of(chunks) if len(chunk.times) > 1]
-            labels = Labels(names=encoder.names, units=lesson.model.units)
             new_guard = guard_where_nobody_acts(episodes, labels, *requests, lesson.machine)
         new_guard.save(guard, provenance)
     if as_json:
@@ -250,7 +247,8 @@ def _judge_of(judge: Judge | None, columns: LogColumns) -> Judge:
     if judge == "learnt" and columns.failed is None:
         raise ValueError(
             "--guard learns from failures, and which there were is not known: --failed COLUMN or "
-            "--failed 'gap<=0' says it; of cars in pairs --judge kinematic needs none"
+            "--failed 'gap<=0' says it (of times or last rows docs/logs.md makes one); of cars in "
+            "pairs --judge kinematic needs none"
         )
     return judge
 
@@ -338,6 +336,7 @@ def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, An
 
 
 def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
+    from evofsm.cli.learning import MOST_LEVELS, range_of
     from evofsm.fsm.rules import describe_rule
 
     read, actions = learning.read, learning.model.actions
@@ -352,6 +351,14 @@ def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
         text += f"; {read.clipped_below:,} below and {read.clipped_above:,} above "
         text += f"({n_beyond / read.rows:.1%} of rows) were put into the end intervals"
     text = text if n_beyond else f"{text}; none was beyond"
+    numbers = sorted(read.levels) if len(read.levels) <= MOST_LEVELS else []
+    places = [actions.encode(number) for number in numbers]
+    if len(numbers) > 1:
+        text += "; " + ", ".join(
+            f"{n:g} is a({k + 1})" for n, k in zip(numbers, places, strict=True)
+        )
+    if len({*places}) < len(places):
+        text += f": several are one action (--action-range {range_of(numbers)} tells them apart)"
     yield "actions", text if action else "none: nobody acts (--action '')"
     settings = describe_rule(learning.machine.rule)
     for name in ("radius", "spread"):  # which the rule may have itself

@@ -18,9 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving.naming import RANGES, VARIABLES
+from evofsm.driving.naming import UNITS as CAR_UNITS
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import vehicles
 from evofsm.io.tables import (
+    SI,
     TIMES,
     UNITS,
     CsvTable,
@@ -57,6 +59,9 @@ _FEWEST_VALUES = 5
 OLDEST = 0.5
 # Share by which the usual steps of two files may differ.
 _SAME_STEP = 0.05
+# Numbers that stand for none, where they are so many times as far out as all others of a column.
+_STAND_INS = [999, 9999, 99999, 999999, 32767, 32768, 65535, 2**31 - 1, 2**31, 2**32 - 1]
+_FAR_OUT = 3.0
 # Speeds [m/s] and usual steps [s] beyond these are most likely in another unit.
 _FASTEST, _LONGEST_USUAL = 60.0, 5.0
 # Two witnesses of one thing are compared in more rows than so, and where they go up and down
@@ -161,6 +166,11 @@ class Noted:
     failed_at_once: int = 0  #: of them, those with one row
     #: What a variable was whenever an episode failed at once, if always the same.
     at_once: dict[str, float] = field(default_factory=dict)
+
+    def si_units(self, names: Sequence[str]) -> list[str]:
+        """The units of columns as they were read: of the SI, if they have one there."""
+        told_units = dict(zip(VARIABLES, CAR_UNITS, strict=True)) | self.units
+        return [SI.get(unit, unit) for unit in (told_units.get(name, "") for name in names)]
 
     def see(self, chunk: Chunk, names: Sequence[str], *, first: bool = False) -> None:
         """Look for what is beyond belief; in the first rows also for what contradicts itself."""
@@ -488,13 +498,15 @@ def hours_unsaid(times: Floats, sample: str, before: float = 0.0) -> Floats:
     """(T,) how many hours more went by than dates [s] of a clock say that is put back and on.
 
     So is one without a zone, as the sample shows, in the night of some Sundays; a step is taken for
-    that if it is a usual one but for the hour. Before the first row so many hours were unsaid.
+    that if it is one of some rows but for the hour. Before the first row so many hours were unsaid.
     """
     steps, hours = np.diff(times), np.zeros(len(times))
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else math.nan
     odd = np.flatnonzero(are_unusual(steps, usual))
     for hour in (1, -1) if not _ZONE.search(sample) else ():
-        for row in odd[~are_unusual(steps[odd] + 3600.0 * hour, usual)] + 1:
+        later = steps[odd] + 3600.0 * hour  # of irregular rows a longer step
+        is_near = (later >= 0.0) & (later < (1800.0 if hour > 0 else min(12.0 * usual, 1800.0)))
+        for row in odd[is_near | ~are_unusual(later, usual)] + 1:
             at = datetime.fromtimestamp(times[row], UTC)
             if at.weekday() == 6 and at.hour < 4 and at.month in _CHANGES:
                 hours[row] = hour
@@ -504,6 +516,18 @@ def hours_unsaid(times: Floats, sample: str, before: float = 0.0) -> Floats:
     anew = np.append(False, steps < -86400.0)  # of another machine, perhaps
     latest = np.maximum.accumulate(np.where(anew, np.arange(len(times)), 0))
     return hours - np.where(latest > 0, hours[latest], 0.0)
+
+
+def are_stand_ins(values: Floats) -> Bools:
+    """(T,) which numbers stand for none, such as -9999 among those from 0 to 100.
+
+    >>> are_stand_ins(np.array([0.0, 1.0, -9999.0, 999.0, np.nan])).tolist()
+    [False, False, True, True, False]
+    """
+    size = np.abs(values)
+    are_likely = np.isin(size, _STAND_INS)
+    usual = size[~are_likely & np.isfinite(size)]
+    return np.asarray(are_likely & (size > _FAR_OUT * usual.max(initial=0.0)) & bool(usual.any()))
 
 
 def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
@@ -715,7 +739,7 @@ class _Clock:
             times = np.append(self._last, times[on])
         self._last = times[-1]
         first = steps[:_FIRST_ROWS]
-        if np.isnan(self._usual) and not (np.isnan(first).all() or self._resampled):
+        if np.isnan(self._usual) and not np.isnan(first).all():
             exact = -math.log10(np.spacing(np.nanmax(abs(times))))  # digits that times can have
             self._settle(round(float(np.nanmedian(first)), min(9, int(exact))))
         if self._longest:
@@ -742,6 +766,14 @@ class _Clock:
         return late
 
     def _settle(self, usual: float) -> None:
+        self._usual = usual
+        if self._resampled:
+            if usual > LONGEST_STEP * self.dt:
+                raise ValueError(
+                    f"{self._path} has a row every {usual:g} s, and --resample makes one every "
+                    f"{self.dt:g} s, of which most would be holes: --resample {usual:g}s at least"
+                )
+            return
         if usual <= 0.0:
             raise ValueError(
                 f"{self._path}: a row follows the one before within less than a nanosecond; the "
@@ -755,7 +787,6 @@ class _Clock:
                 f"{self.dt:g} s; a machine knows only one step: --resample "
                 f"{2.0 * max(usual, self.dt):g}s, or learn them apart"
             )
-        self._usual = usual
 
 
 class _Reader:
@@ -791,6 +822,10 @@ class _Reader:
         request, factors = self._wanted()
         last_chunk: Chunk | None = None  # until it is known whether its last row failed
         for piece in filter(attrgetter("rows"), self._table.pieces(request)):
+            if action not in self._observed and (odd := are_stand_ins(piece.numbers[action])).any():
+                for row in np.flatnonzero(odd).tolist():
+                    piece.skips.leave_out("stand-in", partial(piece.told, row, action), 0)
+                piece.numbers[action] = np.where(odd, np.nan, piece.numbers[action])
             for name, factor in factors.items():
                 piece.numbers[name] = piece.numbers[name] * factor
             if clock.ticks and not request.dates:
@@ -913,6 +948,7 @@ class _Reader:
                     )
         except ValueError as error:
             raise ValueError(f"{table.path}: {error}") from None
+        self._compare_units(column_units, numbers)
         self._noted.units |= column_units
         self._noted.untold += [name for name in numbers if name not in column_units]
         if not clock and is_number(table.first(columns.time)):
@@ -920,6 +956,19 @@ class _Reader:
         texts = [*self._episode, *categories, *term_texts]
         request = Wanted(numbers, texts, clock if is_dated else (), form)
         return request, {name: UNITS[unit] for name, unit in column_units.items() if unit in UNITS}
+
+    def _compare_units(self, units: Mapping[str, str], numbers: Sequence[str]) -> None:
+        """Raise where a column has a unit that is not that of the files before, as both tell."""
+        for name in {*numbers} & {*self._noted.units, *self._noted.untold}:
+            pair = now, before = units.get(name, ""), self._noted.units.get(name, "")
+            factor = UNITS.get(now or before, 1.0)
+            if len({SI.get(unit, unit) for unit in pair}) > 1 and (all(pair) or factor != 1.0):
+                remedy = f"--unit {quote(f'{name}={now or before}')} says one for all"
+                remedy = remedy if factor != 1.0 else "learn them apart"
+                raise ValueError(
+                    f"{self._table.path}: column {name!r} has {now or 'no unit'}, and "
+                    f"{before or 'no unit'} in the files before; {remedy}"
+                )
 
     def _times(self, piece: Piece, *, is_date: bool) -> Floats:
         if not self._clock.ticks:
