@@ -155,8 +155,9 @@ LOOKED_AT = {
 @pytest.mark.parametrize("names", LOOKED_AT)
 def test_what_a_first_look_proposes_reads_all_rows(evofsm, names):
     clock, part = LOOKED_AT[names]
-    rows = (f"{clock(k)},{k % 7 + 99 * (k in (297, 303))},{k == 300}" for k in range(600))
-    Path("log.csv").write_text("\n".join([f"{names},level,f", *rows]))
+    rows = (f"{clock(k)},{k % 7 + 99 * (k in (297, 303))}@5,{k == 300}" for k in range(600))
+    text = "\n".join([f"{names},level,f", *rows]).replace(",", ";")
+    Path("log.csv").write_text(text.replace("@", ","))  # decimal commas
     looked = evofsm("learn", "log.csv").stdout
     assert part in " ".join(looked.split())
     assert "--where" not in looked

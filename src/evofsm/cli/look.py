@@ -66,9 +66,10 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
     print("\nA way to learn from it:")
     if before and len(files) == 1:
         kind = "csv" if isinstance(table, CsvTable) else "parquet"
-        how = f", separator={table.separator!r}, infer_schema=False" * (kind == "csv")
+        mark, how = f", separator={table.separator!r}" * (kind == "csv"), ", infer_schema=False"
         files = [f"{Path(file).name.partition('.')[0]}-sorted.{kind}"]
-        code = f"p.read_{kind}({file!r}{how}){before}.write_{kind}({files[0]!r})"
+        read = f"p.read_{kind}({file!r}{mark}{how * bool(mark)})"
+        code = f"{read}{before}.write_{kind}({files[0]!r}{mark})"
         print(f"  python -c {in_quotes(f'import polars as p; {code}')}")
     command = [f"evofsm learn {' '.join(map(quote, files))}"]
     command += (f"{name} {in_quotes(value)}" for name, value in options)
