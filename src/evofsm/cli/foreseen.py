@@ -123,11 +123,10 @@ def _of_two_rows(episodes: Sequence[Chunk]) -> Sequence[Chunk]:
 
 def _document(judge: Foresight, runs: Runs, times: Floats, columns: Floats) -> dict[str, Any]:
     own_rate, alarms, limits = judge.alarm, [], []
-    options = {"columns": columns, "early": _early(judge, runs, times)}
     for rate, budget in enumerate(RATES):
         row: dict[str, Any] = {"stated": budget, "is_own": rate == own_rate}
         for kind, plain in (("learnt", None), ("plain", True)):
-            tally, _ = judge.tally(runs, rate, plain=plain, **options)
+            tally, _ = judge.tally(runs, rate, plain=plain, columns=columns)
             row[kind] = {**tally._asdict(), "false_a_day": tally.rate}
         alarms.append(row)
         row = {"stated": budget, "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 3])]}
@@ -147,12 +146,6 @@ def _document(judge: Foresight, runs: Runs, times: Floats, columns: Floats) -> d
     fails = [dict(zip(("where", "came", "failed"), row, strict=True)) for row in judge.fails(runs)]
     tables = {"alarms": alarms, "limits": limits, "fails": fails}
     return {**head, **tables, "listed": hits, "missed": misses}
-
-
-def _early(judge: Foresight, runs: Runs, times: Floats) -> Floats:
-    """(E,) how much sooner than a step after the row before each episode failed [rows]."""
-    steps = (times[runs.last] - times[runs.last - 1]) / judge.dt
-    return np.where(runs.failed, np.clip(1.0 - steps, 0.0, 1.0), 0.0)
 
 
 def _listed(

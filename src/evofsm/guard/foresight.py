@@ -429,7 +429,6 @@ class Foresight(LearningJudge):
         *,
         plain: bool | None = None,
         columns: Floats | None = None,
-        early: ArrayLike = 0.0,
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,).
 
@@ -441,8 +440,6 @@ class Foresight(LearningJudge):
             Whether it is that of plain thresholds; by default of the kind that did better.
         columns : ndarray, optional
             The `columns` of the log, if they are known.
-        early : (E,) array_like, optional
-            How much sooner than its row each failure came [rows].
         """
         limits = self.of_rate(rate, plain=plain)
         columns = self.columns(log) if columns is None else columns
@@ -450,7 +447,7 @@ class Foresight(LearningJudge):
         leads, rows = np.zeros(len(log.starts)), np.flatnonzero(on)
         false = _tally(above, on, rows, log.starts, log.failed, self._spans, leads)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
-        lead = float(np.maximum(leads - np.asarray(early), 0.0).sum()) / max(n, 1) * self.dt
+        lead = float(leads.sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
 
     def words(self, rate: int, *, plain: bool | None = None) -> str:
