@@ -68,7 +68,6 @@ OPTIONS = {
     ),
     "km/h": (table(v_leader=lambda k: 70 + k / 9), "", r"\? (--unit v_leader=km/h) converts", ""),
     "ms": (table(time=lambda k: 100 * k), "", r"\? (--unit time=ms) converts", ""),
-    "us": (table(time=lambda k: 100_000 * k), "", r"\? (--unit time=us) converts", ""),
     "ns": (table(time=lambda k: EPOCH + 10**8 * k), "", r"\? (--unit time=ns) converts", ""),
     "called km/h": (
         *(table("time,ego_kmh,u"), "--observe ego_kmh --action u"),
