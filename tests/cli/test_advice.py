@@ -113,8 +113,6 @@ def test_an_option_that_is_advised_mends_it(evofsm, log, how, where, value):
 
 def test_an_option_that_is_too_much_is_left_out(evofsm):
     Path("drive.csv").write_text(table())
-    told = said(evofsm("learn", "drive.csv", "--dt", 1))
-    assert "0.1: without --dt that column is the clock" in told
     assert evofsm("learn", "drive.csv").stderr == ""
     Path("fcd.xml").write_text(beside(0, 0, 0))
     asked = "learn", "fcd.xml", "--failed", "crash"

@@ -69,8 +69,6 @@ def test_a_dead_end_is_marked_by_its_shape_and_in_words(model):
 
 
 def test_what_cannot_be_drawn_or_is_no_process_is_refused(model):
-    with pytest.raises(ValueError, match="least is 2"):
-        to_dot(model, least=2)
     with pytest.raises(ValueError, match=r"state is 99; there are states 0 to 6"):
         to_dot(model, dead_ends=[0, 99])
     empty = EvolvingFSM(n_actions=1, radius=0.5)

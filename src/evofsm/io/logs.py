@@ -561,6 +561,32 @@ def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         yield _joined(parts)
 
 
+class LoggedRow(NamedTuple):
+    """A row of a trace, for whoever decides on each."""
+
+    begins: bool  #: an episode
+    time: float  #: [s]
+    values: dict[str, float]  #: of the variables, by their names
+    action: float  #: taken after it, NaN where none is known
+    failed: bool  #: whether the episode ended with it in failure
+
+
+def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterator[LoggedRow]:
+    """The rows of chunks, one by one; names are ``columns.observe.names``.
+
+    >>> z, u = np.array([[9.0, 20.0, 19.0]]), np.array([-1.0])
+    >>> chunk = Chunk("a.csv", z, u, np.zeros(1), np.zeros(1, np.int64), dt=0.1)
+    >>> next(rows_of([chunk])).values
+    {'gap': 9.0, 'v_follower': 20.0, 'v_leader': 19.0}
+    """
+    for chunk in chunks:
+        begins = np.zeros(len(chunk.times), np.bool_)
+        begins[chunk.starts] = True
+        columns = (begins, chunk.times, chunk.observations, chunk.actions, chunk.fails)
+        for first, time, values, *rest in zip(*(a.tolist() for a in columns), strict=True):
+            yield LoggedRow(first, time, dict(zip(names, values, strict=True)), *rest)
+
+
 def _joined(parts: Sequence[Chunk]) -> Chunk:
     """Chunks as one; ``jumps`` are those of the last one."""
     before = np.cumsum([0, *(len(part.times) for part in parts[:-1])])
@@ -951,8 +977,6 @@ class _Reader:
         self._compare_units(column_units, numbers)
         self._noted.units |= column_units
         self._noted.untold += [name for name in numbers if name not in column_units]
-        if not clock and is_number(table.first(columns.time)):
-            numbers.append(columns.time)  # to be compared with --dt
         texts = [*self._episode, *categories, *term_texts]
         request = Wanted(numbers, texts, clock if is_dated else (), form)
         return request, {name: UNITS[unit] for name, unit in column_units.items() if unit in UNITS}
@@ -972,8 +996,6 @@ class _Reader:
 
     def _times(self, piece: Piece, *, is_date: bool) -> Floats:
         if not self._clock.ticks:
-            if self._before == 0:
-                self._compare_dt(piece)
             rows = np.arange(self._before, self._before + piece.rows)
             return rows * np.float64(self._clock.dt)
         times = np.where(piece.bad, np.nan, piece.numbers[self._columns.time])
@@ -992,18 +1014,6 @@ class _Reader:
             )
         self._last_date, self._hours = times[-1], hours[-1]
         return (times - self._first_date) * _MICROSECOND + 3600.0 * hours[1:]
-
-    def _compare_dt(self, piece: Piece) -> None:
-        """Say where a clock that is not read says something else than --dt."""
-        time, dt = self._columns.time, self._clock.dt
-        steps = np.diff(piece.numbers.get(time, np.zeros(0)))
-        step = float(np.median(steps)) if len(steps) else np.nan
-        units = (1.0, 1e-3, 1e-6, 1e-9)
-        if step > 0.0 and not any(abs(step * unit / dt - 1.0) < _SAME_STEP for unit in units):
-            self._noted.told.append(
-                f"{self._table.path}: --dt says {dt:g} s from a row to the next, and column "
-                f"{time!r} goes on by {step:g}: without --dt that column is the clock"
-            )
 
     def _starts(self, piece: Piece) -> Bools:
         """The rows that begin another episode, of which all rows have to stand together."""
