@@ -277,12 +277,12 @@ def _is_looked_at(files: list[str], reading: Reading) -> bool:
     """Whether nobody said what is observed in a log of no cars; then what it holds was printed."""
     from evofsm.driving.naming import VARIABLES
     from evofsm.io.logs import open_table
-    from evofsm.io.tables import CsvTable, ParquetTable, Skips, silent
+    from evofsm.io.tables import CsvTable, ParquetTable, Skips
 
     columns = reading.columns
     if columns.observe.names != VARIABLES:
         return False
-    table = open_table(files[0], columns, reading.lengths, silent, reading.topics, Skips(), [])
+    table = open_table(files[0], columns, reading.lengths, reading.topics, Skips())
     if not isinstance(table, CsvTable | ParquetTable) or {*VARIABLES} & {*table.columns}:
         return False
     from evofsm.cli.look import show_look

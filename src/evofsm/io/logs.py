@@ -463,8 +463,8 @@ def read_traces(
     for path in paths:
         clock.open(path)
         rows, left_out = 0, notes.leaderless + notes.elsewhere
-        skips = Skips(columns.skip_bad, notes.skipped)
-        table = open_table(path, columns, lengths, on_read, topics, skips, notes.told)
+        skips = Skips(columns.skip_bad, notes.skipped, notes.told, on_read)
+        table = open_table(path, columns, lengths, topics, skips)
         file_columns = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
         chunks = _Reader(table, file_columns, clock, notes).chunks()
         if file_columns.longest_hole:
@@ -671,10 +671,8 @@ def open_table(
     path: str,
     columns: LogColumns,
     lengths: VehicleLengths,
-    on_read: OnRead,
     topics: Topics | None,
     skips: Skips,
-    told: list[str],
 ) -> Table:
     """The rows of a file, whatever it holds."""
     kind = file_kind(path)
@@ -686,23 +684,20 @@ def open_table(
             )
         from evofsm.io.rosbag import BagTable
 
-        return BagTable(path, topics, on_read, skips, told)
+        return BagTable(path, topics, skips)
     moments = None
     if kind in ("osi", "mcap"):
         read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap
-        moments = vehicles.pairs_of_scenes(path, read(path, on_read, skips), skips)
+        moments = vehicles.pairs_of_scenes(path, read(path, skips), skips)
     elif kind == "xml":
-        steps = vehicles.fcd_of_xml(path, on_read, skips)
+        steps = vehicles.fcd_of_xml(path, skips)
         moments = vehicles.pairs_of_fcd(path, steps, lengths, skips)
     if moments is not None:
         return PairTable(path, moments, skips)
     log_names = {*columns.observe.names, columns.action, columns.time}
     names = log_names.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
-    table: Table = (
-        CsvTable(path, on_read, names, skips)
-        if kind == "csv"
-        else ParquetTable(path, on_read, skips)
-    )
+    is_csv = kind == "csv"
+    table: Table = CsvTable(path, names, skips) if is_csv else ParquetTable(path, skips)
     there = set(table.columns)
     if set(columns.observe.names) <= there:
         return table
