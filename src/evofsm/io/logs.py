@@ -762,7 +762,9 @@ class _Clock:
         first = steps[:_FIRST_ROWS]
         if np.isnan(self._usual) and not np.isnan(first).all():
             exact = -math.log10(np.spacing(np.nanmax(abs(times))))  # digits that times can have
-            self._settle(round(float(np.nanmedian(first)), min(9, int(exact))))
+            # Some stand still for a while, and write less then: of means only what no step fits.
+            usual = float(np.nanquantile(first, 0.1 if self._resampled else 0.5))
+            self._settle(round(usual, min(9, int(exact))))
         if self._longest:
             return np.asarray(steps > self._longest), late
         return are_unusual(steps, self._usual), late
