@@ -70,6 +70,8 @@ def test_it_is_said_which_number_is_which_action_and_which_is_none(
     said = ", ".join(f"{number} is a({k + 1})" for k, number in enumerate(numbers))
     assert f"none was beyond; {said}" in " ".join(told.stdout.split())
     assert "warning: 5 numbers of the action are far from all others" in told.stderr
+    left_out = evofsm(*read, between, "--no-leader", "cmd==-9999")  # as who knows them says
+    assert ("5 rows: a number" in left_out.stdout, left_out.stderr) == (True, "")
     together = evofsm(*read, f"{numbers[0] - 1}:99:50").stdout
     assert f"several are one action (--action-range {between}" in " ".join(together.split())
 

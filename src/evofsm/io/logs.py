@@ -843,9 +843,11 @@ class _Reader:
     def chunks(self) -> Iterator[Chunk]:
         action, clock = self._columns.action, self._clock
         request, factors = self._wanted()
+        terms = [term for condition in self._conditions.values() for term in condition.terms]
+        uses = {*self._observed, *(term.column for term in terms)}  # who compares knows better
         last_chunk: Chunk | None = None  # until it is known whether its last row failed
         for piece in filter(attrgetter("rows"), self._table.pieces(request)):
-            if action not in self._observed and (odd := are_stand_ins(piece.numbers[action])).any():
+            if action not in uses and (odd := are_stand_ins(piece.numbers[action])).any():
                 for row in np.flatnonzero(odd).tolist():
                     piece.skips.leave_out("stand-in", partial(piece.told, row, action), 0)
                 piece.numbers[action] = np.where(odd, np.nan, piece.numbers[action])
