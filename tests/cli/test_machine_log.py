@@ -4,9 +4,10 @@ import json
 import random
 import re
 import shlex
-from datetime import UTC
+from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
+from zoneinfo import ZoneInfo
 
 import pytest
 
@@ -159,6 +160,54 @@ def test_a_first_look_says_what_is_odd_in_a_log(evofsm, refused):
     assert "say what is observed in odd.csv" in unsaid.stderr
 
 
+def test_a_later_file_is_read_by_its_own_header_or_refused_with_what_differs(evofsm, refused):
+    def write(name, header="t,heat,u\n", row="{t},{heat}.5,{u}\n", step=1):
+        rows = (row.format(t=step * k, heat=k % 50, u=k % 3) for k in range(200))
+        Path(f"{name}.csv").write_text("".join([header, *rows]))
+
+    def learn(files, *words, how=evofsm):
+        return how("learn", *files, "--observe", "heat", "--time", "t", "--action", "u", *words)
+
+    write("a")
+    write("own", "u;note;heat;t\n", "{u};on;{heat},5;{t}\n")
+    write("lacks", "t,u\n", "{t},{u}\n")
+    write("slow", step=60)
+    for unit in ("mm", "cm", "degC", "degF"):
+        write(unit, f"t,heat,u\ns,{unit},-\n")
+    same, own = (json.loads(learn(["a.csv", f], "--json").stdout) for f in ("a.csv", "own.csv"))
+    assert own["model"]["states"] == same["model"]["states"]
+    assert learn(["mm.csv", "cm.csv"]).exit_code == 0
+    for first, other, words, fault in (
+        ("a", "lacks", (), "lacks.csv has no column 'heat'"),
+        ("a", "slow", (), "slow.csv has a row every 60 s, but a.csv has one every 1 s"),
+        ("a", "slow", ("--resample", "2s"), "row every 60 s, and --resample makes one every 2 s"),
+        ("degC", "degF", (), "degF.csv: column 'heat' has degF, and degC in the files before"),
+        ("a", "mm", (), "mm.csv: column 'heat' has mm, and no unit in the files before"),
+        ("mm", "a", (), "no unit, and mm in the files before; --unit heat=mm says one for all"),
+    ):
+        assert fault in learn([f"{first}.csv", f"{other}.csv"], *words, how=refused)
+    assert learn(["mm.csv", "a.csv"], "--unit", "heat=mm").exit_code == 0
+
+
+@pytest.mark.parametrize("month", [3, 10])
+def test_local_time_of_irregular_rows_runs_on_where_summer_time_changes(evofsm, month):
+    chance, rows = random.Random(1), []
+    at = datetime(2025, month, 29 if month == 3 else 25, 23, 30, tzinfo=UTC)
+    for k in range(1500):
+        at += timedelta(seconds=5 + chance.uniform(-3, 3) + 30 * (chance.random() < 0.02))
+        local = at.astimezone(ZoneInfo("Europe/Berlin"))
+        rows.append(f"{local:%d.%m.%Y %H:%M:%S};{k % 9};{int(k == 1400)}")
+    Path("night.csv").write_text("\n".join(["Zeit;heat;trip", *rows]))
+    assert f"ends or begins 2025-{month}" in evofsm("learn", "night.csv").stdout.replace(
+        "-03", "-3"
+    )
+    asked = "--observe", "heat", "--action", "", "--time", "Zeit", "--failed", "trip"
+    told = evofsm("learn", "night.csv", *asked, "--resample", "20s", "--hole", "1min")
+    (line,) = told.stderr.splitlines()
+    assert "summer time ends or begins; hours run on there" in line
+    assert "time jumps" not in told.stdout
+
+
 def test_failures_right_after_a_hole_are_counted_wherever_others_are(evofsm):
     chance, time, rows = random.Random(1), 0, []
     for run in range(24):
@@ -185,6 +234,19 @@ def test_failures_right_after_a_hole_are_counted_wherever_others_are(evofsm):
         assert re.search(rf"Alarms: (all|the last 12 of) {len(found['listed'])}\n", told.stdout)
         for stderr in (learnt.stderr, told.stderr):
             assert "12 of 24 failures came right after a hole or standstill: what led" in stderr
+
+
+def test_an_alarm_that_came_long_before_counts_once_in_each_horizon(evofsm):
+    chance, rows = random.Random(1), ["run,t,heat,trip"]
+    for run, k in ((run, k) for run in range(20) for k in range(300)):
+        rises = run % 2 * max(0, k - (80 if run == 17 else 200)) / 20
+        heat = f"{5 + rises + chance.gauss(0, 0.2):.2f}"
+        rows.append(f"{run},{60 * (k + 1000 * run)},{heat},{int(run % 2 and k == 299)}")
+    Path("wear.csv").write_text("\n".join(rows))
+    asked = "--observe", "heat", "--action", "", "--time", "t", "--failed", "trip"
+    told = evofsm("monitor", "wear.csv", "--summary", *asked, "--horizon", 1200).stdout
+    assert "; one that stays on counts anew each 20 min" in " ".join(told.split())
+    assert re.findall(r"^(\d+) .* h  yes, the last of [78] ", told, re.M) == ["6"]
 
 
 def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(evofsm):

@@ -103,6 +103,8 @@ def test_one_failure_is_learnt_from_and_of_alarms_the_closest_that_there_is_coun
     for runs in ([rising], [rising * 0.5, rising]):
         one = Foresight.learn_log(runs, [run.max() == 1.0 for run in runs], dt=DT)
         assert one.alarm is None  # cross-validated it was never right
+        for words in (one.alarm_in_words, one.of(0), one.told_by_experience):
+            assert "with one failure nothing can be cross-validated" in words
     judge = copy.deepcopy(surge)
     judge.held_out = np.array([[0, 0, 4, 2], [3, 1, 4, 0], [2, 2, 4, 1], [4, 4, 4, 0]])
     for judge.stated, alarm in ((0.05, 1), (0.1, 1), (0.3, 1), (1.0, 2), (2.0, 2), (9.0, 3)):

@@ -16,8 +16,8 @@ _KEEP = (
     "Keep the head where the log is not. Without it (--head) neither an end that is cut off nor a "
     "log that is written anew can be detected."
 )
-# So many fields that differ are shown, and so much of each.
-_FIELDS, _LETTERS = 5, 40
+# So many fields that differ are shown.
+_FIELDS = 5
 
 
 def audit(
@@ -86,7 +86,7 @@ def _of_replay(found: Audit) -> Iterator[tuple[str, str]]:
     else:
         yield "replay", f"DIFFERS at record {difference.record}: {difference.explanation}"
         for name, original, replay in difference.fields[:_FIELDS]:
-            yield "", f"{name}: recorded {_short(original)}, replayed {_short(replay)}"
+            yield "", f"{name}: recorded {original}, replayed {replay}"
         yield "", f"before it {text}"
     for why in dict.fromkeys(found.not_replayed):
         yield "", f"{counted(found.not_replayed.count(why), 'session')} not replayed: {why}"
@@ -95,7 +95,3 @@ def _of_replay(found: Audit) -> Iterator[tuple[str, str]]:
     if difference is not None and found.other_makers:
         makers = ", ".join(f"{field.name} {field.recorded}" for field in found.other_makers)
         yield "", f"it was recorded with {makers}: floats may differ there"
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= _LETTERS else f"{text[: _LETTERS - 3]}..."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +18,6 @@ from evofsm.fsm.validation import counted
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
 from evofsm.guard.foresight import DATES, RATE, RATES, Runs, false_times, span
 from evofsm.io import Chunk
-from evofsm.io.tables import SI
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,8 +46,8 @@ def guard_where_nobody_acts(
     """A guard that alarms before failures, as it was learnt from the episodes of a log."""
     rows, failed = [e.observations for e in episodes], [e.failed for e in episodes]
     settings: dict[str, Any] = {"dt": float(episodes[0].dt), "horizon": horizon, "hold": hold}
-    names, units = labels.names, labels.units
-    judge = Foresight.learn_log(rows, failed, **settings, names=names, units=units)
+    settings |= {"names": labels.names, "units": labels.units}
+    judge = Foresight.learn_log(rows, failed, **settings)
     return _guard_of(judge, false_a_day, machine, learn=False)
 
 
@@ -74,7 +73,7 @@ def show_foreseen(
     episodes: Sequence[Chunk],
     guard: Guard | None,
     names: Sequence[str],
-    units: Mapping[str, str],
+    units: Sequence[str],
     asked: tuple[float | None, float, float | None],
     split: float,
     plot: Path | None,
@@ -83,8 +82,7 @@ def show_foreseen(
 ) -> None:
     """Say what came of the alarms of a guard, or of one that learns from the log's first part.
 
-    Units are those that the log told of its columns. What is asked for are the horizon, the hold
-    time and false alarms a day.
+    What is asked for are the horizon, the hold time and false alarms a day.
     """
     title, held_out = str(file), "; not held out, if this guard learnt from them"
     if guard is None:
@@ -96,8 +94,7 @@ def show_foreseen(
             if not any(e.failed for e in (*first_part, *episodes)):
                 why = "no episode failed, so there is nothing to foresee (--failed says what did)"
             raise ValueError(f"{file}: {why}")
-        si_units = [SI.get(unit, unit) for unit in (units.get(name, "") for name in names)]
-        labels = Labels(names=tuple(names), units=tuple(si_units))
+        labels = Labels(names=tuple(names), units=tuple(units))
         guard = guard_where_nobody_acts(first_part, labels, *asked)
         learnt_from = "episode" if first == 1 else f"{len(first_part):,} episodes"
         title += f": learnt from its first {learnt_from}, judged by the rest"
@@ -126,11 +123,10 @@ def _of_two_rows(episodes: Sequence[Chunk]) -> Sequence[Chunk]:
 
 def _document(judge: Foresight, runs: Runs, times: Floats, columns: Floats) -> dict[str, Any]:
     own_rate, alarms, limits = judge.alarm, [], []
-    options = {"columns": columns, "early": _early(judge, runs, times)}
     for rate, budget in enumerate(RATES):
         row: dict[str, Any] = {"stated": budget, "is_own": rate == own_rate}
         for kind, plain in (("learnt", None), ("plain", True)):
-            tally, _ = judge.tally(runs, rate, plain=plain, **options)
+            tally, _ = judge.tally(runs, rate, plain=plain, columns=columns)
             row[kind] = {**tally._asdict(), "false_a_day": tally.rate}
         alarms.append(row)
         row = {"stated": budget, "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 3])]}
@@ -150,12 +146,6 @@ def _document(judge: Foresight, runs: Runs, times: Floats, columns: Floats) -> d
     fails = [dict(zip(("where", "came", "failed"), row, strict=True)) for row in judge.fails(runs)]
     tables = {"alarms": alarms, "limits": limits, "fails": fails}
     return {**head, **tables, "listed": hits, "missed": misses}
-
-
-def _early(judge: Foresight, runs: Runs, times: Floats) -> Floats:
-    """(E,) how much sooner than a step after the row before each episode failed [rows]."""
-    steps = (times[runs.last] - times[runs.last - 1]) / judge.dt
-    return np.where(runs.failed, np.clip(1.0 - steps, 0.0, 1.0), 0.0)
 
 
 def _listed(
@@ -188,8 +178,11 @@ def _tables(
     found: dict[str, Any], judge: Foresight, title: str, held_out: str
 ) -> Iterator[RenderableType]:
     days = found["seconds"] / 86400.0
-    soon = f"an alarm is right if one comes within {span(found['horizon'])}"
-    text, rows, bold, worse = f"none: {why_none(judge)}", [], [], []
+    horizon = span(found["horizon"])
+    soon = f"an alarm is right if one comes within {horizon}"
+    if any(hit["false"] > 1 - hit["failed"] for hit in found["listed"]):
+        soon += f"; one that stays on counts anew each {horizon}"
+    text, rows, bold, worse = f"none: {judge.alarm_in_words}", [], [], []
     for k, alarm in enumerate(found["alarms"]):
         row = [f"{alarm['stated']:g}"]
         for tally in (alarm["learnt"], alarm["plain"]):
@@ -221,8 +214,9 @@ def _tables(
         yield table("\nWhere it fails, as it was learnt", header, rows)
     rows = []
     for hit in found["listed"][-_LISTED:]:
-        false = {0: [], 1: ["no"]}.get(hit["false"], [f"{hit['false']} times no"])
-        failed = ", then ".join([*false, *["yes"] * hit["failed"]])
+        times, failed = hit["false"] + hit["failed"], "yes" if hit["failed"] else "no"
+        if times > 1:
+            failed += f", the last of {times}" if hit["failed"] else f", {times} times"
         why = hit["reason"].partition("; after")[0]
         rows.append([f"{hit['episode'] + 1}", date(hit["time"]), span(hit["lasts"]), failed, why])
     if rows:
@@ -238,18 +232,11 @@ def alarms_of(judge: Foresight, worse: Collection[int] = ()) -> Iterator[Rendera
     """What each alarm is, and how often it was right, beside plain thresholds but the worse."""
     places = []
     for rates, rate in judge.alarms.items():
-        plain = "" if rate in worse or judge.is_plain(rate) else judge.words(rate, plain=True)
-        beside = f"; plain thresholds would be {plain}" * bool(plain)
-        text = why_none(judge) if judge.held_out[0, 2] == 1.0 else judge.of(rate)
+        text, plain = judge.of(rate), judge.words(rate, plain=True)
+        is_said = rate in worse or text.startswith("plain thresholds do as well")
+        beside = f"; plain thresholds would be {plain}" * bool(plain and not is_said)
         places.append((rates, f"{text}{beside}"))
     yield facts("\nWhere they alarm, by false alarms a day", places)
-
-
-def why_none(judge: Foresight) -> str:
-    """Why there is no alarm."""
-    if judge.held_out[0, 2] == 1.0:
-        return "with one failure nothing can be cross-validated"
-    return "cross-validated, no alarm was better than chance"
 
 
 def _last(hits: Sequence[Any], what: str) -> str:

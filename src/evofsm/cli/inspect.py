@@ -6,7 +6,7 @@ import math
 import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.options import Json, Saved, option, picture, quoted, reading_of, typed
 from evofsm.cli.show import facts, print_json, say, show, table
@@ -65,6 +65,7 @@ def load_model(place: Path) -> tuple[FSMModel, Header, Guard | None]:
     """A model from wherever one was left, what its file says of itself, and the guard it is of."""
     from evofsm import store
     from evofsm.driving import FAMILIES, load_family
+    from evofsm.fsm.actions import IntervalActions
     from evofsm.fsm.machine import EvolvingFSM
     from evofsm.fsm.model import FSMModel
     from evofsm.fsm.naming import Labels
@@ -89,6 +90,8 @@ def load_model(place: Path) -> tuple[FSMModel, Header, Guard | None]:
     if not machine.n_states:
         raise ValueError(f"{place} has seen nothing yet: an episode has to be over")
     labels = getattr(guard and guard.judge, "labels", Labels())
+    if isinstance(actions := getattr(guard and guard.reviser, "actions", None), IntervalActions):
+        labels = labels._replace(actions=actions)
     if family in FAMILIES:
         labels = load_family(family).labels
     return machine.model(**labels._asdict()), header, guard
@@ -139,18 +142,12 @@ def _draw(model: FSMModel, guard: Guard | None, out: Path, logged: Any, title: s
 # -- As a whole -----------------------------------------------------------------------------------
 
 
-class Passage(NamedTuple):
-    """A transition from one state to another."""
+def passages(model: FSMModel) -> list[dict[str, Any]]:
+    """The transitions between states that were recognised most often.
 
-    origin: int  #: state
-    target: int  #: state
-    times: int  #: steps in which the recognised state went from the one to the other
-    share: float  #: of the steps from the state of origin
-    learnt: float  #: probability per step that the matrices give, actions as often as used
-
-
-def passages(model: FSMModel) -> list[Passage]:
-    """The transitions between states that were recognised most often."""
+    Their share is that of all steps from the state of origin; what was learnt is the probability
+    per step that the matrices give, actions as often as they were used.
+    """
     import numpy as np
 
     counts = model.changes - np.diag(np.diag(model.changes))
@@ -159,7 +156,8 @@ def passages(model: FSMModel) -> list[Passage]:
     most_first = np.argsort(-counts, axis=None, kind="stable")[:_PASSAGES].tolist()
     places = (divmod(place, model.n_states) for place in most_first)
     return [
-        Passage(i, j, int(counts[i, j]), float(counts[i, j] / steps[i]), float(learnt[i, j]))
+        {"origin": i, "target": j, "times": int(counts[i, j])}
+        | {"share": float(counts[i, j] / steps[i]), "learnt": float(learnt[i, j])}
         for i, j in places
         if counts[i, j] > 0.0
     ]
@@ -214,7 +212,7 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
         return
     rows = [
         (f"#{i + 1} → #{j + 1}", f"{times:,}", f"{share:.4f}", f"{learnt:.3f}")
-        for i, j, times, share, learnt in transitions
+        for i, j, times, share, learnt in map(dict.values, transitions)
     ]
     title = f"Transitions that matter: the {len(transitions)} most frequent"
     yield table(title, ("from → to", "times", "share", "learnt"), rows)

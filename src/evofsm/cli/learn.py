@@ -84,13 +84,11 @@ def learn(
     Of a log whose columns nobody named, evofsm learn LOG prints what is in it, and what to ask.
     """
     from evofsm.cli.foreseen import alarms_of, guard_where_nobody_acts
-    from evofsm.cli.learning import guard_of_log, learn_traces, refusing, teach, warnings_of
-    from evofsm.driving.naming import UNITS, VARIABLES
-    from evofsm.fsm import Labels
-    from evofsm.guard import Foresight
+    from evofsm.cli.learning import learn_traces, refusing, teach, warnings_of
+    from evofsm.driving.assumed import guard_of_monitor
+    from evofsm.guard import ActionReviser, Foresight, Guard, LearntRisk, Mode
     from evofsm.io import episodes_of
     from evofsm.io.logs import Noted
-    from evofsm.io.tables import SI
 
     _check_out(out)
     _check_out(guard, "--guard")
@@ -108,17 +106,11 @@ def learn(
     kind = None if guard is None else _judge_of(judge if acts else "learnt", columns)
     notes = Noted()
     sources = [{"name": file, "bytes": _size(file)} for file in files]
-
-    def units_read() -> list[str]:
-        unit_of = {**dict(zip(VARIABLES, UNITS, strict=True)), **notes.units}
-        units = [unit_of.get(name, "") for name in encoder.names]
-        return [SI.get(unit, unit) for unit in units]
-
-    log_chunks: list[Chunk] | None = [] if guard is not None and not acts else None
     with progress("Learning", sum(file["bytes"] for file in sources)) as move:  # type: ignore[misc]
-        traces = read.traces(files, notes, lambda count: move(advance=count))
-        chunks = traces if log_chunks is None else _kept(traces, log_chunks)
-        lesson = learn_traces(chunks, machine, actions, encoder.names, units_read)
+        chunks: Iterable[Chunk] = read.traces(files, notes, lambda count: move(advance=count))
+        chunks = list(chunks) if guard is not None and not acts else chunks
+        units_of = partial(notes.si_units, encoder.names)
+        lesson = learn_traces(chunks, machine, actions, encoder.names, units_of)
     provenance = {"files": sources, "rows": lesson.read.rows, "episodes": lesson.read.episodes}
     provenance |= {"transitions": lesson.transitions, "failures": lesson.read.failures}
     provenance["read with"] = {k: v for k, v in given_of(reading).items() if k != "topics"}
@@ -129,19 +121,23 @@ def learn(
         lesson.model.save(out, provenance)
     new_guard = None
     if guard is not None:
-        assert kind is not None
         assert lesson.model.dt is not None
-        if log_chunks is None:
-            settings = kind, lesson.model.dt, brakes, tolerance
-            new_guard = guard_of_log(*settings, actions, machine, encoder.names, lesson.model.units)
+        dt, labels = lesson.model.dt, lesson.model.labels
+        names, units = labels.names, labels.units
+        if acts:
+            if kind == "kinematic":
+                new_guard = guard_of_monitor(dt, brakes, tolerance)
+            else:
+                learnt = LearntRisk(dt, actions.low, actions.high, names=names, units=units)
+                reviser = ActionReviser(learnt, actions, tolerance=tolerance, mode=Mode.SHADOW)
+                new_guard = Guard.of(reviser, interval=dt, machine=machine.copy())
             with progress("Teaching the guard", lesson.read.rows) as move:
                 share = teach(new_guard, read.traces(files), lambda count: move(count))
             if refusal := refusing(share):
                 warn(f"warning: in the later half of the log the guard {refusal}")
         else:
             requests = horizon, persist, false_a_day
-            episodes = [chunk for chunk in episodes_of(log_chunks) if len(chunk.times) > 1]
-            labels = Labels(names=encoder.names, units=lesson.model.units)
+            episodes = [chunk for chunk in episodes_of(chunks) if len(chunk.times) > 1]
             new_guard = guard_where_nobody_acts(episodes, labels, *requests, lesson.machine)
         new_guard.save(guard, provenance)
     if as_json:
@@ -251,7 +247,8 @@ def _judge_of(judge: Judge | None, columns: LogColumns) -> Judge:
     if judge == "learnt" and columns.failed is None:
         raise ValueError(
             "--guard learns from failures, and which there were is not known: --failed COLUMN or "
-            "--failed 'gap<=0' says it; of cars in pairs --judge kinematic needs none"
+            "--failed 'gap<=0' says it (of times or last rows docs/logs.md makes one); of cars in "
+            "pairs --judge kinematic needs none"
         )
     return judge
 
@@ -280,12 +277,12 @@ def _is_looked_at(files: list[str], reading: Reading) -> bool:
     """Whether nobody said what is observed in a log of no cars; then what it holds was printed."""
     from evofsm.driving.naming import VARIABLES
     from evofsm.io.logs import open_table
-    from evofsm.io.tables import CsvTable, ParquetTable, Skips, silent
+    from evofsm.io.tables import CsvTable, ParquetTable, Skips
 
     columns = reading.columns
     if columns.observe.names != VARIABLES:
         return False
-    table = open_table(files[0], columns, reading.lengths, silent, reading.topics, Skips(), [])
+    table = open_table(files[0], columns, reading.lengths, reading.topics, Skips())
     if not isinstance(table, CsvTable | ParquetTable) or {*VARIABLES} & {*table.columns}:
         return False
     from evofsm.cli.look import show_look
@@ -294,19 +291,11 @@ def _is_looked_at(files: list[str], reading: Reading) -> bool:
     return True
 
 
-def _kept(chunks: Iterable[Chunk], kept: list[Chunk]) -> Iterator[Chunk]:
-    """The same chunks, which are kept."""
-    for chunk in chunks:
-        kept.append(chunk)
-        yield chunk
-
-
 # -- What came of it ------------------------------------------------------------------------------
 
 
 def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
     """Where it is, what it takes, and what it reckons with."""
-    from evofsm.cli.foreseen import why_none
     from evofsm.guard import Foresight, LearntRisk
     from evofsm.guard.foresight import span
 
@@ -318,11 +307,12 @@ def _of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> 
     yield f"The guard was saved to {path}. {takes}"
     if isinstance(guard.judge, Foresight):
         soon = f"up to {span(guard.judge.horizon * guard.judge.dt)} before a failure (--horizon)"
+        words = guard.judge.alarm_in_words
         if guard.judge.alarm is None:
-            why = why_none(guard.judge)
-            yield f"It never alarms: {why} (fewer columns, or a longer --horizon?)."
+            hint = " (fewer columns, or a longer --horizon?)" * ("chance" in words)
+            yield f"It never alarms: {words}{hint}."
         else:
-            yield f"{guard.judge.alarm_in_words.capitalize()} (--false-a-day), {soon}."
+            yield f"{words.capitalize()} (--false-a-day), {soon}."
         judges = "evofsm monitor LOG --summary, with the same options, judges such alarms held out"
         yield f"{judges}; evofsm inspect {path} prints its states."
         return
@@ -346,6 +336,7 @@ def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, An
 
 
 def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
+    from evofsm.cli.learning import MOST_LEVELS, range_of
     from evofsm.fsm.rules import describe_rule
 
     read, actions = learning.read, learning.model.actions
@@ -360,6 +351,14 @@ def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
         text += f"; {read.clipped_below:,} below and {read.clipped_above:,} above "
         text += f"({n_beyond / read.rows:.1%} of rows) were put into the end intervals"
     text = text if n_beyond else f"{text}; none was beyond"
+    numbers = sorted(read.levels) if len(read.levels) <= MOST_LEVELS else []
+    places = [actions.encode(number) for number in numbers]
+    if len(numbers) > 1:
+        text += "; " + ", ".join(
+            f"{n:g} is a({k + 1})" for n, k in zip(numbers, places, strict=True)
+        )
+    if len({*places}) < len(places):
+        text += f": several are one action (--action-range {range_of(numbers)} tells them apart)"
     yield "actions", text if action else "none: nobody acts (--action '')"
     settings = describe_rule(learning.machine.rule)
     for name in ("radius", "spread"):  # which the rule may have itself

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from shlex import quote
 from typing import Any, NamedTuple
 
@@ -12,12 +12,11 @@ import numpy as np
 
 from evofsm.cli.options import Reading
 from evofsm.cli.show import warn
-from evofsm.driving.assumed import guard_of_monitor
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.guard import ActionReviser, Guard, LearntRisk, Mode
+from evofsm.guard import ActionReviser, Guard
 from evofsm.io import Chunk, episodes_of
 from evofsm.io.logs import LogColumns, Noted
 from evofsm.io.tables import SI, TIMES, UNITS
@@ -34,10 +33,13 @@ _MATCHES = 0.02
 _LEFT_OUT = {
     "comment": "comments between rows were passed over",
     "action": "rows have no action, and what leads on from them was not learnt",
+    "stand-in": "numbers of the action are far from all others, and were read as missing",
     "cut": "file ends early, and what is whole was read",
 }
 # What reaches so far is no car's speed in any unit [m/s]: revolutions, perhaps.
 _NO_SPEED = 500.0
+#: Columns of more different numbers are no choice among some; and the most intervals for those.
+MOST_LEVELS, _MOST_INTERVALS = 12, 50
 # Numbers that stand for nobody in many recordings.
 _NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
 
@@ -55,6 +57,7 @@ class Read:
     failures: int = 0  #: episodes that ended in failure
     dt: float = np.nan  #: usual time between two rows [s]
     last_time: float = np.nan  #: of the latest row [s]
+    levels: set[float] = field(default_factory=set)  #: numbers of the action, while they are few
 
 
 class Learning(NamedTuple):
@@ -208,24 +211,6 @@ def episodes_read(
 # -- A guard --------------------------------------------------------------------------------------
 
 
-def guard_of_log(
-    judge: str,
-    dt: float,
-    brakes: float,
-    tolerance: float,
-    actions: IntervalActions,
-    machine: EvolvingFSM,
-    names: Sequence[str],
-    units: Sequence[str],
-) -> Guard:
-    """A guard in shadow mode that has learnt nothing yet, of cars or of any other system."""
-    if judge == "kinematic":
-        return guard_of_monitor(dt, brakes, tolerance)
-    learnt = LearntRisk(dt, actions.low, actions.high, names=names, units=units)
-    reviser = ActionReviser(learnt, actions, tolerance=tolerance, mode=Mode.SHADOW)
-    return Guard.of(reviser, interval=dt, machine=machine.copy())
-
-
 def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) -> float:
     """The share in which a guard refuses, of the later half of a log; ``show`` is told of rows."""
     n_rows, refusals, reviser = 0, bytearray(), guard.reviser
@@ -268,3 +253,17 @@ def _count(read: Read, chunk: Chunk, actions: IntervalActions) -> None:
     read.failures += 0 if chunk.failures is None else len(chunk.failures)
     read.clipped_below += int((chunk.actions < actions.low).sum())
     read.clipped_above += int((chunk.actions > actions.high).sum())
+    if len(read.levels) <= MOST_LEVELS:
+        read.levels.update(np.unique(chunk.actions[~np.isnan(chunk.actions)]).tolist())
+
+
+def range_of(levels: Sequence[float]) -> str:
+    """The --action-range in which each of some rising numbers is an action; or nothing.
+
+    >>> range_of([10.0, 20.0, 30.0]), range_of([0.5])
+    ('5:35:10', '')
+    """
+    width = float(min(np.diff(levels), default=0.0))
+    if len(levels) > MOST_LEVELS or not levels[-1] - levels[0] < _MOST_INTERVALS * width:
+        return ""
+    return f"{levels[0] - width / 2.0:.6g}:{levels[-1] + width / 2.0:.6g}:{width:.6g}"

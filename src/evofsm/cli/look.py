@@ -13,10 +13,11 @@ import numpy as np
 import polars
 from numpy.typing import NDArray
 
+from evofsm.cli.learning import range_of
 from evofsm.cli.options import in_quotes, quoted, seconds
 from evofsm.cli.show import facts, show
 from evofsm.guard.foresight import span
-from evofsm.io.logs import SKIPPED, USUAL_EPISODE, are_unusual, hours_unsaid
+from evofsm.io.logs import SKIPPED, USUAL_EPISODE, are_stand_ins, are_unusual, hours_unsaid
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, explained, is_date
 
 Pairs = list[tuple[str, str]]
@@ -65,9 +66,10 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
     print("\nA way to learn from it:")
     if before and len(files) == 1:
         kind = "csv" if isinstance(table, CsvTable) else "parquet"
-        how = f", separator={table.separator!r}, infer_schema=False" * (kind == "csv")
+        mark, how = f", separator={table.separator!r}" * (kind == "csv"), ", infer_schema=False"
         files = [f"{Path(file).name.partition('.')[0]}-sorted.{kind}"]
-        code = f"p.read_{kind}({file!r}{how}){before}.write_{kind}({files[0]!r})"
+        read = f"p.read_{kind}({file!r}{mark}{how * bool(mark)})"
+        code = f"{read}{before}.write_{kind}({files[0]!r}{mark})"
         print(f"  python -c {in_quotes(f'import polars as p; {code}')}")
     command = [f"evofsm learn {' '.join(map(quote, files))}"]
     command += (f"{name} {in_quotes(value)}" for name, value in options)
@@ -87,6 +89,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     numbers = [name for name, kind in frame.schema.items() if kind.is_numeric() and name != clock]
     values = {name: frame[name].to_numpy() for name in numbers}
     values = {name: z for name, z in values.items() if np.isfinite(z).any()}
+    stand_ins = {name: np.unique(z[are_stand_ins(z)]) for name, z in values.items()}
+    values = {name: np.where(are_stand_ins(z), np.nan, z) for name, z in values.items()}
     texts = [name for name in frame.columns if frame[name].dtype == polars.String]
     runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
     limit = _round(0.1 * float(np.nanquantile(np.abs(values[still]), 0.95))) if still else 0.0
@@ -108,6 +112,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
         name: _range(name, z[order], (runs | (name == still))[order], last)
         for name, z in values.items()
     }
+    for name in (name for name in values if len(stand_ins[name])):
+        columns[name] += f"; {', '.join(f'{x:g}' for x in stand_ins[name])} for none"
     columns |= {name: _told(frame[name]) for name in texts}
     facts = [*columns.items()][:_COLUMNS_SHOWN]
     if more := len(columns) - len(facts):
@@ -130,6 +136,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
     facts += [("a failure?", f"{text} {frequency}") for _, text, frequency, _ in rare]
+    untold = "no column tells of one; docs/logs.md makes one of times, or of the last rows of runs"
+    facts += [] if rare else [("a failure?", untold)]
     options += [("--failed", text) for _, text, *_ in rare[:1]]
     if group:
         mend = f", but mixed: sort rows by {group} and then by {clock} first, as below"
@@ -142,7 +150,11 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
         del spans[still]
     # What goes on by the same from row to row is a count of them.
     steady = {n: e.tolist() for n, e in spans.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
-    return facts, _of_numbers(steady, options), before if is_mixed else ""
+    action = next(filter(_SET.search, steady), "")  # else nobody acts
+    nobody = [f"{_named(n, _SIGNS)}=={x:g}" for n in steady if n != action for x in stand_ins[n]]
+    options += [("--no-leader", " or ".join(nobody))] if nobody else []
+    levels = np.unique(values[action][np.isfinite(values[action])]) if action else np.zeros(0)
+    return facts, _of_numbers(steady, action, levels, options), before if is_mixed else ""
 
 
 def _first_rows(
@@ -270,12 +282,11 @@ def _of_steps(at: Floats, segments: Floats, facts: Pairs, lacking: int) -> tuple
     """What makes one clock of these times, if so many rows are left out; and rows that are late."""
     within = np.diff(segments) == 0.0
     steps = np.diff(at)[within]
-    later = steps[steps > 0.0]
+    later, odd = steps[steps > 0.0], _odd(steps)
     usual = float(np.median(later)) if len(later) else math.nan
     if len(later):
         often = span(float(f"{usual:.2g}")) if usual < 3600.0 else f"{usual / 3600.0:.3g} h"
         facts[-1] = facts[-1][0], f"{facts[-1][1]}, one every {often}"
-    odd = (steps <= 0.0) | are_unusual(steps, usual)
     parts = np.split(at, np.flatnonzero(~within) + 1)
     latest = np.concatenate([np.fmax.accumulate(part) for part in parts])
     n_twice, n_earlier = int((steps == 0.0).sum()), int((at < latest).sum())
@@ -289,15 +300,18 @@ def _of_steps(at: Floats, segments: Floats, facts: Pairs, lacking: int) -> tuple
     return [("--resample", step[1]), ("--hole", hole[1])], n_earlier
 
 
-def _of_numbers(ends: dict[str, list[float]], options: Pairs) -> Pairs:
+def _of_numbers(ends: dict[str, list[float]], action: str, levels: Floats, options: Pairs) -> Pairs:
     """With what to observe of numbers that go from here to there, and what somebody sets."""
     if not ends:
         return []
-    action = next(filter(_SET.search, ends), "")  # else nobody acts
     variables = [name for name in ends if name != action] or [action]
     apart = {name: _round((high - low) / 4.0) for name, (low, high) in ends.items()}
     acts = [("--action", _named(action, ""))]
-    if action:
+    if between := range_of(levels.tolist()) if action else "":
+        acts.append(("--action-range", between))
+        last = f",{_named(action, ',=')}=last"  # no mean of them is one of them
+        options = [(name, value + last * (name == "--resample")) for name, value in options]
+    elif action:
         width, (low, high) = apart[action], ends[action]
         low, high = math.floor(low / width) * width, math.ceil(high / width) * width
         acts.append(("--action-range", f"{low:.6g}:{high:.6g}:{width:g}"))
@@ -319,7 +333,7 @@ def _stands(z: Floats) -> bool:
     """Whether numbers are near 0 for a while, and else far from it."""
     size = np.abs(z[np.isfinite(z)])
     low, mid = (float(np.mean(size < x * np.quantile(size, 0.95))) for x in (0.05, 0.5))
-    return 0.01 < low < 0.9 and mid - low < 0.02 and len(np.unique(size)) > 2
+    return 0.01 < low < 0.9 and mid - low < 0.02 and len(np.unique(size)) > _MOST_TEXTS
 
 
 def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str, str, str, Rows]]:

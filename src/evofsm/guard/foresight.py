@@ -409,10 +409,6 @@ class Foresight(LearningJudge):
         is_of_rate = (self.limits[:, _RATE] == rate) & (self.limits[:, _KIND] == kind)
         return np.asarray(self.limits[is_of_rate])
 
-    def is_plain(self, rate: int) -> bool:
-        """Whether plain thresholds do as well."""
-        return bool(self.held_out[rate, 3] == _PLAIN)
-
     def where(self, rate: int) -> Floats:
         """(r, SIZE) forms beyond which an alarm is on while nothing changes; `HELD` is how near."""
         m, forms = len(self.labels.names), []
@@ -433,7 +429,6 @@ class Foresight(LearningJudge):
         *,
         plain: bool | None = None,
         columns: Floats | None = None,
-        early: ArrayLike = 0.0,
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,).
 
@@ -445,8 +440,6 @@ class Foresight(LearningJudge):
             Whether it is that of plain thresholds; by default of the kind that did better.
         columns : ndarray, optional
             The `columns` of the log, if they are known.
-        early : (E,) array_like, optional
-            How much sooner than its row each failure came [rows].
         """
         limits = self.of_rate(rate, plain=plain)
         columns = self.columns(log) if columns is None else columns
@@ -454,7 +447,7 @@ class Foresight(LearningJudge):
         leads, rows = np.zeros(len(log.starts)), np.flatnonzero(on)
         false = _tally(above, on, rows, log.starts, log.failed, self._spans, leads)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
-        lead = float(np.maximum(leads - np.asarray(early), 0.0).sum()) / max(n, 1) * self.dt
+        lead = float(leads.sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
 
     def words(self, rate: int, *, plain: bool | None = None) -> str:
@@ -519,9 +512,11 @@ class Foresight(LearningJudge):
 
     @property
     def alarm_in_words(self) -> str:
-        """Which alarm it is."""
+        """Which alarm it is, or why there is none."""
+        if self.held_out[0, 2] == 1.0:
+            return "with one failure nothing can be cross-validated"
         if self.alarm is None:
-            return "no alarm was better than chance"
+            return "cross-validated, no alarm was better than chance"
         fewest = ", as none is for fewer" * (RATES[self.alarm] > self.stated)
         return f"it alarms as for {RATES[self.alarm]:g} false alarms a day{fewest}"
 
@@ -560,7 +555,8 @@ class Foresight(LearningJudge):
         """What the alarm for one of `RATES` is, and how often it was right, in words."""
         right, false, failures, kind = self.held_out[rate].tolist()
         if kind == _NO_KIND:
-            return "no alarm is false so seldom and better than chance"
+            few = "no alarm is false so seldom and better than chance"
+            return self.alarm_in_words if failures == 1.0 else few
         plain = "plain thresholds do as well: " * (kind == _PLAIN)
         record = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
         return f"{plain}{self.words(rate)} ({record}, {_COUNTED})"

@@ -205,14 +205,15 @@ class _Player:
         if not self._is_under_way and (before or kind in ("decision", "end")):
             raise ValueError("it belongs to no episode")
         for row in before:
-            self._silent(self._guard, *row)
+            self._row(self._guard, None, *row)
         if kind in ("begin", "settings"):
             self._set(self._guard, content["settings"])
         if kind == "begin":
             self._guard.begin()
             self._is_under_way = True
         elif kind == "decision":
-            self._decision(self._guard, content)
+            names = ("time", "observation", "proposed", "mask")
+            self._row(self._guard, content, *(content[name] for name in names))
         elif kind == "end":
             self._end(self._guard, content)
 
@@ -245,37 +246,36 @@ class _Player:
         if fields := _differing(settings, settings_now(guard)):
             raise _DiffersError("there are no such settings", fields)
 
-    def _silent(self, guard: Guard, time: Any, observation: Any, *proposed: Any) -> None:
-        """What was executed as it was proposed, or nothing was proposed to."""
+    def _row(
+        self,
+        guard: Guard,
+        content: Mapping[str, Any] | None,
+        time: Any,
+        observation: Any,
+        *proposed: Any,
+    ) -> None:
+        """A row that was decided on so, or of which nothing was to be said; or not decided on."""
+        situation = guard.recognise(_floats(observation), _number(time))
         if not proposed:
-            guard.recognise(_floats(observation), _number(time))
             return
-        when, entry, speaks = self._again(guard, time, observation, *proposed)
-        if speaks:
+        action, *mask = proposed
+        proposal = Proposal(_action(action), checked_mask(guard.actions, *mask or [None]))
+        revision = guard.revise(situation, proposal)
+        entry, when = (
+            decision_of(situation, proposal, revision),
+            f"the decision at {situation.time:g} s",
+        )
+        speaks = is_spoken(guard.reviser, revision)
+        if content is None and speaks:
             raise _DiffersError(
                 f"{when} was recorded as nothing to speak of, but {entry['reason']}",
                 (Field("executed", canonical(entry["proposed"]), canonical(entry["executed"])),),
             )
-        self.decisions += 1
-
-    def _decision(self, guard: Guard, content: Mapping[str, Any]) -> None:
-        row = (content[name] for name in ("time", "observation", "proposed", "mask"))
-        when, entry, speaks = self._again(guard, *row)
-        if fields := _differing({name: content[name] for name in entry}, entry):
+        if content and (fields := _differing({name: content[name] for name in entry}, entry)):
             raise _DiffersError(f"{when} comes out otherwise", fields)
-        if not speaks:
+        if content and not speaks:
             raise _DiffersError(f"{when} changed nothing")
         self.decisions += 1
-
-    @staticmethod
-    def _again(
-        guard: Guard, time: Any, observation: Any, action: Any, mask: Any = None
-    ) -> tuple[str, dict[str, Any], bool]:
-        proposal = Proposal(_action(action), checked_mask(guard.actions, mask))
-        situation = guard.recognise(_floats(observation), _number(time))
-        revision = guard.revise(situation, proposal)
-        entry = decision_of(situation, proposal, revision)
-        return f"the decision at {situation.time:g} s", entry, is_spoken(guard.reviser, revision)
 
     def _end(self, guard: Guard, content: Mapping[str, Any]) -> None:
         last = content["observation"]

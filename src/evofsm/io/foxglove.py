@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from evofsm.driving.naming import DECISION_COLUMNS, VARIABLES, observed
 from evofsm.extras import needs
 from evofsm.guard import Decision, DecisionLogger, Guard, Proposal, Revision, Situation
-from evofsm.guard.actions import same_action
+from evofsm.guard.actions import action_text, same_action
 from evofsm.guard.record import RECORD, Column
 
 with needs("foxglove-sdk", "mcap", "writing MCAP, and a live view in Foxglove"):
@@ -104,17 +104,6 @@ def _schema(column: Column | None) -> dict[str, Any]:
         items = _of("number", "probability")
         return {**_of("array", "probability of each state, from 0"), "items": items}
     return _of({float: "number", int: "integer", str: "string"}[column.kind], column.about)
-
-
-def _shown(action: Any) -> str:
-    return f"{action:+.2f}" if isinstance(action, float) else str(action)
-
-
-def _is_known(value: Any) -> bool:
-    """Whether it is a number, a text or a list; actions that are vectors are left to the log."""
-    if isinstance(value, float):
-        return math.isfinite(value)
-    return value is not None and not isinstance(value, np.ndarray)
 
 
 class _File:
@@ -269,7 +258,7 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
             verb = "executed" if is_changed else "would advise"
             instead = revision.executed if is_changed else revision.advised
             unit = " m/s²" if self._names == VARIABLES else ""
-            text = f"proposed {_shown(revision.proposed)}, {verb} {_shown(instead)}{unit}"
+            text = f"proposed {action_text(revision.proposed)}, {verb} {action_text(instead)}{unit}"
             level = LogLevel.Warning if is_changed else LogLevel.Info
             self._note(level, f"{text}: {revision.reason}")
 
@@ -303,7 +292,12 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
         self._log.log(entry, log_time=self._now())
 
     def _send(self, topic: str, message: Mapping[str, Any]) -> None:
-        fields = {name: value for name, value in message.items() if _is_known(value)}
+        fields = {
+            name: value
+            for name, value in message.items()  # actions that are vectors are left to the log
+            if isinstance(value, str | int | list)
+            or (isinstance(value, float) and math.isfinite(value))
+        }
         data = json.dumps(fields, ensure_ascii=False, allow_nan=False).encode()
         self._channels[topic].log(data, log_time=self._now())
         if self._file is not None and self._file.error is not None:

@@ -58,7 +58,7 @@ def to_dot(
     Raises
     ------
     ValueError
-        If ``least`` is no probability, or a dead end no state.
+        If a dead end is no state.
 
     Examples
     --------
@@ -74,7 +74,6 @@ def to_dot(
     }
     <BLANKLINE>
     """
-    _refuse_no_probability(least)
     end_states = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
     marked_states = {check_index("state", state, model.n_states) for state in end_states}
     lines = [_DOT_HEAD]
@@ -99,11 +98,6 @@ def to_dot(
         label = f'label="{chance:.3f} ({count:,.0f})", penwidth={width:.2f}'
         lines.append(f"  s{i + 1} -> s{j + 1} [{label}{dashes}];")
     return "\n".join([*lines, "}", ""])
-
-
-def _refuse_no_probability(least: float) -> None:
-    if not 0.0 <= least <= 1.0:
-        raise ValueError(f"least is {least}; it must be a probability, from 0 to 1")
 
 
 def _where(model: FSMModel, state: int) -> list[str]:
@@ -146,8 +140,7 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     Raises
     ------
     ValueError
-        If the model counted no decisions, ``evidence`` is not positive, or ``least`` no
-        probability.
+        If the model counted no decisions, or ``evidence`` is not positive.
 
     Examples
     --------
@@ -162,7 +155,6 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
         0.514194120112:(s'=1) + // seen 2
         0.152472546555:(s'=2); // seen 1
     """
-    _refuse_no_probability(least)
     n = model.n_states
     if not evidence > 0.0:
         raise ValueError(f"evidence is {evidence}; it must be positive")

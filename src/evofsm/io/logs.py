@@ -18,9 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving.naming import RANGES, VARIABLES
+from evofsm.driving.naming import UNITS as CAR_UNITS
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import vehicles
 from evofsm.io.tables import (
+    SI,
     TIMES,
     UNITS,
     CsvTable,
@@ -57,6 +59,9 @@ _FEWEST_VALUES = 5
 OLDEST = 0.5
 # Share by which the usual steps of two files may differ.
 _SAME_STEP = 0.05
+# Numbers that stand for none, where they are so many times as far out as all others of a column.
+_STAND_INS = [999, 9999, 99999, 999999, 32767, 32768, 65535, 2**31 - 1, 2**31, 2**32 - 1]
+_FAR_OUT = 3.0
 # Speeds [m/s] and usual steps [s] beyond these are most likely in another unit.
 _FASTEST, _LONGEST_USUAL = 60.0, 5.0
 # Two witnesses of one thing are compared in more rows than so, and where they go up and down
@@ -161,6 +166,11 @@ class Noted:
     failed_at_once: int = 0  #: of them, those with one row
     #: What a variable was whenever an episode failed at once, if always the same.
     at_once: dict[str, float] = field(default_factory=dict)
+
+    def si_units(self, names: Sequence[str]) -> list[str]:
+        """The units of columns as they were read: of the SI, if they have one there."""
+        told_units = dict(zip(VARIABLES, CAR_UNITS, strict=True)) | self.units
+        return [SI.get(unit, unit) for unit in (told_units.get(name, "") for name in names)]
 
     def see(self, chunk: Chunk, names: Sequence[str], *, first: bool = False) -> None:
         """Look for what is beyond belief; in the first rows also for what contradicts itself."""
@@ -453,8 +463,8 @@ def read_traces(
     for path in paths:
         clock.open(path)
         rows, left_out = 0, notes.leaderless + notes.elsewhere
-        skips = Skips(columns.skip_bad, notes.skipped)
-        table = open_table(path, columns, lengths, on_read, topics, skips, notes.told)
+        skips = Skips(columns.skip_bad, notes.skipped, notes.told, on_read)
+        table = open_table(path, columns, lengths, topics, skips)
         file_columns = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
         chunks = _Reader(table, file_columns, clock, notes).chunks()
         if file_columns.longest_hole:
@@ -488,13 +498,15 @@ def hours_unsaid(times: Floats, sample: str, before: float = 0.0) -> Floats:
     """(T,) how many hours more went by than dates [s] of a clock say that is put back and on.
 
     So is one without a zone, as the sample shows, in the night of some Sundays; a step is taken for
-    that if it is a usual one but for the hour. Before the first row so many hours were unsaid.
+    that if it is one of some rows but for the hour. Before the first row so many hours were unsaid.
     """
     steps, hours = np.diff(times), np.zeros(len(times))
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else math.nan
     odd = np.flatnonzero(are_unusual(steps, usual))
     for hour in (1, -1) if not _ZONE.search(sample) else ():
-        for row in odd[~are_unusual(steps[odd] + 3600.0 * hour, usual)] + 1:
+        later = steps[odd] + 3600.0 * hour  # of irregular rows a longer step
+        is_near = (later >= 0.0) & (later < (1800.0 if hour > 0 else min(12.0 * usual, 1800.0)))
+        for row in odd[is_near | ~are_unusual(later, usual)] + 1:
             at = datetime.fromtimestamp(times[row], UTC)
             if at.weekday() == 6 and at.hour < 4 and at.month in _CHANGES:
                 hours[row] = hour
@@ -504,6 +516,18 @@ def hours_unsaid(times: Floats, sample: str, before: float = 0.0) -> Floats:
     anew = np.append(False, steps < -86400.0)  # of another machine, perhaps
     latest = np.maximum.accumulate(np.where(anew, np.arange(len(times)), 0))
     return hours - np.where(latest > 0, hours[latest], 0.0)
+
+
+def are_stand_ins(values: Floats) -> Bools:
+    """(T,) which numbers stand for none, such as -9999 among those from 0 to 100.
+
+    >>> are_stand_ins(np.array([0.0, 1.0, -9999.0, 999.0, np.nan])).tolist()
+    [False, False, True, True, False]
+    """
+    size = np.abs(values)
+    are_likely = np.isin(size, _STAND_INS)
+    usual = size[~are_likely & np.isfinite(size)]
+    return np.asarray(are_likely & (size > _FAR_OUT * usual.max(initial=0.0)) & bool(usual.any()))
 
 
 def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
@@ -548,17 +572,8 @@ class LoggedRow(NamedTuple):
 
 
 def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterator[LoggedRow]:
-    """The rows of chunks, one by one.
+    """The rows of chunks, one by one; names are ``columns.observe.names``.
 
-    Parameters
-    ----------
-    chunks : iterable of Chunk
-        As `read_traces` yields them.
-    names : sequence of str
-        Of the variables: ``columns.observe.names``.
-
-    Examples
-    --------
     >>> z, u = np.array([[9.0, 20.0, 19.0]]), np.array([-1.0])
     >>> chunk = Chunk("a.csv", z, u, np.zeros(1), np.zeros(1, np.int64), dt=0.1)
     >>> next(rows_of([chunk])).values
@@ -656,10 +671,8 @@ def open_table(
     path: str,
     columns: LogColumns,
     lengths: VehicleLengths,
-    on_read: OnRead,
     topics: Topics | None,
     skips: Skips,
-    told: list[str],
 ) -> Table:
     """The rows of a file, whatever it holds."""
     kind = file_kind(path)
@@ -671,23 +684,20 @@ def open_table(
             )
         from evofsm.io.rosbag import BagTable
 
-        return BagTable(path, topics, on_read, skips, told)
+        return BagTable(path, topics, skips)
     moments = None
     if kind in ("osi", "mcap"):
         read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap
-        moments = vehicles.pairs_of_scenes(path, read(path, on_read, skips), skips)
+        moments = vehicles.pairs_of_scenes(path, read(path, skips), skips)
     elif kind == "xml":
-        steps = vehicles.fcd_of_xml(path, on_read, skips)
+        steps = vehicles.fcd_of_xml(path, skips)
         moments = vehicles.pairs_of_fcd(path, steps, lengths, skips)
     if moments is not None:
         return PairTable(path, moments, skips)
     log_names = {*columns.observe.names, columns.action, columns.time}
     names = log_names.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
-    table: Table = (
-        CsvTable(path, on_read, names, skips)
-        if kind == "csv"
-        else ParquetTable(path, on_read, skips)
-    )
+    is_csv = kind == "csv"
+    table: Table = CsvTable(path, names, skips) if is_csv else ParquetTable(path, skips)
     there = set(table.columns)
     if set(columns.observe.names) <= there:
         return table
@@ -750,9 +760,11 @@ class _Clock:
             times = np.append(self._last, times[on])
         self._last = times[-1]
         first = steps[:_FIRST_ROWS]
-        if np.isnan(self._usual) and not (np.isnan(first).all() or self._resampled):
+        if np.isnan(self._usual) and not np.isnan(first).all():
             exact = -math.log10(np.spacing(np.nanmax(abs(times))))  # digits that times can have
-            self._settle(round(float(np.nanmedian(first)), min(9, int(exact))))
+            # Some stand still for a while, and write less then: of means only what no step fits.
+            usual = float(np.nanquantile(first, 0.1 if self._resampled else 0.5))
+            self._settle(round(usual, min(9, int(exact))))
         if self._longest:
             return np.asarray(steps > self._longest), late
         return are_unusual(steps, self._usual), late
@@ -777,6 +789,14 @@ class _Clock:
         return late
 
     def _settle(self, usual: float) -> None:
+        self._usual = usual
+        if self._resampled:
+            if usual > LONGEST_STEP * self.dt:
+                raise ValueError(
+                    f"{self._path} has a row every {usual:g} s, and --resample makes one every "
+                    f"{self.dt:g} s, of which most would be holes: --resample {usual:g}s at least"
+                )
+            return
         if usual <= 0.0:
             raise ValueError(
                 f"{self._path}: a row follows the one before within less than a nanosecond; the "
@@ -790,7 +810,6 @@ class _Clock:
                 f"{self.dt:g} s; a machine knows only one step: --resample "
                 f"{2.0 * max(usual, self.dt):g}s, or learn them apart"
             )
-        self._usual = usual
 
 
 class _Reader:
@@ -824,8 +843,14 @@ class _Reader:
     def chunks(self) -> Iterator[Chunk]:
         action, clock = self._columns.action, self._clock
         request, factors = self._wanted()
+        terms = [term for condition in self._conditions.values() for term in condition.terms]
+        uses = {*self._observed, *(term.column for term in terms)}  # who compares knows better
         last_chunk: Chunk | None = None  # until it is known whether its last row failed
         for piece in filter(attrgetter("rows"), self._table.pieces(request)):
+            if action not in uses and (odd := are_stand_ins(piece.numbers[action])).any():
+                for row in np.flatnonzero(odd).tolist():
+                    piece.skips.leave_out("stand-in", partial(piece.told, row, action), 0)
+                piece.numbers[action] = np.where(odd, np.nan, piece.numbers[action])
             for name, factor in factors.items():
                 piece.numbers[name] = piece.numbers[name] * factor
             if clock.ticks and not request.dates:
@@ -948,18 +973,28 @@ class _Reader:
                     )
         except ValueError as error:
             raise ValueError(f"{table.path}: {error}") from None
+        self._compare_units(column_units, numbers)
         self._noted.units |= column_units
         self._noted.untold += [name for name in numbers if name not in column_units]
-        if not clock and is_number(table.first(columns.time)):
-            numbers.append(columns.time)  # to be compared with --dt
         texts = [*self._episode, *categories, *term_texts]
         request = Wanted(numbers, texts, clock if is_dated else (), form)
         return request, {name: UNITS[unit] for name, unit in column_units.items() if unit in UNITS}
 
+    def _compare_units(self, units: Mapping[str, str], numbers: Sequence[str]) -> None:
+        """Raise where a column has a unit that is not that of the files before, as both tell."""
+        for name in {*numbers} & {*self._noted.units, *self._noted.untold}:
+            pair = now, before = units.get(name, ""), self._noted.units.get(name, "")
+            factor = UNITS.get(now or before, 1.0)
+            if len({SI.get(unit, unit) for unit in pair}) > 1 and (all(pair) or factor != 1.0):
+                remedy = f"--unit {quote(f'{name}={now or before}')} says one for all"
+                remedy = remedy if factor != 1.0 else "learn them apart"
+                raise ValueError(
+                    f"{self._table.path}: column {name!r} has {now or 'no unit'}, and "
+                    f"{before or 'no unit'} in the files before; {remedy}"
+                )
+
     def _times(self, piece: Piece, *, is_date: bool) -> Floats:
         if not self._clock.ticks:
-            if self._before == 0:
-                self._compare_dt(piece)
             rows = np.arange(self._before, self._before + piece.rows)
             return rows * np.float64(self._clock.dt)
         times = np.where(piece.bad, np.nan, piece.numbers[self._columns.time])
@@ -978,18 +1013,6 @@ class _Reader:
             )
         self._last_date, self._hours = times[-1], hours[-1]
         return (times - self._first_date) * _MICROSECOND + 3600.0 * hours[1:]
-
-    def _compare_dt(self, piece: Piece) -> None:
-        """Say where a clock that is not read says something else than --dt."""
-        time, dt = self._columns.time, self._clock.dt
-        steps = np.diff(piece.numbers.get(time, np.zeros(0)))
-        step = float(np.median(steps)) if len(steps) else np.nan
-        units = (1.0, 1e-3, 1e-6, 1e-9)
-        if step > 0.0 and not any(abs(step * unit / dt - 1.0) < _SAME_STEP for unit in units):
-            self._noted.told.append(
-                f"{self._table.path}: --dt says {dt:g} s from a row to the next, and column "
-                f"{time!r} goes on by {step:g}: without --dt that column is the clock"
-            )
 
     def _starts(self, piece: Piece) -> Bools:
         """The rows that begin another episode, of which all rows have to stand together."""

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from evofsm.extras import needs
 from evofsm.io.mcap import messages
-from evofsm.io.tables import UNITS, OnRead, Piece, RefusedError, Skips, Table, Wanted, readable
+from evofsm.io.tables import UNITS, Piece, RefusedError, Skips, Table, Wanted, readable
 from evofsm.io.vehicles import ACTION
 
 with needs("msgspec", "ros", "a bag of ROS 2"):
@@ -203,11 +203,8 @@ class BagTable(Table):
     next row.
     """
 
-    def __init__(
-        self, path: str, topics: Topics, on_read: OnRead, skips: Skips, told: list[str]
-    ) -> None:
-        self.path, self.skips = path, skips
-        self._topics, self._on_read, self._told = topics, on_read, told
+    def __init__(self, path: str, topics: Topics, skips: Skips) -> None:
+        self.path, self.skips, self._topics = path, skips, topics
         self.derives = "v_follower" in topics.variables and ACTION not in topics.variables
         self.columns = ["time", *topics.variables, *([ACTION] if self.derives else [])]
 
@@ -272,7 +269,7 @@ class BagTable(Table):
             (self._of_mcap if is_mcap else _of_sqlite)(file, topics, there)
             for file, is_mcap in _files(Path(self.path))
         ):
-            self._on_read(len(data))
+            self.skips.on_read(len(data))
             counts[topic] += 1
             if data.startswith(_ZSTD):  # as only the folder's metadata.yaml would say
                 data = zstandard.decompress(data)
@@ -314,7 +311,7 @@ class BagTable(Table):
         for topic, (first, last, begin, end) in spans.items():
             bag_span, own_span = (last - first) / _NANOSECONDS, (end - begin) / _NANOSECONDS
             if own_span and abs(own_span - bag_span) > max(_SPAN, _SHARE * bag_span):
-                self._told.append(
+                self.skips.told.append(
                     f"{self.path}: messages of {topic} span {own_span:.3g} s by their headers, and "
                     f"{bag_span:.3g} s as recorded, by which times are (played, or simulated, at "
                     'another speed?): stamp = "header" in the file of --topics goes by the headers'

@@ -9,12 +9,11 @@ import os
 import re
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,6 @@ from evofsm.store import LARGEST_OBSERVATION
 if TYPE_CHECKING:
     import polars
 
-Item = TypeVar("Item")
 Numbers = dict[str, NDArray[np.float64]]
 Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag"]
 #: Called with the number of bytes each time some were read from a file.
@@ -145,9 +143,19 @@ def file_kind(path: str) -> Kind:
 
 
 class Skips:
-    """Rows of a file that cannot be right: so many are left out, and counted; more are refused."""
+    """Rows of a file that cannot be right: so many are left out, and counted; more are refused.
 
-    def __init__(self, most: int = 0, kinds: dict[str, tuple[int, str]] | None = None) -> None:
+    What else is to be said of a file, and how much of it was read, is told to it as well.
+    """
+
+    def __init__(
+        self,
+        most: int = 0,
+        kinds: dict[str, tuple[int, str]] | None = None,
+        told: list[str] | None = None,
+        on_read: OnRead = silent,
+    ) -> None:
+        self.told, self.on_read = [] if told is None else told, on_read
         self._left = self._most = most
         self._kinds = {} if kinds is None else kinds  # of all files: how many, and the first
         self._first: dict[str, str] = {}  # of this file
@@ -179,14 +187,14 @@ class Skips:
 class Source(AbstractContextManager["Source"]):
     """A file that is read once, unpacked if it is gzipped; it may end early if ``skips`` allow."""
 
-    def __init__(self, path: str, on_read: OnRead = silent, skips: Skips | None = None) -> None:
+    def __init__(self, path: str, skips: Skips | None = None) -> None:
         if os.path.isdir(path):
             raise IsADirectoryError(f"{path} is a folder; name the files in it")
         if os.path.exists(path) and not os.path.isfile(path):
             raise ValueError(f"{path} is a pipe or a device; write it to a file first")
         self.path = path
         self.lines = 0  # read so far of one that is gzipped
-        self._on_read, self._skips, self._ended = on_read, skips, False
+        self._skips, self._ended = skips, False
         self._raw = io.BufferedReader(io.FileIO(path))
         self._packed = self._raw.peek(2).startswith(_GZIP)
         self._file = gzip.GzipFile(fileobj=self._raw) if self._packed else self._raw
@@ -240,7 +248,8 @@ class Source(AbstractContextManager["Source"]):
             self._ended, data = True, b""
         if self._packed:
             self.lines += data.count(b"\n")
-        self._on_read(self._raw.tell() - before)
+        if self._skips is not None:
+            self._skips.on_read(self._raw.tell() - before)
         return data
 
 
@@ -450,15 +459,6 @@ class Dialect:
         return f"{count} fields, but the header names {named} {why}"
 
 
-def _ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """The same, each made by another thread while the one before is in use."""
-    with ThreadPoolExecutor(1) as pool:
-        future = pool.submit(next, items, None)
-        while (item := future.result()) is not None:
-            future = pool.submit(next, items, None)
-            yield item
-
-
 class CsvTable(Table):
     """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
 
@@ -470,20 +470,13 @@ class CsvTable(Table):
     odd, such as a line break within quotes, and what a message is to name.
     """
 
-    def __init__(
-        self,
-        path: str,
-        on_read: OnRead = silent,
-        names: Collection[str] = (),
-        skips: Skips | None = None,
-    ) -> None:
+    def __init__(self, path: str, names: Collection[str] = (), skips: Skips | None = None) -> None:
         with needs("polars", "tables", f"{path}: a table"):
             import polars  # noqa: F401 (said here, before the work begins)
         self.path, self.skips = path, skips or Skips()
-        self._on_read = on_read
         # A field may be long that nobody asks for; lines are bounded.
         csv.field_size_limit(max(csv.field_size_limit(), _CSV_BYTES + 2 * _LONGEST_LINE))
-        with Source(path, skips=Skips(1)) as source:  # said where the rows are read
+        with Source(path, Skips(1)) as source:  # said where the rows are read
             text = decoded(source.rows(), path).removeprefix("\ufeff")
         most = Dialect.most_above
         lines = [line.rstrip("\r") for line in text.split("\n", most)[:most]]
@@ -540,12 +533,10 @@ class CsvTable(Table):
             fault = f"two columns are called {twice[0]!r}"
             raise ValueError(f"{self.path}, line {self._above}: {fault}")
         columns, behind = self.columns, False
-        with Source(self.path, self._on_read, self.skips) as source:
-            for block, lines_before, series in _ahead(self._blocks(source, wanted)):
+        with Source(self.path, self.skips) as source:
+            for block, lines_before in self._blocks(source):
                 here = partial(self._odd, block, lines_before, columns, wanted)
-                if columns != self.columns:  # as its blocks were read
-                    series = self._plain(block, columns, wanted)
-                anew = [0] if behind else []
+                series, anew = self._plain(block, columns, wanted), [0] if behind else []
                 if series is None:
                     odd = here()
                     columns, anew = odd.columns, anew + odd.anew
@@ -566,10 +557,8 @@ class CsvTable(Table):
                 if n_rows or anew:
                     yield wanted.piece(series, partial(self._find, here, wanted), self.skips, anew)
 
-    def _blocks(
-        self, source: Source, wanted: Wanted
-    ) -> Iterator[tuple[bytes, int, dict[str, polars.Series] | None]]:
-        """Lines of the file that are not all empty, how many were before, and what is in them."""
+    def _blocks(self, source: Source) -> Iterator[tuple[bytes, int]]:
+        """Lines of the file that are not all empty, and how many were before."""
         lines_before = 0
         while block := source.rows():
             if not block.isascii():
@@ -578,7 +567,7 @@ class CsvTable(Table):
                 block, lines_before = block.partition(b"\n")[2], lines_before + 1
             lines = _count(block, b"\n")
             if lines < len(block):
-                yield block, lines_before, self._plain(block, self.columns, wanted)
+                yield block, lines_before
             lines_before += lines
 
     def _plain(
@@ -674,11 +663,10 @@ _AS_PARQUET = "Parquet (was a copy or a download interrupted?)"
 class ParquetTable(Table):
     """A Parquet file; read with polars because pyarrow cannot be imported beside libsumo."""
 
-    def __init__(self, path: str, on_read: OnRead = silent, skips: Skips | None = None) -> None:
+    def __init__(self, path: str, skips: Skips | None = None) -> None:
         with needs("polars", "tables", f"{path}: Parquet"):
             import polars
         self.path, self.skips = path, skips or Skips()
-        self._on_read = on_read
         # polars takes other paths for addresses on the network, or of somebody's home.
         self._scan = polars.scan_parquet(os.path.abspath(path), glob=False)
         with readable(self.path, _AS_PARQUET):
@@ -715,7 +703,7 @@ class ParquetTable(Table):
                 frame = part.slice(first, _PARQUET_ROWS).collect()
             series = {name: frame[name] for name in wanted.all}
             yield wanted.piece(series, partial(self._find, frame, first), self.skips)
-            self._on_read(os.path.getsize(self.path) * len(frame) // self._rows)
+            self.skips.on_read(os.path.getsize(self.path) * len(frame) // self._rows)
 
     def _find(
         self, frame: polars.DataFrame, first: int, row: int, name: str | None

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving.naming import VARIABLES
 from evofsm.extras import needs
-from evofsm.io.tables import OnRead, Piece, Skips, Source, Table, Wanted, explained
+from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained
 from evofsm.store import LARGEST_OBSERVATION
 
 #: The action of a pair of vehicles: what the follower did until the next time.
@@ -258,7 +258,7 @@ def _across(apart: Any, headings: Any) -> Any:
     return abs((apart * headings.conjugate()).imag) / (abs(headings) + 1e-9)
 
 
-def fcd_of_xml(path: str, on_read: OnRead, skips: Skips) -> Iterator[_Timestep]:
+def fcd_of_xml(path: str, skips: Skips) -> Iterator[_Timestep]:
     """Read FCD in XML, with a parser that keeps nothing and knows its line."""
     # Told the encoding, it asks no codec for the one that a file names: SUMO writes UTF-8.
     parser = expat.ParserCreate("utf-8")
@@ -299,7 +299,7 @@ def fcd_of_xml(path: str, on_read: OnRead, skips: Skips) -> Iterator[_Timestep]:
         f"there is a <!DOCTYPE {name[:40]}>, and entities are not read"
     )
     n_bytes, data = 0, b" "
-    with Source(path, on_read, skips) as source:
+    with Source(path, skips) as source:
         while data:
             data = source.read(_BYTES_AT_ONCE)
             try:
@@ -524,10 +524,10 @@ _MOST_BYTES = 1 << 28  # of a message; one of a sensor with images has a few mil
 _LENGTH = struct.Struct("<I")
 
 
-def scenes_of_osi(path: str, on_read: OnRead, skips: Skips) -> Iterator[Scene]:
+def scenes_of_osi(path: str, skips: Skips) -> Iterator[Scene]:
     """Read ground truth, or that within sensor views, from a ``.osi`` file, scene by scene."""
     osi = _osi(path)
-    with Source(path, on_read, skips) as source:
+    with Source(path, skips) as source:
         is_view, number = False, 0
         while head := source.read(_LENGTH.size):
             number += 1
@@ -548,7 +548,7 @@ def scenes_of_osi(path: str, on_read: OnRead, skips: Skips) -> Iterator[Scene]:
                 yield _scene(osi, f"{path}, message {number}", data, is_view)
 
 
-def scenes_of_mcap(path: str, on_read: OnRead, skips: Skips) -> Iterator[Scene]:
+def scenes_of_mcap(path: str, skips: Skips) -> Iterator[Scene]:
     """Read OSI in MCAP: the first channel of ground truth or of sensor views."""
     from evofsm.io.mcap import messages
 
@@ -561,7 +561,7 @@ def scenes_of_mcap(path: str, on_read: OnRead, skips: Skips) -> Iterator[Scene]:
             channel_id = channel.id
         if channel.id == channel_id:
             number += 1
-            on_read(len(message.data))
+            skips.on_read(len(message.data))
             with skips.leaving_out("message"):
                 yield _scene(osi, f"{path}, message {number}", message.data, kind == "SensorView")
     if channel_id is None:

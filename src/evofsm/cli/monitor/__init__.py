@@ -201,8 +201,9 @@ def monitor(
                 warn(f"warning: {warning} {sentry.interval:g} s: --resample {sentry.interval:g}s")
             if alone:
                 refuse_other_limit(False, false_a_day, tolerance)
-                about = log_format.columns.observe.names, notes.units, alarms, split, plot
-                show_foreseen(file, list(chunks), sentry, *about, as_json=as_json)
+                every, names = list(chunks), log_format.columns.observe.names
+                about = names, notes.si_units(names), alarms, split, plot
+                show_foreseen(file, every, sentry, *about, as_json=as_json)
                 return None
         if summary and (as_json or plot):
             raise ValueError("--json and --plot are for logs where nobody acts: --action ''")
