@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from evofsm import Guard
+from evofsm import EvolvingFSM, Guard
 from evofsm.driving import Unrevised, guard_for_family, learners_of, load_family, teach
 
 
