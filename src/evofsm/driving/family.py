@@ -21,7 +21,7 @@ import numpy as np
 
 from evofsm.driving.drivers import IDM, ChangingIDM, refuse_others
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.driving.scenarios import Behind, Scenario
+from evofsm.driving.scenarios import Scenario
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
 
@@ -273,17 +273,10 @@ def _with(part: str, **values: float) -> Callable[[Scenario, Numbers], Scenario]
     return switch
 
 
-def _third_car(scenario: Scenario, numbers: Numbers) -> Scenario:
-    gap = numbers.between("behind.gap", 10.0, 40.0)
-    driver = IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=-6.0, highest=2.5)
-    return replace(scenario, behind=Behind(driver, gap))
-
-
 #: What can be switched on in any family, by name.
 SWITCHES: Mapping[str, Callable[[Scenario, Numbers], Scenario]] = {
     "noise": _with("sensors", gap_noise=0.5, speed_noise=0.3),  # white, on all, at every step
     "delay": _with("sensors", delay=0.2),  # of what is seen
     "actuator": _with("body", delay=0.2),  # from a command to its effect
     "jerk": _with("body", jerk=15.0),
-    "third_car": _third_car,
 }

@@ -44,7 +44,7 @@ from evofsm.driving import (
 )
 from evofsm.driving.cars import name_judge
 from evofsm.driving.measures import time_headway, time_to_collision
-from evofsm.driving.world import GAP, GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
+from evofsm.driving.world import GAP, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
 from evofsm.extras import needs
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.naming import Labels
@@ -168,7 +168,7 @@ class OnRoads:
         road = self._road
         self.observation, self.time, self.failed = road.observation, road.time, road.collided
         self.over = road.over or self._stood >= _STOOD
-        self.terminated = road.collided or road.rear_ended
+        self.terminated = road.collided
 
     def propose(self) -> Action:
         """What the driver wants, by what was seen last of each variable."""
@@ -199,8 +199,6 @@ class OnRoads:
             x_follower=float(distance),
             time_to_collision=float(time_to_collision(observation)),
             time_headway=float(time_headway(observation)),
-            gap_behind=float(now[GAP_BEHIND]),
-            rear_ended=road.rear_ended,
         )
 
     def close(self) -> None:
