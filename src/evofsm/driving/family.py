@@ -185,7 +185,8 @@ class Family:
         if noise is not None:
             scenario = replace(scenario, sensors=replace(scenario.sensors, seed=noise))
         for name in self.switches:
-            scenario = SWITCHES[name](scenario, numbers)
+            part, values = SWITCHES[name]
+            scenario = replace(scenario, **{part: replace(getattr(scenario, part), **values)})
         self._check_limits(scenario, driver)
         return Draw(
             scenario, driver, self.variants[numbers.variant] if self.variants else self.name
@@ -265,18 +266,10 @@ def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
 # The sizes are our own: what a production radar and brake system roughly show.
 
 
-def _with(part: str, **values: float) -> Callable[[Scenario, Numbers], Scenario]:
-    def switch(scenario: Scenario, numbers: Numbers) -> Scenario:
-        new_part = replace(getattr(scenario, part), **values)
-        return replace(scenario, **{part: new_part})
-
-    return switch
-
-
-#: What can be switched on in any family, by name.
-SWITCHES: Mapping[str, Callable[[Scenario, Numbers], Scenario]] = {
-    "noise": _with("sensors", gap_noise=0.5, speed_noise=0.3),  # white, on all, at every step
-    "delay": _with("sensors", delay=0.2),  # of what is seen
-    "actuator": _with("body", delay=0.2),  # from a command to its effect
-    "jerk": _with("body", jerk=15.0),
+#: What can be switched on in any family, by name: what of a part of its scenarios is changed.
+SWITCHES: Mapping[str, tuple[str, dict[str, float]]] = {
+    "noise": ("sensors", {"gap_noise": 0.5, "speed_noise": 0.3}),  # white, on all, at every step
+    "delay": ("sensors", {"delay": 0.2}),  # of what is seen
+    "actuator": ("body", {"delay": 0.2}),  # from a command to its effect
+    "jerk": ("body", {"jerk": 15.0}),
 }
