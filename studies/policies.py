@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm.driving import (
-    AlwaysBrake,
     Draw,
     EnvelopeReviser,
     Family,
@@ -96,7 +95,6 @@ def fixed_policies(family: Family) -> list[Policy]:
     fixed = measures.FIXED_MEASURES.items()
     return [
         Policy("unrevised", Group.BOUND, lambda family, draw: Unrevised(family.actions)),
-        Policy("always-brake", Group.BOUND, lambda family, draw: AlwaysBrake(family.actions)),
         Policy("oracle", Group.BOUND, lambda f, draw: _told(f, draw.scenario.leader.brake_decel)),
         *(envelope(name, Group.FIXED, measure) for name, measure in fixed),
         envelope("rss-matched", Group.MATCHED, rss),

@@ -67,9 +67,8 @@ def pump():
 
 @pytest.fixture
 def shown():
-    """Serve a page in a thread, and play on it; settings are those of `Player`."""
+    """Serve a page in a thread, and play on it; settings are those of `LivePage`."""
     pytest.importorskip("websockets")
-    from evofsm.cli.watch.player import Player
     from evofsm.cli.watch.server import LivePage
 
     @contextmanager
@@ -79,10 +78,9 @@ def shown():
         async def serve():
             try:
                 with opened() as watched:
-                    async with LivePage() as page:
-                        page.player = Player(watched, page, **settings)
+                    async with LivePage(watched, **settings) as page:
                         stop = asyncio.Event()
-                        playing = asyncio.create_task(page.player.play())
+                        playing = asyncio.create_task(page.play())
                         served.put((page, asyncio.get_running_loop(), stop))
                         await stop.wait()
                         playing.cancel()

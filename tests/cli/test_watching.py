@@ -8,12 +8,18 @@ import pytest
 
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.options import reading_of
-from evofsm.cli.watch.logged import watched_log
 from evofsm.cli.watch.player import Player
-from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_guard
+from evofsm.cli.watch.session import (
+    OnRoads,
+    Session,
+    learn_first,
+    read_simulated,
+    watched_guard,
+    watched_log,
+)
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, load_family, teach
-from evofsm.driving.assumed import guard_of_monitor
+from evofsm.driving.cars import guard_of_monitor
 from monitor_rows import line, traffic
 
 pytestmark = pytest.mark.usefixtures("compiled")

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from evofsm import IntervalActions
 from evofsm.driving import (
-    AlwaysBrake,
     EnvelopeReviser,
     LatentRisk,
     Unrevised,
@@ -253,7 +252,7 @@ def test_episodes_of_learning_and_of_none_come_out_the_same(tmp_path):
 
 
 REVISERS = {
-    "always brakes": lambda judge, machine: AlwaysBrake(ACTIONS),
+    "unrevised": lambda judge, machine: Unrevised(ACTIONS),
     "measure": lambda judge, machine: EnvelopeReviser(measures.TimeToCollision(4.0), ACTIONS),
     "shadow": lambda judge, machine: ActionReviser(judge, ACTIONS, mode=Mode.SHADOW),
 }
@@ -321,7 +320,7 @@ def test_sensors_that_fail_come_out_the_same(tmp_path):
     assert result.replayed == len(came)
 
 
-class Own(AlwaysBrake):
+class Own(Unrevised):
     """A reviser that no package declares."""
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from evofsm.cli.options import Reading
 from evofsm.cli.show import warn
-from evofsm.driving.assumed import guard_of_monitor
+from evofsm.driving.cars import guard_of_monitor
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM

@@ -19,7 +19,6 @@ from .judge import dead_ends_of as dead_ends_of
 from .leaders import REAL_DRIVES as REAL_DRIVES
 from .leaders import LeaderBrakes as LeaderBrakes
 from .naming import WORDS as WORDS
-from .revisers import AlwaysBrake as AlwaysBrake
 from .revisers import EnvelopeReviser as EnvelopeReviser
 from .revisers import Unrevised as Unrevised
 from .scenarios import Body as Body

@@ -538,7 +538,7 @@ def dead_ends_of(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[int]:
 
 def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     """Gap and speeds, as they can be judged; unless they must be ``whole``, NaN where not seen."""
-    numbers = _series("observation", observation)
+    numbers = real_array("observation", observation, 1)
     if len(numbers) != 3:
         raise ValueError(
             f"observation has shape {numbers.shape}; it must be (3,): gap, speed of the follower "
@@ -557,22 +557,9 @@ def _one_finite(name: str, value: float) -> float:
 
 
 def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    array = _series(name, values)
+    array = real_array(name, values, 1)
     refuse_unusable(name, array)
     return array
-
-
-def _series(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Real numbers in a row; what is that already is not looked at for long, nor copied."""
-    if (
-        type(values) is np.ndarray
-        and values.dtype == np.float64
-        and values.ndim == 1
-        and len(values)
-        and values.flags.carray  # a read-only one would be compiled for
-    ):
-        return values
-    return real_array(name, values, 1)
 
 
 @compiled

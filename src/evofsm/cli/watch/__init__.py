@@ -98,17 +98,15 @@ def watch(
 
 
 async def _serve(watched: Session, *, browse: bool) -> None:
-    from evofsm.cli.watch.player import Player
     from evofsm.cli.watch.server import LivePage
 
-    async with LivePage() as page:
-        page.player = Player(watched, page, awaits=True)
+    async with LivePage(watched, awaits=True) as page:
         may = "steer the run" if watched.start.live else "look on"
         say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
         print(f"  {page.address}", flush=True)
         if browse:
             webbrowser.open(page.address)
-        await page.player.play()
+        await page.play()
         await asyncio.Event().wait()  # it broke off; the page says why
 
 
@@ -134,7 +132,7 @@ def _logged(what: str, reading: Reading, *asked: Any, **settings: Any) -> Sessio
     from tempfile import TemporaryDirectory
 
     from evofsm.cli.sumocfg import trace_configuration
-    from evofsm.cli.watch.logged import watched_log
+    from evofsm.cli.watch.session import watched_log
 
     if not what.endswith(".sumocfg"):
         return watched_log(what, reading, *asked, **settings)

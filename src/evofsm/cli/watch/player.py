@@ -58,11 +58,6 @@ class Player:
         self._order: Callable[[], object] | None = None  # of what may take time, the latest
         self._news = asyncio.Event()
 
-    def attend(self) -> None:
-        """Someone looks on: play, if that was waited for."""
-        if self._awaits:
-            self.set(awaits=False)
-
     def set(self, **changes: bool | float) -> None:
         """Play on otherwise: ``paused``, or at a ``speed``; with ``steps`` once, though paused."""
         for name, value in changes.items():
