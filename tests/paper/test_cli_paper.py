@@ -47,7 +47,7 @@ def test_a_claim_that_fails_is_shown_and_ends_with_1(tmp_path, monkeypatch):
 
 def test_a_folder_that_cannot_be_is_said_in_a_line_before_anything_is_driven(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("evofsm.paper.reproduction.run_paper", None)
+    monkeypatch.setattr("evofsm.paper.run_paper", None)
     (tmp_path / "file").write_text("in the way")
     run = evofsm("--world", "kinematic", "--out", "file")
     assert (run.exit_code, run.stdout) == (2, "")

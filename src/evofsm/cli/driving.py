@@ -15,7 +15,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from threading import Thread
@@ -229,7 +229,6 @@ def _decided(driven: Episode) -> dict[str, list[Any]]:
 def drive_in_turn(
     results: Results,
     episodes: int,
-    world: World,
     move: Advance = lambda *_, **__: None,
     audit: DecisionLogger | None = None,
 ) -> Driving:
@@ -237,7 +236,7 @@ def drive_in_turn(
     setup, guard, n_episodes = results.setup, results.guard, len(results.rows)
     if setup.learn and n_episodes > episodes:
         raise ValueError(f"{results.folder} has driven {n_episodes} episodes, more than {episodes}")
-    guard.audit = audit
+    guard.audit, world = audit, open_world(setup.world)
     for number in range(episodes):
         if number in results.rows:
             continue
@@ -282,13 +281,7 @@ def drive_at_once(
 
 
 def _row(setup: Setup, guard: Guard, number: int) -> Outcomes:
-    return setup.drive(guard, _opened(setup.world), number)[1]
-
-
-@cache
-def _opened(name: str) -> World:
-    """The world of this process, open for as long as it lives."""
-    return open_world(name).__enter__()
+    return setup.drive(guard, open_world(setup.world), number)[1]
 
 
 def _begin_work() -> None:
