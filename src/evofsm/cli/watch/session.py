@@ -168,7 +168,6 @@ class OnRoads:
         self._road = self._closing.enter_context(self.world.open(draw.scenario))
         self._steps = draw.scenario.steps(self.interval)
         self._stood = 0.0
-        self._held = np.full(3, np.nan)
         self._look()
 
     def _look(self) -> None:
@@ -178,10 +177,8 @@ class OnRoads:
         self.terminated = road.collided
 
     def propose(self) -> Action:
-        """What the driver wants, by what was seen last of each variable."""
-        observation = self.observation
-        self._held = np.where(np.isnan(observation), self._held, observation)
-        return self._controller.propose(self._held, self.time).action
+        """What the driver wants."""
+        return self._controller.propose(self.observation, self.time).action
 
     def advance(self, revision: Revision) -> None:
         """Drive on."""
