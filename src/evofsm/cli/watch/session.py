@@ -26,14 +26,15 @@ from evofsm.cli.watch.shown import (
     CALM,
     OF_CARS,
     Cars,
-    Chronicle,
     Frame,
     Graph,
     Judged,
     Known,
     Start,
+    Story,
     cars_of,
     first_of_its_kind,
+    go_on,
     graph_of,
     known_of,
     numbers,
@@ -594,8 +595,7 @@ class Session(AbstractContextManager["Session"]):
         self.case = case
         system.begin(case)
         self._guard.begin()
-        calm = min(CALM, _CALM * system.interval)
-        self._chronicle = Chronicle(self._tolerance, system.alone, calm)
+        self._story = Story(alone=system.alone)
         self._number = 0
         self.start = self._begun()
         return self.start
@@ -613,7 +613,9 @@ class Session(AbstractContextManager["Session"]):
         )
         frame = self._end(frame) if self.system.over else self._decide(frame)
         self._number += 1
-        return frame._replace(story=self._chronicle.tell(frame))
+        calm = min(CALM, _CALM * self.system.interval)
+        self._story = go_on(self._story, frame, self._tolerance, calm)
+        return frame._replace(story=self._story)
 
     def graph(self) -> Graph:
         """The states found so far."""
