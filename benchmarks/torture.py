@@ -39,7 +39,7 @@ from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.state import State
 from evofsm.cli.monitor.transports import Server, Stream
 from evofsm.driving.cars import guard_for_cars
-from evofsm.driving.families import load_family
+from evofsm.driving.family import load_family
 from evofsm.driving.judge import LatentRisk
 from evofsm.fsm.arrays import MACHINE
 from evofsm.fsm.machine import EvolvingFSM

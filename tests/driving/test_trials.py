@@ -6,8 +6,7 @@ import pytest
 pytest.importorskip("scipy")
 
 from evofsm.driving.cars import TOLD, guard_for_cars, guard_for_family, learners_of, name_judge
-from evofsm.driving.families import load_family
-from evofsm.driving.family import held_out, training
+from evofsm.driving.family import held_out, load_family, training
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.trials import (
     drive,

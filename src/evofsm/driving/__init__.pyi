@@ -7,12 +7,12 @@ from .cars import learners_of as learners_of
 from .drivers import IDM as IDM
 from .drivers import ChangingIDM as ChangingIDM
 from .env import CarFollowing as CarFollowing
-from .families import FAMILIES as FAMILIES
-from .families import load_family as load_family
+from .family import FAMILIES as FAMILIES
 from .family import Draw as Draw
 from .family import Family as Family
 from .family import Numbers as Numbers
 from .family import held_out as held_out
+from .family import load_family as load_family
 from .family import training as training
 from .judge import LatentRisk as LatentRisk
 from .judge import dead_ends_of as dead_ends_of

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving.families import load_family
-from evofsm.driving.family import Draw, Family
+from evofsm.driving.family import Draw, Family, load_family
 from evofsm.driving.sumo import open_world
 from evofsm.driving.world import Episode, Road
 from evofsm.extras import needs
