@@ -60,7 +60,7 @@ def test_danger_shows_long_before_time_to_collision_notices_and_is_told_from_whe
     assert risky.proposed_risk.critical < risky.needed
     assert story.first < story.danger.dead_end < story.leader_brakes
     assert story.time_to_collision - story.first > 20.0
-    assert story.leader_decel == 9.0
+    assert story.leader_decel == pytest.approx(9.0)
     late = [frame.story for frame in frames if frame.time >= story.danger.dead_end]
     assert {one.danger.dead_end for one in late} == {story.danger.dead_end}
 

@@ -49,9 +49,8 @@ from evofsm.driving import (
     unrevised_guard,
 )
 from evofsm.driving.cars import assumptions, guard_of_monitor, name_judge
-from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.driving.world import GAP, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
+from evofsm.driving.world import LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
 from evofsm.extras import needs
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.naming import Labels
@@ -172,10 +171,12 @@ class OnRoads:
         self._look()
 
     def _look(self) -> None:
-        road = self._road
+        road, record = self._road, self._road.episode().record
         self.observation, self.time, self.failed = road.observation, road.time, road.collided
-        self.over = road.over or self._stood >= _STOOD
-        self.terminated = road.collided
+        self.over, self.terminated = road.over or self._stood >= _STOOD, road.collided
+        stands = not record[-1, [SPEED, LEADER_SPEED]].any()
+        brakes = record[-2:, LEADER_ACCELERATION].min() < 0.0
+        self._stood = self._stood + self.interval if stands and brakes else 0.0
 
     def propose(self) -> Action:
         """What the driver wants."""
@@ -187,24 +188,12 @@ class OnRoads:
         self._look()
 
     def cars(self) -> Cars:
-        """Where they are."""
-        road, episode = self._road, self._road.episode()
-        record, speeds, now = episode.record, episode.record[:, SPEED], episode.record[-1]
-        distance = 0.5 * (speeds[1:] + speeds[:-1]).sum() * road.scenario.dt
-        a_leader = float(record[-2, LEADER_ACCELERATION]) if len(record) > 1 else math.nan
-        stands = now[SPEED] == now[LEADER_SPEED] == 0.0 and a_leader < 0.0
-        self._stood = self._stood + self.interval if stands else 0.0
-        observation = self.observation
-        return Cars(
-            gap=float(now[GAP]),
-            v_follower=float(speeds[-1]),
-            v_leader=float(now[LEADER_SPEED]),
-            a_follower=float(episode.realised[-2:][0]),
-            a_leader=a_leader,
-            x_follower=float(distance),
-            time_to_collision=float(time_to_collision(observation)),
-            time_headway=float(time_headway(observation)),
-        )
+        """Where they are, by what there was at each decision."""
+        episode = self._road.episode()
+        last = len(episode.time) - 1
+        rows = [*range(0, last, self._steps), last]
+        *_, now = cars_of(episode.time[rows], episode.observations[rows])
+        return now
 
     def close(self) -> None:
         """Leave the road."""

@@ -112,7 +112,7 @@ class Cars(NamedTuple):
     gap: float  #: bumper to bumper, as it truly is [m]
     v_follower: float  #: [m/s]
     v_leader: float  #: [m/s]
-    a_follower: float  #: what the body did until now [m/s²]; NaN at first
+    a_follower: float  #: since the time before, on average [m/s²]; NaN at first
     a_leader: float  #: [m/s²]; NaN at first
     x_follower: float  #: front bumper, from where it started [m]
     time_to_collision: float  #: [s]; infinite where the gap does not close
