@@ -67,7 +67,7 @@ def pump():
 
 @pytest.fixture
 def shown():
-    """Serve a page in a thread, and play on it; settings are those of `LivePage`."""
+    """Serve a page in a thread, and play on it, as it is set."""
     pytest.importorskip("websockets")
     from evofsm.cli.watch.server import LivePage
 
@@ -78,7 +78,8 @@ def shown():
         async def serve():
             try:
                 with opened() as watched:
-                    async with LivePage(watched, **settings) as page:
+                    async with LivePage(watched) as page:
+                        page.set(**{"awaits": False, **settings})
                         stop = asyncio.Event()
                         playing = asyncio.create_task(page.play())
                         served.put((page, asyncio.get_running_loop(), stop))

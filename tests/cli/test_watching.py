@@ -265,7 +265,8 @@ def test_what_was_before_is_shown_at_once():
     session.start = session.start._replace(begins=2.0)
 
     async def play():
-        player = Player(session, lambda kind, what: told.append(kind), speed=0.25)
+        player = Player(session, lambda kind, what: told.append(kind))
+        player.set(awaits=False, speed=0.25)
         playing = asyncio.create_task(player.play())
         await asyncio.sleep(1.0)
         playing.cancel()
@@ -277,7 +278,8 @@ def test_what_was_before_is_shown_at_once():
 def test_a_run_that_breaks_off_says_why():
     session, told = opened(), []
     session.step = lambda: 1 / 0
-    player = Player(session, lambda *what: told.append(what), speed=math.inf)
+    player = Player(session, lambda *what: told.append(what))
+    player.set(awaits=False, speed=math.inf)
     asyncio.run(asyncio.wait_for(player.play(), 60.0))
     assert told[-1] == ("failed", "ZeroDivisionError: division by zero")
 

@@ -100,7 +100,7 @@ def watch(
 async def _serve(watched: Session, *, browse: bool) -> None:
     from evofsm.cli.watch.server import LivePage
 
-    async with LivePage(watched, awaits=True) as page:
+    async with LivePage(watched) as page:
         may = "steer the run" if watched.start.live else "look on"
         say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
         print(f"  {page.address}", flush=True)

@@ -80,8 +80,8 @@ def _rounded(value: Any) -> Any:
 class LivePage(Player):
     """Plays a run to browsers on this computer, which it serves in ``async with``."""
 
-    def __init__(self, watched: Session, **settings: Any) -> None:
-        super().__init__(watched, self.tell, **settings)
+    def __init__(self, watched: Session) -> None:
+        super().__init__(watched, self.tell)
         self.token = secrets.token_urlsafe(24)
         self.port = 0  #: where it listens
         self._latest: dict[str, str] = {}  # messages of the present run, for who comes later
