@@ -41,7 +41,7 @@ from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import Action, nearest_bounds
 from evofsm.guard.api import LearningJudge, Trial
-from evofsm.store import COUNT, FLAG, LARGEST_OBSERVATION, SIZE, SMALLEST, Kind, Numbers, Place
+from evofsm.store import COUNT, FLAG, SIZE, SMALLEST, Kind, Numbers, Place
 
 if TYPE_CHECKING:
     from evofsm.guard import ActionReviser
@@ -216,7 +216,7 @@ class LatentRisk(Retraced, LearningJudge):
         self, observation: ArrayLike, acceleration: float, *, learn: bool, watched: bool = False
     ) -> None:
         triple = _three_finite(observation, whole=False)
-        command = _one_finite("acceleration", acceleration)
+        (command,) = _finite("acceleration", [acceleration]).tolist()
         self._keep_up(triple, command, learn and is_whole(triple), watched)
 
     @step
@@ -548,12 +548,6 @@ def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     if not math.isfinite(gap + speed + leader_speed):  # looked at closely only where it has to be
         refuse_unusable("observation", numbers if whole else numbers[~np.isnan(numbers)])
     return gap, speed, leader_speed
-
-
-def _one_finite(name: str, value: float) -> float:
-    if type(value) is float and abs(value) <= LARGEST_OBSERVATION:  # false of NaN
-        return value
-    return float(_finite(name, [value])[0])
 
 
 def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
