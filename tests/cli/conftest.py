@@ -69,6 +69,7 @@ def pump():
 def shown():
     """Serve a page in a thread, and play on it, as it is set."""
     pytest.importorskip("websockets")
+    from evofsm.cli.watch.player import Player
     from evofsm.cli.watch.server import LivePage
 
     @contextmanager
@@ -78,10 +79,11 @@ def shown():
         async def serve():
             try:
                 with opened() as watched:
-                    async with LivePage(watched) as page:
-                        page.set(**{"awaits": False, **settings})
+                    async with LivePage() as page:
+                        page.player = Player(watched, page)
+                        page.player.set(**{"awaits": False, **settings})
                         stop = asyncio.Event()
-                        playing = asyncio.create_task(page.play())
+                        playing = asyncio.create_task(page.player.play())
                         served.put((page, asyncio.get_running_loop(), stop))
                         await stop.wait()
                         playing.cancel()

@@ -98,15 +98,17 @@ def watch(
 
 
 async def _serve(watched: Session, *, browse: bool) -> None:
+    from evofsm.cli.watch.player import Player
     from evofsm.cli.watch.server import LivePage
 
-    async with LivePage(watched) as page:
+    async with LivePage() as page:
+        page.player = Player(watched, page)
         may = "steer the run" if watched.start.live else "look on"
         say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
         print(f"  {page.address}", flush=True)
         if browse:
             webbrowser.open(page.address)
-        await page.play()
+        await page.player.play()
         await asyncio.Event().wait()  # it broke off; the page says why
 
 

@@ -34,7 +34,7 @@ class Player:
 
     ``audience`` is told what happens: "start" with a `Start`, "frame" with a `Frame`, "graph" with
     a `Graph`, "known" with what is `Known`, "clock" with a `Clock`, and "failed" with why it broke
-    off. It waits until someone attends, which `set` says.
+    off. It waits until someone attends.
     """
 
     def __init__(self, watched: Session, audience: Callable[[str, Any], object]) -> None:
@@ -50,11 +50,13 @@ class Player:
         self._order: Callable[[], object] | None = None  # of what may take time, the latest
         self._news = asyncio.Event()
 
-    def set(self, **changes: bool | float) -> None:
-        """Play on otherwise: ``paused``, or at a ``speed``; with ``steps`` once, though paused.
+    def attend(self) -> None:
+        """Someone looks on: play, if that was waited for."""
+        if self._awaits:
+            self.set(awaits=False)
 
-        Before anything is played ``awaits=False`` says that someone attends.
-        """
+    def set(self, **changes: bool | float) -> None:
+        """Play on otherwise: ``paused``, or at a ``speed``; with ``steps`` once, though paused."""
         for name, value in changes.items():
             setattr(self, f"_{name}", value)
         self._due = time.monotonic()

@@ -21,7 +21,6 @@ from typing import Any, Self
 import msgspec
 
 from evofsm.cli.watch.player import Player
-from evofsm.cli.watch.session import Session
 from evofsm.cli.watch.shown import Frame, Start
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.extras import needs
@@ -52,12 +51,17 @@ _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # junk on the socket is nobody's traceback
 
 
-def message(kind: str, what: Any, start: Start) -> str:
-    """What a `Player` tells, as a page reads it: JSON, null for what is no finite number."""
+def message(kind: str, what: Any, start: Start | None = None) -> str:
+    """What a `Player` tells, as a page reads it: JSON, null for what is no finite number.
+
+    >>> message("failed", "no road")
+    '{"kind":"failed","text":"no road"}'
+    """
     body: dict[str, Any] = what._asdict() if hasattr(what, "_asdict") else {"text": what}
     if isinstance(what, Start):
         body |= introduce(what)
     elif isinstance(what, Frame):
+        assert start is not None
         story, danger = what.story, what.story.danger
         body["danger"] = None
         dead_end = None if danger is None else danger.dead_end  # since when no braking helps [s]
@@ -77,16 +81,17 @@ def _rounded(value: Any) -> Any:
     return [_rounded(part) for part in value] if isinstance(value, list | tuple) else value
 
 
-class LivePage(Player):
-    """Plays a run to browsers on this computer, which it serves in ``async with``."""
+class LivePage:
+    """Serves a run to browsers on this computer, in ``async with``; the audience of a `Player`."""
 
-    def __init__(self, watched: Session) -> None:
-        super().__init__(watched, self.tell)
+    def __init__(self) -> None:
         self.token = secrets.token_urlsafe(24)
+        self.player: Player | None = None  #: does what pages ask for
         self.port = 0  #: where it listens
         self._latest: dict[str, str] = {}  # messages of the present run, for who comes later
         self._frames: deque[str] = deque(maxlen=_MOST_FRAMES)
         self._clients: set[ServerConnection] = set()
+        self._start: Start | None = None
         paths = (files(__package__) / "live").iterdir()
         self._files = {file.name: file.read_bytes() for file in paths}
 
@@ -117,12 +122,13 @@ class LivePage(Player):
         self._server.close()
         await self._server.wait_closed()
 
-    def tell(self, kind: str, what: Any) -> None:
-        """Send what happens to all who look on, and keep it for who comes later."""
-        if kind == "start":
+    def __call__(self, kind: str, what: Any) -> None:
+        """What the player tells."""
+        if isinstance(what, Start):
+            self._start = what
             self._frames.clear()
             self._latest.clear()
-        text = message(kind, what, self._watched.start)
+        text = message(kind, what, self._start)
         if kind == "frame":
             self._frames.append(text)
         else:
@@ -157,8 +163,8 @@ class LivePage(Player):
         parts = ",".join([*self._latest.values(), *self._frames])  # the start first
         broadcast([connection], f'{{"kind":"whole","parts":[{parts}]}}')
         self._clients.add(connection)
-        if self._awaits:
-            self.set(awaits=False)
+        if self.player is not None:
+            self.player.attend()
         try:
             async for text in connection:
                 if not isinstance(text, str):
@@ -173,20 +179,21 @@ class LivePage(Player):
             self._clients.discard(connection)
 
     def _obey(self, command: _Command) -> None:
-        start = self._watched.start
+        if self.player is None or self._start is None:
+            return
         match (command.do, command.value):
             case ("pause", bool(paused)):
-                self.set(paused=paused)
+                self.player.set(paused=paused)
             case ("step", None):
-                self.set(paused=True, steps=True)
-            case ("speed", float(speed)) if speed in start.speeds:
-                self.set(speed=speed)
-            case ("revise", bool(on)) if start.live:
-                self.revise(on)
+                self.player.set(paused=True, steps=True)
+            case ("speed", float(speed)) if speed in self._start.speeds:
+                self.player.set(speed=speed)
+            case ("revise", bool(on)) if self._start.live:
+                self.player.revise(on)
             case ("restart", None):
-                self.restart()
-            case ("case", float(case)) if case in range(len(start.cases)):
-                self.restart(int(case))
+                self.player.restart()
+            case ("case", float(case)) if case in range(len(self._start.cases)):
+                self.player.restart(int(case))
             case _:
                 raise ValueError(command.do)
 
