@@ -103,7 +103,9 @@ class ClosedLoop(Study):
     tolerance: Annotated[
         float, Option(help="Share of leaders' hard brakes that need not be survived.")
     ] = TOLERANCE
-    switches: Annotated[str, Option("--with", help="noise, delay, actuator; with commas.")] = ""
+    switches: Annotated[
+        str, Option("--with", help="noise, delay, actuator, jerk; with commas.")
+    ] = ""
     rule_seeds: Annotated[
         int, Option(min=0, help="Learning seeds in the comparison of state rules; 0: none.")
     ] = 2

@@ -139,7 +139,7 @@ FULL = Scenario(
     initial_gap=20.0,
     duration=20.0,
     initial_speed=14.0,
-    body=Body(lowest=-6.0, highest=2.0, delay=0.2),
+    body=Body(lowest=-6.0, highest=2.0, delay=0.2, jerk=15.0),
     sensors=Sensors(gap_noise=0.5, speed_noise=0.3, delay=0.2, seed=3),
 )
 
@@ -169,11 +169,12 @@ def test_waves_then_the_brake_move_the_leader():
     assert (accelerations[800:] == -5.0).all()
 
 
-def test_a_body_is_late_and_limited():
+def test_a_body_is_late_limited_and_smooth():
     scenario = replace(FULL, sensors=Sensors())
     episode = KinematicWorld().run(scenario, lambda z: -9.0)
     realised = episode.record[:, REALISED]
     assert (realised[:20] == 0.0).all()
+    assert np.diff(realised[:100]).min() == pytest.approx(-0.15)
     assert realised.min() == -6.0
 
 

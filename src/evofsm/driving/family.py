@@ -260,6 +260,7 @@ SWITCHES: Mapping[str, tuple[str, dict[str, float]]] = {
     "noise": ("sensors", {"gap_noise": 0.5, "speed_noise": 0.3}),  # white, on all, at every step
     "delay": ("sensors", {"delay": 0.2}),  # of what is seen
     "actuator": ("body", {"delay": 0.2}),  # from a command to its effect
+    "jerk": ("body", {"jerk": 15.0}),
 }
 
 

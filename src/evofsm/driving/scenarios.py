@@ -54,17 +54,20 @@ class Body:
     """What the follower's body makes of a command.
 
     ``lowest`` and ``highest`` bound the realised acceleration [m/s²], ``delay`` is the time from a
-    command to its effect [s].
+    command to its effect [s], ``jerk`` the fastest change of the realised acceleration [m/s³].
     """
 
     lowest: float = -math.inf
     highest: float = math.inf
     delay: float = 0.0
+    jerk: float = math.inf
 
     def __post_init__(self) -> None:
         if not self.lowest < self.highest:
             raise ValueError(f"body's bounds are [{self.lowest}, {self.highest}]; lowest is first")
         refuse_others(self, "body's", "", "delay")
+        if not self.jerk > 0.0:
+            raise ValueError(f"body's jerk is {self.jerk}; it must be positive")
 
 
 @dataclass(frozen=True)

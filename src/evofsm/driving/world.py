@@ -91,7 +91,7 @@ class Plan(NamedTuple):
     waves: NDArray[np.float64]  # (k, 2) from a time on, an acceleration
     brake: NDArray[np.float64]  # (4,) decel, speed, time, and 1 once it brakes
     cut_in: NDArray[np.float64]  # (3,) row, gap, speed
-    body: NDArray[np.float64]  # (3,) lowest, highest, delay in steps
+    body: NDArray[np.float64]  # (4,) lowest, highest, delay in steps, jerk times dt
 
     @classmethod
     def of(cls, scenario: Scenario) -> Plan:
@@ -105,7 +105,9 @@ class Plan(NamedTuple):
             np.array(leader.waves, dtype=np.float64).reshape(-1, 2),
             np.array([leader.brake_decel, leader.brake_speed, leader.brake_time, 0.0]),
             np.array(entry, dtype=np.float64),
-            np.array([body.lowest, body.highest, scenario.steps(body.delay)]),
+            np.array(
+                [body.lowest, body.highest, scenario.steps(body.delay), body.jerk * scenario.dt]
+            ),
         )
 
 
@@ -141,7 +143,11 @@ def decide(plan: Plan, record: NDArray[np.float64], row: int, command: float) ->
     now[COMMANDED] = command
     command_row = row - int(body[2])
     acceleration = record[command_row, COMMANDED] if command_row >= 0 else 0.0
-    now[REALISED] = min(max(acceleration, body[0]), body[1])
+    acceleration = min(max(acceleration, body[0]), body[1])
+    if body[3] < np.inf:
+        last = record[row - 1, REALISED] if row > 0 else 0.0
+        acceleration = min(max(acceleration, last - body[3]), last + body[3])
+    now[REALISED] = acceleration
 
 
 @compiled
