@@ -104,7 +104,7 @@ class ClosedLoop(Study):
         float, Option(help="Share of leaders' hard brakes that need not be survived.")
     ] = TOLERANCE
     switches: Annotated[
-        str, Option("--with", help="noise, delay, actuator, jerk; with commas.")
+        str, Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
     ] = ""
     rule_seeds: Annotated[
         int, Option(min=0, help="Learning seeds in the comparison of state rules; 0: none.")
@@ -473,7 +473,7 @@ def _check(study: ClosedLoop, policy: str, seed: int, after: int, guard: Guard) 
 _MEASURED = (
     *("collisions", "collision_rate", "collision_low", "collision_high"),
     *("mobility", "mobility_low", "mobility_high"),
-    *("intervention_rate", "mean_change", "jerk", "episodes_until_safe"),
+    *("intervention_rate", "mean_change", "jerk", "rear_ends", "episodes_until_safe"),
     "train_collisions",
 )
 _LEARNT = pl.col("group") == Group.LEARNT
@@ -592,7 +592,7 @@ _IS_BETTER = (_FEWER > _ROUNDING) | (
         (_FURTHER > _ROUNDING)
         | pl.any_horizontal(
             pl.col(price) < pl.col(f"{price}_ours") - _ROUNDING
-            for price in ("intervention_rate", "mean_change", "jerk")
+            for price in ("intervention_rate", "mean_change", "jerk", "rear_ends")
         )
     )
 )
@@ -691,10 +691,11 @@ _POLICIES = {
 
 def _parts(study: ClosedLoop, found: Frames, lines: pl.DataFrame) -> Iterator[Table | Figure]:
     ours = pl.when(pl.col("policy").is_in([OURS, MACHINE])).then(pl.lit("ours"))
+    behind = study.drawn_from.draw(study.seed, 0).scenario.behind is not None
     yield Table(
         "All policies",
         lines,
-        _POLICIES,
+        _POLICIES | ({"rear-ended": "{rear_ends:g}"} if behind else {}),
         "All drive the same held-out episodes. Of learners each column's median over seeds by "
         "itself, and the seed with most collisions, of those least mobility. Intervals: Clopper "
         "and Pearson, and bootstrap over episodes; of medians, the medians of their ends. "

@@ -582,7 +582,7 @@ from pathlib import Path
 
 from evofsm.driving.drivers import IDM, ChangingIDM
 from evofsm.driving.family import Draw, Family
-from evofsm.driving.scenarios import Body, CutIn, Leader, Scenario, Sensors
+from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sensors
 
 cases = {{
 {draws}}}

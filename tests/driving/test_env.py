@@ -1,4 +1,5 @@
 import importlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from evofsm.driving.env import ID, CarFollowing  # noqa: E402
 from evofsm.driving.family import load_family  # noqa: E402
+from evofsm.driving.scenarios import Behind  # noqa: E402
 
 NAME = f"evofsm.driving.env:{ID}"
-INFO = {"time", "gap", "distance", "failed", "split", "index"}
+INFO = {"time", "gap", "distance", "failed", "rear_ended", "split", "index"}
 
 
 def drive(env, policy, **reset):
@@ -82,7 +84,7 @@ def test_a_collision_terminates_costs_and_is_a_failure():
         env, lambda *_: 2.5, options={"index": 0}
     )
     assert (terminated, truncated) == (True, False)
-    assert info["failed"]
+    assert (info["failed"], info["rear_ended"]) == (True, False)
     assert reward == info["distance"] - 100.0
     assert observation[0] == info["gap"] <= 0.0
     assert not any(answer[-1]["failed"] for answer in before)
@@ -93,6 +95,26 @@ def test_the_end_of_time_truncates():
     _, reward, terminated, truncated, info = answers[-1]
     assert (terminated, truncated, info["failed"], reward) == (False, True, False, 0.0)
     assert info["time"] == pytest.approx(35.0, abs=0.02)
+
+
+def test_being_rear_ended_terminates_and_costs_but_is_no_failure():
+    family = load_family("emergency")
+
+    def followed_closely(numbers):
+        scenario, hasty = family.make(numbers)
+        return replace(scenario, behind=Behind(hasty, 5.0)), hasty
+
+    env = CarFollowing(replace(family, make=followed_closely))
+
+    def stops_dead(observation, info):
+        return 2.5 if info["time"] < 3.0 else -2.5
+
+    ends = [drive(env, stops_dead, options={"index": index})[-1] for index in range(8)]
+    rear_ended = [end for end in ends if end[-1]["rear_ended"]]
+    assert rear_ended
+    for _, reward, terminated, truncated, info in rear_ended:
+        assert (terminated, truncated, info["failed"]) == (True, False, False)
+        assert reward == info["distance"] - env.collision_cost
 
 
 @pytest.mark.parametrize("action", [[np.nan], [np.inf], [1.0, 2.0]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evofsm.driving.drivers import IDM, ChangingIDM
-from evofsm.driving.scenarios import Body, CutIn, Leader, Scenario, Sensors
+from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sensors
 from evofsm.driving.sumo import SumoWorld
 from evofsm.driving.world import REALISED, KinematicWorld
 from evofsm.paper.runs import CASES, Settings
@@ -141,6 +141,7 @@ FULL = Scenario(
     initial_speed=14.0,
     body=Body(lowest=-6.0, highest=2.0, delay=0.2, jerk=15.0),
     sensors=Sensors(gap_noise=0.5, speed_noise=0.3, delay=0.2, seed=3),
+    behind=Behind(IDM(1.25, 25.0, 2.0, 1.0, 2.0, lowest=-8.0), gap=15.0),
 )
 
 
@@ -170,7 +171,7 @@ def test_waves_then_the_brake_move_the_leader():
 
 
 def test_a_body_is_late_limited_and_smooth():
-    scenario = replace(FULL, sensors=Sensors())
+    scenario = replace(FULL, sensors=Sensors(), behind=None)
     episode = KinematicWorld().run(scenario, lambda z: -9.0)
     realised = episode.record[:, REALISED]
     assert (realised[:20] == 0.0).all()
@@ -184,6 +185,14 @@ def test_sensors_see_late_and_with_the_noise_of_their_seed():
     late = np.array(seen)[20:] - episode.observations[:-20]
     assert late[:, 0].std() == pytest.approx(0.5, rel=0.2)
     assert late[:, 1].std() == pytest.approx(0.3, rel=0.2)
+
+
+def test_a_car_behind_may_run_into_a_follower_who_brakes():
+    sleepy = IDM(1.25, 25.0, 2.0, 0.1, 2.0, lowest=-1.0)
+    scenario = replace(FULL, behind=Behind(sleepy, gap=4.0), sensors=Sensors())
+    episode = KinematicWorld().run(scenario, lambda z: -6.0)
+    assert episode.rear_ended
+    assert not episode.collided
 
 
 def test_cars_that_begin_close_and_under_way_are_driven_in_sumo():

@@ -73,7 +73,7 @@ def test_cases_are_written_as_a_family_that_fails_as_often(found, tmp_path):
     assert 0.0 < far[-1] <= far[0] <= 1.0
 
 
-@pytest.mark.parametrize("name", [*FAMILIES, "cut_in+noise+delay+actuator+jerk"])
+@pytest.mark.parametrize("name", [*FAMILIES, "cut_in+noise+delay+actuator+jerk+third_car"])
 def test_what_is_kept_is_what_was_drawn_to_the_last_bit(name, tmp_path):
     family = load_family(name).shifted or load_family(name)
     cases = {f"case {k}": family.draw(0, k) for k in range(4)}

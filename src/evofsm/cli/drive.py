@@ -163,6 +163,8 @@ def _summary(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
     share = f"{row.collisions:,} of {row.episodes:,}: {row.collision_rate:.1%}"
     yield "collisions", f"{share} {interval}"
     yield "rate", str(row.failures)
+    if row.rear_ends:
+        yield "rear-ended", f"{row.rear_ends}"
     yield "mobility", f"{row.mobility:.2f} of the way that the controller makes by itself"
     interventions = f"{row.intervention_rate:.1%} of decisions"
     yield "interventions", f"{interventions}; mean change {row.mean_change:.2f} m/s²"

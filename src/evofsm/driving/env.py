@@ -44,10 +44,12 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     family's interval. What lies beyond the range is commanded at its edge.
 
     The reward of a step is the distance travelled in it [m], less ``collision_cost`` where it
-    ends in a collision. An episode terminates when the cars collide, and is truncated when its
+    ends in a collision. An episode terminates when two cars collide, and is truncated when its
     time is up. ``info`` holds ``time`` [s], ``gap`` [m] as it truly is, ``distance`` [m] and
-    ``realised`` acceleration [m/s²] of the step, and ``failed``, whether the follower ran into its
-    leader. ``split`` and ``index`` say which scenario it is.
+    ``realised`` acceleration [m/s²] of the step, ``failed``, whether the follower ran into its
+    leader, and ``rear_ended``, whether the car behind, if any, ran into the follower. Both
+    terminate and both cost, but only the first is a failure. ``split`` and ``index`` say which
+    scenario it is.
 
     Parameters
     ----------
@@ -140,6 +142,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
             "gap": float(step.observations[-1, 0]),
             "distance": float(np.trapezoid(step.observations[:, 1], step.time)),
             "failed": step.collided,
+            "rear_ended": step.rear_ended,
             **self._which,
         }
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from evofsm.driving.drivers import IDM, ChangingIDM, refuse_others
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.driving.scenarios import Body, CutIn, Leader, Scenario
+from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
 
@@ -192,7 +192,11 @@ class Family:
             scenario = replace(scenario, sensors=replace(scenario.sensors, seed=noise))
         for name in self.switches:
             part, values = SWITCHES[name]
-            scenario = replace(scenario, **{part: replace(getattr(scenario, part), **values)})
+            if part == "behind":
+                gap = numbers.between("behind.gap", 10.0, 40.0)
+                scenario = replace(scenario, behind=Behind(_normal(-6.0), gap))
+            else:
+                scenario = replace(scenario, **{part: replace(getattr(scenario, part), **values)})
         self._check_limits(scenario, driver)
         return Draw(
             scenario, driver, self.variants[numbers.variant] if self.variants else self.name
@@ -261,6 +265,7 @@ SWITCHES: Mapping[str, tuple[str, dict[str, float]]] = {
     "delay": ("sensors", {"delay": 0.2}),  # of what is seen
     "actuator": ("body", {"delay": 0.2}),  # from a command to its effect
     "jerk": ("body", {"jerk": 15.0}),
+    "third_car": ("behind", {}),  # at a gap that is drawn
 }
 
 

@@ -88,6 +88,17 @@ class Sensors:
 
 
 @dataclass(frozen=True)
+class Behind:
+    """A third car, at first ``gap`` [m] behind the follower, from bumper to bumper."""
+
+    driver: IDM
+    gap: float
+
+    def __post_init__(self) -> None:
+        refuse_others(self, "the car behind's", "gap")
+
+
+@dataclass(frozen=True)
 class Scenario:
     """Cars on a straight road, from a given start until two collide or time is up."""
 
@@ -95,9 +106,10 @@ class Scenario:
     initial_gap: float  #: from bumper to bumper [m]
     duration: float = 35.0  #: time that is driven at most [s]
     dt: float = 0.01  #: time of a step [s]
-    initial_speed: float = 0.0  #: of the follower [m/s]
+    initial_speed: float = 0.0  #: of the follower, and of the car behind it [m/s]
     body: Body = field(default_factory=Body)
     sensors: Sensors = field(default_factory=Sensors)
+    behind: Behind | None = None
 
     def __post_init__(self) -> None:
         refuse_others(self, "scenario's", "initial_gap duration dt", "initial_speed")

@@ -7,6 +7,7 @@ step, the ballistic update, and no teleporting, no gap added to collisions, no r
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -16,11 +17,14 @@ from typing import Any
 
 from evofsm.driving.scenarios import Scenario
 from evofsm.driving.world import (
+    ACCELERATION_BEHIND,
     GAP,
+    GAP_BEHIND,
     LEADER_ACCELERATION,
     LEADER_SPEED,
     REALISED,
     SPEED,
+    SPEED_BEHIND,
     KinematicWorld,
     Road,
     World,
@@ -31,12 +35,12 @@ from evofsm.extras import needs
 #: The worlds there are.
 WORLDS = ("sumo", "kinematic")
 
-_CARS = "follower", "leader"
+_CARS = ["follower", "leader", "behind"]
 
 _ROAD_LENGTH = 200_000.0
 _FASTEST = 100.0
 _VEHICLE_LENGTH = 5.0
-# Where the front bumper of the follower stands at first [m].
+# Where the front bumper of the last car stands at first.
 _FIRST_PLACE = 10.0
 
 _NET = f"""<net version="1.20">
@@ -123,12 +127,18 @@ def _refuse_what_sumo_cannot_drive(scenario: Scenario) -> None:
             "another step; choose one of 0.001 s, 0.002 s, ..., or the kinematic world"
         )
     # Nobody is faster than this; what the leader needs, the follower does not exceed.
-    farthest = _FIRST_PLACE + scenario.initial_gap + _FASTEST * scenario.duration
+    farthest = _start(scenario) + scenario.initial_gap + _FASTEST * scenario.duration
     if farthest > _ROAD_LENGTH:
         raise ValueError(
             f"initial_gap {scenario.initial_gap:g} m and duration {scenario.duration:g} s may lead "
             f"beyond the road's {_ROAD_LENGTH:g} m"
         )
+
+
+def _start(scenario: Scenario) -> float:
+    """Where the follower's front bumper stands at first [m], behind it what else there is."""
+    behind = scenario.behind
+    return _FIRST_PLACE + (behind.gap + _VEHICLE_LENGTH if behind else 0.0)
 
 
 class _Road(Road):
@@ -137,9 +147,11 @@ class _Road(Road):
     def __init__(self, sumo: Any, scenario: Scenario) -> None:
         super().__init__(scenario)
         self._sumo = sumo
-        starts = _FIRST_PLACE, _FIRST_PLACE + scenario.initial_gap + _VEHICLE_LENGTH
-        speeds = scenario.initial_speed, scenario.leader.initial_speed
-        for car, position, speed in zip(_CARS, starts, speeds, strict=True):
+        self._cars = _CARS if scenario.behind else _CARS[:2]
+        start, record = _start(scenario), self._record[0]
+        starts = start, start + scenario.initial_gap + _VEHICLE_LENGTH, _FIRST_PLACE
+        speeds = record[[SPEED, LEADER_SPEED, SPEED_BEHIND]].tolist()
+        for car, position, speed in zip(self._cars, starts, speeds, strict=False):
             # Standing, as SUMO does not insert a car that is too fast for the one ahead.
             sumo.vehicle.add(
                 car, "along", "car", depart="now", departPos=repr(position), departSpeed="0"
@@ -147,7 +159,7 @@ class _Road(Road):
             sumo.vehicle.setSpeedMode(car, 0)
             sumo.vehicle.setSpeed(car, speed)
         sumo.simulationStep()  # the first step only puts the cars on the road
-        for car, speed in zip(_CARS, speeds, strict=True):
+        for car, speed in zip(self._cars, speeds, strict=False):
             sumo.vehicle.setPreviousSpeed(car, speed)
         self._observe()
 
@@ -156,9 +168,9 @@ class _Road(Road):
             decide(self._plan, self._record, self.row, command)
             if self.over:
                 break
-            did = self._record[self.row, [REALISED, LEADER_ACCELERATION]]
+            did = self._record[self.row, [REALISED, LEADER_ACCELERATION, ACCELERATION_BEHIND]]
             vehicle = self._sumo.vehicle
-            for car, acceleration in zip(_CARS, did.tolist(), strict=True):
+            for car, acceleration in zip(self._cars, did.tolist(), strict=False):
                 speed = max(0.0, vehicle.getSpeed(car) + acceleration * self.scenario.dt)
                 vehicle.setSpeed(car, speed)
             self._sumo.simulationStep()
@@ -169,13 +181,17 @@ class _Road(Road):
 
     def _cut_in(self, gap: float, speed: float) -> None:
         vehicle = self._sumo.vehicle
-        follower, leader = _CARS
+        follower, leader = self._cars[:2]
         vehicle.moveTo(leader, "road_0", vehicle.getLanePosition(follower) + gap + _VEHICLE_LENGTH)
         vehicle.setPreviousSpeed(leader, speed)
         vehicle.setSpeed(leader, speed)
 
     def _observe(self) -> None:
         vehicle, now = self._sumo.vehicle, self._record[self.row]
-        rear, front = (vehicle.getLanePosition(car) for car in _CARS)
-        now[GAP] = front - _VEHICLE_LENGTH - rear
-        now[SPEED], now[LEADER_SPEED] = (vehicle.getSpeed(car) for car in _CARS)
+        position = [vehicle.getLanePosition(car) for car in self._cars]
+        now[GAP] = position[1] - _VEHICLE_LENGTH - position[0]
+        now[GAP_BEHIND] = math.inf
+        now[SPEED], now[LEADER_SPEED] = (vehicle.getSpeed(car) for car in self._cars[:2])
+        if self.scenario.behind is not None:
+            now[GAP_BEHIND] = position[0] - _VEHICLE_LENGTH - position[2]
+            now[SPEED_BEHIND] = vehicle.getSpeed(self._cars[2])

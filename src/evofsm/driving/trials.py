@@ -89,6 +89,7 @@ class Outcome(NamedTuple):
     """One driven draw."""
 
     collided: bool
+    rear_ended: bool
     mobility: float  #: distance, in those of the unrevised controller
     changed: int  #: decisions in which the proposal was not executed
     decisions: int
@@ -124,6 +125,7 @@ def outcome_of(episode: Episode, unrevised: Reference) -> Outcome:
     jerk = np.diff(accelerations) / unrevised.interval
     return Outcome(
         episode.collided,
+        episode.rear_ended,
         # Where the leader brakes at once there is no way to be kept.
         _distance(episode, unrevised.until) / unrevised.distance if unrevised.distance > 0 else 1.0,
         int(episode.changed.sum()),
@@ -178,10 +180,11 @@ class Row:
     family: str
     policy: str
     episodes: int
-    collisions: int
+    collisions: int  #: with the leader; not `rear_ends`
     collision_rate: float
     collision_low: float  #: 95 % interval (Clopper and Pearson 1934)
     collision_high: float
+    rear_ends: int
     mobility: float
     mobility_low: float  #: 95 % interval (bootstrap over episodes)
     mobility_high: float
@@ -227,6 +230,7 @@ def summarise(family: str, policy: str, outcomes: Sequence[Outcome], interval: f
         collision_rate=collisions / n,
         collision_low=float(exact.low),
         collision_high=float(exact.high),
+        rear_ends=sum(o.rear_ended for o in outcomes),
         mobility=float(mobility.mean()),
         mobility_low=low,
         mobility_high=high,

@@ -23,8 +23,12 @@ from evofsm.fsm.kernels import compiled
 from evofsm.guard import Controller, Decision, Proposal
 
 #: What a row of the record holds.
-RUN_COLUMNS = ("gap", "v_follower", "v_leader", "commanded", "realised", "a_leader")
-GAP, SPEED, LEADER_SPEED, COMMANDED, REALISED, LEADER_ACCELERATION = range(6)
+RUN_COLUMNS = (
+    *("gap", "v_follower", "v_leader", "gap_behind", "v_behind"),
+    *("commanded", "realised", "a_leader", "a_behind"),
+)
+GAP, SPEED, LEADER_SPEED, GAP_BEHIND, SPEED_BEHIND = range(5)
+COMMANDED, REALISED, LEADER_ACCELERATION, ACCELERATION_BEHIND = range(5, 9)
 # Actions that differ by less are the same [m/s²].
 _SAME_ACTION = 1e-9
 
@@ -39,7 +43,7 @@ class Episode:
     """One run, a row every ``dt``; the last row of a collision is the first gap of 0 or less."""
 
     time: NDArray[np.float64]  #: (T,) [s]
-    record: NDArray[np.float64]  #: (T, 6) the columns of `evofsm.driving.world.RUN_COLUMNS`
+    record: NDArray[np.float64]  #: (T, 9) the columns of `evofsm.driving.world.RUN_COLUMNS`
     decisions: tuple[Decision, ...] = ()  #: of the guard that it was driven under, if any
 
     @property
@@ -61,6 +65,11 @@ class Episode:
     def collided(self) -> bool:
         """Whether the run ended in a collision with the leader."""
         return bool(self.record[-1, GAP] <= 0.0)
+
+    @property
+    def rear_ended(self) -> bool:
+        """Whether the car behind ran into the follower."""
+        return bool(self.record[-1, GAP_BEHIND] <= 0.0)
 
     @property
     def proposed(self) -> NDArray[np.float64]:
@@ -92,6 +101,7 @@ class Plan(NamedTuple):
     brake: NDArray[np.float64]  # (4,) decel, speed, time, and 1 once it brakes
     cut_in: NDArray[np.float64]  # (3,) row, gap, speed
     body: NDArray[np.float64]  # (4,) lowest, highest, delay in steps, jerk times dt
+    behind: NDArray[np.float64]  # (1, 9) parameters of the driver behind; (0, 9) for none
 
     @classmethod
     def of(cls, scenario: Scenario) -> Plan:
@@ -108,6 +118,7 @@ class Plan(NamedTuple):
             np.array(
                 [body.lowest, body.highest, scenario.steps(body.delay), body.jerk * scenario.dt]
             ),
+            scenario.behind.driver.parameters if scenario.behind else np.empty((0, 9)),
         )
 
 
@@ -120,8 +131,8 @@ def move(position: float, speed: float, acceleration: float, dt: float) -> tuple
 
 @compiled
 def is_over(record: NDArray[np.float64], row: int) -> bool:
-    """Whether a run ends with this row: the cars have met, or it is the last."""
-    return bool(record[row, GAP] <= 0.0 or row + 1 == len(record))
+    """Whether a run ends with this row: two cars have met, or it is the last."""
+    return bool(record[row, GAP] <= 0.0 or record[row, GAP_BEHIND] <= 0.0 or row + 1 == len(record))
 
 
 @compiled
@@ -149,6 +160,11 @@ def decide(plan: Plan, record: NDArray[np.float64], row: int, command: float) ->
         acceleration = min(max(acceleration, last - body[3]), last + body[3])
     now[REALISED] = acceleration
 
+    if len(plan.behind) > 0:
+        now[ACCELERATION_BEHIND] = idm_kernel(
+            plan.behind, time, now[GAP_BEHIND], now[SPEED_BEHIND], now[SPEED]
+        )
+
 
 @compiled
 def advance(
@@ -161,8 +177,8 @@ def advance(
 ) -> int:
     """Some steps under one command, in closed form; returns the row reached.
 
-    ``positions`` are those of the follower and the leader. Where the run is over no one moves any
-    more.
+    ``positions`` are those of the follower, the leader, and the car behind. Where the run is over
+    no one moves any more.
     """
     for _ in range(steps):
         decide(plan, record, row, command)
@@ -178,6 +194,12 @@ def advance(
         if row == plan.cut_in[0]:
             positions[1], then[LEADER_SPEED] = positions[0] + plan.cut_in[1], plan.cut_in[2]
         then[GAP] = positions[1] - positions[0]
+        then[GAP_BEHIND] = np.inf
+        if len(plan.behind) > 0:
+            positions[2], then[SPEED_BEHIND] = move(
+                positions[2], now[SPEED_BEHIND], now[ACCELERATION_BEHIND], dt
+            )
+            then[GAP_BEHIND] = positions[0] - positions[2]
     return row
 
 
@@ -188,7 +210,7 @@ class Road:
     """Cars under way in one run of a scenario, in closed form.
 
     Whoever drives asks `observation`, then tells `advance` what to do. The run is `over` with the
-    row in which the cars met, or with the last; `advance` then only records what was commanded.
+    row in which two cars met, or with the last; `advance` then only records what was commanded.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -202,9 +224,11 @@ class Road:
         noise = np.random.default_rng(sensors.seed)  # what the sensors add
         self._noise = noise.normal(scale=deviation, size=size) if deviation.any() else None
         self._delay = scenario.steps(scenario.sensors.delay)
-        gap, speeds = scenario.initial_gap, (scenario.initial_speed, scenario.leader.initial_speed)
-        self._record[0, : LEADER_SPEED + 1] = gap, *speeds
-        self._positions = np.array([0.0, gap])
+        behind, start = scenario.behind, self._record[0]
+        start[GAP], start[GAP_BEHIND] = scenario.initial_gap, behind.gap if behind else math.inf
+        start[SPEED] = start[SPEED_BEHIND] = scenario.initial_speed
+        start[LEADER_SPEED] = scenario.leader.initial_speed
+        self._positions = np.array([0.0, start[GAP], -start[GAP_BEHIND]])
 
     def advance(self, command: float, steps: int = 1) -> None:
         """Drive some steps with this acceleration commanded to the follower [m/s²]."""
@@ -234,6 +258,11 @@ class Road:
         """Whether the follower has hit the leader."""
         return bool(self._record[self.row, GAP] <= 0.0)
 
+    @property
+    def rear_ended(self) -> bool:
+        """Whether the car behind has hit the follower."""
+        return bool(self._record[self.row, GAP_BEHIND] <= 0.0)
+
     def episode(self, first: int = 0) -> Episode:
         """What was recorded so far, from a row on."""
         rows = slice(first, self.row + 1)
@@ -248,7 +277,7 @@ class Road:
     def step(
         self, action: float, /
     ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
-        """Drive on; running into the leader is a failure."""
+        """Drive on; of two collisions that end a run, running into the leader is a failure."""
         start, speed = self.time, self._record[self.row, SPEED]
         self.advance(action, self.every)
         seconds, failed = self.time - start, self.collided
@@ -257,7 +286,8 @@ class Road:
             "failed": failed,
             "realised": (self._record[self.row, SPEED] - speed) / seconds if seconds else math.nan,
         }
-        return self.observation, 0.0, failed, self.over and not failed, outcome
+        terminated = failed or self.rear_ended
+        return self.observation, 0.0, terminated, self.over and not terminated, outcome
 
 
 class World(ABC):

@@ -50,7 +50,13 @@ from evofsm.driving import (
 )
 from evofsm.driving.cars import assumptions, guard_of_monitor, name_judge
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.driving.world import LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
+from evofsm.driving.world import (
+    GAP_BEHIND,
+    LEADER_ACCELERATION,
+    LEADER_SPEED,
+    SPEED,
+    World,
+)
 from evofsm.extras import needs
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.naming import Labels
@@ -173,7 +179,8 @@ class OnRoads:
     def _look(self) -> None:
         road, record = self._road, self._road.episode().record
         self.observation, self.time, self.failed = road.observation, road.time, road.collided
-        self.over, self.terminated = road.over or self._stood >= _STOOD, road.collided
+        self.over = road.over or self._stood >= _STOOD
+        self.terminated = road.collided or road.rear_ended
         stands = not record[-1, [SPEED, LEADER_SPEED]].any()
         brakes = record[-2:, LEADER_ACCELERATION].min() < 0.0
         self._stood = self._stood + self.interval if stands and brakes else 0.0
@@ -193,7 +200,8 @@ class OnRoads:
         last = len(episode.time) - 1
         rows = [*range(0, last, self._steps), last]
         *_, now = cars_of(episode.time[rows], episode.observations[rows])
-        return now
+        gap_behind = float(episode.record[-1, GAP_BEHIND])
+        return now._replace(gap_behind=gap_behind, rear_ended=self._road.rear_ended)
 
     def close(self) -> None:
         """Leave the road."""

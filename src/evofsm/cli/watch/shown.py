@@ -117,6 +117,8 @@ class Cars(NamedTuple):
     x_follower: float  #: front bumper, from where it started [m]
     time_to_collision: float  #: [s]; infinite where the gap does not close
     time_headway: float  #: [s]
+    gap_behind: float = math.inf  #: to the car behind [m]; infinite where there is none
+    rear_ended: bool = False  #: by the car behind
 
 
 def cars_of(times: NDArray[np.float64], observed: NDArray[np.float64]) -> Iterator[Cars]:

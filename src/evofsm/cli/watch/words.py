@@ -93,7 +93,7 @@ def tell(frame: Frame, start: Start) -> Told:
 
 def _status(frame: Frame, tolerance: float) -> str:
     story = frame.story
-    if frame.failed:
+    if frame.failed or (frame.cars and frame.cars.rear_ended):
         return "failure"
     if frame.over:
         return "ended"
@@ -196,6 +196,8 @@ def _outcome(frame: Frame, start: Start) -> str:
         parts.append(f"The leader braked from {since} on, by up to {story.leader_decel:.1f} m/s².")
     if frame.failed:
         parts.append(f"{start.fails or ('Collision' if start.cars else 'Failed')} at {when}.")
+    elif frame.cars and frame.cars.rear_ended:
+        parts.append(f"The car behind ran into the follower at {when}.")
     elif frame.over:
         parts.append(f"It ended at {when} without failure.")
     return " ".join(parts)

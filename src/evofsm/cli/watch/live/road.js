@@ -11,10 +11,11 @@ export function drawRoad(canvas, run) {
   const motion = run.motion;
   if (!motion) return;
   const length = run.start.car_length;
-  const needed = Math.max(45, 2 * length + Math.max(motion.gap, 0) * 1.12 + 16);
+  const behind = motion.gap_behind === null ? 0 : motion.gap_behind + length;
+  const needed = Math.max(45, behind + 2 * length + Math.max(motion.gap, 0) * 1.12 + 16);
   view += (needed - view) * 0.06;
   const scale = width / view;
-  const front = (length + 6) * scale; // where the follower's front bumper is
+  const front = (behind + length + 6) * scale; // where the follower's front bumper is
   const lane = { top: 46, bottom: height - 24 };
   const middle = (lane.top + lane.bottom) / 2;
 
@@ -30,6 +31,9 @@ export function drawRoad(canvas, run) {
 
   const carHeight = (lane.bottom - lane.top) * 0.52;
   const car = (x, ink, brakes) => drawCar(pen, x, middle, length * scale, carHeight, ink, brakes);
+  if (motion.gap_behind !== null) {
+    car(front - (length + motion.gap_behind) * scale, colour.line, false);
+  }
   const tail = front + motion.gap * scale; // the leader's rear bumper
   car(front, colour.follower, motion.a_follower < BRAKES);
   car(tail + length * scale, colour.leader, motion.a_leader < BRAKES);
@@ -47,6 +51,7 @@ export function drawRoad(canvas, run) {
   });
   const frame = run.frame;
   if (frame.failed && frame.told.headline.startsWith("Collision")) drawCollision(pen, front, middle, carHeight);
+  if (frame.cars.rear_ended) drawCollision(pen, front - length * scale, middle, carHeight);
   canvas.setAttribute("aria-label", `${left}. ${right}. Gap ${Math.max(0, motion.gap).toFixed(1)} metres.`);
 }
 

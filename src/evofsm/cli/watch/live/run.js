@@ -115,6 +115,7 @@ export class Run {
       v_leader: between("v_leader"),
       x_follower: between("x_follower") - bend * own,
       gap: between("gap") - bend * (others - own),
+      gap_behind: old.gap_behind === null ? null : between("gap_behind"),
       a_follower: next.a_follower,
       a_leader: next.a_leader,
     };
