@@ -18,10 +18,27 @@ from evofsm.driving import (
     measures,
 )
 from evofsm.fsm import EvolvingFSM, wilson_bounds
-from evofsm.guard import ActionReviser, Judgement, Reviser, RiskMeasure, Situation
+from evofsm.guard import (
+    ActionReviser,
+    Judgement,
+    Proposal,
+    Reviser,
+    Revision,
+    RiskMeasure,
+    Situation,
+)
 
 # States of a smaller belief are left out.
 _LEAST_BELIEF = 1e-3
+
+
+class AlwaysBrake(Unrevised):
+    """Brakes in full always: no one is safer, or gets less far."""
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """Full braking."""
+        kept = super().revise(situation, proposal)
+        return kept._replace(executed=self.actions.low, advised=self.actions.low)
 
 
 class Group(StrEnum):
@@ -95,6 +112,7 @@ def fixed_policies(family: Family) -> list[Policy]:
     fixed = measures.FIXED_MEASURES.items()
     return [
         Policy("unrevised", Group.BOUND, lambda family, draw: Unrevised(family.actions)),
+        Policy("always-brake", Group.BOUND, lambda family, draw: AlwaysBrake(family.actions)),
         Policy("oracle", Group.BOUND, lambda f, draw: _told(f, draw.scenario.leader.brake_decel)),
         *(envelope(name, Group.FIXED, measure) for name, measure in fixed),
         envelope("rss-matched", Group.MATCHED, rss),

@@ -33,6 +33,8 @@ def test_the_unrevised_driver_collides_and_ours_does_not(found):
     (unrevised,) = rows_of(found, "unrevised")
     assert unrevised["collision_rate"] > 0.8
     assert (unrevised["mobility"], unrevised["intervention_rate"]) == (1.0, 0.0)
+    (always,) = rows_of(found, "always-brake")
+    assert (always["mobility"], always["collisions"]) == (0.0, 0)
     ours = rows_of(found, OURS)
     assert [row["learning_seed"] for row in ours] == [0, 1]
     assert all(row["collisions"] == row["train_collisions"] == 0 for row in ours)
