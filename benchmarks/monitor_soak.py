@@ -25,7 +25,7 @@ from typing import NamedTuple
 from evofsm.cli.monitor.decider import EPISODE, Answer, Decider
 from evofsm.cli.monitor.messages import Row
 from evofsm.cli.monitor.state import State
-from evofsm.driving.assumed import guard_of_monitor
+from evofsm.driving.cars import guard_of_monitor
 from evofsm.guard import Guard
 from monitor_rows import JUNK, line, traffic
 

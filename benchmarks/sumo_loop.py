@@ -14,8 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evofsm.driving.families import load_family
-from evofsm.driving.family import Draw, Family
+from evofsm.driving.family import Draw, Family, load_family
 from evofsm.driving.sumo import SumoWorld
 from evofsm.driving.trials import drive, teach
 from evofsm.driving.world import Episode

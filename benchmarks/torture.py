@@ -39,9 +39,8 @@ from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.state import State
 from evofsm.cli.monitor.transports import Server, Stream
 from evofsm.driving.cars import guard_for_cars
-from evofsm.driving.families import load_family
+from evofsm.driving.family import load_family
 from evofsm.driving.judge import LatentRisk
-from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.arrays import MACHINE
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
@@ -93,7 +92,7 @@ def driving(folder: Path) -> Work:
 def _drive(path: Path) -> bytes:
     setup = Setup(load_family("emergency"))
     with closing(Results(setup, make_guard(setup), path)) as results:
-        driving = drive_in_turn(results, 4, KinematicWorld())
+        driving = drive_in_turn(results, 4)
     told = json.dumps(asdict(driving.row))
     return (path / "episodes.csv").read_bytes() + _saved(driving.guard.machine) + told.encode()
 

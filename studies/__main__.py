@@ -10,7 +10,8 @@ from typing import Annotated
 
 import typer
 
-from evofsm.paper import print_page, write_page
+from evofsm.cli import print_page
+from evofsm.paper import write_page
 from studies import lib
 
 #: Where each study is, in the order in which the evidence tells them.

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -369,10 +368,9 @@ def _drive_both_worlds(study: ClosedLoop) -> Found:
     guard = guard_for_family(family, tolerance=study.tolerance)
     teach(guard, training(family, study.seed, 0, study.world_train))
     found = []
-    for name, opened in (("sumo", SumoWorld()), ("kinematic", nullcontext(KinematicWorld()))):
+    for name, world in (("sumo", SumoWorld()), ("kinematic", KinematicWorld())):
         tested, draws = _frozen(guard), held_out(family, study.seed, study.world_test)
-        with opened as world:
-            drives = [drive(tested, draw, world) for draw in draws]
+        drives = [drive(tested, draw, world) for draw in draws]
         speeds = [one.observations[:, 1].mean() for one in drives]
         found.append(
             {

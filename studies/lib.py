@@ -32,9 +32,9 @@ from scipy.optimize import isotonic_regression
 from scipy.special import expit
 from scipy.stats import beta
 
-from evofsm.cli import print_json
+from evofsm.cli import print_json, print_page
 from evofsm.extras import install
-from evofsm.paper import Figure, Page, Table, print_page, write_page
+from evofsm.paper import Figure, Page, Table, write_page
 
 #: Rows of a study by name; those of its main table are called ``"rows"``.
 Frames = Mapping[str, pl.DataFrame]

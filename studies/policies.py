@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm.driving import (
-    AlwaysBrake,
     Draw,
     EnvelopeReviser,
     Family,
@@ -19,10 +18,27 @@ from evofsm.driving import (
     measures,
 )
 from evofsm.fsm import EvolvingFSM, wilson_bounds
-from evofsm.guard import ActionReviser, Judgement, Reviser, RiskMeasure, Situation
+from evofsm.guard import (
+    ActionReviser,
+    Judgement,
+    Proposal,
+    Reviser,
+    Revision,
+    RiskMeasure,
+    Situation,
+)
 
 # States of a smaller belief are left out.
 _LEAST_BELIEF = 1e-3
+
+
+class AlwaysBrake(Unrevised):
+    """Brakes in full always: no one is safer, or gets less far."""
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """Full braking."""
+        kept = super().revise(situation, proposal)
+        return kept._replace(executed=self.actions.low, advised=self.actions.low)
 
 
 class Group(StrEnum):

@@ -418,17 +418,6 @@ def write(
     return axes.annotate(text, xy, xytext=offset, fontsize=points(size), **options)
 
 
-def mark(axes: Axes, x: float, y: float, **look: Any) -> None:
-    """Mark a place, beyond the edge of the axes as well."""
-    axes.plot([x], [y], **{"linestyle": "none", "clip_on": False, **look})
-
-
-def draw_collision(axes: Axes, x: float, y: float) -> None:
-    """Mark where a run ended in a collision."""
-    look: Look = {"marker": "X", "markersize": 8, "markeredgecolor": "white"}
-    mark(axes, x, y, color=COLORS["ink"], markeredgewidth=0.7, zorder=7, **look)
-
-
 def draw_state(
     axes: Axes, x: float, y: float, state: int, size: float, *, dead_end: bool, numbered: bool
 ) -> None:
@@ -436,8 +425,9 @@ def draw_state(
     edge = COLORS["dead end" if dead_end else "ink"]
     fill, text = (edge, "white") if dead_end else ("white", edge)
     width = size * (1.18 if dead_end else 1.0 if numbered else 0.35)
-    look: Look = {"marker": "h" if dead_end else "o", "markersize": width, "markerfacecolor": fill}
-    mark(axes, x, y, markeredgecolor=edge, markeredgewidth=0.8, zorder=5.0 + 0.5 * dead_end, **look)
+    look: Look = {"marker": "h" if dead_end else "o", "markersize": width, "clip_on": False}
+    look |= {"markerfacecolor": fill, "markeredgecolor": edge, "markeredgewidth": 0.8}
+    axes.plot([x], [y], linestyle="none", zorder=5.0 + 0.5 * dead_end, **look)
     if numbered or dead_end:
         look = {"ha": "center", "va": "center_baseline", "fontweight": "bold", "zorder": 6}
         axes.annotate(f"{state + 1}", (x, y), fontsize=min(0.72 * size, 8.5), color=text, **look)

@@ -67,7 +67,7 @@ def pump():
 
 @pytest.fixture
 def shown():
-    """Serve a page in a thread, and play on it; settings are those of `Player`."""
+    """Serve a page in a thread, and play on it, as it is set."""
     pytest.importorskip("websockets")
     from evofsm.cli.watch.player import Player
     from evofsm.cli.watch.server import LivePage
@@ -80,7 +80,8 @@ def shown():
             try:
                 with opened() as watched:
                     async with LivePage() as page:
-                        page.player = Player(watched, page, **settings)
+                        page.player = Player(watched, page)
+                        page.player.set(**{"awaits": False, **settings})
                         stop = asyncio.Event()
                         playing = asyncio.create_task(page.player.play())
                         served.put((page, asyncio.get_running_loop(), stop))

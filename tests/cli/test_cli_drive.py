@@ -21,8 +21,7 @@ from evofsm.cli.driving import (
     drive_in_turn,
     make_guard,
 )
-from evofsm.driving import KinematicWorld, load_family
-from evofsm.driving.sumo import open_world
+from evofsm.driving import load_family
 from evofsm.guard import Guard
 
 EMERGENCY = load_family("emergency")
@@ -37,10 +36,10 @@ def begun(folder, setup):
     return closing(Results(setup, make_guard(setup), folder))
 
 
-def in_turn(folder=None, episodes=6, place=None, **options):
+def in_turn(folder=None, episodes=6, **options):
     setup = Setup(options.pop("family", EMERGENCY), **options)
     with begun(folder, setup) as results:
-        return drive_in_turn(results, episodes, place or KinematicWorld())
+        return drive_in_turn(results, episodes)
 
 
 def at_once(folder=None, episodes=6, workers=2, **options):
@@ -133,7 +132,7 @@ def test_learning_that_is_stopped_goes_on_bit_for_bit(tmp_path, snapshot, monkey
     stops = [1, 2, 4]
     while stops:
         with begun(folder, setup) as results, pytest.raises(StoppedError):
-            drive_in_turn(results, 5, KinematicWorld(), show)
+            drive_in_turn(results, 5, show)
     again = in_turn(folder, 5)
     assert results_of(folder) == results_of(tmp_path / "plain")
     assert snapshot(again.guard.machine) == snapshot(plain.guard.machine)
@@ -238,8 +237,7 @@ def test_it_is_what_driving_in_turn_makes_of_the_same_episodes(tmp_path, world):
     if world == "sumo":
         pytest.importorskip("libsumo")
     asked = {"family": load_family("rare"), "seed": 3, "world": world}
-    with open_world(world) as place:
-        plain = in_turn(place=place, learn=False, **asked)
+    plain = in_turn(learn=False, **asked)
     driven = at_once(tmp_path, **asked)
     assert driven.row == plain.row
     assert at_once(tmp_path, 3, **asked).row.episodes == 3  # the first ones are summed up

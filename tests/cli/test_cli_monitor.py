@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from evofsm.cli.app import application
 from evofsm.cli.monitor.decider import Decider
-from evofsm.driving.assumed import guard_of_monitor
+from evofsm.driving.cars import guard_of_monitor
 from evofsm.guard import audit
 from monitor_rows import JUNK, closing_in, line, traffic
 

@@ -18,7 +18,6 @@ from playwright import sync_api as playwright
 from evofsm.cli.foreseen import guard_where_nobody_acts
 from evofsm.cli.learning import episodes_read, learn_chunk
 from evofsm.cli.options import reading_of
-from evofsm.cli.watch.logged import watched_log
 from evofsm.cli.watch.session import (
     OnRoads,
     Session,
@@ -26,6 +25,7 @@ from evofsm.cli.watch.session import (
     read_simulated,
     system_machine,
     watched_guard,
+    watched_log,
 )
 from evofsm.driving import KinematicWorld, load_family
 from evofsm.fsm import IntervalActions, Labels

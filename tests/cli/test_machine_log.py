@@ -16,7 +16,7 @@ from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.slots import Slots
 from evofsm.cli.monitor.summary import decided_on_log
 from evofsm.cli.options import reading_of
-from evofsm.cli.watch.logged import watched_log
+from evofsm.cli.watch.session import watched_log
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.io import LogColumns, episodes_of
 

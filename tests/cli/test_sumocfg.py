@@ -11,7 +11,7 @@ pytest.importorskip("libsumo")
 from evofsm.cli.options import reading_of
 from evofsm.cli.sumocfg import trace_configuration
 from evofsm.cli.watch import _is_log
-from evofsm.cli.watch.logged import watched_log
+from evofsm.cli.watch.session import watched_log
 from evofsm.cli.watch.words import tell
 
 CARS = """<routes>

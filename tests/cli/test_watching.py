@@ -7,9 +7,15 @@ from functools import cache
 import pytest
 
 from evofsm.cli.options import reading_of
-from evofsm.cli.watch.logged import watched_log
 from evofsm.cli.watch.player import Player
-from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_guard
+from evofsm.cli.watch.session import (
+    OnRoads,
+    Session,
+    learn_first,
+    read_simulated,
+    watched_guard,
+    watched_log,
+)
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, load_family, teach
 
@@ -51,7 +57,7 @@ def test_danger_shows_long_before_time_to_collision_notices_and_is_told_from_whe
     assert risky.proposed_risk.critical < risky.needed
     assert story.first < story.danger.dead_end < story.leader_brakes
     assert story.time_to_collision - story.first > 20.0
-    assert story.leader_decel == 9.0
+    assert story.leader_decel == pytest.approx(9.0)
     late = [frame.story for frame in frames if frame.time >= story.danger.dead_end]
     assert {one.danger.dead_end for one in late} == {story.danger.dead_end}
 
@@ -232,7 +238,8 @@ def test_what_was_before_is_shown_at_once():
     session.start = session.start._replace(begins=2.0)
 
     async def play():
-        player = Player(session, lambda kind, what: told.append(kind), speed=0.25)
+        player = Player(session, lambda kind, what: told.append(kind))
+        player.set(awaits=False, speed=0.25)
         playing = asyncio.create_task(player.play())
         await asyncio.sleep(1.0)
         playing.cancel()
@@ -244,7 +251,8 @@ def test_what_was_before_is_shown_at_once():
 def test_a_run_that_breaks_off_says_why():
     session, told = opened(), []
     session.step = lambda: 1 / 0
-    player = Player(session, lambda *what: told.append(what), speed=math.inf)
+    player = Player(session, lambda *what: told.append(what))
+    player.set(awaits=False, speed=math.inf)
     asyncio.run(asyncio.wait_for(player.play(), 60.0))
     assert told[-1] == ("failed", "ZeroDivisionError: division by zero")
 

@@ -10,7 +10,7 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from evofsm.driving.env import ID, CarFollowing  # noqa: E402
-from evofsm.driving.families import load_family  # noqa: E402
+from evofsm.driving.family import load_family  # noqa: E402
 from evofsm.driving.scenarios import Behind  # noqa: E402
 
 NAME = f"evofsm.driving.env:{ID}"

@@ -9,8 +9,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from evofsm.driving.families import FAMILIES, load_family
-from evofsm.driving.family import SWITCHES
+from evofsm.driving.family import FAMILIES, SWITCHES, load_family
 from evofsm.driving.measures import is_dead_end
 from evofsm.driving.trials import drive, unrevised_guard
 from evofsm.driving.world import KinematicWorld

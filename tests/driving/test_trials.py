@@ -6,11 +6,9 @@ import pytest
 pytest.importorskip("scipy")
 
 from evofsm.driving.cars import TOLD, guard_for_cars, guard_for_family, learners_of, name_judge
-from evofsm.driving.families import load_family
-from evofsm.driving.family import held_out
+from evofsm.driving.family import held_out, load_family
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.trials import (
-    Trial,
     drive,
     outcome_of,
     reference_of,
@@ -18,7 +16,6 @@ from evofsm.driving.trials import (
     unrevised_guard,
 )
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.reviser import Mode
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -56,16 +53,6 @@ def test_outcomes_compare_with_the_controller_alone():
     assert row.collision_low == pytest.approx(0.025 ** (1.0 / 3.0))  # Clopper and Pearson
     seconds = sum(len(one.decisions) for one in same) * EMERGENCY.interval
     assert row.hours == pytest.approx(seconds / 3600.0)
-
-
-def test_a_trial_gives_the_same_rows_in_any_order_and_keeps_what_it_is_of():
-    guard = guard_for_family(EMERGENCY, mode=Mode.SHADOW)
-    guard.freeze()
-    trial = Trial(EMERGENCY, guard, "kinematic", 0, "test")
-    rows = [trial(number) for number in (2, 0, 1)]
-    assert rows[1:] == [trial(0), trial(1)]
-    assert [row["episode"] for row in rows] == [2, 0, 1]
-    assert all(row["collided"] for row in rows)
 
 
 def test_nobody_drives_a_scenario_without_a_controller():

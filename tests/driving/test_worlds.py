@@ -67,12 +67,10 @@ def test_where_a_library_of_the_system_is_missing_sumo_says_which(monkeypatch):
 
 
 def test_a_second_simulation_in_the_process_is_refused():
-    with SumoWorld() as first:
-        first.run(replace(SETTINGS.scenario, duration=0.1), SETTINGS.drivers[2])
-        with pytest.raises(RuntimeError, match="another process"):
-            SumoWorld().run(SETTINGS.scenario, SETTINGS.drivers[2])
-    with SumoWorld() as after:
-        assert len(after.run(replace(SETTINGS.scenario, duration=0.1), SETTINGS.drivers[2]).time)
+    world, short = SumoWorld(), replace(SETTINGS.scenario, duration=0.1)
+    with world.open(short), pytest.raises(RuntimeError, match="another process"):
+        SumoWorld().run(short, SETTINGS.drivers[2])
+    assert len(world.run(short, SETTINGS.drivers[2]).time)
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
@@ -117,14 +115,14 @@ def test_a_road_that_may_be_too_short_is_refused():
         SumoWorld().run(replace(SETTINGS.scenario, duration=5000.0), SETTINGS.drivers[1])
 
 
-def test_a_world_closed_from_outside_starts_again():
+def test_after_a_run_that_was_closed_from_outside_another_one_starts():
     import libsumo
 
-    short = replace(SETTINGS.scenario, duration=0.5)
-    with SumoWorld() as world:
-        before = world.run(short, SETTINGS.drivers[1])
+    world, short = SumoWorld(), replace(SETTINGS.scenario, duration=0.5)
+    before = world.run(short, SETTINGS.drivers[1])
+    with world.open(short):
         libsumo.close()
-        after = world.run(short, SETTINGS.drivers[1])
+    after = world.run(short, SETTINGS.drivers[1])
     assert np.array_equal(before.observations, after.observations)
 
 

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from evofsm import IntervalActions
 from evofsm.driving import (
-    AlwaysBrake,
     EnvelopeReviser,
     LatentRisk,
     Unrevised,
@@ -237,7 +236,7 @@ def test_each_record_is_on_the_disk_before_its_action_is_executed(tmp_path, monk
 
 
 REVISERS = {
-    "always brakes": lambda judge, machine: AlwaysBrake(ACTIONS),
+    "unrevised": lambda judge, machine: Unrevised(ACTIONS),
     "measure": lambda judge, machine: EnvelopeReviser(measures.TimeToCollision(4.0), ACTIONS),
     "shadow": lambda judge, machine: ActionReviser(judge, ACTIONS, mode=Mode.SHADOW),
 }
@@ -305,7 +304,7 @@ def test_sensors_that_fail_come_out_the_same(tmp_path):
     assert result.replayed == len(came)
 
 
-class Own(AlwaysBrake):
+class Own(Unrevised):
     """A reviser that no package declares."""
 
 

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from evofsm.driving import IDM, AlwaysBrake, EnvelopeReviser, LatentRisk, Unrevised
+from evofsm.driving import IDM, EnvelopeReviser, LatentRisk, Unrevised
 from evofsm.driving.measures import ModifiedTimeToCollision
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.rules import Novelty, Paper
@@ -25,7 +25,6 @@ OURS = [
     ActionReviser(LatentRisk(lowest=-2.5), ACTIONS, mode=Mode.SHADOW),
     EnvelopeReviser(ModifiedTimeToCollision(), ACTIONS),
     Unrevised(ACTIONS),
-    AlwaysBrake(ACTIONS),
     CALM,
 ]
 

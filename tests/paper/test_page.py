@@ -7,9 +7,9 @@ from dataclasses import replace
 import polars as pl
 import pytest
 from matplotlib.figure import Figure as Drawn
-from rich.console import Console
 
-from evofsm.paper import Figure, Page, Table, print_page, write_page
+from evofsm.cli import print_page
+from evofsm.paper import Figure, Page, Table, write_page
 from evofsm.paper.page import cell
 
 EVIL = '<script>alert("1 & 2")</script>'
@@ -91,11 +91,12 @@ def test_what_is_told_is_text_and_never_markup(written):
 
 
 @pytest.mark.parametrize("width", [40, 80, 200])
-def test_the_terminal_says_the_same_and_cuts_no_number(width, capsys):
+def test_the_terminal_says_the_same_and_cuts_no_number(width, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(width))
     wide = pl.DataFrame({"name": ["[bold]row"], **{f"column {k}": [12345.25] for k in range(20)}})
     parts = [Table("Wide", wide), Table("Empty", AREAS[:0], {"who": "{who}"})]
     page = replace(PAGE, parts=parts, targets=TARGETS.with_columns(met=False))
-    print_page(page, out=Console(width=width, markup=False, highlight=False))
+    print_page(page)
     said = capsys.readouterr().out
     assert said.count("12345.2") == 20
     assert "[bold]row" in said

@@ -9,7 +9,7 @@ import pytest
 from evofsm.driving import KinematicWorld
 from evofsm.fsm import FSMModel
 from evofsm.paper.claims import check_claims
-from evofsm.paper.reproduction import Reproduction, divergences, reproduce
+from evofsm.paper.reproduction import divergences, page_of, write
 from evofsm.paper.runs import Settings, run_paper
 
 PAGE = Path(__file__).parents[2] / "docs" / "paper.md"
@@ -62,13 +62,13 @@ def test_all_ten_claims_hold_in_closed_form_as_the_page_on_the_paper_shows(study
 )
 def test_under_other_settings_claims_fail_that_have_to(changes, broken):
     study = drive(2, **changes)
-    found = Reproduction(study, check_claims(study))
-    holds = {claim.id for claim in found.claims if claim.holds}
+    claims = check_claims(study)
+    holds = {claim.id for claim in claims if claim.holds}
     assert not holds & broken
-    told = f"{len(holds)} of {len(found.claims)} claims of the paper hold in the kinematic world"
-    assert found.page().answer == told
+    told = f"{len(holds)} of {len(claims)} claims of the paper hold in the kinematic world"
+    assert page_of(study).answer == told
     if "brake_at_40" in broken:
-        assert found.claims[1].measured == "the leader did not brake"
+        assert claims[1].measured == "the leader did not brake"
 
 
 def test_whoever_forecasts_better_is_where_it_loses(study):
@@ -76,7 +76,7 @@ def test_whoever_forecasts_better_is_where_it_loses(study):
     assert round(largest["e-FSM"], 3) == 0.051
     assert largest["persistence"] < 0.001
     assert largest["e-FSM, all rounds"] > 0.15
-    (lost,) = Reproduction(study, check_claims(study)).page().losses
+    (lost,) = page_of(study).losses
     assert ("persistence", "case 1") in lost.frame.select("forecast", "where").rows()
 
 
@@ -97,14 +97,14 @@ def test_a_setting_that_there_is_not_is_refused_by_name():
 
 @pytest.mark.slow
 def test_all_of_it_is_written_and_can_be_read_back(tmp_path, read_page):
-    found = reproduce("kinematic", rounds=2)
+    study = drive(rounds=2)
     folder = tmp_path / "new" / "folder"
-    read = read_page(found.write(folder, "make paper"))
+    read = read_page(write(study, folder, "make paper"))
     read.is_sound()
     for said in ("Does the paper's machine", "make paper", "#4 at 15 s"):
         assert said in read.text
     assert len(list((folder / "figures").iterdir())) == 12
     claims = json.loads((folder / "claims.json").read_text())
-    assert [claim["id"] for claim in claims] == [claim.id for claim in found.claims]
+    assert [claim["id"] for claim in claims] == [claim.id for claim in check_claims(study)]
     model = FSMModel.load(folder / "model.evofsm")
-    assert np.array_equal(model.centers, found.study.model.centers)
+    assert np.array_equal(model.centers, study.model.centers)

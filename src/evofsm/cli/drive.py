@@ -128,14 +128,9 @@ def _drive_in_turn(
     results: Results, episodes: int, audit: Path | None, mcap: Path | None
 ) -> Driving:
     from evofsm.cli.driving import drive_in_turn
-    from evofsm.driving.sumo import open_world
 
-    with (
-        _log_of(audit, mcap) as log,
-        open_world(results.setup.world) as place,
-        progress("Driving", episodes) as move,
-    ):
-        summary = drive_in_turn(results, episodes, place, move, log)
+    with _log_of(audit, mcap) as log, progress("Driving", episodes) as move:
+        summary = drive_in_turn(results, episodes, move, log)
     if audit is not None:
         warn(f"head of {audit}, to be kept elsewhere: {log.head}")
     return summary

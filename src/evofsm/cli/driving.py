@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from threading import Thread
@@ -28,13 +29,17 @@ from evofsm.driving import (
     Family,
     Outcome,
     Unrevised,
+    drive,
     guard_for_family,
     learners_of,
+    outcome_of,
+    reference_of,
     summarise,
 )
 from evofsm.driving.cars import name_judge
 from evofsm.driving.naming import DECISION_COLUMNS
-from evofsm.driving.trials import Row, Trial
+from evofsm.driving.sumo import open_world
+from evofsm.driving.trials import Row
 from evofsm.driving.world import World
 from evofsm.extras import needs
 from evofsm.guard import TOLERANCE, DecisionLogger, Guard, Mode
@@ -75,9 +80,13 @@ class Setup:
         file = source and Path(source).read_text("utf-8")
         return {**settings, "mode": self.mode.value, "file": file}
 
-    def trial(self, guard: Guard, world: World | str) -> Trial:
-        """Its episodes, by their number: training draws while it learns, held-out ones else."""
-        return Trial(self.family, guard, world, self.seed, "train" if self.learn else "test")
+    def drive(self, guard: Guard, world: World, number: int) -> tuple[Episode, Outcomes]:
+        """An episode, of a training draw while it learns, of a held-out one else; and its row."""
+        draw = self.family.draw(self.seed, number, "train" if self.learn else "test")
+        alone = reference_of(self.family, draw, world)
+        episode = drive(guard, draw, world)
+        outcome = outcome_of(episode, alone)
+        return episode, {"episode": number, "variant": draw.variant, **outcome._asdict()}
 
 
 class Driving(NamedTuple):
@@ -181,7 +190,7 @@ class Results:
 
     def _write(self, folder: Path, rows: Sequence[Outcomes]) -> None:
         self.save_guard(now=True)
-        names = [name for name in rows[0] if name != "decided"]
+        names = ["episode", "variant", *Outcome._fields]
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\n")
         table.writerows([names, *([row[name] for name in names] for row in rows)])
@@ -220,7 +229,6 @@ def _decided(driven: Episode) -> dict[str, list[Any]]:
 def drive_in_turn(
     results: Results,
     episodes: int,
-    world: World,
     move: Advance = lambda *_, **__: None,
     audit: DecisionLogger | None = None,
 ) -> Driving:
@@ -228,12 +236,11 @@ def drive_in_turn(
     setup, guard, n_episodes = results.setup, results.guard, len(results.rows)
     if setup.learn and n_episodes > episodes:
         raise ValueError(f"{results.folder} has driven {n_episodes} episodes, more than {episodes}")
-    guard.audit = audit
-    trial = setup.trial(guard, world)
+    guard.audit, world = audit, open_world(setup.world)
     for number in range(episodes):
         if number in results.rows:
             continue
-        episode, row = trial.drive(number)
+        episode, row = setup.drive(guard, world, number)
         results.add({**row, "decided": _decided(episode)})
         if setup.learn:
             results.save_guard()
@@ -253,14 +260,14 @@ def drive_at_once(
     """
     guard = results.guard.copy(states=False)  # what is decided does not depend on them
     guard.freeze()
-    trial = results.setup.trial(guard, results.setup.world)
     numbers = [number for number in range(episodes) if number not in results.rows]
     size = max(1, min(_BATCH, len(numbers) // (8 * workers)))
     move(len(results.rows))
     # Forking a process that has started threads may hang; a fresh one costs a second.
     pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_work)
     try:
-        for row in pool.map(trial, numbers, chunksize=size):
+        row_of = partial(_row, results.setup, guard)
+        for row in pool.map(row_of, numbers, chunksize=size):
             results.add(row)
             move(len(results.rows))
         return results.summed_up(episodes)
@@ -271,6 +278,10 @@ def drive_at_once(
         ) from None
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _row(setup: Setup, guard: Guard, number: int) -> Outcomes:
+    return setup.drive(guard, open_world(setup.world), number)[1]
 
 
 def _begin_work() -> None:

@@ -85,7 +85,7 @@ def learn(
     """
     from evofsm.cli.foreseen import alarms_of, guard_where_nobody_acts
     from evofsm.cli.learning import learn_traces, refusing, teach, warnings_of
-    from evofsm.driving.assumed import guard_of_monitor
+    from evofsm.driving.cars import guard_of_monitor
     from evofsm.guard import ActionReviser, Foresight, Guard, LearntRisk, Mode
     from evofsm.io import episodes_of
     from evofsm.io.logs import Noted

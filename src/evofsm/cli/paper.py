@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from evofsm.cli.options import InWorld, Json, option, require_world
-from evofsm.cli.show import print_json, progress
+from evofsm.cli.show import print_json, print_page, progress
 
 
 def paper(
@@ -23,16 +23,17 @@ def paper(
     """
     require_world(world, polars="tables", matplotlib="plot", jinja2="plot")
     out.mkdir(parents=True, exist_ok=True)  # where that fails nothing is driven first
-    from evofsm.paper import print_page
-    from evofsm.paper.reproduction import reproduce
+    from evofsm.driving.sumo import open_world
+    from evofsm.paper import Settings, check_claims, run_paper
+    from evofsm.paper.reproduction import page_of, write
 
     with progress(f"Driving and learning ({world})") as move:
-        reproduction = reproduce(world, rounds, move)
-    command = shlex.join(["evofsm", *sys.argv[1:]])
-    page = reproduction.write(out, command)
+        study = run_paper(open_world(world), world, Settings.load(), rounds, move)
+    command, claims = shlex.join(["evofsm", *sys.argv[1:]]), check_claims(study)
+    page = write(study, out, command)
     if as_json:
-        print_json([claim._asdict() for claim in reproduction.claims])
+        print_json([claim._asdict() for claim in claims])
     else:
-        print_page(reproduction.page(command))
+        print_page(page_of(study, command))
         print(f"\nPage with all figures: {page}")
-    return 0 if reproduction.holds else 1
+    return 0 if all(claim.holds for claim in claims) else 1

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from evofsm.paper import Page, Table
+
 
 def show(*parts: RenderableType) -> None:
     """Print texts and tables, without the spaces that fill lines up.
@@ -71,8 +73,12 @@ def table(
     *,
     left: Collection[int] = (0,),
     bold: Collection[int] = (),
+    whole: bool = False,
 ) -> RenderableType:
-    """Cells below one another; ``left`` are the columns set to the left, ``bold`` rows set off."""
+    """Cells below one another; ``left`` are the columns set to the left, ``bold`` rows set off.
+
+    With ``whole`` only those to the left may be folded.
+    """
     from rich import box
     from rich.table import Table
     from rich.text import Text
@@ -82,15 +88,47 @@ def table(
     grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1, 0, 0))
     grid.title, grid.title_justify, grid.title_style = Text(title, "bold"), "left", ""
     for place, name in enumerate(header):
-        words = [word for row in (header, *rows) for word in row[place].split()]
+        cells = [row[place] for row in rows]
+        parts = cells if whole and place not in left else " ".join(cells).split()
         grid.add_column(
             visible(name),
             justify="left" if place in left else "right",
-            min_width=max(map(len, words), default=0),
+            min_width=max(map(len, [*name.split(), *parts]), default=0),
         )
     for place, row in enumerate(rows):
         grid.add_row(*map(visible, row), style="bold" if place in bold else "")
     return grid
+
+
+def print_page(*pages: Page) -> None:
+    """Print what a page says: its targets, tables, and where it loses; many in a line each.
+
+    Rows that are ours begin with ``>``, those that fail with ``!``.
+    """
+    from evofsm.paper.page import summary
+
+    if len(pages) != 1:
+        _show_table(summary(pages))
+        return
+    (page,) = pages
+    say(f"{page.title}\n{page.answer}".strip())
+    for item in page.tables:
+        _show_table(item)
+    say("\nWhere it loses" if page.losses else "\nIt loses in no row of these tables.")
+    for item in page.losses:
+        _show_table(item)
+
+
+def _show_table(item: Table) -> None:
+    signs = {"ours": "> ", "fails": "! "}
+    marks = [signs.get(mark or "", "") for mark in item.marks]
+    rows = [(mark + row[0], *row[1:]) for mark, row in zip(marks, item.cells, strict=True)]
+    texts = [place for place, is_number in enumerate(item.numeric) if not is_number]
+    bold = [place for place, mark in enumerate(marks) if mark]
+    say(f"\n{item.title}")
+    show(table("", item.header, rows, left=texts, bold=bold, whole=True))
+    if item.note:
+        say(item.note)
 
 
 def print_json(document: object) -> None:

@@ -473,10 +473,7 @@ class Watching:
     def __init__(self, seeing: Seeing) -> None:
         self._seeing = seeing
         self.cars: dict[str, None] = {}  #: by id
-        self.ids: list[str] = []  #: of cars with somebody ahead, now
-        self.observations = np.empty((0, 3))  #: of each gap [m], its speed and the other's [m/s]
-        self.ttc = np.empty(0)  #: time to collision of each [s]
-        self.drac = np.empty(0)  #: deceleration to avoid it, of each [m/s²]
+        self.step(0.0)
 
     def add(self, car: str) -> None:
         """Watch it from now on."""
@@ -489,9 +486,11 @@ class Watching:
     def step(self, time: float) -> None:
         """Look at every car."""
         observations = {car: pair for car in self.cars if (pair := self._seeing.pair(car))}
-        self.ids = list(observations)
+        self.ids = list(observations)  #: of cars with somebody ahead, now
+        #: (n, 3) of each gap [m], its speed and the other's [m/s].
         self.observations = np.array(list(observations.values())).reshape(-1, 3)
-        self.ttc = time_to_collision(self.observations)
+        self.ttc = time_to_collision(self.observations)  #: of each time to collision [s]
+        #: Of each the deceleration to avoid it [m/s²].
         self.drac = deceleration_to_avoid_collision(self.observations)
 
 
@@ -505,22 +504,21 @@ class _Ride:
     lost: float = 0.0  # of that time, against the speed that each would drive on a free road [s]
     hard_brakes: int = 0
     jerks: float = 0.0  # sum of squares
-    _latest: dict[str, tuple[float, float]] = field(default_factory=dict)  # speed, acceleration
+    latest: dict[str, tuple[float, float]] = field(default_factory=dict)  # speed, acceleration
 
-    def see(self, car: str, speed: float, free: float) -> None:
-        dt = self.dt
-        self.seconds += dt
-        self.metres += speed * dt
-        self.lost += dt * max(0.0, 1.0 - speed / free) if free > 0.0 else 0.0
-        before, was = self._latest.get(car, (speed, 0.0))
-        acceleration = (speed - before) / dt
-        self.hard_brakes += acceleration < -_HARD <= was
-        self.jerks += (acceleration - was) ** 2 / dt
-        self._latest[car] = speed, acceleration
-
-    def forget(self, cars: Iterable[str]) -> None:
+    def see(self, cars: Iterable[str], vehicle: Any) -> None:
+        """Take in a step of cars that are here; others are forgotten."""
+        before, self.latest, dt = self.latest, {}, self.dt
         for car in cars:
-            self._latest.pop(car, None)
+            speed, free = vehicle.getSpeed(car), vehicle.getAllowedSpeed(car)
+            self.seconds += dt
+            self.metres += speed * dt
+            self.lost += dt * max(0.0, 1.0 - speed / free) if free > 0.0 else 0.0
+            last_speed, was = before.get(car, (speed, 0.0))
+            acceleration = (speed - last_speed) / dt
+            self.hard_brakes += acceleration < -_HARD <= was
+            self.jerks += (acceleration - was) ** 2 / dt
+            self.latest[car] = speed, acceleration
 
     def told(self) -> dict[str, float]:
         seconds = self.seconds or math.nan
@@ -615,9 +613,7 @@ class Attachment:
         self._count_cars()
         self._count_collisions(now)
         self.looked += len(self._cars.cars)
-        vehicle = self._sumo.vehicle
-        for car in self._cars.cars:
-            self._ride.see(car, vehicle.getSpeed(car), vehicle.getAllowedSpeed(car))
+        self._ride.see(self._cars.cars, self._sumo.vehicle)
         self._cars.step(now)
         self.seconds += clock.perf_counter() - begin
         return True
@@ -655,7 +651,7 @@ class Attachment:
         for car in here.intersection(self.cars):
             self._cars.remove(car)
         self._cars.cars.clear()
-        self._ride.forget(self._known)
+        self._ride.latest.clear()
         self._known.clear()
         self._met.clear()
         self._seeing.look_up()
@@ -669,7 +665,6 @@ class Attachment:
             if self._chosen(self._sumo, car):
                 self._cars.add(car)
                 self.ever.add(car)
-        self._ride.forget(self._known - here)
         for car in self._known - here:
             self._cars.cars.pop(car, None)
             self._seeing.forget(car)

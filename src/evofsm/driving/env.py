@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving.families import load_family
-from evofsm.driving.family import Draw, Family
+from evofsm.driving.family import Draw, Family, load_family
 from evofsm.driving.sumo import open_world
 from evofsm.driving.world import Episode, Road
 from evofsm.extras import needs
@@ -91,8 +90,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self.observation_space = Box(np.array(LOW), np.array(HIGH), dtype=np.float64)
         actions = self.family.actions
         self.action_space = Box(actions.low, actions.high, (1,), np.float64)
-        self._open = ExitStack()
-        self._world = self._open.enter_context(open_world(world))
+        self._world = open_world(world)
         self._run = ExitStack()
         self._road: Road | None = None
 
@@ -134,10 +132,9 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         return np.clip(observation, LOW, HIGH), reward, terminated, truncated, info
 
     def close(self) -> None:
-        """Leave the road and the world."""
+        """Leave the road."""
         self._road = None
         self._run.close()
-        self._open.close()
 
     def _info(self, step: Episode) -> dict[str, Any]:
         return {

@@ -41,7 +41,7 @@ from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import Action, nearest_bounds
 from evofsm.guard.api import LearningJudge, Trial
-from evofsm.store import COUNT, FLAG, LARGEST_OBSERVATION, SIZE, SMALLEST, Kind, Numbers, Place
+from evofsm.store import COUNT, FLAG, SIZE, SMALLEST, Kind, Numbers, Place
 
 if TYPE_CHECKING:
     from evofsm.guard import ActionReviser
@@ -216,7 +216,7 @@ class LatentRisk(Retraced, LearningJudge):
         self, observation: ArrayLike, acceleration: float, *, learn: bool, watched: bool = False
     ) -> None:
         triple = _three_finite(observation, whole=False)
-        command = _one_finite("acceleration", acceleration)
+        (command,) = _finite("acceleration", [acceleration]).tolist()
         self._keep_up(triple, command, learn and is_whole(triple), watched)
 
     @step
@@ -538,7 +538,7 @@ def dead_ends_of(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[int]:
 
 def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     """Gap and speeds, as they can be judged; unless they must be ``whole``, NaN where not seen."""
-    numbers = _series("observation", observation)
+    numbers = real_array("observation", observation, 1)
     if len(numbers) != 3:
         raise ValueError(
             f"observation has shape {numbers.shape}; it must be (3,): gap, speed of the follower "
@@ -550,29 +550,10 @@ def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     return gap, speed, leader_speed
 
 
-def _one_finite(name: str, value: float) -> float:
-    if type(value) is float and abs(value) <= LARGEST_OBSERVATION:  # false of NaN
-        return value
-    return float(_finite(name, [value])[0])
-
-
 def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    array = _series(name, values)
+    array = real_array(name, values, 1)
     refuse_unusable(name, array)
     return array
-
-
-def _series(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Real numbers in a row; what is that already is not looked at for long, nor copied."""
-    if (
-        type(values) is np.ndarray
-        and values.dtype == np.float64
-        and values.ndim == 1
-        and len(values)
-        and values.flags.carray  # a read-only one would be compiled for
-    ):
-        return values
-    return real_array(name, values, 1)
 
 
 @compiled

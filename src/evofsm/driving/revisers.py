@@ -1,4 +1,4 @@
-"""Revisers that know a car: brake where a classic measure calls for it, always, or never."""
+"""Revisers that know a car: brake where a classic measure calls for it, or never."""
 
 from __future__ import annotations
 
@@ -107,11 +107,3 @@ class Unrevised:
     def restored(cls, described: Mapping[str, Any], actions: IntervalActions) -> Self:
         """The one that was `described`."""
         return cls(actions)
-
-
-class AlwaysBrake(Unrevised):
-    """Brakes in full always: no one is safer, or gets less far."""
-
-    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
-        """Full braking."""
-        return unjudged_revision(self.actions.low, proposal, "always brakes")

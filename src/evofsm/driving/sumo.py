@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import tempfile
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,8 @@ from evofsm.extras import needs
 
 #: The worlds there are.
 WORLDS = ("sumo", "kinematic")
+
+_CARS = ["follower", "leader", "behind"]
 
 _ROAD_LENGTH = 200_000.0
 _FASTEST = 100.0
@@ -62,7 +65,7 @@ _ROUTES = f"""<routes>
 
 
 class SumoWorld(World, AbstractContextManager["SumoWorld"]):
-    """The world that is SUMO itself. Close it after use, or use it in a ``with`` statement.
+    """The world that is SUMO itself; each run is a simulation of its own.
 
     Notes
     -----
@@ -73,59 +76,46 @@ class SumoWorld(World, AbstractContextManager["SumoWorld"]):
     def __init__(self) -> None:
         with needs("libsumo", "sumo", "the world 'sumo'"):
             self._sumo: Any = import_module("libsumo")
-        self._folder: tempfile.TemporaryDirectory[str] | None = None  # while a simulation is open
-        self._dt = 0.0
-        self._runs = 0
-
-    def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
-        """Put the cars on a road, for use in a ``with`` statement."""
-        _refuse_what_sumo_cannot_drive(scenario)
-        goes_on = self._folder is not None and self._sumo.isLoaded()
-        if not goes_on or self._dt != scenario.dt:
-            self.close()
-            self._start(scenario.dt)
-        self._runs += 1
-        return _Road(self._sumo, self._runs, scenario)
-
-    def close(self) -> None:
-        """End the simulation."""
-        if self._folder is not None:
-            if self._sumo.isLoaded():
-                self._sumo.close()
-            self._folder.cleanup()
-            self._folder = None
 
     def __exit__(self, *error: object) -> None:
-        self.close()
+        """Nothing is open between two runs."""
 
-    def _start(self, dt: float) -> None:
-        if self._sumo.isLoaded():
+    @contextmanager
+    def open(self, scenario: Scenario) -> Iterator[Road]:
+        """Put the cars on a road, for use in a ``with`` statement."""
+        _refuse_what_sumo_cannot_drive(scenario)
+        sumo = self._sumo
+        if sumo.isLoaded():
             raise RuntimeError(
                 "this process runs a SUMO simulation already, and libsumo has room for one: "
                 "close that one, or use another process"
             )
-        folder = tempfile.TemporaryDirectory(prefix="evofsm-sumo-")
-        net, routes = Path(folder.name) / "road.net.xml", Path(folder.name) / "road.rou.xml"
-        net.write_text(_NET)
-        routes.write_text(_ROUTES)
-        self._sumo.start(
-            [
-                "sumo",
-                *("--net-file", str(net), "--route-files", str(routes)),
-                *("--step-length", repr(dt), "--step-method.ballistic", "true"),
-                *("--collision.action", "warn", "--collision.mingap-factor", "0"),
-                *("--time-to-teleport", "-1", "--no-step-log", "true", "--no-warnings", "true"),
-            ]
-        )
-        self._folder, self._dt = folder, dt
+        with tempfile.TemporaryDirectory(prefix="evofsm-sumo-") as folder:
+            net, routes = Path(folder) / "road.net.xml", Path(folder) / "road.rou.xml"
+            net.write_text(_NET)
+            routes.write_text(_ROUTES)
+            sumo.start(
+                [
+                    "sumo",
+                    *("--net-file", str(net), "--route-files", str(routes)),
+                    *("--step-length", repr(scenario.dt), "--step-method.ballistic", "true"),
+                    *("--collision.action", "warn", "--collision.mingap-factor", "0"),
+                    *("--time-to-teleport", "-1", "--no-step-log", "true", "--no-warnings", "true"),
+                ]
+            )
+        try:
+            yield _Road(sumo, scenario)
+        finally:
+            if sumo.isLoaded():  # else it was closed from outside
+                sumo.close()
 
 
-def open_world(name: str) -> AbstractContextManager[World]:
-    """Open a world by its name, one of `WORLDS`, for use in a ``with`` statement."""
+def open_world(name: str) -> World:
+    """A world by its name, one of `WORLDS`."""
     if name == "sumo":
         return SumoWorld()
     if name == "kinematic":
-        return nullcontext(KinematicWorld())
+        return KinematicWorld()
     raise ValueError(f"there is no world {name!r}; there are {', '.join(WORLDS)}")
 
 
@@ -151,19 +141,17 @@ def _start(scenario: Scenario) -> float:
     return _FIRST_PLACE + (behind.gap + _VEHICLE_LENGTH if behind else 0.0)
 
 
-class _Road(Road, AbstractContextManager["_Road"]):
-    """Cars of their own for one run, in a simulation that goes on from run to run."""
+class _Road(Road):
+    """The cars of one run."""
 
-    def __init__(self, sumo: Any, run: int, scenario: Scenario) -> None:
+    def __init__(self, sumo: Any, scenario: Scenario) -> None:
         super().__init__(scenario)
         self._sumo = sumo
-        self._cars = [f"{role}{run}" for role in ("follower", "leader", "behind")]
+        self._cars = _CARS if scenario.behind else _CARS[:2]
         start, record = _start(scenario), self._record[0]
-        starts = [start, start + scenario.initial_gap + _VEHICLE_LENGTH, _FIRST_PLACE]
+        starts = start, start + scenario.initial_gap + _VEHICLE_LENGTH, _FIRST_PLACE
         speeds = record[[SPEED, LEADER_SPEED, SPEED_BEHIND]].tolist()
-        if scenario.behind is None:
-            del self._cars[2], starts[2], speeds[2]
-        for car, position, speed in zip(self._cars, starts, speeds, strict=True):
+        for car, position, speed in zip(self._cars, starts, speeds, strict=False):
             # Standing, as SUMO does not insert a car that is too fast for the one ahead.
             sumo.vehicle.add(
                 car, "along", "car", depart="now", departPos=repr(position), departSpeed="0"
@@ -171,7 +159,7 @@ class _Road(Road, AbstractContextManager["_Road"]):
             sumo.vehicle.setSpeedMode(car, 0)
             sumo.vehicle.setSpeed(car, speed)
         sumo.simulationStep()  # the first step only puts the cars on the road
-        for car, speed in zip(self._cars, speeds, strict=True):
+        for car, speed in zip(self._cars, speeds, strict=False):
             sumo.vehicle.setPreviousSpeed(car, speed)
         self._observe()
 
@@ -207,9 +195,3 @@ class _Road(Road, AbstractContextManager["_Road"]):
         if self.scenario.behind is not None:
             now[GAP_BEHIND] = position[0] - _VEHICLE_LENGTH - position[2]
             now[SPEED_BEHIND] = vehicle.getSpeed(self._cars[2])
-
-    def __exit__(self, *error: object) -> None:
-        for car in self._cars:
-            if car in self._sumo.vehicle.getIDList():
-                self._sumo.vehicle.remove(car)
-        self._sumo.simulationStep()

@@ -1,7 +1,7 @@
 """Episodes of cars under a guard, and what came of them: collisions, distance, comfort.
 
 All that drives cars goes through `drive`, which is the loop of `evofsm.guard.run_episode` on a
-road. A `Trial` is the same as a function of an episode's number, for any ``map``.
+road.
 """
 
 from __future__ import annotations
@@ -9,15 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from evofsm.driving.family import Draw, Family
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.scenarios import Scenario, steps_between
-from evofsm.driving.sumo import open_world
 from evofsm.driving.world import LEADER_ACCELERATION, SPEED, Drives, Episode, KinematicWorld, World
 from evofsm.extras import needs
 from evofsm.fsm.proportions import FailureRecord
@@ -170,36 +168,6 @@ def try_out(
     frozen.freeze()
     alone = alone or [reference_of(family, draw) for draw in draws]
     return [outcome_of(*pair) for pair in zip(teach(frozen, draws), alone, strict=True)]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Episodes of a family by their number: a function for any ``map``, of threads or processes."""
-
-    family: Family
-    guard: Guard  #: frozen, no episode depends on another one
-    world: World | str  #: of a name each process opens a world of its own
-    seed: int
-    split: str
-
-    def drive(self, number: int) -> tuple[Episode, dict[str, Any]]:
-        """An episode, and its row: number, variant and `Outcome`."""
-        world = _opened(self.world) if isinstance(self.world, str) else self.world
-        draw = self.family.draw(self.seed, number, split=self.split)
-        alone = reference_of(self.family, draw, world)
-        episode = drive(self.guard, draw, world)
-        outcome = outcome_of(episode, alone)
-        return episode, {"episode": number, "variant": draw.variant, **outcome._asdict()}
-
-    def __call__(self, number: int) -> dict[str, Any]:
-        """The row of an episode."""
-        return self.drive(number)[1]
-
-
-@cache
-def _opened(name: str) -> World:
-    """The world of this process, open for as long as it lives."""
-    return open_world(name).__enter__()
 
 
 # -- What came of many ----------------------------------------------------------------------------

@@ -62,12 +62,6 @@ class Episode:
         return self.record[:, LEADER_ACCELERATION].copy()
 
     @property
-    def realised(self) -> NDArray[np.float64]:
-        """(T,) ndarray: what the follower did after each row [m/s²]; NaN after the last."""
-        change = np.diff(self.record[:, SPEED], append=np.nan)
-        return change / np.diff(self.time, append=np.nan)
-
-    @property
     def collided(self) -> bool:
         """Whether the run ended in a collision with the leader."""
         return bool(self.record[-1, GAP] <= 0.0)

@@ -2,7 +2,6 @@ from .claims import check_claims as check_claims
 from .page import Figure as Figure
 from .page import Page as Page
 from .page import Table as Table
-from .page import print_page as print_page
 from .page import write_page as write_page
 from .runs import Settings as Settings
 from .runs import run_paper as run_paper

@@ -79,7 +79,8 @@ def draw_case(study: PaperStudy, run: Run) -> Drawn:
     gap.plot(time, gaps, color=COLORS["ink"])
     gap.set(ylim=(0.0, 1.08 * gaps.max()), ylabel="gap [m]")
     if episode.collided:
-        plot.draw_collision(gap, float(time[-1]), 0.0)
+        look: Look = {"marker": "X", "markersize": 8, "color": COLORS["ink"], "clip_on": False}
+        gap.plot([time[-1]], [0.0], markeredgecolor="white", markeredgewidth=0.7, zorder=7, **look)
     speeds.plot(time, followers, label="follower", **_FOLLOWER)
     speeds.plot(time, leaders, label="leader", **_LEADER_LINE)
     speeds.set_ylim(bottom=0.0)
@@ -105,7 +106,7 @@ def draw_case(study: PaperStudy, run: Run) -> Drawn:
         share, is_last = at / settings.scenario.duration, place == len(moments) - 1
         before = share > (0.93 if is_last else 0.5)
         height = 7.0 + 13.0 * place * before  # each text that ends there in a row of its own
-        look: Look = {"ha": "right" if before else "left", "xycoords": ("data", "axes fraction")}
+        look = {"ha": "right" if before else "left", "xycoords": ("data", "axes fraction")}
         look["fontweight"] = "bold" if text.startswith("collision") else "normal"
         plot.write(gap, text, (at, 1.0), (-3.0 if before else 3.0, height), size=7.5, **look)
     figure.align_ylabels(panels)

@@ -1,7 +1,7 @@
 """Pages of results: text, tables and figures in one HTML file that loads nothing.
 
-`write_page` writes one, `print_page` says the same in the terminal. The paper's page and those of
-all studies are made here.
+The paper's page and those of all studies are made here; `evofsm.cli.print_page` says the same in
+the terminal.
 """
 
 from __future__ import annotations
@@ -26,15 +26,12 @@ with needs("polars", "tables", "tables of results"):
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawn
-    from rich.console import Console
 
 #: What a cell says where there is no number.
 NONE = "–"
 _PACKAGES = ("numpy", "numba", "polars", "matplotlib")
 # A table with a longer cell is one of words, which are folded.
 _WORDS = 36
-# Where nobody watches, tables are as wide as they like, up to this.
-_WIDEST = 200
 
 
 class _Cell(Formatter):
@@ -238,7 +235,7 @@ def write_page(path: Path, pages: Sequence[Page], title: str = "", about: str = 
             page.name: _drawn(page, path.parent / (page.name if len(pages) > 1 else "figures"))
             for page in pages
         },
-        summary=_summary(pages),
+        summary=summary(pages),
         versions=_versions([package for page in pages for package in page.packages]),
         date=datetime.now(UTC).date().isoformat(),
     )
@@ -262,7 +259,8 @@ def _drawn(page: Page, folder: Path) -> dict[str, str]:
     return images
 
 
-def _summary(pages: Sequence[Page]) -> Table:
+def summary(pages: Sequence[Page]) -> Table:
+    """What many pages ask and answer, a line each."""
     rows = {
         "question": [page.title for page in pages],
         "answer": [page.answer for page in pages],
@@ -278,60 +276,3 @@ def _versions(more: Sequence[str]) -> dict[str, str]:
     names = {"libsumo": "SUMO (libsumo)"}
     versions |= {names.get(name, name): version(name) for name in (*_PACKAGES, *more)}
     return {**versions, "system": f"{platform.system()} on {platform.machine()}"}
-
-
-# -- The terminal ---------------------------------------------------------------------------------
-
-
-def print_page(*pages: Page, out: Console | None = None) -> None:
-    """Print what a page says: its targets, tables, and where it loses; many in a line each."""
-    out = out or _console()
-    if len(pages) != 1:
-        print_table(_summary(pages), out)
-        return
-    (page,) = pages
-    out.print(page.title, style="bold")
-    out.print(page.answer, style="bold red" if page.holds is False else "")
-    for table in page.tables:
-        print_table(table, out)
-    out.print("\nWhere it loses", style="bold")
-    for table in page.losses:
-        print_table(table, out)
-    if not page.losses:
-        out.print("In no row of these tables.")
-
-
-def print_table(table: Table, out: Console) -> None:
-    """Print a table; rows that are ours begin with ``>``, those that fail with ``!``.
-
-    It may be wider than the terminal: no number is ever cut in two.
-    """
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table as Grid
-
-    signs = {"ours": "> ", "fails": "! "}
-    styles = {"ours": "bold", "fails": "bold red"}
-    grid, least = Grid(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0)), 0
-    for k, (name, is_number) in enumerate(zip(table.header, table.numeric, strict=True)):
-        column = [name, *(row[k] for row in table.cells)]
-        longest = max(map(len, column if is_number else " ".join(column).split()), default=0)
-        alignment: Any = {"justify": "right" if is_number else "left", "vertical": "bottom"}
-        grid.add_column(name, min_width=longest, **alignment)
-        least += longest + 2
-    for row, mark in zip(table.cells, table.marks, strict=True):
-        grid.add_row(signs.get(mark or "", "") + row[0], *row[1:], style=styles.get(mark or ""))
-    out.print(f"\n{table.title}", style="bold")
-    grid.width = least if least > out.width else None
-    out.print(grid, crop=False)
-    if table.note:
-        out.print(table.note, style="dim")
-
-
-def _console() -> Console:
-    """Standard output; brackets are no markup, and a pipe has room for every column."""
-    from rich.console import Console
-
-    out = Console(markup=False, highlight=False, emoji=False)
-    if not out.is_terminal:
-        out.width = max(out.width, _WIDEST)
-    return out

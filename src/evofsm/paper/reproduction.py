@@ -1,21 +1,18 @@
-"""The paper's study: drive its runs, hold every claim against them, and write what came out."""
+"""The page on the paper's study: every claim held against the runs, and what came out."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 
-from evofsm.driving.sumo import open_world
 from evofsm.fsm.divergence import jensen_shannon
-from evofsm.paper.claims import LARGEST_DIVERGENCE, Claim, check_claims
+from evofsm.paper.claims import LARGEST_DIVERGENCE, check_claims
 from evofsm.paper.figures import figures
 from evofsm.paper.page import Page, Table, write_page
-from evofsm.paper.runs import CASES, PaperStudy, Settings, run_paper
+from evofsm.paper.runs import CASES, PaperStudy
 
 _ABOUT = """Does the paper's machine do what the paper says?
 
@@ -37,63 +34,40 @@ _SOURCE = (
 _OURS = "e-FSM"
 
 
-@dataclass(frozen=True)
-class Reproduction:
-    """The runs, and every claim held against them."""
-
-    study: PaperStudy
-    claims: tuple[Claim, ...]
-
-    @property
-    def holds(self) -> bool:
-        """Whether all claims hold."""
-        return all(claim.holds for claim in self.claims)
-
-    def page(self, command: str = "evofsm paper") -> Page:
-        """Every claim beside what was measured, and what an expert would ask next."""
-        study = self.study
-        world = _WORLDS.get(study.world, study.world)
-        n_holds = sum(claim.holds for claim in self.claims)
-        first, *rest = figures(study)
-        forecasts = divergences(study)
-        return Page(
-            name="paper",
-            about=_ABOUT,
-            parts=[first, _table_of_forecasts(forecasts), *rest],
-            command=command,
-            lost=[_table_of_losses(forecasts)],
-            targets=pl.DataFrame(self.claims).select("claim", "paper", "measured", "holds"),
-            facts={
-                "world": world,
-                "runs": f"{len(study.runs)}: the four cases, round by round",
-                "extra runs": f"{len(study.extra_runs)}: case 1, but the leader brakes in full at "
-                f"{' or '.join(map('{:g} s'.format, study.settings.brake_at))}, where the dead end "
-                "is recognised, to see whether a collision follows, as in the paper",
-            },
-            packages=("libsumo",) if study.world == "sumo" else (),
-            sources={_SOURCE: "https://arxiv.org/abs/1908.10823"},
-            verdict=f"{n_holds} of {len(self.claims)} claims of the paper hold in {world}",
-        )
-
-    def write(self, folder: Path, command: str = "evofsm paper") -> Path:
-        """Write page, figures, ``claims.json`` and ``model.evofsm``."""
-        folder.mkdir(parents=True, exist_ok=True)
-        claims = [claim._asdict() for claim in self.claims]
-        text = json.dumps(claims, indent=2, ensure_ascii=False)
-        (folder / "claims.json").write_text(f"{text}\n", encoding="utf-8")
-        self.study.model.save(folder / "model.evofsm")
-        return write_page(folder / "index.html", [self.page(command)])
+def page_of(study: PaperStudy, command: str = "evofsm paper") -> Page:
+    """Every claim beside what was measured, and what an expert would ask next."""
+    claims, world = check_claims(study), _WORLDS[study.world]
+    n_holds = sum(claim.holds for claim in claims)
+    first, *rest = figures(study)
+    forecasts = divergences(study)
+    return Page(
+        name="paper",
+        about=_ABOUT,
+        parts=[first, _table_of_forecasts(forecasts), *rest],
+        command=command,
+        lost=[_table_of_losses(forecasts)],
+        targets=pl.DataFrame(claims).select("claim", "paper", "measured", "holds"),
+        facts={
+            "world": world,
+            "runs": f"{len(study.runs)}: the four cases, round by round",
+            "extra runs": f"{len(study.extra_runs)}: case 1, but the leader brakes in full at "
+            f"{' or '.join(map('{:g} s'.format, study.settings.brake_at))}, where the dead end "
+            "is recognised, to see whether a collision follows, as in the paper",
+        },
+        packages=("libsumo",) if study.world == "sumo" else (),
+        sources={_SOURCE: "https://arxiv.org/abs/1908.10823"},
+        verdict=f"{n_holds} of {len(claims)} claims of the paper hold in {world}",
+    )
 
 
-def reproduce(
-    world: str = "sumo",
-    rounds: int = 20,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Reproduction:
-    """Drive the four cases of the paper, round by round, and hold every claim against the runs."""
-    with open_world(world) as place:
-        study = run_paper(place, world, Settings.load(), rounds, progress)
-    return Reproduction(study, check_claims(study))
+def write(study: PaperStudy, folder: Path, command: str) -> Path:
+    """Write page, figures, ``claims.json`` and ``model.evofsm``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    claims = [claim._asdict() for claim in check_claims(study)]
+    text = json.dumps(claims, indent=2, ensure_ascii=False)
+    (folder / "claims.json").write_text(f"{text}\n", encoding="utf-8")
+    study.model.save(folder / "model.evofsm")
+    return write_page(folder / "index.html", [page_of(study, command)])
 
 
 # -- Beside the claims: what an expert would ask next ---------------------------------------------

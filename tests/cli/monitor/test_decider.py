@@ -3,8 +3,8 @@ import json
 import pytest
 
 from evofsm.cli.monitor.decider import Decider
-from evofsm.driving import AlwaysBrake, guard_for_cars
-from evofsm.driving.assumed import guard_of_monitor, guard_of_traffic
+from evofsm.driving import EnvelopeReviser, guard_for_cars, measures
+from evofsm.driving.cars import guard_of_monitor, guard_of_traffic
 from evofsm.guard import AuditLog, Guard, Mode, audit
 from monitor_rows import closing_in as rows
 from monitor_rows import line
@@ -206,7 +206,8 @@ def test_where_the_audit_log_cannot_be_written_the_decisions_go_on(tmp_path, mon
 
 def test_a_reviser_without_risks_alarms_where_it_differs():
     cars = guard_for_cars(-6.0, 2.5)
-    guard = Guard.of(AlwaysBrake(cars.actions), interval=0.1)
+    headway = EnvelopeReviser(measures.TimeHeadway(2.0), cars.actions, 0.1)
+    guard = Guard.of(headway, interval=0.1)
     answer = Decider(guard).answer(b'{"time": 0, "observation": [9, 9, 9], "proposal": 2}')
     assert (answer["alarm"], answer["mode"], answer["risk_proposed"]) == (True, "act", None)
 

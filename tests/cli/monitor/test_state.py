@@ -7,7 +7,7 @@ from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.slots import Slots
 from evofsm.cli.monitor.state import State
 from evofsm.cli.monitor.transports import Server
-from evofsm.driving.assumed import guard_of_monitor
+from evofsm.driving.cars import guard_of_monitor
 from evofsm.guard import Guard, Mode
 from evofsm.io import LogColumns
 from evofsm.io.logs import Resample

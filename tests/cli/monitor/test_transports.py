@@ -23,7 +23,7 @@ from evofsm.cli.monitor.transports import (
     UdpTransport,
     ZenohTransport,
 )
-from evofsm.driving.assumed import guard_of_monitor
+from evofsm.driving.cars import guard_of_monitor
 from evofsm.io import LogColumns
 from evofsm.io.logs import Resample
 from monitor_rows import JUNK, closing_in, line

@@ -140,7 +140,7 @@ def monitor(
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.summary import Text
     from evofsm.cli.monitor.transports import Server, json_line
-    from evofsm.driving.assumed import assumptions, guard_of_monitor, guard_of_traffic
+    from evofsm.driving.cars import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
     from evofsm.guard import Foresight, Guard
     from evofsm.store import read_header

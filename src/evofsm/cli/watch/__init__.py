@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 import webbrowser
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from shlex import quote
@@ -79,7 +79,7 @@ def watch(
         raise ValueError(f"--guard and options of columns are for a log, and {what} is none")
     defaults = {} if guard is None else read_header(guard).provenance.get("read with", {})
     reader = partial(reading_of, **{**reading.keywords, **defaults, **given_of(reading)})
-    with suppress(KeyboardInterrupt), ExitStack() as stack:
+    with suppress(KeyboardInterrupt):
         if is_log:
             risk = None if tolerance == TOLERANCE else tolerance
             log_guard = None if guard is None else Guard.load(guard)
@@ -90,10 +90,10 @@ def watch(
                     raise
                 look = f"evofsm learn {quote(what)} says what it holds, and what to name"
                 raise ValueError(f"{error}. Is it no log of cars? {look}") from error
-            run = stack.enter_context(run)
         else:
-            run = _driven(stack, what, case or 1, world, judge, tolerance, seed, learn_first)
-        asyncio.run(_serve(run, browse=not no_browser))
+            run = _driven(what, case or 1, world, judge, tolerance, seed, learn_first)
+        with run:
+            asyncio.run(_serve(run, browse=not no_browser))
     say("\nThe page is closed.")
 
 
@@ -102,7 +102,7 @@ async def _serve(watched: Session, *, browse: bool) -> None:
     from evofsm.cli.watch.server import LivePage
 
     async with LivePage() as page:
-        page.player = Player(watched, page, awaits=True)
+        page.player = Player(watched, page)
         may = "steer the run" if watched.start.live else "look on"
         say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
         print(f"  {page.address}", flush=True)
@@ -134,7 +134,7 @@ def _logged(what: str, reading: Reading, *asked: Any, **settings: Any) -> Sessio
     from tempfile import TemporaryDirectory
 
     from evofsm.cli.sumocfg import trace_configuration
-    from evofsm.cli.watch.logged import watched_log
+    from evofsm.cli.watch.session import watched_log
 
     if not what.endswith(".sumocfg"):
         return watched_log(what, reading, *asked, **settings)
@@ -147,7 +147,6 @@ def _logged(what: str, reading: Reading, *asked: Any, **settings: Any) -> Sessio
 
 
 def _driven(
-    stack: ExitStack,
     what: str,
     case: int,
     world: World,
@@ -173,10 +172,10 @@ def _driven(
         from evofsm.driving.sumo import open_world
 
         family = load_family(what)
-        system: System = OnRoads(family, stack.enter_context(open_world(world)), seed)
+        system: System = OnRoads(family, open_world(world), seed)
         guard = watched_guard(family, judge=judge, tolerance=tolerance)
     else:
         system, guard = environment, environment.guard
     with progress("Learning first", episodes) as move:
         learn_first(guard, system, episodes, move)
-    return stack.enter_context(Session(system, guard, case=case - 1))
+    return Session(system, guard, case=case - 1)

@@ -34,24 +34,16 @@ class Player:
 
     ``audience`` is told what happens: "start" with a `Start`, "frame" with a `Frame`, "graph" with
     a `Graph`, "known" with what is `Known`, "clock" with a `Clock`, and "failed" with why it broke
-    off. With ``awaits`` it waits until someone attends.
+    off. It waits until someone attends.
     """
 
-    def __init__(
-        self,
-        watched: Session,
-        audience: Callable[[str, Any], object],
-        *,
-        paused: bool = False,
-        speed: float | None = None,
-        awaits: bool = False,
-    ) -> None:
-        if speed is None:  # real time, but no more decisions in a second than can be followed
-            speeds, pace = watched.start.speeds, _FOLLOWED * watched.start.interval
-            pace = min(1.0, pace) if 1.0 in speeds else pace
-            speed = max((rate for rate in speeds if rate <= pace), default=speeds[0])
-        self._watched, self._audience, self._awaits = watched, audience, awaits
-        self._paused, self._speed, self._over = paused, speed, False
+    def __init__(self, watched: Session, audience: Callable[[str, Any], object]) -> None:
+        # Real time, but no more decisions in a second than can be followed.
+        speeds, pace = watched.start.speeds, _FOLLOWED * watched.start.interval
+        pace = min(1.0, pace) if 1.0 in speeds else pace
+        self._speed = max((rate for rate in speeds if rate <= pace), default=speeds[0])
+        self._watched, self._audience, self._awaits = watched, audience, True
+        self._paused = self._over = False
         self._steps = False  # once, although it is paused
         self._due = 0.0  # when the next frame is [s]
         self._since = self._states = 0  # frames since the latest graph, and its states

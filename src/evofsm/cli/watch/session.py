@@ -1,6 +1,7 @@
 """Drives a system decision by decision and shows every one; the guard goes on learning.
 
-A system is a family of scenarios for cars, or any environment of Gymnasium with a controller.
+A system is a family of scenarios for cars, or any environment of Gymnasium with a controller. A log
+is played row by row beside a guard.
 """
 
 from __future__ import annotations
@@ -8,27 +9,32 @@ from __future__ import annotations
 import math
 import re
 import runpy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.cli.foreseen import date
+from evofsm.cli.learning import episodes_read, learn_chunk
+from evofsm.cli.options import BRAKES, Reading, refuse_other_limit
+from evofsm.cli.show import warn
 from evofsm.cli.watch.shown import (
     CALM,
     OF_CARS,
     Cars,
-    Chronicle,
     Frame,
     Graph,
     Judged,
     Known,
     Start,
+    Story,
     cars_of,
     first_of_its_kind,
+    go_on,
     graph_of,
     known_of,
     numbers,
@@ -42,9 +48,15 @@ from evofsm.driving import (
     teach,
     unrevised_guard,
 )
-from evofsm.driving.cars import name_judge
-from evofsm.driving.measures import time_headway, time_to_collision
-from evofsm.driving.world import GAP, GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
+from evofsm.driving.cars import assumptions, guard_of_monitor, name_judge
+from evofsm.driving.naming import UNITS, VARIABLES
+from evofsm.driving.world import (
+    GAP_BEHIND,
+    LEADER_ACCELERATION,
+    LEADER_SPEED,
+    SPEED,
+    World,
+)
 from evofsm.extras import needs
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.naming import Labels
@@ -64,7 +76,7 @@ from evofsm.guard import (
 )
 from evofsm.guard.actions import Action, Choices, change, is_usable, limits, put_into
 from evofsm.guard.foresight import DATES
-from evofsm.io import Chunk
+from evofsm.io.logs import LONGEST_STEP, Chunk, Noted
 
 #: The state rule for looking on: coarse enough that each state can be told from the others.
 WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
@@ -89,8 +101,9 @@ _APART = 1_000_000
 _LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
 # So many rows of a long episode are played one by one, and so many in a second.
 _PLAYED, _A_SECOND = 400, 10.0
-# Rows of an episode that shows something.
-_SHOWS = 10
+# Rows of an episode that shows something; fewer of cars are not watched. Times of a log that
+# differ by less are one [s], and its step may differ from that of a guard by this share.
+_SHOWS, _TICK, _OTHER_STEP = 10, 5e-4, 0.1
 # What a file may define besides its environment.
 _PARTS = ("controller", "failed", "variables")
 # Of more variables only those of the plane are named.
@@ -161,20 +174,20 @@ class OnRoads:
         self._road = self._closing.enter_context(self.world.open(draw.scenario))
         self._steps = draw.scenario.steps(self.interval)
         self._stood = 0.0
-        self._held = np.full(3, np.nan)
         self._look()
 
     def _look(self) -> None:
-        road = self._road
+        road, record = self._road, self._road.episode().record
         self.observation, self.time, self.failed = road.observation, road.time, road.collided
         self.over = road.over or self._stood >= _STOOD
         self.terminated = road.collided or road.rear_ended
+        stands = not record[-1, [SPEED, LEADER_SPEED]].any()
+        brakes = record[-2:, LEADER_ACCELERATION].min() < 0.0
+        self._stood = self._stood + self.interval if stands and brakes else 0.0
 
     def propose(self) -> Action:
-        """What the driver wants, by what was seen last of each variable."""
-        observation = self.observation
-        self._held = np.where(np.isnan(observation), self._held, observation)
-        return self._controller.propose(self._held, self.time).action
+        """What the driver wants."""
+        return self._controller.propose(self.observation, self.time).action
 
     def advance(self, revision: Revision) -> None:
         """Drive on."""
@@ -182,26 +195,13 @@ class OnRoads:
         self._look()
 
     def cars(self) -> Cars:
-        """Where they are."""
-        road, episode = self._road, self._road.episode()
-        record, speeds, now = episode.record, episode.record[:, SPEED], episode.record[-1]
-        distance = 0.5 * (speeds[1:] + speeds[:-1]).sum() * road.scenario.dt
-        a_leader = float(record[-2, LEADER_ACCELERATION]) if len(record) > 1 else math.nan
-        stands = now[SPEED] == now[LEADER_SPEED] == 0.0 and a_leader < 0.0
-        self._stood = self._stood + self.interval if stands else 0.0
-        observation = self.observation
-        return Cars(
-            gap=float(now[GAP]),
-            v_follower=float(speeds[-1]),
-            v_leader=float(now[LEADER_SPEED]),
-            a_follower=float(episode.realised[-2:][0]),
-            a_leader=a_leader,
-            x_follower=float(distance),
-            time_to_collision=float(time_to_collision(observation)),
-            time_headway=float(time_headway(observation)),
-            gap_behind=float(now[GAP_BEHIND]),
-            rear_ended=road.rear_ended,
-        )
+        """Where they are, by what there was at each decision."""
+        episode = self._road.episode()
+        last = len(episode.time) - 1
+        rows = [*range(0, last, self._steps), last]
+        *_, now = cars_of(episode.time[rows], episode.observations[rows])
+        gap_behind = float(episode.record[-1, GAP_BEHIND])
+        return now._replace(gap_behind=gap_behind, rear_ended=self._road.rear_ended)
 
     def close(self) -> None:
         """Leave the road."""
@@ -450,10 +450,103 @@ class Logged:
         """There is nothing to leave."""
 
 
-System = OnRoads | Simulated
+def watched_log(
+    path: str,
+    reading: Reading,
+    tolerance: float | None = None,
+    case: int | None = None,
+    guard: Guard | None = None,
+    *,
+    brakes: float = BRAKES,
+    collisions: Mapping[str, Sequence[float]] = MappingProxyType({}),
+) -> Session:
+    """The episodes of a log, with a guard; of cars without one with what `evofsm monitor` has.
+
+    Of cars an episode is over with a contact; where they come apart again, another one begins. So
+    it is with ``collisions`` that a simulation counted [s], by the name of who follows whom.
+    ``case`` is the number of the episode to begin with, from 1.
+    """
+    names = reading.columns.observe.names
+    of_cars = reading.acts and len(names) == len(VARIABLES) and (not guard or names == VARIABLES)
+    if guard is None and not of_cars:
+        raise ValueError(f"{path} is of no cars: --guard names a guard (evofsm learn --guard)")
+    episodes = episodes_read(path, reading, Noted(), dated=not of_cars)
+    stretches = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
+    if not stretches:
+        why = f"nobody follows anybody for {_SHOWS}" if of_cars else "no episode has two"
+        raise ValueError(f"{path}: {why} rows")
+    labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
+    rows = [stretch.rows for stretch in stretches]
+    refuse_other_limit(reading.acts, None, tolerance)
+    if guard is None:
+        risk = TOLERANCE if tolerance is None else tolerance
+        guard = guard_of_monitor(rows[0].dt, brakes, risk)
+        assert guard.machine is not None
+        for chunk in rows:
+            learn_chunk(guard.machine, chunk, guard.actions)
+        warn(assumptions(brakes, risk))
+    else:
+        if tuple(names) != guard.variables or abs(rows[0].dt / guard.interval - 1.0) > _OTHER_STEP:
+            holds = f"{', '.join(names)} every {rows[0].dt:.4g} s"
+            wants = f"{', '.join(guard.variables)} every {guard.interval:.4g} s"
+            raise ValueError(f"{path} is read as {holds}; this guard decides on {wants}")
+        if tolerance is not None:
+            guard.reviser.tolerance = tolerance  # type: ignore[attr-defined]
+    guard.learn = False
+    if isinstance(guard.judge, Foresight):
+        stretches = list(_alarmed(guard.judge, guard.judge.alarm, stretches))
+    system = Logged(path, stretches, labels, acts=reading.acts, of_cars=of_cars)
+    return Session(system, guard, case=system.first if case is None else case - 1, on=False)
+
+
+def _alarmed(judge: Foresight, rate: int | None, found: Sequence[Played]) -> Iterator[Played]:
+    """With whether alarms come before the last row, with which nothing is decided."""
+    runs = judge.runs([p.rows.observations for p in found], [bool(p.fails) for p in found])
+    on = np.zeros(len(runs.rows), np.bool_) if rate is None else judge.tally(runs, rate)[1]
+    for stretch, part in zip(found, np.split(on, runs.starts[1:]), strict=True):
+        yield stretch._replace(alarms=bool((part[1:-1] & ~part[:-2]).any()))
+
+
+def _whole(episodes: Iterable[Chunk]) -> Iterator[Played]:
+    for number, episode in enumerate(episodes, 1):
+        began = f", {date(episode.times[0])}" if episode.times[0] >= DATES else ""
+        yield Played(f"episode {number}{began}", episode, "Failure (by the log)" * episode.failed)
+
+
+def _of_cars(
+    episodes: Iterable[Chunk], collisions: Mapping[str, Sequence[float]]
+) -> Iterator[Played]:
+    for number, whole in enumerate(episodes, 1):
+        name = "".join(whole.names) or f"episode {number}"
+        for rows, fails in _stretches(whole, collisions.get(name, ())):
+            began = f", from {rows.times[0]:.1f} s" if whole.names else ""
+            yield Played(name + began, rows, fails)
+
+
+def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Chunk, str]]:
+    """Those of an episode that are long enough, and how each failed."""
+    crashes = np.zeros(len(episode.times), np.bool_)
+    for time in collisions:  # who collides may be taken off the road before it is written down
+        row = int(np.searchsorted(episode.times, time + _TICK)) - 1
+        crashes[row] |= row >= 0 and time - episode.times[row] < LONGEST_STEP * episode.dt
+    contacts = crashes | (episode.observations[:, 0] <= 0.0)
+    begins = np.flatnonzero(~contacts & np.append(True, contacts[:-1]))
+    for first in begins.tolist():
+        ends = np.flatnonzero(contacts[first:])
+        last = first + int(ends[0]) if len(ends) else len(contacts) - 1
+        if last + 1 - first < _SHOWS:
+            continue
+        fails = "Failure (by the log)" * bool(episode.fails[last])
+        if contacts[last]:
+            fails = "Collision (by SUMO)" if episode.observations[last, 0] > 0.0 else "Collision"
+        rows = episode.rows(first, last + 1)
+        failures = np.array([last - first] if fails else [], np.int64)
+        yield rows._replace(starts=np.zeros(1, np.int64), failures=failures), fails
 
 
 # -- A run ----------------------------------------------------------------------------------------
+
+System = OnRoads | Simulated
 
 
 class Session(AbstractContextManager["Session"]):
@@ -499,8 +592,7 @@ class Session(AbstractContextManager["Session"]):
         self.case = case
         system.begin(case)
         self._guard.begin()
-        calm = min(CALM, _CALM * system.interval)
-        self._chronicle = Chronicle(self._tolerance, system.alone, calm)
+        self._story = Story(alone=system.alone)
         self._number = 0
         self.start = self._begun()
         return self.start
@@ -518,7 +610,9 @@ class Session(AbstractContextManager["Session"]):
         )
         frame = self._end(frame) if self.system.over else self._decide(frame)
         self._number += 1
-        return frame._replace(story=self._chronicle.tell(frame))
+        calm = min(CALM, _CALM * self.system.interval)
+        self._story = go_on(self._story, frame, self._tolerance, calm)
+        return frame._replace(story=self._story)
 
     def graph(self) -> Graph:
         """The states found so far."""

@@ -112,7 +112,7 @@ class Cars(NamedTuple):
     gap: float  #: bumper to bumper, as it truly is [m]
     v_follower: float  #: [m/s]
     v_leader: float  #: [m/s]
-    a_follower: float  #: what the body did until now [m/s²]; NaN at first
+    a_follower: float  #: since the time before, on average [m/s²]; NaN at first
     a_leader: float  #: [m/s²]; NaN at first
     x_follower: float  #: front bumper, from where it started [m]
     time_to_collision: float  #: [s]; infinite where the gap does not close
@@ -283,42 +283,27 @@ def _plane(learnt: State, fails: Any) -> tuple[int, int]:
 # -- The story ------------------------------------------------------------------------------------
 
 
-class Chronicle:
-    """Writes the story of a run, frame by frame: when danger began, and what was done about it.
-
-    ``alone`` is when the controller fails if left to itself; danger is over once wishes were
-    tolerable for a ``calm`` [s].
-    """
-
-    def __init__(self, tolerance: float, alone: float = math.nan, calm: float = CALM) -> None:
-        self.tolerance, self.calm = tolerance, calm
-        self.story = Story(alone=alone)
-
-    def tell(self, frame: Frame) -> Story:
-        """The story with one more frame."""
-        story = self.story if frame.cars is None else _on_the_road(self.story, frame, frame.cars)
-        self.story = story = story._replace(
-            judged=story.judged or not math.isnan(frame.proposed_risk.risk),
-            revised=story.revised + frame.revised,
-            advised=story.advised + frame.advises,
-            failure=frame.time if frame.failed else math.nan,
-        )
-        if not frame.over:
-            self.story = self._danger(frame, story)
-        return self.story
-
-    def _danger(self, frame: Frame, story: Story) -> Story:
-        is_tolerable = not frame.proposed_risk.risk > self.tolerance
-        danger = story.danger if story.in_danger else None
-        if danger is None:
-            if is_tolerable:
-                return story
-            danger = Danger(frame, frame.time)
-            first = frame.time if math.isnan(story.first) else story.first
-            story = story._replace(in_danger=True, first=first)
-        elif is_tolerable and frame.time - danger.last >= self.calm:
-            return story._replace(in_danger=False)
-        return story._replace(danger=_went_on(danger, frame, is_tolerable))
+def go_on(story: Story, frame: Frame, tolerance: float, calm: float) -> Story:
+    """The story with one more frame; danger ends once wishes were tolerable for a ``calm`` [s]."""
+    if frame.cars is not None:
+        story = _on_the_road(story, frame, frame.cars)
+    story = story._replace(
+        judged=story.judged or not math.isnan(frame.proposed_risk.risk),
+        revised=story.revised + frame.revised,
+        advised=story.advised + frame.advises,
+        failure=frame.time if frame.failed else math.nan,
+    )
+    is_tolerable = not frame.proposed_risk.risk > tolerance
+    danger = story.danger if story.in_danger else None
+    if frame.over or (danger is None and is_tolerable):
+        return story
+    if danger is None:
+        danger = Danger(frame, frame.time)
+        first = frame.time if math.isnan(story.first) else story.first
+        story = story._replace(in_danger=True, first=first)
+    elif is_tolerable and frame.time - danger.last >= calm:
+        return story._replace(in_danger=False)
+    return story._replace(danger=_went_on(danger, frame, is_tolerable))
 
 
 def _on_the_road(story: Story, frame: Frame, cars: Cars) -> Story:
