@@ -40,8 +40,7 @@ def test_a_given_model_knows_of_brakes_that_were_never_tried():
     without, told = (
         sum(drive(guard, 100 + k) for k in range(8)) for guard in (taught(), taught(model=move))
     )
-    assert without >= 6
-    assert told <= 2  # it is fitted, not copied
+    assert told <= 2 < 5 <= without  # it is fitted, not copied
 
 
 def test_what_is_wrong_with_a_given_function_is_said_and_nothing_is_learnt():

@@ -268,10 +268,10 @@ def look_ahead(
 ) -> State:
     """Look as far ahead as it takes to fail where nothing helps, and half as far again.
 
-    Farther after an episode that failed although it was certified not to; less far after one that
-    went on for the whole horizon from where nothing seemed to help, but not as far as was too short
-    lately. What the model says of failure farther away than that is believed again little by
-    little.
+    Farther after an episode that failed as late after its last certificate as where nothing helps:
+    what fails sooner was not foreseen for another reason. Less far after one that went on for the
+    whole horizon from where nothing seemed to help, but not as far as was too short lately. What
+    the model says of failure farther away than that is believed again little by little.
     """
     H, s, most = state.horizon, settings, farthest(known, settings)
     ends = value_of(known, state.situations, state.policies[: s.n_asked], rest)
@@ -285,13 +285,19 @@ def look_ahead(
     else:
         trust = min(trust / s.latest, float(s.horizon_max))
         longest = max(s.latest * T, min(episode.fails_after, trust))
-        if episode.failed and episode.certified.any():  # it did not look far enough
+        if late(episode) > T:  # it did not look far enough
             too_short = max(too_short, min(s.ahead * T, s.horizon_max / s.ahead))
             longest = min(s.ahead * longest, s.horizon_max / s.ahead)
             trust = max(trust, longest)
         T = max(min(after, trust), longest)
     horizon = int(max(min(s.ahead * T, most), s.horizon_min))
     return state._replace(time_to_failure=T, believed=trust, horizon=horizon, too_short=too_short)
+
+
+def late(episode: Episode) -> int:
+    """How many steps after the last certificate it failed; 0 where it did not, or without any."""
+    steps = np.flatnonzero(episode.certified)
+    return len(episode.actions) - int(steps[-1]) if episode.failed and len(steps) else 0
 
 
 def farthest(known: Model, settings: LearntSettings) -> float:
@@ -302,9 +308,7 @@ def farthest(known: Model, settings: LearntSettings) -> float:
 
 def is_too_short(state: State, known: Model, episode: Episode, settings: LearntSettings) -> bool:
     """Whether a certified episode failed later than it looks ahead, as far as that may be."""
-    steps = np.flatnonzero(episode.certified)
-    is_late = len(steps) > 0 and len(episode.actions) - steps[-1] > state.horizon
-    return bool(episode.failed and is_late and state.horizon + 1 > farthest(known, settings))
+    return late(episode) > state.horizon >= int(farthest(known, settings))
 
 
 def coarser(state: State, settings: LearntSettings) -> State:
