@@ -126,7 +126,7 @@ def guard():
     told = {"names": system.variables, "units": ["m", "m", "m/s", "m/s"]}
     judge = LearntRisk(system.interval, **system.actions.settings, **told)
     guard = Guard(**system.actions.settings, interval=system.interval, judge=judge)
-    for episode in range(10):
+    for episode in range(16):
         run(system, guard, Start.training(0, 0, episode))
     return guard
 
