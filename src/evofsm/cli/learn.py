@@ -353,12 +353,12 @@ def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     text = text if n_beyond else f"{text}; none was beyond"
     numbers = sorted(read.levels) if len(read.levels) <= MOST_LEVELS else []
     places = [actions.encode(number) for number in numbers]
-    if len(numbers) > 1:
-        text += "; " + ", ".join(
-            f"{n:g} is a({k + 1})" for n, k in zip(numbers, places, strict=True)
-        )
+    meanings = [f"{n:g} is a({k + 1})" for n, k in zip(numbers, places, strict=True)]
+    text += f"; {', '.join(meanings)}" * (len(numbers) > 1)
     if len({*places}) < len(places):
-        text += f": several are one action (--action-range {range_of(numbers)} tells them apart)"
+        apart = range_of(numbers)
+        text += ": several are one action"
+        text += f" (--action-range {apart} tells them apart)" * bool(apart)
     yield "actions", text if action else "none: nobody acts (--action '')"
     settings = describe_rule(learning.machine.rule)
     for name in ("radius", "spread"):  # which the rule may have itself
