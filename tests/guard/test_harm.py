@@ -198,10 +198,11 @@ def test_frozen_it_does_not_forget_why_it_was_there():
     """While it learned a careless controller had luck of late: it may have been another one."""
     luck = [(45, "e", None)] * 3
     harm = arms([(60, "e", None)] * 19 + [(28, "f", None)], luck)
-    first = [Outcome(-k, 20, failed=True, guarded=False) for k in (1, 2)]
+    first = [Outcome(1, 20, failed=True, guarded=False)] * 2
     harm = harm._replace(outcomes=(*first, *harm.outcomes), kept=400.0)
     assert not harm.helps(learning=True)
     assert harm.helps(learning=False)
+    assert not harm._replace(moved=2).helps(learning=False)  # nor of a system that moves otherwise
 
 
 def test_a_controller_that_became_good_drives_on_alone_under_a_guard_that_always_fails():

@@ -76,7 +76,7 @@ class Outcome(NamedTuple):
 #: told; and numbers.
 OUTCOMES = Numbers().of("h", 7)
 SETTINGS = {
-    **dict.fromkeys(("n_episodes", "changed"), COUNT),
+    **dict.fromkeys(("n_episodes", "changed", "moved"), COUNT),
     "refuses": bool,
     "ends": bool,
     **dict.fromkeys(("decided", "kept"), Numbers(least=0.0, most=COUNT.most)),
@@ -93,11 +93,7 @@ class Harm(NamedTuple):
     decided: float = 0.0  #: decisions of late in which it could refuse
     kept: float = 0.0  #: and of these proposals that were kept
     changed: int = 0  #: the latest episode in which another controller seems to have come, or 0
-
-    @property
-    def alone(self) -> list[Outcome]:
-        """Of the controller alone."""
-        return [outcome for outcome in self.outcomes if not outcome.guarded]
+    moved: int = 0  #: and after which the system moves otherwise
 
     @property
     def is_on_trial(self) -> bool:
@@ -107,7 +103,12 @@ class Harm(NamedTuple):
     @property
     def lately(self) -> list[Outcome]:
         """Of the controller alone, as far as it seems to be this one."""
-        return [outcome for outcome in self.alone if outcome.episode > self.changed]
+        return self._alone(learning=True)
+
+    def _alone(self, *, learning: bool) -> list[Outcome]:
+        """Of the controller alone: of this one; frozen, in the system as it moves now."""
+        since = self.changed if learning else self.moved
+        return [o for o in self.outcomes if o.episode > since and not o.guarded]
 
     @property
     def guarded(self) -> list[Outcome]:
@@ -129,7 +130,7 @@ class Harm(NamedTuple):
         does one that fails more than half as often per step as the controller alone; more than a
         tenth, if it replaces nearly every proposal: then it would fly any controller's craft so.
         """
-        guarded, alone = self.guarded, self.lately if learning else self.alone
+        guarded, alone = self.guarded, self._alone(learning=learning)
         if _all_failed(guarded, max(_CAREFUL, len(guarded))):
             return False
         if not guarded or not alone:
@@ -200,7 +201,7 @@ class Harm(NamedTuple):
 
     def told(self, *, learning: bool) -> str:
         """How both arms ended, where it is not beyond doubt that the guard helps; else nothing."""
-        guarded, alone = self.guarded, self.alone
+        guarded, alone = self.guarded, self._alone(learning=learning)
         if not guarded or not alone:
             return ""
         in_doubt = learning and (1.0 - self.drives(_DRAWS)) ** self._draws > 1.0 - _SAID

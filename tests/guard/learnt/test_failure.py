@@ -96,6 +96,7 @@ def sides(failures, rows, unit, blur):
         ([[9.4, 5.0]], EXACT + 0.2, {(0, 1.0, 9.4)}),
         ([[9.4, 5.0], [9.8, 4.0]], EXACT + 0.2, {(0, 1.0, 9.4)}),
         ([[2.0, 5.0]], EXACT + 0.2, set()),  # farther in than any noise
+        ([[5.0, 5.0]], EXACT + 3.0, set()),  # nothing but noise
         ([[0.0, 5.0]], ABOVE_ALONE, set()),  # where a variable saturates nothing is blurred
         (AMID, EXACT + 0.2, {(0, -1.0, 0.3)}),  # the one that may explain most
     ],

@@ -33,8 +33,9 @@ _MAX_FORMS, BLUR = 8, 0.5
 _FEW_FAILURES, _SHARE, _FEW_SIDES = 3, 0.25, 4
 # So many failures may leave two sides undecided.
 _MOST_UNDECIDED = 2
-# Beyond an end is what is so many typical steps beyond; blurred ends are so wide [scales].
-_BEYOND, _BLURRED = 1e-12, 5.0
+# Beyond an end is what is so many typical steps beyond; blurred ends are so wide [scales], unless
+# a scale is a larger share of the spread: a variable that is noise alone explains no failure.
+_BEYOND, _BLURRED, _NOISY = 1e-12, 5.0, 0.5
 # Survived observations of a fit; steps of Newton, and the ridge for each of them.
 _FIT_ROWS, _NEWTON, _RIDGE = 400, 40, 1e-9
 # Fits of what explains failures with more likelihood than this each; how many survived ones that
@@ -296,7 +297,8 @@ def _sides(says: int, failures: Floats, survived: Survived, blur: Floats, least:
     )
     with np.errstate(over="ignore"):  # of a variable that never changed it is far enough
         beyond = far / np.tile(unit, 2)
-    perhaps = (far > -_BLURRED * blur.T.ravel()) | ((again > 0.0) & np.isfinite(again))
+    wide = _BLURRED * np.where(blur < _NOISY * survived.spread[:, None], blur, 0.0)
+    perhaps = (far > -wide.T.ravel()) | ((again > 0.0) & np.isfinite(again))
     is_open = np.ones(len(failures), bool)
     thresholds: dict[int, float] = {}
     for clear in (max(least, _BEYOND), _BEYOND):

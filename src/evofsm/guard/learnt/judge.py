@@ -616,7 +616,10 @@ class LearntRisk(LearningJudge, SearchingJudge):
             blank = State.none(z.shape[1], self.size, self.choices, self.settings, None)
             kept_names = ("horizon", "stride", "margin", "n_failed")
             self.state = blank._replace(**{name: getattr(now, name) for name in kept_names})
+        n_drifts = len(self.state.drifts)
         self.state = learn(self.state, episode, self._given)
+        if len(self.state.drifts) > n_drifts:  # another system: how one fares alone is not known
+            self.harm = self.harm._replace(moved=self.harm.n_episodes)
         self.parts = Parts.of(self.state, self.settings, self.dt)
         self._used, self._ranks = np.zeros((self.size, 2)), np.arange(len(self.state.policies))
 
