@@ -138,35 +138,35 @@ class Seeing:
 
     def body(self, car: str) -> _Facts:
         """Of a car; that its type changes is not noticed."""
-        body = self._bodies.get(car)
-        if body is None:
+        if car not in self._bodies:
             vehicle = self._vehicle
             late = vehicle.getActionStepLength(car) > self.dt + _TICK
             facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car), late
-            body = self._bodies[car] = _Facts(*facts)
-        return body
+            self._bodies[car] = _Facts(*facts)
+        return self._bodies[car]
 
     def pair(self, car: str) -> tuple[float, float, float] | None:
         """Gap from bumper to bumper [m], its speed and that of whoever is ahead [m/s]."""
         speed = self._vehicle.getSpeed(car)
-        leader = self.ahead(car, speed)
+        leader = self.neighbour(car, speed)
         return None if leader is None else (leader.gap, speed, leader.speed)
 
-    def ahead(self, car: str, speed: float) -> Neighbour | None:
-        """Whoever is ahead on its route, if near enough to matter."""
-        leader, gap = self._vehicle.getLeader(car, _far(speed)) or ("", 0.0)
-        if not leader:
+    def neighbour(self, car: str, speed: float, *, is_ahead: bool = True) -> Neighbour | None:
+        """Whoever is ahead on its route, or behind, if near enough to matter."""
+        find = self._vehicle.getLeader if is_ahead else self._vehicle.getFollower
+        reach = _LOOKS_AHEAD + speed + 0.5 * speed * speed / _GENTLE
+        other, gap = find(car, reach) or ("", 0.0)
+        if not other:
             return None
-        v, body = self._vehicle.getSpeed(leader), self.body(car)
-        return Neighbour(leader, gap + body.min_gap, self._room(gap, body, speed - v), v)
-
-    def behind(self, car: str, speed: float) -> Neighbour | None:
-        """Whoever is behind."""
-        follower, gap = self._vehicle.getFollower(car, _far(speed))
-        if not follower:
-            return None
-        v, body = self._vehicle.getSpeed(follower), self.body(follower)
-        return Neighbour(follower, gap + body.min_gap, self._room(gap, body, v - speed), v)
+        v, follower = self._vehicle.getSpeed(other), self.body(car if is_ahead else other)
+        closing_speed = speed - v if is_ahead else v - speed
+        euler = self._euler
+        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * closing_speed
+        # Who is nearer than SUMO lets anybody be stands in a queue, or beside, where lanes merge.
+        # Across a junction SUMO says 0 of all that is nearer than minGap.
+        spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
+        room = max(gap + spare_gap - late, _NEAREST)
+        return Neighbour(other, gap + follower.min_gap, room, v)
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
         """The speed that a car's own model wants after the next step [m/s], but for red lights."""
@@ -179,14 +179,6 @@ class Seeing:
         follow_speed = vehicle.getFollowSpeed(car, speed, gap, ahead.speed, decel, ahead.id)
         slowest = speed - vehicle.getEmergencyDecel(car) * self.dt
         return float(max(min(follow_speed, fastest), slowest, 0.0))
-
-    def _room(self, gap: float, follower: _Facts, closing: float) -> float:
-        euler = self._euler
-        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * closing
-        # Who is nearer than SUMO lets anybody be stands in a queue, or beside, where lanes merge.
-        # Across a junction SUMO says 0 of all that is nearer than minGap.
-        spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
-        return max(gap + spare_gap - late, _NEAREST)
 
     def rows(
         self, car: str, speed: float, ahead: Neighbour | None, behind: Neighbour | None
@@ -201,10 +193,6 @@ class Seeing:
                 x = from_ + way * (near.room + 0.5 * long)
                 row[:] = 1.0, x, 0.0, near.speed, 0.0, long, _CAR_WIDTH, ax
         return rows.ravel()
-
-
-def _far(speed: float) -> float:
-    return _LOOKS_AHEAD + speed + 0.5 * speed * speed / _GENTLE
 
 
 # -- Guarding ---------------------------------------------------------------------------------
@@ -247,16 +235,21 @@ class Guarding:
         seeing: Seeing,
         guard: Guard | None,
         acts: bool,
-        settings: Mapping[str, float],
+        tolerance: float,
+        regain: float,
         report: Callable[[GuardedStep], None] | None,
     ) -> None:
         self._sumo, self._vehicle, self._seeing = sumo, sumo.vehicle, seeing
         self._acts, self._report = acts, report
-        self._template, self._settings = guard, settings
+        self._template, self._tolerance, self._regain = guard, tolerance, regain
         self.cars: dict[str, _Car] = {}  #: by id
         self._watches: dict[str, BrakeWatch] = {}
-        if guard is not None:
-            _refuse_what_sees_something_else(guard)
+        judge = None if guard is None else _judge(guard)
+        if not (judge is None or isinstance(judge, TrafficRisk) or judge.labels.names == VARIABLES):
+            raise ValueError(
+                f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must "
+                f"be a TrafficRisk, or observe {', '.join(VARIABLES)}"
+            )
         # How hard SUMO's cars brake is exactly known, and has an end.
         #: How hard they were seen to brake.
         self.leaders = Manoeuvres(_LEADER_DECEL, width=_SEEN_TO)
@@ -312,11 +305,13 @@ class Guarding:
 
     def _look(self, car: _Car, speed: float, time: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
-        ahead, before = self._seeing.ahead(car.id, speed), car.around[0]
+        ahead, before = self._seeing.neighbour(car.id, speed), car.around[0]
         scene = isinstance(_judge(car.guard), TrafficRisk)
         # Who is behind matters only where one brakes: if acting, because somebody is ahead.
         alone = ahead is None and self._acts
-        behind = self._seeing.behind(car.id, speed) if scene and not alone else None
+        behind = None
+        if scene and not alone:
+            behind = self._seeing.neighbour(car.id, speed, is_ahead=False)
         car.around = ahead, behind
         if (ahead and ahead.id) != (before and before.id):
             car.guard.begin()  # what is known of the one before does not hold of this one
@@ -410,13 +405,13 @@ class Guarding:
     def _guard_for(self, car: str, high: float) -> Guard:
         mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
-            decel, settings, dt = self._vehicle.getDecel(car), self._settings, self.interval
-            how = {"margin": _MARGIN, "regain": settings["regain"]}
+            decel, dt = self._vehicle.getDecel(car), self.interval
+            how = {"margin": _MARGIN, "regain": self._regain}
             risk = LatentRisk.given(-decel, decel, _LEADER_DECEL, dt, **how)
             risk.manoeuvres = self.leaders
             low, judge = -max(self._vehicle.getEmergencyDecel(car), decel), TrafficRisk(risk)
-            limits, tolerance = (low, high, decel, dt), settings["tolerance"]
-            return guard_for_traffic(*limits, judge=judge, tolerance=tolerance, mode=mode)
+            limits = low, high, decel, dt
+            return guard_for_traffic(*limits, judge=judge, tolerance=self._tolerance, mode=mode)
         guard = self._template.copy()
         guard.freeze()
         if isinstance(guard.reviser, ActionReviser):
@@ -427,16 +422,6 @@ class Guarding:
 def _judge(guard: Guard) -> ActionJudge | None:
     """Who judges actions; None where a formula alone decides, as in an `EnvelopeReviser`."""
     return getattr(guard.reviser, "risk", None)
-
-
-def _refuse_what_sees_something_else(guard: Guard) -> None:
-    judge = _judge(guard)
-    if judge is None or isinstance(judge, TrafficRisk) or judge.labels.names == VARIABLES:
-        return
-    raise ValueError(
-        f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must be a "
-        f"TrafficRisk, or observe {', '.join(VARIABLES)}"
-    )
 
 
 # -- Which cars, and what came of them ------------------------------------------------------------
@@ -750,8 +735,7 @@ def attach(
     is_chosen, sight = choose(vehicles), Seeing(sumo)
     cars: Guarding | Watching = Watching(sight)
     if mode != "watch":
-        settings = {"tolerance": tolerance, "regain": regain}
-        cars = Guarding(sumo, sight, guard, mode == "act", settings, report)
+        cars = Guarding(sumo, sight, guard, mode == "act", tolerance, regain, report)
     attachment = Attachment(sumo, is_chosen, sight, cars)
     attachment.listen()
     return attachment

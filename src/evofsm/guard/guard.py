@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from io import BytesIO
-from operator import attrgetter
 from typing import Any, NamedTuple, Protocol, Self, SupportsFloat
 
 import numpy as np
@@ -85,7 +84,7 @@ class InputMonitor(NamedTuple):
         if time <= self.time:
             return Intake.REPEATED if time == self.time else Intake.LATE, self
         intake, latest_row = Intake.WHOLE, observation
-        if math.isnan(observation.dot(observation)):  # the quickest way to ask for NaN
+        if _is_missing(observation):
             intake = Intake.PARTIAL
             if len(self.held) == len(observation):  # what was seen of them before is still held
                 latest_row = np.where(np.isnan(observation), self.held, observation)
@@ -104,12 +103,12 @@ class DecisionLogger(Protocol):
         """An observation came in, at ``time`` [s]."""
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
-        """A decision was made.
+        """A decision was made: where the system was, what was proposed, and what came of that.
 
         Parameters
         ----------
         situation, proposal, revision
-            Where the system was, what was proposed there, and what was made of it.
+            As `Guard.revise` takes and returns them.
         """
 
     def ended(
@@ -128,12 +127,6 @@ class DecisionLogger(Protocol):
 
 # Settings that stand in a file as they are.
 _PLAIN_SETTINGS = ("explaining", "interval", "learn", "n_episodes", "n_failed", "shadow")
-# What of a guard changes in an episode.
-_CHANGING = (
-    *("_monitor", "_latest", "_under_way", "_passing", "_decisions", "_acted", "_watched", "_kept"),
-    *("_begun", "_learn", "_frozen", "n_episodes", "n_failed"),
-)
-_CHANGES = attrgetter(*_CHANGING)
 # What a judge has that learns.
 _LEARNS = ("dt", "learn", "watch", "follow", "start_episode", "end", "sums", "save", "load")
 # The files of the machine and of the judge, as bytes.
@@ -349,10 +342,8 @@ class Guard:
             text = f"the judge was made for decisions every {judge.dt} s"
             raise ValueError(f"interval is {interval} s, but {text}")
         if machine is not None and machine.n_actions != self.actions.n_actions:
-            raise ValueError(
-                f"the machine has {machine.n_actions} actions, but the set has "
-                f"{self.actions.n_actions}"
-            )
+            counts = f"{machine.n_actions} actions, but the set has {self.actions.n_actions}"
+            raise ValueError(f"the machine has {counts}")
         if isinstance(action_judge, LearntRisk):
             if bool(action_judge.choices) != isinstance(self.actions, Choices):
                 raise ValueError(
@@ -371,13 +362,13 @@ class Guard:
         self.failed = failed
         self.audit: DecisionLogger | None = audit
         self.explaining = explaining
+        labels = Labels() if action_judge is None else action_judge.labels
         #: What the judge calls the variables of an observation; empty where it does not say.
-        self.variables: tuple[str, ...] = () if action_judge is None else action_judge.labels.names
+        self.variables: tuple[str, ...] = labels.names
         #: What is done without a usable proposal where nothing is judged.
         self.fallback: Fallback = getattr(reviser, "fallback", NOTHING)
-        self._labels = (Labels() if action_judge is None else action_judge.labels)._replace(
-            actions=self.actions if isinstance(self.actions, IntervalActions) else None, dt=interval
-        )
+        intervals = self.actions if isinstance(self.actions, IntervalActions) else None
+        self._labels = labels._replace(actions=intervals, dt=interval)
         #: Episodes that it learnt from, and those of them that failed.
         self.n_episodes, self.n_failed = n_episodes, n_failed
         self._frozen: FSMModel | None = None
@@ -438,13 +429,12 @@ class Guard:
 
     def _savepoint(self) -> Rollback:
         """What takes back all that is done from now on."""
-        attributes = _CHANGES(self)
+        attributes = {**vars(self)}
         parts: Any = self.machine, self.judge, self.reviser, self.audit
         rollbacks = [part.savepoint() for part in parts if hasattr(part, "savepoint")]
 
         def rollback() -> None:
-            for name, value in zip(_CHANGING, attributes, strict=True):
-                setattr(self, name, value)
+            vars(self).update(attributes)
             for take_back in rollbacks:
                 take_back()
 
@@ -611,7 +601,7 @@ class Guard:
 
     def _count_missing(self, z: NDArray[np.float64]) -> None:
         """Warn where no observation is whole for long: nothing is learnt from such."""
-        self._lacking = self._lacking + 1 if math.isnan(z.dot(z)) else 0
+        self._lacking = self._lacking + 1 if _is_missing(z) else 0
         if self._lacking == _MANY:
             names = ", ".join(map(self._labels.variable, np.flatnonzero(np.isnan(z)).tolist()))
             warnings.warn(
@@ -627,7 +617,7 @@ class Guard:
         state: int | None = None
         is_incomplete = bool(intake) and bool(intake & Intake.PARTIAL)
         if model is not None:
-            if model.n_states and not math.isnan(latest_row.dot(latest_row)):
+            if model.n_states and not _is_missing(latest_row):
                 belief = model.recognise(latest_row)
                 state = int(belief.argmax())
         elif machine is not None and not (is_incomplete and machine.n_states == 0):
@@ -762,7 +752,7 @@ class Guard:
         terminated = terminated and not failed
         machine = self.machine if self._learn else None
         if machine is not None:
-            has_gaps = z is not None and math.isnan(z.dot(z))
+            has_gaps = z is not None and _is_missing(z)
             if z is not None and (machine.n_states or not has_gaps):
                 machine.observe(z, failed=failed, partial=has_gaps)
             elif failed and machine.state is not None:
@@ -836,12 +826,9 @@ class Guard:
             Whether it has the machine too. Without it the same is decided, unless the judge asks
             the states, and nothing is recognised.
         """
-        machine = None if self.machine is None else self.machine.copy()
-        reviser, judge = copy.deepcopy(
-            (self.reviser, self.judge), {} if self.machine is None else {id(self.machine): machine}
-        )
-        names = (*_PLAIN_SETTINGS, "failed")
-        settings = {name: getattr(self, name) for name in names}
+        parts = self.reviser, self.judge, self.machine
+        reviser, judge, machine = copy.deepcopy(parts)
+        settings = {name: getattr(self, name) for name in (*_PLAIN_SETTINGS, "failed")}
         return type(self).of(reviser, judge=judge, machine=machine if states else None, **settings)
 
     @alone
@@ -920,6 +907,11 @@ class Guard:
                 failed=failed,
                 **{name: settings[name] for name in _PLAIN_SETTINGS},
             )
+
+
+def _is_missing(z: NDArray[np.float64]) -> bool:
+    """Whether a variable is NaN; the quickest way to ask for it."""
+    return math.isnan(z.dot(z))
 
 
 def ends_of(judge: ActionJudge | None, m: int) -> NDArray[np.float64]:
