@@ -16,7 +16,7 @@ import time as clock
 import warnings
 import weakref
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from importlib import import_module
 from itertools import chain, count
@@ -75,9 +75,6 @@ _STANDS, _SAME_SPEED = 0.1, 1e-6
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
 # and 1), but braking as hard as it has to (bit 2). Red lights and right of way stay as they were.
 _ON, _OFF = 0b011, 0b100
-
-
-# -- What SUMO says of the cars around one --------------------------------------------------------
 
 
 class Neighbour(NamedTuple):
@@ -193,9 +190,6 @@ class Seeing:
                 x = from_ + way * (near.room + 0.5 * long)
                 row[:] = 1.0, x, 0.0, near.speed, 0.0, long, _CAR_WIDTH, ax
         return rows.ravel()
-
-
-# -- Guarding ---------------------------------------------------------------------------------
 
 
 class GuardedStep(NamedTuple):
@@ -399,8 +393,6 @@ class Guarding:
         for leader in sorted(self._watches.keys() - speeds.keys()):
             decels.append(self._watches.pop(leader).end())
         self.leaders.remember(*decels)
-
-    # -- Guards ---------------------------------------------------------------------------------
 
     def _guard_for(self, car: str, high: float) -> Guard:
         mode = Mode.ACT if self._acts else Mode.SHADOW

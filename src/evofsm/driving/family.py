@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import operator
 import runpy
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from itertools import count
@@ -36,9 +36,6 @@ SPLITS = ("train", "test")
 
 # Numbers that are equal but for rounding.
 _ROUNDING = 1e-9
-
-
-# -- A draw ---------------------------------------------------------------------------------------
 
 
 class Draw(NamedTuple):
@@ -98,9 +95,6 @@ class Numbers:
 
 #: What makes a draw: a scenario and who drives the follower.
 Make = Callable[[Numbers], tuple[Scenario, IDM | ChangingIDM]]
-
-
-# -- A family -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,10 +186,12 @@ class Family:
         for name in self.switches:
             part, values, ranges = SWITCHES[name]
             drawn = {of: numbers.between(f"{part}.{of}", *ends) for of, ends in ranges.items()}
-            before = getattr(scenario, part) or _THIRD_CAR
-            scenario = replace(scenario, **{part: replace(before, **values, **drawn)})
+            whole: Any = getattr(scenario, part) or _THIRD_CAR
+            scenario = replace(scenario, **{part: replace(whole, **values, **drawn)})
         self._check_limits(scenario, driver)
-        return Draw(scenario, driver, self.variants[numbers.variant] if self.variants else self.name)
+        return Draw(
+            scenario, driver, self.variants[numbers.variant] if self.variants else self.name
+        )
 
     def _check_limits(self, scenario: Scenario, driver: IDM | ChangingIDM) -> None:
         """Who is given the limits must be able to rely on them."""
@@ -250,7 +246,6 @@ def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
     return [family.draw(seed, index, split="test") for index in range(episodes)]
 
 
-# -- Switches -------------------------------------------------------------------------------------
 # The sizes are our own: what a production radar and brake system roughly show.
 
 

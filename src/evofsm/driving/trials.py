@@ -74,9 +74,6 @@ def teach(guard: Guard, draws: Iterable[Draw]) -> list[Episode]:
     return [drive(guard, draw) for draw in draws]
 
 
-# -- What came of an episode ----------------------------------------------------------------------
-
-
 class Reference(NamedTuple):
     """How far the unrevised controller came in a draw, and until when that counts."""
 
@@ -168,9 +165,6 @@ def try_out(
     frozen.freeze()
     alone = alone or [reference_of(family, draw) for draw in draws]
     return [outcome_of(*pair) for pair in zip(teach(frozen, draws), alone, strict=True)]
-
-
-# -- What came of many ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -64,9 +64,6 @@ FIELDS: Mapping[str, set[str]] = {
 }
 
 
-# -- Records --------------------------------------------------------------------------------------
-
-
 def canonical(content: Any) -> str:
     """JSON that is the same for equal content, with words for numbers that are not finite."""
     try:
@@ -147,9 +144,6 @@ def unseal(line: bytes) -> Record | None:
         return None
     whole = type(number) is int and isinstance(previous, str)
     return Record(number, previous, digest, content) if whole else None
-
-
-# -- The chain ------------------------------------------------------------------------------------
 
 
 class Field(NamedTuple):
@@ -245,9 +239,6 @@ def _against(kept: Head, head: Head) -> Finding:
         return Finding(last + 1, why)
     why = f"record {number} is not the one that the head is of: records up to it were written anew"
     return Finding(number, why)
-
-
-# -- Logging --------------------------------------------------------------------------------------
 
 
 class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):

@@ -694,9 +694,6 @@ def span(seconds: float) -> str:
     return f"{seconds / 3600.0:.3g} h"
 
 
-# -- Kernels --------------------------------------------------------------------------------------
-
-
 @kernel
 def _look_ahead(
     x: Floats, starts: Ints, keeps: float, ahead: Floats, memory: Floats, found: NDArray[Any]

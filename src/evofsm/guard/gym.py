@@ -303,9 +303,6 @@ def _of_one(infos: Mapping[str, Any], k: int, count: int) -> dict[str, Any]:
     return info
 
 
-# -- One environment's episodes under a guard ---------------------------------------------------
-
-
 class Decided(NamedTuple):
     """What is executed for a proposed action, and what is said about it."""
 

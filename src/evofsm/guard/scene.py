@@ -302,8 +302,6 @@ class SceneRisk(LearningJudge, SearchingJudge):
             "places": float(history.away.sum()),
         }
 
-    # -- Files ----------------------------------------------------------------------------------
-
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what is remembered to a file; all else follows from it."""
         settings = {name: getattr(self, name) for name in ("dt", "columns", "relative")}
@@ -326,9 +324,6 @@ class SceneRisk(LearningJudge, SearchingJudge):
             history.refuse_damaged(judge.memory.past, judge.memory.n_actions)
             judge.memory.restore(history, **counts)
         return judge
-
-
-# -- What is remembered -------------------------------------------------------------------------
 
 
 class Seen(NamedTuple):
@@ -415,9 +410,6 @@ class Past(NamedTuple):
             raise ValueError("a failure is not at the end of an episode")
 
 
-# -- How close is too close ---------------------------------------------------------------------
-
-
 class Contact(NamedTuple):
     """The probability of failure in a step, by how close an object comes in it.
 
@@ -478,9 +470,6 @@ def _closest_on_lines(start: _Floats, end: _Floats, sides: _Floats, least: _Floa
                 at = start[k, i] + share * (end[k, i] - start[k, i])
                 far = max(far, abs(at) / sides[i])
             least[k] = min(least[k], far)
-
-
-# -- What is remembered, and forecast from it ---------------------------------------------------
 
 
 class Foreseen(NamedTuple):
