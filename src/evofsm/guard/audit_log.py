@@ -50,7 +50,7 @@ _STATES, _MOST_QUIET, _LONGEST_LINE = 3, 240, 1 << 26
 _SEAL, _LINE_END = b',"hash":"', b'"}\n'
 # How a log begins: so a half-written one is told from other people's files.
 _ABOUT = "evofsm audit log"
-_OPENING = b'{"about":"evofsm audit log",'
+_OPENING = f'{{"about":"{_ABOUT}",'.encode()
 # What a decision tells as it is recorded elsewhere, too.
 _TOLD = tuple(name for name in RECORD if name not in ("time", "n_states", "risk_low", "risk_high"))
 #: The names in a record of each kind, beside ``kind`` and ``clock``.
@@ -250,8 +250,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
     Parameters
     ----------
     path : Path
-        A file that is there is gone on with; a half-written end, as of a process that was killed,
-        is cut off.
+        A file that is there is gone on with; a half-written end is cut off.
     sync : {"record", "episode"}
         When records are forced onto the disk: each, before its action is executed, or those of an
         episode at its end, which takes no time while driving.
@@ -267,8 +266,8 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
     Notes
     -----
     Between the episodes of a log anything may teach machine or judge, during one nothing else may.
-    What a guard takes back, as after an interrupt (Ctrl-C), is taken back here, too. Where a
-    process forks, the log stays with the parent.
+    What a guard takes back is taken back here, too. Where a process forks, the log stays with the
+    parent.
 
     Examples
     --------
@@ -346,7 +345,8 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         """An observation came in, at ``time`` [s]."""
         if self._guard is None:
             raise ValueError("the log was given to a guard within an episode; give it before one")
-        self._keep_seen()
+        if self._seen:  # nothing was proposed to what came in last
+            self._before.append(self._seen)
         self._seen = [float(time), observation.tolist()]
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
@@ -375,7 +375,9 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         """The episode ended; an OSError if something could not be written since it began."""
         if self._guard is None:
             return
-        self._keep_seen()
+        if self._seen:
+            self._before.append(self._seen)
+        self._seen = []
         self._learnt = sums_of(self._guard)
         last = None if observation is None else observation.tolist()
         before = self._take_before()
@@ -422,12 +424,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         is_owner = os.getpid() == self._owner and not self._file.closed
         if is_owner and os.fstat(self._file.fileno()).st_size > self._size:
             self._file.truncate(self._size)
-
-    def _keep_seen(self) -> None:
-        """Nothing was proposed to what came in last."""
-        if self._seen:
-            self._before.append(self._seen)
-            self._seen = []
 
     def _flush(self) -> None:
         if self._before:

@@ -1,8 +1,4 @@
-"""The framework's loop: observe, recognise, propose, revise, execute, learn.
-
-Whoever the controller is and whatever it controls, what it proposes is revised before it is
-executed, and what came of it is learnt before the next decision (the paper's Section 4.1).
-"""
+"""The framework's loop (the paper's Section 4.1): observe, recognise, propose, revise, learn."""
 
 from __future__ import annotations
 
@@ -148,8 +144,7 @@ class Guard:
     Before an action is executed, the judge says how likely it is that failure can no longer be
     avoided after it. A proposal within the tolerance is kept; any other is replaced by the closest
     action that is tolerable. The machine recognises and counts the states in which that happens.
-
-    An episode begins with the first `decide` after `end`; until then machine and judge learn.
+    An episode begins with the first `decide` after `end`.
 
     Parameters
     ----------
@@ -206,8 +201,7 @@ class Guard:
     Notes
     -----
     Threads may share a guard: each call is done before the next begins, and what it decides on is
-    one stream of observations. A file is saved between two calls. What an attribute returns, as
-    `machine` or `judge`, has to be left alone meanwhile.
+    one stream of observations. `machine` and `judge` themselves have to be left alone meanwhile.
 
     Each call is done as a whole: where it raises (an input is refused, a judge or the audit log
     fails, Ctrl-C), guard, machine, judge and audit log are as before, and it may be made again. A
@@ -401,12 +395,11 @@ class Guard:
 
     @transaction
     def freeze(self) -> None:
-        """Learn nothing from now on: what is decided depends on the present episode alone.
+        """Learn nothing from now on: the same episode is decided the same again, bit for bit.
 
-        The same episode is then decided the same again, bit for bit. An episode that is under way
-        is broken off: nothing more is learnt from it. Where it steps back, or guarded episodes seem
-        to fail sooner than those of the controller alone, proposals pass. It warns of that, and of
-        a guard that refuses nearly everything.
+        An episode that is under way is broken off: nothing more is learnt from it. Where it steps
+        back, or guarded episodes seem to fail sooner than those of the controller alone, proposals
+        pass. It warns of that, and of a guard that refuses nearly everything.
         """
         self.learn = False
         if why := self._why_passing():
@@ -484,8 +477,8 @@ class Guard:
         observation : (m,) array_like
             NaN where a variable was not observed.
         proposal : float, (d,) array_like, Proposal or None
-            What the controller wants; None, or NaN, where it has nothing. A vector where the set
-            of actions is a box. ``Proposal(action, mask=...)`` also says which are allowed now.
+            What the controller wants; None, or NaN, where it has nothing.
+            ``Proposal(action, mask=...)`` also says which actions are allowed now.
         time : float, optional
             Of the observation, in this episode [s]; without it decisions are counted, one every
             `interval`. What is not later than the one before tells nothing new.

@@ -189,8 +189,8 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
 
     The guard learns every environment's episode **as a whole when it ends**. Within an episode a
     twin of the guard (`Guard.copy`) decides, made as the episode begins: it learns from its own,
-    but not from those that run alongside. What you change about the guard, its mode for example,
-    counts from the next episode on. With one environment it comes to the same as `RevisedActions`.
+    but not from those that run alongside. What you change about the guard counts from the next
+    episode on. With one environment it comes to the same as `RevisedActions`.
 
     Parameters
     ----------

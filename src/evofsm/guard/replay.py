@@ -1,9 +1,8 @@
 """Audit a log: whether it is what was written, and whether those were the decisions.
 
-The second question is answered by deciding again, without a world: what was observed and proposed
-is told to the guard that the log began with, and each decision must come out as it was recorded, to
-the last bit. So neither a forged decision nor a forged model hides behind a chain that was made
-anew.
+It decides again, without a world: what was observed and proposed is told to the guard that the log
+began with, and each decision must come out as it was recorded, to the last bit. So neither a forged
+decision nor a forged model hides behind a chain that was made anew.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.guard.actions import Action, checked_mask
+from evofsm.guard.actions import checked_mask
 from evofsm.guard.api import Proposal
 from evofsm.guard.audit_log import (
     FIELDS,
@@ -94,10 +93,6 @@ def audit(path: Path, kept: Head | None = None, *, failed: _Failed | None = None
         As the guard had it. No log holds code: without it episodes of a guard that was told by a
         function where it fails are not replayed, which is said.
 
-    Returns
-    -------
-    Audit
-
     Raises
     ------
     OSError
@@ -127,22 +122,20 @@ fields=())
         fault = _misfit(record, started=counts["start"] > 0)
         if fault is not None:
             break
-        counts[record.content["kind"]] += 1
-        counts["quiet rows"] += len(record.content.get("before", ()))
+        kind, before = record.content["kind"], record.content.get("before", ())
+        counts[kind] += 1
+        counts["all decisions"] += len(before) + (kind == "decision")
         if difference is None:
             difference = player.play(record)
     fault = fault or chain.finding
     if chain.head == NOTHING and fault is None:
         raise ValueError(f"{path} is no audit log, or no record of it was finished")
-    spoke = counts["decision"]
-    contents = Contents(
-        counts["start"], counts["begin"], spoke + counts["quiet rows"], spoke, counts["settings"]
-    )
+    names = "start", "begin", "all decisions", "decision", "settings"
     return Audit(
         head=chain.head,
         half_written=chain.half_written,
         finding=fault,
-        contents=contents,
+        contents=Contents(*(counts[name] for name in names)),
         replayed=player.decisions,
         difference=difference,
         not_replayed=tuple(player.not_replayed),
@@ -205,7 +198,7 @@ class _Player:
         if not self._is_under_way and (before or kind in ("decision", "end")):
             raise ValueError("it belongs to no episode")
         for row in before:
-            self._row(self._guard, None, *row)
+            self._row(self._guard, None, row)
         if kind in ("begin", "settings"):
             self._set(self._guard, content["settings"])
         if kind == "begin":
@@ -213,7 +206,7 @@ class _Player:
             self._is_under_way = True
         elif kind == "decision":
             names = ("time", "observation", "proposed", "mask")
-            self._row(self._guard, content, *(content[name] for name in names))
+            self._row(self._guard, content, [content[name] for name in names])
         elif kind == "end":
             self._end(self._guard, content)
 
@@ -246,26 +239,18 @@ class _Player:
         if fields := _differing(settings, settings_now(guard)):
             raise _DiffersError("there are no such settings", fields)
 
-    def _row(
-        self,
-        guard: Guard,
-        content: Mapping[str, Any] | None,
-        time: Any,
-        observation: Any,
-        *proposed: Any,
-    ) -> None:
+    def _row(self, guard: Guard, content: Mapping[str, Any] | None, row: Sequence[Any]) -> None:
         """A row that was decided on so, or of which nothing was to be said; or not decided on."""
+        time, observation, *proposed = row
         situation = guard.recognise(_floats(observation), _number(time))
         if not proposed:
             return
-        action, *mask = proposed
-        proposal = Proposal(_action(action), checked_mask(guard.actions, *mask or [None]))
+        action, mask = proposed if len(proposed) > 1 else (*proposed, None)
+        action = _floats(action) if isinstance(action, list) else _number(action)
+        proposal = Proposal(action, checked_mask(guard.actions, mask))
         revision = guard.revise(situation, proposal)
-        entry, when = (
-            decision_of(situation, proposal, revision),
-            f"the decision at {situation.time:g} s",
-        )
-        speaks = is_spoken(guard.reviser, revision)
+        entry = decision_of(situation, proposal, revision)
+        when, speaks = f"the decision at {situation.time:g} s", is_spoken(guard.reviser, revision)
         if content is None and speaks:
             raise _DiffersError(
                 f"{when} was recorded as nothing to speak of, but {entry['reason']}",
@@ -298,13 +283,10 @@ def _floats(values: Sequence[Any]) -> NDArray[np.float64]:
     return np.array([_number(value) for value in values])
 
 
-def _action(action: Any) -> Action:
-    return _floats(action) if isinstance(action, list) else _number(action)
-
-
 def _differing(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> tuple[Field, ...]:
-    fields = {
-        name: tuple(canonical(entry[name]) if name in entry else "" for entry in (recorded, again))
-        for name in sorted(recorded.keys() | again.keys())
-    }
-    return tuple(Field(name, *values) for name, values in fields.items() if values[0] != values[1])
+    before, after = (
+        {name: canonical(value) for name, value in of.items()} for of in (recorded, again)
+    )
+    names = sorted(before.keys() | after.keys())
+    fields = [Field(name, before.get(name, ""), after.get(name, "")) for name in names]
+    return tuple(field for field in fields if field.recorded != field.replayed)
