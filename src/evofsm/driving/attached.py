@@ -1,9 +1,9 @@
 """Attach guards to a running SUMO simulation, or only watch: which cars, and what came of it.
 
-SUMO goes on driving them. A guard says how hard a car may accelerate in the next step, at most;
-where that is less than its own driver might want, the speed is set, and SUMO still minds all else:
-red lights, right of way, stops. What a driver wanted shows in what SUMO does; only where it is held
-back, its car-following model is asked.
+A guard says how hard a car may accelerate in the next step, at most; where that is less than its
+own driver might want, the speed is set, and SUMO still minds all else: red lights, right of way,
+stops. What a driver wanted shows in what SUMO does; only where it is held back, its car-following
+model is asked.
 
 SUMO's ``getLeader`` and ``getFollower`` take off minGap of whoever follows; where it counts a
 collision before the bumpers touch (``--collision.mingap-factor``), the gap ends there.
@@ -497,16 +497,6 @@ class _Ride:
             self.jerks += (acceleration - was) ** 2 / dt
             self.latest[car] = speed, acceleration
 
-    def told(self) -> dict[str, float]:
-        seconds = self.seconds or math.nan
-        return {
-            "car_seconds": self.seconds,
-            "speed": self.metres / seconds,  # [m/s]
-            "hard_brakes": self.hard_brakes,  # harder than 5 m/s²
-            "jerk": math.sqrt(self.jerks / seconds),  # root of the mean square [m/s³]
-            "time_lost": self.lost,  # [s]
-        }
-
 
 class Collision(NamedTuple):
     """A collision, told once for the two."""
@@ -606,13 +596,18 @@ class Attachment:
         ``revised`` (those that changed what the driver wanted, `Guarding.revised`), and
         ``microseconds`` for each decision, all that guarding takes.
         """
-        collisions, cars, guards = self.collisions, self.ever, self.guarding
+        collisions, cars, guards, ride = self.collisions, self.ever, self.guarding, self._ride
+        seconds = ride.seconds or math.nan
         numbers = {
             "cars": len(cars),
             "collisions": len(collisions),
             "of_guarded": sum(c.collider in cars for c in collisions),
             "into_guarded": sum(c.victim in cars and c.collider not in cars for c in collisions),
-            **self._ride.told(),
+            "car_seconds": ride.seconds,
+            "speed": ride.metres / seconds,
+            "hard_brakes": ride.hard_brakes,
+            "jerk": math.sqrt(ride.jerks / seconds),
+            "time_lost": ride.lost,
         }
         if guards is not None and guards.decisions:
             numbers |= {name: getattr(guards, name) for name in ("decisions", "limited", "revised")}
@@ -668,10 +663,8 @@ def attach(
     """Guard, or watch, cars of a SUMO simulation that runs.
 
     From then on each ``simulationStep`` does the rest. SUMO drives a guarded car as before, but no
-    faster than its guard allows; guards that are made here learn how hard leaders brake, from what
-    each sees.
-    The guard minds who is ahead and behind in its lane; right of way, red lights and lane changes
-    stay SUMO's.
+    faster than its guard allows, who minds who is ahead and behind in its lane; right of way, red
+    lights and lane changes stay SUMO's. Guards that are made here learn how hard leaders brake.
 
     Parameters
     ----------
@@ -681,9 +674,8 @@ def attach(
         ``"all"``, ``"type:NAME"``, a share such as 0.1 or ``"10%"``, or ids; those to come as well.
     guard : Guard, optional
         Each car gets a copy, frozen. It observes scenes (`guard_for_traffic`) or gap and speeds
-        (`guard_for_cars`, or `Guard.of` an `EnvelopeReviser`). Without one, each knows the car's
-        own limits: it counts on SUMO's ``decel`` and brakes up to ``emergencyDecel`` where it has
-        to.
+        (`guard_for_cars`, or `Guard.of` an `EnvelopeReviser`). Without one, each counts on SUMO's
+        ``decel`` of its car and brakes up to ``emergencyDecel`` where it has to.
     mode : {"act", "shadow", "watch"}
         Whether guards act, only say what they would do, or there are none: then only time to
         collision and needed deceleration are measured.

@@ -157,8 +157,7 @@ class TrafficRisk(ActionJudge):
     Parameters
     ----------
     ahead : LatentRisk
-        Judges each pair in which oneself is the follower. The braking it counts on may be softer
-        than what is possible, so that one brakes early.
+        Judges each pair in which oneself is the follower.
 
     Notes
     -----

@@ -1,8 +1,4 @@
-"""Episodes of cars under a guard, and what came of them: collisions, distance, comfort.
-
-All that drives cars goes through `drive`, which is the loop of `evofsm.guard.run_episode` on a
-road.
-"""
+"""Episodes of cars under a guard, and what came of them: collisions, distance, comfort."""
 
 from __future__ import annotations
 
@@ -106,7 +102,7 @@ def reference_of(family: Family, draw: Draw, world: World | None = None) -> Refe
     Parameters
     ----------
     family, draw, world
-        Of whom, where, and in which world, as in `drive`.
+        As in `drive`.
     """
     alone = drive(unrevised_guard(family), draw, world)
     brake = -draw.scenario.leader.brake_decel

@@ -44,6 +44,8 @@ from evofsm.guard.reviser import is_spoken
 _log = logging.getLogger(__name__)
 
 LOG_VERSION = 1
+#: What may be changed about a guard between episodes.
+SETTINGS = ("explaining", "interval", "learn", "shadow")
 # Most probable states of a belief that are written; decisions that are held back at most, which a
 # kill loses; and bytes of a line, which holds a machine at most.
 _STATES, _MOST_QUIET, _LONGEST_LINE = 3, 240, 1 << 26
@@ -507,13 +509,8 @@ def _start(guard: Guard) -> dict[str, Any]:
 
 def settings_now(guard: Guard) -> dict[str, Any]:
     """What may be changed between episodes; and, of the reviser, while driving."""
-    return {
-        "explaining": guard.explaining,
-        "interval": guard.interval,
-        "learn": guard.learn,
-        "reviser": settings_of(guard.reviser),
-        "shadow": guard.shadow,
-    }
+    own = {name: getattr(guard, name) for name in SETTINGS}
+    return {**own, "reviser": settings_of(guard.reviser)}
 
 
 def sums_of(guard: Guard) -> dict[str, float]:

@@ -47,7 +47,7 @@ from evofsm.guard.api import (
 )
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.rollout import refuse_too_many
-from evofsm.guard.parts import outline, part_class, rebuild
+from evofsm.guard.parts import outline, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.warming import warm_judge, warm_machine
 from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
@@ -894,12 +894,9 @@ class Guard:
         with store.explained(path):
             if settings["failed"] and failed is None:
                 raise ValueError("this guard knew failures by a function; give it again: failed=")
-            instance = None if isinstance(judge, type) else judge
-            return cls.of(
-                **rebuild(settings, *_loaded(settings, files, judge), instance),
-                failed=failed,
-                **{name: settings[name] for name in _PLAIN_SETTINGS},
-            )
+            parts = rebuild(settings, files, judge)
+            plain = {name: settings[name] for name in _PLAIN_SETTINGS}
+            return cls.of(failed=failed, **parts, **plain)
 
 
 def _is_missing(z: NDArray[np.float64]) -> bool:
@@ -939,24 +936,6 @@ def _actions(low: ArrayLike | None, high: ArrayLike | None, n_actions: int | Non
     least, most = np.asarray(low, np.float64).item(), np.asarray(high, np.float64).item()
     width = (most - least) / _INTERVALS if least < most else 1.0
     return IntervalActions(least, most, width, outside="clip")
-
-
-def _loaded(
-    kept: Mapping[str, Any],
-    files: Mapping[str, NDArray[Any]],
-    judge: ActionJudge | type[LearningJudge] | None,
-) -> tuple[EvolvingFSM | None, LearningJudge | None]:
-    """Machine and judge from their files, of which one may be empty."""
-    machine = risk = None
-    if files["machine"].size:
-        machine = EvolvingFSM.load(BytesIO(files["machine"].tobytes()))
-    if files["judge"].size:
-        kind = judge if isinstance(judge, type) else None
-        if kind is None and kept["judge"] is None:
-            raise ValueError("no installed package declares its judge; give the judge's class")
-        kind = kind or part_class(kept["judge"])
-        risk = kind.load(BytesIO(files["judge"].tobytes()))
-    return machine, risk
 
 
 def _bytes(saved: EvolvingFSM | LearningJudge | None) -> NDArray[np.uint8]:

@@ -24,6 +24,7 @@ from evofsm.guard.audit_log import (
     FIELDS,
     LOG_VERSION,
     NOTHING,
+    SETTINGS,
     Chain,
     Field,
     Finding,
@@ -231,10 +232,9 @@ class _Player:
 
     @staticmethod
     def _set(guard: Guard, settings: Mapping[str, Any]) -> None:
-        guard.explaining = bool(settings["explaining"])
-        guard.interval, guard.shadow = settings["interval"], settings["shadow"]
-        if guard.learn != settings["learn"]:
-            guard.learn = settings["learn"]
+        for name in SETTINGS:
+            if getattr(guard, name) != settings[name]:
+                setattr(guard, name, settings[name])
         set_again(guard.reviser, settings["reviser"])
         if fields := _differing(settings, settings_now(guard)):
             raise _DiffersError("there are no such settings", fields)

@@ -1,7 +1,7 @@
-"""The action reviser: it keeps what a controller proposes, or replaces it by something better.
+"""The action reviser of the paper's Section 4.2: it keeps what is proposed, or finds a better one.
 
-The module of the paper's Section 4.2, where it improves actions. The authors' own sequel tests an
-action by predicting the states it leads to (Han, Filev, Ozguner, arXiv:2006.08092).
+The authors' own sequel tests an action by predicting the states it leads to (Han, Filev, Ozguner,
+arXiv:2006.08092).
 """
 
 from __future__ import annotations
@@ -112,9 +112,8 @@ class ActionReviser:
 
     By the least change: the action closest to the proposal whose risk is within the tolerance;
     where there is none, the least risky one. Where the judge has to try an action first
-    (`api.Trial`), that is held for a while instead: so a car's own brakes are learnt. Once it
-    has begun to revise, it keeps on until the proposal is safe by a margin, so that it does not
-    chatter.
+    (`api.Trial`), that is held for a while instead. Once it has begun to revise, it keeps on until
+    the proposal is safe by a margin, so that it does not chatter.
 
     A judge that looks for an action itself (`api.SearchingJudge`) is asked for it. Where nothing of
     what it decides is executed (any mode but `Mode.ACT`), nothing is tried.
