@@ -152,10 +152,10 @@ class Seeing:
         """Whoever is ahead on its route, or behind, if near enough to matter."""
         find = self._vehicle.getLeader if is_ahead else self._vehicle.getFollower
         reach = _LOOKS_AHEAD + speed + 0.5 * speed * speed / _GENTLE
-        other, gap = find(car, reach) or ("", 0.0)
-        if not other:
+        neighbour, gap = find(car, reach) or ("", 0.0)
+        if not neighbour:
             return None
-        v, follower = self._vehicle.getSpeed(other), self.body(car if is_ahead else other)
+        v, follower = self._vehicle.getSpeed(neighbour), self.body(car if is_ahead else neighbour)
         closing_speed = speed - v if is_ahead else v - speed
         euler = self._euler
         late = 0.125 * follower.decel * euler * euler - 0.5 * euler * closing_speed
@@ -163,7 +163,7 @@ class Seeing:
         # Across a junction SUMO says 0 of all that is nearer than minGap.
         spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
         room = max(gap + spare_gap - late, _NEAREST)
-        return Neighbour(other, gap + follower.min_gap, room, v)
+        return Neighbour(neighbour, gap + follower.min_gap, room, v)
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
         """The speed that a car's own model wants after the next step [m/s], but for red lights."""

@@ -185,9 +185,9 @@ class Family:
             scenario = replace(scenario, sensors=replace(scenario.sensors, seed=noise))
         for name in self.switches:
             part, values, ranges = SWITCHES[name]
-            drawn = {of: numbers.between(f"{part}.{of}", *ends) for of, ends in ranges.items()}
+            draws = {of: numbers.between(f"{part}.{of}", *ends) for of, ends in ranges.items()}
             whole: Any = getattr(scenario, part) or _THIRD_CAR
-            scenario = replace(scenario, **{part: replace(whole, **values, **drawn)})
+            scenario = replace(scenario, **{part: replace(whole, **values, **draws)})
         self._check_limits(scenario, driver)
         return Draw(
             scenario, driver, self.variants[numbers.variant] if self.variants else self.name

@@ -218,7 +218,7 @@ class TrafficRisk(ActionJudge):
     def _survived(self, pairs: Sequence[Pair]) -> tuple[float, Pair | None]:
         """The hardest braking of oneself that all behind survive [m/s²], and who survives least."""
         behind = [pair for pair in pairs if pair.role is Role.BEHIND]
-        limits = [float(self._behind.critical(one.observation, _COASTING)[0]) for one in behind]
+        limits = [float(self._behind.critical(pair.observation, _COASTING)[0]) for pair in behind]
         return min(zip(limits, behind, strict=True), key=itemgetter(0), default=(math.inf, None))
 
     def choose(

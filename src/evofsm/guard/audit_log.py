@@ -306,11 +306,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
             self._file.close()
             raise
 
-    @property
-    def head(self) -> Head:
-        """The last record. Keep it elsewhere: it shows what is cut off or written anew later."""
-        return self._head
-
     def close(self) -> None:
         """Write what was held back; an OSError if that failed, now or before."""
         if self._file.closed:
@@ -419,7 +414,9 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
                 raise ValueError(f"{self.path} is no audit log; it was left alone")
             self._file.truncate(chain.size)
             _log.warning("%s: a half-written record was cut off", self.path)
-        self._head, self._size = chain.head, chain.size
+        #: The last record. Keep it elsewhere: it shows what is cut off or written anew later.
+        self.head: Head = chain.head
+        self._size = chain.size
 
     def _cut(self) -> None:
         """Cut off what was taken back, or is half of a record."""
@@ -439,7 +436,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         if self._failure is not None:
             return
         clock = datetime.now(UTC).isoformat()
-        line, head = seal({"kind": kind, "clock": clock, **content}, self._head)
+        line, head = seal({"kind": kind, "clock": clock, **content}, self.head)
         try:
             if os.getpid() != self._owner:
                 why = "the log belongs to the process that opened it; a child of that needs its own"
@@ -453,7 +450,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
                 self._cut()
             self._fail(error)
             return
-        self._head, self._size = head, self._size + len(line)
+        self.head, self._size = head, self._size + len(line)
         self._force("record")
 
     def _force(self, what: str = "episode") -> None:
@@ -509,8 +506,8 @@ def _start(guard: Guard) -> dict[str, Any]:
 
 def settings_now(guard: Guard) -> dict[str, Any]:
     """What may be changed between episodes; and, of the reviser, while driving."""
-    own = {name: getattr(guard, name) for name in SETTINGS}
-    return {**own, "reviser": settings_of(guard.reviser)}
+    settings = {name: getattr(guard, name) for name in SETTINGS}
+    return {**settings, "reviser": settings_of(guard.reviser)}
 
 
 def sums_of(guard: Guard) -> dict[str, float]:

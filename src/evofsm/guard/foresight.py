@@ -423,12 +423,7 @@ class Foresight(LearningJudge):
         return [(int(v), at) for *_, v, when, _, at in limits if v < m and not when]
 
     def tally(
-        self,
-        log: Runs,
-        rate: int,
-        *,
-        plain: bool | None = None,
-        columns: Floats | None = None,
+        self, log: Runs, rate: int, *, plain: bool | None = None, columns: Floats | None = None
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,).
 
