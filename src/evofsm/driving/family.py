@@ -1,9 +1,8 @@
 """Families of scenarios, each a Python function of numbers that are drawn by seed.
 
 A `Family` has a function ``make(numbers)`` that returns a scenario and who drives the follower. It
-asks `Numbers` for whatever is drawn, each number by the place that it is for, such as
-``scenario.initial_gap``. Each place has random numbers of its own, whatever else is drawn. All are
-in SI units.
+asks `Numbers` for whatever is drawn, each number by the place that it is for, which has random
+numbers of its own, whatever else is drawn. All are in SI units.
 
 In those that come with the package drivers are those of the paper. What the unrevised driver comes
 to was counted on 400 test draws of seed 1.
@@ -15,12 +14,12 @@ import math
 import operator
 import runpy
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import count
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex
 from zlib import crc32
 
 import numpy as np
@@ -210,12 +209,11 @@ class Family:
                 f"{self.decel:g}; bound its body, or the driver and the actions"
             )
 
-    def __reduce__(self) -> Any:
+    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
         """From a file it is read anew in other processes, which do not know its functions."""
         if self.source:
             return read_family, (self.source, self.switches)
-        values = {part.name: getattr(self, part.name) for part in fields(self)}
-        return partial(type(self), **values), ()
+        return super().__reduce_ex__(protocol)
 
 
 def training(

@@ -1,17 +1,15 @@
 """Latent risk: how likely failure is after an action, even if one is cautious from then on.
 
-A failure is rare and its causes are long past when it comes, so counting failures says too little
-and too late. What leads to it can be learnt from every ordinary minute: how hard leaders brake
-(`leaders`) and how well one brakes oneself (`brakes`). An action is then *rehearsed*
+Failures are rare, but what leads to them can be learnt from every ordinary minute: how hard leaders
+brake (`leaders`) and how well one brakes oneself (`brakes`). An action is then *rehearsed*
 (`rehearsal`): it is taken, full braking follows, and the leader brakes. The hardest braking of the
 leader that still ends well is the critical deceleration, and the latent risk is the probability
 that the leader brakes harder than that. A situation is a dead end where, if the leader braked hard
 now, even braking in full at once would be too late; while it does not, that can still be left.
 
-It is left *in proportion*. What could begin is answered by a comfortable deceleration at most.
-Harder braking answers what is seen: it is the least that avoids the collision that is foreseen if
-the leader goes on as it does. A gap is safe where one may keep the speed for a decision; one that
-is not is to be so within a stated time.
+It is left *in proportion* (`LatentRisk.choose`). What could begin is answered by a comfortable
+deceleration at most. Harder braking answers what is seen: it is the least that avoids the collision
+that is foreseen if the leader goes on as it does.
 """
 
 from __future__ import annotations
@@ -317,7 +315,7 @@ class LatentRisk(Retraced, LearningJudge):
 
         The closest one down to ``comfort`` that is tolerable, or that `foresee` says regains a safe
         gap within ``regain``; ``comfort`` where there is none, and harder only as far as it takes
-        to avoid the collision that is foreseen. In a smaller gap one never brakes less.
+        to avoid the collision that is foreseen.
         """
         here = self._cautious(situation.observation)
         if not is_whole(here):

@@ -1,9 +1,8 @@
 """Many cars instead of one leader: a scene of objects, its pairs, and a judge of the worst of them.
 
-Every pair is one car behind another, with a gap and two speeds. Whoever is ahead, cuts in or
-crosses is a leader, and each is rehearsed as the one leader of `LatentRisk`. For whoever is behind,
-oneself is the leader: by the same rehearsal, in which it keeps its speed until it has reacted, own
-braking that is harder than it survives ends in a collision that one has caused.
+Whoever is ahead, cuts in or crosses is a leader, and each is rehearsed as the one leader of
+`LatentRisk`. For whoever is behind, oneself is the leader: by the same rehearsal, in which it keeps
+its speed until it has reacted, own braking that is harder than it survives ends in a collision.
 """
 
 from __future__ import annotations
