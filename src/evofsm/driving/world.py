@@ -251,11 +251,6 @@ class Road:
         """Whether the follower has hit the leader."""
         return bool(self._record[self.row, GAP] <= 0.0)
 
-    @property
-    def rear_ended(self) -> bool:
-        """Whether the car behind has hit the follower."""
-        return bool(self._record[self.row, GAP_BEHIND] <= 0.0)
-
     def episode(self, first: int = 0) -> Episode:
         """What was recorded so far, from a row on."""
         rows = slice(first, self.row + 1)
@@ -279,7 +274,7 @@ class Road:
             "failed": failed,
             "realised": (self._record[self.row, SPEED] - speed) / seconds if seconds else math.nan,
         }
-        terminated = failed or self.rear_ended
+        terminated = failed or bool(self._record[self.row, GAP_BEHIND] <= 0.0)
         return self.observation, 0.0, terminated, self.over and not terminated, outcome
 
 
