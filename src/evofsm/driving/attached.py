@@ -295,8 +295,6 @@ class Guarding:
         if decides:
             self._watch(seen_leaders)
 
-    # -- A step ---------------------------------------------------------------------------------
-
     def _look(self, car: _Car, speed: float, time: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
         ahead, before = self._seeing.neighbour(car.id, speed), car.around[0]
@@ -414,9 +412,6 @@ class Guarding:
 def _judge(guard: Guard) -> ActionJudge | None:
     """Who judges actions; None where a formula alone decides, as in an `EnvelopeReviser`."""
     return getattr(guard.reviser, "risk", None)
-
-
-# -- Which cars, and what came of them ------------------------------------------------------------
 
 
 def choose(vehicles: str | float | Iterable[str]) -> Callable[[Any, str], bool]:

@@ -507,9 +507,6 @@ FAMILIES: Mapping[str, MakeFamily] = {
 }
 
 
-# -- By name, or from a file ----------------------------------------------------------------------
-
-
 def load_family(name: str | PathLike[str]) -> Family:
     """A family by its name, or from a file.
 

@@ -176,8 +176,6 @@ class LatentRisk(Retraced, LearningJudge):
         risk.brakes.trust(positive("decel", decel))
         return risk
 
-    # -- Learning -------------------------------------------------------------------------------
-
     def learn(
         self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
     ) -> None:
@@ -265,8 +263,6 @@ class LatentRisk(Retraced, LearningJudge):
             f"{len(self.manoeuvres)} manoeuvres of leaders, 1 % brake harder than "
             f"{self.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {brakes}"
         )
-
-    # -- Judging --------------------------------------------------------------------------------
 
     def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
         """Latent risk of each acceleration that could be commanded now [m/s²].
@@ -429,8 +425,6 @@ class LatentRisk(Retraced, LearningJudge):
             f"{rehearsal._HALVINGS + 2} rehearsals of 2 steps\n"
         )
         return Part(Path(__file__).with_suffix(".c"), 3, {"OPTIONS": len(lowest)}, constants, about)
-
-    # -- Keeping it -----------------------------------------------------------------------------
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt, and what it learnt from for people, to a file (`evofsm.store`)."""

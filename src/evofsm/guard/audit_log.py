@@ -401,8 +401,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
 
         return rollback
 
-    # -- Writing ----------------------------------------------------------------------------------
-
     def _find_end(self) -> None:
         """Where the last whole record ends; a part of one after it is cut off."""
         chain = Chain(self.path)

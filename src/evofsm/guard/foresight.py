@@ -197,8 +197,6 @@ class Foresight(LearningJudge):
         self._learnt = (0, 0) if log is None else (int(log.failed.sum()), len(log.rows))
         self.start_episode()
 
-    # -- Learning -------------------------------------------------------------------------------
-
     @classmethod
     def learn_log(
         cls,
@@ -380,8 +378,6 @@ class Foresight(LearningJudge):
             table += [(number, plain, *limits[k], limits[k][2] * at) for k, at in rule]
         return np.array(table, np.float64).reshape(-1, 6)
 
-    # -- Telling --------------------------------------------------------------------------------
-
     @property
     def _spans(self) -> Ints:
         """The horizon, how long a limit has to be passed, and how long an alarm stays on [rows]."""
@@ -555,8 +551,6 @@ class Foresight(LearningJudge):
         plain = "plain thresholds do as well: " * (kind == _PLAIN)
         record = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
         return f"{plain}{self.words(rate)} ({record}, {_COUNTED})"
-
-    # -- Beside a machine -----------------------------------------------------------------------
 
     def start_episode(self, *, learn: bool = True) -> None:
         """Nothing was seen yet; what was before, of an episode that nobody ended, went well."""

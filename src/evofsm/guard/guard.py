@@ -375,8 +375,6 @@ class Guard:
         self.shadow = bool(shadow)
         self.learn = learn
 
-    # -- An episode -----------------------------------------------------------------------------
-
     @property
     def learn(self) -> bool:
         """Whether machine and judge learn; if it is set, an episode under way is broken off."""
@@ -806,8 +804,6 @@ class Guard:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         share(self)
-
-    # -- Keeping it -----------------------------------------------------------------------------
 
     @alone
     def copy(self, *, states: bool = True) -> Self:

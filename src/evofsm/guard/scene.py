@@ -162,8 +162,6 @@ class SceneRisk(LearningJudge, SearchingJudge):
                 f"{low} to {high}"
             )
 
-    # -- Deciding -------------------------------------------------------------------------------
-
     def search(
         self,
         situation: Situation,
@@ -244,8 +242,6 @@ class SceneRisk(LearningJudge, SearchingJudge):
         if self.relative:
             return Seen(ego, away, rest + ego[_P:])
         return Seen(ego, away - ego[:_P], rest)
-
-    # -- Learning -------------------------------------------------------------------------------
 
     def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike) -> None:
         """Take in an observation and the action after it."""
@@ -564,8 +560,6 @@ class Memory:
             links[ends[t] + index[mutual]] = ends[t + 1] + nearest[mutual]
         return past._replace(links=links)
 
-    # -- Learning -------------------------------------------------------------------------------
-
     def _fit_motion(self, past: Past) -> None:
         """How places change, by what oneself and objects were like before and after."""
         rows, moment = np.flatnonzero(past.links >= 0), past.moment
@@ -657,8 +651,6 @@ class Memory:
         far, rest, ego = self._spreads
         near = _NEAR_TO * away / far, _NEAR_TO * other / rest
         return np.hstack([*near, (away + own[:, :_P]) / far, own[:, _P:] / ego[_P:]])
-
-    # -- Forecasting ----------------------------------------------------------------------------
 
     def apart(self, own: _Floats, one: _Floats) -> _Floats:
         """(k,) squared distance of states of oneself from one, each number by its spread."""
