@@ -815,8 +815,9 @@ class Guard:
             Whether it has the machine too. Without it the same is decided, unless the judge asks
             the states, and nothing is recognised.
         """
-        parts = self.reviser, self.judge, self.machine
-        reviser, judge, machine = copy.deepcopy(parts)
+        machine = None if self.machine is None else self.machine.copy()
+        memo = {id(self.machine): machine}  # for a judge that asks the machine
+        reviser, judge = copy.deepcopy((self.reviser, self.judge), memo)
         settings = {name: getattr(self, name) for name in (*_PLAIN_SETTINGS, "failed")}
         return type(self).of(reviser, judge=judge, machine=machine if states else None, **settings)
 
