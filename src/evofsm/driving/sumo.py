@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -27,9 +27,6 @@ from evofsm.driving.world import (
     decide,
 )
 from evofsm.extras import needs
-
-#: The worlds there are.
-WORLDS = ("sumo", "kinematic")
 
 _CARS = ["follower", "leader", "behind"]
 
@@ -106,13 +103,15 @@ class SumoWorld(World, AbstractContextManager["SumoWorld"]):
                 sumo.close()
 
 
+#: The worlds there are.
+WORLDS: Mapping[str, type[World]] = {"sumo": SumoWorld, "kinematic": KinematicWorld}
+
+
 def open_world(name: str) -> World:
     """A world by its name, one of `WORLDS`."""
-    if name == "sumo":
-        return SumoWorld()
-    if name == "kinematic":
-        return KinematicWorld()
-    raise ValueError(f"there is no world {name!r}; there are {', '.join(WORLDS)}")
+    if name not in WORLDS:
+        raise ValueError(f"there is no world {name!r}; there are {', '.join(WORLDS)}")
+    return WORLDS[name]()
 
 
 def _refuse_what_sumo_cannot_drive(scenario: Scenario) -> None:

@@ -605,10 +605,8 @@ def audit(path: Path, kept: Head | None = None, *, failed: _Failed | None = None
 
     Raises
     ------
-    OSError
-        If there is no such file, or it may not be read.
-    ValueError
-        If it is no audit log.
+    OSError, ValueError
+        If the file cannot be read, or is no audit log.
 
     Examples
     --------

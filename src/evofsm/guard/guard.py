@@ -873,10 +873,9 @@ class Guard:
 
         Raises
         ------
-        OSError
-            If there is no such file, or it may not be read.
-        ValueError
-            If the file holds something else or is damaged, or judge or ``failed`` are needed.
+        OSError, ValueError
+            If the file cannot be read, holds something else or is damaged, or judge or ``failed``
+            are needed.
 
         Examples
         --------
