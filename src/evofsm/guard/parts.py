@@ -47,31 +47,25 @@ def part_name(part: object) -> str | None:
 
 def outline(guard: _Guard) -> dict[str, Any]:
     """All of a guard but what machine and judge have learnt; None for what is not known here."""
-    return {
-        "actions": asdict(guard.actions),
-        "judge": None if guard.judge is None else part_name(guard.judge),
-        "reviser": _reviser(guard),
-    }
+    reviser, judge = guard.reviser, None if guard.judge is None else part_name(guard.judge)
+    description: dict[str, Any] | None = None
+    if type(reviser) is ActionReviser:
+        # Whom it asks, if that is who learns.
+        is_known = judge is not None and reviser.risk is guard.judge
+        description = {"judge": {"class": judge} if is_known else None}
+        description |= {"class": "ActionReviser", "settings": settings_of(reviser)}
+    elif name := part_name(reviser):
+        made_of = reviser.described()
+        description = None if made_of is None else {"class": name, **made_of}
+    return {"actions": asdict(guard.actions), "judge": judge, "reviser": description}
 
 
 def can_be_made_again(guard: _Guard) -> bool:
     """Whether `rebuild` needs no more than the `outline`."""
-    reviser = _reviser(guard)
-    if reviser is None or (guard.judge is not None and part_name(guard.judge) is None):
-        return False
-    return not isinstance(guard.reviser, ActionReviser) or reviser["judge"] is not None
-
-
-def _reviser(guard: _Guard) -> dict[str, Any] | None:
-    reviser = guard.reviser
-    if type(reviser) is ActionReviser:
-        # Whom it asks, if that is who learns.
-        judge = part_name(reviser.risk) if reviser.risk is guard.judge else None
-        description = None if judge is None else {"class": judge}
-        return {"class": "ActionReviser", "judge": description, "settings": settings_of(reviser)}
-    name = part_name(reviser)
-    description = reviser.described() if name else None
-    return None if description is None else {"class": name, **description}
+    parts = outline(guard)
+    knows_judge = guard.judge is None or parts["judge"] is not None
+    reviser: Any = parts["reviser"]
+    return knows_judge and reviser is not None and reviser.get("judge", {}) is not None
 
 
 def rebuild(
