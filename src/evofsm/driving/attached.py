@@ -573,7 +573,11 @@ class Attachment:
         self._now = now
         self._seeing.look_at_kinds()
         self._count_cars()
-        self._count_collisions(now)
+        for collision in self._sumo.simulation.getCollisions():
+            pair = collision.collider, collision.victim
+            if now - self._met.get(pair, -math.inf) > _SAME_COLLISION:
+                self.collisions.append(Collision(now, *pair, collision.type))
+            self._met[pair] = now
         self.looked += len(self._cars.cars)
         self._ride.see(self._cars.cars, self._sumo.vehicle)
         self._cars.step(now)
@@ -636,13 +640,6 @@ class Attachment:
             self._cars.cars.pop(car, None)
             self._seeing.forget(car)
         self._known = here
-
-    def _count_collisions(self, now: float) -> None:
-        for collision in self._sumo.simulation.getCollisions():
-            pair = collision.collider, collision.victim
-            if now - self._met.get(pair, -math.inf) > _SAME_COLLISION:
-                self.collisions.append(Collision(now, *pair, collision.type))
-            self._met[pair] = now
 
 
 def attach(
