@@ -10,7 +10,7 @@ from evofsm.cli.options import Json, argument, imported, option
 from evofsm.cli.show import facts, print_json, show
 
 if TYPE_CHECKING:
-    from evofsm.guard.replay import Audit
+    from evofsm.guard.audit_log import Audit
 
 _KEEP = (
     "Keep the head where the log is not. Without it (--head) neither an end that is cut off nor a "

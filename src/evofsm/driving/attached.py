@@ -1,9 +1,9 @@
 """Attach guards to a running SUMO simulation, or only watch: which cars, and what came of it.
 
-SUMO goes on driving them. A guard says how hard a car may accelerate in the next step, at most;
-where that is less than its own driver might want, the speed is set, and SUMO still minds all else:
-red lights, right of way, stops. What a driver wanted shows in what SUMO does; only where it is held
-back, its car-following model is asked.
+A guard says how hard a car may accelerate in the next step, at most; where that is less than its
+own driver might want, the speed is set, and SUMO still minds all else: red lights, right of way,
+stops. What a driver wanted shows in what SUMO does; only where it is held back, its car-following
+model is asked.
 
 SUMO's ``getLeader`` and ``getFollower`` take off minGap of whoever follows; where it counts a
 collision before the bumpers touch (``--collision.mingap-factor``), the gap ends there.
@@ -16,7 +16,7 @@ import time as clock
 import warnings
 import weakref
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from importlib import import_module
 from itertools import chain, count
@@ -77,9 +77,6 @@ _STANDS, _SAME_SPEED = 0.1, 1e-6
 _ON, _OFF = 0b011, 0b100
 
 
-# -- What SUMO says of the cars around one --------------------------------------------------------
-
-
 class Neighbour(NamedTuple):
     """Another car in one's lane."""
 
@@ -138,35 +135,35 @@ class Seeing:
 
     def body(self, car: str) -> _Facts:
         """Of a car; that its type changes is not noticed."""
-        body = self._bodies.get(car)
-        if body is None:
+        if car not in self._bodies:
             vehicle = self._vehicle
             late = vehicle.getActionStepLength(car) > self.dt + _TICK
             facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car), late
-            body = self._bodies[car] = _Facts(*facts)
-        return body
+            self._bodies[car] = _Facts(*facts)
+        return self._bodies[car]
 
     def pair(self, car: str) -> tuple[float, float, float] | None:
         """Gap from bumper to bumper [m], its speed and that of whoever is ahead [m/s]."""
         speed = self._vehicle.getSpeed(car)
-        leader = self.ahead(car, speed)
+        leader = self.neighbour(car, speed)
         return None if leader is None else (leader.gap, speed, leader.speed)
 
-    def ahead(self, car: str, speed: float) -> Neighbour | None:
-        """Whoever is ahead on its route, if near enough to matter."""
-        leader, gap = self._vehicle.getLeader(car, _far(speed)) or ("", 0.0)
-        if not leader:
+    def neighbour(self, car: str, speed: float, *, is_ahead: bool = True) -> Neighbour | None:
+        """Whoever is ahead on its route, or behind, if near enough to matter."""
+        find = self._vehicle.getLeader if is_ahead else self._vehicle.getFollower
+        reach = _LOOKS_AHEAD + speed + 0.5 * speed * speed / _GENTLE
+        neighbour, gap = find(car, reach) or ("", 0.0)
+        if not neighbour:
             return None
-        v, body = self._vehicle.getSpeed(leader), self.body(car)
-        return Neighbour(leader, gap + body.min_gap, self._room(gap, body, speed - v), v)
-
-    def behind(self, car: str, speed: float) -> Neighbour | None:
-        """Whoever is behind."""
-        follower, gap = self._vehicle.getFollower(car, _far(speed))
-        if not follower:
-            return None
-        v, body = self._vehicle.getSpeed(follower), self.body(follower)
-        return Neighbour(follower, gap + body.min_gap, self._room(gap, body, v - speed), v)
+        v, follower = self._vehicle.getSpeed(neighbour), self.body(car if is_ahead else neighbour)
+        closing_speed = speed - v if is_ahead else v - speed
+        euler = self._euler
+        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * closing_speed
+        # Who is nearer than SUMO lets anybody be stands in a queue, or beside, where lanes merge.
+        # Across a junction SUMO says 0 of all that is nearer than minGap.
+        spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
+        room = max(gap + spare_gap - late, _NEAREST)
+        return Neighbour(neighbour, gap + follower.min_gap, room, v)
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
         """The speed that a car's own model wants after the next step [m/s], but for red lights."""
@@ -179,14 +176,6 @@ class Seeing:
         follow_speed = vehicle.getFollowSpeed(car, speed, gap, ahead.speed, decel, ahead.id)
         slowest = speed - vehicle.getEmergencyDecel(car) * self.dt
         return float(max(min(follow_speed, fastest), slowest, 0.0))
-
-    def _room(self, gap: float, follower: _Facts, closing: float) -> float:
-        euler = self._euler
-        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * closing
-        # Who is nearer than SUMO lets anybody be stands in a queue, or beside, where lanes merge.
-        # Across a junction SUMO says 0 of all that is nearer than minGap.
-        spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
-        return max(gap + spare_gap - late, _NEAREST)
 
     def rows(
         self, car: str, speed: float, ahead: Neighbour | None, behind: Neighbour | None
@@ -201,13 +190,6 @@ class Seeing:
                 x = from_ + way * (near.room + 0.5 * long)
                 row[:] = 1.0, x, 0.0, near.speed, 0.0, long, _CAR_WIDTH, ax
         return rows.ravel()
-
-
-def _far(speed: float) -> float:
-    return _LOOKS_AHEAD + speed + 0.5 * speed * speed / _GENTLE
-
-
-# -- Guarding ---------------------------------------------------------------------------------
 
 
 class GuardedStep(NamedTuple):
@@ -247,16 +229,21 @@ class Guarding:
         seeing: Seeing,
         guard: Guard | None,
         acts: bool,
-        settings: Mapping[str, float],
+        tolerance: float,
+        regain: float,
         report: Callable[[GuardedStep], None] | None,
     ) -> None:
         self._sumo, self._vehicle, self._seeing = sumo, sumo.vehicle, seeing
         self._acts, self._report = acts, report
-        self._template, self._settings = guard, settings
+        self._template, self._tolerance, self._regain = guard, tolerance, regain
         self.cars: dict[str, _Car] = {}  #: by id
         self._watches: dict[str, BrakeWatch] = {}
-        if guard is not None:
-            _refuse_what_sees_something_else(guard)
+        judge = None if guard is None else _judge(guard)
+        if not (judge is None or isinstance(judge, TrafficRisk) or judge.labels.names == VARIABLES):
+            raise ValueError(
+                f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must "
+                f"be a TrafficRisk, or observe {', '.join(VARIABLES)}"
+            )
         # How hard SUMO's cars brake is exactly known, and has an end.
         #: How hard they were seen to brake.
         self.leaders = Manoeuvres(_LEADER_DECEL, width=_SEEN_TO)
@@ -308,15 +295,15 @@ class Guarding:
         if decides:
             self._watch(seen_leaders)
 
-    # -- A step ---------------------------------------------------------------------------------
-
     def _look(self, car: _Car, speed: float, time: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
-        ahead, before = self._seeing.ahead(car.id, speed), car.around[0]
+        ahead, before = self._seeing.neighbour(car.id, speed), car.around[0]
         scene = isinstance(_judge(car.guard), TrafficRisk)
         # Who is behind matters only where one brakes: if acting, because somebody is ahead.
         alone = ahead is None and self._acts
-        behind = self._seeing.behind(car.id, speed) if scene and not alone else None
+        behind = None
+        if scene and not alone:
+            behind = self._seeing.neighbour(car.id, speed, is_ahead=False)
         car.around = ahead, behind
         if (ahead and ahead.id) != (before and before.id):
             car.guard.begin()  # what is known of the one before does not hold of this one
@@ -405,18 +392,16 @@ class Guarding:
             decels.append(self._watches.pop(leader).end())
         self.leaders.remember(*decels)
 
-    # -- Guards ---------------------------------------------------------------------------------
-
     def _guard_for(self, car: str, high: float) -> Guard:
         mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
-            decel, settings, dt = self._vehicle.getDecel(car), self._settings, self.interval
-            how = {"margin": _MARGIN, "regain": settings["regain"]}
+            decel, dt = self._vehicle.getDecel(car), self.interval
+            how = {"margin": _MARGIN, "regain": self._regain}
             risk = LatentRisk.given(-decel, decel, _LEADER_DECEL, dt, **how)
             risk.manoeuvres = self.leaders
             low, judge = -max(self._vehicle.getEmergencyDecel(car), decel), TrafficRisk(risk)
-            limits, tolerance = (low, high, decel, dt), settings["tolerance"]
-            return guard_for_traffic(*limits, judge=judge, tolerance=tolerance, mode=mode)
+            limits = low, high, decel, dt
+            return guard_for_traffic(*limits, judge=judge, tolerance=self._tolerance, mode=mode)
         guard = self._template.copy()
         guard.freeze()
         if isinstance(guard.reviser, ActionReviser):
@@ -427,19 +412,6 @@ class Guarding:
 def _judge(guard: Guard) -> ActionJudge | None:
     """Who judges actions; None where a formula alone decides, as in an `EnvelopeReviser`."""
     return getattr(guard.reviser, "risk", None)
-
-
-def _refuse_what_sees_something_else(guard: Guard) -> None:
-    judge = _judge(guard)
-    if judge is None or isinstance(judge, TrafficRisk) or judge.labels.names == VARIABLES:
-        return
-    raise ValueError(
-        f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must be a "
-        f"TrafficRisk, or observe {', '.join(VARIABLES)}"
-    )
-
-
-# -- Which cars, and what came of them ------------------------------------------------------------
 
 
 def choose(vehicles: str | float | Iterable[str]) -> Callable[[Any, str], bool]:
@@ -519,16 +491,6 @@ class _Ride:
             self.hard_brakes += acceleration < -_HARD <= was
             self.jerks += (acceleration - was) ** 2 / dt
             self.latest[car] = speed, acceleration
-
-    def told(self) -> dict[str, float]:
-        seconds = self.seconds or math.nan
-        return {
-            "car_seconds": self.seconds,
-            "speed": self.metres / seconds,  # [m/s]
-            "hard_brakes": self.hard_brakes,  # harder than 5 m/s²
-            "jerk": math.sqrt(self.jerks / seconds),  # root of the mean square [m/s³]
-            "time_lost": self.lost,  # [s]
-        }
 
 
 class Collision(NamedTuple):
@@ -611,7 +573,11 @@ class Attachment:
         self._now = now
         self._seeing.look_at_kinds()
         self._count_cars()
-        self._count_collisions(now)
+        for collision in self._sumo.simulation.getCollisions():
+            pair = collision.collider, collision.victim
+            if now - self._met.get(pair, -math.inf) > _SAME_COLLISION:
+                self.collisions.append(Collision(now, *pair, collision.type))
+            self._met[pair] = now
         self.looked += len(self._cars.cars)
         self._ride.see(self._cars.cars, self._sumo.vehicle)
         self._cars.step(now)
@@ -629,13 +595,18 @@ class Attachment:
         ``revised`` (those that changed what the driver wanted, `Guarding.revised`), and
         ``microseconds`` for each decision, all that guarding takes.
         """
-        collisions, cars, guards = self.collisions, self.ever, self.guarding
+        collisions, cars, guards, ride = self.collisions, self.ever, self.guarding, self._ride
+        seconds = ride.seconds or math.nan
         numbers = {
             "cars": len(cars),
             "collisions": len(collisions),
             "of_guarded": sum(c.collider in cars for c in collisions),
             "into_guarded": sum(c.victim in cars and c.collider not in cars for c in collisions),
-            **self._ride.told(),
+            "car_seconds": ride.seconds,
+            "speed": ride.metres / seconds,
+            "hard_brakes": ride.hard_brakes,
+            "jerk": math.sqrt(ride.jerks / seconds),
+            "time_lost": ride.lost,
         }
         if guards is not None and guards.decisions:
             numbers |= {name: getattr(guards, name) for name in ("decisions", "limited", "revised")}
@@ -670,13 +641,6 @@ class Attachment:
             self._seeing.forget(car)
         self._known = here
 
-    def _count_collisions(self, now: float) -> None:
-        for collision in self._sumo.simulation.getCollisions():
-            pair = collision.collider, collision.victim
-            if now - self._met.get(pair, -math.inf) > _SAME_COLLISION:
-                self.collisions.append(Collision(now, *pair, collision.type))
-            self._met[pair] = now
-
 
 def attach(
     sumo: Any,
@@ -691,10 +655,8 @@ def attach(
     """Guard, or watch, cars of a SUMO simulation that runs.
 
     From then on each ``simulationStep`` does the rest. SUMO drives a guarded car as before, but no
-    faster than its guard allows; guards that are made here learn how hard leaders brake, from what
-    each sees.
-    The guard minds who is ahead and behind in its lane; right of way, red lights and lane changes
-    stay SUMO's.
+    faster than its guard allows, who minds who is ahead and behind in its lane; right of way, red
+    lights and lane changes stay SUMO's. Guards that are made here learn how hard leaders brake.
 
     Parameters
     ----------
@@ -704,9 +666,8 @@ def attach(
         ``"all"``, ``"type:NAME"``, a share such as 0.1 or ``"10%"``, or ids; those to come as well.
     guard : Guard, optional
         Each car gets a copy, frozen. It observes scenes (`guard_for_traffic`) or gap and speeds
-        (`guard_for_cars`, or `Guard.of` an `EnvelopeReviser`). Without one, each knows the car's
-        own limits: it counts on SUMO's ``decel`` and brakes up to ``emergencyDecel`` where it has
-        to.
+        (`guard_for_cars`, or `Guard.of` an `EnvelopeReviser`). Without one, each counts on SUMO's
+        ``decel`` of its car and brakes up to ``emergencyDecel`` where it has to.
     mode : {"act", "shadow", "watch"}
         Whether guards act, only say what they would do, or there are none: then only time to
         collision and needed deceleration are measured.
@@ -750,8 +711,7 @@ def attach(
     is_chosen, sight = choose(vehicles), Seeing(sumo)
     cars: Guarding | Watching = Watching(sight)
     if mode != "watch":
-        settings = {"tolerance": tolerance, "regain": regain}
-        cars = Guarding(sumo, sight, guard, mode == "act", settings, report)
+        cars = Guarding(sumo, sight, guard, mode == "act", tolerance, regain, report)
     attachment = Attachment(sumo, is_chosen, sight, cars)
     attachment.listen()
     return attachment

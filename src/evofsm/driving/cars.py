@@ -51,8 +51,6 @@ def guard_for_cars(
     """A guard for a car that follows another.
 
     It observes gap [m], own speed and the leader's speed [m/s], and decides on the acceleration.
-    Unless told otherwise its judge knows how cars follow each other, and learns how hard they
-    brake.
 
     Parameters
     ----------
@@ -71,8 +69,8 @@ def guard_for_cars(
         One that has learnt; without it a new one.
     judge : LearningJudge, "kinematic" or "learnt"
         One that has learnt, or which to make: a `LatentRisk`, which is told how cars follow each
-        other, or a `LearntRisk`, which is told nothing but which episodes failed, and prevents
-        nothing before the first of them.
+        other and learns how hard they brake, or a `LearntRisk`, which is told nothing but which
+        episodes failed, and prevents nothing before the first of them.
     seed : int
         Of the judge that is made, where that is a `LearntRisk`.
     **settings

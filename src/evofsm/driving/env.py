@@ -40,16 +40,15 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     """Drive behind a leader who may brake, in scenarios of a family.
 
     An observation is ``[gap [m], v_follower [m/s], v_leader [m/s]]``, the gap from bumper to
-    bumper; an action is an acceleration [m/s²] in the family's range, commanded for the
-    family's interval. What lies beyond the range is commanded at its edge.
+    bumper; an action is an acceleration [m/s²] in the family's range, commanded for the family's
+    interval. What lies beyond the range is commanded at its edge.
 
-    The reward of a step is the distance travelled in it [m], less ``collision_cost`` where it
-    ends in a collision. An episode terminates when two cars collide, and is truncated when its
-    time is up. ``info`` holds ``time`` [s], ``gap`` [m] as it truly is, ``distance`` [m] and
-    ``realised`` acceleration [m/s²] of the step, ``failed``, whether the follower ran into its
-    leader, and ``rear_ended``, whether the car behind, if any, ran into the follower. Both
-    terminate and both cost, but only the first is a failure. ``split`` and ``index`` say which
-    scenario it is.
+    The reward of a step is the distance travelled in it [m], less ``collision_cost`` where it ends
+    in a collision. An episode terminates when two cars collide, and is truncated when its time is
+    up. ``info`` holds ``time`` [s], ``gap`` [m] as it truly is, ``distance`` [m] and ``realised``
+    acceleration [m/s²] of the step, ``failed``, whether the follower ran into its leader,
+    ``rear_ended``, whether the car behind, if any, ran into the follower, which is no failure, and
+    ``split`` and ``index`` of the scenario.
 
     Parameters
     ----------

@@ -1,9 +1,8 @@
 """Families of scenarios, each a Python function of numbers that are drawn by seed.
 
 A `Family` has a function ``make(numbers)`` that returns a scenario and who drives the follower. It
-asks `Numbers` for whatever is drawn, each number by the place that it is for, such as
-``scenario.initial_gap``. Each place has random numbers of its own, whatever else is drawn. All are
-in SI units.
+asks `Numbers` for whatever is drawn, each number by the place that it is for, which has random
+numbers of its own, whatever else is drawn. All are in SI units.
 
 In those that come with the package drivers are those of the paper. What the unrevised driver comes
 to was counted on 400 test draws of seed 1.
@@ -14,13 +13,13 @@ from __future__ import annotations
 import math
 import operator
 import runpy
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import count
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex
 from zlib import crc32
 
 import numpy as np
@@ -36,9 +35,6 @@ SPLITS = ("train", "test")
 
 # Numbers that are equal but for rounding.
 _ROUNDING = 1e-9
-
-
-# -- A draw ---------------------------------------------------------------------------------------
 
 
 class Draw(NamedTuple):
@@ -100,9 +96,6 @@ class Numbers:
 Make = Callable[[Numbers], tuple[Scenario, IDM | ChangingIDM]]
 
 
-# -- A family -------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Family:
     """Scenarios that are drawn by seed.
@@ -162,11 +155,10 @@ class Family:
         """How many variants come in turn; 1 where none do."""
         return max(1, len(self.variants)) if self.in_turn else 1
 
-    def with_switches(self, names: Iterable[str]) -> Family:
+    def with_switches(self, names: Sequence[str]) -> Family:
         """The family with some of `SWITCHES` on; what it draws is otherwise the same."""
-        on = tuple(names)
-        after = None if self.shifted is None else self.shifted.with_switches(on)
-        return replace(self, switches=(*self.switches, *on), shifted=after)
+        after = None if self.shifted is None else self.shifted.with_switches(names)
+        return replace(self, switches=(*self.switches, *names), shifted=after)
 
     def draw(self, seed: int, index: int, split: str = "train") -> Draw:
         """One scenario: always the same for the same arguments.
@@ -191,12 +183,10 @@ class Family:
         if noise is not None:
             scenario = replace(scenario, sensors=replace(scenario.sensors, seed=noise))
         for name in self.switches:
-            part, values = SWITCHES[name]
-            if part == "behind":
-                gap = numbers.between("behind.gap", 10.0, 40.0)
-                scenario = replace(scenario, behind=Behind(_normal(-6.0), gap))
-            else:
-                scenario = replace(scenario, **{part: replace(getattr(scenario, part), **values)})
+            part, values, ranges = SWITCHES[name]
+            draws = {of: numbers.between(f"{part}.{of}", *ends) for of, ends in ranges.items()}
+            whole: Any = getattr(scenario, part) or _THIRD_CAR
+            scenario = replace(scenario, **{part: replace(whole, **values, **draws)})
         self._check_limits(scenario, driver)
         return Draw(
             scenario, driver, self.variants[numbers.variant] if self.variants else self.name
@@ -219,12 +209,11 @@ class Family:
                 f"{self.decel:g}; bound its body, or the driver and the actions"
             )
 
-    def __reduce__(self) -> Any:
+    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
         """From a file it is read anew in other processes, which do not know its functions."""
         if self.source:
             return read_family, (self.source, self.switches)
-        values = {part.name: getattr(self, part.name) for part in fields(self)}
-        return partial(type(self), **values), ()
+        return super().__reduce_ex__(protocol)
 
 
 def training(
@@ -255,17 +244,17 @@ def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
     return [family.draw(seed, index, split="test") for index in range(episodes)]
 
 
-# -- Switches -------------------------------------------------------------------------------------
 # The sizes are our own: what a production radar and brake system roughly show.
 
 
-#: What can be switched on in any family, by name: what of a part of its scenarios is changed.
-SWITCHES: Mapping[str, tuple[str, dict[str, float]]] = {
-    "noise": ("sensors", {"gap_noise": 0.5, "speed_noise": 0.3}),  # white, on all, at every step
-    "delay": ("sensors", {"delay": 0.2}),  # of what is seen
-    "actuator": ("body", {"delay": 0.2}),  # from a command to its effect
-    "jerk": ("body", {"jerk": 15.0}),
-    "third_car": ("behind", {}),  # at a gap that is drawn
+#: What can be switched on in any family, by name: what of a part of its scenarios is changed, to
+#: which values, and to values that are drawn from which ranges.
+SWITCHES: Mapping[str, tuple[str, dict[str, float], dict[str, tuple[float, float]]]] = {
+    "noise": ("sensors", {"gap_noise": 0.5, "speed_noise": 0.3}, {}),  # white, at every step
+    "delay": ("sensors", {"delay": 0.2}, {}),  # of what is seen
+    "actuator": ("body", {"delay": 0.2}, {}),  # from a command to its effect
+    "jerk": ("body", {"jerk": 15.0}, {}),
+    "third_car": ("behind", {}, {"gap": (10.0, 40.0)}),
 }
 
 
@@ -288,6 +277,9 @@ def _aggressive(lowest: float, desired_speed: float = 28.0) -> IDM:
 
 def _normal(lowest: float) -> IDM:
     return IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=lowest, highest=2.5)
+
+
+_THIRD_CAR = Behind(_normal(-6.0), gap=10.0)  # where that is switched on
 
 
 def _paper(numbers: Numbers) -> tuple[Scenario, IDM | ChangingIDM]:
@@ -515,9 +507,6 @@ FAMILIES: Mapping[str, MakeFamily] = {
 }
 
 
-# -- By name, or from a file ----------------------------------------------------------------------
-
-
 def load_family(name: str | PathLike[str]) -> Family:
     """A family by its name, or from a file.
 
@@ -546,19 +535,17 @@ def load_family(name: str | PathLike[str]) -> Family:
     """
     base, *switches = [str(name)] if Path(name).is_file() else str(name).split("+")
     if base in FAMILIES:
-        family = FAMILIES[base]()
-        return family.with_switches(switches) if switches else family
-    path = Path(base)
-    if path.suffix != ".py" or not path.is_file():
+        return FAMILIES[base]().with_switches(switches)
+    if not base.endswith(".py") or not Path(base).is_file():
         raise ValueError(
             f"there is no family {base!r}; there are {', '.join(FAMILIES)}, or name a file of "
             "Python that exists"
         )
-    return read_family(path, switches)
+    return read_family(base, switches)
 
 
-def read_family(path: str | Path, switches: Iterable[str] = ()) -> Family:
-    """The ``family`` that a file of Python defines."""
+def read_family(path: str | Path, switches: Sequence[str] = ()) -> Family:
+    """The ``family`` that a file of Python defines; a ValueError names the file."""
     try:
         definition = runpy.run_path(str(path)).get("family")
         if not isinstance(definition, Family):

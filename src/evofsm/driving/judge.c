@@ -5,7 +5,7 @@
   double before, commanded;              /* the latest two commands [m/s²] */
   double mean[3], spread[3][3];          /* where one most likely was, and how sure that is */
   double here[3], around[3][3];          /* the same now */
-  int is_located, is_located_now;        /* whether that is known */
+  int is_located;                        /* whether that is known */
   int revising, tries;
   double options[EVOFSM_OPTIONS], risk[EVOFSM_OPTIONS], critical[EVOFSM_OPTIONS];
 /* ==== source ==== */
@@ -84,7 +84,6 @@ static void locate(evofsm_state *s, const double now[3]) {
   } else {
     begin_at(s, now, is_sure);
   }
-  s->is_located_now = is_whole(s->here);
 }
 
 /* LatentRisk._cautious: closer by what is not sure about it. */
@@ -328,7 +327,7 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
 }
 
 static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
-  if (s->is_located_now) {
+  if (is_whole(s->here)) {
     s->is_located = 1;
     memcpy(s->mean, s->here, sizeof s->mean);
     memcpy(s->spread, s->around, sizeof s->spread);

@@ -1,17 +1,15 @@
 """Latent risk: how likely failure is after an action, even if one is cautious from then on.
 
-A failure is rare and its causes are long past when it comes, so counting failures says too little
-and too late. What leads to it can be learnt from every ordinary minute: how hard leaders brake
-(`leaders`) and how well one brakes oneself (`brakes`). An action is then *rehearsed*
+Failures are rare, but what leads to them can be learnt from every ordinary minute: how hard leaders
+brake (`leaders`) and how well one brakes oneself (`brakes`). An action is then *rehearsed*
 (`rehearsal`): it is taken, full braking follows, and the leader brakes. The hardest braking of the
 leader that still ends well is the critical deceleration, and the latent risk is the probability
 that the leader brakes harder than that. A situation is a dead end where, if the leader braked hard
 now, even braking in full at once would be too late; while it does not, that can still be left.
 
-It is left *in proportion*. What could begin is answered by a comfortable deceleration at most.
-Harder braking answers what is seen: it is the least that avoids the collision that is foreseen if
-the leader goes on as it does. A gap is safe where one may keep the speed for a decision; one that
-is not is to be so within a stated time.
+It is left *in proportion* (`LatentRisk.choose`). What could begin is answered by a comfortable
+deceleration at most. Harder braking answers what is seen: it is the least that avoids the collision
+that is foreseen if the leader goes on as it does.
 """
 
 from __future__ import annotations
@@ -58,16 +56,18 @@ _STANDS = 0.1
 _CAUTION = 2.5
 
 
-# -- What a file may hold -------------------------------------------------------------------------
-# No car is asked to brake harder [m/s²]; decisions are no closer nor farther apart [s].
-
+# What a file may hold: no car is asked to brake harder [m/s²], decisions are no closer nor farther
+# apart [s], and no braking that is seen so often is harder [m/s²].
 _ASKED, _SHORTEST_DT, _LONGEST_DT = 100.0, 1e-6, 1e6
+_MOST_BROUGHT = hardest_seen(_SHORTEST_DT)
 _ACCELERATION = Numbers(least=SMALLEST, most=_ASKED)
+_BROUGHT = Numbers(least=-_MOST_BROUGHT, most=_MOST_BROUGHT)
+_SHORTFALL = Numbers(least=-2.0 * _MOST_BROUGHT - _ASKED, most=2.0 * _MOST_BROUGHT + _ASKED)
 _PRODUCT, _NOISE = Numbers(least=-1e300, most=1e300), Numbers(least=0.0, most=1e300)
 _RISK = Kind(
     "risk",
     {
-        "brakes": Numbers(("samples",)),
+        "brakes": _BROUGHT.of("samples"),
         "stretches": FLAG.of("samples"),
         "decels": Numbers(("decels",), SMALLEST, HARDEST),
         "gentle": COUNT.of(1),
@@ -75,8 +75,8 @@ _RISK = Kind(
         "noise_gap": _NOISE.of("gaps"),
         "noise_speed": _NOISE.of("speeds"),
         "noise_leader": _NOISE.of("leaders"),
-        "doubts_brought": Numbers(("brought",)),
-        "doubts_shortfalls": Numbers(("shortfalls",)),
+        "doubts_brought": _BROUGHT.of("brought"),
+        "doubts_shortfalls": _SHORTFALL.of("shortfalls"),
     },
     {
         "lowest": Numbers(least=-_ASKED, most=-SMALLEST),
@@ -87,16 +87,6 @@ _RISK = Kind(
         "margin": SIZE,
     },
 )
-
-
-def _refuse_other_brakes(dt: float, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Raise for braking that could not have been seen at this interval of time."""
-    most = hardest_seen(dt)
-    brought = Numbers(("n",), -most, most)
-    brought.refuse_others("brakes", arrays["brakes"])
-    brought.refuse_others("doubts_brought", arrays["doubts_brought"])
-    short = Numbers(("n",), -2.0 * most - _ASKED, 2.0 * most + _ASKED)
-    short.refuse_others("doubts_shortfalls", arrays["doubts_shortfalls"])
 
 
 class LatentRisk(Retraced, LearningJudge):
@@ -186,8 +176,6 @@ class LatentRisk(Retraced, LearningJudge):
         risk.brakes.trust(positive("decel", decel))
         return risk
 
-    # -- Learning -------------------------------------------------------------------------------
-
     def learn(
         self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
     ) -> None:
@@ -276,8 +264,6 @@ class LatentRisk(Retraced, LearningJudge):
             f"{self.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {brakes}"
         )
 
-    # -- Judging --------------------------------------------------------------------------------
-
     def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
         """Latent risk of each acceleration that could be commanded now [m/s²].
 
@@ -325,7 +311,7 @@ class LatentRisk(Retraced, LearningJudge):
 
         The closest one down to ``comfort`` that is tolerable, or that `foresee` says regains a safe
         gap within ``regain``; ``comfort`` where there is none, and harder only as far as it takes
-        to avoid the collision that is foreseen. In a smaller gap one never brakes less.
+        to avoid the collision that is foreseen.
         """
         here = self._cautious(situation.observation)
         if not is_whole(here):
@@ -440,13 +426,19 @@ class LatentRisk(Retraced, LearningJudge):
         )
         return Part(Path(__file__).with_suffix(".c"), 3, {"OPTIONS": len(lowest)}, constants, about)
 
-    # -- Keeping it -----------------------------------------------------------------------------
-
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt, and what it learnt from for people, to a file (`evofsm.store`)."""
         settings = {**self._settings, "own_brakes": self.brakes.assumed}
-        learnt = self._learnt()
-        _refuse_other_brakes(self.dt, learnt)
+        full = np.array(self.brakes.full, np.float64).reshape(-1, 2)
+        learnt = {
+            "decels": np.array(self.manoeuvres.decels),
+            "gentle": np.array([self.manoeuvres.gentle], np.float64),
+            **{"brakes": full[:, 0], "stretches": full[:, 1]},
+            **self.perception.learnt(),
+            "lagged": np.array(self.brakes.lagged),
+            "doubts_brought": np.ravel(np.array(self.brakes.brought, np.float64)),
+            "doubts_shortfalls": np.ravel(np.array(self.brakes.shortfalls, np.float64)),
+        }
         store.write(path, _RISK, settings, learnt, provenance)
 
     @classmethod
@@ -454,7 +446,6 @@ class LatentRisk(Retraced, LearningJudge):
         """Read what was learnt, between two episodes."""
         settings, arrays = store.read(path, _RISK)
         with store.explained(path):
-            _refuse_other_brakes(settings["dt"], arrays)
             risk = cls(**settings)
             risk.manoeuvres.remember(*arrays["decels"].tolist())
             risk.manoeuvres.gentle = int(arrays["gentle"][0])
@@ -470,18 +461,6 @@ class LatentRisk(Retraced, LearningJudge):
     @property
     def _settings(self) -> dict[str, float]:
         return {name: getattr(self, name) for name in _RISK.settings}
-
-    def _learnt(self) -> dict[str, NDArray[np.float64]]:
-        return {
-            "decels": np.array(self.manoeuvres.decels),
-            "gentle": np.array([self.manoeuvres.gentle], dtype=np.float64),
-            "brakes": np.array([value for value, _ in self.brakes.full], np.float64),
-            "stretches": np.array([begins for _, begins in self.brakes.full], np.float64),
-            **self.perception.learnt(),
-            "lagged": np.array(self.brakes.lagged),
-            "doubts_brought": np.ravel(np.array(self.brakes.brought, np.float64)),
-            "doubts_shortfalls": np.ravel(np.array(self.brakes.shortfalls, np.float64)),
-        }
 
 
 def effective(speed: float, actions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -513,9 +492,6 @@ def in_proportion(
     return None
 
 
-# -- Of states ----------------------------------------------------------------------------------
-
-
 def dead_ends_of(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[int]:
     """States at whose centre a hard brake of the leader more likely than not ends in failure.
 
@@ -531,9 +507,6 @@ def dead_ends_of(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[int]:
     critical = [risk.critical(center, [risk.lowest])[0] for center in known.centers]
     indices: list[int] = np.flatnonzero(risk.manoeuvres.harder(critical) > 0.5).tolist()
     return indices
-
-
-# -- Numbers ------------------------------------------------------------------------------------
 
 
 def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:

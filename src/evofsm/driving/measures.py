@@ -73,9 +73,6 @@ class _ShortTime(_Measure):
         raise NotImplementedError
 
 
-# -- Time to collision ----------------------------------------------------------------------------
-
-
 def time_to_collision(observations: Floats) -> Floats:
     """Gap over closing speed [s]: until the cars meet if both kept their speed (Hayward 1972).
 
@@ -148,9 +145,6 @@ class TimeHeadway(_ShortTime):
         return time_headway(observations)
 
 
-# -- Needed braking -------------------------------------------------------------------------------
-
-
 def deceleration_to_avoid_collision(observations: Floats) -> Floats:
     """Braking with which a leader that keeps its speed is just avoided [m/s²].
 
@@ -177,9 +171,6 @@ class DecelerationToAvoidCollision(_Measure):
     def score(self, observations: Floats, dt: float) -> Floats:
         """Needed deceleration − threshold [m/s²]; infinite where the cars have met."""
         return deceleration_to_avoid_collision(observations) - self.threshold
-
-
-# -- Safe distances -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -279,9 +270,6 @@ class PerformanceModel(_Measure):
         return _unsafe_once_met(gap, distance - gap)
 
 
-# -- Fuzzy safety ---------------------------------------------------------------------------------
-
-
 def _membership(gap: Floats, unsafe: Floats, safe: Floats) -> Floats:
     """1 below ``unsafe``, 0 from ``safe`` on, and linear in between."""
     member = np.asarray(gap < unsafe, dtype=np.float64)
@@ -367,9 +355,6 @@ FIXED_MEASURES: Mapping[str, RiskMeasure] = {
     "r157-careful": PerformanceModel.careful_human(),
     "fuzzy": FuzzySafety(),
 }
-
-
-# -- The truth ------------------------------------------------------------------------------------
 
 
 def is_dead_end(observations: Floats, decel: float, leader_decel: float) -> NDArray[np.bool_]:

@@ -140,9 +140,6 @@ def is_whole(observation: Three) -> bool:
     return not isnan(gap + speed + leader)
 
 
-# -- The filter ---------------------------------------------------------------------------------
-
-
 @compiled
 def _diagonal(deviations: Three) -> Matrix:
     gap, speed, leader = deviations
@@ -198,9 +195,6 @@ def _filtered(
         (spread[1, 0], spread[1, 1], spread[1, 2]),
         (spread[2, 0], spread[2, 1], spread[2, 2]),
     )
-
-
-# -- The noise ----------------------------------------------------------------------------------
 
 
 class _Sizes:

@@ -2,11 +2,8 @@
 
 The follower does what is asked of it for one decision interval and then brakes in full; the leader
 brakes from now on until it stands. The *critical deceleration* is the hardest braking of the leader
-that ends without a collision. Asking for the fixed cautious policy, and not for the best of many
-uncertain answers, keeps luck out of the estimate.
-
-What leaders could do is not what they do. `foresee` asks what comes of an action if the leader goes
-on as it is seen, and whether the gap is safe again some seconds later.
+that ends without a collision. `foresee` asks what comes of an action if the leader goes on as it is
+seen, and whether the gap is safe again some seconds later.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -17,23 +17,16 @@ from typing import Any
 
 from evofsm.driving.scenarios import Scenario
 from evofsm.driving.world import (
-    ACCELERATION_BEHIND,
+    ACCELERATIONS,
     GAP,
     GAP_BEHIND,
-    LEADER_ACCELERATION,
-    LEADER_SPEED,
-    REALISED,
-    SPEED,
-    SPEED_BEHIND,
+    SPEEDS,
     KinematicWorld,
     Road,
     World,
     decide,
 )
 from evofsm.extras import needs
-
-#: The worlds there are.
-WORLDS = ("sumo", "kinematic")
 
 _CARS = ["follower", "leader", "behind"]
 
@@ -110,13 +103,15 @@ class SumoWorld(World, AbstractContextManager["SumoWorld"]):
                 sumo.close()
 
 
+#: The worlds there are.
+WORLDS: Mapping[str, type[World]] = {"sumo": SumoWorld, "kinematic": KinematicWorld}
+
+
 def open_world(name: str) -> World:
     """A world by its name, one of `WORLDS`."""
-    if name == "sumo":
-        return SumoWorld()
-    if name == "kinematic":
-        return KinematicWorld()
-    raise ValueError(f"there is no world {name!r}; there are {', '.join(WORLDS)}")
+    if name not in WORLDS:
+        raise ValueError(f"there is no world {name!r}; there are {', '.join(WORLDS)}")
+    return WORLDS[name]()
 
 
 def _refuse_what_sumo_cannot_drive(scenario: Scenario) -> None:
@@ -148,9 +143,8 @@ class _Road(Road):
         super().__init__(scenario)
         self._sumo = sumo
         self._cars = _CARS if scenario.behind else _CARS[:2]
-        start, record = _start(scenario), self._record[0]
+        start, speeds = _start(scenario), self._record[0, SPEEDS].tolist()
         starts = start, start + scenario.initial_gap + _VEHICLE_LENGTH, _FIRST_PLACE
-        speeds = record[[SPEED, LEADER_SPEED, SPEED_BEHIND]].tolist()
         for car, position, speed in zip(self._cars, starts, speeds, strict=False):
             # Standing, as SUMO does not insert a car that is too fast for the one ahead.
             sumo.vehicle.add(
@@ -168,9 +162,8 @@ class _Road(Road):
             decide(self._plan, self._record, self.row, command)
             if self.over:
                 break
-            did = self._record[self.row, [REALISED, LEADER_ACCELERATION, ACCELERATION_BEHIND]]
-            vehicle = self._sumo.vehicle
-            for car, acceleration in zip(self._cars, did.tolist(), strict=False):
+            vehicle, accelerations = self._sumo.vehicle, self._record[self.row, ACCELERATIONS]
+            for car, acceleration in zip(self._cars, accelerations.tolist(), strict=False):
                 speed = max(0.0, vehicle.getSpeed(car) + acceleration * self.scenario.dt)
                 vehicle.setSpeed(car, speed)
             self._sumo.simulationStep()
@@ -189,9 +182,8 @@ class _Road(Road):
     def _observe(self) -> None:
         vehicle, now = self._sumo.vehicle, self._record[self.row]
         position = [vehicle.getLanePosition(car) for car in self._cars]
+        now[SPEEDS[: len(position)]] = [vehicle.getSpeed(car) for car in self._cars]
         now[GAP] = position[1] - _VEHICLE_LENGTH - position[0]
         now[GAP_BEHIND] = math.inf
-        now[SPEED], now[LEADER_SPEED] = (vehicle.getSpeed(car) for car in self._cars[:2])
         if self.scenario.behind is not None:
             now[GAP_BEHIND] = position[0] - _VEHICLE_LENGTH - position[2]
-            now[SPEED_BEHIND] = vehicle.getSpeed(self._cars[2])

@@ -1,9 +1,8 @@
 """Many cars instead of one leader: a scene of objects, its pairs, and a judge of the worst of them.
 
-Every pair is one car behind another, with a gap and two speeds. Whoever is ahead, cuts in or
-crosses is a leader, and each is rehearsed as the one leader of `LatentRisk`. For whoever is behind,
-oneself is the leader: by the same rehearsal, in which it keeps its speed until it has reacted, own
-braking that is harder than it survives ends in a collision that one has caused.
+Whoever is ahead, cuts in or crosses is a leader, and each is rehearsed as the one leader of
+`LatentRisk`. For whoever is behind, oneself is the leader: by the same rehearsal, in which it keeps
+its speed until it has reacted, own braking that is harder than it survives ends in a collision.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import Enum
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -44,9 +44,6 @@ _BEHIND, _REACTION = 4.5, 1.0
 _COASTING, _ONE = np.zeros(1), np.ones(1)
 # Where one's own speed stands in the rows of a scene.
 _SPEED = COLUMNS.index("vx")
-
-
-# -- Scenes -------------------------------------------------------------------------------------
 
 
 class Object(NamedTuple):
@@ -150,9 +147,6 @@ def _pair(ego: list[float], obj: list[float], index: int) -> Pair | None:
     return Pair(Role.CROSSING if crosses else role, index, gap, ego[3], max(vx, 0.0), braking)
 
 
-# -- The judge ----------------------------------------------------------------------------------
-
-
 class TrafficRisk(ActionJudge):
     """Judges accelerations among any number of objects, as the worst of the pairs with them.
 
@@ -162,8 +156,7 @@ class TrafficRisk(ActionJudge):
     Parameters
     ----------
     ahead : LatentRisk
-        Judges each pair in which oneself is the follower. The braking it counts on may be softer
-        than what is possible, so that one brakes early.
+        Judges each pair in which oneself is the follower.
 
     Notes
     -----
@@ -201,14 +194,9 @@ class TrafficRisk(ActionJudge):
         actions = np.ascontiguousarray(actions, np.float64)
         zeros = np.zeros(len(actions))
         worst: Judgement | None = None
-        self.worst, hardest, limit = None, -float(actions.min()), math.inf
-        follower = None
-        for pair in pairs_of(situation.observation):
+        self.worst, hardest, pairs = None, -float(actions.min()), pairs_of(situation.observation)
+        for pair in pairs:
             if pair.role is Role.BEHIND:
-                # Who does not brake is hit by nobody that it has to mind.
-                bound = self._survived(pair) if hardest > 0.0 else math.inf
-                if bound < limit:
-                    limit, follower = bound, pair
                 continue
             here = Situation(pair.observation, _ONE, None, math.nan, 0.0)
             judgement = self.ahead.judge(here, actions)
@@ -217,6 +205,8 @@ class TrafficRisk(ActionJudge):
             worst = judgement if worst is None else _worse(worst, judgement)
         if worst is None:
             worst = Judgement(zeros, zeros, zeros, zeros + math.inf, 0.0)
+        # Who does not brake is hit by nobody that it has to mind.
+        limit, follower = self._survived(pairs) if hardest > 0.0 else (math.inf, None)
         if hardest <= limit:
             return worst
         hit = np.where(actions < -limit, 1.0, 0.0)
@@ -224,9 +214,11 @@ class TrafficRisk(ActionJudge):
             self.worst = follower
         return _worse(worst, Judgement(hit, hit, hit, zeros + math.inf, 0.0))
 
-    def _survived(self, pair: Pair) -> float:
-        """The hardest braking of oneself that who is behind survives [m/s²]."""
-        return float(self._behind.critical(pair.observation, _COASTING)[0])
+    def _survived(self, pairs: Sequence[Pair]) -> tuple[float, Pair | None]:
+        """The hardest braking of oneself that all behind survive [m/s²], and who survives least."""
+        behind = [pair for pair in pairs if pair.role is Role.BEHIND]
+        limits = [float(self._behind.critical(pair.observation, _COASTING)[0]) for pair in behind]
+        return min(zip(limits, behind, strict=True), key=itemgetter(0), default=(math.inf, None))
 
     def choose(
         self,
@@ -237,16 +229,14 @@ class TrafficRisk(ActionJudge):
     ) -> tuple[int, str] | None:
         """Index of the acceleration that is in proportion ahead and survived behind, and why."""
         avoids, regains = np.ones((2, len(options)), np.bool_)
-        limit = math.inf
-        for pair in pairs_of(situation.observation):
-            if pair.role is Role.BEHIND:
-                limit = min(limit, self._survived(pair))
-                continue
-            pair_arguments = pair[2:5], pair.braking, options, tolerances[-1]
-            two = self.ahead._foreseen(*pair_arguments, hardest=-float(options.min()))
-            avoids, regains = avoids & two[0], regains & two[1]
+        pairs = pairs_of(situation.observation)
+        for pair in pairs:
+            if pair.role is not Role.BEHIND:
+                pair_arguments = pair[2:5], pair.braking, options, tolerances[-1]
+                two = self.ahead._foreseen(*pair_arguments, hardest=-float(options.min()))
+                avoids, regains = avoids & two[0], regains & two[1]
         avoids &= options <= options[0]
-        bearable = options >= -limit
+        bearable = options >= -self._survived(pairs)[0]
         arguments = options, judged.risk, tolerances, self.ahead.comfort, avoids & bearable, regains
         if (choice := in_proportion(*arguments)) is not None:
             return choice
@@ -270,7 +260,7 @@ class TrafficRisk(ActionJudge):
             return "nobody is near"
         text = f"object {pair.number}, {pair.role.value}"
         if pair.role is Role.BEHIND:
-            return f"{text}, survives no braking harder than {self._survived(pair):.1f} m/s²"
+            return f"{text}, survives no braking harder than {self._survived([pair])[0]:.1f} m/s²"
         return f"{text}: {self.ahead.why(judged)}"
 
     def refuse_unfit(self, low: Action, high: Action) -> None:

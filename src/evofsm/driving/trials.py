@@ -1,8 +1,4 @@
-"""Episodes of cars under a guard, and what came of them: collisions, distance, comfort.
-
-All that drives cars goes through `drive`, which is the loop of `evofsm.guard.run_episode` on a
-road.
-"""
+"""Episodes of cars under a guard, and what came of them: collisions, distance, comfort."""
 
 from __future__ import annotations
 
@@ -74,9 +70,6 @@ def teach(guard: Guard, draws: Iterable[Draw]) -> list[Episode]:
     return [drive(guard, draw) for draw in draws]
 
 
-# -- What came of an episode ----------------------------------------------------------------------
-
-
 class Reference(NamedTuple):
     """How far the unrevised controller came in a draw, and until when that counts."""
 
@@ -109,7 +102,7 @@ def reference_of(family: Family, draw: Draw, world: World | None = None) -> Refe
     Parameters
     ----------
     family, draw, world
-        Of whom, where, and in which world, as in `drive`.
+        As in `drive`.
     """
     alone = drive(unrevised_guard(family), draw, world)
     brake = -draw.scenario.leader.brake_decel
@@ -168,9 +161,6 @@ def try_out(
     frozen.freeze()
     alone = alone or [reference_of(family, draw) for draw in draws]
     return [outcome_of(*pair) for pair in zip(teach(frozen, draws), alone, strict=True)]
-
-
-# -- What came of many ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ agree within 1e-9 at every step.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -29,13 +28,13 @@ RUN_COLUMNS = (
 )
 GAP, SPEED, LEADER_SPEED, GAP_BEHIND, SPEED_BEHIND = range(5)
 COMMANDED, REALISED, LEADER_ACCELERATION, ACCELERATION_BEHIND = range(5, 9)
+#: Columns of the follower, the leader and the car behind.
+SPEEDS = [SPEED, LEADER_SPEED, SPEED_BEHIND]
+ACCELERATIONS = [REALISED, LEADER_ACCELERATION, ACCELERATION_BEHIND]
 # Actions that differ by less are the same [m/s²].
 _SAME_ACTION = 1e-9
 
 Drives = Controller | Callable[[NDArray[np.float64]], float | Proposal]
-
-
-# -- What was driven ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +85,6 @@ class Episode:
         """(D,) ndarray: where the proposal was not executed, or was none that could be."""
         change = np.abs(self.executed - self.proposed)
         return np.asarray(~(change <= _SAME_ACTION))  # also true of NaN
-
-
-# -- How cars move --------------------------------------------------------------------------------
 
 
 class Plan(NamedTuple):
@@ -203,9 +199,6 @@ def advance(
     return row
 
 
-# -- A run under way ------------------------------------------------------------------------------
-
-
 class Road:
     """Cars under way in one run of a scenario, in closed form.
 
@@ -223,7 +216,7 @@ class Road:
         deviation = np.array([sensors.gap_noise, sensors.speed_noise, sensors.speed_noise])
         noise = np.random.default_rng(sensors.seed)  # what the sensors add
         self._noise = noise.normal(scale=deviation, size=size) if deviation.any() else None
-        self._delay = scenario.steps(scenario.sensors.delay)
+        self._delay = scenario.steps(sensors.delay)
         behind, start = scenario.behind, self._record[0]
         start[GAP], start[GAP_BEHIND] = scenario.initial_gap, behind.gap if behind else math.inf
         start[SPEED] = start[SPEED_BEHIND] = scenario.initial_speed
@@ -258,11 +251,6 @@ class Road:
         """Whether the follower has hit the leader."""
         return bool(self._record[self.row, GAP] <= 0.0)
 
-    @property
-    def rear_ended(self) -> bool:
-        """Whether the car behind has hit the follower."""
-        return bool(self._record[self.row, GAP_BEHIND] <= 0.0)
-
     def episode(self, first: int = 0) -> Episode:
         """What was recorded so far, from a row on."""
         rows = slice(first, self.row + 1)
@@ -286,16 +274,16 @@ class Road:
             "failed": failed,
             "realised": (self._record[self.row, SPEED] - speed) / seconds if seconds else math.nan,
         }
-        terminated = failed or self.rear_ended
+        terminated = failed or bool(self._record[self.row, GAP_BEHIND] <= 0.0)
         return self.observation, 0.0, terminated, self.over and not terminated, outcome
 
 
-class World(ABC):
-    """A place to drive in."""
+class World:
+    """A place to drive in: if not told otherwise in closed form, by SUMO's ballistic update."""
 
-    @abstractmethod
     def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
         """Put the cars on a road, for use in a ``with`` statement."""
+        return nullcontext(Road(scenario))
 
     def run(self, scenario: Scenario, controller: Drives, interval: float | None = None) -> Episode:
         """Drive the scenario with ``controller`` in the follower.
@@ -318,12 +306,5 @@ class World(ABC):
             return road.episode()
 
 
-# -- In closed form -------------------------------------------------------------------------------
-
-
 class KinematicWorld(World):
-    """The closed-form world: points on a line, by SUMO's ballistic update."""
-
-    def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
-        """Put the cars on a road, for use in a ``with`` statement."""
-        return nullcontext(Road(scenario))
+    """The world in closed form: points on a line."""

@@ -1,7 +1,6 @@
 """The guard beside any controller: it judges what is proposed, revises, learns, and writes it down.
 
-The paper's Section 4: a controller proposes, a reviser improves, a machine learns. Nothing here
-knows who the controller is or where it drives.
+Nothing here knows who the controller is or where it drives.
 """
 
 from __future__ import annotations

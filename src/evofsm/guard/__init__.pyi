@@ -16,6 +16,7 @@ from .api import Search as Search
 from .api import Situation as Situation
 from .audit_log import AuditLog as AuditLog
 from .audit_log import Head as Head
+from .audit_log import audit as audit
 from .foresight import Foresight as Foresight
 from .guard import DecisionLogger as DecisionLogger
 from .guard import Guard as Guard
@@ -26,7 +27,6 @@ from .learnt.state import LearntSettings as LearntSettings
 from .loop import Decision as Decision
 from .loop import run_episode as run_episode
 from .pettingzoo import RevisedAgents as RevisedAgents
-from .replay import audit as audit
 from .reviser import ActionReviser as ActionReviser
 from .reviser import Mode as Mode
 from .reviser import is_spoken as is_spoken

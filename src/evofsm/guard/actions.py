@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, TypeAlias
@@ -92,7 +91,10 @@ class BoxActions:
 
     def __post_init__(self) -> None:
         for name in ("low", "high"):
-            object.__setattr__(self, name, _finite(name, getattr(self, name)))
+            array = real_array(name, getattr(self, name), 1)
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} is {tuple(array.tolist())}; it must be finite")
+            object.__setattr__(self, name, tuple(array.tolist()))
         if len(self.low) != len(self.high):
             raise ValueError(
                 f"low has {len(self.low)} components and high has {len(self.high)}; an action has "
@@ -122,16 +124,12 @@ class BoxActions:
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """(2, d) the lowest and the highest value of each component."""
-        bounds = np.array([self.low, self.high])
-        bounds.setflags(write=False)
-        return bounds
+        return np.array([self.low, self.high])
 
     @cached_property
     def half(self) -> NDArray[np.float64]:
         """(d,) ndarray: half the range of each component."""
-        half: NDArray[np.float64] = 0.5 * (self.bounds[1] - self.bounds[0])
-        half.setflags(write=False)
-        return half
+        return np.asarray(0.5 * (self.bounds[1] - self.bounds[0]))
 
     @cached_property
     def cells(self) -> NDArray[np.float64]:
@@ -139,19 +137,15 @@ class BoxActions:
 
         After them stand the corners of the whole box, cells of no width.
         """
-        edges = [
-            np.linspace(low, high, count + 1).tolist()
-            for low, high, count in zip(self.low, self.high, self.levels, strict=True)
-        ]
+        components = zip(self.low, self.high, self.levels, strict=True)
+        edges = [np.linspace(low, high, count + 1).tolist() for low, high, count in components]
         sides = [list(itertools.pairwise(axis)) for axis in edges]
         ends = [
             [(axis[0], axis[0]), (axis[-1], axis[-1])] if len(axis) > 2 else [(axis[0], axis[-1])]
             for axis in edges
         ]
         boxes = [*itertools.product(*sides), *itertools.product(*ends)]
-        cells = np.ascontiguousarray(np.moveaxis(np.array(boxes), 2, 0))
-        cells.setflags(write=False)
-        return cells
+        return np.ascontiguousarray(np.moveaxis(np.array(boxes), 2, 0))
 
     def clip(self, action: ArrayLike) -> NDArray[np.float64]:
         """(..., d) ndarray: the actions of the set that are closest; NaN stays."""
@@ -283,10 +277,3 @@ def nearest_bounds(actions: ActionSet) -> tuple[NDArray[np.float64], NDArray[np.
     highest[:-1] = np.nextafter(highest[:-1], -math.inf)
     low, high = actions.low, actions.high
     return np.array([low, *lowest, low, high]), np.array([high, *highest, low, high])
-
-
-def _finite(name: str, values: Sequence[float]) -> tuple[float, ...]:
-    array = real_array(name, values, 1)
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} is {tuple(array.tolist())}; it must be finite")
-    return tuple(array.tolist())

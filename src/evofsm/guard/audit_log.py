@@ -5,6 +5,10 @@ the SHA-256 of the line up to the comma before it, and ``previous`` that of the 
 for the first): a hash chain as in Haber and Stornetta (J. Cryptology 3, 1991). A row of ``before``
 is ``[time, observation]``, with the proposal after that if there was one, and with its mask if it
 had one.
+
+An audit also decides again, without a world: what was observed and proposed is told to the guard
+that the log began with, and each decision must come out as it was recorded, to the last bit. So
+neither a forged decision nor a forged model hides behind a chain that was made anew.
 """
 
 from __future__ import annotations
@@ -18,12 +22,14 @@ import os
 import platform
 import stat
 import sys
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
 from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple, Self
 
 import numba
@@ -33,24 +39,26 @@ from numpy.typing import NDArray
 import evofsm
 from evofsm import store
 from evofsm.fsm.sharing import Rollback
-from evofsm.guard.actions import written
+from evofsm.guard.actions import checked_mask, written
 from evofsm.guard.api import Proposal, Revision, Situation
 from evofsm.guard.guard import DecisionLogger, Guard
 from evofsm.guard.loop import Decision
-from evofsm.guard.parts import can_be_made_again, settings_of
+from evofsm.guard.parts import can_be_made_again, set_again, settings_of
 from evofsm.guard.record import RECORD
 from evofsm.guard.reviser import is_spoken
 
 _log = logging.getLogger(__name__)
 
 LOG_VERSION = 1
+#: What may be changed about a guard between episodes.
+SETTINGS = ("explaining", "interval", "learn", "shadow")
 # Most probable states of a belief that are written; decisions that are held back at most, which a
 # kill loses; and bytes of a line, which holds a machine at most.
 _STATES, _MOST_QUIET, _LONGEST_LINE = 3, 240, 1 << 26
 _SEAL, _LINE_END = b',"hash":"', b'"}\n'
 # How a log begins: so a half-written one is told from other people's files.
 _ABOUT = "evofsm audit log"
-_OPENING = b'{"about":"evofsm audit log",'
+_OPENING = f'{{"about":"{_ABOUT}",'.encode()
 # What a decision tells as it is recorded elsewhere, too.
 _TOLD = tuple(name for name in RECORD if name not in ("time", "n_states", "risk_low", "risk_high"))
 #: The names in a record of each kind, beside ``kind`` and ``clock``.
@@ -62,9 +70,6 @@ FIELDS: Mapping[str, set[str]] = {
     "settings": {"settings"},
     "end": {"before", "failed", "learnt", "observation", "score", "terminated"},
 }
-
-
-# -- Records --------------------------------------------------------------------------------------
 
 
 def canonical(content: Any) -> str:
@@ -147,9 +152,6 @@ def unseal(line: bytes) -> Record | None:
         return None
     whole = type(number) is int and isinstance(previous, str)
     return Record(number, previous, digest, content) if whole else None
-
-
-# -- The chain ------------------------------------------------------------------------------------
 
 
 class Field(NamedTuple):
@@ -247,9 +249,6 @@ def _against(kept: Head, head: Head) -> Finding:
     return Finding(number, why)
 
 
-# -- Logging --------------------------------------------------------------------------------------
-
-
 class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
     """Logs what a guard decides, so that nobody can change it unnoticed: ``Guard(..., audit=log)``.
 
@@ -259,8 +258,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
     Parameters
     ----------
     path : Path
-        A file that is there is gone on with; a half-written end, as of a process that was killed,
-        is cut off.
+        A file that is there is gone on with; a half-written end is cut off.
     sync : {"record", "episode"}
         When records are forced onto the disk: each, before its action is executed, or those of an
         episode at its end, which takes no time while driving.
@@ -276,8 +274,8 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
     Notes
     -----
     Between the episodes of a log anything may teach machine or judge, during one nothing else may.
-    What a guard takes back, as after an interrupt (Ctrl-C), is taken back here, too. Where a
-    process forks, the log stays with the parent.
+    What a guard takes back is taken back here, too. Where a process forks, the log stays with the
+    parent.
 
     Examples
     --------
@@ -313,11 +311,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         except BaseException:
             self._file.close()
             raise
-
-    @property
-    def head(self) -> Head:
-        """The last record. Keep it elsewhere: it shows what is cut off or written anew later."""
-        return self._head
 
     def close(self) -> None:
         """Write what was held back; an OSError if that failed, now or before."""
@@ -355,7 +348,8 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         """An observation came in, at ``time`` [s]."""
         if self._guard is None:
             raise ValueError("the log was given to a guard within an episode; give it before one")
-        self._keep_seen()
+        if self._seen:  # nothing was proposed to what came in last
+            self._before.append(self._seen)
         self._seen = [float(time), observation.tolist()]
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
@@ -384,7 +378,9 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         """The episode ended; an OSError if something could not be written since it began."""
         if self._guard is None:
             return
-        self._keep_seen()
+        if self._seen:
+            self._before.append(self._seen)
+        self._seen = []
         self._learnt = sums_of(self._guard)
         last = None if observation is None else observation.tolist()
         before = self._take_before()
@@ -405,8 +401,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
 
         return rollback
 
-    # -- Writing ----------------------------------------------------------------------------------
-
     def _find_end(self) -> None:
         """Where the last whole record ends; a part of one after it is cut off."""
         chain = Chain(self.path)
@@ -424,19 +418,15 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
                 raise ValueError(f"{self.path} is no audit log; it was left alone")
             self._file.truncate(chain.size)
             _log.warning("%s: a half-written record was cut off", self.path)
-        self._head, self._size = chain.head, chain.size
+        #: The last record. Keep it elsewhere: it shows what is cut off or written anew later.
+        self.head: Head = chain.head
+        self._size = chain.size
 
     def _cut(self) -> None:
         """Cut off what was taken back, or is half of a record."""
         is_owner = os.getpid() == self._owner and not self._file.closed
         if is_owner and os.fstat(self._file.fileno()).st_size > self._size:
             self._file.truncate(self._size)
-
-    def _keep_seen(self) -> None:
-        """Nothing was proposed to what came in last."""
-        if self._seen:
-            self._before.append(self._seen)
-            self._seen = []
 
     def _flush(self) -> None:
         if self._before:
@@ -450,7 +440,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         if self._failure is not None:
             return
         clock = datetime.now(UTC).isoformat()
-        line, head = seal({"kind": kind, "clock": clock, **content}, self._head)
+        line, head = seal({"kind": kind, "clock": clock, **content}, self.head)
         try:
             if os.getpid() != self._owner:
                 why = "the log belongs to the process that opened it; a child of that needs its own"
@@ -464,7 +454,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
                 self._cut()
             self._fail(error)
             return
-        self._head, self._size = head, self._size + len(line)
+        self.head, self._size = head, self._size + len(line)
         self._force("record")
 
     def _force(self, what: str = "episode") -> None:
@@ -520,13 +510,8 @@ def _start(guard: Guard) -> dict[str, Any]:
 
 def settings_now(guard: Guard) -> dict[str, Any]:
     """What may be changed between episodes; and, of the reviser, while driving."""
-    return {
-        "explaining": guard.explaining,
-        "interval": guard.interval,
-        "learn": guard.learn,
-        "reviser": settings_of(guard.reviser),
-        "shadow": guard.shadow,
-    }
+    settings = {name: getattr(guard, name) for name in SETTINGS}
+    return {**settings, "reviser": settings_of(guard.reviser)}
 
 
 def sums_of(guard: Guard) -> dict[str, float]:
@@ -560,3 +545,255 @@ def _plain(kind: type, value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return written(value)
     return None if value is None else kind(value)
+
+
+# -- Auditing -------------------------------------------------------------------------------------
+
+# What a record that someone made up may run into.
+_NONSENSE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
+_NO_FUNCTION = (
+    "the guard was given a function that says where it fails, and no log holds code; give it as "
+    "failed (--failed MODULE:FUNCTION)"
+)
+# Where there is a decision logger, decisions that speak are explained.
+_DEAF: Any = SimpleNamespace(
+    **dict.fromkeys(("begin", "seen", "decided", "ended"), lambda *told, **rest: None)
+)
+_Failed = Callable[[NDArray[np.float64]], bool]
+
+
+class Contents(NamedTuple):
+    """What a log holds."""
+
+    sessions: int  #: times that the guard was written down
+    episodes: int
+    decisions: int
+    spoke: int  #: decisions that changed something or raised an alarm
+    settings: int  #: times that settings were changed while driving
+
+
+class Audit(NamedTuple):
+    """All that is found out about a log."""
+
+    head: Head  #: the last record up to which it is what was written
+    half_written: int  #: what a last line without an end holds, as after a crash [byte]
+    finding: Finding | None  #: None where nothing was tampered with
+    contents: Contents  #: of the records up to there
+    replayed: int  #: decisions that came out as they were recorded
+    difference: Finding | None  #: the first record that does not come out again
+    not_replayed: tuple[str, ...]  #: why not, of each session that could not be
+    other_makers: tuple[Field, ...]  #: what computed then and what does now, where that differs
+
+    @property
+    def is_good(self) -> bool:
+        """Whether nothing was tampered with, and nothing came out otherwise."""
+        return self.finding is None and self.difference is None
+
+
+def audit(path: Path, kept: Head | None = None, *, failed: _Failed | None = None) -> Audit:
+    """Verify the chain of a log and the form of its records, and decide again.
+
+    Parameters
+    ----------
+    path : Path
+        A log that is being written is audited up to where it is now.
+    kept : Head, optional
+        A head that was kept elsewhere.
+    failed : callable, optional
+        As the guard had it. No log holds code: without it episodes of a guard that was told by a
+        function where it fails are not replayed, which is said.
+
+    Raises
+    ------
+    OSError, ValueError
+        If the file cannot be read, or is no audit log.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from evofsm.driving import guard_for_cars
+    >>> from evofsm.guard import AuditLog
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "audit.jsonl"
+    ...     with AuditLog(path) as log:
+    ...         guard = guard_for_cars(low=-2.5, high=2.5, audit=log)
+    ...         revision = guard.decide([9.0, 20.0, 10.0], proposal=1.0)
+    ...     forged = path.read_text().replace('"executed":-2.5', '"executed":2.5')
+    ...     _ = path.write_text(forged)
+    ...     audit(path).finding
+    Finding(record=3, explanation='record 3 was altered: its hash is not that of what it says', \
+fields=())
+    """
+    chain, counts, player = Chain(path, kept), Counter[str](), _Player(failed)
+    fault = difference = None
+    for record in chain.records():
+        fault = _misfit(record, started=counts["start"] > 0)
+        if fault is not None:
+            break
+        kind, before = record.content["kind"], record.content.get("before", ())
+        counts[kind] += 1
+        counts["all decisions"] += len(before) + (kind == "decision")
+        if difference is None:
+            difference = player.play(record)
+    fault = fault or chain.finding
+    if chain.head == NOTHING and fault is None:
+        raise ValueError(f"{path} is no audit log, or no record of it was finished")
+    names = "start", "begin", "all decisions", "decision", "settings"
+    return Audit(
+        head=chain.head,
+        half_written=chain.half_written,
+        finding=fault,
+        contents=Contents(*(counts[name] for name in names)),
+        replayed=player.decisions,
+        difference=difference,
+        not_replayed=tuple(player.not_replayed),
+        other_makers=tuple(player.other_makers.values()),
+    )
+
+
+def _misfit(record: Record, *, started: bool) -> Finding | None:
+    """What no log holds: a chain says nothing about it, nor does replaying."""
+    content = record.content
+    kind, version = content.get("kind"), content.get("version", LOG_VERSION)
+    why = ""
+    if not isinstance(kind, str) or kind not in FIELDS:
+        why = f"there is no kind {str(kind)[:40]!r}"
+    elif type(version) is not int or version != LOG_VERSION:
+        why = f"its version is {version!r}, not {LOG_VERSION} (did a newer evofsm write it?)"
+    elif kind != "start" and not started:
+        why = "it comes before the guard that decides"
+    elif names := sorted((FIELDS[kind] | {"kind", "clock"}) ^ content.keys()):
+        has = "has" if names[0] in content else "lacks"
+        why = f"a record of kind {kind!r} {has} {names[0][:40]!r}"
+    elif not isinstance(content.get("before", []), list):
+        why = "what it holds before it is no list"
+    return Finding(record.number, f"record {record.number} was forged: {why}") if why else None
+
+
+class _DiffersError(Exception):
+    """Something came out otherwise: an explanation, and the fields."""
+
+
+class _Player:
+    """The guard that a log began with, told again what happened."""
+
+    def __init__(self, failed: _Failed | None) -> None:
+        self.decisions = 0
+        self.not_replayed: list[str] = []
+        self.other_makers: dict[str, Field] = {}
+        self._failed = failed
+        self._guard: Guard | None = None  # None while a session cannot be replayed
+        self._is_under_way = False
+
+    def play(self, record: Record) -> Finding | None:
+        """What differs; None where it comes out as it was recorded."""
+        try:
+            self._play(record.content)
+        except _DiffersError as differs:
+            return Finding(record.number, *differs.args)
+        except _NONSENSE as error:
+            text = f"there is no {error}" if isinstance(error, KeyError) else str(error)
+            return Finding(record.number, f"it cannot be replayed: {text}")
+        return None
+
+    def _play(self, content: Mapping[str, Any]) -> None:
+        kind, before = content["kind"], content.get("before", ())
+        if kind == "start":
+            self._start(content)
+            return
+        if self._guard is None:
+            return
+        if not self._is_under_way and (before or kind in ("decision", "end")):
+            raise ValueError("it belongs to no episode")
+        for row in before:
+            self._row(self._guard, None, row)
+        if kind in ("begin", "settings"):
+            self._set(self._guard, content["settings"])
+        if kind == "begin":
+            self._guard.begin()
+            self._is_under_way = True
+        elif kind == "decision":
+            names = ("time", "observation", "proposed", "mask")
+            self._row(self._guard, content, [content[name] for name in names])
+        elif kind == "end":
+            self._end(self._guard, content)
+
+    def _start(self, content: Mapping[str, Any]) -> None:
+        now = made_by()
+        for name, then in content["made_by"].items():
+            if then != now.get(name):
+                self.other_makers[name] = Field(name, str(then), now.get(name, ""))
+        self._guard, self._is_under_way = None, False
+        needs_code = content["told_failures"]
+        if content["guard"] is None:
+            self.not_replayed.append(
+                f"{content['reviser']} is no reviser that is known here, or asks a judge that is "
+                "not, or that was not told what happened, or the guard was too large"
+            )
+        elif needs_code and self._failed is None:
+            self.not_replayed.append(_NO_FUNCTION)
+        else:
+            file = BytesIO(base64.b64decode(content["guard"], validate=True))
+            self._guard = Guard.load(file, failed=self._failed if needs_code else None)
+            self._guard.audit = _DEAF
+
+    @staticmethod
+    def _set(guard: Guard, settings: Mapping[str, Any]) -> None:
+        for name in SETTINGS:
+            if getattr(guard, name) != settings[name]:
+                setattr(guard, name, settings[name])
+        set_again(guard.reviser, settings["reviser"])
+        if fields := _differing(settings, settings_now(guard)):
+            raise _DiffersError("there are no such settings", fields)
+
+    def _row(self, guard: Guard, content: Mapping[str, Any] | None, row: Sequence[Any]) -> None:
+        """A row that was decided on so, or of which nothing was to be said; or not decided on."""
+        time, observation, *proposed = row
+        situation = guard.recognise(_floats(observation), _number(time))
+        if not proposed:
+            return
+        action, mask = proposed if len(proposed) > 1 else (*proposed, None)
+        action = _floats(action) if isinstance(action, list) else _number(action)
+        proposal = Proposal(action, checked_mask(guard.actions, mask))
+        revision = guard.revise(situation, proposal)
+        entry = decision_of(situation, proposal, revision)
+        when, speaks = f"the decision at {situation.time:g} s", is_spoken(guard.reviser, revision)
+        if content is None and speaks:
+            raise _DiffersError(
+                f"{when} was recorded as nothing to speak of, but {entry['reason']}",
+                (Field("executed", canonical(entry["proposed"]), canonical(entry["executed"])),),
+            )
+        if content and (fields := _differing({name: content[name] for name in entry}, entry)):
+            raise _DiffersError(f"{when} comes out otherwise", fields)
+        if content and not speaks:
+            raise _DiffersError(f"{when} changed nothing")
+        self.decisions += 1
+
+    def _end(self, guard: Guard, content: Mapping[str, Any]) -> None:
+        last = content["observation"]
+        how = {name: content[name] for name in ("failed", "terminated", "score")}
+        guard.end(observation=None if last is None else _floats(last), **how)
+        self._is_under_way = False
+        if fields := _differing(content["learnt"], sums_of(guard)):
+            raise _DiffersError("something else was learnt until its end", fields)
+
+
+def _number(value: Any) -> float:
+    if value in ("NaN", "Infinity", "-Infinity"):
+        return float(value)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{value!r} stands where a number should")
+    return float(value)
+
+
+def _floats(values: Sequence[Any]) -> NDArray[np.float64]:
+    return np.array([_number(value) for value in values])
+
+
+def _differing(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> tuple[Field, ...]:
+    before, after = (
+        {name: canonical(value) for name, value in of.items()} for of in (recorded, again)
+    )
+    names = sorted(before.keys() | after.keys())
+    fields = [Field(name, before.get(name, ""), after.get(name, "")) for name in names]
+    return tuple(field for field in fields if field.recorded != field.replayed)

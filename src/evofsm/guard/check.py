@@ -1,7 +1,6 @@
-"""Checks for what users write: whether it keeps what a guard, a machine or a study relies on.
+"""Checks for what users write: a contract for controllers, revisers, judges and state rules.
 
-There is a contract for each kind of part: controllers, revisers, judges and state rules. A check
-gets a part made anew, and says what is wrong and what the likely cause is.
+A check gets a part made anew, and says what is wrong and what the likely cause is.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """A frozen guard in C99: no heap, no recursion, every loop bounded; it decides as it does here.
 
-An FMU is the same C, compiled where a compiler is, with ``fmi2.c`` around it.
-
 The C stands beside the Python that it mirrors: ``guard.c`` is the loop, ``learnt/rollout.c`` and
-``driving/judge.c`` are judges. What was learnt comes before it, as constants.
+``driving/judge.c`` are judges. What was learnt comes before it, as constants. An FMU is the same C,
+compiled where a compiler is, with ``fmi2.c`` around it.
 """
 
 from __future__ import annotations

@@ -197,8 +197,6 @@ class Foresight(LearningJudge):
         self._learnt = (0, 0) if log is None else (int(log.failed.sum()), len(log.rows))
         self.start_episode()
 
-    # -- Learning -------------------------------------------------------------------------------
-
     @classmethod
     def learn_log(
         cls,
@@ -380,8 +378,6 @@ class Foresight(LearningJudge):
             table += [(number, plain, *limits[k], limits[k][2] * at) for k, at in rule]
         return np.array(table, np.float64).reshape(-1, 6)
 
-    # -- Telling --------------------------------------------------------------------------------
-
     @property
     def _spans(self) -> Ints:
         """The horizon, how long a limit has to be passed, and how long an alarm stays on [rows]."""
@@ -423,12 +419,7 @@ class Foresight(LearningJudge):
         return [(int(v), at) for *_, v, when, _, at in limits if v < m and not when]
 
     def tally(
-        self,
-        log: Runs,
-        rate: int,
-        *,
-        plain: bool | None = None,
-        columns: Floats | None = None,
+        self, log: Runs, rate: int, *, plain: bool | None = None, columns: Floats | None = None
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,).
 
@@ -561,8 +552,6 @@ class Foresight(LearningJudge):
         record = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
         return f"{plain}{self.words(rate)} ({record}, {_COUNTED})"
 
-    # -- Beside a machine -----------------------------------------------------------------------
-
     def start_episode(self, *, learn: bool = True) -> None:
         """Nothing was seen yet; what was before, of an episode that nobody ended, went well."""
         if self._seen and self.log is not None:
@@ -692,9 +681,6 @@ def span(seconds: float) -> str:
         if seconds < most:
             return f"{seconds / size:.3g} {unit}"
     return f"{seconds / 3600.0:.3g} h"
-
-
-# -- Kernels --------------------------------------------------------------------------------------
 
 
 @kernel

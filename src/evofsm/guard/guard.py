@@ -1,8 +1,4 @@
-"""The framework's loop: observe, recognise, propose, revise, execute, learn.
-
-Whoever the controller is and whatever it controls, what it proposes is revised before it is
-executed, and what came of it is learnt before the next decision (the paper's Section 4.1).
-"""
+"""The framework's loop (the paper's Section 4.1): observe, recognise, propose, revise, learn."""
 
 from __future__ import annotations
 
@@ -13,7 +9,6 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from io import BytesIO
-from operator import attrgetter
 from typing import Any, NamedTuple, Protocol, Self, SupportsFloat
 
 import numpy as np
@@ -52,7 +47,7 @@ from evofsm.guard.api import (
 )
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.rollout import refuse_too_many
-from evofsm.guard.parts import outline, part_class, rebuild
+from evofsm.guard.parts import outline, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.warming import warm_judge, warm_machine
 from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
@@ -85,7 +80,7 @@ class InputMonitor(NamedTuple):
         if time <= self.time:
             return Intake.REPEATED if time == self.time else Intake.LATE, self
         intake, latest_row = Intake.WHOLE, observation
-        if math.isnan(observation.dot(observation)):  # the quickest way to ask for NaN
+        if _is_missing(observation):
             intake = Intake.PARTIAL
             if len(self.held) == len(observation):  # what was seen of them before is still held
                 latest_row = np.where(np.isnan(observation), self.held, observation)
@@ -104,12 +99,12 @@ class DecisionLogger(Protocol):
         """An observation came in, at ``time`` [s]."""
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
-        """A decision was made.
+        """A decision was made: where the system was, what was proposed, and what came of that.
 
         Parameters
         ----------
         situation, proposal, revision
-            Where the system was, what was proposed there, and what was made of it.
+            As `Guard.revise` takes and returns them.
         """
 
     def ended(
@@ -128,12 +123,6 @@ class DecisionLogger(Protocol):
 
 # Settings that stand in a file as they are.
 _PLAIN_SETTINGS = ("explaining", "interval", "learn", "n_episodes", "n_failed", "shadow")
-# What of a guard changes in an episode.
-_CHANGING = (
-    *("_monitor", "_latest", "_under_way", "_passing", "_decisions", "_acted", "_watched", "_kept"),
-    *("_begun", "_learn", "_frozen", "n_episodes", "n_failed"),
-)
-_CHANGES = attrgetter(*_CHANGING)
 # What a judge has that learns.
 _LEARNS = ("dt", "learn", "watch", "follow", "start_episode", "end", "sums", "save", "load")
 # The files of the machine and of the judge, as bytes.
@@ -155,8 +144,7 @@ class Guard:
     Before an action is executed, the judge says how likely it is that failure can no longer be
     avoided after it. A proposal within the tolerance is kept; any other is replaced by the closest
     action that is tolerable. The machine recognises and counts the states in which that happens.
-
-    An episode begins with the first `decide` after `end`; until then machine and judge learn.
+    An episode begins with the first `decide` after `end`.
 
     Parameters
     ----------
@@ -213,8 +201,7 @@ class Guard:
     Notes
     -----
     Threads may share a guard: each call is done before the next begins, and what it decides on is
-    one stream of observations. A file is saved between two calls. What an attribute returns, as
-    `machine` or `judge`, has to be left alone meanwhile.
+    one stream of observations. `machine` and `judge` themselves have to be left alone meanwhile.
 
     Each call is done as a whole: where it raises (an input is refused, a judge or the audit log
     fails, Ctrl-C), guard, machine, judge and audit log are as before, and it may be made again. A
@@ -349,10 +336,8 @@ class Guard:
             text = f"the judge was made for decisions every {judge.dt} s"
             raise ValueError(f"interval is {interval} s, but {text}")
         if machine is not None and machine.n_actions != self.actions.n_actions:
-            raise ValueError(
-                f"the machine has {machine.n_actions} actions, but the set has "
-                f"{self.actions.n_actions}"
-            )
+            counts = f"{machine.n_actions} actions, but the set has {self.actions.n_actions}"
+            raise ValueError(f"the machine has {counts}")
         if isinstance(action_judge, LearntRisk):
             if bool(action_judge.choices) != isinstance(self.actions, Choices):
                 raise ValueError(
@@ -371,13 +356,13 @@ class Guard:
         self.failed = failed
         self.audit: DecisionLogger | None = audit
         self.explaining = explaining
+        labels = Labels() if action_judge is None else action_judge.labels
         #: What the judge calls the variables of an observation; empty where it does not say.
-        self.variables: tuple[str, ...] = () if action_judge is None else action_judge.labels.names
+        self.variables: tuple[str, ...] = labels.names
         #: What is done without a usable proposal where nothing is judged.
         self.fallback: Fallback = getattr(reviser, "fallback", NOTHING)
-        self._labels = (Labels() if action_judge is None else action_judge.labels)._replace(
-            actions=self.actions if isinstance(self.actions, IntervalActions) else None, dt=interval
-        )
+        intervals = self.actions if isinstance(self.actions, IntervalActions) else None
+        self._labels = labels._replace(actions=intervals, dt=interval)
         #: Episodes that it learnt from, and those of them that failed.
         self.n_episodes, self.n_failed = n_episodes, n_failed
         self._frozen: FSMModel | None = None
@@ -389,8 +374,6 @@ class Guard:
         #: Whether proposals pass in some or all episodes where it was not shown to help.
         self.shadow = bool(shadow)
         self.learn = learn
-
-    # -- An episode -----------------------------------------------------------------------------
 
     @property
     def learn(self) -> bool:
@@ -410,12 +393,11 @@ class Guard:
 
     @transaction
     def freeze(self) -> None:
-        """Learn nothing from now on: what is decided depends on the present episode alone.
+        """Learn nothing from now on: the same episode is decided the same again, bit for bit.
 
-        The same episode is then decided the same again, bit for bit. An episode that is under way
-        is broken off: nothing more is learnt from it. Where it steps back, or guarded episodes seem
-        to fail sooner than those of the controller alone, proposals pass. It warns of that, and of
-        a guard that refuses nearly everything.
+        An episode that is under way is broken off: nothing more is learnt from it. Where it steps
+        back, or guarded episodes seem to fail sooner than those of the controller alone, proposals
+        pass. It warns of that, and of a guard that refuses nearly everything.
         """
         self.learn = False
         if why := self._why_passing():
@@ -438,13 +420,12 @@ class Guard:
 
     def _savepoint(self) -> Rollback:
         """What takes back all that is done from now on."""
-        attributes = _CHANGES(self)
+        attributes = {**vars(self)}
         parts: Any = self.machine, self.judge, self.reviser, self.audit
         rollbacks = [part.savepoint() for part in parts if hasattr(part, "savepoint")]
 
         def rollback() -> None:
-            for name, value in zip(_CHANGING, attributes, strict=True):
-                setattr(self, name, value)
+            vars(self).update(attributes)
             for take_back in rollbacks:
                 take_back()
 
@@ -494,8 +475,8 @@ class Guard:
         observation : (m,) array_like
             NaN where a variable was not observed.
         proposal : float, (d,) array_like, Proposal or None
-            What the controller wants; None, or NaN, where it has nothing. A vector where the set
-            of actions is a box. ``Proposal(action, mask=...)`` also says which are allowed now.
+            What the controller wants; None, or NaN, where it has nothing.
+            ``Proposal(action, mask=...)`` also says which actions are allowed now.
         time : float, optional
             Of the observation, in this episode [s]; without it decisions are counted, one every
             `interval`. What is not later than the one before tells nothing new.
@@ -611,7 +592,7 @@ class Guard:
 
     def _count_missing(self, z: NDArray[np.float64]) -> None:
         """Warn where no observation is whole for long: nothing is learnt from such."""
-        self._lacking = self._lacking + 1 if math.isnan(z.dot(z)) else 0
+        self._lacking = self._lacking + 1 if _is_missing(z) else 0
         if self._lacking == _MANY:
             names = ", ".join(map(self._labels.variable, np.flatnonzero(np.isnan(z)).tolist()))
             warnings.warn(
@@ -627,7 +608,7 @@ class Guard:
         state: int | None = None
         is_incomplete = bool(intake) and bool(intake & Intake.PARTIAL)
         if model is not None:
-            if model.n_states and not math.isnan(latest_row.dot(latest_row)):
+            if model.n_states and not _is_missing(latest_row):
                 belief = model.recognise(latest_row)
                 state = int(belief.argmax())
         elif machine is not None and not (is_incomplete and machine.n_states == 0):
@@ -762,7 +743,7 @@ class Guard:
         terminated = terminated and not failed
         machine = self.machine if self._learn else None
         if machine is not None:
-            has_gaps = z is not None and math.isnan(z.dot(z))
+            has_gaps = z is not None and _is_missing(z)
             if z is not None and (machine.n_states or not has_gaps):
                 machine.observe(z, failed=failed, partial=has_gaps)
             elif failed and machine.state is not None:
@@ -824,8 +805,6 @@ class Guard:
         self.__dict__.update(state)
         share(self)
 
-    # -- Keeping it -----------------------------------------------------------------------------
-
     @alone
     def copy(self, *, states: bool = True) -> Self:
         """A twin that learns for itself, as between two episodes; without the audit log.
@@ -837,11 +816,9 @@ class Guard:
             the states, and nothing is recognised.
         """
         machine = None if self.machine is None else self.machine.copy()
-        reviser, judge = copy.deepcopy(
-            (self.reviser, self.judge), {} if self.machine is None else {id(self.machine): machine}
-        )
-        names = (*_PLAIN_SETTINGS, "failed")
-        settings = {name: getattr(self, name) for name in names}
+        memo = {id(self.machine): machine}  # for a judge that asks the machine
+        reviser, judge = copy.deepcopy((self.reviser, self.judge), memo)
+        settings = {name: getattr(self, name) for name in (*_PLAIN_SETTINGS, "failed")}
         return type(self).of(reviser, judge=judge, machine=machine if states else None, **settings)
 
     @alone
@@ -896,10 +873,9 @@ class Guard:
 
         Raises
         ------
-        OSError
-            If there is no such file, or it may not be read.
-        ValueError
-            If the file holds something else or is damaged, or judge or ``failed`` are needed.
+        OSError, ValueError
+            If the file cannot be read, holds something else or is damaged, or judge or ``failed``
+            are needed.
 
         Examples
         --------
@@ -914,12 +890,14 @@ class Guard:
         with store.explained(path):
             if settings["failed"] and failed is None:
                 raise ValueError("this guard knew failures by a function; give it again: failed=")
-            instance = None if isinstance(judge, type) else judge
-            return cls.of(
-                **rebuild(settings, *_loaded(settings, files, judge), instance),
-                failed=failed,
-                **{name: settings[name] for name in _PLAIN_SETTINGS},
-            )
+            parts = rebuild(settings, files, judge)
+            plain = {name: settings[name] for name in _PLAIN_SETTINGS}
+            return cls.of(failed=failed, **parts, **plain)
+
+
+def _is_missing(z: NDArray[np.float64]) -> bool:
+    """Whether a variable is NaN; the quickest way to ask for it."""
+    return math.isnan(z.dot(z))
 
 
 def ends_of(judge: ActionJudge | None, m: int) -> NDArray[np.float64]:
@@ -954,24 +932,6 @@ def _actions(low: ArrayLike | None, high: ArrayLike | None, n_actions: int | Non
     least, most = np.asarray(low, np.float64).item(), np.asarray(high, np.float64).item()
     width = (most - least) / _INTERVALS if least < most else 1.0
     return IntervalActions(least, most, width, outside="clip")
-
-
-def _loaded(
-    kept: Mapping[str, Any],
-    files: Mapping[str, NDArray[Any]],
-    judge: ActionJudge | type[LearningJudge] | None,
-) -> tuple[EvolvingFSM | None, LearningJudge | None]:
-    """Machine and judge from their files, of which one may be empty."""
-    machine = risk = None
-    if files["machine"].size:
-        machine = EvolvingFSM.load(BytesIO(files["machine"].tobytes()))
-    if files["judge"].size:
-        kind = judge if isinstance(judge, type) else None
-        if kind is None and kept["judge"] is None:
-            raise ValueError("no installed package declares its judge; give the judge's class")
-        kind = kind or part_class(kept["judge"])
-        risk = kind.load(BytesIO(files["judge"].tobytes()))
-    return machine, risk
 
 
 def _bytes(saved: EvolvingFSM | LearningJudge | None) -> NDArray[np.uint8]:

@@ -189,8 +189,8 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
 
     The guard learns every environment's episode **as a whole when it ends**. Within an episode a
     twin of the guard (`Guard.copy`) decides, made as the episode begins: it learns from its own,
-    but not from those that run alongside. What you change about the guard, its mode for example,
-    counts from the next episode on. With one environment it comes to the same as `RevisedActions`.
+    but not from those that run alongside. What you change about the guard counts from the next
+    episode on. With one environment it comes to the same as `RevisedActions`.
 
     Parameters
     ----------
@@ -301,9 +301,6 @@ def _of_one(infos: Mapping[str, Any], k: int, count: int) -> dict[str, Any]:
             many = len(value) if isinstance(value, list | tuple) else (*np.shape(value), 0)[0]
             info[name] = value[k] if many == count else value
     return info
-
-
-# -- One environment's episodes under a guard ---------------------------------------------------
 
 
 class Decided(NamedTuple):

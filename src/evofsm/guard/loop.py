@@ -1,7 +1,4 @@
-"""The one loop of an episode: observe, propose, revise, execute, learn (the paper's Section 4.1).
-
-Whoever drives, teaches, tests, times or records a guard iterates over `run_episode`.
-"""
+"""The one loop of an episode: observe, propose, revise, execute, learn (the paper's 4.1)."""
 
 from __future__ import annotations
 

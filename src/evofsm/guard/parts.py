@@ -10,7 +10,11 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from io import BytesIO
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
@@ -43,53 +47,54 @@ def part_name(part: object) -> str | None:
 
 def outline(guard: _Guard) -> dict[str, Any]:
     """All of a guard but what machine and judge have learnt; None for what is not known here."""
-    return {
-        "actions": asdict(guard.actions),
-        "judge": None if guard.judge is None else part_name(guard.judge),
-        "reviser": _reviser(guard),
-    }
+    reviser, judge = guard.reviser, None if guard.judge is None else part_name(guard.judge)
+    description: dict[str, Any] | None = None
+    if type(reviser) is ActionReviser:
+        # Whom it asks, if that is who learns.
+        is_known = judge is not None and reviser.risk is guard.judge
+        description = {"judge": {"class": judge} if is_known else None}
+        description |= {"class": "ActionReviser", "settings": settings_of(reviser)}
+    elif name := part_name(reviser):
+        made_of = reviser.described()
+        description = None if made_of is None else {"class": name, **made_of}
+    return {"actions": asdict(guard.actions), "judge": judge, "reviser": description}
 
 
 def can_be_made_again(guard: _Guard) -> bool:
     """Whether `rebuild` needs no more than the `outline`."""
-    reviser = _reviser(guard)
-    if reviser is None or (guard.judge is not None and part_name(guard.judge) is None):
-        return False
-    return not isinstance(guard.reviser, ActionReviser) or reviser["judge"] is not None
-
-
-def _reviser(guard: _Guard) -> dict[str, Any] | None:
-    reviser = guard.reviser
-    if type(reviser) is ActionReviser:
-        # Whom it asks, if that is who learns.
-        judge = part_name(reviser.risk) if reviser.risk is guard.judge else None
-        description = None if judge is None else {"class": judge}
-        return {"class": "ActionReviser", "judge": description, "settings": settings_of(reviser)}
-    name = part_name(reviser)
-    description = reviser.described() if name else None
-    return None if description is None else {"class": name, **description}
+    parts = outline(guard)
+    knows_judge = guard.judge is None or parts["judge"] is not None
+    reviser: Any = parts["reviser"]
+    return knows_judge and reviser is not None and reviser.get("judge", {}) is not None
 
 
 def rebuild(
     told: Mapping[str, Any],
-    machine: EvolvingFSM | None,
-    risk: LearningJudge | None,
-    judge: ActionJudge | None = None,
+    files: Mapping[str, NDArray[np.uint8]],
+    judge: ActionJudge | type[LearningJudge] | None,
 ) -> dict[str, Any]:
-    """The parts of an `outline`, with a machine and a judge that were read from elsewhere.
+    """The parts of an `outline`, with the files of machine and judge, of which one may be empty.
 
-    ``judge`` is asked where the outline knows none, and none that learns was read.
+    ``judge`` is its class, or the one that is asked, where the outline knows none.
     """
     fields, reviser = told["actions"], told["reviser"]
     kind = IntervalActions if "width" in fields else BoxActions if "low" in fields else Choices
     actions: ActionSet = kind(**fields)
+    machine, action_judge = None, None if isinstance(judge, type) else judge
+    risk: LearningJudge | None = None
+    if files["machine"].size:
+        machine = EvolvingFSM.load(BytesIO(files["machine"].tobytes()))
+    if files["judge"].size:
+        if told["judge"] is None and not isinstance(judge, type):
+            raise ValueError("no installed package declares its judge; give the judge's class")
+        judge_class = judge if isinstance(judge, type) else part_class(told["judge"])
+        action_judge = risk = judge_class.load(BytesIO(files["judge"].tobytes()))
     parts = {"machine": machine, "judge": risk}
     if reviser["class"] != "ActionReviser":
         return parts | {"reviser": part_class(reviser["class"]).restored(reviser, actions)}
     description = reviser["judge"]
     if description is not None and part_class(description["class"]) is not type(risk):
         raise ValueError(f"what its {description['class']} has learnt is missing")
-    action_judge = judge if risk is None else risk
     if action_judge is None:
         raise ValueError("no installed package declares its judge; give the judge as it is")
     again = ActionReviser(action_judge, actions)

@@ -1,7 +1,7 @@
-"""The action reviser: it keeps what a controller proposes, or replaces it by something better.
+"""The action reviser of the paper's Section 4.2: it keeps what is proposed, or finds a better one.
 
-The module of the paper's Section 4.2, where it improves actions. The authors' own sequel tests an
-action by predicting the states it leads to (Han, Filev, Ozguner, arXiv:2006.08092).
+The authors' own sequel tests an action by predicting the states it leads to (Han, Filev, Ozguner,
+arXiv:2006.08092).
 """
 
 from __future__ import annotations
@@ -112,9 +112,8 @@ class ActionReviser:
 
     By the least change: the action closest to the proposal whose risk is within the tolerance;
     where there is none, the least risky one. Where the judge has to try an action first
-    (`api.Trial`), that is held for a while instead: so a car's own brakes are learnt. Once it
-    has begun to revise, it keeps on until the proposal is safe by a margin, so that it does not
-    chatter.
+    (`api.Trial`), that is held for a while instead. Once it has begun to revise, it keeps on until
+    the proposal is safe by a margin, so that it does not chatter.
 
     A judge that looks for an action itself (`api.SearchingJudge`) is asked for it. Where nothing of
     what it decides is executed (any mode but `Mode.ACT`), nothing is tried.
@@ -165,12 +164,12 @@ class ActionReviser:
 
     def start_episode(self) -> None:
         """Nothing is under way yet."""
-        self._revising = False
+        self.refuses = False  #: whether the latest proposal would rather not be executed
         self._trial = 0
 
     def savepoint(self) -> Rollback:
         """What takes back all that is decided from now on."""
-        now = {"_revising": self._revising, "_trial": self._trial, "passing": self.passing}
+        now = {"refuses": self.refuses, "_trial": self._trial, "passing": self.passing}
         return partial(vars(self).update, now)
 
     @property
@@ -182,11 +181,6 @@ class ActionReviser:
     def acts(self) -> bool:
         """Whether what it decides is executed."""
         return self.mode is Mode.ACT and not self.passing
-
-    @property
-    def refuses(self) -> bool:
-        """Whether the latest proposal would rather not be executed."""
-        return self._revising
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """What to execute instead of the proposal, which is first made usable (`make_usable`)."""
@@ -222,9 +216,9 @@ class ActionReviser:
         if self._searches:
             how: dict[str, Any] = {} if mask is None else {"mask": mask}
             options, judgement, best, reason = self.risk.search(  # type: ignore[attr-defined]
-                situation, wanted, tolerance=self.tolerance, revising=self._revising, **how
+                situation, wanted, tolerance=self.tolerance, revising=self.refuses, **how
             )
-            self._revising = best != 0
+            self.refuses = best != 0
             within = np.minimum(np.maximum(options, self._low), self._high)
             return Search(within, judgement, best, reason)
         options = np.minimum(np.maximum(wanted, self._lowest), self._highest)
@@ -234,8 +228,8 @@ class ActionReviser:
             options = self.risk.effective(situation, options)
         if self.risk.trial() is None:  # most proposals are kept: this one is looked at first
             judgement = self.risk.judge(situation, options[:1])
-            if judgement.risk[0] <= self.tolerance * (_RELEASE if self._revising else 1.0):
-                self._revising = False
+            if judgement.risk[0] <= self.tolerance * (_RELEASE if self.refuses else 1.0):
+                self.refuses = False
                 return Search(options[:1], judgement, 0, _KEPT)
         judgement = self.risk.judge(situation, options)
         return Search(options, judgement, *self._decide(situation, options, judgement, acts))
@@ -244,16 +238,16 @@ class ActionReviser:
         self, situation: Situation, options: NDArray[np.float64], judged: Judgement, acts: bool
     ) -> tuple[int, str]:
         """Index of the best option, and why."""
-        limit = self.tolerance * (_RELEASE if self._revising else 1.0)
+        limit = self.tolerance * (_RELEASE if self.refuses else 1.0)
         trial = self.risk.trial()
         if self._trial > 0 and trial is not None:
             self._trial -= 1
             return self._closest_to(trial.action, options), f"{trial.unknown}: {trial.doing}"
         if not judged.risk[0] > limit:
-            self._revising = False
+            self.refuses = False
             is_known = judged.risk[0] <= limit
             return 0, _KEPT if is_known else "its risk is not known yet"
-        self._revising = True
+        self.refuses = True
         why = self.risk.why(judged)
         if trial is not None:
             if acts:
@@ -264,7 +258,7 @@ class ActionReviser:
         # Once revising, what is safe by the margin; else whatever is tolerable.
         choice = self.risk.choose(situation, options, judged, (limit, self.tolerance))
         if choice is not None:
-            self._revising = choice[0] != 0
+            self.refuses = choice[0] != 0
             return choice[0], f"{why}; {choice[1]}"
         change = distances(self.actions, options, options[0])
         # Of several that are least risky the lowest, in a box that of the least change.

@@ -162,8 +162,6 @@ class SceneRisk(LearningJudge, SearchingJudge):
                 f"{low} to {high}"
             )
 
-    # -- Deciding -------------------------------------------------------------------------------
-
     def search(
         self,
         situation: Situation,
@@ -245,8 +243,6 @@ class SceneRisk(LearningJudge, SearchingJudge):
             return Seen(ego, away, rest + ego[_P:])
         return Seen(ego, away - ego[:_P], rest)
 
-    # -- Learning -------------------------------------------------------------------------------
-
     def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike) -> None:
         """Take in an observation and the action after it."""
         scene = self._read(np.asarray(observation, np.float64))
@@ -302,8 +298,6 @@ class SceneRisk(LearningJudge, SearchingJudge):
             "places": float(history.away.sum()),
         }
 
-    # -- Files ----------------------------------------------------------------------------------
-
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what is remembered to a file; all else follows from it."""
         settings = {name: getattr(self, name) for name in ("dt", "columns", "relative")}
@@ -326,9 +320,6 @@ class SceneRisk(LearningJudge, SearchingJudge):
             history.refuse_damaged(judge.memory.past, judge.memory.n_actions)
             judge.memory.restore(history, **counts)
         return judge
-
-
-# -- What is remembered -------------------------------------------------------------------------
 
 
 class Seen(NamedTuple):
@@ -415,9 +406,6 @@ class Past(NamedTuple):
             raise ValueError("a failure is not at the end of an episode")
 
 
-# -- How close is too close ---------------------------------------------------------------------
-
-
 class Contact(NamedTuple):
     """The probability of failure in a step, by how close an object comes in it.
 
@@ -478,9 +466,6 @@ def _closest_on_lines(start: _Floats, end: _Floats, sides: _Floats, least: _Floa
                 at = start[k, i] + share * (end[k, i] - start[k, i])
                 far = max(far, abs(at) / sides[i])
             least[k] = min(least[k], far)
-
-
-# -- What is remembered, and forecast from it ---------------------------------------------------
 
 
 class Foreseen(NamedTuple):
@@ -575,8 +560,6 @@ class Memory:
             links[ends[t] + index[mutual]] = ends[t + 1] + nearest[mutual]
         return past._replace(links=links)
 
-    # -- Learning -------------------------------------------------------------------------------
-
     def _fit_motion(self, past: Past) -> None:
         """How places change, by what oneself and objects were like before and after."""
         rows, moment = np.flatnonzero(past.links >= 0), past.moment
@@ -668,8 +651,6 @@ class Memory:
         far, rest, ego = self._spreads
         near = _NEAR_TO * away / far, _NEAR_TO * other / rest
         return np.hstack([*near, (away + own[:, :_P]) / far, own[:, _P:] / ego[_P:]])
-
-    # -- Forecasting ----------------------------------------------------------------------------
 
     def apart(self, own: _Floats, one: _Floats) -> _Floats:
         """(k,) squared distance of states of oneself from one, each number by its spread."""

@@ -12,11 +12,10 @@ import pytest
 from evofsm.guard import Guard, Mode
 from evofsm.guard.actions import same_action
 from evofsm.guard.api import Proposal, Situation
-from evofsm.guard.audit_log import AuditLog
+from evofsm.guard.audit_log import AuditLog, audit
 from evofsm.guard.learnt import judge as judging
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.rollout import search
-from evofsm.guard.replay import audit
 
 
 def kept(said):

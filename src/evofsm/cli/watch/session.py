@@ -177,12 +177,12 @@ class OnRoads:
         self._look()
 
     def _look(self) -> None:
-        road, record = self._road, self._road.episode().record
+        road, episode = self._road, self._road.episode()
         self.observation, self.time, self.failed = road.observation, road.time, road.collided
         self.over = road.over or self._stood >= _STOOD
-        self.terminated = road.collided or road.rear_ended
-        stands = not record[-1, [SPEED, LEADER_SPEED]].any()
-        brakes = record[-2:, LEADER_ACCELERATION].min() < 0.0
+        self.terminated = episode.collided or episode.rear_ended
+        stands = not episode.record[-1, [SPEED, LEADER_SPEED]].any()
+        brakes = episode.record[-2:, LEADER_ACCELERATION].min() < 0.0
         self._stood = self._stood + self.interval if stands and brakes else 0.0
 
     def propose(self) -> Action:
@@ -201,7 +201,7 @@ class OnRoads:
         rows = [*range(0, last, self._steps), last]
         *_, now = cars_of(episode.time[rows], episode.observations[rows])
         gap_behind = float(episode.record[-1, GAP_BEHIND])
-        return now._replace(gap_behind=gap_behind, rear_ended=self._road.rear_ended)
+        return now._replace(gap_behind=gap_behind, rear_ended=episode.rear_ended)
 
     def close(self) -> None:
         """Leave the road."""
