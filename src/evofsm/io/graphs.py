@@ -58,7 +58,7 @@ def to_dot(
     Raises
     ------
     ValueError
-        If a dead end is no state.
+        If ``least`` is no probability, or a dead end is no state.
 
     Examples
     --------
@@ -74,6 +74,7 @@ def to_dot(
     }
     <BLANKLINE>
     """
+    _refuse_unless_probability(least)
     end_states = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
     marked_states = {check_index("state", state, model.n_states) for state in end_states}
     lines = [_DOT_HEAD]
@@ -98,6 +99,11 @@ def to_dot(
         label = f'label="{chance:.3f} ({count:,.0f})", penwidth={width:.2f}'
         lines.append(f"  s{i + 1} -> s{j + 1} [{label}{dashes}];")
     return "\n".join([*lines, "}", ""])
+
+
+def _refuse_unless_probability(least: float) -> None:
+    if not 0.0 <= least <= 1.0:
+        raise ValueError(f"least is {least}; it must be a probability, from 0 to 1")
 
 
 def _where(model: FSMModel, state: int) -> list[str]:
@@ -140,7 +146,8 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     Raises
     ------
     ValueError
-        If the model counted no decisions, or ``evidence`` is not positive.
+        If the model counted no decisions, ``evidence`` is not positive, or ``least`` is no
+        probability.
 
     Examples
     --------
@@ -156,6 +163,7 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
         0.152472546555:(s'=2); // seen 1
     """
     n = model.n_states
+    _refuse_unless_probability(least)
     if not evidence > 0.0:
         raise ValueError(f"evidence is {evidence}; it must be positive")
     if not model.decisions.any():
