@@ -87,7 +87,7 @@ class Forecasts:
         Z, I
             As `EvolvingFSM.learn_many` takes them.
         """
-        beliefs = np.atleast_2d(model.recognise(valid.real_rows("observations", Z)))
+        beliefs = model.recognise(valid.real_array("observations", Z, ndim=2, copy=False))
         actions = valid.check_actions(I, len(beliefs), self.n_actions)
         self.n_states = self._check_states(model.n_states)
         near = model.recognise(model.centers)
@@ -114,7 +114,7 @@ class Forecasts:
         steps : int
             One of the horizons.
         """
-        rows = valid.real_rows("belief", np.atleast_2d(belief))
+        rows = valid.real_array("belief", np.atleast_2d(belief), ndim=2)
         valid.refuse_unless_distribution("belief", rows)
         self._check_states(rows.shape[1])
         if steps not in self.steps:

@@ -49,26 +49,22 @@ def kernel(function: Function) -> Function:
 
 def inner_kernel(function: Function) -> Function:
     """A kernel that only kernels call, as a part of each of them."""
-    return _inside(function, forceinline=True)
+    return rare_kernel(function, forceinline=True)
 
 
 def spliced_kernel(function: Function) -> Function:
     """A long kernel that is called in one place: it is compiled there, and not by itself."""
-    return _inside(function, inline="always")
+    return rare_kernel(function, inline="always")
 
 
-def rare_kernel(function: Function) -> Function:
+def rare_kernel(function: Function, **options: Any) -> Function:
     """A kernel that only kernels call, and seldom."""
-    return _inside(function)
+    return cast(Function, _njit(no_cpython_wrapper=True, **_OPTIONS, **options)(function))
 
 
 def uncompiled(kernel: Function) -> Function:
     """The function of a kernel, where to compile it would take longer than it does."""
     return cast(Function, getattr(kernel, "py_func", kernel))
-
-
-def _inside(function: Function, **options: Any) -> Function:
-    return cast(Function, _njit(no_cpython_wrapper=True, **_OPTIONS, **options)(function))
 
 
 class Entry:

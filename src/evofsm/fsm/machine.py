@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, Self, SupportsIndex, cast
+from typing import Any, Self, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ from evofsm.fsm import step as stepping
 from evofsm.fsm import validation as valid
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.arrays import MACHINE, NO_ACTION, NOT_OPEN, OF_ACTIONS, OF_MODEL, Learnt, Settings
-from evofsm.fsm.clusters import PAPER, width_of
+from evofsm.fsm.clusters import width_of
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.explanation import Explanation, explain
 from evofsm.fsm.kernels import LINE, Entry, uncompiled
@@ -111,26 +111,23 @@ class EvolvingFSM(Retraced):
         failure_horizon: int | None = None,
     ) -> None:
         self._rule = rules.Paper() if rule is None else rules.check_rule(rule)
-        settings = Settings(
-            radius=0.3 if radius is None else positive("radius", radius),
-            distance_weight=positive("distance_weight", distance_weight),
-            learning_rate=probability("learning_rate", learning_rate),
-            prior_frequency=positive("prior_frequency", prior_frequency),
-            spread=3.0 if spread is None else positive("spread", spread),
-            belief_tolerance=probability("belief_tolerance", belief_tolerance)
-            if belief_tolerance
-            else 0.0,
-            max_states=_or_infinity("max_states", max_states),
-            failure_horizon=_or_infinity("failure_horizon", failure_horizon),
-            rule=PAPER,
-            weights=np.empty(0),
-        )
-        table = {name: float(value) for name, value in self._rule.table.items() if name != "rule"}
-        settings = settings._replace(rule=int(self._rule.table["rule"]), **cast(Any, table))
+        table = {name: float(value) for name, value in self._rule.table.items()}
         for name, value in (("radius", radius), ("spread", spread)):
-            if value not in (None, getattr(settings, name)):
+            if value is not None and table.setdefault(name, positive(name, value)) != value:
                 raise ValueError(f"{name} is {value}, but the rule has its own: {self._rule}")
-        self._settings = settings
+        tolerance = belief_tolerance and probability("belief_tolerance", belief_tolerance)
+        settings: dict[str, Any] = {
+            "radius": 0.3,
+            "spread": 3.0,
+            "distance_weight": positive("distance_weight", distance_weight),
+            "learning_rate": probability("learning_rate", learning_rate),
+            "prior_frequency": positive("prior_frequency", prior_frequency),
+            "belief_tolerance": float(tolerance),
+            "max_states": _or_infinity("max_states", max_states),
+            "failure_horizon": _or_infinity("failure_horizon", failure_horizon),
+            **table,
+        }
+        self._settings = Settings(**settings | {"rule": int(table["rule"])}, weights=np.empty(0))
         self._learnt = arrays.blank(0, whole("n_actions", n_actions), 0, 0)
         self._share()
         MACHINE.refuse_others(self._content)
@@ -190,13 +187,7 @@ class EvolvingFSM(Retraced):
 
     @alone
     def learn_one(self, z: ArrayLike, i: SupportsIndex) -> Step:
-        """Observe, then act; the action shows in the next step.
-
-        Parameters
-        ----------
-        z, i
-            As `observe` and `act` take them.
-        """
+        """Observe, then act, as `observe` and `act` do; the action shows in the next step."""
         return self._step(self._checked(z), valid.check_action(i, self.n_actions), None)
 
     @alone
@@ -227,12 +218,10 @@ class EvolvingFSM(Retraced):
         belief : bool
             Whether the trace holds the belief of every row as well.
         """
-        observations = valid.real_rows("observations", Z)
+        observations = valid.real_array("observations", Z, ndim=2, copy=False)
         rows = len(observations)
-        if self.n_states and rows:
-            self._refuse_other_length(observations.shape[1])
         valid.refuse_unusable("observations", observations)
-        observations = np.require(observations, requirements=("C", "W"))
+        observations = np.require(observations, requirements="W")
         actions = valid.check_actions(I, rows, self.n_actions)
         starts = valid.check_rows("episode_starts", episode_starts, rows)
         ends = valid.check_rows("failures", () if failures is None else failures, rows)
@@ -303,12 +292,7 @@ class EvolvingFSM(Retraced):
     ) -> Explanation:
         """What experience says of the present situation, as `FSMModel.explain` tells it.
 
-        Parameters
-        ----------
-        action : int, optional
-            What came of taking it there.
-        labels : Labels, optional
-            What the numbers mean.
+        With an ``action``, also what came of taking it there; ``labels`` say what numbers mean.
         """
         index = None if action is None else valid.check_action(action, self.n_actions)
         if self.state is None:
@@ -552,7 +536,7 @@ class EvolvingFSM(Retraced):
         if n == 0:
             gaps = np.flatnonzero(absent).tolist()
             raise ValueError(f"variables {gaps} of a machine's first observation are missing")
-        self._refuse_other_length(len(z))
+        self._fit(len(z))
         vector = np.where(absent, 0.0, z)
         valid.refuse_unusable("observation", vector)
         action = int(now["action"])
@@ -574,7 +558,7 @@ class EvolvingFSM(Retraced):
         return Step(int(belief.argmax()), belief, Event.NONE, forecast, surprise)
 
     def _checked(self, z: ArrayLike) -> Floats:
-        """An observation as a vector of its own, of as many variables as the first one had."""
+        """An observation as a vector of its own."""
         if (
             type(z) is np.ndarray
             and z.dtype is _FLOAT64
@@ -583,19 +567,16 @@ class EvolvingFSM(Retraced):
         ):
             return z.copy()
         vector = valid.real_array("observation", z, ndim=1)
-        if self.n_states:
-            self._refuse_other_length(len(vector))
         valid.refuse_unusable("observation", vector)
         return vector
 
-    def _refuse_other_length(self, m: int) -> None:
-        if m != self.n_variables:
+    def _fit(self, m: int) -> None:
+        """Make room for observations of ``m`` variables; raise where the first had others."""
+        if self.n_states and m != self.n_variables:
             raise ValueError(
                 f"observation has {m} variables, but this machine was started with "
                 f"{self.n_variables}"
             )
-
-    def _fit(self, m: int) -> None:
         if self.n_states == 0:
             self._settings = self._settings._replace(weights=rules.weights_of(self._rule, m))
             learnt = arrays.blank(m, self.n_actions, LINE, 0)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm import store
+from evofsm.fsm import validation as valid
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.arrays import MODEL, OF_MODEL
 from evofsm.fsm.clusters import recognise_rows
@@ -18,17 +19,7 @@ from evofsm.fsm.explanation import Explanation, Nearest, explain
 from evofsm.fsm.kernels import lanes
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.rules import Paper, StateRule, describe_rule, reach, restore_rule, weights_of
-from evofsm.fsm.validation import (
-    Floats,
-    check_action,
-    check_index,
-    real_array,
-    refuse_more_failures,
-    refuse_unless_distribution,
-    refuse_unusable,
-    state_name,
-    whole,
-)
+from evofsm.fsm.validation import Floats
 from evofsm.store import Place
 
 # In place of counts that are not given.
@@ -104,12 +95,12 @@ class FSMModel:
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         MODEL.refuse_others(self._content)
-        refuse_more_failures({name: getattr(self, name) for name in OF_MODEL})
+        valid.refuse_more_failures({name: getattr(self, name) for name in OF_MODEL})
         failure_counts = self.failures, self.endings, self.failed_soon
         is_told = bool(self.failures_told) or any(counts.any() for counts in failure_counts)
         object.__setattr__(self, "failures_told", is_told)
-        if n:
-            refuse_unless_distribution("a row of transition_matrices", self.transition_matrices)
+        rows = self.transition_matrices
+        valid.refuse_unless_distribution("a row of transition_matrices", rows)
         for name in ("names", "units"):
             if len(getattr(self, name)) not in (0, m):
                 raise ValueError(f"{name} are {getattr(self, name)}, but there are {m} variables")
@@ -148,13 +139,12 @@ class FSMModel:
 
     def recognise(self, z: ArrayLike) -> Floats:
         """(n,) belief of an observation (m,), or (N, n) of many: the paper's Section 2.2.2."""
-        array, rows = self._observations(z)
-        belief = believed(*self._places, rows, self.width)
-        return belief if array.ndim == 2 else belief[0]
+        belief = believed(*self._places, self._rows(z), self.width)
+        return belief if np.ndim(z) == 2 else belief[0]
 
     def nearest(self, z: ArrayLike) -> Nearest:
         """Which state an observation (m,) is nearest to, and how far a state reaches."""
-        _, rows = self._observations(z)
+        rows = self._rows(z)
         if len(rows) != 1:
             raise ValueError(f"z holds {len(rows)} observations; one is asked for")
         offsets = (self.centers - rows[0]) * weights_of(self.rule, self.n_variables)
@@ -179,9 +169,9 @@ class FSMModel:
         horizon : int
             Number of steps, at least 1.
         """
-        there, steps = self._belief(belief), whole("horizon", horizon)
+        there, steps = self._belief(belief), valid.whole("horizon", horizon)
         if action is not None:
-            there = there @ self.transition_matrices[check_action(action, self.n_actions)]
+            there = there @ self.transition_matrices[valid.check_action(action, self.n_actions)]
             steps -= 1
         return np.asarray(there @ np.linalg.matrix_power(self.marginal_matrix, steps))
 
@@ -225,16 +215,18 @@ class FSMModel:
         Never seen, as far as the states tell: 29 from the nearest, #2 (gap 1 m), where a state
         reaches 2.8.
         """
-        index = None if action is None else check_action(action, self.n_actions)
+        index = None if action is None else valid.check_action(action, self.n_actions)
         if (situation is None) == (observation is None):
             raise ValueError("give either a situation or an observation")
+        nearest = None if observation is None else self.nearest(observation)
         if observation is not None:
             belief = np.ravel(self.recognise(observation))
-            return explain(self, belief, index, self.labels, self.nearest(observation))
-        if np.ndim(situation) == 0:  # type: ignore[arg-type] # it is given
-            state = check_index("state", situation, self.n_states, state_name)
-            return explain(self, np.eye(self.n_states)[state], index, self.labels)
-        return explain(self, self._belief(situation), index, self.labels)
+        elif np.ndim(situation) == 0:  # type: ignore[arg-type] # it is given
+            state = valid.check_index("state", situation, self.n_states, valid.state_name)
+            belief = np.eye(self.n_states)[state]
+        else:
+            belief = self._belief(situation)
+        return explain(self, belief, index, self.labels, nearest)
 
     def __repr__(self) -> str:
         variables = ", ".join(self.names) or f"{self.n_variables} variables"
@@ -250,13 +242,7 @@ class FSMModel:
     # -- Files ------------------------------------------------------------------------------------
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write it to a file.
-
-        Parameters
-        ----------
-        path, provenance
-            As `EvolvingFSM.save` takes them.
-        """
+        """Write it to a file, as `EvolvingFSM.save` does."""
         arrays = {name: getattr(self, name) for name in OF_MODEL}
         store.write(path, MODEL, self._content, arrays, provenance)
 
@@ -287,16 +273,15 @@ class FSMModel:
         """Centres (m, n), as kernels take them, and 1 / scale of each variable."""
         return np.array(self.centers.T, order="C"), weights_of(self.rule, self.n_variables)
 
-    def _observations(self, z: ArrayLike) -> tuple[Floats, Floats]:
-        """One observation or many, as given and row by row; refused where it is none."""
-        array = real_array("z", z, ndim=np.ndim(z))
-        rows = np.atleast_2d(array)
-        if rows.ndim != 2 or rows.shape[1] != self.n_variables:
+    def _rows(self, z: ArrayLike) -> Floats:
+        """(N, m) of one observation or many; refused where it is none."""
+        array = valid.real_array("z", z, ndim=np.ndim(z))
+        if array.ndim not in (1, 2) or array.shape[-1] != self.n_variables:
             raise ValueError(f"z has shape {array.shape}; a row needs {self.n_variables} variables")
-        refuse_unusable("z", array)
+        valid.refuse_unusable("z", array)
         if self.n_states == 0:
             raise ValueError("this model has no states: its machine had observed nothing")
-        return array, rows
+        return np.atleast_2d(array)
 
     def _belief(self, belief: Any) -> Floats:
         array = np.asarray(belief, dtype=np.float64)
@@ -305,7 +290,7 @@ class FSMModel:
                 f"belief has shape {array.shape}; the model has {self.n_states} states"
             )
         if self.n_states:
-            refuse_unless_distribution("belief", array)
+            valid.refuse_unless_distribution("belief", array)
         return array
 
 

@@ -61,8 +61,10 @@ def step(
         learnt.changes[now.state, nearest] += 1.0
     for i in range(lanes(n)):
         learnt.belief[i] = new_belief[i]
+    there = learnt.states[nearest]
     learnt.sums[VISITS, nearest] += 1.0
-    _count_visit(learnt, nearest)
+    learnt.sums[EPISODES, nearest] += there.latest_visit < now.began  # once for each episode
+    there.latest_visit = now.clock
     now.state, now.action, now.chained = nearest, NO_ACTION, 1
     if failed:
         _end(learnt, settings)
@@ -150,14 +152,6 @@ def _create(learnt: Learnt, settings: Settings, nearest: int, potential: float) 
 def _tick(now: Any) -> None:
     now.clock += 1
     now.began = now.began if now.chained else now.clock
-
-
-@inner_kernel
-def _count_visit(learnt: Learnt, state: int) -> None:
-    """Count that the present episode is in a state; once for each episode."""
-    there, now = learnt.states[state], learnt.now[0]
-    learnt.sums[EPISODES, state] += there.latest_visit < now.began
-    there.latest_visit = now.clock
 
 
 @inner_kernel

@@ -131,65 +131,55 @@ def merge_closest(learnt: Learnt, settings: Settings, nearest: int) -> Any:
 
 @rare_kernel
 def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> None:
-    """Add what was learnt of a state to another, whose centre moves between theirs, by visits."""
+    """Move what was learnt of a state to another, whose centre moves between theirs, by visits."""
     now, sums, a, b = learnt.now[0], learnt.sums, learnt.states[kept], learnt.states[given]
     share = sums[VISITS, given] / max(sums[VISITS, kept] + sums[VISITS, given], 1.0)
     for k in range(len(weights)):
         center = learnt.centers[k]
         center[kept] += share * (center[given] - center[kept])
-    _merge_rows(learnt, kept, given, n)
     for i in range(n):
         learnt.changes[kept, i] += learnt.changes[given, i]
+        learnt.changes[given, i] = 0.0
     for i in range(n):
         learnt.changes[i, kept] += learnt.changes[i, given]
+        learnt.changes[i, given] = 0.0
     # Of the present episode it is known that it came to both; of those before it is not.
     sums[EPISODES, kept] -= a.latest_visit >= now.began and b.latest_visit >= now.began
     for k in range(len(sums)):
         sums[k, kept] += sums[k, given]
+        sums[k, given] = 0.0
     a.latest_visit = max(a.latest_visit, b.latest_visit)
-    a.joined = 1.0
+    a.joined, b.joined, b.latest_visit = 1.0, 0.0, 0.0
     learnt.potentials[kept] = max(learnt.potentials[kept], learnt.potentials[given])
     learnt.belief[kept] += learnt.belief[given]
+    learnt.belief[given] = learnt.potentials[given] = 0.0
     for place in range(now.n_places):
-        learnt.decisions[place, kept] += learnt.decisions[place, given]
-        learnt.failures[place, kept] += learnt.failures[place, given]
-        record, addition = learnt.tries[place, kept], learnt.tries[place, given]
-        in_both = record.latest_try >= now.began and addition.latest_try >= now.began
-        record.tried += addition.tried - in_both
-        record.failed_after += addition.failed_after
-        record.latest_try = max(record.latest_try, addition.latest_try)
+        _merge_actions(learnt, place, kept, given, n)
     now.state = kept if now.state == given else now.state
-    _forget(learnt, given, n)
     # The latest observation, from centres of which one has moved.
     latest = learnt.variables["latest"]
     measure_distances(learnt.centers, weights, n, latest, learnt.squared_distances)
 
 
 @spliced_kernel
-def _forget(learnt: Learnt, given: int, n: int) -> None:
-    learnt.states[given].joined = learnt.states[given].latest_visit = 0.0
-    for k in range(len(learnt.sums)):
-        learnt.sums[k, given] = 0.0
-    learnt.belief[given] = learnt.potentials[given] = 0.0
+def _merge_actions(learnt: Learnt, place: int, kept: int, given: int, n: int) -> None:
+    """Move the transitions from and to a state by one action, and its counts, to another state."""
+    matrix, frequency = learnt.matrices[place], learnt.origin_frequency[place]
+    together = frequency[kept] + frequency[given]
+    share = frequency[given] / together if together > 0.0 else 0.0
+    for j in range(n):
+        matrix[kept, j] += share * (matrix[given, j] - matrix[kept, j])
+        matrix[given, j] = 0.0
+    frequency[kept], frequency[given] = together, 0.0
     for i in range(n):
-        learnt.changes[given, i] = learnt.changes[i, given] = 0.0
-    for place in range(learnt.now[0].n_places):
-        learnt.decisions[place, given] = learnt.failures[place, given] = 0.0
-        record = learnt.tries[place, given]
-        record.tried = record.failed_after = record.latest_try = 0.0
-
-
-@spliced_kernel
-def _merge_rows(learnt: Learnt, kept: int, given: int, n: int) -> None:
-    """Add the frequencies of transitions from and to a state to those of another one."""
-    for place in range(learnt.now[0].n_places):
-        matrix, frequency = learnt.matrices[place], learnt.origin_frequency[place]
-        together = frequency[kept] + frequency[given]
-        share = frequency[given] / together if together > 0.0 else 0.0
-        for j in range(n):
-            matrix[kept, j] += share * (matrix[given, j] - matrix[kept, j])
-            matrix[given, j] = 0.0
-        frequency[kept], frequency[given] = together, 0.0
-        for i in range(n):
-            matrix[i, kept] += matrix[i, given]
-            matrix[i, given] = 0.0
+        matrix[i, kept] += matrix[i, given]
+        matrix[i, given] = 0.0
+    for counts in (learnt.decisions[place], learnt.failures[place]):
+        counts[kept] += counts[given]
+        counts[given] = 0.0
+    now, record, addition = learnt.now[0], learnt.tries[place, kept], learnt.tries[place, given]
+    in_both = record.latest_try >= now.began and addition.latest_try >= now.began
+    record.tried += addition.tried - in_both
+    record.failed_after += addition.failed_after
+    record.latest_try = max(record.latest_try, addition.latest_try)
+    addition.tried = addition.failed_after = addition.latest_try = 0.0

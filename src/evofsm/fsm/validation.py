@@ -103,26 +103,18 @@ def whole(name: str, value: SupportsIndex) -> int:
     return number
 
 
-def real_array(name: str, values: ArrayLike, ndim: int) -> Floats:
-    """A new array of real numbers with ``ndim`` axes, the last one not empty."""
+def real_array(name: str, values: ArrayLike, ndim: int, *, copy: bool = True) -> Floats:
+    """Real numbers with ``ndim`` axes, the last one not empty; a new array unless told not to."""
     array = _array(name, values)
     if array.dtype.kind not in "fiub":
         raise TypeError(
             f"{name} has dtype {array.dtype}; it must hold real numbers "
             "(is there a text, a None or a complex number among them?)"
         )
-    if array.ndim != ndim or array.shape[-1] == 0:
+    if array.ndim != ndim or 0 in array.shape[-1:]:
         shape = "(variables,)" if ndim == 1 else "(rows, variables)"
         raise ValueError(f"{name} has shape {array.shape}; it must be {shape}, not empty")
-    return array.astype(np.float64)
-
-
-def real_rows(name: str, values: ArrayLike) -> Floats:
-    """Rows of real numbers, without gaps in memory: those given where they are that already."""
-    if type(values) is not np.ndarray or values.dtype != np.float64:
-        return real_array(name, values, ndim=2)
-    is_fit = values.ndim == 2 and values.shape[1]
-    return np.ascontiguousarray(values) if is_fit else real_array(name, values, ndim=2)
+    return np.array(array, np.float64, order="C", copy=copy or None)
 
 
 def _array(name: str, values: Any) -> NDArray[Any]:
