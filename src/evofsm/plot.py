@@ -32,7 +32,6 @@ with needs("matplotlib", "plot", "plotting"):
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
     from matplotlib.text import Annotation
 
 __all__ = ["COLORS", "experience", "graph", "states"]
@@ -116,8 +115,8 @@ def states(
     every = dots if len(dots) else centers.repeat(times, axis=0)
     ends = np.transpose([usual_range(x, y) for x, y in zip(every.T, dots[fails].T, strict=True)])
     centers, in_view = np.clip(centers, *ends), ((centers >= ends[0]) & (centers <= ends[1])).all(1)
-    look: Look = {"markersize": 1.5, "color": ink(0.3), "zorder": 1.2, "rasterized": True}
     if len(dots):
+        look: Look = {"markersize": 1.5, "color": ink(0.3), "zorder": 1.2, "rasterized": True}
         ax.plot(*dots.T, ".", label="observed", **look)
     if np.any(fails):
         look = {"markersize": 5.0, "color": COLORS["dead end"], "zorder": 4.0}
@@ -360,7 +359,7 @@ def history(
         sample = np.arange(0, len(z), max(len(z) // 2000, 1))
         nearest_states = [model.nearest(row).state for row in z[sample]]
         axes[-2].plot(x[sample], nearest_states, ".", markersize=1.5, color=COLORS["leader"])
-        label_states(axes[-2].yaxis, model.n_states)
+        label_states(axes[-2], model.n_states)
         write(axes[-2], "state", (0.0, 1.0), (0.0, 5.0), size=8.0, xycoords="axes fraction")
     look = {"linestyle": "none", "marker": "X", "markersize": 5.0, "color": COLORS["dead end"]}
     for kind, label in enumerate(("failure, foreseen", "failure, not foreseen"), 1):
@@ -462,22 +461,8 @@ def _apart(places: NDArray[np.float64], size: float) -> NDArray[np.float64]:
     return places
 
 
-def label_states(axis: Axis, n: int, dead_ends: States = (), *, called: str = "") -> None:
-    """Put the states' numbers, from 1, on an axis that counts them from 0; the dead ends' bold.
-
-    On an upward axis the rows of dead ends are tinted as well where they are ``called`` something.
-    """
+def label_states(ax: Axes, n: int) -> None:
+    """Put the states' numbers, from 1, on an upward axis that counts them from 0."""
     ticks = range(0, n, 1 if n <= _TICKS else math.ceil(n / 8))
-    sign = "" if axis is axis.axes.xaxis else "#"  # which there is no room for
-    axis.set_ticks(ticks, [f"{sign}{state + 1}" for state in ticks])
-    axis.set_tick_params(length=0, labelsize=points(7.0), pad=2.0)
-    for state, label in zip(ticks, axis.get_ticklabels(), strict=False):
-        if state in dead_ends:
-            label.set(color=COLORS["dead end"], fontweight="bold")
-    if called:
-        axis.axes.set_ylim(-0.6, n - 0.4)
-        tint: Look = {"color": COLORS["dead end"], "alpha": 0.18, "linewidth": 0.0, "zorder": 0.5}
-        look: Look = {"xycoords": ("axes fraction", "data"), "fontweight": "bold"}
-        for state in dead_ends:
-            axis.axes.axhspan(state - 0.5, state + 0.5, **tint)
-            write(axis.axes, called, (1.0, state), (4.0, 0.0), color=COLORS["dead end"], **look)
+    ax.set_yticks(ticks, [f"#{state + 1}" for state in ticks])
+    ax.tick_params("y", length=0, labelsize=points(7.0), pad=2.0)

@@ -208,6 +208,7 @@ def _optional(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 _SIZES = dict.fromkeys(("radius", "spread"), SIZE)
+# Squares of observations over the scales, summed over a long run, must not overflow.
 _RULE = _optional({**_SIZES, "scales": Numbers(("scales",), 1e-20, 1e20)})
 _BELOW_1, _WEIGHT = math.nextafter(1.0, 0.0), Numbers(least=SMALLEST, most=1e50)
 _LIMITS = dict.fromkeys(("max_states", "failure_horizon"), FROM_1)

@@ -108,16 +108,16 @@ def explain(
     sentences = [
         _of_place(known, belief, state, labels),
         _of_episodes(here, visits, soon, tally, "" if action is None else labels.action(action)),
-        "" if better is None else f"Better after {labels.action(better)}: {after_better}",
-        "" if is_exact else "States were joined here, so an episode may count twice",
-        ""
-        if origin is None
-        else f"Most often reached from {state_name(origin)}: {arrivals[origin]:,.0f} of "
-        f"{arrivals.sum():,.0f} times",
     ]
-    text = " ".join(f"{sentence}." for sentence in sentences if sentence)
+    if better is not None:
+        sentences.append(f"Better after {labels.action(better)}: {after_better}")
+    if not is_exact:
+        sentences.append("States were joined here, so an episode may count twice")
+    if origin is not None:
+        share = f"{arrivals[origin]:,.0f} of {arrivals.sum():,.0f} times"
+        sentences.append(f"Most often reached from {state_name(origin)}: {share}")
     contents = visits, here, origin, tally, better, after_better
-    return Explanation(text, state, float(belief[state]), *contents)
+    return Explanation(". ".join(sentences) + ".", state, float(belief[state]), *contents)
 
 
 def _never_seen(known: Any, belief: Floats, nearest: Nearest, labels: Labels) -> Explanation:

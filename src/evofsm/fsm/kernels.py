@@ -5,10 +5,8 @@ Constants that a kernel uses stand in a file of kernels: so a cache that is out 
 
 from __future__ import annotations
 
-import json
 import logging
 import os
-import re
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache, partial
@@ -195,23 +193,16 @@ def announce_compiling() -> None:
 
 def _drop_stale_caches(package: Path) -> None:
     """Delete cached code where a file of kernels has changed; Numba looks at its own file only."""
-    note = package / "__pycache__" / "kernels.json"
-    files = [(path, path.stat()) for path in sorted(package.rglob("*.py"))]
-    times = [[str(path), stat.st_size, stat.st_mtime_ns] for path, stat in files]
-    before: dict[str, Any] = {}
-    with suppress(OSError, ValueError):
-        before = json.loads(note.read_text("utf-8"))
-    if before.get("times") == times:
+    note = package / "__pycache__" / "kernels.sha256"
+    sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
+    digest = sha256(b"".join(text for text in sources if b"kernels import" in text)).digest()
+    if note.is_file() and note.read_bytes() == digest:
         return
-    sources = [path.read_bytes() for path, _ in files]
-    uses = re.compile(rb"^@(\w*kernel|compiled)\b", re.MULTILINE)
-    digest = sha256(b"".join(source for source in sources if uses.search(source))).hexdigest()
-    if before.get("digest") != digest:
-        for path in package.rglob("__pycache__/*.nb[ic]"):
-            path.unlink(missing_ok=True)
+    for path in package.rglob("__pycache__/*.nb[ic]"):
+        path.unlink(missing_ok=True)
     note.parent.mkdir(exist_ok=True)
     draft = note.with_name(f"{note.name}.{os.getpid()}")
-    draft.write_text(json.dumps({"times": times, "digest": digest}), "utf-8")
+    draft.write_bytes(digest)
     draft.replace(note)
 
 

@@ -41,8 +41,8 @@ from evofsm.store import LARGEST_OBSERVATION, Place
 _LIMITS = {"max_states": None, "failure_horizon": None}
 _OPTIONS = {**_LIMITS, "belief_tolerance": 0.0}
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
-# Arrays of a snapshot that a machine answers with.
-_ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers"}
+# What of a snapshot a machine answers with, beside what is its own.
+_ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"}
 _FLOAT64 = np.dtype(np.float64)
 # Compiled code of a step.
 _LEARN_ROWS = Entry(stepping.learn_rows)
@@ -451,7 +451,7 @@ class EvolvingFSM(Retraced):
         Parameters
         ----------
         path : str, path-like or binary file
-            A file of that name is replaced, or left as it was where this cannot be written.
+            It is replaced, or left as it was where this cannot be written.
         provenance : mapping, optional
             What it learnt from, for JSON.
         """
@@ -461,8 +461,7 @@ class EvolvingFSM(Retraced):
     def load(cls, path: Place) -> Self:
         """Read it from a file; it goes on bit for bit as if it had never been stopped.
 
-        Raises an OSError if it may not be read, and a ValueError if it holds something else, is
-        damaged, or of a newer version.
+        An OSError says that it may not be read, a ValueError that it is damaged, or something else.
         """
         content, learnt = store.read(path, MACHINE)
         with store.explained(path):
@@ -482,13 +481,12 @@ class EvolvingFSM(Retraced):
     @alone
     def __getstate__(self) -> dict[str, Any]:
         learnt = [array.copy() for array in self._learnt]
-        return {"rule": self._rule, "settings": self._settings, "learnt": learnt}
+        return {"_rule": self._rule, "_settings": self._settings, "_learnt": learnt}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self._rule, self._settings = state["rule"], state["settings"]
+        vars(self).update(state)
         # A file that is mapped for reading cannot be written to.
-        learnt = (np.require(array, requirements=("C", "W")) for array in state["learnt"])
-        self._learnt = Learnt(*learnt)
+        self._learnt = Learnt(*(np.require(array, None, ("C", "W")) for array in self._learnt))
         self._share()
 
     def __repr__(self) -> str:

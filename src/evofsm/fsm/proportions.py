@@ -109,12 +109,10 @@ class FailureRecord(NamedTuple):
                 exposures.append(f"{_exposure(exposure)} {unit}")
             if exposure:
                 rates.append(_rate(self.failures, exposure / per, words))
-        text = f"{counted(self.failures, 'failure')} in {', '.join(exposures)}"
-        if not rates:
-            return f"{text}: nothing is known"
-        if self.failures == 0:
-            return f"{text}: at most {', '.join(rates)}, 95 %"
-        return f"{text}: {', '.join(rates)}, 90 %"
+        known = f"{', '.join(rates)}, 90 %" if rates else "nothing is known"
+        if rates and self.failures == 0:
+            known = f"at most {', '.join(rates)}, 95 %"
+        return f"{counted(self.failures, 'failure')} in {', '.join(exposures)}: {known}"
 
 
 def _rate(failures: int, exposure: float, words: str) -> str:

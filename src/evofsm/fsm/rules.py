@@ -16,8 +16,6 @@ import numpy as np
 from evofsm.fsm.clusters import NOVELTY, PAPER
 from evofsm.fsm.validation import Floats, positive
 
-# Squares of observations over the scales, summed over a long run, must not overflow.
-_SCALES = 1e-20, 1e20
 # Where a rule has no radius that says so, a state reaches so many roots of the width.
 _WIDTHS = 2.0
 
@@ -93,9 +91,6 @@ class Novelty:
 
     def __post_init__(self) -> None:
         scales = tuple(positive("a scale", scale) for scale in self.scales)
-        for scale in scales:
-            if not _SCALES[0] <= scale <= _SCALES[1]:
-                raise ValueError(f"a scale is {scale}; it must lie between 1e-20 and 1e20")
         object.__setattr__(self, "scales", scales)
         object.__setattr__(self, "radius", positive("radius", self.radius))
         object.__setattr__(self, "spread", positive("spread", self.spread))
@@ -113,11 +108,7 @@ _RULES: dict[str, Any] = {"paper": Paper, "novelty": Novelty}
 def register_rule(name: str, rule: type) -> None:
     """Let machines take a state rule, and files name it.
 
-    Parameters
-    ----------
-    name : str
-    rule : type
-        A frozen dataclass as `StateRule`, whose settings JSON has words for.
+    It is a frozen dataclass as `StateRule`, whose settings JSON has words for.
 
     Examples
     --------
@@ -146,8 +137,7 @@ def rule_named(name: object) -> Any:
     if name not in _RULES:
         raise ValueError(
             f"rule is {name!r}; it must be one of {', '.join(_RULES)} (one of your own is known "
-            "once its module was imported and has called register_rule, or by an entry point of "
-            "evofsm.rules)"
+            "once its module has called register_rule, or by an entry point of evofsm.rules)"
         )
     return _RULES[name]
 
@@ -183,10 +173,8 @@ def describe_rule(rule: StateRule) -> dict[str, Any]:
     return {"name": name} | {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
 
 
-def restore_rule(description: Mapping[str, Any]) -> StateRule:
+def restore_rule(description: Mapping[str, Any] | None) -> StateRule:
     """The rule that `describe_rule` put into words."""
-    if not isinstance(description, Mapping) or not isinstance(description.get("name"), str):
-        raise ValueError(f"rule is {description!r}; it must have a name")
-    settings = {name: value for name, value in description.items() if name != "name"}
-    rule: StateRule = rule_named(description["name"])(**settings)
+    settings = dict(description or {})
+    rule: StateRule = rule_named(settings.pop("name", None))(**settings)
     return rule

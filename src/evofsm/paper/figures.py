@@ -90,8 +90,12 @@ def draw_case(study: PaperStudy, run: Run) -> Drawn:
     acceleration.plot(time, episode.accelerations, **_FOLLOWER)
     acceleration.set_ylabel("acceleration\n[m/s²]")
     state.step(time, run.state, where="post", color=COLORS["ink"])
-    plot.label_states(state.yaxis, study.model.n_states, study.dead_ends, called="collisions")
-    state.set_ylabel("recognised\nstate")
+    plot.label_states(state, study.model.n_states)
+    state.set(ylim=(-0.6, study.model.n_states - 0.4), ylabel="recognised\nstate")
+    look = {"xycoords": ("axes fraction", "data"), "color": COLORS["dead end"]}
+    for dead_end in study.dead_ends:
+        state.axhspan(dead_end - 0.5, dead_end + 0.5, **{**_TINT, "alpha": 0.18})
+        plot.write(state, "collisions", (1.0, dead_end), (4.0, 0.0), fontweight="bold", **look)
     action.step(time, run.action, where="post", **_FOLLOWER)
     n_actions = settings.actions.n_actions
     ticks = range(0, n_actions, max(1, round((n_actions - 1) / 4)))

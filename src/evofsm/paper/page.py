@@ -219,7 +219,6 @@ def write_page(path: Path, pages: Sequence[Page], title: str = "", about: str = 
     """
     with needs("jinja2", "plot", "writing the page"):
         from jinja2 import Environment, PackageLoader, StrictUndefined
-    path.parent.mkdir(parents=True, exist_ok=True)
     environment = Environment(
         loader=PackageLoader("evofsm.paper", ""),
         autoescape=True,

@@ -42,7 +42,7 @@ class Settings:
     actions: IntervalActions
 
     @classmethod
-    def load(cls, changes: Mapping[str, Any] | None = None) -> Settings:
+    def load(cls, changes: Mapping[str, Mapping[str, Any]] | None = None) -> Settings:
         """The paper's settings, with others in the place of some.
 
         ``changes`` are tables of ``settings.toml``, with what is changed in them; a ValueError says
@@ -55,7 +55,12 @@ class Settings:
         (6.0, 5.0)
         """
         tables = tomllib.loads(files(__package__).joinpath("settings.toml").read_text("utf-8"))
-        _merge(tables, changes or {})
+        for table, values in (changes or {}).items():
+            for name in values:
+                if name not in tables.get(table, {}):
+                    known = ", ".join(tables.get(table, tables))
+                    raise ValueError(f"[{table}]: there is no {name!r}; known are {known}")
+            tables[table] |= values
         scenario, leader, cases = dict(tables["scenario"]), dict(tables["leader"]), tables["cases"]
         safe_until = scenario.pop("safe_until")
         brake = {name: leader.pop(name) for name in ("brake_speed", "brake_decel")}
@@ -76,17 +81,6 @@ class Settings:
             machine=tables["machine"],
             actions=IntervalActions(**tables["actions"], outside="clip"),
         )
-
-
-def _merge(known: dict[str, Any], changes: Mapping[str, Any], where: str = "changes") -> None:
-    """Put changes in the place of known values."""
-    for name, value in changes.items():
-        if name not in known:
-            raise ValueError(f"{where}: there is no {name!r}; known are {', '.join(known)}")
-        if isinstance(known[name], dict):
-            _merge(known[name], value, f"{where}, [{name}]")
-        else:
-            known[name] = value
 
 
 # -- Runs -----------------------------------------------------------------------------------------
