@@ -154,7 +154,7 @@ def write(
     arrays: Mapping[str, NDArray[Any]],
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a file as a whole or not at all; when this returns, it is on the disk.
+    """Write a file as a whole or not at all.
 
     A ValueError or TypeError says what no file of this kind may hold.
     """
@@ -162,10 +162,7 @@ def write(
         raise TypeError(f"provenance is {provenance!r}; it must be a mapping of names to values")
     header = Header(kind.name, _VERSION, __version__, dict(settings), dict(provenance or {}))
     parts = _packed(kind, header, arrays)
-    if not isinstance(place, str | os.PathLike):
-        place.writelines(parts)
-        return
-    with replacing(place) as file:
+    with replacing(place) if isinstance(place, str | os.PathLike) else nullcontext(place) as file:
         file.writelines(parts)
 
 
@@ -174,10 +171,8 @@ def _packed(kind: Kind, header: Header, arrays: Mapping[str, NDArray[Any]]) -> l
     entries: dict[str, _Entry] = {}
     begin = 0
     for name, array in arrays.items():
-        if array.dtype not in _TYPE_NAMES:
-            raise ValueError(f"{name} is of {array.dtype}, which no file may hold")
-        end = begin + array.nbytes
-        entries[name] = _Entry(_TYPE_NAMES[array.dtype], list(array.shape), [begin, end])
+        dtype, end = _TYPE_NAMES.get(array.dtype, str(array.dtype)), begin + array.nbytes
+        entries[name] = _Entry(dtype, list(array.shape), [begin, end])
         begin = end
     text = json.dumps(header._asdict())
     sizes = _refuse_unfit(kind, json.loads(text)["settings"], entries)
@@ -265,13 +260,6 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
                 temporary.unlink(missing_ok=True)
         raise
     sweep(target)
-    # Not all systems can flush a folder; the file is whole, if not under its name, without it.
-    with suppress(OSError):
-        descriptor = os.open(target.parent, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def _write_over(target: Path, whole: BinaryIO) -> None:
@@ -497,8 +485,7 @@ def explained(place: Place) -> Iterator[None]:
     try:
         yield
     except _DAMAGE as error:
-        why = str(error)
-        why = why if len(why) <= _MOST_SAID else f"{why[:_MOST_SAID]} ..."
+        why = str(error)[:_MOST_SAID]
         raise ValueError(f"{_named(place)} cannot be read as an evofsm file: {why}") from error
 
 

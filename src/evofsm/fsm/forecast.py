@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evofsm.fsm import validation as valid
 from evofsm.fsm.arrays import NO_ACTION
@@ -83,7 +83,7 @@ class Forecasts:
         Parameters
         ----------
         model : FSMModel
-            Snapshot of the machine that has learnt these rows, ``machine.model()``.
+            Of the machine that has learnt these rows.
         Z, I
             As `EvolvingFSM.learn_many` takes them.
         """
@@ -94,7 +94,10 @@ class Forecasts:
         self._elsewhere = (1.0 - _ANYWHERE) * near + _ANYWHERE / self.n_states
         states = [np.flatnonzero(belief > _LEAST_BELIEF) for belief in beliefs]
         for horizon, steps in enumerate(self.steps):
-            self._make_room(horizon, actions)
+            counts = self._counts[horizon]
+            for action in {NO_ACTION, *actions.tolist()} | set(counts):
+                old = counts.get(action, np.zeros((0, 0)))
+                counts[action] = np.pad(old, (0, self.n_states - len(old)))
             for row in range(steps, len(beliefs)):
                 before = row - steps
                 arguments = beliefs[before], states[before], beliefs[row], states[row]
@@ -161,10 +164,3 @@ class Forecasts:
                 f"there are {n} states, but {self.n_states} were learnt (of another machine?)"
             )
         return n
-
-    def _make_room(self, horizon: int, actions: NDArray[np.int64]) -> None:
-        """Make room for all states, and for the actions that are used for the first time."""
-        counts, n = self._counts[horizon], self.n_states
-        for action in {NO_ACTION, *np.unique(actions).tolist()} | set(counts):
-            old = counts.get(action, np.zeros((0, 0)))
-            counts[action] = np.pad(old, (0, n - len(old)))

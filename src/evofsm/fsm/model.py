@@ -22,18 +22,14 @@ from evofsm.fsm.rules import Paper, StateRule, describe_rule, reach, restore_rul
 from evofsm.fsm.validation import Floats
 from evofsm.store import Place
 
-# In place of counts that are not given.
-_BLANK: Any = None
-
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class FSMModel:
     """States and transitions as they stood when the snapshot was taken.
 
-    n is the number of states, m of variables, q of actions. Distances and potentials are those of
-    observations divided by the rule's scales. Rows of a matrix are "from", columns "to". Arrays are
-    read-only, and counts that are not given are 0. Parts that do not fit each other, or hold what
-    cannot be, are refused.
+    `EvolvingFSM.model` takes it. n is the number of states, m of variables, q of actions. Distances
+    and potentials are those of observations divided by the rule's scales. Rows of a matrix are
+    "from", columns "to". Arrays are read-only.
 
     Counts never forget. An episode is counted once for each state it came to, and each action it
     took there, for its observations are no independent evidence; the one that is going on is not
@@ -72,35 +68,23 @@ class FSMModel:
     names: tuple[str, ...] = ()  #: of the m variables
     units: tuple[str, ...] = ()  #: of the m variables
     dt: float | None = None  #: time between two observations [s]
-    visits: Floats = _BLANK  #: (n,) observations in which each state was the most probable
-    created: Floats = _BLANK  #: (n,) number of the observation that created each state, from 1
-    changes: Floats = _BLANK  #: (n, n) steps from the most probable state to the next (column)
-    decisions: Floats = _BLANK  #: (q, n) transitions that began in each state, by belief
-    failures: Floats = _BLANK  #: (q, n) those of `decisions` that led straight into failure
-    endings: Floats = _BLANK  #: (n,) failures whose last observation was recognised as each state
-    episodes: Floats = _BLANK  #: (n,) episodes that came to each state
-    failed_soon: Floats = _BLANK  #: (n,) those of `episodes` that failed soon after they were there
-    joined: Floats = _BLANK  #: (n,) 1 where states were joined, so that an episode may count twice
-    tried: Floats = _BLANK  #: (q, n) episodes that took each action in each state
-    failed_after: Floats = _BLANK  #: (q, n) those of `tried` that failed soon after they did
+    visits: Floats  #: (n,) observations in which each state was the most probable
+    created: Floats  #: (n,) number of the observation that created each state, from 1
+    changes: Floats  #: (n, n) steps from the most probable state to the next (column)
+    decisions: Floats  #: (q, n) transitions that began in each state, by belief
+    failures: Floats  #: (q, n) those of `decisions` that led straight into failure
+    endings: Floats  #: (n,) failures whose last observation was recognised as each state
+    episodes: Floats  #: (n,) episodes that came to each state
+    failed_soon: Floats  #: (n,) those of `episodes` that failed soon after they were there
+    joined: Floats  #: (n,) 1 where states were joined, so that an episode may count twice
+    tried: Floats  #: (q, n) episodes that took each action in each state
+    failed_after: Floats  #: (q, n) those of `tried` that failed soon after they did
 
     def __post_init__(self) -> None:
-        m, q, n = self.n_variables, self.n_actions, self.n_states
-        sizes: dict[int | str, int] = {"n": n, "m": m, "q": q}
-        for name, numbers in OF_MODEL.items():
-            values = getattr(self, name)
-            shape = [sizes[size] for size in numbers.shape]
-            array = np.zeros(shape) if values is None else np.array(values, np.float64)
-            numbers.refuse_others(name, array, sizes)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        for name in OF_MODEL:
+            getattr(self, name).setflags(write=False)
         MODEL.refuse_others(self._content)
-        valid.refuse_more_failures({name: getattr(self, name) for name in OF_MODEL})
-        failure_counts = self.failures, self.endings, self.failed_soon
-        is_told = bool(self.failures_told) or any(counts.any() for counts in failure_counts)
-        object.__setattr__(self, "failures_told", is_told)
-        rows = self.transition_matrices
-        valid.refuse_unless_distribution("a row of transition_matrices", rows)
+        m, q = self.n_variables, self.n_actions
         for name in ("names", "units"):
             if len(getattr(self, name)) not in (0, m):
                 raise ValueError(f"{name} are {getattr(self, name)}, but there are {m} variables")

@@ -39,10 +39,7 @@ def wilson_bounds(share: float, count: float, quantile: float = _QUANTILE) -> tu
 
 @cache
 def poisson_bounds(count: int) -> tuple[float, float]:
-    """90 % interval of the number of events to be expected where ``count`` were seen.
-
-    The bounds are where as few, and as many, are seen in 5 % of cases (Garwood 1936).
-    """
+    """90 % interval of the expected number of events where ``count`` were seen (Garwood 1936)."""
     return _mean(count - 1, 0.95) if count else 0.0, _mean(count, 0.05)
 
 
@@ -78,12 +75,9 @@ def _percent(share: float, rounded: Callable[[float], int]) -> str:
 
 
 def outward(rounded: Callable[[float], int], value: float, decimals: int) -> float:
-    """A number with so many decimals, rounded by ``math.floor`` or ``math.ceil``.
-
-    What is off such a number by rounding alone is that number: 0.1 + 0.2 is 0.3.
-    """
+    """A number with so many decimals, rounded by ``math.floor`` or ``math.ceil``."""
     scale = 10.0**decimals
-    return rounded(round(value * scale, 6)) / scale
+    return rounded(round(value * scale, 6)) / scale  # 0.1 + 0.2 is 0.3
 
 
 class FailureRecord(NamedTuple):

@@ -50,9 +50,7 @@ def step(
     surprise = np.nan
     if now.chained and now.action != NO_ACTION:
         place = place_of(learnt, now.action, settings.prior_frequency)
-        matrix, frequency = learnt.matrices[place], learnt.origin_frequency[place]
-        belief, rate = learnt.belief, settings.learning_rate
-        forecast_and_identify(matrix, frequency, n, belief, new_belief, rate, forecast)
+        forecast_and_identify(learnt, settings, place, n, new_belief, forecast)
         surprise = jensen_shannon_kernel(forecast, new_belief, lanes(n), scratch[TERMS])
         learnt.actions[now.action].uses += 1.0
         _count_decision(learnt, place, n, failed)
@@ -83,12 +81,9 @@ def learn_rows(
     scratch: Floats,
     row: int,
     trace: Trace,
-    beliefs: Floats,
+    beliefs: Floats,  # (T, capacity), or empty where nobody wants them
 ) -> int:
-    """Step through the rows from ``row`` on; returns where it stopped for want of room.
-
-    ``beliefs`` is (T, capacity), or empty where nobody wants them.
-    """
+    """Step through the rows from ``row`` on; returns where it stopped for want of room."""
     now, room = learnt.now[0], (len(learnt.belief), len(learnt.matrices))
     while row < len(observations) and room_for(learnt, settings) == room:
         now.chained = 0 if starts[row] else now.chained

@@ -48,23 +48,19 @@ def place_of(learnt: Learnt, action: int, prior_frequency: float) -> int:
 
 @inner_kernel
 def forecast_and_identify(
-    matrix: Floats,
-    origin_frequency: Floats,
-    n: int,
-    origin: Floats,
-    reached: Floats,
-    learning_rate: float,
-    predicted: Floats,
+    learnt: Learnt, settings: Settings, place: int, n: int, reached: Floats, predicted: Floats
 ) -> None:
-    """Forecast one step, ``origin @ P``, then learn the transition from ``origin`` to ``reached``.
+    """Forecast one step, ``belief @ P``, then learn the transition from there to ``reached``.
 
     Both in one pass over the matrix, which is most of what a step costs. A row whose state was
     not believed in plays no part in either.
     """
+    matrix, origin_frequency = learnt.matrices[place], learnt.origin_frequency[place]
+    learning_rate = settings.learning_rate
     for j in range(lanes(n)):
         predicted[j] = 0.0
     for i in range(n):
-        belief = origin[i]
+        belief = learnt.belief[i]
         gain = learning_rate * belief
         frequency = (1.0 - learning_rate) * origin_frequency[i] + gain
         is_known = frequency >= _LOWEST_FREQUENCY

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, SupportsFloat, SupportsIndex, TypeAlias, TypeVar
 
@@ -15,8 +15,6 @@ from evofsm.store import LARGEST_OBSERVATION
 Floats: TypeAlias = NDArray[np.float64]
 _F = TypeVar("_F")
 
-# Cases, and failures among them.
-_OUTCOMES = (("decisions", "failures"), ("episodes", "failed_soon"), ("tried", "failed_after"))
 # NumPy is quicker for longer vectors.
 _SHORT = 16
 _ENCODE = "IntervalActions.encode turns a number into one"
@@ -156,13 +154,6 @@ def refuse_unless_distribution(name: str, rows: Floats) -> None:
     """Raise unless every row, along the last axis, has no entry below 0 and sums to 1."""
     if not ((rows >= 0.0).all() and (np.abs(rows.sum(axis=-1) - 1.0) < 1e-6).all()):
         raise ValueError(f"{name} is no distribution: entries must be 0 or more and sum to 1")
-
-
-def refuse_more_failures(arrays: Mapping[str, Floats]) -> None:
-    """Raise where there are more failures than cases, in what has the outcomes by name."""
-    for cases, failures in _OUTCOMES:
-        if (arrays[failures] > arrays[cases]).any():
-            raise ValueError(f"{failures} cannot be more than {cases}")
 
 
 def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.int64]:

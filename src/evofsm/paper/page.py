@@ -1,8 +1,4 @@
-"""Pages of results: text, tables and figures in one HTML file that loads nothing.
-
-The paper's page and those of all studies are made here; `evofsm.cli.print_page` says the same in
-the terminal.
-"""
+"""Pages of results, of the paper and of all studies: one HTML file that loads nothing."""
 
 from __future__ import annotations
 

@@ -25,9 +25,6 @@ from evofsm.fsm.model import FSMModel
 CASES = (1, 2, 3, 4)
 
 
-# -- Settings -------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Settings:
     """All that the runs can be told; the defaults stand in ``settings.toml``."""
