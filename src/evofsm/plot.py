@@ -147,8 +147,7 @@ def states(
         _explain(ax)
     draw_centers(ax, centers, dead_ends, size=13.0)
     ax.axis(limits)
-    across, up = map(model.labels.variable, variables)
-    ax.set(xlabel=across, ylabel=up)
+    ax.set(xlabel=model.labels.variable(pair[0]), ylabel=model.labels.variable(pair[1]))
     return ax
 
 
@@ -310,14 +309,11 @@ def history(
     ----------
     axes : sequence of Axes
         One for each variable, then one for the states if there is a model, and one for alarms.
-    time : (T,) array_like
-        In seconds, or as dates since 1970.
-    rows : (T, m) array_like
-    names : sequence of str
-    alarms : (T,) array_like
-        1 while an alarm is on that a failure followed, 2 while one is that none did; else 0.
-    failures : (T,) array_like
-        1 with a failure that was foreseen, 2 with one that was not; else 0.
+    time, rows, names : (T,) and (T, m) array_like, sequence of str
+        The time in seconds, or as dates since 1970.
+    alarms, failures : (T,) array_like
+        1 while an alarm is on that a failure followed, and with a failure that was foreseen; 2
+        where none followed, or it was not; else 0.
     model : FSMModel, optional
     limits : sequence of (int, float)
         Variables, by their index, and the values at which they alarm.

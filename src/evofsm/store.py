@@ -154,10 +154,7 @@ def write(
     arrays: Mapping[str, NDArray[Any]],
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a file as a whole or not at all.
-
-    A ValueError or TypeError says what no file of this kind may hold.
-    """
+    """Write a file as a whole or not at all; an error says what no such file may hold."""
     if not isinstance(provenance, Mapping | None):
         raise TypeError(f"provenance is {provenance!r}; it must be a mapping of names to values")
     header = Header(kind.name, _VERSION, __version__, dict(settings), dict(provenance or {}))
@@ -334,10 +331,7 @@ def read_header(place: Place) -> Header:
 
 
 def read(place: Place, kind: Kind) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Read a file of a kind: its settings and its arrays, all that the kind declares checked.
-
-    A ValueError says whether it holds something else, is damaged or of a newer version.
-    """
+    """Read a file of a kind: its settings and its arrays, all that the kind declares checked."""
     with _opened(place) as file:
         with explained(place):
             header, entries, head, sha256 = _unpacked(file)

@@ -334,17 +334,9 @@ class EvolvingFSM(Retraced):
             array[indices] = contents[name][contents["place"][indices]]
         parts = {name: contents[name] for name in OF_MODEL} | of_actions
         parts["centers"] = contents["centers"].T
-        return FSMModel(
-            **parts,
-            width=self.width,
-            rule=self._rule,
-            failures_told=self.failures_told,
-            settings=self.settings,
-            actions=actions,
-            names=tuple(names),
-            units=tuple(units),
-            dt=dt,
-        )
+        own = {name: getattr(self, name) for name in ("width", "rule", "failures_told", "settings")}
+        labels = Labels(actions, tuple(names), tuple(units), dt)
+        return FSMModel(**parts, **own, **labels._asdict())
 
     def __getattr__(self, name: str) -> Any:
         """A setting, or an array of the snapshot of now."""

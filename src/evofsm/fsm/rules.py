@@ -16,7 +16,7 @@ import numpy as np
 from evofsm.fsm.clusters import NOVELTY, PAPER
 from evofsm.fsm.validation import Floats, positive
 
-# Where a rule has no radius that says so, a state reaches so many roots of the width.
+# So many roots of the width a state reaches where no radius says so: the similarity is 1/e⁴ there.
 _WIDTHS = 2.0
 
 
@@ -159,11 +159,7 @@ def weights_of(rule: StateRule, m: int) -> Floats:
 
 
 def reach(rule: StateRule, width: float) -> float:
-    """Distance from a centre, in scales, beyond which an observation is like no state.
-
-    The radius of `Novelty`; of other rules twice the root of the width of recognition, where the
-    similarity is 1/e⁴, or 2 %.
-    """
+    """Distance from a centre, in scales, beyond which an observation is like no state."""
     return rule.radius if isinstance(rule, Novelty) else _WIDTHS * math.sqrt(width)
 
 

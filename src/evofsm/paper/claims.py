@@ -35,15 +35,15 @@ def check_claims(study: PaperStudy) -> tuple[Claim, ...]:
 
 def _of_collisions(study: PaperStudy) -> Iterator[Claim]:
     as_in_paper = sum(run.episode.collided == _COLLIDES[run.case] for run in study.runs)
-    safe = all(study.safe_at_the_end.values())
     yield Claim(
         "collisions_by_case",
         "Collision in cases 1 and 4, none in cases 2 and 3",
         "yes, no, no, yes",
         f"{', '.join(_outcome(run) for run in study.last_round)}; so in {as_in_paper} of "
         f"{len(study.runs)} runs; cases 2 and 3 "
-        f"{'are safe' if safe else 'have collided'} at {study.settings.safe_until:g} s",
-        as_in_paper == len(study.runs) and safe,
+        f"{'are safe' if study.is_safe_at_the_end else 'have collided'} at "
+        f"{study.settings.safe_until:g} s",
+        as_in_paper == len(study.runs) and study.is_safe_at_the_end,
     )
     decel = study.settings.scenario.leader.brake_decel
     for time, run in zip(study.settings.brake_at, study.extra_runs, strict=True):

@@ -105,7 +105,7 @@ class PaperStudy:
     settings: Settings
     runs: tuple[Run, ...]
     extra_runs: tuple[Run, ...]
-    safe_at_the_end: Mapping[int, bool]  #: whether the longer runs of cases 2 and 3 stay safe
+    is_safe_at_the_end: bool  #: whether the longer runs of cases 2 and 3 stay safe
     model: FSMModel
     dead_end: int  #: index of the state that stands at most collisions; -1 without collisions
 
@@ -150,15 +150,13 @@ def run_paper(
     progress : callable
         Told how many runs are done, of how many.
     order : sequence of int
-        In which the cases are driven in each round.
+        In which the cases are driven in each round, each of them once.
     observe : callable, optional
         What the machine observes of a run, (T, 3), told how many runs came before, and the run;
         without it what truly happened.
     """
     if rounds < 1:
         raise ValueError(f"rounds is {rounds}; the cases must be driven at least once")
-    if sorted(order) != list(CASES):
-        raise ValueError(f"order is {list(order)}; it must hold each of the cases once")
     machine = EvolvingFSM(settings.actions.n_actions, **settings.machine)
     total = rounds * len(CASES) + len(settings.brake_at) + 2
     runs, extra_runs = list[Run](), list[Run]()
@@ -187,17 +185,10 @@ def run_paper(
         scenario = replace(settings.scenario, leader=leader)
         extra_runs.append(learn(machine.copy(), f"brake at {time:g} s", 1, scenario))
     longer = replace(settings.scenario, duration=settings.safe_until)
-    safe = {case: not world.run(longer, settings.drivers[case]).collided for case in (2, 3)}
+    is_safe = not any(world.run(longer, settings.drivers[case]).collided for case in (2, 3))
     progress(total, total)
+    dt = settings.scenario.dt
+    model = machine.model(actions=settings.actions, names=VARIABLES, units=UNITS, dt=dt)
     at_collisions = [run.state[-1] for run in runs if run.episode.collided]
-    return PaperStudy(
-        world=name,
-        settings=settings,
-        runs=tuple(runs),
-        extra_runs=tuple(extra_runs),
-        safe_at_the_end=safe,
-        model=machine.model(
-            actions=settings.actions, names=VARIABLES, units=UNITS, dt=settings.scenario.dt
-        ),
-        dead_end=int(np.bincount(at_collisions).argmax()) if at_collisions else -1,
-    )
+    dead_end = int(np.bincount(at_collisions).argmax()) if at_collisions else -1
+    return PaperStudy(name, settings, tuple(runs), tuple(extra_runs), is_safe, model, dead_end)
