@@ -60,8 +60,6 @@ _TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
 _OLD = 600.0
 # Why no file can take the place of another one.
 _IRREPLACEABLE = (errno.EBUSY, errno.EXDEV, errno.EACCES, errno.EPERM, errno.EROFS)
-# Of an error that quotes a damaged file, so many letters are told.
-_MOST_SAID = 300
 # What reading a damaged file may run into (RuntimeError: JSON that is nested too deep).
 _DAMAGE = (ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, EOFError)
 
@@ -93,9 +91,9 @@ class Numbers(NamedTuple):
             return
         for number in (float(numbers.min()), float(numbers.max())):
             if not self.least <= number <= self.most:
+                ends = f"{self.least:g} and {self.most:g}"
                 raise ValueError(
-                    f"{name} of {number:g} cannot be right: it must lie between {self.least:g} and "
-                    f"{self.most:g}"
+                    f"{name} of {number:g} cannot be right: it must lie between {ends}"
                 )
         if self.whole and (isinstance(given, float) or (numbers != np.rint(numbers)).any()):
             raise ValueError(f"{name} holds a fraction; it must be an integer")
@@ -196,10 +194,8 @@ def only_writer(file: BinaryIO, path: str | os.PathLike[str], otherwise: str) ->
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(
-                f"{os.fspath(path)} is being written by another process; wait for its end, or "
-                f"{otherwise}"
-            ) from None
+            why = "is being written by another process; wait for its end, or"
+            raise ValueError(f"{os.fspath(path)} {why} {otherwise}") from None
 
 
 def let_others_write(file: BinaryIO) -> None:
@@ -373,10 +369,8 @@ def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise ValueError("it is another program's file, or its header is damaged") from None
     if type(version) is int and version > _VERSION:
-        raise ValueError(
-            f"its version {version} is newer than this library's {_VERSION}; "
-            "a newer evofsm reads it"
-        )
+        versions = f"its version {version} is newer than this library's {_VERSION}"
+        raise ValueError(f"{versions}; a newer evofsm reads it")
     header = Header(**header_fields)
     types = (str, int, str, dict, dict)
     if tuple(map(type, header)) != types or not re.fullmatch("[a-z]{1,20}", header.kind):
@@ -479,7 +473,7 @@ def explained(place: Place) -> Iterator[None]:
     try:
         yield
     except _DAMAGE as error:
-        why = str(error)[:_MOST_SAID]
+        why = str(error)[:300]  # it may quote a damaged file
         raise ValueError(f"{_named(place)} cannot be read as an evofsm file: {why}") from error
 
 

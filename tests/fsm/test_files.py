@@ -101,7 +101,7 @@ MACHINES = [
 MODELS = [
     ("visits", -1.0, "visits of -1"),
     ("actions", {"low": -1e308, "high": 0.0, "width": 1e308}, "actions.low of -1e"),
-    ("actions", {"low": -0.5, "high": 1.0, "width": 1e-12}, "100,000 intervals at most"),
+    ("actions", {"low": -0.5, "high": 1.0, "width": 1e-12}, "1 to 100,000 intervals"),
     ("failures_told", {}, "failures_told is {}; it must be of type bool"),
     ("names", {}, r"names is {}; it must be of type list\[str\]"),
     ("units", ["m", 1], r"units is \['m', 1\]"),

@@ -56,16 +56,11 @@ class IntervalActions:
         if not self.low < self.high:
             raise ValueError(f"low is {self.low} and high is {self.high}; low must be below high")
         if not self.width * _MOST >= self.high - self.low:
-            raise ValueError(
-                f"width is {self.width}; it must be positive, and make {_MOST:,} intervals at most"
-            )
+            raise ValueError(f"width is {self.width}; it must make 1 to {_MOST:,} intervals")
         if self.outside not in ("error", "clip"):
             raise ValueError(f"outside is {self.outside!r}; it must be 'error' or 'clip'")
         if not (np.diff(self.edges) > 0.0).all():
-            raise ValueError(
-                f"width is {self.width}, but edges are rounded to {_DIGITS} decimals and then "
-                "coincide; use a larger unit"
-            )
+            raise ValueError(f"width is {self.width}: rounded edges coincide; use a larger unit")
 
     @property
     def n_actions(self) -> int:

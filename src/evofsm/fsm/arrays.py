@@ -125,9 +125,6 @@ def resized(learnt: Learnt, capacity: int, places: int) -> Learnt:
     return copy
 
 
-# -- By name --------------------------------------------------------------------------------------
-
-
 def by_name(learnt: Learnt) -> dict[str, NDArray[Any]]:
     """Every array and every field of records, without spare room, as a copy."""
     n, s = int(learnt.now["n_states"][0]), int(learnt.now["n_places"][0])

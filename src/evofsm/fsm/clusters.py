@@ -150,9 +150,6 @@ def _absorb(now: Any, variables: Records, weights: Floats, z: Floats) -> None:
     now.scatter += increment
 
 
-# -- Recognise ------------------------------------------------------------------------------------
-
-
 @inner_kernel
 def width_of(settings: Settings, variance: float) -> float:
     """Width of recognition by the total variance of observations; the paper leaves it open."""

@@ -50,10 +50,8 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
     """
     p, q = np.asarray(p, dtype=np.float64), np.asarray(q, dtype=np.float64)
     if p.ndim == 0 or q.ndim == 0 or p.shape[-1] != q.shape[-1]:
-        raise ValueError(
-            f"p has shape {p.shape} and q has shape {q.shape}: "
-            "both need the same number of states on their last axis"
-        )
+        shapes = f"p has shape {p.shape} and q has shape {q.shape}"
+        raise ValueError(f"{shapes}: both need the same number of states on their last axis")
     refuse_unless_distribution("p", p)
     refuse_unless_distribution("q", q)
     shape = np.broadcast_shapes(p.shape, q.shape)

@@ -160,7 +160,6 @@ class Forecasts:
     def _check_states(self, n: int) -> int:
         """A number of states that can be of the same machine, later on."""
         if n < self.n_states:
-            raise ValueError(
-                f"there are {n} states, but {self.n_states} were learnt (of another machine?)"
-            )
+            before = f"{self.n_states} were learnt (of another machine?)"
+            raise ValueError(f"there are {n} states, but {before}")
         return n

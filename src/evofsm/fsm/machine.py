@@ -35,7 +35,7 @@ from evofsm.fsm.sharing import Retraced, alone, share, step
 from evofsm.fsm.step import EVENTS, PREDICTED, Event, Step, Trace, blank_trace
 from evofsm.fsm.transitions import room_for
 from evofsm.fsm.validation import Floats, positive, probability, whole
-from evofsm.store import LARGEST_OBSERVATION, Place
+from evofsm.store import Place
 
 # What a machine does not have to be given, with what holds if it is not.
 _LIMITS = {"max_states": None, "failure_horizon": None}
@@ -43,7 +43,6 @@ _OPTIONS = {**_LIMITS, "belief_tolerance": 0.0}
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
 # What of a snapshot a machine answers with, beside what is its own.
 _ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"}
-_FLOAT64 = np.dtype(np.float64)
 # Compiled code of a step.
 _LEARN_ROWS = Entry(stepping.learn_rows)
 
@@ -110,7 +109,8 @@ class EvolvingFSM(Retraced):
         belief_tolerance: float = 0.0,
         failure_horizon: int | None = None,
     ) -> None:
-        self._rule = rules.Paper() if rule is None else rules.check_rule(rule)
+        self._rule = rules.Paper() if rule is None else rule
+        rules.describe_rule(self._rule)
         table = {name: float(value) for name, value in self._rule.table.items()}
         for name, value in (("radius", radius), ("spread", spread)):
             if value is not None and table.setdefault(name, positive(name, value)) != value:
@@ -332,11 +332,12 @@ class EvolvingFSM(Retraced):
         contents["transition_matrices"] = contents["matrices"]
         for name, array in of_actions.items():
             array[indices] = contents[name][contents["place"][indices]]
-        parts = {name: contents[name] for name in OF_MODEL} | of_actions
+        parts: dict[str, Any] = {name: contents[name] for name in OF_MODEL} | of_actions
         parts["centers"] = contents["centers"].T
-        own = {name: getattr(self, name) for name in ("width", "rule", "failures_told", "settings")}
+        for name in ("width", "rule", "failures_told", "settings"):
+            parts[name] = getattr(self, name)
         labels = Labels(actions, tuple(names), tuple(units), dt)
-        return FSMModel(**parts, **own, **labels._asdict())
+        return FSMModel(**parts, **labels._asdict())
 
     def __getattr__(self, name: str) -> Any:
         """A setting, or an array of the snapshot of now."""
@@ -460,9 +461,7 @@ class EvolvingFSM(Retraced):
             machine = cls(**{**content, "rule": rules.restore_rule(content["rule"])})
             if m := len(learnt["first"]):
                 machine._fit(m)
-                machine._learnt = arrays.from_names(learnt, m, machine.n_actions)
-            else:
-                machine._learnt.now["failures_told"] = learnt["failures_told"]
+            machine._learnt = arrays.from_names(learnt, m, machine.n_actions)
             return machine
 
     @property
@@ -549,13 +548,6 @@ class EvolvingFSM(Retraced):
 
     def _checked(self, z: ArrayLike) -> Floats:
         """An observation as a vector of its own."""
-        if (
-            type(z) is np.ndarray
-            and z.dtype is _FLOAT64
-            and z.shape == self._learnt.variables.shape
-            and valid.is_within(z, LARGEST_OBSERVATION)
-        ):
-            return z.copy()
         vector = valid.real_array("observation", z, ndim=1)
         valid.refuse_unusable("observation", vector)
         return vector
@@ -563,10 +555,8 @@ class EvolvingFSM(Retraced):
     def _fit(self, m: int) -> None:
         """Make room for observations of ``m`` variables; raise where the first had others."""
         if self.n_states and m != self.n_variables:
-            raise ValueError(
-                f"observation has {m} variables, but this machine was started with "
-                f"{self.n_variables}"
-            )
+            before = f"this machine was started with {self.n_variables}"
+            raise ValueError(f"observation has {m} variables, but {before}")
         if self.n_states == 0:
             self._settings = self._settings._replace(weights=rules.weights_of(self._rule, m))
             learnt = arrays.blank(m, self.n_actions, LINE, 0)

@@ -137,10 +137,7 @@ class FSMModel:
         return Nearest(state, float(distances[state]), reach(self.rule, self.width))
 
     def propagate(
-        self,
-        belief: ArrayLike,
-        action: SupportsIndex | None = None,
-        horizon: int = 1,
+        self, belief: ArrayLike, action: SupportsIndex | None = None, horizon: int = 1
     ) -> Floats:
         """(n,) distribution over states some steps later: the paper's Section 2.3.2.
 
@@ -223,8 +220,6 @@ class FSMModel:
         """Itself: nothing in it ever changes."""
         return self
 
-    # -- Files ------------------------------------------------------------------------------------
-
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write it to a file, as `EvolvingFSM.save` does."""
         arrays = {name: getattr(self, name) for name in OF_MODEL}
@@ -250,8 +245,6 @@ class FSMModel:
             "settings": dict(self.settings),
         }
 
-    # -- Inside ---------------------------------------------------------------------------------
-
     @cached_property
     def _places(self) -> tuple[Floats, Floats]:
         """Centres (m, n), as kernels take them, and 1 / scale of each variable."""
@@ -268,12 +261,10 @@ class FSMModel:
         return np.atleast_2d(array)
 
     def _belief(self, belief: Any) -> Floats:
-        array = np.asarray(belief, dtype=np.float64)
-        if array.shape != (self.n_states,):
-            raise ValueError(
-                f"belief has shape {array.shape}; the model has {self.n_states} states"
-            )
-        if self.n_states:
+        array, n = np.asarray(belief, dtype=np.float64), self.n_states
+        if array.shape != (n,):
+            raise ValueError(f"belief has shape {array.shape}; the model has {n} states")
+        if n:
             valid.refuse_unless_distribution("belief", array)
         return array
 

@@ -16,9 +16,6 @@ from evofsm.fsm.validation import Floats, number
 with needs("River", "river", "a clusterer of River"):
     from river import base
 
-# A clusterer acts on nothing: there is one action, and it is always taken.
-_ACTION = 0
-
 
 class RiverClusterer(base.Clusterer):
     """The states of an `EvolvingFSM` as the clusters of a River clusterer.
@@ -72,7 +69,7 @@ class RiverClusterer(base.Clusterer):
         z = self._vector(x)
         if self.machine.n_states or not np.isnan(z).any():
             self.machine.observe(z, partial=True)
-            self.machine.act(_ACTION)
+            self.machine.act(0)  # a clusterer acts on nothing: there is one action
 
     @property
     def centers(self) -> dict[int, dict[Hashable, float]]:

@@ -1,7 +1,4 @@
-"""State rules: when an observation creates or moves a state, and how wide a state is recognised.
-
-Its ``table`` has the numbers by which `evofsm.fsm.clusters.determine` judges an observation.
-"""
+"""State rules: by what numbers `evofsm.fsm.clusters.determine` judges an observation."""
 
 from __future__ import annotations
 
@@ -142,14 +139,6 @@ def rule_named(name: object) -> Any:
     return _RULES[name]
 
 
-def check_rule(rule: StateRule) -> StateRule:
-    """One of the rules, as an object."""
-    if type(rule) not in _RULES.values():
-        names = ", ".join(f"{kind.__name__}(...)" for kind in _RULES.values())
-        raise TypeError(f"rule is {rule!r}; it must be an object: {names}")
-    return rule
-
-
 def weights_of(rule: StateRule, m: int) -> Floats:
     """(m,) 1 / scale of each variable."""
     scales = np.array(rule.scales or [1.0] * m)
@@ -164,9 +153,13 @@ def reach(rule: StateRule, width: float) -> float:
 
 
 def describe_rule(rule: StateRule) -> dict[str, Any]:
-    """A rule in plain JSON: its name and its settings."""
-    name, kind = next(item for item in _RULES.items() if item[1] is type(rule))
-    return {"name": name} | {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
+    """A rule in plain JSON: its name and its settings; a TypeError where it is none."""
+    for name, kind in _RULES.items():
+        if kind is type(rule):
+            settings = [part.name for part in fields(_RULES[name])]
+            return {"name": name} | {part: getattr(rule, part) for part in settings}
+    names = ", ".join(f"{kind.__name__}(...)" for kind in _RULES.values())
+    raise TypeError(f"rule is {rule!r}; it must be an object: {names}")
 
 
 def restore_rule(description: Mapping[str, Any] | None) -> StateRule:

@@ -106,8 +106,7 @@ def merge_closest(learnt: Learnt, settings: Settings, nearest: int) -> Any:
     """Merge the two closest of all n states and the newcomer; returns the index that is free.
 
     That index goes to the new state, so that no other changes. The newcomer is the latest
-    observation, and ``nearest`` the centre closest to it. Where it is one of the two, that is n: it
-    is left out.
+    observation, closest to the centre ``nearest``. Where it is one of the two, n is returned.
     """
     n, weights = learnt.now[0].n_states, settings.weights
     closest = learnt.squared_distances[nearest]

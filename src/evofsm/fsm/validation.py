@@ -105,10 +105,8 @@ def real_array(name: str, values: ArrayLike, ndim: int, *, copy: bool = True) ->
     """Real numbers with ``ndim`` axes, the last one not empty; a new array unless told not to."""
     array = _array(name, values)
     if array.dtype.kind not in "fiub":
-        raise TypeError(
-            f"{name} has dtype {array.dtype}; it must hold real numbers "
-            "(is there a text, a None or a complex number among them?)"
-        )
+        hint = "is there a text, a None or a complex number among them?"
+        raise TypeError(f"{name} has dtype {array.dtype}; it must hold real numbers ({hint})")
     if array.ndim != ndim or 0 in array.shape[-1:]:
         shape = "(variables,)" if ndim == 1 else "(rows, variables)"
         raise ValueError(f"{name} has shape {array.shape}; it must be {shape}, not empty")
@@ -129,24 +127,19 @@ def _array(name: str, values: Any) -> NDArray[Any]:
         raise ValueError(f"{name}: rows have different lengths") from None
 
 
-def is_within(values: Floats, largest: float) -> bool:
-    """Whether this is a short vector of numbers of at most that size: the quick way to ask it."""
-    if values.ndim != 1 or not 0 < len(values) <= _SHORT:
-        return False
-    return all([-largest <= value <= largest for value in values.tolist()])  # noqa: C419
-
-
 def refuse_unusable(name: str, values: Floats) -> None:
     """Raise for the first entry that is not finite, or too large."""
-    if not values.size or is_within(values, LARGEST_OBSERVATION):
+    most = LARGEST_OBSERVATION
+    if values.ndim == 1 and len(values) <= _SHORT:
+        if all([-most <= value <= most for value in values.tolist()]):  # noqa: C419
+            return
+    elif not values.size or -most <= values.min() <= values.max() <= most:  # false of NaN
         return
-    if -LARGEST_OBSERVATION <= values.min() <= values.max() <= LARGEST_OBSERVATION:
-        return  # false of NaN
-    place = tuple(int(k) for k in np.argwhere(~(np.abs(values) <= LARGEST_OBSERVATION))[0])
+    place = tuple(int(k) for k in np.argwhere(~(np.abs(values) <= most))[0])
     where = f"row {place[0]}, variable {place[1]}" if len(place) > 1 else f"variable {place[0]}"
     raise ValueError(
         f"{name}, {where}: {values[place]} cannot be used; every entry must be finite "
-        f"and at most {LARGEST_OBSERVATION:g} in size (a missing sensor value?)"
+        f"and at most {most:g} in size (a missing sensor value?)"
     )
 
 
@@ -162,15 +155,11 @@ def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.i
     if actions.shape != (rows,):
         raise ValueError(f"actions have shape {actions.shape}; {rows} observations need ({rows},)")
     if rows and actions.dtype.kind not in "iu":
-        raise TypeError(
-            f"actions have dtype {actions.dtype}; they must be integer indices, "
-            f"none of them masked ({_ENCODE})"
-        )
+        need = f"they must be integer indices, none of them masked ({_ENCODE})"
+        raise TypeError(f"actions have dtype {actions.dtype}; {need}")
     if len(wrong := np.flatnonzero((actions < -1) | (actions >= n_actions))):
-        raise ValueError(
-            f"action in row {wrong[0]} is {actions[wrong[0]]}; "
-            f"there are actions 0 to {n_actions - 1}, and -1 for none"
-        )
+        there = f"there are actions 0 to {n_actions - 1}, and -1 for none"
+        raise ValueError(f"action in row {wrong[0]} is {actions[wrong[0]]}; {there}")
     return actions.astype(np.int64)
 
 

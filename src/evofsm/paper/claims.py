@@ -48,16 +48,16 @@ def _of_collisions(study: PaperStudy) -> Iterator[Claim]:
     decel = study.settings.scenario.leader.brake_decel
     for time, run in zip(study.settings.brake_at, study.extra_runs, strict=True):
         at_brake = run.state[run.episode.leader_accelerations == -decel][:1].tolist()
-        measured = "the leader did not brake"
+        outcome = "the leader did not brake"
         if at_brake:
             end = f"collision at {run.episode.time[-1]:.1f} s, in {state_name(run.state[-1])}"
             fate = end if run.episode.collided else "no collision"
-            measured = f"{state_name(at_brake[0])} at the brake; {fate}"
+            outcome = f"{state_name(at_brake[0])} at the brake; {fate}"
         yield Claim(
             f"brake_at_{time:g}",
             f"Leader brakes at {time:g} s, in the dead end: collision",
             "collision",
-            measured,
+            outcome,
             run.episode.collided and at_brake == [study.dead_end],
         )
 

@@ -193,9 +193,6 @@ class Page:
         return [table for table in self.lost if len(table.frame)]
 
 
-# -- The file -------------------------------------------------------------------------------------
-
-
 def write_page(path: Path, pages: Sequence[Page], title: str = "", about: str = "") -> Path:
     """Draw all figures and write one file that holds all it shows.
 
@@ -208,11 +205,6 @@ def write_page(path: Path, pages: Sequence[Page], title: str = "", about: str = 
     pages : sequence of Page
     title, about : str
         Of many pages together; of one its own are taken.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        If matplotlib or jinja2 is not installed.
     """
     with needs("jinja2", "plot", "writing the page"):
         from jinja2 import Environment, PackageLoader, StrictUndefined

@@ -70,9 +70,6 @@ def write(study: PaperStudy, folder: Path, command: str) -> Path:
     return page
 
 
-# -- Beside the claims: what an expert would ask next ---------------------------------------------
-
-
 def _table_of_forecasts(forecasts: pl.DataFrame) -> Table:
     return Table(
         "Largest divergence of one-step forecasts [bit], by case, and the mean",

@@ -1,7 +1,4 @@
-"""The runs: what they are told, each case driven as often as asked, every row shown to one machine.
-
-The settings stand, with comments, in ``settings.toml``.
-"""
+"""The runs: each case driven as often as asked, every row shown to one machine."""
 
 from __future__ import annotations
 
@@ -55,8 +52,8 @@ class Settings:
         for table, values in (changes or {}).items():
             for name in values:
                 if name not in tables.get(table, {}):
-                    known = ", ".join(tables.get(table, tables))
-                    raise ValueError(f"[{table}]: there is no {name!r}; known are {known}")
+                    names = ", ".join(tables.get(table, tables))
+                    raise ValueError(f"[{table}]: there is no {name!r}; known are {names}")
             tables[table] |= values
         scenario, leader, cases = dict(tables["scenario"]), dict(tables["leader"]), tables["cases"]
         safe_until = scenario.pop("safe_until")
@@ -78,9 +75,6 @@ class Settings:
             machine=tables["machine"],
             actions=IntervalActions(**tables["actions"], outside="clip"),
         )
-
-
-# -- Runs -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +133,8 @@ def run_paper(
 
     Parameters
     ----------
-    world : World
-        Where to drive.
-    name : str
-        What to call it.
+    world, name : World, str
+        Where to drive, and what to call it.
     settings : Settings
         ``Settings.load()`` for the paper's.
     rounds : int
