@@ -319,10 +319,10 @@ def history(
         Variables, by their index, and the values at which they alarm.
     """
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
-    fails, lasts = np.asarray(failures), np.ptp(when)
-    unit, size = ("hours", 3600.0) if lasts > 7200.0 else ("minutes", 60.0)
-    steps, is_dated = np.diff(when), bool(when[0] >= DATES)
-    unit, size = ("days", 86400.0) if lasts > 2e5 or is_dated else (unit, size)
+    fails, steps, is_dated = np.asarray(failures), np.diff(when), bool(when[0] >= DATES)
+    unit, size = ("hours", 3600.0) if np.ptp(when) > 7200.0 else ("minutes", 60.0)
+    if np.ptp(when) > 2e5 or is_dated:
+        unit, size = "days", 86400.0
     step = float(np.median(steps)) if len(steps) else 0.0
     holes = np.flatnonzero(steps > 3.0 * step) + 1  # before each a row without numbers ends lines
     x = (when - when[0] * (not is_dated)) / size

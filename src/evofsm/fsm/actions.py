@@ -93,10 +93,9 @@ class IntervalActions:
             raise ValueError("action is NaN; it has no interval")
         beyond = (values < self.low) | (values > self.high)
         if self.outside == "error" and beyond.any():
-            raise ValueError(
-                f"action {values[beyond].flat[0]} is outside [{self.low}, {self.high}]; "
-                'widen the range, or use outside="clip" to put it into the end interval'
-            )
+            limits = f"outside [{self.low}, {self.high}]"
+            fix = 'widen the range, or use outside="clip" to put it into the end interval'
+            raise ValueError(f"action {values[beyond].flat[0]} is {limits}; {fix}")
         index = np.searchsorted(self.edges[1:-1], values, side="right")
         return int(index) if values.ndim == 0 else index.astype(np.int64)
 

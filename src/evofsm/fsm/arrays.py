@@ -149,8 +149,8 @@ def from_names(arrays: Mapping[str, NDArray[Any]], m: int, q: int) -> Learnt:
     for name, array in _named(learnt):
         array[...] = arrays[name]
     now, places = learnt.now[0], learnt.actions["place"]
-    sizes_fit = (now["n_states"], now["n_places"]) == (n, s) and now["action"] < q
-    if not (sizes_fit and now["state"] < max(n, 1)):
+    fits = (now["n_states"], now["n_places"]) == (n, s)
+    if not (fits and now["action"] < q and now["state"] < max(n, 1)):
         raise ValueError(f"where it is does not fit {n} states, {q} actions and {s} matrices")
     if sorted(places[places != NOT_OPEN]) != list(range(s)):
         raise ValueError("place of an action is not that of a matrix")

@@ -49,8 +49,7 @@ class Tally(NamedTuple):
         """Of the share, 90 % (Wilson 1927); from 0 to 1 without any, or where it is not known."""
         if not (self.episodes and self.is_told):
             return 0.0, 1.0
-        interval: tuple[float, float] = wilson_bounds(self.share, float(self.episodes))
-        return interval
+        return wilson_bounds(self.share, float(self.episodes))
 
     def __str__(self) -> str:
         if not self.is_told:
@@ -124,10 +123,8 @@ def _never_seen(known: Any, belief: Floats, nearest: Nearest, labels: Labels) ->
     state, no_tally = nearest.state, Tally(0, 0, is_told=known.failures_told)
     place = labels.place(known.centers[state])
     place = place if place.startswith("(") else f"({place})"
-    text = (
-        f"Never seen, as far as the states tell: {nearest.distance:.3g} from the nearest, "
-        f"{state_name(state)} {place}, where a state reaches {nearest.reach:.3g}."
-    )
+    text = f"Never seen, as far as the states tell: {nearest.distance:.3g} from the nearest, "
+    text += f"{state_name(state)} {place}, where a state reaches {nearest.reach:.3g}."
     return Explanation(text, state, float(belief[state]), 0, no_tally, never_seen=True)
 
 

@@ -98,8 +98,7 @@ class Forecasts:
             for action in {NO_ACTION, *actions.tolist()} | set(counts):
                 old = counts.get(action, np.zeros((0, 0)))
                 counts[action] = np.pad(old, (0, self.n_states - len(old)))
-            for row in range(steps, len(beliefs)):
-                before = row - steps
+            for before, row in enumerate(range(steps, len(beliefs))):
                 arguments = beliefs[before], states[before], beliefs[row], states[row]
                 self._learn(horizon, int(actions[before]), *arguments)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache, partial
@@ -164,8 +165,6 @@ def total(values: NDArray[np.float64], n: int) -> float:
     return (a + b) + (c + d)
 
 
-# -- Saying that kernels are compiled -------------------------------------------------------------
-
 _log = logging.getLogger("evofsm")
 
 
@@ -188,14 +187,12 @@ def announce_compiling() -> None:
     event.register("numba:compile", _Announcement())
 
 
-# -- Caches ---------------------------------------------------------------------------------------
-
-
 def _drop_stale_caches(package: Path) -> None:
     """Delete cached code where a file of kernels has changed; Numba looks at its own file only."""
     note = package / "__pycache__" / "kernels.sha256"
+    uses = re.compile(rb"\n@(\w*kernel|compiled)\b")
     sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
-    digest = sha256(b"".join(text for text in sources if b"kernels import" in text)).digest()
+    digest = sha256(b"".join(filter(uses.search, sources))).digest()
     if note.is_file() and note.read_bytes() == digest:
         return
     for path in package.rglob("__pycache__/*.nb[ic]"):

@@ -187,7 +187,13 @@ class EvolvingFSM(Retraced):
 
     @alone
     def learn_one(self, z: ArrayLike, i: SupportsIndex) -> Step:
-        """Observe, then act, as `observe` and `act` do; the action shows in the next step."""
+        """Observe, then act; the action shows in the next step.
+
+        Parameters
+        ----------
+        z, i
+            As `observe` and `act` take them.
+        """
         return self._step(self._checked(z), valid.check_action(i, self.n_actions), None)
 
     @alone
@@ -292,7 +298,10 @@ class EvolvingFSM(Retraced):
     ) -> Explanation:
         """What experience says of the present situation, as `FSMModel.explain` tells it.
 
-        With an ``action``, also what came of taking it there; ``labels`` say what numbers mean.
+        Parameters
+        ----------
+        action, labels : int, Labels, optional
+            What came of taking it there; what the numbers mean.
         """
         index = None if action is None else valid.check_action(action, self.n_actions)
         if self.state is None:

@@ -221,7 +221,13 @@ class FSMModel:
         return self
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write it to a file, as `EvolvingFSM.save` does."""
+        """Write it to a file.
+
+        Parameters
+        ----------
+        path, provenance
+            As `EvolvingFSM.save` takes them.
+        """
         arrays = {name: getattr(self, name) for name in OF_MODEL}
         store.write(path, MODEL, self._content, arrays, provenance)
 

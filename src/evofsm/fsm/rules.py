@@ -105,7 +105,10 @@ _RULES: dict[str, Any] = {"paper": Paper, "novelty": Novelty}
 def register_rule(name: str, rule: type) -> None:
     """Let machines take a state rule, and files name it.
 
-    It is a frozen dataclass as `StateRule`, whose settings JSON has words for.
+    Parameters
+    ----------
+    name, rule : str, type
+        A frozen dataclass as `StateRule`, whose settings JSON has words for.
 
     Examples
     --------
@@ -132,10 +135,9 @@ def rule_named(name: object) -> Any:
         for point in entry_points(group="evofsm.rules", name=name):
             register_rule(name, point.load())
     if name not in _RULES:
-        raise ValueError(
-            f"rule is {name!r}; it must be one of {', '.join(_RULES)} (one of your own is known "
-            "once its module has called register_rule, or by an entry point of evofsm.rules)"
-        )
+        hint = "once its module has called register_rule, or by an entry point of evofsm.rules"
+        names = f"{', '.join(_RULES)} (one of your own is known {hint})"
+        raise ValueError(f"rule is {name!r}; it must be one of {names}")
     return _RULES[name]
 
 

@@ -98,9 +98,6 @@ def expand(learnt: Learnt, new: int, n: int, prior_frequency: float) -> None:
         forget_row(learnt, place, new, n, prior_frequency)
 
 
-# -- The state limit -----------------------------------------------------------------------------
-
-
 @rare_kernel
 def merge_closest(learnt: Learnt, settings: Settings, nearest: int) -> Any:
     """Merge the two closest of all n states and the newcomer; returns the index that is free.

@@ -57,9 +57,6 @@ def check_action(i: Any, n_actions: int) -> int:
     return check_index("action", i, n_actions, action_name)
 
 
-# -- Settings and numbers -------------------------------------------------------------------------
-
-
 def function(name: str, value: _F, such_as: str) -> _F:
     """The function, or None; a TypeError for anything else."""
     if value is not None and not callable(value):
@@ -137,10 +134,8 @@ def refuse_unusable(name: str, values: Floats) -> None:
         return
     place = tuple(int(k) for k in np.argwhere(~(np.abs(values) <= most))[0])
     where = f"row {place[0]}, variable {place[1]}" if len(place) > 1 else f"variable {place[0]}"
-    raise ValueError(
-        f"{name}, {where}: {values[place]} cannot be used; every entry must be finite "
-        f"and at most {most:g} in size (a missing sensor value?)"
-    )
+    need = f"every entry must be finite and at most {most:g} in size (a missing sensor value?)"
+    raise ValueError(f"{name}, {where}: {values[place]} cannot be used; {need}")
 
 
 def refuse_unless_distribution(name: str, rows: Floats) -> None:
