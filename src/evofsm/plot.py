@@ -32,7 +32,6 @@ with needs("matplotlib", "plot", "plotting"):
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
     from matplotlib.text import Annotation
 
 __all__ = ["COLORS", "experience", "graph", "states"]
@@ -116,8 +115,8 @@ def states(
     every = dots if len(dots) else centers.repeat(times, axis=0)
     ends = np.transpose([usual_range(x, y) for x, y in zip(every.T, dots[fails].T, strict=True)])
     centers, in_view = np.clip(centers, *ends), ((centers >= ends[0]) & (centers <= ends[1])).all(1)
-    look: Look = {"markersize": 1.5, "color": ink(0.3), "zorder": 1.2, "rasterized": True}
     if len(dots):
+        look: Look = {"markersize": 1.5, "color": ink(0.3), "zorder": 1.2, "rasterized": True}
         ax.plot(*dots.T, ".", label="observed", **look)
     if np.any(fails):
         look = {"markersize": 5.0, "color": COLORS["dead end"], "zorder": 4.0}
@@ -148,8 +147,7 @@ def states(
         _explain(ax)
     draw_centers(ax, centers, dead_ends, size=13.0)
     ax.axis(limits)
-    across, up = map(model.labels.variable, variables)
-    ax.set(xlabel=across, ylabel=up)
+    ax.set(xlabel=model.labels.variable(pair[0]), ylabel=model.labels.variable(pair[1]))
     return ax
 
 
@@ -311,23 +309,20 @@ def history(
     ----------
     axes : sequence of Axes
         One for each variable, then one for the states if there is a model, and one for alarms.
-    time : (T,) array_like
-        In seconds, or as dates since 1970.
-    rows : (T, m) array_like
-    names : sequence of str
-    alarms : (T,) array_like
-        1 while an alarm is on that a failure followed, 2 while one is that none did; else 0.
-    failures : (T,) array_like
-        1 with a failure that was foreseen, 2 with one that was not; else 0.
+    time, rows, names : (T,) and (T, m) array_like, sequence of str
+        The time in seconds, or as dates since 1970.
+    alarms, failures : (T,) array_like
+        1 while an alarm is on that a failure followed, and with a failure that was foreseen; 2
+        where none followed, or it was not; else 0.
     model : FSMModel, optional
     limits : sequence of (int, float)
         Variables, by their index, and the values at which they alarm.
     """
     when, z = np.asarray(time, np.float64), np.asarray(rows, np.float64)
-    fails, lasts = np.asarray(failures), np.ptp(when)
-    unit, size = ("hours", 3600.0) if lasts > 7200.0 else ("minutes", 60.0)
-    steps, is_dated = np.diff(when), bool(when[0] >= DATES)
-    unit, size = ("days", 86400.0) if lasts > 2e5 or is_dated else (unit, size)
+    fails, steps, is_dated = np.asarray(failures), np.diff(when), bool(when[0] >= DATES)
+    unit, size = ("hours", 3600.0) if np.ptp(when) > 7200.0 else ("minutes", 60.0)
+    if np.ptp(when) > 2e5 or is_dated:
+        unit, size = "days", 86400.0
     step = float(np.median(steps)) if len(steps) else 0.0
     holes = np.flatnonzero(steps > 3.0 * step) + 1  # before each a row without numbers ends lines
     x = (when - when[0] * (not is_dated)) / size
@@ -360,7 +355,7 @@ def history(
         sample = np.arange(0, len(z), max(len(z) // 2000, 1))
         nearest_states = [model.nearest(row).state for row in z[sample]]
         axes[-2].plot(x[sample], nearest_states, ".", markersize=1.5, color=COLORS["leader"])
-        label_states(axes[-2].yaxis, model.n_states)
+        label_states(axes[-2], model.n_states)
         write(axes[-2], "state", (0.0, 1.0), (0.0, 5.0), size=8.0, xycoords="axes fraction")
     look = {"linestyle": "none", "marker": "X", "markersize": 5.0, "color": COLORS["dead end"]}
     for kind, label in enumerate(("failure, foreseen", "failure, not foreseen"), 1):
@@ -462,22 +457,8 @@ def _apart(places: NDArray[np.float64], size: float) -> NDArray[np.float64]:
     return places
 
 
-def label_states(axis: Axis, n: int, dead_ends: States = (), *, called: str = "") -> None:
-    """Put the states' numbers, from 1, on an axis that counts them from 0; the dead ends' bold.
-
-    On an upward axis the rows of dead ends are tinted as well where they are ``called`` something.
-    """
+def label_states(ax: Axes, n: int) -> None:
+    """Put the states' numbers, from 1, on an upward axis that counts them from 0."""
     ticks = range(0, n, 1 if n <= _TICKS else math.ceil(n / 8))
-    sign = "" if axis is axis.axes.xaxis else "#"  # which there is no room for
-    axis.set_ticks(ticks, [f"{sign}{state + 1}" for state in ticks])
-    axis.set_tick_params(length=0, labelsize=points(7.0), pad=2.0)
-    for state, label in zip(ticks, axis.get_ticklabels(), strict=False):
-        if state in dead_ends:
-            label.set(color=COLORS["dead end"], fontweight="bold")
-    if called:
-        axis.axes.set_ylim(-0.6, n - 0.4)
-        tint: Look = {"color": COLORS["dead end"], "alpha": 0.18, "linewidth": 0.0, "zorder": 0.5}
-        look: Look = {"xycoords": ("axes fraction", "data"), "fontweight": "bold"}
-        for state in dead_ends:
-            axis.axes.axhspan(state - 0.5, state + 0.5, **tint)
-            write(axis.axes, called, (1.0, state), (4.0, 0.0), color=COLORS["dead end"], **look)
+    ax.set_yticks(ticks, [f"#{state + 1}" for state in ticks])
+    ax.tick_params("y", length=0, labelsize=points(7.0), pad=2.0)

@@ -60,8 +60,6 @@ _TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
 _OLD = 600.0
 # Why no file can take the place of another one.
 _IRREPLACEABLE = (errno.EBUSY, errno.EXDEV, errno.EACCES, errno.EPERM, errno.EROFS)
-# Of an error that quotes a damaged file, so many letters are told.
-_MOST_SAID = 300
 # What reading a damaged file may run into (RuntimeError: JSON that is nested too deep).
 _DAMAGE = (ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, EOFError)
 
@@ -93,9 +91,9 @@ class Numbers(NamedTuple):
             return
         for number in (float(numbers.min()), float(numbers.max())):
             if not self.least <= number <= self.most:
+                ends = f"{self.least:g} and {self.most:g}"
                 raise ValueError(
-                    f"{name} of {number:g} cannot be right: it must lie between {self.least:g} and "
-                    f"{self.most:g}"
+                    f"{name} of {number:g} cannot be right: it must lie between {ends}"
                 )
         if self.whole and (isinstance(given, float) or (numbers != np.rint(numbers)).any()):
             raise ValueError(f"{name} holds a fraction; it must be an integer")
@@ -154,18 +152,12 @@ def write(
     arrays: Mapping[str, NDArray[Any]],
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a file as a whole or not at all; when this returns, it is on the disk.
-
-    A ValueError or TypeError says what no file of this kind may hold.
-    """
+    """Write a file as a whole or not at all; an error says what no such file may hold."""
     if not isinstance(provenance, Mapping | None):
         raise TypeError(f"provenance is {provenance!r}; it must be a mapping of names to values")
     header = Header(kind.name, _VERSION, __version__, dict(settings), dict(provenance or {}))
     parts = _packed(kind, header, arrays)
-    if not isinstance(place, str | os.PathLike):
-        place.writelines(parts)
-        return
-    with replacing(place) as file:
+    with replacing(place) if isinstance(place, str | os.PathLike) else nullcontext(place) as file:
         file.writelines(parts)
 
 
@@ -174,10 +166,8 @@ def _packed(kind: Kind, header: Header, arrays: Mapping[str, NDArray[Any]]) -> l
     entries: dict[str, _Entry] = {}
     begin = 0
     for name, array in arrays.items():
-        if array.dtype not in _TYPE_NAMES:
-            raise ValueError(f"{name} is of {array.dtype}, which no file may hold")
-        end = begin + array.nbytes
-        entries[name] = _Entry(_TYPE_NAMES[array.dtype], list(array.shape), [begin, end])
+        dtype, end = _TYPE_NAMES.get(array.dtype, str(array.dtype)), begin + array.nbytes
+        entries[name] = _Entry(dtype, list(array.shape), [begin, end])
         begin = end
     text = json.dumps(header._asdict())
     sizes = _refuse_unfit(kind, json.loads(text)["settings"], entries)
@@ -204,10 +194,8 @@ def only_writer(file: BinaryIO, path: str | os.PathLike[str], otherwise: str) ->
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(
-                f"{os.fspath(path)} is being written by another process; wait for its end, or "
-                f"{otherwise}"
-            ) from None
+            why = "is being written by another process; wait for its end, or"
+            raise ValueError(f"{os.fspath(path)} {why} {otherwise}") from None
 
 
 def let_others_write(file: BinaryIO) -> None:
@@ -265,13 +253,6 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
                 temporary.unlink(missing_ok=True)
         raise
     sweep(target)
-    # Not all systems can flush a folder; the file is whole, if not under its name, without it.
-    with suppress(OSError):
-        descriptor = os.open(target.parent, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def _write_over(target: Path, whole: BinaryIO) -> None:
@@ -346,10 +327,7 @@ def read_header(place: Place) -> Header:
 
 
 def read(place: Place, kind: Kind) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Read a file of a kind: its settings and its arrays, all that the kind declares checked.
-
-    A ValueError says whether it holds something else, is damaged or of a newer version.
-    """
+    """Read a file of a kind: its settings and its arrays, all that the kind declares checked."""
     with _opened(place) as file:
         with explained(place):
             header, entries, head, sha256 = _unpacked(file)
@@ -391,10 +369,8 @@ def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise ValueError("it is another program's file, or its header is damaged") from None
     if type(version) is int and version > _VERSION:
-        raise ValueError(
-            f"its version {version} is newer than this library's {_VERSION}; "
-            "a newer evofsm reads it"
-        )
+        versions = f"its version {version} is newer than this library's {_VERSION}"
+        raise ValueError(f"{versions}; a newer evofsm reads it")
     header = Header(**header_fields)
     types = (str, int, str, dict, dict)
     if tuple(map(type, header)) != types or not re.fullmatch("[a-z]{1,20}", header.kind):
@@ -497,8 +473,7 @@ def explained(place: Place) -> Iterator[None]:
     try:
         yield
     except _DAMAGE as error:
-        why = str(error)
-        why = why if len(why) <= _MOST_SAID else f"{why[:_MOST_SAID]} ..."
+        why = str(error)[:300]  # it may quote a damaged file
         raise ValueError(f"{_named(place)} cannot be read as an evofsm file: {why}") from error
 
 

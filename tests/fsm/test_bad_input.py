@@ -80,8 +80,7 @@ def test_an_observation_or_a_batch_of_another_length(grown, refuses):
     words = "observation has 3 variables.*started with 2"
     for z in ([1.0, 2.0, 3.0], np.ones(3)):
         refuses(grown, lambda m, z=z: m.observe(z), ValueError, words)
-    for Z in (np.ones((1, 3)), [[NAN] * 3]):
-        refuses(grown, lambda m, Z=Z: m.learn_many(Z, [0]), ValueError, words)
+    refuses(grown, lambda m: m.learn_many(np.ones((1, 3)), [0]), ValueError, words)
 
 
 @pytest.mark.parametrize(("i", "error", "words"), cases(ACTIONS))

@@ -79,6 +79,13 @@ def test_what_cannot_be_drawn_or_is_no_process_is_refused(model):
     assert "NO DECISION FAILED" in to_prism(empty.model())
 
 
+@pytest.mark.parametrize("least", [-0.1, 1.5, 30.0, np.nan])
+def test_what_is_left_out_is_said_by_a_probability(model, least):
+    for write in (to_dot, to_prism):
+        with pytest.raises(ValueError, match=r"least of .* must lie between 0 and 1"):
+            write(model, least=least)
+
+
 # -- PRISM ----------------------------------------------------------------------------------------
 
 NAME = r"[A-Za-z_][A-Za-z0-9_]*"

@@ -15,18 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.fsm.kernels import lanes, records
-from evofsm.fsm.validation import Floats, refuse_more_failures, refuse_unless_distribution
-from evofsm.store import (
-    COUNT,
-    FLAG,
-    FROM_1,
-    LARGEST_OBSERVATION,
-    SHARE,
-    SIZE,
-    SMALLEST,
-    Kind,
-    Numbers,
-)
+from evofsm.fsm.validation import Floats
+from evofsm.store import COUNT, FLAG, FROM_1, LARGEST_OBSERVATION, SHARE, SIZE, Kind, Numbers
 
 Records: TypeAlias = NDArray[Any]
 
@@ -135,9 +125,6 @@ def resized(learnt: Learnt, capacity: int, places: int) -> Learnt:
     return copy
 
 
-# -- By name --------------------------------------------------------------------------------------
-
-
 def by_name(learnt: Learnt) -> dict[str, NDArray[Any]]:
     """Every array and every field of records, without spare room, as a copy."""
     n, s = int(learnt.now["n_states"][0]), int(learnt.now["n_places"][0])
@@ -156,39 +143,18 @@ def _named(learnt: Learnt) -> Iterator[tuple[str, NDArray[Any]]]:
 
 
 def from_names(arrays: Mapping[str, NDArray[Any]], m: int, q: int) -> Learnt:
-    """What `by_name` gave, if its numbers do not contradict each other."""
+    """What `by_name` gave, if its sizes and indices are right: kernels take them on trust."""
     n, s = len(arrays["belief"]), len(arrays["matrices"])
     learnt = blank(m, q, n, s)
     for name, array in _named(learnt):
         array[...] = arrays[name]
-    _refuse_impossible(learnt)
-    return resized(learnt, lanes(n), s)
-
-
-def _refuse_impossible(learnt: Learnt) -> None:
-    """Raise where numbers contradict each other: kernels take counts and indices on trust."""
-    now, (n, s), q = learnt.now[0], learnt.origin_frequency.shape[::-1], len(learnt.actions)
-    for name, limits in (
-        ("n_states", range(n, n + 1)),
-        ("n_places", range(s, s + 1)),
-        ("action", range(NO_ACTION, q)),
-        ("state", range(max(n, 1))),
-    ):
-        if int(now[name]) not in limits:
-            raise ValueError(
-                f"{name} is {now[name]}, but there are {n} states, {q} actions and {s} matrices"
-            )
-    if now["n_observations"] < n:
-        raise ValueError(f"n_observations is {now['n_observations']}, but there are {n} states")
-    latest = {"began": now["began"], "latest_visit": learnt.states["latest_visit"]}
-    for name, when in (latest | {"latest_try": learnt.tries["latest_try"]}).items():
-        if np.max(when, initial=0.0) > now["clock"]:
-            raise ValueError(f"{name} is after the latest of {now['clock']} observations")
-    if sorted(learnt.actions["place"][learnt.actions["place"] != NOT_OPEN]) != list(range(s)):
+    now, places = learnt.now[0], learnt.actions["place"]
+    fits = (now["n_states"], now["n_places"]) == (n, s)
+    if not (fits and now["action"] < q and now["state"] < max(n, 1)):
+        raise ValueError(f"where it is does not fit {n} states, {q} actions and {s} matrices")
+    if sorted(places[places != NOT_OPEN]) != list(range(s)):
         raise ValueError("place of an action is not that of a matrix")
-    refuse_more_failures(by_name(learnt))
-    refuse_unless_distribution("belief", learnt.belief)
-    refuse_unless_distribution("a row of matrices", learnt.matrices)
+    return resized(learnt, lanes(n), s)
 
 
 # -- What files may hold --------------------------------------------------------------------------
@@ -208,8 +174,9 @@ def _optional(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 _SIZES = dict.fromkeys(("radius", "spread"), SIZE)
+# Squares of observations over the scales, summed over a long run, must not overflow.
 _RULE = _optional({**_SIZES, "scales": Numbers(("scales",), 1e-20, 1e20)})
-_BELOW_1, _WEIGHT = math.nextafter(1.0, 0.0), Numbers(least=SMALLEST, most=1e50)
+_BELOW_1, _WEIGHT = math.nextafter(1.0, 0.0), SIZE._replace(most=1e50)
 _LIMITS = dict.fromkeys(("max_states", "failure_horizon"), FROM_1)
 #: Of a machine, with those of its rule.
 _SETTINGS: dict[str, Any] = {

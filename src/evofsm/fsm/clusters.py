@@ -79,10 +79,7 @@ def _judge(
 
 @inner_kernel
 def exceeds(value: float, other: float) -> bool:
-    """Whether a value of 0 or more is the greater one, and not by rounding alone.
-
-    Observations from a grid are often exactly as dense as a centre, or exactly a radius away.
-    """
+    """Whether a value of 0 or more is greater, and not by rounding alone, as often on a grid."""
     return value > other * (1.0 + _ROUNDING)
 
 
@@ -153,15 +150,9 @@ def _absorb(now: Any, variables: Records, weights: Floats, z: Floats) -> None:
     now.scatter += increment
 
 
-# -- Recognise ------------------------------------------------------------------------------------
-
-
 @inner_kernel
 def width_of(settings: Settings, variance: float) -> float:
-    """Width of recognition, where observations so far have this total variance.
-
-    The paper leaves its var(z*) open.
-    """
+    """Width of recognition by the total variance of observations; the paper leaves it open."""
     if settings.rule == NOVELTY:
         return settings.spread * settings.radius * settings.radius
     return settings.spread * variance

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,10 +31,6 @@ def jensen_shannon_kernel(p: Floats, q: Floats, n: int, terms: Floats) -> float:
     return min(max(0.5 * total(terms, n) / _LN_2, 0.0), 1.0)
 
 
-@overload
-def jensen_shannon(p: Sequence[float], q: Sequence[float]) -> float: ...
-@overload
-def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any: ...
 def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
     """Jensen-Shannon divergence in bits (Lin 1991), between 0 (equal) and 1 (disjoint).
 
@@ -55,10 +50,8 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
     """
     p, q = np.asarray(p, dtype=np.float64), np.asarray(q, dtype=np.float64)
     if p.ndim == 0 or q.ndim == 0 or p.shape[-1] != q.shape[-1]:
-        raise ValueError(
-            f"p has shape {p.shape} and q has shape {q.shape}: "
-            "both need the same number of states on their last axis"
-        )
+        shapes = f"p has shape {p.shape} and q has shape {q.shape}"
+        raise ValueError(f"{shapes}: both need the same number of states on their last axis")
     refuse_unless_distribution("p", p)
     refuse_unless_distribution("q", q)
     shape = np.broadcast_shapes(p.shape, q.shape)

@@ -49,8 +49,7 @@ class Tally(NamedTuple):
         """Of the share, 90 % (Wilson 1927); from 0 to 1 without any, or where it is not known."""
         if not (self.episodes and self.is_told):
             return 0.0, 1.0
-        interval: tuple[float, float] = wilson_bounds(self.share, float(self.episodes))
-        return interval
+        return wilson_bounds(self.share, float(self.episodes))
 
     def __str__(self) -> str:
         if not self.is_told:
@@ -108,26 +107,24 @@ def explain(
     sentences = [
         _of_place(known, belief, state, labels),
         _of_episodes(here, visits, soon, tally, "" if action is None else labels.action(action)),
-        "" if better is None else f"Better after {labels.action(better)}: {after_better}",
-        "" if is_exact else "States were joined here, so an episode may count twice",
-        ""
-        if origin is None
-        else f"Most often reached from {state_name(origin)}: {arrivals[origin]:,.0f} of "
-        f"{arrivals.sum():,.0f} times",
     ]
-    text = " ".join(f"{sentence}." for sentence in sentences if sentence)
+    if better is not None:
+        sentences.append(f"Better after {labels.action(better)}: {after_better}")
+    if not is_exact:
+        sentences.append("States were joined here, so an episode may count twice")
+    if origin is not None:
+        share = f"{arrivals[origin]:,.0f} of {arrivals.sum():,.0f} times"
+        sentences.append(f"Most often reached from {state_name(origin)}: {share}")
     contents = visits, here, origin, tally, better, after_better
-    return Explanation(text, state, float(belief[state]), *contents)
+    return Explanation(". ".join(sentences) + ".", state, float(belief[state]), *contents)
 
 
 def _never_seen(known: Any, belief: Floats, nearest: Nearest, labels: Labels) -> Explanation:
     state, no_tally = nearest.state, Tally(0, 0, is_told=known.failures_told)
     place = labels.place(known.centers[state])
     place = place if place.startswith("(") else f"({place})"
-    text = (
-        f"Never seen, as far as the states tell: {nearest.distance:.3g} from the nearest, "
-        f"{state_name(state)} {place}, where a state reaches {nearest.reach:.3g}."
-    )
+    text = f"Never seen, as far as the states tell: {nearest.distance:.3g} from the nearest, "
+    text += f"{state_name(state)} {place}, where a state reaches {nearest.reach:.3g}."
     return Explanation(text, state, float(belief[state]), 0, no_tally, never_seen=True)
 
 

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evofsm.fsm import validation as valid
 from evofsm.fsm.arrays import NO_ACTION
@@ -83,20 +83,22 @@ class Forecasts:
         Parameters
         ----------
         model : FSMModel
-            Snapshot of the machine that has learnt these rows, ``machine.model()``.
+            Of the machine that has learnt these rows.
         Z, I
             As `EvolvingFSM.learn_many` takes them.
         """
-        beliefs = np.atleast_2d(model.recognise(valid.real_rows("observations", Z)))
+        beliefs = model.recognise(valid.real_array("observations", Z, ndim=2, copy=False))
         actions = valid.check_actions(I, len(beliefs), self.n_actions)
         self.n_states = self._check_states(model.n_states)
         near = model.recognise(model.centers)
         self._elsewhere = (1.0 - _ANYWHERE) * near + _ANYWHERE / self.n_states
         states = [np.flatnonzero(belief > _LEAST_BELIEF) for belief in beliefs]
         for horizon, steps in enumerate(self.steps):
-            self._make_room(horizon, actions)
-            for row in range(steps, len(beliefs)):
-                before = row - steps
+            counts = self._counts[horizon]
+            for action in {NO_ACTION, *actions.tolist()} | set(counts):
+                old = counts.get(action, np.zeros((0, 0)))
+                counts[action] = np.pad(old, (0, self.n_states - len(old)))
+            for before, row in enumerate(range(steps, len(beliefs))):
                 arguments = beliefs[before], states[before], beliefs[row], states[row]
                 self._learn(horizon, int(actions[before]), *arguments)
 
@@ -114,7 +116,7 @@ class Forecasts:
         steps : int
             One of the horizons.
         """
-        rows = valid.real_rows("belief", np.atleast_2d(belief))
+        rows = valid.real_array("belief", np.atleast_2d(belief), ndim=2)
         valid.refuse_unless_distribution("belief", rows)
         self._check_states(rows.shape[1])
         if steps not in self.steps:
@@ -157,14 +159,6 @@ class Forecasts:
     def _check_states(self, n: int) -> int:
         """A number of states that can be of the same machine, later on."""
         if n < self.n_states:
-            raise ValueError(
-                f"there are {n} states, but {self.n_states} were learnt (of another machine?)"
-            )
+            before = f"{self.n_states} were learnt (of another machine?)"
+            raise ValueError(f"there are {n} states, but {before}")
         return n
-
-    def _make_room(self, horizon: int, actions: NDArray[np.int64]) -> None:
-        """Make room for all states, and for the actions that are used for the first time."""
-        counts, n = self._counts[horizon], self.n_states
-        for action in {NO_ACTION, *np.unique(actions).tolist()} | set(counts):
-            old = counts.get(action, np.zeros((0, 0)))
-            counts[action] = np.pad(old, (0, n - len(old)))

@@ -5,7 +5,6 @@ Constants that a kernel uses stand in a file of kernels: so a cache that is out 
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import re
@@ -49,26 +48,22 @@ def kernel(function: Function) -> Function:
 
 def inner_kernel(function: Function) -> Function:
     """A kernel that only kernels call, as a part of each of them."""
-    return _inside(function, forceinline=True)
+    return rare_kernel(function, forceinline=True)
 
 
 def spliced_kernel(function: Function) -> Function:
     """A long kernel that is called in one place: it is compiled there, and not by itself."""
-    return _inside(function, inline="always")
+    return rare_kernel(function, inline="always")
 
 
-def rare_kernel(function: Function) -> Function:
+def rare_kernel(function: Function, **options: Any) -> Function:
     """A kernel that only kernels call, and seldom."""
-    return _inside(function)
+    return cast(Function, _njit(no_cpython_wrapper=True, **_OPTIONS, **options)(function))
 
 
 def uncompiled(kernel: Function) -> Function:
     """The function of a kernel, where to compile it would take longer than it does."""
     return cast(Function, getattr(kernel, "py_func", kernel))
-
-
-def _inside(function: Function, **options: Any) -> Function:
-    return cast(Function, _njit(no_cpython_wrapper=True, **_OPTIONS, **options)(function))
 
 
 class Entry:
@@ -170,8 +165,6 @@ def total(values: NDArray[np.float64], n: int) -> float:
     return (a + b) + (c + d)
 
 
-# -- Saying that kernels are compiled -------------------------------------------------------------
-
 _log = logging.getLogger("evofsm")
 
 
@@ -194,28 +187,19 @@ def announce_compiling() -> None:
     event.register("numba:compile", _Announcement())
 
 
-# -- Caches ---------------------------------------------------------------------------------------
-
-
 def _drop_stale_caches(package: Path) -> None:
     """Delete cached code where a file of kernels has changed; Numba looks at its own file only."""
-    note = package / "__pycache__" / "kernels.json"
-    files = [(path, path.stat()) for path in sorted(package.rglob("*.py"))]
-    times = [[str(path), stat.st_size, stat.st_mtime_ns] for path, stat in files]
-    before: dict[str, Any] = {}
-    with suppress(OSError, ValueError):
-        before = json.loads(note.read_text("utf-8"))
-    if before.get("times") == times:
+    note = package / "__pycache__" / "kernels.sha256"
+    uses = re.compile(rb"\n@(\w*kernel|compiled)\b")
+    sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
+    digest = sha256(b"".join(filter(uses.search, sources))).digest()
+    if note.is_file() and note.read_bytes() == digest:
         return
-    sources = [path.read_bytes() for path, _ in files]
-    uses = re.compile(rb"^@(\w*kernel|compiled)\b", re.MULTILINE)
-    digest = sha256(b"".join(source for source in sources if uses.search(source))).hexdigest()
-    if before.get("digest") != digest:
-        for path in package.rglob("__pycache__/*.nb[ic]"):
-            path.unlink(missing_ok=True)
+    for path in package.rglob("__pycache__/*.nb[ic]"):
+        path.unlink(missing_ok=True)
     note.parent.mkdir(exist_ok=True)
     draft = note.with_name(f"{note.name}.{os.getpid()}")
-    draft.write_text(json.dumps({"times": times, "digest": digest}), "utf-8")
+    draft.write_bytes(digest)
     draft.replace(note)
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, Self, SupportsIndex, cast
+from typing import Any, Self, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ from evofsm.fsm import step as stepping
 from evofsm.fsm import validation as valid
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.arrays import MACHINE, NO_ACTION, NOT_OPEN, OF_ACTIONS, OF_MODEL, Learnt, Settings
-from evofsm.fsm.clusters import PAPER, width_of
+from evofsm.fsm.clusters import width_of
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.explanation import Explanation, explain
 from evofsm.fsm.kernels import LINE, Entry, uncompiled
@@ -35,15 +35,14 @@ from evofsm.fsm.sharing import Retraced, alone, share, step
 from evofsm.fsm.step import EVENTS, PREDICTED, Event, Step, Trace, blank_trace
 from evofsm.fsm.transitions import room_for
 from evofsm.fsm.validation import Floats, positive, probability, whole
-from evofsm.store import LARGEST_OBSERVATION, Place
+from evofsm.store import Place
 
 # What a machine does not have to be given, with what holds if it is not.
 _LIMITS = {"max_states": None, "failure_horizon": None}
 _OPTIONS = {**_LIMITS, "belief_tolerance": 0.0}
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
-# Arrays of a snapshot that a machine answers with.
-_ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers"}
-_FLOAT64 = np.dtype(np.float64)
+# What of a snapshot a machine answers with, beside what is its own.
+_ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"}
 # Compiled code of a step.
 _LEARN_ROWS = Entry(stepping.learn_rows)
 
@@ -110,27 +109,25 @@ class EvolvingFSM(Retraced):
         belief_tolerance: float = 0.0,
         failure_horizon: int | None = None,
     ) -> None:
-        self._rule = rules.Paper() if rule is None else rules.check_rule(rule)
-        settings = Settings(
-            radius=0.3 if radius is None else positive("radius", radius),
-            distance_weight=positive("distance_weight", distance_weight),
-            learning_rate=probability("learning_rate", learning_rate),
-            prior_frequency=positive("prior_frequency", prior_frequency),
-            spread=3.0 if spread is None else positive("spread", spread),
-            belief_tolerance=probability("belief_tolerance", belief_tolerance)
-            if belief_tolerance
-            else 0.0,
-            max_states=_or_infinity("max_states", max_states),
-            failure_horizon=_or_infinity("failure_horizon", failure_horizon),
-            rule=PAPER,
-            weights=np.empty(0),
-        )
-        table = {name: float(value) for name, value in self._rule.table.items() if name != "rule"}
-        settings = settings._replace(rule=int(self._rule.table["rule"]), **cast(Any, table))
+        self._rule = rules.Paper() if rule is None else rule
+        rules.describe_rule(self._rule)
+        table = {name: float(value) for name, value in self._rule.table.items()}
         for name, value in (("radius", radius), ("spread", spread)):
-            if value not in (None, getattr(settings, name)):
+            if value is not None and table.setdefault(name, positive(name, value)) != value:
                 raise ValueError(f"{name} is {value}, but the rule has its own: {self._rule}")
-        self._settings = settings
+        tolerance = belief_tolerance and probability("belief_tolerance", belief_tolerance)
+        settings: dict[str, Any] = {
+            "radius": 0.3,
+            "spread": 3.0,
+            "distance_weight": positive("distance_weight", distance_weight),
+            "learning_rate": probability("learning_rate", learning_rate),
+            "prior_frequency": positive("prior_frequency", prior_frequency),
+            "belief_tolerance": float(tolerance),
+            "max_states": _or_infinity("max_states", max_states),
+            "failure_horizon": _or_infinity("failure_horizon", failure_horizon),
+            **table,
+        }
+        self._settings = Settings(**settings | {"rule": int(table["rule"])}, weights=np.empty(0))
         self._learnt = arrays.blank(0, whole("n_actions", n_actions), 0, 0)
         self._share()
         MACHINE.refuse_others(self._content)
@@ -227,12 +224,10 @@ class EvolvingFSM(Retraced):
         belief : bool
             Whether the trace holds the belief of every row as well.
         """
-        observations = valid.real_rows("observations", Z)
+        observations = valid.real_array("observations", Z, ndim=2, copy=False)
         rows = len(observations)
-        if self.n_states and rows:
-            self._refuse_other_length(observations.shape[1])
         valid.refuse_unusable("observations", observations)
-        observations = np.require(observations, requirements=("C", "W"))
+        observations = np.require(observations, requirements="W")
         actions = valid.check_actions(I, rows, self.n_actions)
         starts = valid.check_rows("episode_starts", episode_starts, rows)
         ends = valid.check_rows("failures", () if failures is None else failures, rows)
@@ -305,10 +300,8 @@ class EvolvingFSM(Retraced):
 
         Parameters
         ----------
-        action : int, optional
-            What came of taking it there.
-        labels : Labels, optional
-            What the numbers mean.
+        action, labels : int, Labels, optional
+            What came of taking it there; what the numbers mean.
         """
         index = None if action is None else valid.check_action(action, self.n_actions)
         if self.state is None:
@@ -348,19 +341,12 @@ class EvolvingFSM(Retraced):
         contents["transition_matrices"] = contents["matrices"]
         for name, array in of_actions.items():
             array[indices] = contents[name][contents["place"][indices]]
-        parts = {name: contents[name] for name in OF_MODEL} | of_actions
+        parts: dict[str, Any] = {name: contents[name] for name in OF_MODEL} | of_actions
         parts["centers"] = contents["centers"].T
-        return FSMModel(
-            **parts,
-            width=self.width,
-            rule=self._rule,
-            failures_told=self.failures_told,
-            settings=self.settings,
-            actions=actions,
-            names=tuple(names),
-            units=tuple(units),
-            dt=dt,
-        )
+        for name in ("width", "rule", "failures_told", "settings"):
+            parts[name] = getattr(self, name)
+        labels = Labels(actions, tuple(names), tuple(units), dt)
+        return FSMModel(**parts, **labels._asdict())
 
     def __getattr__(self, name: str) -> Any:
         """A setting, or an array of the snapshot of now."""
@@ -467,7 +453,7 @@ class EvolvingFSM(Retraced):
         Parameters
         ----------
         path : str, path-like or binary file
-            A file of that name is replaced, or left as it was where this cannot be written.
+            It is replaced, or left as it was where this cannot be written.
         provenance : mapping, optional
             What it learnt from, for JSON.
         """
@@ -477,17 +463,14 @@ class EvolvingFSM(Retraced):
     def load(cls, path: Place) -> Self:
         """Read it from a file; it goes on bit for bit as if it had never been stopped.
 
-        Raises an OSError if it may not be read, and a ValueError if it holds something else, is
-        damaged, or of a newer version.
+        An OSError says that it may not be read, a ValueError that it is damaged, or something else.
         """
         content, learnt = store.read(path, MACHINE)
         with store.explained(path):
             machine = cls(**{**content, "rule": rules.restore_rule(content["rule"])})
             if m := len(learnt["first"]):
                 machine._fit(m)
-                machine._learnt = arrays.from_names(learnt, m, machine.n_actions)
-            else:
-                machine._learnt.now["failures_told"] = learnt["failures_told"]
+            machine._learnt = arrays.from_names(learnt, m, machine.n_actions)
             return machine
 
     @property
@@ -498,13 +481,12 @@ class EvolvingFSM(Retraced):
     @alone
     def __getstate__(self) -> dict[str, Any]:
         learnt = [array.copy() for array in self._learnt]
-        return {"rule": self._rule, "settings": self._settings, "learnt": learnt}
+        return {"_rule": self._rule, "_settings": self._settings, "_learnt": learnt}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self._rule, self._settings = state["rule"], state["settings"]
+        vars(self).update(state)
         # A file that is mapped for reading cannot be written to.
-        learnt = (np.require(array, requirements=("C", "W")) for array in state["learnt"])
-        self._learnt = Learnt(*learnt)
+        self._learnt = Learnt(*(np.require(array, None, ("C", "W")) for array in self._learnt))
         self._share()
 
     def __repr__(self) -> str:
@@ -552,7 +534,7 @@ class EvolvingFSM(Retraced):
         if n == 0:
             gaps = np.flatnonzero(absent).tolist()
             raise ValueError(f"variables {gaps} of a machine's first observation are missing")
-        self._refuse_other_length(len(z))
+        self._fit(len(z))
         vector = np.where(absent, 0.0, z)
         valid.refuse_unusable("observation", vector)
         action = int(now["action"])
@@ -574,28 +556,16 @@ class EvolvingFSM(Retraced):
         return Step(int(belief.argmax()), belief, Event.NONE, forecast, surprise)
 
     def _checked(self, z: ArrayLike) -> Floats:
-        """An observation as a vector of its own, of as many variables as the first one had."""
-        if (
-            type(z) is np.ndarray
-            and z.dtype is _FLOAT64
-            and z.shape == self._learnt.variables.shape
-            and valid.is_within(z, LARGEST_OBSERVATION)
-        ):
-            return z.copy()
+        """An observation as a vector of its own."""
         vector = valid.real_array("observation", z, ndim=1)
-        if self.n_states:
-            self._refuse_other_length(len(vector))
         valid.refuse_unusable("observation", vector)
         return vector
 
-    def _refuse_other_length(self, m: int) -> None:
-        if m != self.n_variables:
-            raise ValueError(
-                f"observation has {m} variables, but this machine was started with "
-                f"{self.n_variables}"
-            )
-
     def _fit(self, m: int) -> None:
+        """Make room for observations of ``m`` variables; raise where the first had others."""
+        if self.n_states and m != self.n_variables:
+            before = f"this machine was started with {self.n_variables}"
+            raise ValueError(f"observation has {m} variables, but {before}")
         if self.n_states == 0:
             self._settings = self._settings._replace(weights=rules.weights_of(self._rule, m))
             learnt = arrays.blank(m, self.n_actions, LINE, 0)

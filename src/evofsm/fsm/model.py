@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm import store
+from evofsm.fsm import validation as valid
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.arrays import MODEL, OF_MODEL
 from evofsm.fsm.clusters import recognise_rows
@@ -18,31 +19,17 @@ from evofsm.fsm.explanation import Explanation, Nearest, explain
 from evofsm.fsm.kernels import lanes
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.rules import Paper, StateRule, describe_rule, reach, restore_rule, weights_of
-from evofsm.fsm.validation import (
-    Floats,
-    check_action,
-    check_index,
-    real_array,
-    refuse_more_failures,
-    refuse_unless_distribution,
-    refuse_unusable,
-    state_name,
-    whole,
-)
+from evofsm.fsm.validation import Floats
 from evofsm.store import Place
-
-# In place of counts that are not given.
-_BLANK: Any = None
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class FSMModel:
     """States and transitions as they stood when the snapshot was taken.
 
-    n is the number of states, m of variables, q of actions. Distances and potentials are those of
-    observations divided by the rule's scales. Rows of a matrix are "from", columns "to". Arrays are
-    read-only, and counts that are not given are 0. Parts that do not fit each other, or hold what
-    cannot be, are refused.
+    `EvolvingFSM.model` takes it. n is the number of states, m of variables, q of actions. Distances
+    and potentials are those of observations divided by the rule's scales. Rows of a matrix are
+    "from", columns "to". Arrays are read-only.
 
     Counts never forget. An episode is counted once for each state it came to, and each action it
     took there, for its observations are no independent evidence; the one that is going on is not
@@ -81,35 +68,23 @@ class FSMModel:
     names: tuple[str, ...] = ()  #: of the m variables
     units: tuple[str, ...] = ()  #: of the m variables
     dt: float | None = None  #: time between two observations [s]
-    visits: Floats = _BLANK  #: (n,) observations in which each state was the most probable
-    created: Floats = _BLANK  #: (n,) number of the observation that created each state, from 1
-    changes: Floats = _BLANK  #: (n, n) steps from the most probable state to the next (column)
-    decisions: Floats = _BLANK  #: (q, n) transitions that began in each state, by belief
-    failures: Floats = _BLANK  #: (q, n) those of `decisions` that led straight into failure
-    endings: Floats = _BLANK  #: (n,) failures whose last observation was recognised as each state
-    episodes: Floats = _BLANK  #: (n,) episodes that came to each state
-    failed_soon: Floats = _BLANK  #: (n,) those of `episodes` that failed soon after they were there
-    joined: Floats = _BLANK  #: (n,) 1 where states were joined, so that an episode may count twice
-    tried: Floats = _BLANK  #: (q, n) episodes that took each action in each state
-    failed_after: Floats = _BLANK  #: (q, n) those of `tried` that failed soon after they did
+    visits: Floats  #: (n,) observations in which each state was the most probable
+    created: Floats  #: (n,) number of the observation that created each state, from 1
+    changes: Floats  #: (n, n) steps from the most probable state to the next (column)
+    decisions: Floats  #: (q, n) transitions that began in each state, by belief
+    failures: Floats  #: (q, n) those of `decisions` that led straight into failure
+    endings: Floats  #: (n,) failures whose last observation was recognised as each state
+    episodes: Floats  #: (n,) episodes that came to each state
+    failed_soon: Floats  #: (n,) those of `episodes` that failed soon after they were there
+    joined: Floats  #: (n,) 1 where states were joined, so that an episode may count twice
+    tried: Floats  #: (q, n) episodes that took each action in each state
+    failed_after: Floats  #: (q, n) those of `tried` that failed soon after they did
 
     def __post_init__(self) -> None:
-        m, q, n = self.n_variables, self.n_actions, self.n_states
-        sizes: dict[int | str, int] = {"n": n, "m": m, "q": q}
-        for name, numbers in OF_MODEL.items():
-            values = getattr(self, name)
-            shape = [sizes[size] for size in numbers.shape]
-            array = np.zeros(shape) if values is None else np.array(values, np.float64)
-            numbers.refuse_others(name, array, sizes)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        for name in OF_MODEL:
+            getattr(self, name).setflags(write=False)
         MODEL.refuse_others(self._content)
-        refuse_more_failures({name: getattr(self, name) for name in OF_MODEL})
-        failure_counts = self.failures, self.endings, self.failed_soon
-        is_told = bool(self.failures_told) or any(counts.any() for counts in failure_counts)
-        object.__setattr__(self, "failures_told", is_told)
-        if n:
-            refuse_unless_distribution("a row of transition_matrices", self.transition_matrices)
+        m, q = self.n_variables, self.n_actions
         for name in ("names", "units"):
             if len(getattr(self, name)) not in (0, m):
                 raise ValueError(f"{name} are {getattr(self, name)}, but there are {m} variables")
@@ -148,13 +123,12 @@ class FSMModel:
 
     def recognise(self, z: ArrayLike) -> Floats:
         """(n,) belief of an observation (m,), or (N, n) of many: the paper's Section 2.2.2."""
-        array, rows = self._observations(z)
-        belief = believed(*self._places, rows, self.width)
-        return belief if array.ndim == 2 else belief[0]
+        belief = believed(*self._places, self._rows(z), self.width)
+        return belief if np.ndim(z) == 2 else belief[0]
 
     def nearest(self, z: ArrayLike) -> Nearest:
         """Which state an observation (m,) is nearest to, and how far a state reaches."""
-        _, rows = self._observations(z)
+        rows = self._rows(z)
         if len(rows) != 1:
             raise ValueError(f"z holds {len(rows)} observations; one is asked for")
         offsets = (self.centers - rows[0]) * weights_of(self.rule, self.n_variables)
@@ -163,10 +137,7 @@ class FSMModel:
         return Nearest(state, float(distances[state]), reach(self.rule, self.width))
 
     def propagate(
-        self,
-        belief: ArrayLike,
-        action: SupportsIndex | None = None,
-        horizon: int = 1,
+        self, belief: ArrayLike, action: SupportsIndex | None = None, horizon: int = 1
     ) -> Floats:
         """(n,) distribution over states some steps later: the paper's Section 2.3.2.
 
@@ -179,9 +150,9 @@ class FSMModel:
         horizon : int
             Number of steps, at least 1.
         """
-        there, steps = self._belief(belief), whole("horizon", horizon)
+        there, steps = self._belief(belief), valid.whole("horizon", horizon)
         if action is not None:
-            there = there @ self.transition_matrices[check_action(action, self.n_actions)]
+            there = there @ self.transition_matrices[valid.check_action(action, self.n_actions)]
             steps -= 1
         return np.asarray(there @ np.linalg.matrix_power(self.marginal_matrix, steps))
 
@@ -225,16 +196,18 @@ class FSMModel:
         Never seen, as far as the states tell: 29 from the nearest, #2 (gap 1 m), where a state
         reaches 2.8.
         """
-        index = None if action is None else check_action(action, self.n_actions)
+        index = None if action is None else valid.check_action(action, self.n_actions)
         if (situation is None) == (observation is None):
             raise ValueError("give either a situation or an observation")
+        nearest = None if observation is None else self.nearest(observation)
         if observation is not None:
             belief = np.ravel(self.recognise(observation))
-            return explain(self, belief, index, self.labels, self.nearest(observation))
-        if np.ndim(situation) == 0:  # type: ignore[arg-type] # it is given
-            state = check_index("state", situation, self.n_states, state_name)
-            return explain(self, np.eye(self.n_states)[state], index, self.labels)
-        return explain(self, self._belief(situation), index, self.labels)
+        elif np.ndim(situation) == 0:  # type: ignore[arg-type] # it is given
+            state = valid.check_index("state", situation, self.n_states, valid.state_name)
+            belief = np.eye(self.n_states)[state]
+        else:
+            belief = self._belief(situation)
+        return explain(self, belief, index, self.labels, nearest)
 
     def __repr__(self) -> str:
         variables = ", ".join(self.names) or f"{self.n_variables} variables"
@@ -246,8 +219,6 @@ class FSMModel:
     def __deepcopy__(self, memo: Any) -> Self:
         """Itself: nothing in it ever changes."""
         return self
-
-    # -- Files ------------------------------------------------------------------------------------
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write it to a file.
@@ -280,32 +251,27 @@ class FSMModel:
             "settings": dict(self.settings),
         }
 
-    # -- Inside ---------------------------------------------------------------------------------
-
     @cached_property
     def _places(self) -> tuple[Floats, Floats]:
         """Centres (m, n), as kernels take them, and 1 / scale of each variable."""
         return np.array(self.centers.T, order="C"), weights_of(self.rule, self.n_variables)
 
-    def _observations(self, z: ArrayLike) -> tuple[Floats, Floats]:
-        """One observation or many, as given and row by row; refused where it is none."""
-        array = real_array("z", z, ndim=np.ndim(z))
-        rows = np.atleast_2d(array)
-        if rows.ndim != 2 or rows.shape[1] != self.n_variables:
+    def _rows(self, z: ArrayLike) -> Floats:
+        """(N, m) of one observation or many; refused where it is none."""
+        array = valid.real_array("z", z, ndim=np.ndim(z))
+        if array.ndim not in (1, 2) or array.shape[-1] != self.n_variables:
             raise ValueError(f"z has shape {array.shape}; a row needs {self.n_variables} variables")
-        refuse_unusable("z", array)
+        valid.refuse_unusable("z", array)
         if self.n_states == 0:
             raise ValueError("this model has no states: its machine had observed nothing")
-        return array, rows
+        return np.atleast_2d(array)
 
     def _belief(self, belief: Any) -> Floats:
-        array = np.asarray(belief, dtype=np.float64)
-        if array.shape != (self.n_states,):
-            raise ValueError(
-                f"belief has shape {array.shape}; the model has {self.n_states} states"
-            )
-        if self.n_states:
-            refuse_unless_distribution("belief", array)
+        array, n = np.asarray(belief, dtype=np.float64), self.n_states
+        if array.shape != (n,):
+            raise ValueError(f"belief has shape {array.shape}; the model has {n} states")
+        if n:
+            valid.refuse_unless_distribution("belief", array)
         return array
 
 

@@ -38,10 +38,8 @@ class Words(NamedTuple):
 
 @cache
 def _words_of(names: tuple[str, ...]) -> Words | None:
-    for point in entry_points(group="evofsm.words", name=",".join(names)):
-        words: Words = point.load()
-        return words
-    return None
+    points = entry_points(group="evofsm.words", name=",".join(names))
+    return next((point.load() for point in points), None)
 
 
 class Labels(NamedTuple):

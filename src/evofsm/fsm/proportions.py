@@ -17,7 +17,6 @@ from evofsm.fsm.validation import counted
 _QUANTILE = 1.645
 # From so many events on their distribution is taken to be a power of a normal one.
 _MANY_EVENTS = 50
-_BISECTIONS = 60
 
 
 @compiled
@@ -39,10 +38,7 @@ def wilson_bounds(share: float, count: float, quantile: float = _QUANTILE) -> tu
 
 @cache
 def poisson_bounds(count: int) -> tuple[float, float]:
-    """90 % interval of the number of events to be expected where ``count`` were seen.
-
-    The bounds are where as few, and as many, are seen in 5 % of cases (Garwood 1936).
-    """
+    """90 % interval of the expected number of events where ``count`` were seen (Garwood 1936)."""
     return _mean(count - 1, 0.95) if count else 0.0, _mean(count, 0.05)
 
 
@@ -52,7 +48,7 @@ def _mean(most: int, share: float) -> float:
         width, shape = _QUANTILE if share < 0.5 else -_QUANTILE, most + 1.0
         return float(shape * (1.0 - 1.0 / (9.0 * shape) + width / (3.0 * math.sqrt(shape))) ** 3)
     low, high = 0.0, 2.0 * most + 20.0
-    for _ in range(_BISECTIONS):
+    for _ in range(60):
         mean = 0.5 * (low + high)
         terms = (mean**k / math.factorial(k) for k in range(most + 1))
         low, high = (mean, high) if math.exp(-mean) * sum(terms) > share else (low, mean)
@@ -78,12 +74,9 @@ def _percent(share: float, rounded: Callable[[float], int]) -> str:
 
 
 def outward(rounded: Callable[[float], int], value: float, decimals: int) -> float:
-    """A number with so many decimals, rounded by ``math.floor`` or ``math.ceil``.
-
-    What is off such a number by rounding alone is that number: 0.1 + 0.2 is 0.3.
-    """
+    """A number with so many decimals, rounded by ``math.floor`` or ``math.ceil``."""
     scale = 10.0**decimals
-    return rounded(round(value * scale, 6)) / scale
+    return rounded(round(value * scale, 6)) / scale  # 0.1 + 0.2 is 0.3
 
 
 class FailureRecord(NamedTuple):
@@ -106,15 +99,15 @@ class FailureRecord(NamedTuple):
             (self.kilometres, "km", 1000.0, "per 1,000 km"),
         ):
             if exposure is not None:
-                exposures.append(f"{_exposure(exposure)} {unit}")
+                few = f"{outward(math.floor, exposure, 2):g}"
+                many = f"{math.floor(exposure + 1e-6):,}"
+                exposures.append(f"{few if exposure < 10.0 else many} {unit}")
             if exposure:
                 rates.append(_rate(self.failures, exposure / per, words))
-        text = f"{counted(self.failures, 'failure')} in {', '.join(exposures)}"
-        if not rates:
-            return f"{text}: nothing is known"
-        if self.failures == 0:
-            return f"{text}: at most {', '.join(rates)}, 95 %"
-        return f"{text}: {', '.join(rates)}, 90 %"
+        verdict = f"{', '.join(rates)}, 90 %" if rates else "nothing is known"
+        if rates and self.failures == 0:
+            verdict = f"at most {', '.join(rates)}, 95 %"
+        return f"{counted(self.failures, 'failure')} in {', '.join(exposures)}: {verdict}"
 
 
 def _rate(failures: int, exposure: float, words: str) -> str:
@@ -128,10 +121,6 @@ def _rate(failures: int, exposure: float, words: str) -> str:
 def _two_digits(value: float, rounded: Callable[[float], int]) -> str:
     decimals = 1 - math.floor(math.log10(value))
     return f"{outward(rounded, value, decimals):,.{max(decimals, 0)}f}"
-
-
-def _exposure(value: float) -> str:
-    return f"{outward(math.floor, value, 2):g}" if value < 10.0 else f"{math.floor(value + 1e-6):,}"
 
 
 def usual_range(values: NDArray[np.float64], failed: NDArray[np.float64]) -> tuple[float, float]:

@@ -16,10 +16,6 @@ from evofsm.fsm.validation import Floats, number
 with needs("River", "river", "a clusterer of River"):
     from river import base
 
-# A clusterer acts on nothing: there is one action, and it is always taken.
-_ACTION = 0
-_HINT = " (river.preprocessing.OneHotEncoder makes numbers of categories)"
-
 
 class RiverClusterer(base.Clusterer):
     """The states of an `EvolvingFSM` as the clusters of a River clusterer.
@@ -73,13 +69,13 @@ class RiverClusterer(base.Clusterer):
         z = self._vector(x)
         if self.machine.n_states or not np.isnan(z).any():
             self.machine.observe(z, partial=True)
-            self.machine.act(_ACTION)
+            self.machine.act(0)  # a clusterer acts on nothing: there is one action
 
     @property
     def centers(self) -> dict[int, dict[Hashable, float]]:
         """The centre of each state by feature, as River's metrics of clusterers ask for them."""
-        rows = self.machine.centers.tolist() if self.machine.n_states else ()
-        return {k: dict(zip(self._observed, row, strict=True)) for k, row in enumerate(rows)}
+        rows = enumerate(self.machine.centers.tolist())
+        return {k: dict(zip(self._observed, row, strict=True)) for k, row in rows}
 
     def predict_one(self, x: Mapping[Hashable, Any]) -> int:
         """Index of the most probable state; 0 before anything was learnt."""
@@ -101,10 +97,11 @@ class RiverClusterer(base.Clusterer):
 
     def _vector(self, x: Mapping[Hashable, Any]) -> Floats:
         """The features in their order, NaN for those that were not observed."""
-        values = [math.nan if x.get(name) is None else x[name] for name in self._observed]
-        names = [f"feature {name!r}" for name in self._observed]
-        z = np.array([number(*pair, _HINT) for pair in zip(names, values, strict=True)])
-        if np.isinf(z).any():
-            name = names[np.isinf(z).argmax()]
-            raise ValueError(f"{name} is infinite; it must be finite (None: not observed)")
+        z = np.full(len(self._observed), np.nan)
+        hint = " (river.preprocessing.OneHotEncoder makes numbers of categories)"
+        for k, name in enumerate(self._observed):
+            if x.get(name) is not None:
+                z[k] = number(f"feature {name!r}", x[name], hint)
+            if math.isinf(z[k]):
+                raise ValueError(f"feature {name!r} is infinite; it must be finite")
         return z

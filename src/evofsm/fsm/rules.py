@@ -1,7 +1,4 @@
-"""State rules: when an observation creates or moves a state, and how wide a state is recognised.
-
-Its ``table`` has the numbers by which `evofsm.fsm.clusters.determine` judges an observation.
-"""
+"""State rules: by what numbers `evofsm.fsm.clusters.determine` judges an observation."""
 
 from __future__ import annotations
 
@@ -16,9 +13,7 @@ import numpy as np
 from evofsm.fsm.clusters import NOVELTY, PAPER
 from evofsm.fsm.validation import Floats, positive
 
-# Squares of observations over the scales, summed over a long run, must not overflow.
-_SCALES = 1e-20, 1e20
-# Where a rule has no radius that says so, a state reaches so many roots of the width.
+# So many roots of the width a state reaches where no radius says so: the similarity is 1/e⁴ there.
 _WIDTHS = 2.0
 
 
@@ -93,9 +88,6 @@ class Novelty:
 
     def __post_init__(self) -> None:
         scales = tuple(positive("a scale", scale) for scale in self.scales)
-        for scale in scales:
-            if not _SCALES[0] <= scale <= _SCALES[1]:
-                raise ValueError(f"a scale is {scale}; it must lie between 1e-20 and 1e20")
         object.__setattr__(self, "scales", scales)
         object.__setattr__(self, "radius", positive("radius", self.radius))
         object.__setattr__(self, "spread", positive("spread", self.spread))
@@ -115,8 +107,7 @@ def register_rule(name: str, rule: type) -> None:
 
     Parameters
     ----------
-    name : str
-    rule : type
+    name, rule : str, type
         A frozen dataclass as `StateRule`, whose settings JSON has words for.
 
     Examples
@@ -144,20 +135,10 @@ def rule_named(name: object) -> Any:
         for point in entry_points(group="evofsm.rules", name=name):
             register_rule(name, point.load())
     if name not in _RULES:
-        raise ValueError(
-            f"rule is {name!r}; it must be one of {', '.join(_RULES)} (one of your own is known "
-            "once its module was imported and has called register_rule, or by an entry point of "
-            "evofsm.rules)"
-        )
+        hint = "once its module has called register_rule, or by an entry point of evofsm.rules"
+        names = f"{', '.join(_RULES)} (one of your own is known {hint})"
+        raise ValueError(f"rule is {name!r}; it must be one of {names}")
     return _RULES[name]
-
-
-def check_rule(rule: StateRule) -> StateRule:
-    """One of the rules, as an object."""
-    if type(rule) not in _RULES.values():
-        names = ", ".join(f"{kind.__name__}(...)" for kind in _RULES.values())
-        raise TypeError(f"rule is {rule!r}; it must be an object: {names}")
-    return rule
 
 
 def weights_of(rule: StateRule, m: int) -> Floats:
@@ -169,24 +150,22 @@ def weights_of(rule: StateRule, m: int) -> Floats:
 
 
 def reach(rule: StateRule, width: float) -> float:
-    """Distance from a centre, in scales, beyond which an observation is like no state.
-
-    The radius of `Novelty`; of other rules twice the root of the width of recognition, where the
-    similarity is 1/e⁴, or 2 %.
-    """
+    """Distance from a centre, in scales, beyond which an observation is like no state."""
     return rule.radius if isinstance(rule, Novelty) else _WIDTHS * math.sqrt(width)
 
 
 def describe_rule(rule: StateRule) -> dict[str, Any]:
-    """A rule in plain JSON: its name and its settings."""
-    name, kind = next(item for item in _RULES.items() if item[1] is type(rule))
-    return {"name": name} | {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
+    """A rule in plain JSON: its name and its settings; a TypeError where it is none."""
+    for name, kind in _RULES.items():
+        if kind is type(rule):
+            settings = [part.name for part in fields(_RULES[name])]
+            return {"name": name} | {part: getattr(rule, part) for part in settings}
+    names = ", ".join(f"{kind.__name__}(...)" for kind in _RULES.values())
+    raise TypeError(f"rule is {rule!r}; it must be an object: {names}")
 
 
-def restore_rule(description: Mapping[str, Any]) -> StateRule:
+def restore_rule(description: Mapping[str, Any] | None) -> StateRule:
     """The rule that `describe_rule` put into words."""
-    if not isinstance(description, Mapping) or not isinstance(description.get("name"), str):
-        raise ValueError(f"rule is {description!r}; it must have a name")
-    settings = {name: value for name, value in description.items() if name != "name"}
-    rule: StateRule = rule_named(description["name"])(**settings)
+    settings = dict(description or {})
+    rule: StateRule = rule_named(settings.pop("name", None))(**settings)
     return rule

@@ -50,9 +50,7 @@ def step(
     surprise = np.nan
     if now.chained and now.action != NO_ACTION:
         place = place_of(learnt, now.action, settings.prior_frequency)
-        matrix, frequency = learnt.matrices[place], learnt.origin_frequency[place]
-        belief, rate = learnt.belief, settings.learning_rate
-        forecast_and_identify(matrix, frequency, n, belief, new_belief, rate, forecast)
+        forecast_and_identify(learnt, settings, place, n, new_belief, forecast)
         surprise = jensen_shannon_kernel(forecast, new_belief, lanes(n), scratch[TERMS])
         learnt.actions[now.action].uses += 1.0
         _count_decision(learnt, place, n, failed)
@@ -61,8 +59,10 @@ def step(
         learnt.changes[now.state, nearest] += 1.0
     for i in range(lanes(n)):
         learnt.belief[i] = new_belief[i]
+    there = learnt.states[nearest]
     learnt.sums[VISITS, nearest] += 1.0
-    _count_visit(learnt, nearest)
+    learnt.sums[EPISODES, nearest] += there.latest_visit < now.began  # once for each episode
+    there.latest_visit = now.clock
     now.state, now.action, now.chained = nearest, NO_ACTION, 1
     if failed:
         _end(learnt, settings)
@@ -81,12 +81,9 @@ def learn_rows(
     scratch: Floats,
     row: int,
     trace: Trace,
-    beliefs: Floats,
+    beliefs: Floats,  # (T, capacity), or empty where nobody wants them
 ) -> int:
-    """Step through the rows from ``row`` on; returns where it stopped for want of room.
-
-    ``beliefs`` is (T, capacity), or empty where nobody wants them.
-    """
+    """Step through the rows from ``row`` on; returns where it stopped for want of room."""
     now, room = learnt.now[0], (len(learnt.belief), len(learnt.matrices))
     while row < len(observations) and room_for(learnt, settings) == room:
         now.chained = 0 if starts[row] else now.chained
@@ -150,14 +147,6 @@ def _create(learnt: Learnt, settings: Settings, nearest: int, potential: float) 
 def _tick(now: Any) -> None:
     now.clock += 1
     now.began = now.began if now.chained else now.clock
-
-
-@inner_kernel
-def _count_visit(learnt: Learnt, state: int) -> None:
-    """Count that the present episode is in a state; once for each episode."""
-    there, now = learnt.states[state], learnt.now[0]
-    learnt.sums[EPISODES, state] += there.latest_visit < now.began
-    there.latest_visit = now.clock
 
 
 @inner_kernel

@@ -48,23 +48,19 @@ def place_of(learnt: Learnt, action: int, prior_frequency: float) -> int:
 
 @inner_kernel
 def forecast_and_identify(
-    matrix: Floats,
-    origin_frequency: Floats,
-    n: int,
-    origin: Floats,
-    reached: Floats,
-    learning_rate: float,
-    predicted: Floats,
+    learnt: Learnt, settings: Settings, place: int, n: int, reached: Floats, predicted: Floats
 ) -> None:
-    """Forecast one step, ``origin @ P``, then learn the transition from ``origin`` to ``reached``.
+    """Forecast one step, ``belief @ P``, then learn the transition from there to ``reached``.
 
     Both in one pass over the matrix, which is most of what a step costs. A row whose state was
     not believed in plays no part in either.
     """
+    matrix, origin_frequency = learnt.matrices[place], learnt.origin_frequency[place]
+    learning_rate = settings.learning_rate
     for j in range(lanes(n)):
         predicted[j] = 0.0
     for i in range(n):
-        belief = origin[i]
+        belief = learnt.belief[i]
         gain = learning_rate * belief
         frequency = (1.0 - learning_rate) * origin_frequency[i] + gain
         is_known = frequency >= _LOWEST_FREQUENCY
@@ -102,16 +98,12 @@ def expand(learnt: Learnt, new: int, n: int, prior_frequency: float) -> None:
         forget_row(learnt, place, new, n, prior_frequency)
 
 
-# -- The state limit -----------------------------------------------------------------------------
-
-
 @rare_kernel
 def merge_closest(learnt: Learnt, settings: Settings, nearest: int) -> Any:
     """Merge the two closest of all n states and the newcomer; returns the index that is free.
 
     That index goes to the new state, so that no other changes. The newcomer is the latest
-    observation, and ``nearest`` the centre closest to it. Where it is one of the two, that is n: it
-    is left out.
+    observation, closest to the centre ``nearest``. Where it is one of the two, n is returned.
     """
     n, weights = learnt.now[0].n_states, settings.weights
     closest = learnt.squared_distances[nearest]
@@ -131,65 +123,55 @@ def merge_closest(learnt: Learnt, settings: Settings, nearest: int) -> Any:
 
 @rare_kernel
 def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> None:
-    """Add what was learnt of a state to another, whose centre moves between theirs, by visits."""
+    """Move what was learnt of a state to another, whose centre moves between theirs, by visits."""
     now, sums, a, b = learnt.now[0], learnt.sums, learnt.states[kept], learnt.states[given]
     share = sums[VISITS, given] / max(sums[VISITS, kept] + sums[VISITS, given], 1.0)
     for k in range(len(weights)):
         center = learnt.centers[k]
         center[kept] += share * (center[given] - center[kept])
-    _merge_rows(learnt, kept, given, n)
     for i in range(n):
         learnt.changes[kept, i] += learnt.changes[given, i]
+        learnt.changes[given, i] = 0.0
     for i in range(n):
         learnt.changes[i, kept] += learnt.changes[i, given]
+        learnt.changes[i, given] = 0.0
     # Of the present episode it is known that it came to both; of those before it is not.
     sums[EPISODES, kept] -= a.latest_visit >= now.began and b.latest_visit >= now.began
     for k in range(len(sums)):
         sums[k, kept] += sums[k, given]
+        sums[k, given] = 0.0
     a.latest_visit = max(a.latest_visit, b.latest_visit)
-    a.joined = 1.0
+    a.joined, b.joined, b.latest_visit = 1.0, 0.0, 0.0
     learnt.potentials[kept] = max(learnt.potentials[kept], learnt.potentials[given])
     learnt.belief[kept] += learnt.belief[given]
+    learnt.belief[given] = learnt.potentials[given] = 0.0
     for place in range(now.n_places):
-        learnt.decisions[place, kept] += learnt.decisions[place, given]
-        learnt.failures[place, kept] += learnt.failures[place, given]
-        record, addition = learnt.tries[place, kept], learnt.tries[place, given]
-        in_both = record.latest_try >= now.began and addition.latest_try >= now.began
-        record.tried += addition.tried - in_both
-        record.failed_after += addition.failed_after
-        record.latest_try = max(record.latest_try, addition.latest_try)
+        _merge_actions(learnt, place, kept, given, n)
     now.state = kept if now.state == given else now.state
-    _forget(learnt, given, n)
     # The latest observation, from centres of which one has moved.
     latest = learnt.variables["latest"]
     measure_distances(learnt.centers, weights, n, latest, learnt.squared_distances)
 
 
 @spliced_kernel
-def _forget(learnt: Learnt, given: int, n: int) -> None:
-    learnt.states[given].joined = learnt.states[given].latest_visit = 0.0
-    for k in range(len(learnt.sums)):
-        learnt.sums[k, given] = 0.0
-    learnt.belief[given] = learnt.potentials[given] = 0.0
+def _merge_actions(learnt: Learnt, place: int, kept: int, given: int, n: int) -> None:
+    """Move the transitions from and to a state by one action, and its counts, to another state."""
+    matrix, frequency = learnt.matrices[place], learnt.origin_frequency[place]
+    together = frequency[kept] + frequency[given]
+    share = frequency[given] / together if together > 0.0 else 0.0
+    for j in range(n):
+        matrix[kept, j] += share * (matrix[given, j] - matrix[kept, j])
+        matrix[given, j] = 0.0
+    frequency[kept], frequency[given] = together, 0.0
     for i in range(n):
-        learnt.changes[given, i] = learnt.changes[i, given] = 0.0
-    for place in range(learnt.now[0].n_places):
-        learnt.decisions[place, given] = learnt.failures[place, given] = 0.0
-        record = learnt.tries[place, given]
-        record.tried = record.failed_after = record.latest_try = 0.0
-
-
-@spliced_kernel
-def _merge_rows(learnt: Learnt, kept: int, given: int, n: int) -> None:
-    """Add the frequencies of transitions from and to a state to those of another one."""
-    for place in range(learnt.now[0].n_places):
-        matrix, frequency = learnt.matrices[place], learnt.origin_frequency[place]
-        together = frequency[kept] + frequency[given]
-        share = frequency[given] / together if together > 0.0 else 0.0
-        for j in range(n):
-            matrix[kept, j] += share * (matrix[given, j] - matrix[kept, j])
-            matrix[given, j] = 0.0
-        frequency[kept], frequency[given] = together, 0.0
-        for i in range(n):
-            matrix[i, kept] += matrix[i, given]
-            matrix[i, given] = 0.0
+        matrix[i, kept] += matrix[i, given]
+        matrix[i, given] = 0.0
+    for counts in (learnt.decisions[place], learnt.failures[place]):
+        counts[kept] += counts[given]
+        counts[given] = 0.0
+    now, record, addition = learnt.now[0], learnt.tries[place, kept], learnt.tries[place, given]
+    in_both = record.latest_try >= now.began and addition.latest_try >= now.began
+    record.tried += addition.tried - in_both
+    record.failed_after += addition.failed_after
+    record.latest_try = max(record.latest_try, addition.latest_try)
+    addition.tried = addition.failed_after = addition.latest_try = 0.0

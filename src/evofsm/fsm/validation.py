@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, SupportsFloat, SupportsIndex, TypeAlias, TypeVar
 
@@ -15,8 +15,6 @@ from evofsm.store import LARGEST_OBSERVATION
 Floats: TypeAlias = NDArray[np.float64]
 _F = TypeVar("_F")
 
-# Cases, and failures among them.
-_OUTCOMES = (("decisions", "failures"), ("episodes", "failed_soon"), ("tried", "failed_after"))
 # NumPy is quicker for longer vectors.
 _SHORT = 16
 _ENCODE = "IntervalActions.encode turns a number into one"
@@ -57,9 +55,6 @@ def check_index(what: str, i: Any, n: int, name: Callable[[int], str] = str) -> 
 def check_action(i: Any, n_actions: int) -> int:
     """An index of one of the actions."""
     return check_index("action", i, n_actions, action_name)
-
-
-# -- Settings and numbers -------------------------------------------------------------------------
 
 
 def function(name: str, value: _F, such_as: str) -> _F:
@@ -103,26 +98,16 @@ def whole(name: str, value: SupportsIndex) -> int:
     return number
 
 
-def real_array(name: str, values: ArrayLike, ndim: int) -> Floats:
-    """A new array of real numbers with ``ndim`` axes, the last one not empty."""
+def real_array(name: str, values: ArrayLike, ndim: int, *, copy: bool = True) -> Floats:
+    """Real numbers with ``ndim`` axes, the last one not empty; a new array unless told not to."""
     array = _array(name, values)
     if array.dtype.kind not in "fiub":
-        raise TypeError(
-            f"{name} has dtype {array.dtype}; it must hold real numbers "
-            "(is there a text, a None or a complex number among them?)"
-        )
-    if array.ndim != ndim or array.shape[-1] == 0:
+        hint = "is there a text, a None or a complex number among them?"
+        raise TypeError(f"{name} has dtype {array.dtype}; it must hold real numbers ({hint})")
+    if array.ndim != ndim or 0 in array.shape[-1:]:
         shape = "(variables,)" if ndim == 1 else "(rows, variables)"
         raise ValueError(f"{name} has shape {array.shape}; it must be {shape}, not empty")
-    return array.astype(np.float64)
-
-
-def real_rows(name: str, values: ArrayLike) -> Floats:
-    """Rows of real numbers, without gaps in memory: those given where they are that already."""
-    if type(values) is not np.ndarray or values.dtype != np.float64:
-        return real_array(name, values, ndim=2)
-    is_fit = values.ndim == 2 and values.shape[1]
-    return np.ascontiguousarray(values) if is_fit else real_array(name, values, ndim=2)
+    return np.array(array, np.float64, order="C", copy=copy or None)
 
 
 def _array(name: str, values: Any) -> NDArray[Any]:
@@ -139,25 +124,18 @@ def _array(name: str, values: Any) -> NDArray[Any]:
         raise ValueError(f"{name}: rows have different lengths") from None
 
 
-def is_within(values: Floats, largest: float) -> bool:
-    """Whether this is a short vector of numbers of at most that size: the quick way to ask it."""
-    if values.ndim != 1 or not 0 < len(values) <= _SHORT:
-        return False
-    return all([-largest <= value <= largest for value in values.tolist()])  # noqa: C419
-
-
 def refuse_unusable(name: str, values: Floats) -> None:
     """Raise for the first entry that is not finite, or too large."""
-    if not values.size or is_within(values, LARGEST_OBSERVATION):
+    most = LARGEST_OBSERVATION
+    if values.ndim == 1 and len(values) <= _SHORT:
+        if all([-most <= value <= most for value in values.tolist()]):  # noqa: C419
+            return
+    elif not values.size or -most <= values.min() <= values.max() <= most:  # false of NaN
         return
-    if -LARGEST_OBSERVATION <= values.min() <= values.max() <= LARGEST_OBSERVATION:
-        return  # false of NaN
-    place = tuple(int(k) for k in np.argwhere(~(np.abs(values) <= LARGEST_OBSERVATION))[0])
+    place = tuple(int(k) for k in np.argwhere(~(np.abs(values) <= most))[0])
     where = f"row {place[0]}, variable {place[1]}" if len(place) > 1 else f"variable {place[0]}"
-    raise ValueError(
-        f"{name}, {where}: {values[place]} cannot be used; every entry must be finite "
-        f"and at most {LARGEST_OBSERVATION:g} in size (a missing sensor value?)"
-    )
+    need = f"every entry must be finite and at most {most:g} in size (a missing sensor value?)"
+    raise ValueError(f"{name}, {where}: {values[place]} cannot be used; {need}")
 
 
 def refuse_unless_distribution(name: str, rows: Floats) -> None:
@@ -166,28 +144,17 @@ def refuse_unless_distribution(name: str, rows: Floats) -> None:
         raise ValueError(f"{name} is no distribution: entries must be 0 or more and sum to 1")
 
 
-def refuse_more_failures(arrays: Mapping[str, Floats]) -> None:
-    """Raise where there are more failures than cases, in what has the outcomes by name."""
-    for cases, failures in _OUTCOMES:
-        if (arrays[failures] > arrays[cases]).any():
-            raise ValueError(f"{failures} cannot be more than {cases}")
-
-
 def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.int64]:
     """An index for each row, or -1 for none."""
     actions = _array("actions", indices)
     if actions.shape != (rows,):
         raise ValueError(f"actions have shape {actions.shape}; {rows} observations need ({rows},)")
     if rows and actions.dtype.kind not in "iu":
-        raise TypeError(
-            f"actions have dtype {actions.dtype}; they must be integer indices, "
-            f"none of them masked ({_ENCODE})"
-        )
+        need = f"they must be integer indices, none of them masked ({_ENCODE})"
+        raise TypeError(f"actions have dtype {actions.dtype}; {need}")
     if len(wrong := np.flatnonzero((actions < -1) | (actions >= n_actions))):
-        raise ValueError(
-            f"action in row {wrong[0]} is {actions[wrong[0]]}; "
-            f"there are actions 0 to {n_actions - 1}, and -1 for none"
-        )
+        there = f"there are actions 0 to {n_actions - 1}, and -1 for none"
+        raise ValueError(f"action in row {wrong[0]} is {actions[wrong[0]]}; {there}")
     return actions.astype(np.int64)
 
 

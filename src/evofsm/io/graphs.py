@@ -13,6 +13,7 @@ import numpy as np
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import in_a_line
 from evofsm.fsm.validation import check_index, counted
+from evofsm.store import Numbers
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.
 _DOT_MARK = ',\n      shape=hexagon, style=filled, fillcolor="#D55E00", fontcolor=white, penwidth=2'
@@ -25,6 +26,7 @@ _DOT_HEAD = """digraph evofsm {
 _LARGEST_NODE, _WIDEST_LINE = 1.2, 3.0
 # Probabilities of a process have so many decimals; those of a command add up to 1 exactly.
 _DECIMALS = 12
+_PROBABILITY = Numbers(least=0.0, most=1.0)
 
 
 def to_dot(
@@ -38,10 +40,8 @@ def to_dot(
     Parameters
     ----------
     model : FSMModel
-    least : float
-        Edges below this probability are left out ...
-    evidence : float
-        ... and those whose change was seen less often than this.
+    least, evidence : float
+        Edges below this probability are left out, and those whose change was seen less often.
     dead_ends : collection of int, optional
         Indices of the states to be called dead ends, from 0. Without it, those in which failures
         ended are marked.
@@ -58,7 +58,7 @@ def to_dot(
     Raises
     ------
     ValueError
-        If a dead end is no state.
+        If ``least`` is no probability, or a dead end is no state.
 
     Examples
     --------
@@ -74,6 +74,7 @@ def to_dot(
     }
     <BLANKLINE>
     """
+    _PROBABILITY.refuse_others("least", least)
     end_states = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
     marked_states = {check_index("state", state, model.n_states) for state in end_states}
     lines = [_DOT_HEAD]
@@ -133,14 +134,13 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     -------
     str
         The process; it begins in the state that was created first. ``"failed"`` labels the failure,
-        ``"unknown"`` states without any command, from which nothing leads on (do not take them for
-        safe), ``"state_i"`` each state, of which ``filter`` asks. Comments say how many decisions
-        and failures a command rests on, and what was left out.
+        ``"unknown"`` states without any command (do not take them for safe), ``"state_i"`` each
+        state. Comments say what a command rests on, and what was left out.
 
     Raises
     ------
     ValueError
-        If the model counted no decisions, or ``evidence`` is not positive.
+        If the model counted no decisions, or ``evidence`` or ``least`` cannot be right.
 
     Examples
     --------
@@ -156,6 +156,7 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
         0.152472546555:(s'=2); // seen 1
     """
     n = model.n_states
+    _PROBABILITY.refuse_others("least", least)
     if not evidence > 0.0:
         raise ValueError(f"evidence is {evidence}; it must be positive")
     if not model.decisions.any():
@@ -168,8 +169,7 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
         about = [f"#{state + 1}", *(_where(model, state) if model.names else [])]
         body += ["", f"  // {', '.join([*about, counted(round(model.visits[state]), 'visit')])}"]
         actions = np.flatnonzero(model.decisions[:, state] >= evidence).tolist()
-        for action in actions:
-            body += _command(model, state, action, least)
+        body += [line for action in actions for line in _command(model, state, action, least)]
         if not actions:
             unknown.append(state + 1)
             body[-1] += ": no action has the evidence"
@@ -218,7 +218,6 @@ def _command(model: FSMModel, state: int, action: int, least: float) -> Iterator
     yield f"  [a{action + 1}] s={state + 1} -> // {decisions:.4g} decisions; {usage}"
     targets = np.flatnonzero(parts).tolist()
     for target in targets:
-        part = parts[target]
-        chance = "1" if part == 10**_DECIMALS else f"0.{part:0{_DECIMALS}d}"
+        chance = "1" if parts[target] == 10**_DECIMALS else f"0.{parts[target]:0{_DECIMALS}d}"
         end = ";" if target == targets[-1] else " +"
         yield f"    {chance}:(s'={target}){end} // {comments[target]}"

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evofsm.fsm.validation import state_name
 from evofsm.paper.runs import PaperStudy, Run
 
 #: In which cases the paper saw a collision.
@@ -28,39 +29,36 @@ class Claim(NamedTuple):
 
 def check_claims(study: PaperStudy) -> tuple[Claim, ...]:
     """Every claim of the paper's Section 3, with a verdict each."""
-    return (
-        *_of_collisions(study),
-        *_of_states(study),
-        *_of_the_dead_end(study),
-        _of_divergence(study),
-    )
+    parts = _of_collisions, _of_states, _of_the_dead_end, _of_divergence
+    return tuple(claim for part in parts for claim in part(study))
 
 
 def _of_collisions(study: PaperStudy) -> Iterator[Claim]:
     as_in_paper = sum(run.episode.collided == _COLLIDES[run.case] for run in study.runs)
-    safe = all(study.safe_at_the_end.values())
     yield Claim(
         "collisions_by_case",
         "Collision in cases 1 and 4, none in cases 2 and 3",
         "yes, no, no, yes",
         f"{', '.join(_outcome(run) for run in study.last_round)}; so in {as_in_paper} of "
         f"{len(study.runs)} runs; cases 2 and 3 "
-        f"{'are safe' if safe else 'have collided'} at {study.settings.safe_until:g} s",
-        as_in_paper == len(study.runs) and safe,
+        f"{'are safe' if study.is_safe_at_the_end else 'have collided'} at "
+        f"{study.settings.safe_until:g} s",
+        as_in_paper == len(study.runs) and study.is_safe_at_the_end,
     )
     decel = study.settings.scenario.leader.brake_decel
     for time, run in zip(study.settings.brake_at, study.extra_runs, strict=True):
-        braking = np.flatnonzero(run.episode.leader_accelerations == -decel)
-        at_brake = int(run.state[braking[0]]) if len(braking) else None
-        end = f"collision at {run.episode.time[-1]:.1f} s, in {_name(run.state[-1])}"
-        fate = end if run.episode.collided else "no collision"
-        has_braked = at_brake is not None
+        at_brake = run.state[run.episode.leader_accelerations == -decel][:1].tolist()
+        outcome = "the leader did not brake"
+        if at_brake:
+            end = f"collision at {run.episode.time[-1]:.1f} s, in {state_name(run.state[-1])}"
+            fate = end if run.episode.collided else "no collision"
+            outcome = f"{state_name(at_brake[0])} at the brake; {fate}"
         yield Claim(
             f"brake_at_{time:g}",
             f"Leader brakes at {time:g} s, in the dead end: collision",
             "collision",
-            f"{_name(at_brake)} at the brake; {fate}" if has_braked else "the leader did not brake",
-            run.episode.collided and at_brake == study.dead_end,
+            outcome,
+            run.episode.collided and at_brake == [study.dead_end],
         )
 
 
@@ -73,9 +71,8 @@ def _of_states(study: PaperStudy) -> Iterator[Claim]:
         f"{', '.join(map(str, counts[:4]))} after runs 1 to 4, {counts[-1]} after {len(counts)}",
         len(set(counts[3:])) == 1 and counts == sorted(counts),
     )
-    final = counts[-1]
-    text = "Number of states at the end"
-    yield Claim("states_final", text, str(_STATES), str(final), final == _STATES)
+    text, is_met = "Number of states at the end", counts[-1] == _STATES
+    yield Claim("states_final", text, str(_STATES), str(counts[-1]), is_met)
 
 
 def _of_the_dead_end(study: PaperStudy) -> Iterator[Claim]:
@@ -86,7 +83,7 @@ def _of_the_dead_end(study: PaperStudy) -> Iterator[Claim]:
         f"One and the same state at every collision of the {len(study.runs)} runs, the dead end "
         "(numbers: order of creation)",
         "#3",
-        ", ".join(map(_name, at_collisions)) or "no collision",
+        ", ".join(map(state_name, at_collisions)) or "no collision",
         len(at_collisions) == 1,
     )
     inside = sum(int(run.state[-1]) == study.dead_end for run in collisions)
@@ -103,9 +100,9 @@ def _of_the_dead_end(study: PaperStudy) -> Iterator[Claim]:
     yield Claim("case4_enters_dead_end", text, "yes", *_change(study, 4, leaves=False))
 
 
-def _of_divergence(study: PaperStudy) -> Claim:
+def _of_divergence(study: PaperStudy) -> Iterator[Claim]:
     largest = [float(np.nanmax(run.surprise)) for run in study.last_round]
-    return Claim(
+    yield Claim(
         "jsd_max_by_case",
         "Largest divergence of forecast and recognised state, but for a run's first, "
         "in the last round",
@@ -125,14 +122,10 @@ def _change(study: PaperStudy, case: int, *, leaves: bool) -> tuple[str, bool]:
         row = min(int(np.searchsorted(run.episode.time, switch)), len(inside) - 1)
         change_row = row + int(np.argmax(inside[row:] != inside[row]))  # `row` where it never does
         as_in_paper += bool(inside[row] == leaves and inside[change_row] != leaves != inside[-1])
-    text = f"{_name(run.state[row])} at {switch:g} s"
+    text = f"{state_name(run.state[row])} at {switch:g} s"
     if change_row > row:
-        text += f", {_name(run.state[change_row])} from {run.episode.time[change_row]:.1f} s"
+        text += f", {state_name(run.state[change_row])} from {run.episode.time[change_row]:.1f} s"
     return f"{text}; so in {as_in_paper} of {len(runs)} rounds", as_in_paper == len(runs)
-
-
-def _name(state: int | None) -> str:
-    return "no state" if state is None else f"#{state + 1}"
 
 
 def _outcome(run: Run) -> str:

@@ -65,9 +65,6 @@ def _letter(panels: Iterable[Axes], offset: plot.Point = (-14.0, 9.0)) -> None:
         plot.write(axes, name, (0.0, 1.0), offset, size=8.5, **look)
 
 
-# -- Over time ------------------------------------------------------------------------------------
-
-
 def draw_case(study: PaperStudy, run: Run) -> Drawn:
     """Gap, speeds, acceleration, recognised state and action of one run, over time."""
     figure = Drawn(figsize=(WIDTH, 6.7))
@@ -83,28 +80,30 @@ def draw_case(study: PaperStudy, run: Run) -> Drawn:
         gap.plot([time[-1]], [0.0], markeredgecolor="white", markeredgewidth=0.7, zorder=7, **look)
     speeds.plot(time, followers, label="follower", **_FOLLOWER)
     speeds.plot(time, leaders, label="leader", **_LEADER_LINE)
-    speeds.set_ylim(bottom=0.0)
-    speeds.set_ylabel("speed [m/s]")
+    speeds.set(ylim=(0.0, None), ylabel="speed [m/s]")
     speeds.legend(loc="upper left")
     acceleration.axhline(0.0, color=COLORS["soft"], linewidth=0.6)
     acceleration.plot(time, episode.accelerations, **_FOLLOWER)
     acceleration.set_ylabel("acceleration\n[m/s²]")
     state.step(time, run.state, where="post", color=COLORS["ink"])
-    plot.label_states(state.yaxis, study.model.n_states, study.dead_ends, called="collisions")
-    state.set_ylabel("recognised\nstate")
+    plot.label_states(state, study.model.n_states)
+    state.set(ylim=(-0.6, study.model.n_states - 0.4), ylabel="recognised\nstate")
+    look = {"xycoords": ("axes fraction", "data"), "color": COLORS["dead end"]}
+    for dead_end in study.dead_ends:
+        state.axhspan(dead_end - 0.5, dead_end + 0.5, **{**_TINT, "alpha": 0.18})
+        plot.write(state, "collisions", (1.0, dead_end), (4.0, 0.0), fontweight="bold", **look)
     action.step(time, run.action, where="post", **_FOLLOWER)
     n_actions = settings.actions.n_actions
     ticks = range(0, n_actions, max(1, round((n_actions - 1) / 4)))
     action.set_yticks(ticks, [f"a({tick + 1})" for tick in ticks])
-    action.set(ylim=(-1.0, n_actions), ylabel="action", xlabel="time [s]")
-    action.set_xlim(0.0, settings.scenario.duration)
+    end = settings.scenario.duration
+    action.set(xlim=(0.0, end), ylim=(-1.0, n_actions), ylabel="action", xlabel="time [s]")
     _tint(figure, panels, study, run)
     moments = _moments(study, run)
     for axes in panels:
         _draw_moments(axes, moments)
     for place, (at, text, _) in enumerate(moments):
-        share, is_last = at / settings.scenario.duration, place == len(moments) - 1
-        before = share > (0.93 if is_last else 0.5)
+        before = at / end > (0.93 if place == len(moments) - 1 else 0.5)
         height = 7.0 + 13.0 * place * before  # each text that ends there in a row of its own
         look = {"ha": "right" if before else "left", "xycoords": ("data", "axes fraction")}
         look["fontweight"] = "bold" if text.startswith("collision") else "normal"
@@ -129,10 +128,9 @@ def _tint(figure: Drawn, panels: Sequence[Axes], study: PaperStudy, run: Run) ->
         height: Look = {"transform": axes.get_xaxis_transform(), "where": hopeless}
         axes.fill_between(time, 0.0, 1.0, **height, **_TINT)
     if hopeless.any():
-        text = (
-            f"dead end: if the leader braked now ({settings.scenario.leader.brake_decel:g} m/s²),\n"
-            f"even full braking ({settings.decel:g} m/s²) would be too late"
-        )
+        decel = settings.scenario.leader.brake_decel
+        text = f"dead end: if the leader braked now ({decel:g} m/s²),\n"
+        text += f"even full braking ({settings.decel:g} m/s²) would be too late"
         patch = Patch(**{**_TINT, "alpha": 0.18})
         figure.legend([patch], [text], loc="upper right", bbox_to_anchor=(0.99, 0.995))
 
@@ -172,9 +170,8 @@ def draw_divergence(study: PaperStudy) -> Drawn:
         axes.plot(time, surprise, linewidth=0.8, label="one-step forecasts", **_FOLLOWER)
         _draw_moments(axes, _moments(study, run))
         axes.set_title(_title_of(study, run))
-    highest = [float(np.nanmax(run.surprise)) for run in study.last_round]
-    grid[0, 0].set_ylim(0.0, 1.12 * max(LARGEST_DIVERGENCE, *highest))
-    grid[0, 0].set_xlim(0.0, study.settings.scenario.duration)
+    highest = max(LARGEST_DIVERGENCE, *(np.nanmax(run.surprise) for run in study.last_round))
+    grid[0, 0].set(xlim=(0.0, study.settings.scenario.duration), ylim=(0.0, 1.12 * highest))
     for left_axes, lower_axes in zip(grid[:, 0], grid[1], strict=True):
         left_axes.set_ylabel("divergence [bit]")
         lower_axes.set_xlabel("time [s]")

@@ -1,8 +1,4 @@
-"""Pages of results: text, tables and figures in one HTML file that loads nothing.
-
-The paper's page and those of all studies are made here; `evofsm.cli.print_page` says the same in
-the terminal.
-"""
+"""Pages of results, of the paper and of all studies: one HTML file that loads nothing."""
 
 from __future__ import annotations
 
@@ -32,6 +28,8 @@ NONE = "–"
 _PACKAGES = ("numpy", "numba", "polars", "matplotlib")
 # A table with a longer cell is one of words, which are folded.
 _WORDS = 36
+# What a cell begins with that holds a number.
+_NUMBER = re.compile(r"[−–∞≤≥<>+\d]").match
 
 
 class _Cell(Formatter):
@@ -124,9 +122,8 @@ class Table:
     @property
     def numeric(self) -> list[bool]:
         """Whether a column, never the first, holds numbers."""
-        columns = list(zip(*self.cells, strict=True))[1:]
-        is_numeric = [all(re.match(r"[−–∞≤≥<>+\d]", text) for text in column) for column in columns]
-        return [False, *(is_numeric or [False] * (len(self.header) - 1))]
+        columns = list(zip(self.header, *self.cells, strict=True))[1:]
+        return [False, *(all(map(_NUMBER, column[1:])) for column in columns)]
 
     @property
     def is_wordy(self) -> bool:
@@ -196,9 +193,6 @@ class Page:
         return [table for table in self.lost if len(table.frame)]
 
 
-# -- The file -------------------------------------------------------------------------------------
-
-
 def write_page(path: Path, pages: Sequence[Page], title: str = "", about: str = "") -> Path:
     """Draw all figures and write one file that holds all it shows.
 
@@ -211,30 +205,18 @@ def write_page(path: Path, pages: Sequence[Page], title: str = "", about: str = 
     pages : sequence of Page
     title, about : str
         Of many pages together; of one its own are taken.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        If matplotlib or jinja2 is not installed.
     """
     with needs("jinja2", "plot", "writing the page"):
         from jinja2 import Environment, PackageLoader, StrictUndefined
-    path.parent.mkdir(parents=True, exist_ok=True)
-    environment = Environment(
-        loader=PackageLoader("evofsm.paper", ""),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    look: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
+    loader = PackageLoader("evofsm.paper", "")
+    environment = Environment(loader=loader, undefined=StrictUndefined, **look)
+    folders = [(page, page.name if len(pages) > 1 else "figures") for page in pages]
     text = environment.get_template("page.html.j2").render(
         title=title or pages[0].title,
         about=[about] if about else pages[0].text,
         pages=pages,
-        images={
-            page.name: _drawn(page, path.parent / (page.name if len(pages) > 1 else "figures"))
-            for page in pages
-        },
+        images={page.name: _drawn(page, path.parent / folder) for page, folder in folders},
         summary=summary(pages),
         versions=_versions([package for page in pages for package in page.packages]),
         date=datetime.now(UTC).date().isoformat(),
@@ -249,7 +231,7 @@ def _drawn(page: Page, folder: Path) -> dict[str, str]:
 
     folder.mkdir(parents=True, exist_ok=True)
     images = {}
-    with matplotlib.style.context(["default", Path(__file__).with_name("house.mplstyle")]):
+    with matplotlib.style.context(["default", "evofsm.paper.house"]):
         for item in (part for part in page.parts if isinstance(part, Figure)):
             figure, svg = item.draw(), folder / f"{item.name}.svg"
             figure.savefig(svg.with_suffix(".png"))

@@ -62,15 +62,12 @@ def page_of(study: PaperStudy, command: str = "evofsm paper") -> Page:
 
 def write(study: PaperStudy, folder: Path, command: str) -> Path:
     """Write page, figures, ``claims.json`` and ``model.evofsm``."""
-    folder.mkdir(parents=True, exist_ok=True)
+    page = write_page(folder / "index.html", [page_of(study, command)])
     claims = [claim._asdict() for claim in check_claims(study)]
     text = json.dumps(claims, indent=2, ensure_ascii=False)
     (folder / "claims.json").write_text(f"{text}\n", encoding="utf-8")
     study.model.save(folder / "model.evofsm")
-    return write_page(folder / "index.html", [page_of(study, command)])
-
-
-# -- Beside the claims: what an expert would ask next ---------------------------------------------
+    return page
 
 
 def _table_of_forecasts(forecasts: pl.DataFrame) -> Table:

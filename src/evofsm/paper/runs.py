@@ -1,7 +1,4 @@
-"""The runs: what they are told, each case driven as often as asked, every row shown to one machine.
-
-The settings stand, with comments, in ``settings.toml``.
-"""
+"""The runs: each case driven as often as asked, every row shown to one machine."""
 
 from __future__ import annotations
 
@@ -25,9 +22,6 @@ from evofsm.fsm.model import FSMModel
 CASES = (1, 2, 3, 4)
 
 
-# -- Settings -------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Settings:
     """All that the runs can be told; the defaults stand in ``settings.toml``."""
@@ -42,7 +36,7 @@ class Settings:
     actions: IntervalActions
 
     @classmethod
-    def load(cls, changes: Mapping[str, Any] | None = None) -> Settings:
+    def load(cls, changes: Mapping[str, Mapping[str, Any]] | None = None) -> Settings:
         """The paper's settings, with others in the place of some.
 
         ``changes`` are tables of ``settings.toml``, with what is changed in them; a ValueError says
@@ -55,7 +49,12 @@ class Settings:
         (6.0, 5.0)
         """
         tables = tomllib.loads(files(__package__).joinpath("settings.toml").read_text("utf-8"))
-        _merge(tables, changes or {})
+        for table, values in (changes or {}).items():
+            for name in values:
+                if name not in tables.get(table, {}):
+                    names = ", ".join(tables.get(table, tables))
+                    raise ValueError(f"[{table}]: there is no {name!r}; known are {names}")
+            tables[table] |= values
         scenario, leader, cases = dict(tables["scenario"]), dict(tables["leader"]), tables["cases"]
         safe_until = scenario.pop("safe_until")
         brake = {name: leader.pop(name) for name in ("brake_speed", "brake_decel")}
@@ -76,20 +75,6 @@ class Settings:
             machine=tables["machine"],
             actions=IntervalActions(**tables["actions"], outside="clip"),
         )
-
-
-def _merge(known: dict[str, Any], changes: Mapping[str, Any], where: str = "changes") -> None:
-    """Put changes in the place of known values."""
-    for name, value in changes.items():
-        if name not in known:
-            raise ValueError(f"{where}: there is no {name!r}; known are {', '.join(known)}")
-        if isinstance(known[name], dict):
-            _merge(known[name], value, f"{where}, [{name}]")
-        else:
-            known[name] = value
-
-
-# -- Runs -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +99,7 @@ class PaperStudy:
     settings: Settings
     runs: tuple[Run, ...]
     extra_runs: tuple[Run, ...]
-    safe_at_the_end: Mapping[int, bool]  #: whether the longer runs of cases 2 and 3 stay safe
+    is_safe_at_the_end: bool  #: whether the longer runs of cases 2 and 3 stay safe
     model: FSMModel
     dead_end: int  #: index of the state that stands at most collisions; -1 without collisions
 
@@ -148,10 +133,8 @@ def run_paper(
 
     Parameters
     ----------
-    world : World
-        Where to drive.
-    name : str
-        What to call it.
+    world, name : World, str
+        Where to drive, and what to call it.
     settings : Settings
         ``Settings.load()`` for the paper's.
     rounds : int
@@ -159,15 +142,13 @@ def run_paper(
     progress : callable
         Told how many runs are done, of how many.
     order : sequence of int
-        In which the cases are driven in each round.
+        In which the cases are driven in each round, each of them once.
     observe : callable, optional
         What the machine observes of a run, (T, 3), told how many runs came before, and the run;
         without it what truly happened.
     """
     if rounds < 1:
         raise ValueError(f"rounds is {rounds}; the cases must be driven at least once")
-    if sorted(order) != list(CASES):
-        raise ValueError(f"order is {list(order)}; it must hold each of the cases once")
     machine = EvolvingFSM(settings.actions.n_actions, **settings.machine)
     total = rounds * len(CASES) + len(settings.brake_at) + 2
     runs, extra_runs = list[Run](), list[Run]()
@@ -196,17 +177,10 @@ def run_paper(
         scenario = replace(settings.scenario, leader=leader)
         extra_runs.append(learn(machine.copy(), f"brake at {time:g} s", 1, scenario))
     longer = replace(settings.scenario, duration=settings.safe_until)
-    safe = {case: not world.run(longer, settings.drivers[case]).collided for case in (2, 3)}
+    is_safe = not any(world.run(longer, settings.drivers[case]).collided for case in (2, 3))
     progress(total, total)
+    dt = settings.scenario.dt
+    model = machine.model(actions=settings.actions, names=VARIABLES, units=UNITS, dt=dt)
     at_collisions = [run.state[-1] for run in runs if run.episode.collided]
-    return PaperStudy(
-        world=name,
-        settings=settings,
-        runs=tuple(runs),
-        extra_runs=tuple(extra_runs),
-        safe_at_the_end=safe,
-        model=machine.model(
-            actions=settings.actions, names=VARIABLES, units=UNITS, dt=settings.scenario.dt
-        ),
-        dead_end=int(np.bincount(at_collisions).argmax()) if at_collisions else -1,
-    )
+    dead_end = int(np.bincount(at_collisions).argmax()) if at_collisions else -1
+    return PaperStudy(name, settings, tuple(runs), tuple(extra_runs), is_safe, model, dead_end)
