@@ -152,7 +152,10 @@ def write(
     arrays: Mapping[str, NDArray[Any]],
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a file as a whole or not at all; an error says what no such file may hold."""
+    """Write a file as a whole or not at all; when this returns, it is on the disk.
+
+    A ValueError or TypeError says what no file of this kind may hold.
+    """
     if not isinstance(provenance, Mapping | None):
         raise TypeError(f"provenance is {provenance!r}; it must be a mapping of names to values")
     header = Header(kind.name, _VERSION, __version__, dict(settings), dict(provenance or {}))
@@ -253,6 +256,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
                 temporary.unlink(missing_ok=True)
         raise
     sweep(target)
+    # Not all systems can flush a folder; the file is whole, if not under its name, without it.
+    with suppress(OSError):
+        descriptor = os.open(target.parent, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _write_over(target: Path, whole: BinaryIO) -> None:
