@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from shlex import quote
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from evofsm.cli.options import Reading
+from evofsm import store
+from evofsm.cli.inspect import model_document
+from evofsm.cli.options import Judge, Reading, imported
 from evofsm.cli.show import warn
+from evofsm.driving import SAFETY_RULE
+from evofsm.driving.cars import guard_of_monitor
 from evofsm.driving.naming import VARIABLES
-from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.model import FSMModel
-from evofsm.guard import ActionReviser, Guard
-from evofsm.io import Chunk, episodes_of
-from evofsm.io.logs import LogColumns, Noted
-from evofsm.io.tables import SI, TIMES, UNITS
+from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, Novelty, ObservationEncoder
+from evofsm.fsm.rules import describe_rule, rule_named
+from evofsm.fsm.validation import positive
+from evofsm.guard import ActionReviser, Foresight, Guard, LearntRisk, Mode
+from evofsm.guard.foresight import span
+from evofsm.io import Chunk, LogColumns, episodes_of
+from evofsm.io.logs import Noted
+from evofsm.io.tables import SI, TIMES, UNITS, quoted_name
 
 # A unit at the end of a column's name, behind another letter or as a word of its own.
 _WORD = "(?:^|[^A-Za-z]|(?<=[a-z])(?=[A-Z]))"
@@ -40,6 +47,7 @@ _LEFT_OUT = {
 _NO_SPEED = 500.0
 #: Columns of more different numbers are no choice among some; and the most intervals for those.
 MOST_LEVELS, _MOST_INTERVALS = 12, 50
+_MOST_ACTIONS = 1000
 # Numbers that stand for nobody in many recordings.
 _NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
 
@@ -211,6 +219,21 @@ def episodes_read(
 # -- A guard --------------------------------------------------------------------------------------
 
 
+def guard_of_log(
+    kind: Judge, model: FSMModel, machine: EvolvingFSM, brakes: float, tolerance: float
+) -> Guard:
+    """A guard that is to be taught what somebody did, in shadow mode."""
+    assert model.dt is not None
+    assert model.actions is not None
+    if kind == "kinematic":
+        return guard_of_monitor(model.dt, brakes, tolerance)
+    actions, labels = model.actions, model.labels
+    ends: dict[str, Any] = {"low": actions.low, "high": actions.high}
+    learnt = LearntRisk(model.dt, **ends, names=labels.names, units=labels.units)
+    reviser = ActionReviser(learnt, actions, tolerance=tolerance, mode=Mode.SHADOW)
+    return Guard.of(reviser, interval=model.dt, machine=machine)
+
+
 def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) -> float:
     """The share in which a guard refuses, of the later half of a log; ``show`` is told of rows."""
     n_rows, refusals, reviser = 0, bytearray(), guard.reviser
@@ -267,3 +290,209 @@ def range_of(levels: Sequence[float]) -> str:
     if len(levels) > MOST_LEVELS or not levels[-1] - levels[0] < _MOST_INTERVALS * width:
         return ""
     return f"{levels[0] - width / 2.0:.6g}:{levels[-1] + width / 2.0:.6g}:{width:.6g}"
+
+
+# -- What was asked for ---------------------------------------------------------------------------
+
+
+def actions_of(text: str) -> IntervalActions:
+    """The intervals of --action-range."""
+    try:
+        low, high, width = map(float, text.split(":"))
+        if width > 0.0 and (high - low) / width > _MOST_ACTIONS:
+            raise ValueError(f"more than {_MOST_ACTIONS} intervals; make them wider")
+        return IntervalActions(low, high, width, outside="clip")
+    except ValueError as error:
+        hint = "write LOW:HIGH:WIDTH, such as -2.5:2.5:0.3"
+        raise ValueError(f"--action-range is {text!r}: {error}; {hint}") from None
+
+
+def machine_of(
+    n_actions: int,
+    rule: str,
+    scale: list[str] | None,
+    max_states: int | None,
+    encoder: ObservationEncoder,
+) -> EvolvingFSM:
+    """A machine that has seen nothing, with the rule of states that was named."""
+    if scale and rule != "novelty":
+        raise ValueError(f"--scale is for --rule novelty, not {rule}")
+    if rule == "novelty":
+        part: Any = Novelty(1.0, _scales(scale, encoder))
+    else:
+        part = imported(rule) if ":" in rule else rule_named(rule)
+    state_rule = part() if isinstance(part, type) else part
+    return EvolvingFSM(n_actions, max_states=max_states, rule=state_rule)
+
+
+def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]:
+    """The difference that counts as 1, for each number that is observed."""
+    scales = {}
+    for text in scale or ():
+        column, _, number = text.rpartition("=")
+        try:
+            scales["".join(quoted_name(column))] = positive("it", float(number))
+        except ValueError:
+            hint = "write COLUMN=NUMBER, such as gap=4"
+            raise ValueError(f"--scale is {text!r}; {hint}") from None
+    single = [name for name in encoder.variables if isinstance(name, str)]
+    if unknown := [column for column in scales if column not in single]:
+        raise ValueError(f"--scale names {unknown[0]!r}; observed are {', '.join(single)}")
+    scales = dict(zip(VARIABLES, SAFETY_RULE.scales, strict=True)) | scales
+    if omissions := [column for column in single if column not in scales]:
+        raise ValueError(
+            f"--rule novelty has to know the difference that counts as 1 in {omissions[0]!r}: "
+            f"--scale {quote(omissions[0])}=2 (a fifth of what it spans, or so)"
+        )
+    return [scales.get(name, 1.0) for name in encoder.names]
+
+
+def size_of(file: str) -> int:
+    """Bytes of a file, or of those in a folder."""
+    path = Path(file)
+    return sum(part.stat().st_size for part in (path.iterdir() if path.is_dir() else [path]))
+
+
+def judge_of(judge: Judge | None, columns: LogColumns) -> Judge:
+    """By what the guard is to judge, from what is observed where nobody said."""
+    names = columns.observe.names
+    if any(not isinstance(variable, str) for variable in columns.observe.variables):
+        raise ValueError("--guard takes numbers alone, and --observe names a discrete column")
+    judge = judge or ("kinematic" if names == VARIABLES else "learnt")
+    if judge == "kinematic" and len(names) != len(VARIABLES):
+        raise ValueError(
+            f"--judge kinematic knows cars by their {', '.join(VARIABLES)}; --observe has to name "
+            f"the three columns in this order, and names {', '.join(names)}"
+        )
+    if judge == "learnt" and columns.failed is None:
+        raise ValueError(
+            "--guard learns from failures, and which there were is not known: --failed COLUMN or "
+            "--failed 'gap<=0' says it (of times or last rows docs/logs.md makes one); of cars in "
+            "pairs --judge kinematic needs none"
+        )
+    return judge
+
+
+def check_out(out: Path | None, option: str = "--out") -> None:
+    """Refuse before the long work what could not be saved after it."""
+    if out is None:
+        return
+    if not out.parent.is_dir():
+        raise FileNotFoundError(f"{option} {out}: there is no folder {out.parent}")
+    if not (os.access(out.parent, os.W_OK) or os.access(out, os.W_OK)):
+        raise PermissionError(f"{option} {out}: the folder {out.parent} may not be written")
+    if out.is_dir():
+        raise IsADirectoryError(f"{option} {out} is a folder; name a file in it")
+    if out.exists() and out.suffix != ".evofsm":  # so are ours called, whatever wrote them
+        try:
+            store.read_header(out)
+        except (ValueError, OSError):
+            fault = "exists and is no file of evofsm; it was left alone"
+            raise ValueError(f"{option} {out}: {fault}") from None
+
+
+# -- What came of it ------------------------------------------------------------------------------
+
+
+def told_of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
+    """Where it is, what it takes, and what it reckons with."""
+    assert guard.judge is not None
+    names = map(guard.judge.labels.variable, range(len(guard.variables)))
+    keys = ", ".join(["time [s]", *names])
+    also = "" if isinstance(guard.judge, Foresight) else ", and proposal, the action"
+    takes = f"evofsm monitor --guard {path} takes rows of {keys}{also}."
+    yield f"The guard was saved to {path}. {takes}"
+    if isinstance(guard.judge, Foresight):
+        soon = f"up to {span(guard.judge.horizon * guard.judge.dt)} before a failure (--horizon)"
+        words = guard.judge.alarm_in_words
+        if guard.judge.alarm is None:
+            hint = " (fewer columns, or a longer --horizon?)" * ("chance" in words)
+            yield f"It never alarms: {words}{hint}."
+        else:
+            yield f"{words.capitalize()} (--false-a-day), {soon}."
+        judges = "evofsm monitor LOG --summary, with the same options, judges such alarms held out"
+        yield f"{judges}; evofsm inspect {path} prints its states."
+        return
+    if not isinstance(guard.judge, LearntRisk):
+        yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
+        return
+    note = "" if len(guard.judge.state.forms) else " nothing yet"
+    yield f"It judges{note}: {guard.judge.told_by_experience}."
+    if beyond:
+        yield f"It knows no action beyond --action-range, where {beyond:.1%} of the log's are."
+
+
+def document_of(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """All that is printed, for JSON; states and actions from 0."""
+    names = ("rows", "episodes", "seconds", "clipped_below", "clipped_above", "jumps", "failures")
+    totals = {name: getattr(learning.read, name) for name in names}
+    if not learning.model.failures_told:
+        totals["failures"] = None
+    model = {**model_document(learning.model), "provenance": provenance}
+    return {**totals, "transitions": learning.transitions, "model": model}
+
+
+def read_of(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
+    """What was read, and the actions and the rule that it was learnt with."""
+    read, actions = learning.read, learning.model.actions
+    yield "rows", f"{read.rows:,}, one every {learning.model.dt:g} s"
+    minutes = read.seconds / 60.0
+    together = f"{read.seconds:.1f} s" if minutes < 2.0 else f"{minutes:,.1f} min"
+    yield "episodes", f"{read.episodes:,}, together {together}"
+    yield "transitions", f"{learning.transitions:,}"
+    assert actions is not None
+    text = f"{actions.n_actions} intervals of {action} from {actions.low:g} to {actions.high:g}"
+    if n_beyond := read.clipped_below + read.clipped_above:
+        text += f"; {read.clipped_below:,} below and {read.clipped_above:,} above "
+        text += f"({n_beyond / read.rows:.1%} of rows) were put into the end intervals"
+    text = text if n_beyond else f"{text}; none was beyond"
+    numbers = sorted(read.levels) if len(read.levels) <= MOST_LEVELS else []
+    places = [actions.encode(number) for number in numbers]
+    meanings = [f"{n:g} is a({k + 1})" for n, k in zip(numbers, places, strict=True)]
+    text += f"; {', '.join(meanings)}" * (len(numbers) > 1)
+    if len({*places}) < len(places):
+        apart = range_of(numbers)
+        text += ": several are one action"
+        text += f" (--action-range {apart} tells them apart)" * bool(apart)
+    yield "actions", text if action else "none: nobody acts (--action '')"
+    settings = describe_rule(learning.machine.rule)
+    for name in ("radius", "spread"):  # which the rule may have itself
+        settings.setdefault(name, learning.machine.settings[name])
+    rule = settings.pop("name")
+    texts = (f"{name} {value}" for name, value in settings.items())
+    yield "rule", f"{rule} (--rule), {', '.join(texts)}"
+
+
+def read_otherwise(
+    noted: Noted, columns: LogColumns, learning: Learning
+) -> Iterator[tuple[str, str]]:
+    """What was not learnt as it stands in the files."""
+    if columns.failed is None:
+        yield "failures", "not known; --failed COLUMN or --failed 'gap<=0' says them"
+    else:
+        several = "" if learning.read.failures == 1 else "s"
+        text = f"{learning.read.failures:,} episode{several} ended with {columns.failed}"
+        left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
+        yield "failures", text + (left_out if noted.after_failure else "")
+    hole = columns.longest_hole
+    if columns.resample:
+        step, ways = columns.resample
+        extras = "".join(f", the {way} of {name}" for name, way in ways.items())
+        means = f"{noted.resampled:,} became means of {step:g} s{extras}"
+        yield "resampled", f"{means} (--resample {step:g}s,NAME=max: others are min, last)"
+    if noted.crossed:
+        yield "holes", f"{noted.crossed:,} of at most {hole:g} s (--hole) cost a transition each"
+    if jumps := learning.read.jumps:
+        yield "time jumps", f"{jumps:,}; each begins an episode (a longer --hole bridges them)"
+    if noted.leaderless:
+        nobody = columns.no_leader not in (None, "end")
+        why = "a number is missing" + f", or {columns.no_leader}" * nobody
+        ends = "" if hole and not columns.no_leader else "; there an episode ends"
+        yield "left out", f"{noted.leaderless:,} rows: {why}{ends}"
+    if noted.elsewhere:
+        why = f"--where {columns.where} does not hold; there an episode ends"
+        yield "left out", f"{noted.elsewhere:,} rows: {why}"
+    conversions = {name: unit for name, unit in noted.units.items() if UNITS.get(unit, 1.0) != 1.0}
+    if conversions:
+        texts = (f"{name} from {unit}" for name, unit in conversions.items())
+        yield "converted", f"{', '.join(texts)} to units of the SI"
