@@ -12,8 +12,9 @@ import math
 import os
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context, parent_process
@@ -27,8 +28,10 @@ from evofsm.cli.show import Advance
 from evofsm.driving import (
     Episode,
     Family,
+    LatentRisk,
     Outcome,
     Unrevised,
+    dead_ends_of,
     drive,
     guard_for_family,
     learners_of,
@@ -36,13 +39,13 @@ from evofsm.driving import (
     reference_of,
     summarise,
 )
-from evofsm.driving.cars import name_judge
+from evofsm.driving.cars import TOLD, name_judge
 from evofsm.driving.naming import DECISION_COLUMNS
 from evofsm.driving.sumo import open_world
 from evofsm.driving.trials import Row
 from evofsm.driving.world import World
 from evofsm.extras import needs
-from evofsm.guard import TOLERANCE, DecisionLogger, Guard, Mode
+from evofsm.guard import TOLERANCE, AuditLog, DecisionLogger, Guard, Mode
 
 #: The columns of ``decisions.parquet`` after ``episode``; `driving/naming.py` says which they are.
 DECISION_TABLE = tuple(name for name, column in DECISION_COLUMNS.items() if column.in_table)
@@ -226,6 +229,15 @@ def _decided(driven: Episode) -> dict[str, list[Any]]:
 # -- In turn --------------------------------------------------------------------------------------
 
 
+def log_of(audit: Path | None, mcap: Path | None) -> AbstractContextManager[Any]:
+    """What records the decisions; None where nobody wants them."""
+    if mcap is not None:
+        from evofsm.io import FoxgloveSink
+
+        return FoxgloveSink(None, mcap)
+    return AuditLog(audit) if audit else nullcontext()
+
+
 def drive_in_turn(
     results: Results,
     episodes: int,
@@ -295,3 +307,35 @@ def _begin_work() -> None:
         os._exit(1)
 
     Thread(target=end_with_parent, daemon=True).start()
+
+
+# -- What came of it ------------------------------------------------------------------------------
+
+
+def told_of(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
+    """Collisions and their price, and what was learnt."""
+    row = driving.row
+    kind = "training" if setup.learn else "held-out"
+    yield "family", f"{row.family}, {row.episodes:,} {kind} episodes"
+    yield "reviser", f"{setup.reviser}, {setup.mode.value}"
+    yield "judge", f"{setup.judge}, given {TOLD[setup.judge]}"
+    interval = f"(95 %: {row.collision_low:.1%} to {row.collision_high:.1%})"
+    share = f"{row.collisions:,} of {row.episodes:,}: {row.collision_rate:.1%}"
+    yield "collisions", f"{share} {interval}"
+    yield "rate", str(row.failures)
+    if row.rear_ends:
+        yield "rear-ended", f"{row.rear_ends}"
+    yield "mobility", f"{row.mobility:.2f} of the way that the controller makes by itself"
+    interventions = f"{row.intervention_rate:.1%} of decisions"
+    yield "interventions", f"{interventions}; mean change {row.mean_change:.2f} m/s²"
+    yield "comfort", f"RMS jerk {row.jerk:.2f} m/s³"
+    yield "learnt", _learnt(driving.guard)
+
+
+def _learnt(guard: Guard) -> str:
+    machine, judge = learners_of(guard)
+    states = f"{machine.n_states} states"
+    if isinstance(judge, LatentRisk):
+        states += f", {len(dead_ends_of(machine, judge))} of them dead ends"
+    experience = getattr(judge, "told_by_experience", "")
+    return f"{states}; {experience}" if experience else states
