@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial, wraps
 from importlib.util import find_spec
@@ -85,7 +85,7 @@ def picture(out: Path, width: float, height: float) -> Iterator[Figure]:
         figure.savefig(out)
 
 
-def require_world(world: World, **extras: str) -> None:
+def require_world(world: str, **extras: str) -> None:
     """The same for a drive: SciPy is for SUMO's distributions and exact intervals."""
     require(scipy="study", **({"libsumo": "sumo"} if world == "sumo" else {}), **extras)
 
@@ -258,6 +258,19 @@ def given_of(reading: partial[Reading]) -> dict[str, Any]:
     """The options of `reading_of` that were typed, by the names of its parameters."""
     usual = signature(reading_of).parameters
     return {k: v for k, v in reading.keywords.items() if v not in (usual[k].default, [])}
+
+
+def as_learnt(
+    reading: partial[Reading], learnt: Path | None, *, without: Collection[str] = ()
+) -> partial[Reading]:
+    """`reading_of` with what was typed, else as the log was read that is ``learnt``."""
+    from evofsm.store import read_header
+
+    defaults: dict[str, Any] = {}
+    if learnt is not None:
+        defaults = read_header(learnt).provenance.get("read with", {})
+    defaults = {name: value for name, value in defaults.items() if name not in without}
+    return partial(reading_of, **{**reading.keywords, **defaults, **given_of(reading)})
 
 
 def typed(given: Mapping[str, Any]) -> str:

@@ -12,6 +12,7 @@ import runpy
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import MappingProxyType, SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -20,8 +21,9 @@ from numpy.typing import NDArray
 
 from evofsm.cli.foreseen import date
 from evofsm.cli.learning import episodes_read, learn_chunk
-from evofsm.cli.options import BRAKES, Reading, refuse_other_limit
-from evofsm.cli.show import warn
+from evofsm.cli.options import BRAKES, Reading, refuse_other_limit, require_world
+from evofsm.cli.show import progress, warn
+from evofsm.cli.sumocfg import trace_configuration
 from evofsm.cli.watch.shown import (
     CALM,
     OF_CARS,
@@ -45,18 +47,14 @@ from evofsm.driving import (
     drive,
     guard_for_family,
     learners_of,
+    load_family,
     teach,
     unrevised_guard,
 )
 from evofsm.driving.cars import assumptions, guard_of_monitor, name_judge
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.driving.world import (
-    GAP_BEHIND,
-    LEADER_ACCELERATION,
-    LEADER_SPEED,
-    SPEED,
-    World,
-)
+from evofsm.driving.sumo import open_world
+from evofsm.driving.world import GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
 from evofsm.extras import needs
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.naming import Labels
@@ -99,6 +97,8 @@ _APART = 1_000_000
 # Episodes from which is known how far variables spread; states are so many spreads apart, times the
 # root of the number of variables, and there are at most so many.
 _LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
+# Of a simulation of somebody else's that are watched [s], and positions of cars in them.
+_SECONDS, _ENOUGH = 600.0, 100_000
 # So many rows of a long episode are played one by one, and so many in a second.
 _PLAYED, _A_SECOND = 400, 10.0
 # Rows of an episode that shows something; fewer of cars are not watched. Times of a log that
@@ -499,6 +499,16 @@ def watched_log(
     return Session(system, guard, case=system.first if case is None else case - 1, on=False)
 
 
+def watched_simulation(path: str, reading: Reading, *choices: Any, brakes: float) -> Session:
+    """What a configuration of SUMO drives, as a log."""
+    with TemporaryDirectory() as folder:
+        log = Path(folder) / Path(path).name
+        duration, is_cut, crashes = trace_configuration(Path(path), log, _SECONDS, _ENOUGH)
+        if is_cut:
+            warn(f"watched are the first {duration:,.0f} s of the simulation")
+        return watched_log(str(log), reading, *choices, brakes=brakes, collisions=crashes)
+
+
 def _alarmed(judge: Foresight, rate: int | None, found: Sequence[Played]) -> Iterator[Played]:
     """With whether alarms come before the last row, with which nothing is decided."""
     runs = judge.runs([p.rows.observations for p in found], [bool(p.fails) for p in found])
@@ -704,3 +714,20 @@ class Session(AbstractContextManager["Session"]):
         if system.failed:
             novel = first_of_its_kind(frame.observation, before, self.known())
         return frame._replace(over=True, failed=system.failed, novel=novel)
+
+
+def watched_run(
+    what: str, case: int, world: str, judge: str, *, tolerance: float, seed: int, learnt: int
+) -> Session:
+    """Cars in a world of their own, or an environment, after so many episodes to learn from."""
+    system: System | None = read_simulated(what, seed=seed, tolerance=tolerance)
+    if isinstance(system, Simulated):
+        guard = system.guard
+    else:
+        require_world(world)
+        family = load_family(what)
+        system = OnRoads(family, open_world(world), seed)
+        guard = watched_guard(family, judge=judge, tolerance=tolerance)
+    with progress("Learning first", learnt) as move:
+        learn_first(guard, system, learnt, move)
+    return Session(system, guard, case=case - 1)
