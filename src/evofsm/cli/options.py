@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial, wraps
 from importlib.util import find_spec
@@ -260,16 +260,17 @@ def given_of(reading: partial[Reading]) -> dict[str, Any]:
     return {k: v for k, v in reading.keywords.items() if v not in (usual[k].default, [])}
 
 
-def as_learnt(
-    reading: partial[Reading], learnt: Path | None, *, without: Collection[str] = ()
-) -> partial[Reading]:
-    """`reading_of` with what was typed, else as the log was read that is ``learnt``."""
+def read_with(learnt: Path | None) -> dict[str, Any]:
+    """The options with which the log was read that a file is learnt from; none where it is not."""
     from evofsm.store import read_header
 
-    defaults: dict[str, Any] = {}
-    if learnt is not None:
-        defaults = read_header(learnt).provenance.get("read with", {})
-    defaults = {name: value for name, value in defaults.items() if name not in without}
+    if learnt is None or not learnt.is_file():
+        return {}
+    return dict(read_header(learnt).provenance.get("read with", {}))
+
+
+def with_defaults(reading: partial[Reading], defaults: Mapping[str, Any]) -> partial[Reading]:
+    """`reading_of` with what was typed, else with these."""
     return partial(reading_of, **{**reading.keywords, **defaults, **given_of(reading)})
 
 

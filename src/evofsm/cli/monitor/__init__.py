@@ -10,27 +10,8 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from evofsm.cli.options import (
-    BRAKES,
-    TOLERANCE,
-    Brakes,
-    FalseADay,
-    Horizon,
-    Json,
-    ModeName,
-    Persist,
-    Reading,
-    argument,
-    given_of,
-    option,
-    quoted,
-    reading_of,
-    reads_logs,
-    refuse_other_limit,
-    require,
-    split_names,
-    typed,
-)
+from evofsm.cli import options
+from evofsm.cli.options import Reading, argument, option
 from evofsm.cli.show import show, warn
 
 if TYPE_CHECKING:
@@ -48,7 +29,7 @@ _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
 _SAVED = b'{"__metadata__"'
 
 
-@reads_logs
+@options.reads_logs
 def monitor(
     files: Annotated[
         list[Path] | None,
@@ -68,12 +49,12 @@ def monitor(
         float | None,
         option("Time between two rows [s], without --guard. [default: of cars 0.1]", min=0.0),
     ] = None,
-    brakes: Brakes = BRAKES,
+    brakes: options.Brakes = options.BRAKES,
     tolerance: Annotated[
         float | None, option("Highest risk that is accepted. [default: of --guard, or 0.02]")
     ] = None,
     traffic: Annotated[bool, option("Judge all objects of scenes.", "--traffic")] = False,
-    mode: Annotated[ModeName, option("How far it goes: in shadow all passes.")] = "shadow",
+    mode: Annotated[options.ModeName, option("How far it goes: in shadow all passes.")] = "shadow",
     learn: Annotated[bool, option("Learn from what comes.", "--learn")] = False,
     state: Annotated[Path | None, option("Save all in this file, and go on from it.")] = None,
     audit: Annotated[Path | None, option("Write an audit log to this file.")] = None,
@@ -95,14 +76,14 @@ def monitor(
     observe: Annotated[str | None, option("Variables of rows. [default: the guard's]")] = None,
     *,
     reading: partial[Reading],
-    horizon: Horizon = None,
-    persist: Persist = 0.0,
-    false_a_day: FalseADay = None,
+    horizon: options.Horizon = None,
+    persist: options.Persist = 0.0,
+    false_a_day: options.FalseADay = None,
     split: Annotated[
         float, option("Of --summary without --guard: the share that is learnt from.", min=0, max=1)
     ] = 0.6,
     plot: Annotated[Path | None, option("Of --summary, where nobody acts: a picture.")] = None,
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> int | None:
     """Decide alongside a stack of your own: rows in, decisions out, a JSON line each.
 
@@ -130,7 +111,7 @@ def monitor(
     if sum(source is not None for source in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
     if plot is not None:
-        require(matplotlib="plot")
+        options.require(matplotlib="plot")
     if traffic and (guard or state or learn):
         raise ValueError("--traffic learns nothing: it goes with no --guard, --state or --learn")
     if summary and (file is None or state or audit):
@@ -143,11 +124,10 @@ def monitor(
     from evofsm.driving.cars import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
     from evofsm.guard import Foresight, Guard
-    from evofsm.store import read_header
 
-    if guard is not None and brakes != BRAKES:
+    if guard is not None and brakes != options.BRAKES:
         raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
-    accepted_risk = TOLERANCE if tolerance is None else tolerance
+    accepted_risk = options.TOLERANCE if tolerance is None else tolerance
     alarms = horizon, persist, false_a_day
 
     def fresh() -> Guard:
@@ -160,18 +140,17 @@ def monitor(
 
     is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
     parts = {"low": low, "high": high, "n_actions": n_actions, "observe": observe}
-    options, new_guard = {name: part for name, part in parts.items() if part is not None}, None
-    if guard is None and not is_log and (options or "action" in given_of(reading)):
+    system, new_guard = {name: part for name, part in parts.items() if part is not None}, None
+    if guard is None and not is_log and (system or "action" in options.given_of(reading)):
         if traffic:
             raise ValueError("--traffic is of cars, and goes with no --observe or --action")
-        new_guard, learn = _begun({**options}, reading, interval, tolerance, alarms), True
-    defaults, learnt = dict[str, Any](), guard or state
-    if learnt is not None and learnt.is_file():
-        defaults = dict(read_header(learnt).provenance.get("read with", {}))
+        new_guard, learn = _begun({**system}, reading, interval, tolerance, alarms), True
+    defaults = options.read_with(guard or state)
+    defaults.pop("observe", None)
+    log_episode = defaults.pop("episode", None)
     if is_log and episode is None:
-        episode = defaults.get("episode")
-    arguments = {k: v for k, v in defaults.items() if k not in ("observe", "episode")}
-    reader = partial(reading_of, **{**reading.keywords, **arguments, **given_of(reading)})
+        episode = log_episode
+    reader = options.with_defaults(reading, defaults)
     if episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
         raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns of a log")
     rows = EPISODE if episode is None or is_log else int(episode)
@@ -185,8 +164,8 @@ def monitor(
             sentry = fresh() if guard else None
             alone = not reader.keywords["action"] or isinstance(sentry and sentry.judge, Foresight)
             names = sentry.variables if sentry else VARIABLES
-            if observe is None or set(split_names(observe)) == set(names):  # in its own order
-                observe = quoted(names)
+            if observe is None or {*options.split_names(observe)} == {*names}:  # in its own order
+                observe = options.quoted(names)
             if alone:
                 reader = partial(reader, action="")
             log_format = reader(observe=observe, episode=episode)
@@ -200,7 +179,7 @@ def monitor(
                 warning = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
                 warn(f"warning: {warning} {sentry.interval:g} s: --resample {sentry.interval:g}s")
             if alone:
-                refuse_other_limit(False, false_a_day, tolerance)
+                options.refuse_other_limit(False, false_a_day, tolerance)
                 every, names = list(chunks), log_format.columns.observe.names
                 about = names, notes.si_units(names), alarms, split, plot
                 show_foreseen(file, every, sentry, *about, as_json=as_json)
@@ -213,8 +192,8 @@ def monitor(
             basics = {"interval": interval, "brakes": brakes} if guard is None else {}
             how = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
             how["false_a_day"] = false_a_day
-            columns = {k: v for k, v in given_of(reader).items() if k != "topics"}
-            keeper = State(state, {"guard": digest, **basics, **how, **options, **columns})
+            columns = {k: v for k, v in options.given_of(reader).items() if k != "topics"}
+            keeper = State(state, {"guard": digest, **basics, **how, **system, **columns})
             stack.callback(keeper.close)
         elif learn and not summary:
             warn("nothing of what is learnt is saved; --state FILE saves it")
@@ -222,7 +201,8 @@ def monitor(
         sentry = fresh() if keeper is None else keeper.guard(fresh, failed)
         _prepare(sentry, mode, (tolerance, false_a_day), audit, stack, learn=learn)
         if not (is_log or traffic):
-            slots = Slots(reader(observe=quoted(sentry.variables or VARIABLES), dt=None).columns)
+            observe = options.quoted(sentry.variables or VARIABLES)
+            slots = Slots(reader(observe=observe, dt=None).columns)
         decider = Decider(sentry, episode=rows, slots=slots)
         notice = assumptions(brakes, accepted_risk)
         if guard is not None:
@@ -246,8 +226,8 @@ def monitor(
         server = Server(decider, keeps=keeper is not None, line=line)
         transport, where = _transport(file, socket, udp, zenoh, stack)
         warn(notice)
-        if slots is not None and (log_options := given_of(reader)):
-            warn(f"rows are read as in a log: {typed(log_options)}")
+        if slots is not None and (log_options := options.given_of(reader)):
+            warn(f"rows are read as in a log: {options.typed(log_options)}")
         warn(f"ready: {where}")
         try:
             server.run(transport)
@@ -264,7 +244,7 @@ def monitor(
 
 def _prepare(
     guard: Guard,
-    mode: ModeName,
+    mode: options.ModeName,
     limits: tuple[float | None, float | None],
     audit: Path | None,
     stack: ExitStack,
@@ -276,7 +256,7 @@ def _prepare(
     from evofsm.guard import ActionReviser, AuditLog, Foresight, Mode
 
     tolerance, false_a_day = limits
-    refuse_other_limit(not isinstance(guard.judge, Foresight), false_a_day, tolerance)
+    options.refuse_other_limit(not isinstance(guard.judge, Foresight), false_a_day, tolerance)
     if isinstance(guard.judge, Foresight) and false_a_day is not None:
         guard.judge.stated = false_a_day
     if isinstance(guard.reviser, ActionReviser):
@@ -333,7 +313,7 @@ def _begun(
         interval=step,
         judge=judge,
         failed=failed if is_told else None,
-        tolerance=TOLERANCE if tolerance is None else tolerance,
+        tolerance=options.TOLERANCE if tolerance is None else tolerance,
         mode=Mode.SHADOW,
     )
 

@@ -62,7 +62,7 @@ def watch(
             risk = None if tolerance == options.TOLERANCE else tolerance
             log_guard = None if guard is None else Guard.load(guard)
             try:
-                log_format = options.as_learnt(reading, guard)()
+                log_format = options.with_defaults(reading, options.read_with(guard))()
                 is_simulation = what.endswith(".sumocfg")
                 show = session.watched_simulation if is_simulation else session.watched_log
                 run = show(what, log_format, risk, case, log_guard, brakes=brakes)
