@@ -10,11 +10,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from evofsm.cli.audit import audit
-from evofsm.cli.check import check
+from evofsm.cli.audit import audit, check
 from evofsm.cli.drive import drive
-from evofsm.cli.export import export
-from evofsm.cli.inspect import explain, inspect
+from evofsm.cli.inspect import explain, export, inspect
 from evofsm.cli.learn import learn
 from evofsm.cli.monitor import monitor
 from evofsm.cli.paper import paper

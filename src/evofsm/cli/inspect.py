@@ -1,14 +1,15 @@
-"""`evofsm inspect` and `evofsm explain`: what was learnt, as a whole and of one situation."""
+"""`evofsm inspect`, `explain` and `export`: what was learnt, of a situation, for other tools."""
 
 from __future__ import annotations
 
 import math
+import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from evofsm.cli.options import Json, Saved, option, picture, quoted, reading_of, typed
+from evofsm.cli.options import Json, ModeName, Saved, option, picture, quoted, reading_of, typed
 from evofsm.cli.show import facts, print_json, say, show, table
 
 if TYPE_CHECKING:
@@ -279,21 +280,24 @@ def explain(
         raise ValueError("name one situation, by --observation or by --state")
     model, _, guard = load_model(file)
     index = None if action is None else _index("--action", action, model.n_actions)
+    here = ""
     if observation is not None:
-        if (count := len(_values(observation))) != model.n_variables:
+        values = _values(observation)
+        if len(values) != model.n_variables:
             names = ", ".join(map(model.labels.variable, range(model.n_variables)))
-            raise ValueError(f"--observation has {count} values; it needs {names}, in this order")
-        explanations = [model.explain(action=index, observation=_values(observation))]
-    elif state == "all":
-        explanations = [model.explain(k, index) for k in range(model.n_states)]
+            fault = f"has {len(values)} values; it needs {names}, in this order"
+            raise ValueError(f"--observation {fault}")
+        explanations = [model.explain(action=index, observation=values)]
+        here = guard.told_here(values) if guard else ""
     else:
-        explanations = [model.explain(_index("--state", state, model.n_states), index)]
+        is_each = state == "all"
+        states = range(model.n_states) if is_each else [_index("--state", state, model.n_states)]
+        explanations = [model.explain(k, index) for k in states]
     if as_json:
         print_json({"file": file, "situations": [_document(model, e) for e in explanations]})
         return
     if not model.failures_told:
         print(textwrap.fill(_UNTOLD, 80))
-    here = guard.told_here(_values(observation)) if guard and observation is not None else ""
     for explanation in explanations:
         say(textwrap.fill(f"{explanation.text} {here}", 80, subsequent_indent="   "))
 
@@ -320,3 +324,72 @@ def _document(model: FSMModel, found: Explanation) -> dict[str, Any]:
         if (tally := getattr(found, name)) is not None:
             document[name] = {**tally._asdict(), "interval": tally.interval}
     return document
+
+
+# -- For other tools ------------------------------------------------------------------------------
+
+
+def export(
+    file: Saved,
+    to: Annotated[
+        Literal["dot", "prism", "c99", "fmu"],
+        option("Graph for Graphviz, process for PRISM and Storm; the guard in C, or as an FMU."),
+    ],
+    out: Annotated[Path | None, option("File to write, else printed; of c99 a folder.")] = None,
+    prefix: Annotated[str, option("Of c99: how all names in it begin.")] = "evofsm",
+    mode: Annotated[ModeName | None, option("Of c99, fmu: act filters. [default: saved]")] = None,
+    least: Annotated[
+        float | None,
+        option("Leave out what is less probable. [default: dot 0.001]", min=0.0, max=1.0),
+    ] = None,
+    evidence: Annotated[
+        float | None, option("Leave out what was seen less often. [default: 1]", min=0.0)
+    ] = None,
+) -> None:
+    """Write what was learnt, or driven, in the formats of other tools."""
+    _refuse_learnt(out)
+    if to in ("c99", "fmu"):
+        from evofsm.guard import Foresight, Guard, Mode
+        from evofsm.guard.export import write_c99, write_fmu
+
+        if out is None:
+            raise ValueError(f"--to {to} prints nothing: name a file, of c99 a folder, by --out")
+        path = file / "guard.evofsm" if file.is_dir() else file
+        guard = Guard.load(path, failed=lambda seen: False)
+        if isinstance(guard.judge, Foresight):
+            why = "a guard where nobody acts (--action '') cannot be exported"
+            raise ValueError(f"{file}: {why}; run `evofsm monitor` beside the machine")
+        if mode and hasattr(guard.reviser, "mode"):
+            guard.reviser.mode = Mode(mode)
+        return write_c99(guard, out, prefix) if to == "c99" else write_fmu(guard, out)
+    from evofsm import store
+    from evofsm.driving import LatentRisk, dead_ends_of
+    from evofsm.fsm.naming import visible
+    from evofsm.io import graphs
+
+    model, _, made_by = load_model(file)
+    judge = made_by and made_by.judge
+    style: dict[str, Any] = {"least": least, "evidence": evidence}
+    if to == "dot" and isinstance(judge, LatentRisk):
+        style["dead_ends"] = dead_ends_of(model, judge)
+    arguments = {name: value for name, value in style.items() if value is not None}
+    text = visible(getattr(graphs, f"to_{to}")(model, **arguments))
+    if out is None:
+        sys.stdout.write(text)
+        return
+    with store.replacing(out) as stream:
+        stream.write(text.encode())
+
+
+def _refuse_learnt(out: Path | None) -> None:
+    """Raise where a graph would take the place of what cannot be had again."""
+    from evofsm.store import read_header
+
+    if out is None or not out.is_file():
+        return
+    if not out.read_bytes().startswith(b"\x89MCAP"):  # as logs of runs do
+        try:
+            read_header(out)
+        except ValueError:
+            return
+    raise ValueError(f"--out {out}: what was learnt or driven is kept there; it was left alone")
