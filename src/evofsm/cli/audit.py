@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import Json, argument, imported, option
-from evofsm.cli.show import facts, print_json, say, show
 
 if TYPE_CHECKING:
     from evofsm.guard.replay import Audit
@@ -35,6 +34,7 @@ def audit(
     bit. Ends with 0 if all is well, 1 if the log was tampered with or a decision comes out
     otherwise, and 2 if it cannot be read.
     """
+    from evofsm.cli.show import facts, print_json, show
     from evofsm.guard import Head
     from evofsm.guard import audit as examine
 
@@ -109,6 +109,7 @@ def check(
     """
     from rich.padding import Padding
 
+    from evofsm.cli.show import print_json, say, show
     from evofsm.guard.check import check_results, kind_of
 
     part = imported(name)

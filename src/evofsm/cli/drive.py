@@ -10,7 +10,6 @@ from typing import Annotated, Literal
 
 from evofsm.cli import options
 from evofsm.cli.options import argument, option
-from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
 
 def drive(
@@ -54,6 +53,8 @@ def drive(
     A SUMO configuration (my.sumocfg) is run as it is, once, with guards in the cars that --vehicles
     names; of all else only --mode (act or shadow), --tolerance and --json hold then.
     """
+    from evofsm.cli.show import facts, print_json, progress, say, show, warn
+
     if family.endswith(".sumocfg"):
         parts = {"frozen": frozen, "workers": workers, "out": out, "audit": audit, "mcap": mcap}
         for name, value in parts.items():

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli import options
 from evofsm.cli.options import Reading, argument, option
-from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
 if TYPE_CHECKING:
     from evofsm.guard import Guard
@@ -59,7 +58,8 @@ def learn(
     Of a log whose columns nobody named, evofsm learn LOG prints what is in it, and what to ask.
     """
     from evofsm.cli import foreseen, learning
-    from evofsm.cli.inspect import tables_of
+    from evofsm.cli.models import tables_of
+    from evofsm.cli.show import facts, print_json, progress, say, show, warn
     from evofsm.guard import Foresight
     from evofsm.io import episodes_of
     from evofsm.io.logs import Noted

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evofsm import store
-from evofsm.cli.inspect import model_document
+from evofsm.cli.models import model_document
 from evofsm.cli.options import Judge, Reading, imported
 from evofsm.cli.show import warn
 from evofsm.driving import SAFETY_RULE

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 from evofsm.cli.options import InWorld, Json, option, require_world
-from evofsm.cli.show import print_json, print_page, progress
 
 
 def paper(
@@ -23,6 +22,7 @@ def paper(
     """
     require_world(world, polars="tables", matplotlib="plot", jinja2="plot")
     out.mkdir(parents=True, exist_ok=True)  # where that fails nothing is driven first
+    from evofsm.cli.show import print_json, print_page, progress
     from evofsm.driving.sumo import open_world
     from evofsm.paper import Settings, check_claims, run_paper
     from evofsm.paper.reproduction import page_of, write

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli import options
 from evofsm.cli.options import Reading, argument, option
-from evofsm.cli.show import show, warn
 
 if TYPE_CHECKING:
     from evofsm.cli.monitor.decider import Decider
@@ -121,6 +120,7 @@ def monitor(
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.summary import Text
     from evofsm.cli.monitor.transports import Server, json_line
+    from evofsm.cli.show import show, warn
     from evofsm.driving.cars import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
     from evofsm.guard import Foresight, Guard
@@ -218,6 +218,7 @@ def monitor(
             return None
         if warm:
             _compile(decider)
+            warn("compiled")
         if keeper is not None:
             again = keeper.begin(decider)
             if decider.n:
@@ -352,4 +353,3 @@ def _compile(decider: Decider) -> None:
     for k in range(4):
         twin.decide(observation + 0.1 * k, None)
     twin.end(observation=observation)
-    warn("compiled")

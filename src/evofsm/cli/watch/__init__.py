@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli import options
 from evofsm.cli.options import Reading, argument, option
-from evofsm.cli.show import say
 
 if TYPE_CHECKING:
     from evofsm.cli.watch.session import Session
@@ -51,6 +50,7 @@ def watch(
     when it is first opened. Ctrl-C ends it.
     """
     options.require(websockets="watch")
+    from evofsm.cli.show import say
     from evofsm.cli.watch import session
     from evofsm.guard import Guard
 
@@ -81,6 +81,7 @@ def watch(
 
 
 async def _serve(watched: Session, *, browse: bool) -> None:
+    from evofsm.cli.show import say
     from evofsm.cli.watch.player import Player
     from evofsm.cli.watch.server import LivePage
 
