@@ -20,24 +20,8 @@ from numpy.typing import NDArray
 from evofsm.driving.naming import RANGES, VARIABLES
 from evofsm.driving.naming import UNITS as CAR_UNITS
 from evofsm.fsm.observations import Category, ObservationEncoder
-from evofsm.io import vehicles
-from evofsm.io.tables import (
-    SI,
-    TIMES,
-    UNITS,
-    CsvTable,
-    OnRead,
-    ParquetTable,
-    Piece,
-    Skips,
-    Table,
-    Wanted,
-    file_kind,
-    is_date,
-    is_number,
-    quoted_name,
-    silent,
-)
+from evofsm.io import tables, vehicles
+from evofsm.io.tables import Piece, Skips, Table, Wanted, is_number
 from evofsm.io.vehicles import ACTION, PairTable, VehicleLengths
 
 if TYPE_CHECKING:
@@ -170,7 +154,7 @@ class Noted:
     def si_units(self, names: Sequence[str]) -> list[str]:
         """The units of columns as they were read: of the SI, if they have one there."""
         told_units = dict(zip(VARIABLES, CAR_UNITS, strict=True)) | self.units
-        return [SI.get(unit, unit) for unit in (told_units.get(name, "") for name in names)]
+        return [tables.SI.get(unit, unit) for unit in (told_units.get(name, "") for name in names)]
 
     def see(self, chunk: Chunk, names: Sequence[str], *, first: bool = False) -> None:
         """Look for what is beyond belief; in the first rows also for what contradicts itself."""
@@ -242,7 +226,7 @@ class Term(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> Term:
         """From ``collided``, ``gap<=0`` or ``Status=='off'``; a ValueError if it is none."""
-        name, rest = quoted_name(text)
+        name, rest = tables.quoted_name(text)
         column, sign, value, *_ = *re.split("([<>]=?|[=!]=|=)", rest, maxsplit=1), "", ""
         column, value, quotation = name + column.strip(), value.strip(), _IN_QUOTES.match(value)
         sign = "==" if sign == "=" else sign
@@ -408,7 +392,7 @@ def read_traces(
     paths: Iterable[str],
     columns: LogColumns | None = None,
     lengths: VehicleLengths | None = None,
-    on_read: OnRead = silent,
+    on_read: tables.OnRead = tables.silent,
     noted: Noted | None = None,
     topics: Topics | None = None,
 ) -> Iterator[Chunk]:
@@ -675,7 +659,7 @@ def open_table(
     skips: Skips,
 ) -> Table:
     """The rows of a file, whatever it holds."""
-    kind = file_kind(path)
+    kind = tables.file_kind(path)
     if kind == "bag" or (kind == "mcap" and topics is not None):  # whatever its profile says
         if topics is None:
             raise ValueError(
@@ -685,28 +669,30 @@ def open_table(
         from evofsm.io.rosbag import BagTable
 
         return BagTable(path, topics, skips)
-    moments = None
+    steps, scenes = None, None
     if kind in ("osi", "mcap"):
         read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap
-        moments = vehicles.pairs_of_scenes(path, read(path, skips), skips)
+        scenes = read(path, skips)
     elif kind == "xml":
         steps = vehicles.fcd_of_xml(path, skips)
-        moments = vehicles.pairs_of_fcd(path, steps, lengths, skips)
-    if moments is not None:
-        return PairTable(path, moments, skips)
-    log_names = {*columns.observe.names, columns.action, columns.time}
-    names = log_names.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
-    is_csv = kind == "csv"
-    table: Table = CsvTable(path, names, skips) if is_csv else ParquetTable(path, skips)
-    there = set(table.columns)
-    if set(columns.observe.names) <= there:
-        return table
-    if (fcd := vehicles.fcd_of_table(table)) is not None:
-        return PairTable(path, vehicles.pairs_of_fcd(path, fcd, lengths, skips), skips)
-    if set(vehicles.OBJECT_COLUMNS) <= there:
+    else:
+        log_names = {*columns.observe.names, columns.action, columns.time}
+        names = log_names.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
+        of_parquet = kind == "parquet"
+        table: Table = (
+            tables.ParquetTable(path, skips) if of_parquet else tables.CsvTable(path, names, skips)
+        )
+        if {*columns.observe.names} <= {*table.columns}:
+            return table
+        steps = vehicles.fcd_of_table(table)
+        if steps is None and not {*vehicles.OBJECT_COLUMNS} <= {*table.columns}:
+            return table
         scenes = vehicles.scenes_of_table(table)
-        return PairTable(path, vehicles.pairs_of_scenes(path, scenes, skips), skips)
-    return table
+    if steps is not None:
+        moments = vehicles.pairs_of_fcd(path, steps, lengths, skips)
+    else:
+        moments = vehicles.pairs_of_scenes(path, scenes or (), skips)
+    return PairTable(path, moments, skips)
 
 
 def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
@@ -959,14 +945,14 @@ class _Reader:
                 )
         form = columns.units.get(columns.time, "")
         form = form if "%" in form else ""
-        is_dated = clock and (form or is_date(" ".join(map(table.first, clock))))
+        is_dated = clock and (form or tables.is_date(" ".join(map(table.first, clock))))
         numbers = [*learnt, *term_numbers, *([] if is_dated else clock)]
         try:
             column_units = {name: unit for name in numbers if (unit := table.units.get(name))}
             units = {name: unit for name, unit in columns.units.items() if unit != form}
             column_units |= units_of(units, numbers)
             for name, unit in column_units.items():
-                if unit in UNITS and (unit in TIMES) != (name == columns.time):
+                if unit in tables.UNITS and (unit in tables.TIMES) != (name == columns.time):
                     raise ValueError(
                         f"column {name!r} has the unit {unit}; the column of the time needs a unit "
                         "of time, and no other one may have it (--unit says which it has)"
@@ -978,14 +964,16 @@ class _Reader:
         self._noted.untold += [name for name in numbers if name not in column_units]
         texts = [*self._episode, *categories, *term_texts]
         request = Wanted(numbers, texts, clock if is_dated else (), form)
-        return request, {name: UNITS[unit] for name, unit in column_units.items() if unit in UNITS}
+        factors = {n: tables.UNITS[u] for n, u in column_units.items() if u in tables.UNITS}
+        return request, factors
 
     def _compare_units(self, units: Mapping[str, str], numbers: Sequence[str]) -> None:
         """Raise where a column has a unit that is not that of the files before, as both tell."""
         for name in {*numbers} & {*self._noted.units, *self._noted.untold}:
             pair = now, before = units.get(name, ""), self._noted.units.get(name, "")
-            factor = UNITS.get(now or before, 1.0)
-            if len({SI.get(unit, unit) for unit in pair}) > 1 and (all(pair) or factor != 1.0):
+            factor = tables.UNITS.get(now or before, 1.0)
+            bases = {tables.SI.get(unit, unit) for unit in pair}
+            if len(bases) > 1 and (all(pair) or factor != 1.0):
                 remedy = f"--unit {quote(f'{name}={now or before}')} says one for all"
                 remedy = remedy if factor != 1.0 else "learn them apart"
                 raise ValueError(

@@ -24,23 +24,7 @@ from evofsm.cli.learning import episodes_read, learn_chunk
 from evofsm.cli.options import BRAKES, Reading, refuse_other_limit, require_world
 from evofsm.cli.show import progress, warn
 from evofsm.cli.sumocfg import trace_configuration
-from evofsm.cli.watch.shown import (
-    CALM,
-    OF_CARS,
-    Cars,
-    Frame,
-    Graph,
-    Judged,
-    Known,
-    Start,
-    Story,
-    cars_of,
-    first_of_its_kind,
-    go_on,
-    graph_of,
-    known_of,
-    numbers,
-)
+from evofsm.cli.watch import shown
 from evofsm.driving import (
     Family,
     LatentRisk,
@@ -194,12 +178,12 @@ class OnRoads:
         self._road.advance(float(revision.executed), self._steps)
         self._look()
 
-    def cars(self) -> Cars:
+    def cars(self) -> shown.Cars:
         """Where they are, by what there was at each decision."""
         episode = self._road.episode()
         last = len(episode.time) - 1
         rows = [*range(0, last, self._steps), last]
-        *_, now = cars_of(episode.time[rows], episode.observations[rows])
+        *_, now = shown.cars_of(episode.time[rows], episode.observations[rows])
         gap_behind = float(episode.record[-1, GAP_BEHIND])
         return now._replace(gap_behind=gap_behind, rear_ended=self._road.rear_ended)
 
@@ -421,7 +405,7 @@ class Logged:
         self._rows, fails = self._played[case].rows, self._played[case].fails
         times = self._rows.times - self._rows.times[0]
         self._times, self._fails = times.tolist(), fails
-        self._cars = list(cars_of(times, self._rows.observations)) if self.of_cars else None
+        self._cars = list(shown.cars_of(times, self._rows.observations)) if self.of_cars else None
         begins = self._times[max(len(times) - _PLAYED, 0)]
         began = float(self._rows.times[0])
         clock = math.nan if self.of_cars or self.interval < 1.0 else 0.0
@@ -442,7 +426,7 @@ class Logged:
         """Go to the next row."""
         self._go_to(self._row + 1)
 
-    def cars(self) -> Cars | None:
+    def cars(self) -> shown.Cars | None:
         """Where they are, if it is of cars."""
         return None if self._cars is None else self._cars[self._row]
 
@@ -594,7 +578,7 @@ class Session(AbstractContextManager["Session"]):
         why = "was not shown to help yet" if reason == "shadow" else reason
         return reason and f"the guard {why}, so what is proposed passes"
 
-    def restart(self, case: int | None = None) -> Start:
+    def restart(self, case: int | None = None) -> shown.Start:
         """Begin a run anew, or another one; one that is under way is broken off."""
         case, system = self.case if case is None else case, self.system
         if not 0 <= case < len(system.cases):
@@ -602,15 +586,15 @@ class Session(AbstractContextManager["Session"]):
         self.case = case
         system.begin(case)
         self._guard.begin()
-        self._story = Story(alone=system.alone)
+        self._story = shown.Story(alone=system.alone)
         self._number = 0
         self.start = self._begun()
         return self.start
 
-    def step(self) -> Frame:
+    def step(self) -> shown.Frame:
         """One decision, and what came of the one before."""
         observation, cars = self.system.observation, self.system.cars()
-        frame = Frame(
+        frame = shown.Frame(
             number=self._number,
             time=self.system.time,
             observation=tuple(observation.tolist()),
@@ -620,17 +604,17 @@ class Session(AbstractContextManager["Session"]):
         )
         frame = self._end(frame) if self.system.over else self._decide(frame)
         self._number += 1
-        calm = min(CALM, _CALM * self.system.interval)
-        self._story = go_on(self._story, frame, self._tolerance, calm)
+        calm = min(shown.CALM, _CALM * self.system.interval)
+        self._story = shown.go_on(self._story, frame, self._tolerance, calm)
         return frame._replace(story=self._story)
 
-    def graph(self) -> Graph:
+    def graph(self) -> shown.Graph:
         """The states found so far."""
-        return graph_of(self.machine, self.judge, self._number)
+        return shown.graph_of(self.machine, self.judge, self._number)
 
-    def known(self) -> Known:
+    def known(self) -> shown.Known:
         """What is known of failure."""
-        return known_of(self.judge)
+        return shown.known_of(self.judge)
 
     def __exit__(self, *error: object) -> None:
         self.system.close()
@@ -644,11 +628,11 @@ class Session(AbstractContextManager["Session"]):
             labels, center = Labels(names=names, units=units, dt=labels.dt), center[two]
         return labels.place(center)
 
-    def _begun(self) -> Start:
+    def _begun(self) -> shown.Start:
         system, actions = self.system, self._guard.actions
         low, high = limits(actions)
         names = tuple(map(system.labels.variable, range(len(system.observation))))
-        return Start(
+        return shown.Start(
             **(system.told if isinstance(system, Logged) else {}),
             system=system.name,
             about=system.about,
@@ -656,30 +640,30 @@ class Session(AbstractContextManager["Session"]):
             case=self.case,
             tolerance=self._tolerance,
             interval=system.interval,
-            names=OF_CARS if system.of_cars else names,
-            low=numbers(low),
-            high=numbers(high),
+            names=shown.OF_CARS if system.of_cars else names,
+            low=shown.numbers(low),
+            high=shown.numbers(high),
             discrete=isinstance(actions, Choices),
             cars=system.of_cars,
             learnt=self._guard.n_episodes,
             judge="learnt" if isinstance(self.judge, Foresight) else name_judge(self.judge),
         )
 
-    def _decide(self, frame: Frame) -> Frame:
+    def _decide(self, frame: shown.Frame) -> shown.Frame:
         guard = self._guard
         revision = guard.decide(self.system.observation, self.system.propose(), frame.time)
         situation, judgement = guard.situation, self._judged
         self.system.advance(revision)
         rows = zip(judgement.risk, judgement.low, judgement.high, judgement.critical, strict=True)
-        wish, act, best = (Judged(*map(float, values)) for values in rows)
+        wish, act, best = (shown.Judged(*map(float, values)) for values in rows)
         return frame._replace(
             state=situation.state,
             proposed_risk=wish,
             executed_risk=act,
             least_risk=math.nan if isinstance(self.judge, Foresight) else best.risk,
-            proposed=numbers(revision.proposed),
-            executed=numbers(revision.executed),
-            advised=numbers(revision.advised),
+            proposed=shown.numbers(revision.proposed),
+            executed=shown.numbers(revision.executed),
+            advised=shown.numbers(revision.advised),
             revised=change(guard.actions, self._wanted, revision.executed) > _SAME_ACTION,
             advises=change(guard.actions, self._wanted, revision.advised) > _SAME_ACTION,
             reason=revision.reason,
@@ -707,12 +691,12 @@ class Session(AbstractContextManager["Session"]):
         assert isinstance(judge, LearntRisk)
         return {"needed": judge.margin, "why": why}
 
-    def _end(self, frame: Frame) -> Frame:
+    def _end(self, frame: shown.Frame) -> shown.Frame:
         system, before = self.system, self.known()
         self._guard.end(system.failed, system.observation, terminated=system.terminated)
         novel = ""
         if system.failed:
-            novel = first_of_its_kind(frame.observation, before, self.known())
+            novel = shown.first_of_its_kind(frame.observation, before, self.known())
         return frame._replace(over=True, failed=system.failed, novel=novel)
 
 
