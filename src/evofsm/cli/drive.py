@@ -102,9 +102,9 @@ def drive(
             warn(f"stopped after {how_far}; the same command goes on from there")
             return 130
     if as_json:
-        print_json(asdict(summary.row))
+        print_json(asdict(summary))
         return None
-    show(facts("What came of driving", driving.told_of(summary, setup)))
+    show(facts("What came of driving", driving.told_of(summary, results)))
     if out is not None:
         say(f"What was learnt, and every episode: {out}")
     if mcap is not None:

@@ -20,7 +20,7 @@ from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from threading import Thread
-from typing import Any, NamedTuple
+from typing import Any
 
 from evofsm import store
 from evofsm.cli.journal import Journal
@@ -90,13 +90,6 @@ class Setup:
         episode = drive(guard, draw, world)
         outcome = outcome_of(episode, alone)
         return episode, {"episode": number, "variant": draw.variant, **outcome._asdict()}
-
-
-class Driving(NamedTuple):
-    """What came of it."""
-
-    row: Row
-    guard: Guard  #: with what it learnt
 
 
 def load_guard(folder: Path) -> tuple[Guard, int]:
@@ -182,14 +175,14 @@ class Results:
             raise
         self._saved = time.monotonic()
 
-    def summed_up(self, episodes: int) -> Driving:
+    def summed_up(self, episodes: int) -> Row:
         """What came of so many episodes; written to the folder, if there is one."""
         setup, rows = self.setup, [self.rows[number] for number in range(episodes)]
         outcomes = [Outcome(*(row[name] for name in Outcome._fields)) for row in rows]
         row = summarise(setup.family.name, setup.reviser, outcomes, setup.family.interval)
         if self.folder is not None:
             self._write(self.folder, rows)
-        return Driving(row, self.guard)
+        return row
 
     def _write(self, folder: Path, rows: Sequence[Outcomes]) -> None:
         self.save_guard(now=True)
@@ -243,7 +236,7 @@ def drive_in_turn(
     episodes: int,
     move: Advance = lambda *_, **__: None,
     audit: DecisionLogger | None = None,
-) -> Driving:
+) -> Row:
     """Drive those episodes that the results lack, one after the other."""
     setup, guard, n_episodes = results.setup, results.guard, len(results.rows)
     if setup.learn and n_episodes > episodes:
@@ -265,7 +258,7 @@ def drive_in_turn(
 
 def drive_at_once(
     results: Results, episodes: int, workers: int, move: Advance = lambda *_, **__: None
-) -> Driving:
+) -> Row:
     """Drive those held-out episodes that the results lack, by many workers.
 
     What comes of it does not depend on who drives, nor on what happens to them.
@@ -312,9 +305,9 @@ def _begin_work() -> None:
 # -- What came of it ------------------------------------------------------------------------------
 
 
-def told_of(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
+def told_of(row: Row, results: Results) -> Iterator[tuple[str, str]]:
     """Collisions and their price, and what was learnt."""
-    row = driving.row
+    setup = results.setup
     kind = "training" if setup.learn else "held-out"
     yield "family", f"{row.family}, {row.episodes:,} {kind} episodes"
     yield "reviser", f"{setup.reviser}, {setup.mode.value}"
@@ -329,13 +322,9 @@ def told_of(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
     interventions = f"{row.intervention_rate:.1%} of decisions"
     yield "interventions", f"{interventions}; mean change {row.mean_change:.2f} m/s²"
     yield "comfort", f"RMS jerk {row.jerk:.2f} m/s³"
-    yield "learnt", _learnt(driving.guard)
-
-
-def _learnt(guard: Guard) -> str:
-    machine, judge = learners_of(guard)
+    machine, judge = learners_of(results.guard)
     states = f"{machine.n_states} states"
     if isinstance(judge, LatentRisk):
         states += f", {len(dead_ends_of(machine, judge))} of them dead ends"
     experience = getattr(judge, "told_by_experience", "")
-    return f"{states}; {experience}" if experience else states
+    yield "learnt", f"{states}; {experience}" if experience else states
