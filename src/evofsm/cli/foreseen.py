@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +17,7 @@ from evofsm.fsm.validation import counted
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
 from evofsm.guard.foresight import DATES, RATE, RATES, Runs, false_times, span
 from evofsm.io import Chunk
+from evofsm.io.tables import date
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 # Less than the share of alarms of any kind that are right: which alarm it is the judge says.
 _ANY_ALARM = 1e-6
-# From here on no year has four digits [s].
-_NO_DATE = 253_402_300_799.0
 # Alarms that are listed.
 _LISTED = 12
 _CAME = ("ahead", "false/day")
@@ -242,14 +240,6 @@ def alarms_of(judge: Foresight, worse: Collection[int] = ()) -> Iterator[Rendera
 def _last(hits: Sequence[Any], what: str) -> str:
     n = len(hits)
     return f"\n{what}: {'all' if n <= _LISTED else f'the last {_LISTED} of'} {n:,}"
-
-
-def date(time: float, unit: str = "") -> str:
-    """A time [s], as people read it; with its unit, where it is no date."""
-    if not DATES <= time < _NO_DATE:
-        return f"{time:.13g}{unit}"
-    text = f"{datetime.fromtimestamp(round(time, 3), UTC):%Y-%m-%d %H:%M:%S.%f}"
-    return text[:-3].removesuffix(".000").removesuffix(":00")
 
 
 def _draw(

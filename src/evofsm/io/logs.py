@@ -763,7 +763,7 @@ class _Clock:
             if late[row]:
                 summer = "summer time that ends? a larger --skip-bad leaves its hour out; or "
                 cause = summer if began and 1800.0 < latest - time <= 3600.0 else ""
-                step = f"from {_moment(latest, began)} to {_moment(time, began)}"
+                step = f"from {tables.date(began + latest)} to {tables.date(began + time)}"
                 piece.skips.leave_out(
                     "time",
                     f"{piece.at(row)}: time goes {step} within an episode; it must run forward "
@@ -1108,11 +1108,6 @@ class _Reader:
         for row in np.flatnonzero(unknown[:-1] & ~starts[1:]).tolist():
             piece.skips.leave_out("action", partial(message, row))
         self._unknown = partial(message, piece.rows - 1) if unknown[-1] else None
-
-
-def _moment(time: float, began: float) -> str:
-    """A time for a message [s], as a date where they are some."""
-    return f"{datetime.fromtimestamp(began + time, UTC):%F %T}" if began else f"{time:g}"
 
 
 def _encoded(piece: Piece, variable: str | Category) -> Floats:

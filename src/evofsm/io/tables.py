@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
+from evofsm.guard.foresight import DATES
 from evofsm.store import LARGEST_OBSERVATION
 
 if TYPE_CHECKING:
@@ -87,6 +88,8 @@ _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
 # The day first, as only dots tell; whether its year has a century, and whether seconds follow.
 _DAY_FIRST = re.compile(r"\d\d?\.\d\d?\.(?:(\d{4})|\d\d),?[T ]+\d\d?:\d\d(:)?")
 _DATE_LIKE = re.compile(r"\s*\d{1,4}([.:/-])\d\d?\1\d")
+# From here on no year has four digits [s].
+_NO_DATE = 253_402_300_799.0
 _ISO = "in ISO 8601, such as 2026-03-14T09:26:53.5+01:00, or as 14.03.2026 09:26:53"
 _SAYS_HOW = "; --unit 'COLUMN=%m/%d/%Y %I:%M:%S %p' says how others are written"
 
@@ -440,11 +443,11 @@ class Dialect:
         self.columns = _fields(header, self.separator)
         self.units: Mapping[str, str] = {}  #: as a row below the names says
         rows = [_fields(row, self.separator) for row in below]
-        values = next((row for row in rows if any(map(_is_value, row))), [])
+        values = next((row for row in rows if any(map(is_value, row))), [])
         above = rows[: rows.index(values)] if values else rows[:1]
         units = [unit_of(text) for row in above[:1] for text in row]
         pairs = zip(units, values, strict=False)
-        over = any(_is_value(value) and text.lower() not in MISSING for text, value in pairs)
+        over = any(is_value(value) and text.lower() not in MISSING for text, value in pairs)
         #: How many rows below the names say what numbers are, such as their units.
         self.n_told = len(above) if over or any(unit in UNITS for unit in units) else 0
         if self.n_told:
@@ -768,6 +771,14 @@ def is_date(text: str) -> bool:
     return (_DATE.match(text) or _DAY_FIRST.match(text.strip())) is not None
 
 
+def date(time: float, unit: str = "") -> str:
+    """A time [s], as people read it; with its unit, where it is no date."""
+    if not DATES <= time < _NO_DATE:
+        return f"{time:.13g}{unit}"
+    text = f"{datetime.fromtimestamp(round(time, 3), UTC):%Y-%m-%d %H:%M:%S.%f}"
+    return text[:-3].removesuffix(".000").removesuffix(":00")
+
+
 def seconds_of_date(text: str, form: str = "") -> float:
     """Since 1970, of one date as logs are read; a ValueError if it is none.
 
@@ -794,7 +805,8 @@ def is_number(text: str) -> bool:
     return True
 
 
-def _is_value(text: str) -> bool:
+def is_value(text: str) -> bool:
+    """Whether it is a number, perhaps with a decimal comma, or a date."""
     return is_number(text.replace(",", ".")) or is_date(text)
 
 

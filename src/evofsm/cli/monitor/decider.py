@@ -16,7 +16,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli.foreseen import date
 from evofsm.cli.monitor.messages import (
     NO_ROW,
     SCHEMA,
@@ -43,6 +42,7 @@ from evofsm.guard import (
     is_spoken,
     make_usable,
 )
+from evofsm.io.tables import date
 
 _log = logging.getLogger(__name__)
 

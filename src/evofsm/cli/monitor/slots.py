@@ -18,7 +18,16 @@ import msgspec
 from evofsm.cli.monitor.messages import NO_ROW, Message, MessageError, Row
 from evofsm.io import LogColumns
 from evofsm.io.logs import Condition, units_of
-from evofsm.io.tables import MISSING, UNITS, Dialect, decoded, explained, is_date, is_number
+from evofsm.io.tables import (
+    MISSING,
+    UNITS,
+    Dialect,
+    decoded,
+    explained,
+    is_date,
+    is_number,
+    is_value,
+)
 
 # Lines that are no rows are told of as the first came, and then as so many had.
 _SAID_AT = [10**k for k in range(1, 10)]
@@ -206,7 +215,7 @@ class CsvRows:
         self._below.append(text)
         dialect, log_units = Dialect(self._header, self._below), self._columns.units
         fields = next(csv.reader([text], delimiter=dialect.separator, strict=True))
-        if not any(map(_is_value, fields)) and len(self._below) <= Dialect.most_below:
+        if not any(map(is_value, fields)) and len(self._below) <= Dialect.most_below:
             return True
         numbers = [name for name in dialect.columns if name in self._numbers]
         units = {name: unit for name, unit in log_units.items() if "%" not in unit}
@@ -236,12 +245,8 @@ class CsvRows:
         return int(number) if self._called[name] == "proposal" and number.is_integer() else number
 
 
-def _is_value(text: str) -> bool:
-    return is_number(text.replace(",", ".")) or is_date(text)
-
-
 def _begins_row(fields: Sequence[str]) -> bool:
-    return _is_value(next(filter(None, fields), ""))
+    return is_value(next(filter(None, fields), ""))
 
 
 def _joined(how: str | None, values: Sequence[Any]) -> Any:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evofsm.cli.foreseen import date
 from evofsm.cli.learning import refusing
 from evofsm.cli.monitor.decider import HOLE, Answer, Decider
 from evofsm.cli.monitor.messages import End, Row
@@ -18,6 +17,7 @@ from evofsm.fsm.naming import visible
 from evofsm.guard.audit_log import lines
 from evofsm.guard.foresight import span
 from evofsm.io.logs import Chunk
+from evofsm.io.tables import date
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

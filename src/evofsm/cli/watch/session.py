@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli.foreseen import date
 from evofsm.cli.learning import episodes_read, learn_chunk
 from evofsm.cli.options import BRAKES, Reading, refuse_other_limit, require_world
 from evofsm.cli.show import progress, warn
@@ -59,6 +58,7 @@ from evofsm.guard import (
 from evofsm.guard.actions import Action, Choices, change, is_usable, limits, put_into
 from evofsm.guard.foresight import DATES
 from evofsm.io.logs import LONGEST_STEP, Chunk, Noted
+from evofsm.io.tables import date
 
 #: The state rule for looking on: coarse enough that each state can be told from the others.
 WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
@@ -559,7 +559,7 @@ class Session(AbstractContextManager["Session"]):
         logger: Any = SimpleNamespace(decided=self._ask, **hooks)
         guard.audit = logger
         self.revising = on
-        self.start = self.restart()
+        self.restart()
 
     @property
     def revising(self) -> bool:
@@ -578,7 +578,7 @@ class Session(AbstractContextManager["Session"]):
         why = "was not shown to help yet" if reason == "shadow" else reason
         return reason and f"the guard {why}, so what is proposed passes"
 
-    def restart(self, case: int | None = None) -> shown.Start:
+    def restart(self, case: int | None = None) -> None:
         """Begin a run anew, or another one; one that is under way is broken off."""
         case, system = self.case if case is None else case, self.system
         if not 0 <= case < len(system.cases):
@@ -588,8 +588,25 @@ class Session(AbstractContextManager["Session"]):
         self._guard.begin()
         self._story = shown.Story(alone=system.alone)
         self._number = 0
-        self.start = self._begun()
-        return self.start
+        actions = self._guard.actions
+        low, high = limits(actions)
+        names = tuple(map(system.labels.variable, range(len(system.observation))))
+        self.start = shown.Start(
+            **(system.told if isinstance(system, Logged) else {}),
+            system=system.name,
+            about=system.about,
+            cases=system.cases,
+            case=case,
+            tolerance=self._tolerance,
+            interval=system.interval,
+            names=shown.OF_CARS if system.of_cars else names,
+            low=shown.numbers(low),
+            high=shown.numbers(high),
+            discrete=isinstance(actions, Choices),
+            cars=system.of_cars,
+            learnt=self._guard.n_episodes,
+            judge="learnt" if isinstance(self.judge, Foresight) else name_judge(self.judge),
+        )
 
     def step(self) -> shown.Frame:
         """One decision, and what came of the one before."""
@@ -627,27 +644,6 @@ class Session(AbstractContextManager["Session"]):
             names, units = (tuple(texts[k] for k in two if texts) for texts in labels[1:3])
             labels, center = Labels(names=names, units=units, dt=labels.dt), center[two]
         return labels.place(center)
-
-    def _begun(self) -> shown.Start:
-        system, actions = self.system, self._guard.actions
-        low, high = limits(actions)
-        names = tuple(map(system.labels.variable, range(len(system.observation))))
-        return shown.Start(
-            **(system.told if isinstance(system, Logged) else {}),
-            system=system.name,
-            about=system.about,
-            cases=system.cases,
-            case=self.case,
-            tolerance=self._tolerance,
-            interval=system.interval,
-            names=shown.OF_CARS if system.of_cars else names,
-            low=shown.numbers(low),
-            high=shown.numbers(high),
-            discrete=isinstance(actions, Choices),
-            cars=system.of_cars,
-            learnt=self._guard.n_episodes,
-            judge="learnt" if isinstance(self.judge, Foresight) else name_judge(self.judge),
-        )
 
     def _decide(self, frame: shown.Frame) -> shown.Frame:
         guard = self._guard
