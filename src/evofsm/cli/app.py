@@ -11,11 +11,10 @@ import typer
 from typer.core import TyperGroup
 
 from evofsm.cli.audit import audit, check
-from evofsm.cli.drive import drive
+from evofsm.cli.drive import drive, paper
 from evofsm.cli.inspect import explain, export, inspect
 from evofsm.cli.learn import learn
 from evofsm.cli.monitor import monitor
-from evofsm.cli.paper import paper
 from evofsm.cli.watch import watch
 
 # What Typer raises where a command is called wrongly, whoever it takes it from.

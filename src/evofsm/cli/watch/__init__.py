@@ -82,8 +82,7 @@ def watch(
 
 async def _serve(watched: Session, *, browse: bool) -> None:
     from evofsm.cli.show import say
-    from evofsm.cli.watch.player import Player
-    from evofsm.cli.watch.server import LivePage
+    from evofsm.cli.watch.server import LivePage, Player
 
     async with LivePage() as page:
         page.player = Player(watched, page)
