@@ -96,9 +96,9 @@ class Decider:
         Messages that are sent again, as after a connection was lost, get the answers of before.
         """
         try:
-            if (json_line := self._csv.read(line)) is None:
+            if (body := self._csv.read(line)) is None:
                 return self._of("waiting", alarm=self._alarm, reason=self._csv.unread or NO_ROW)
-            message = self.form.read(json_line)
+            message = self.form.read(body)
             beyond = self.guard.beyond(np.array(message.observation or (), np.float64))
             if beyond is not None:
                 raise MessageError(*beyond, message.time)

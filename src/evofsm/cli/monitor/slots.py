@@ -13,8 +13,6 @@ from operator import itemgetter
 from statistics import fmean
 from typing import Any
 
-import msgspec
-
 from evofsm.cli.monitor.messages import NO_ROW, Message, MessageError, Row
 from evofsm.io import LogColumns
 from evofsm.io.logs import Condition, units_of
@@ -145,8 +143,8 @@ class CsvRows:
         self._n_unread = 0
         self.place, self.in_csv = "", False  #: of a line, as what is said of it begins
 
-    def read(self, line: bytes) -> bytes | None:
-        """The message on a line; None where it names the columns, or is a title or units."""
+    def read(self, line: bytes) -> bytes | dict[str, Any] | None:
+        """The keys of a row, or JSON as it is; None of names of columns, a title or units."""
         self._count += 1
         self.place, self.in_csv = f"line {self._count}: ", False
         begin = line.lstrip(b"\xef\xbb\xbf \t")[:1]
@@ -168,7 +166,7 @@ class CsvRows:
             if is_header or self._has_units(text):
                 return None
             assert self._dialect is not None
-            return msgspec.json.encode(dict(self._told(self._dialect, text)))
+            return dict(self._told(self._dialect, text))
         except csv.Error as error:
             raise MessageError("line", f"{error} (an unclosed quote?)") from None
 
