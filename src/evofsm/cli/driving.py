@@ -49,14 +49,11 @@ from evofsm.guard import TOLERANCE, AuditLog, DecisionLogger, Guard, Mode
 
 #: The columns of ``decisions.parquet`` after ``episode``; `driving/naming.py` says which they are.
 DECISION_TABLE = tuple(name for name, column in DECISION_COLUMNS.items() if column.in_table)
-#: The guard in a folder of results.
-GUARD = "guard.evofsm"
+GUARD = "guard.evofsm"  #: the guard in a folder of results.
 
 _JOURNAL, _DECISIONS, _EPISODES = "episodes.jsonl", "decisions.parquet", "episodes.csv"
-# The guard is saved so often while it learns [s].
-_EVERY = 60.0
-# So many episodes are one task of a worker: some 500 ms.
-_BATCH = 20
+_EVERY = 60.0  # the guard is saved so often while it learns [s].
+_BATCH = 20  # so many episodes are one task of a worker: some 500 ms.
 
 Outcomes = dict[str, Any]
 

@@ -57,8 +57,7 @@ ByJudge = Annotated[
 Tolerance = Annotated[
     float, option("Share of hard brakes (learnt: of disturbances) that need not be survived.")
 ]
-#: As `evofsm.guard.TOLERANCE`, without what that loads.
-TOLERANCE = 0.02
+TOLERANCE = 0.02  #: as `evofsm.guard.TOLERANCE`, without what that loads.
 #: What a car's brakes are reckoned with where nobody said [m/s²].
 BRAKES = 6.0
 Brakes = Annotated[

@@ -18,10 +18,8 @@ if TYPE_CHECKING:
     from evofsm.cli.monitor.transports import Transport
     from evofsm.guard import Guard
 
-# Share by which the step of a log may differ from that of the guard.
-_SAME_STEP = 0.05
-# Of rows of cars, where nobody said another one [s].
-_INTERVAL = 0.1
+_SAME_STEP = 0.05  # share by which the step of a log may differ from that of the guard.
+_INTERVAL = 0.1  # of rows of cars, where nobody said another one [s].
 # What other files end with holds live rows; so does CSV without --summary.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
 # In the beginning of what was saved.

@@ -27,8 +27,7 @@ _log = logging.getLogger(__name__)
 # The guard is written once so many messages are in the journal, as an episode ends.
 _EVERY = 600
 _PROVENANCE = "monitor"
-# The mark of a journal that was made just now.
-_NEW = -1
+_NEW = -1  # the mark of a journal that was made just now.
 
 
 class State:

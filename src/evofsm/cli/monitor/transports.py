@@ -25,14 +25,10 @@ from evofsm.cli.monitor.messages import LONGEST
 from evofsm.extras import needs
 from evofsm.fsm.naming import visible
 
-# So much is read at once [byte].
-_CHUNK = 1 << 16
-# So many lines may come in one datagram or sample.
-_MOST_LINES = 100
-# What would block is tried again after so long [s].
-_POLL = 0.005
-# A signal that another thread took is seen after so long [s].
-_LONGEST_WAIT = 0.5
+_CHUNK = 1 << 16  # so much is read at once [byte].
+_MOST_LINES = 100  # so many lines may come in one datagram or sample.
+_POLL = 0.005  # what would block is tried again after so long [s].
+_LONGEST_WAIT = 0.5  # a signal that another thread took is seen after so long [s].
 
 
 def json_line(answer: Answer) -> bytes:
