@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import ExitStack, nullcontext
 from functools import partial
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 from evofsm.cli import options
 from evofsm.cli.options import Reading, argument, option
-
-if TYPE_CHECKING:
-    from evofsm.cli.monitor.decider import Decider
-    from evofsm.cli.monitor.transports import Transport
-    from evofsm.guard import Guard
 
 _SAME_STEP = 0.05  # share by which the step of a log may differ from that of the guard.
 _INTERVAL = 0.1  # of rows of cars, where nobody said another one [s].
@@ -113,11 +107,11 @@ def monitor(
         raise ValueError("--traffic learns nothing: it goes with no --guard, --state or --learn")
     if summary and (file is None or state or audit):
         raise ValueError("--summary needs FILE, and goes with no --state or --audit")
-    from evofsm.cli.monitor.decider import EPISODE, Decider
+    from evofsm.cli.monitor.decider import EPISODE, Decider, begun, prepare
     from evofsm.cli.monitor.slots import Slots
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.summary import Text
-    from evofsm.cli.monitor.transports import Server, json_line
+    from evofsm.cli.monitor.transports import Server, json_line, transport_of
     from evofsm.cli.show import show, warn
     from evofsm.driving.cars import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
@@ -142,7 +136,7 @@ def monitor(
     if guard is None and not is_log and (system or "action" in options.given_of(reading)):
         if traffic:
             raise ValueError("--traffic is of cars, and goes with no --observe or --action")
-        new_guard, learn = _begun({**system}, reading, interval, tolerance, alarms), True
+        new_guard, learn = begun({**system}, reading, interval, tolerance, alarms), True
     defaults = options.read_with(guard or state)
     defaults.pop("observe", None)
     log_episode = defaults.pop("episode", None)
@@ -197,7 +191,7 @@ def monitor(
             warn("nothing of what is learnt is saved; --state FILE saves it")
         failed = new_guard.failed if new_guard else None
         sentry = fresh() if keeper is None else keeper.guard(fresh, failed)
-        _prepare(sentry, mode, (tolerance, false_a_day), audit, stack, learn=learn)
+        prepare(sentry, mode, (tolerance, false_a_day), audit, stack, learn=learn)
         if not (is_log or traffic):
             observe = options.quoted(sentry.variables or VARIABLES)
             slots = Slots(reader(observe=observe, dt=None).columns)
@@ -215,7 +209,7 @@ def monitor(
             show(*summary_of(decider, answers, str(file)))
             return None
         if warm:
-            _compile(decider)
+            decider.warm()
             warn("compiled")
         if keeper is not None:
             again = keeper.begin(decider)
@@ -223,7 +217,7 @@ def monitor(
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
         line = Text().line if text else json_line
         server = Server(decider, keeps=keeper is not None, line=line)
-        transport, where = _transport(file, socket, udp, zenoh, stack)
+        transport, where = transport_of(file, socket, udp, zenoh, stack)
         warn(notice)
         if slots is not None and (log_options := options.given_of(reader)):
             warn(f"rows are read as in a log: {options.typed(log_options)}")
@@ -239,115 +233,3 @@ def monitor(
             elif decider.rows:
                 decider.end()
     return None
-
-
-def _prepare(
-    guard: Guard,
-    mode: options.ModeName,
-    limits: tuple[float | None, float | None],
-    audit: Path | None,
-    stack: ExitStack,
-    *,
-    learn: bool,
-) -> None:
-    """Set how far it goes, whether it learns, and who writes it down."""
-    from evofsm.fsm.validation import probability
-    from evofsm.guard import ActionReviser, AuditLog, Foresight, Mode
-
-    tolerance, false_a_day = limits
-    options.refuse_other_limit(not isinstance(guard.judge, Foresight), false_a_day, tolerance)
-    if isinstance(guard.judge, Foresight) and false_a_day is not None:
-        guard.judge.stated = false_a_day
-    if isinstance(guard.reviser, ActionReviser):
-        guard.reviser.mode = Mode(mode)
-        if tolerance is not None:
-            guard.reviser.tolerance = probability("--tolerance", tolerance)
-    elif mode != "act":
-        name = type(guard.reviser).__name__
-        raise ValueError(f"a {name} knows no --mode {mode}: what it says is executed")
-    guard.learn = learn
-    if audit is not None:
-        guard.audit = stack.enter_context(AuditLog(audit, sync="episode"))
-
-
-def _begun(
-    told: dict[str, Any],
-    reading: partial[Reading],
-    interval: float | None,
-    tolerance: float | None,
-    alarms: tuple[float | None, float, float | None],
-) -> Guard:
-    """A guard that knows nothing yet, from what was told of a system."""
-    from evofsm.cli.foreseen import guard_from_zero
-    from evofsm.guard import Guard, LearntRisk, Mode
-    from evofsm.io.logs import Condition
-
-    if "observe" not in told:
-        raise ValueError("say what is observed, the keys of rows: --observe temperature,load")
-    columns, *_, acts = reading(observe=told.pop("observe"), dt=None)
-    names, scheme = columns.observe.names, columns.resample
-    if (step := scheme.step if scheme else interval) is None:
-        raise ValueError("say how often rows come [s]: --interval 1; or --resample 10s of jittered")
-    if not acts and told:
-        raise ValueError("--action '' says that nobody acts, and goes with no range of actions")
-    if not acts:
-        return guard_from_zero(step, names, *alarms)
-    if not told:
-        raise ValueError("say who acts: --low and --high, --n-actions; or --action '', if nobody")
-    for name in {"low", "high"} & {*told}:
-        try:
-            ends = [float(end) for end in told[name].split(",")]
-        except ValueError:
-            raise ValueError(f"--{name} is {told[name]!r}; write a number, or -1,-1") from None
-        told[name] = ends if len(ends) > 1 else ends[0]
-    condition = Condition.parse(columns.failed or names[0])
-
-    def failed(z: Any) -> bool:
-        return condition.holds_of(dict(zip(names, z, strict=True)))
-
-    is_told = columns.failed and {term.column for term in condition.terms} <= {*names}
-    judge = LearntRisk(step, horizon=alarms[0], names=names, **told)
-    return Guard(
-        **told,
-        interval=step,
-        judge=judge,
-        failed=failed if is_told else None,
-        tolerance=options.TOLERANCE if tolerance is None else tolerance,
-        mode=Mode.SHADOW,
-    )
-
-
-def _transport(
-    file: Path | None, socket: Path | None, udp: int | None, zenoh: str | None, stack: ExitStack
-) -> tuple[Transport, str]:
-    """Where rows come from, and that in words."""
-    from evofsm.cli.monitor.transports import SocketTransport, Stream, UdpTransport, ZenohTransport
-
-    if socket is not None:
-        return SocketTransport(socket), f"listens to {socket}"
-    if udp is not None:
-        by_udp = UdpTransport(udp)
-        return by_udp, f"listens to UDP port {by_udp.port}"
-    if zenoh is not None:
-        return ZenohTransport(zenoh), f"listens to {zenoh}/row"
-    if file is None and sys.stdin is None:
-        raise ValueError("standard input is closed; give FILE, --socket, --udp or --zenoh")
-    if sys.stdout is None:
-        raise ValueError("standard output is closed; give --socket, --udp or --zenoh")
-    source = sys.stdin.buffer if file is None else stack.enter_context(file.open("rb"))
-    return Stream(source, sys.stdout.buffer), f"reads {file or 'standard input'}"
-
-
-def _compile(decider: Decider) -> None:
-    """Decide a few times on a copy, which then is thrown away."""
-    import numpy as np
-
-    from evofsm.driving import Object, Scene
-
-    twin, observation = decider.guard.copy(), np.ones(decider.form.count or 1)
-    if decider.form.scenes:
-        ego, car = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
-        observation = Scene(ego, [car, car._replace(x=-20.0)]).rows(2)
-    for k in range(4):
-        twin.decide(observation + 0.1 * k, None)
-    twin.end(observation=observation)

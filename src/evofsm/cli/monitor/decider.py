@@ -10,12 +10,16 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.cli.foreseen import guard_from_zero
 from evofsm.cli.monitor.messages import (
     NO_ROW,
     SCHEMA,
@@ -28,20 +32,26 @@ from evofsm.cli.monitor.messages import (
     Taken,
 )
 from evofsm.cli.monitor.slots import CsvRows, Slots
+from evofsm.cli.options import TOLERANCE, ModeName, Reading, refuse_other_limit
 from evofsm.cli.show import plain
+from evofsm.driving import Object, Scene
 from evofsm.driving.judge import SLIGHT, LatentRisk
 from evofsm.driving.traffic import COLUMNS, TrafficRisk
+from evofsm.fsm.validation import probability
 from evofsm.guard import (
     ActionReviser,
+    AuditLog,
     BoxActions,
     Foresight,
     Guard,
+    LearntRisk,
     Mode,
     Proposal,
     Revision,
     is_spoken,
     make_usable,
 )
+from evofsm.io.logs import Condition
 from evofsm.io.tables import date
 
 _log = logging.getLogger(__name__)
@@ -84,6 +94,16 @@ class Decider:
         self._csv = CsvRows(self.slots, self.form.variables, acts=not self._is_alone)
         if isinstance(judge, Foresight):
             judge.bridges = self.slots.hole or 0.0
+
+    def warm(self) -> None:
+        """Compile what decides, by a few decisions of a copy, which then is thrown away."""
+        twin, observation = self.guard.copy(), np.ones(self.form.count or 1)
+        if self.form.scenes:
+            ego, car = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
+            observation = Scene(ego, [car, car._replace(x=-20.0)]).rows(2)
+        for k in range(4):
+            twin.decide(observation + 0.1 * k, None)
+        twin.end(observation=observation)
 
     # -- Messages -------------------------------------------------------------------------------
 
@@ -384,3 +404,75 @@ def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None
     if observation is None:
         return None
     return [math.nan if value is None else value for value in observation]
+
+
+# -- Its guard ------------------------------------------------------------------------------------
+
+
+def begun(
+    told: dict[str, Any],
+    reading: partial[Reading],
+    interval: float | None,
+    tolerance: float | None,
+    alarms: tuple[float | None, float, float | None],
+) -> Guard:
+    """A guard that knows nothing yet, from what was told of a system."""
+    if "observe" not in told:
+        raise ValueError("say what is observed, the keys of rows: --observe temperature,load")
+    columns, *_, acts = reading(observe=told.pop("observe"), dt=None)
+    names, scheme = columns.observe.names, columns.resample
+    if (step := scheme.step if scheme else interval) is None:
+        raise ValueError("say how often rows come [s]: --interval 1; or --resample 10s of jittered")
+    if not acts and told:
+        raise ValueError("--action '' says that nobody acts, and goes with no range of actions")
+    if not acts:
+        return guard_from_zero(step, names, *alarms)
+    if not told:
+        raise ValueError("say who acts: --low and --high, --n-actions; or --action '', if nobody")
+    for name in {"low", "high"} & {*told}:
+        try:
+            ends = [float(end) for end in told[name].split(",")]
+        except ValueError:
+            raise ValueError(f"--{name} is {told[name]!r}; write a number, or -1,-1") from None
+        told[name] = ends if len(ends) > 1 else ends[0]
+    condition = Condition.parse(columns.failed or names[0])
+
+    def failed(z: Any) -> bool:
+        return condition.holds_of(dict(zip(names, z, strict=True)))
+
+    is_told = columns.failed and {term.column for term in condition.terms} <= {*names}
+    judge = LearntRisk(step, horizon=alarms[0], names=names, **told)
+    return Guard(
+        **told,
+        interval=step,
+        judge=judge,
+        failed=failed if is_told else None,
+        tolerance=TOLERANCE if tolerance is None else tolerance,
+        mode=Mode.SHADOW,
+    )
+
+
+def prepare(
+    guard: Guard,
+    mode: ModeName,
+    limits: tuple[float | None, float | None],
+    audit: Path | None,
+    stack: ExitStack,
+    *,
+    learn: bool,
+) -> None:
+    """Set how far it goes, whether it learns, and who writes it down."""
+    tolerance, false_a_day = limits
+    refuse_other_limit(not isinstance(guard.judge, Foresight), false_a_day, tolerance)
+    if isinstance(guard.judge, Foresight) and false_a_day is not None:
+        guard.judge.stated = false_a_day
+    if isinstance(guard.reviser, ActionReviser):
+        guard.reviser.mode = Mode(mode)
+        if tolerance is not None:
+            guard.reviser.tolerance = probability("--tolerance", tolerance)
+    elif mode != "act":
+        name = type(guard.reviser).__name__
+        raise ValueError(f"a {name} knows no --mode {mode}: what it says is executed")
+    guard.learn = learn
+    if audit is not None:
+        guard.audit = stack.enter_context(AuditLog(audit, sync="episode"))

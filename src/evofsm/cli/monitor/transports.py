@@ -10,10 +10,11 @@ import math
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -320,3 +321,22 @@ class ZenohTransport:
 
 
 Transport = Stream | SocketTransport | UdpTransport | ZenohTransport
+
+
+def transport_of(
+    file: Path | None, unix: Path | None, udp: int | None, zenoh: str | None, stack: ExitStack
+) -> tuple[Transport, str]:
+    """Where rows come from, and that in words."""
+    if unix is not None:
+        return SocketTransport(unix), f"listens to {unix}"
+    if udp is not None:
+        by_udp = UdpTransport(udp)
+        return by_udp, f"listens to UDP port {by_udp.port}"
+    if zenoh is not None:
+        return ZenohTransport(zenoh), f"listens to {zenoh}/row"
+    if file is None and sys.stdin is None:
+        raise ValueError("standard input is closed; give FILE, --socket, --udp or --zenoh")
+    if sys.stdout is None:
+        raise ValueError("standard output is closed; give --socket, --udp or --zenoh")
+    source = sys.stdin.buffer if file is None else stack.enter_context(file.open("rb"))
+    return Stream(source, sys.stdout.buffer), f"reads {file or 'standard input'}"
