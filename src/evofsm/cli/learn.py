@@ -86,13 +86,13 @@ def learn(
         chunks = list(chunks) if guard is not None and not acts else chunks
         units_of = partial(notes.si_units, encoder.names)
         lesson = learning.learn_traces(chunks, machine, actions, encoder.names, units_of)
-    totals, model = lesson.read, lesson.model
+    model = lesson.model
     provenance = {
         "files": [{"name": file, "bytes": size} for file, size in sizes.items()],
-        "rows": totals.rows,
-        "episodes": totals.episodes,
+        "rows": lesson.rows,
+        "episodes": lesson.episodes,
         "transitions": lesson.transitions,
-        "failures": totals.failures,
+        "failures": lesson.failures,
         "read with": {k: v for k, v in options.given_of(reading).items() if k != "topics"},
     }
     warnings = learning.warnings_of(notes, columns)
@@ -104,7 +104,7 @@ def learn(
     if guard is not None and kind is not None:
         if acts:
             new_guard = learning.guard_of_log(kind, model, machine, brakes, tolerance)
-            with progress("Teaching the guard", totals.rows) as move:
+            with progress("Teaching the guard", lesson.rows) as move:
                 share = learning.teach(new_guard, read.traces(files), lambda count: move(count))
             if refusal := learning.refusing(share):
                 warn(f"warning: in the later half of the log the guard {refusal}")
@@ -133,7 +133,7 @@ def learn(
     elif out is not None:
         say(f"Saved to {out}. Look at it again: evofsm inspect {out}")
     if new_guard is not None:
-        beyond = (totals.clipped_below + totals.clipped_above) / totals.rows
+        beyond = (lesson.clipped_below + lesson.clipped_above) / lesson.rows
         for line in learning.told_of_guard(new_guard, guard, brakes, beyond):
             say(line)
 

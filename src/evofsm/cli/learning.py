@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import quote
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -52,9 +52,11 @@ _NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
 
 
 @dataclass
-class Read:
-    """What was read."""
+class Learning:
+    """What was learnt, and from what."""
 
+    machine: EvolvingFSM  #: can go on learning
+    actions: IntervalActions
     rows: int = 0  #: observations
     episodes: int = 0
     seconds: float = 0.0  #: time between the first and the last row of the episodes, together [s]
@@ -65,15 +67,29 @@ class Read:
     dt: float = np.nan  #: usual time between two rows [s]
     last_time: float = np.nan  #: of the latest row [s]
     levels: set[float] = field(default_factory=set)  #: numbers of the action, while they are few
+    model: FSMModel = field(init=False)  #: once all is learnt
 
+    @property
+    def transitions(self) -> int:
+        """How many were learnt."""
+        return int(self.model.uses.sum())
 
-class Learning(NamedTuple):
-    """What was learnt, and from what."""
-
-    machine: EvolvingFSM  #: can go on learning
-    model: FSMModel
-    read: Read
-    transitions: int
+    def take(self, chunk: Chunk) -> None:
+        """Learn a chunk, and count what is in it."""
+        learn_chunk(self.machine, chunk, self.actions)
+        self.dt = chunk.dt
+        steps = np.diff(chunk.times, prepend=self.last_time)
+        steps[chunk.starts] = 0.0
+        self.last_time = float(chunk.times[-1])
+        self.seconds += float(steps.sum())
+        self.rows += len(steps)
+        self.episodes += len(chunk.starts)
+        self.jumps += chunk.jumps
+        self.failures += 0 if chunk.failures is None else len(chunk.failures)
+        self.clipped_below += int((chunk.actions < self.actions.low).sum())
+        self.clipped_above += int((chunk.actions > self.actions.high).sum())
+        if len(self.levels) <= MOST_LEVELS:
+            self.levels.update(np.unique(chunk.actions[~np.isnan(chunk.actions)]).tolist())
 
 
 def learn_traces(
@@ -84,19 +100,17 @@ def learn_traces(
     units: Callable[[], Sequence[str]] = tuple,
 ) -> Learning:
     """Learn all chunks in their order, each row once; units are known once they are read."""
-    machine, read = machine.copy(), Read()
+    lesson = Learning(machine.copy(), actions)
     for chunk in chunks:
-        learn_chunk(machine, chunk, actions)
-        _count(read, chunk, actions)
-    model = machine.model(
-        actions=actions, names=names, units=units(), dt=None if np.isnan(read.dt) else read.dt
-    )
-    if (transitions := int(model.uses.sum())) == 0:
+        lesson.take(chunk)
+    dt = None if np.isnan(lesson.dt) else lesson.dt
+    lesson.model = lesson.machine.model(actions=actions, names=names, units=units(), dt=dt)
+    if lesson.transitions == 0:
         raise ValueError(
             "no transition could be learnt: no row with an action is followed by another row of "
             "its episode (is every row an episode? are the rows sorted by episode and time?)"
         )
-    return Learning(machine, model, read, transitions)
+    return lesson
 
 
 # -- What was noticed in reading ------------------------------------------------------------------
@@ -262,23 +276,6 @@ def learn_chunk(machine: EvolvingFSM, chunk: Chunk, actions: Any) -> None:
     machine.learn_many(chunk.observations, indices, chunk.starts, chunk.failures)
 
 
-def _count(read: Read, chunk: Chunk, actions: IntervalActions) -> None:
-    """Count what is in a chunk."""
-    read.dt = chunk.dt
-    steps = np.diff(chunk.times, prepend=read.last_time)
-    steps[chunk.starts] = 0.0
-    read.last_time = float(chunk.times[-1])
-    read.seconds += float(steps.sum())
-    read.rows += len(steps)
-    read.episodes += len(chunk.starts)
-    read.jumps += chunk.jumps
-    read.failures += 0 if chunk.failures is None else len(chunk.failures)
-    read.clipped_below += int((chunk.actions < actions.low).sum())
-    read.clipped_above += int((chunk.actions > actions.high).sum())
-    if len(read.levels) <= MOST_LEVELS:
-        read.levels.update(np.unique(chunk.actions[~np.isnan(chunk.actions)]).tolist())
-
-
 def range_of(levels: Sequence[float]) -> str:
     """The --action-range in which each of some rising numbers is an action; or nothing.
 
@@ -424,7 +421,7 @@ def told_of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float)
 def document_of(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """All that is printed, for JSON; states and actions from 0."""
     names = ("rows", "episodes", "seconds", "clipped_below", "clipped_above", "jumps", "failures")
-    totals = {name: getattr(learning.read, name) for name in names}
+    totals = {name: getattr(learning, name) for name in names}
     if not learning.model.failures_told:
         totals["failures"] = None
     model = {**model_document(learning.model), "provenance": provenance}
@@ -433,19 +430,18 @@ def document_of(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, 
 
 def read_of(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     """What was read, and the actions and the rule that it was learnt with."""
-    read, actions = learning.read, learning.model.actions
-    yield "rows", f"{read.rows:,}, one every {learning.model.dt:g} s"
-    minutes = read.seconds / 60.0
-    together = f"{read.seconds:.1f} s" if minutes < 2.0 else f"{minutes:,.1f} min"
-    yield "episodes", f"{read.episodes:,}, together {together}"
+    actions = learning.actions
+    yield "rows", f"{learning.rows:,}, one every {learning.model.dt:g} s"
+    minutes = learning.seconds / 60.0
+    together = f"{learning.seconds:.1f} s" if minutes < 2.0 else f"{minutes:,.1f} min"
+    yield "episodes", f"{learning.episodes:,}, together {together}"
     yield "transitions", f"{learning.transitions:,}"
-    assert actions is not None
     text = f"{actions.n_actions} intervals of {action} from {actions.low:g} to {actions.high:g}"
-    if n_beyond := read.clipped_below + read.clipped_above:
-        text += f"; {read.clipped_below:,} below and {read.clipped_above:,} above "
-        text += f"({n_beyond / read.rows:.1%} of rows) were put into the end intervals"
+    if n_beyond := learning.clipped_below + learning.clipped_above:
+        text += f"; {learning.clipped_below:,} below and {learning.clipped_above:,} above "
+        text += f"({n_beyond / learning.rows:.1%} of rows) were put into the end intervals"
     text = text if n_beyond else f"{text}; none was beyond"
-    numbers = sorted(read.levels) if len(read.levels) <= MOST_LEVELS else []
+    numbers = sorted(learning.levels) if len(learning.levels) <= MOST_LEVELS else []
     places = [actions.encode(number) for number in numbers]
     meanings = [f"{n:g} is a({k + 1})" for n, k in zip(numbers, places, strict=True)]
     text += f"; {', '.join(meanings)}" * (len(numbers) > 1)
@@ -469,8 +465,8 @@ def read_otherwise(
     if columns.failed is None:
         yield "failures", "not known; --failed COLUMN or --failed 'gap<=0' says them"
     else:
-        several = "" if learning.read.failures == 1 else "s"
-        text = f"{learning.read.failures:,} episode{several} ended with {columns.failed}"
+        several = "" if learning.failures == 1 else "s"
+        text = f"{learning.failures:,} episode{several} ended with {columns.failed}"
         left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
         yield "failures", text + (left_out if noted.after_failure else "")
     hole = columns.longest_hole
@@ -481,7 +477,7 @@ def read_otherwise(
         yield "resampled", f"{means} (--resample {step:g}s,NAME=max: others are min, last)"
     if noted.crossed:
         yield "holes", f"{noted.crossed:,} of at most {hole:g} s (--hole) cost a transition each"
-    if jumps := learning.read.jumps:
+    if jumps := learning.jumps:
         yield "time jumps", f"{jumps:,}; each begins an episode (a longer --hole bridges them)"
     if noted.leaderless:
         nobody = columns.no_leader not in (None, "end")
