@@ -22,23 +22,9 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
-from evofsm import store
+from evofsm import driving, store
 from evofsm.cli.journal import Journal
 from evofsm.cli.show import Advance
-from evofsm.driving import (
-    Episode,
-    Family,
-    LatentRisk,
-    Outcome,
-    Unrevised,
-    dead_ends_of,
-    drive,
-    guard_for_family,
-    learners_of,
-    outcome_of,
-    reference_of,
-    summarise,
-)
 from evofsm.driving.cars import TOLD, name_judge
 from evofsm.driving.naming import DECISION_COLUMNS
 from evofsm.driving.sumo import open_world
@@ -62,7 +48,7 @@ Outcomes = dict[str, Any]
 class Setup:
     """What is asked for."""
 
-    family: Family
+    family: driving.Family
     reviser: str = "least-risk"
     judge: str = "kinematic"
     mode: Mode = Mode.ACT
@@ -80,12 +66,12 @@ class Setup:
         file = source and Path(source).read_text("utf-8")
         return {**settings, "mode": self.mode.value, "file": file}
 
-    def drive(self, guard: Guard, world: World, number: int) -> tuple[Episode, Outcomes]:
+    def drive(self, guard: Guard, world: World, number: int) -> tuple[driving.Episode, Outcomes]:
         """An episode, of a training draw while it learns, of a held-out one else; and its row."""
         draw = self.family.draw(self.seed, number, "train" if self.learn else "test")
-        alone = reference_of(self.family, draw, world)
-        episode = drive(guard, draw, world)
-        outcome = outcome_of(episode, alone)
+        alone = driving.reference_of(self.family, draw, world)
+        episode = driving.drive(guard, draw, world)
+        outcome = driving.outcome_of(episode, alone)
         return episode, {"episode": number, "variant": draw.variant, **outcome._asdict()}
 
 
@@ -98,10 +84,10 @@ def load_guard(folder: Path) -> tuple[Guard, int]:
 def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     """A guard whose reviser and judge have the setup's names, with what was learnt before."""
     family = setup.family
-    machine, judge = (None, None) if before is None else learners_of(before)
+    machine, judge = (None, None) if before is None else driving.learners_of(before)
     if judge is not None and (kind := name_judge(judge)) != setup.judge:
         raise ValueError(f"what was learnt is of the judge {kind!r}, not of {setup.judge!r}")
-    guard = guard_for_family(
+    guard = driving.guard_for_family(
         family,
         tolerance=setup.tolerance,
         mode=setup.mode,
@@ -113,7 +99,7 @@ def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     if setup.reviser == "least-risk":
         return guard
     learners: dict[str, Any] = {"machine": guard.machine, "judge": guard.judge}
-    reviser = Unrevised(family.actions)
+    reviser = driving.Unrevised(family.actions)
     return Guard.of(reviser, interval=family.interval, learn=setup.learn, **learners)
 
 
@@ -175,15 +161,17 @@ class Results:
     def summed_up(self, episodes: int) -> Row:
         """What came of so many episodes; written to the folder, if there is one."""
         setup, rows = self.setup, [self.rows[number] for number in range(episodes)]
-        outcomes = [Outcome(*(row[name] for name in Outcome._fields)) for row in rows]
-        row = summarise(setup.family.name, setup.reviser, outcomes, setup.family.interval)
+        outcomes = [
+            driving.Outcome(*(row[name] for name in driving.Outcome._fields)) for row in rows
+        ]
+        row = driving.summarise(setup.family.name, setup.reviser, outcomes, setup.family.interval)
         if self.folder is not None:
             self._write(self.folder, rows)
         return row
 
     def _write(self, folder: Path, rows: Sequence[Outcomes]) -> None:
         self.save_guard(now=True)
-        names = ["episode", "variant", *Outcome._fields]
+        names = ["episode", "variant", *driving.Outcome._fields]
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\n")
         table.writerows([names, *([row[name] for name in names] for row in rows)])
@@ -211,7 +199,7 @@ def _write_decisions(path: Path, rows: Sequence[Outcomes]) -> None:
         table.write_parquet(file)
 
 
-def _decided(driven: Episode) -> dict[str, list[Any]]:
+def _decided(driven: driving.Episode) -> dict[str, list[Any]]:
     columns = {name: DECISION_COLUMNS[name].read for name in DECISION_TABLE}
     return {name: [read(d) for d in driven.decisions] for name, read in columns.items()}
 
@@ -319,9 +307,9 @@ def told_of(row: Row, results: Results) -> Iterator[tuple[str, str]]:
     interventions = f"{row.intervention_rate:.1%} of decisions"
     yield "interventions", f"{interventions}; mean change {row.mean_change:.2f} m/s²"
     yield "comfort", f"RMS jerk {row.jerk:.2f} m/s³"
-    machine, judge = learners_of(results.guard)
+    machine, judge = driving.learners_of(results.guard)
     states = f"{machine.n_states} states"
-    if isinstance(judge, LatentRisk):
-        states += f", {len(dead_ends_of(machine, judge))} of them dead ends"
+    if isinstance(judge, driving.LatentRisk):
+        states += f", {len(driving.dead_ends_of(machine, judge))} of them dead ends"
     experience = getattr(judge, "told_by_experience", "")
     yield "learnt", f"{states}; {experience}" if experience else states

@@ -19,21 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm import driving
 from evofsm.cli.learning import episodes_read, learn_chunk
 from evofsm.cli.options import BRAKES, Reading, refuse_other_limit, require_world
 from evofsm.cli.show import progress, warn
 from evofsm.cli.sumocfg import trace_configuration
 from evofsm.cli.watch import shown
-from evofsm.driving import (
-    Family,
-    LatentRisk,
-    drive,
-    guard_for_family,
-    learners_of,
-    load_family,
-    teach,
-    unrevised_guard,
-)
 from evofsm.driving.cars import assumptions, guard_of_monitor, name_judge
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.driving.sumo import open_world
@@ -100,9 +91,9 @@ _ENV_NAMES = {
 }
 
 
-def watched_guard(family: Family, **settings: Any) -> Guard:
+def watched_guard(family: driving.Family, **settings: Any) -> Guard:
     """A guard for cars that has seen nothing, with few enough states to look at."""
-    return guard_for_family(family, rule=WATCHED_RULE, **settings)
+    return driving.guard_for_family(family, rule=WATCHED_RULE, **settings)
 
 
 def learn_first(
@@ -134,7 +125,7 @@ class OnRoads:
 
     of_cars = True
 
-    def __init__(self, family: Family, world: World, seed: int = 0) -> None:
+    def __init__(self, family: driving.Family, world: World, seed: int = 0) -> None:
         self.family, self.world, self.seed = family, world, seed
         self.name, self.about, self.interval = family.name, family.about, family.interval
         self.labels = family.labels
@@ -143,14 +134,14 @@ class OnRoads:
 
     def teach(self, guard: Guard, index: int) -> None:
         """Let a guard learn from a draw that nobody watches."""
-        teach(guard, [self.family.draw(self.seed + 1, index)])
+        driving.teach(guard, [self.family.draw(self.seed + 1, index)])
 
     def begin(self, case: int) -> None:
         """Put the cars on the road."""
         self.close()
         draw = self.family.draw(self.seed, case)
         self._controller = draw.controller
-        alone = drive(unrevised_guard(self.family), draw, self.world)
+        alone = driving.drive(driving.unrevised_guard(self.family), draw, self.world)
         self.alone = float(alone.time[-1]) if alone.collided else math.inf
         self._road = self._closing.enter_context(self.world.open(draw.scenario))
         self._steps = draw.scenario.steps(self.interval)
@@ -547,7 +538,7 @@ class Session(AbstractContextManager["Session"]):
         self, system: System | Logged, guard: Guard, *, case: int = 0, on: bool = True
     ) -> None:
         self.system, self.case = system, case
-        self.machine, self.judge = learners_of(guard)
+        self.machine, self.judge = driving.learners_of(guard)
         self._guard, self._reviser = guard, guard.reviser
         self._tolerance = float(self._reviser.tolerance)  # type: ignore[attr-defined]
         guard.explaining = True
@@ -669,7 +660,7 @@ class Session(AbstractContextManager["Session"]):
         actions, self._wanted = self._guard.actions, revision.executed
         if is_usable(actions, revision.proposed):
             self._wanted = put_into(actions, revision.proposed)
-        safest = actions.low if isinstance(self.judge, LatentRisk) else revision.advised
+        safest = actions.low if isinstance(self.judge, driving.LatentRisk) else revision.advised
         candidates = np.array([self._wanted, revision.executed, safest], np.float64)
         self._judged = self.judge.judge(situation, candidates)
 
@@ -678,7 +669,7 @@ class Session(AbstractContextManager["Session"]):
         if isinstance(judge, Foresight):
             return {}
         why = judge.why(judged) if judged.risk[0] > self._tolerance else ""
-        if isinstance(judge, LatentRisk):
+        if isinstance(judge, driving.LatentRisk):
             quantile = judge.manoeuvres.exceeded_by
             return {"needed": quantile(self._tolerance), "usual": quantile(0.5), "why": why}
         assert isinstance(judge, LearntRisk)
@@ -702,7 +693,7 @@ def watched_run(
         guard = system.guard
     else:
         require_world(world)
-        family = load_family(what)
+        family = driving.load_family(what)
         system = OnRoads(family, open_world(world), seed)
         guard = watched_guard(family, judge=judge, tolerance=tolerance)
     with progress("Learning first", learnt) as move:
