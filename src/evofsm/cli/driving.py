@@ -1,8 +1,4 @@
-"""Drive a family of scenarios under a reviser: in turn and learning, or many episodes at once.
-
-What came of an episode is a row. Where there is a folder, rows are written as they come, and the
-same work goes on from them after whatever ended it.
-"""
+"""Drive a family of scenarios under a reviser: in turn and learning, or many episodes at once."""
 
 from __future__ import annotations
 
@@ -244,10 +240,7 @@ def drive_in_turn(
 def drive_at_once(
     results: Results, episodes: int, workers: int, move: Advance = lambda *_, **__: None
 ) -> Row:
-    """Drive those held-out episodes that the results lack, by many workers.
-
-    What comes of it does not depend on who drives, nor on what happens to them.
-    """
+    """Drive those held-out episodes that the results lack; who drives them makes no odds."""
     guard = results.guard.copy(states=False)  # what is decided does not depend on them
     guard.freeze()
     numbers = [number for number in range(episodes) if number not in results.rows]

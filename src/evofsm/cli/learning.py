@@ -218,10 +218,7 @@ def episodes_read(
     dated: bool,
     fewest: int = 2,
 ) -> Iterator[Chunk]:
-    """The episodes of a log that have so many rows; then what was noticed.
-
-    They have dates where these are wanted, and where the log has some.
-    """
+    """The episodes of a log of so many rows, dated if they shall be; then what was noticed."""
     for episode in episodes_of(reading.traces([path], notes)):
         if len(episode.times) >= fewest:
             yield episode._replace(times=episode.times + notes.began) if dated else episode

@@ -333,10 +333,7 @@ def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
 
 
 def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
-    """A command that has the options of `reading_of` in place of its parameter ``reading``.
-
-    That is given `reading_of` with what was typed; an option that a command has itself is its own.
-    """
+    """A command that has the options of `reading_of`, but for its own, in place of ``reading``."""
     parameters = signature(command, eval_str=True).parameters
     options = signature(reading_of, eval_str=True).parameters
     log_options = {name: parameter for name, parameter in options.items() if name not in parameters}

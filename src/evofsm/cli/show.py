@@ -70,10 +70,7 @@ def table(
     bold: Collection[int] = (),
     whole: bool = False,
 ) -> RenderableType:
-    """Cells below one another; ``left`` are the columns set to the left, ``bold`` rows set off.
-
-    With ``whole`` only those to the left may be folded.
-    """
+    """Cells below one another; ``left`` are columns to the left, which alone fold if ``whole``."""
     grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1, 0, 0))
     grid.title, grid.title_justify, grid.title_style = Text(title, "bold"), "left", ""
     for place, name in enumerate(header):
@@ -154,10 +151,7 @@ Advance = Callable[..., None]
 
 @contextmanager
 def progress(text: str, total: float | None = None) -> Iterator[Advance]:
-    """A bar on standard error, none where nobody watches; yields a function that moves it.
-
-    The function takes how much is done, or `advance`, `total` and `description`.
-    """
+    """A bar on standard error, if somebody watches; yields what moves it: done, or `advance=`."""
     is_unwatched = not sys.stderr.isatty()
     with Progress(console=Console(stderr=True), transient=True, disable=is_unwatched) as bars:
         task = bars.add_task(text, total=total)

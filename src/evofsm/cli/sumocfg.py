@@ -17,10 +17,7 @@ from evofsm.extras import needs
 def run_configuration(
     file: Path, vehicles: str, mode: str, tolerance: float, *, as_json: bool
 ) -> None:
-    """Run it to its end, or until all cars have arrived, and print what came of it.
-
-    That is as `Attachment.summary` has it; where guards act, without them as well.
-    """
+    """Run it to its end, or until all cars have arrived, and print `Attachment.summary` of it."""
     if mode not in ("act", "shadow"):
         raise ValueError(f"--mode is {mode!r}; for a configuration it is act or shadow")
     by_ids = not (vehicles == "all" or vehicles.startswith("type:") or vehicles.endswith("%"))

@@ -1,11 +1,7 @@
 """Decisions written as MCAP, or shown live in Foxglove or Lichtblick, by Foxglove's own library.
 
-What was seen (``/observation``), where that is (``/belief``), how dangerous (``/risk``), and what
-was done about it (``/decision``); ``/event``, and ``/log`` for Foxglove's log panel. The messages
-are JSON with schemas that name every unit, those of ``/log`` Foxglove's own type. What is not
-known is left out of a message: JSON has no NaN, and the schemas have one type for each field.
-`FOXGLOVE_LAYOUT` shows files and what is live alike. Nothing leaves this computer unless another
-host is told.
+The messages are JSON with schemas that name every unit. What is not known is left out of one: JSON
+has no NaN, and the schemas have one type for each field. `FOXGLOVE_LAYOUT` shows them.
 """
 
 from __future__ import annotations

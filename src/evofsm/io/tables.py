@@ -462,14 +462,11 @@ class Dialect:
 
 
 class CsvTable(Table):
-    """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
+    """A CSV file, gzipped or not, with a header; fields end at a comma, semicolon, tab or space.
 
-    Without any of these they end at a space. At a semicolon, a number may have a decimal comma; at
-    a tab where the first rows have one. The header is the line that has most of the names that are
-    looked for; what stands above is passed over, and one further down, as in files that were
-    appended to another, names the columns anew.
-    polars reads blocks of plain lines; Python's own reader, which is slower, blocks with anything
-    odd, such as a line break within quotes, and what a message is to name.
+    The header is the line that has most of the names that are looked for; one further down names
+    the columns anew. polars reads blocks of plain lines; Python's own reader, which is slower,
+    blocks with anything odd, such as a line break within quotes, and what a message is to name.
     """
 
     def __init__(self, path: str, names: Collection[str] = (), skips: Skips | None = None) -> None:

@@ -250,10 +250,7 @@ def _queues(cars: Sequence[_Car], lengths: VehicleLengths) -> Iterator[Following
 
 
 def _across(apart: Any, headings: Any) -> Any:
-    """How far two are apart across the way, in the complex plane.
-
-    On a bend a chord has the mean of the headings at its ends, of which this is given the sum.
-    """
+    """How far apart two are across the way, in the complex plane, by the sum of their headings."""
     return abs((apart * headings.conjugate()).imag) / (abs(headings) + 1e-9)
 
 
@@ -318,11 +315,9 @@ def fcd_of_xml(path: str, skips: Skips) -> Iterator[_Timestep]:
 
 
 def fcd_of_table(table: Table) -> Iterator[_Timestep] | None:
-    """Read FCD in CSV or Parquet: a row per vehicle, consecutive rows of a time together.
+    """Read FCD in CSV or Parquet, rows of a time together; None of another table.
 
-    Nothing where a table is none. SUMO names columns after what it writes first, be it a person;
-    with --output.column-header full by all tags around it, with plain by none; its xml2csv names
-    vehicles and persons apart.
+    SUMO names columns after what it writes first, be it a person; or by --output.column-header.
     """
     columns = table.columns
     if list(columns) == ["timestep_time"]:  # all that SUMO writes of an empty road

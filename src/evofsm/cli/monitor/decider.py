@@ -1,8 +1,4 @@
-"""A guard that is asked by messages: a message in, an answer out, and no input or output.
-
-The same messages bring the same answers, whatever carried them; what is refused leaves the guard
-as it was.
-"""
+"""A guard that is asked by messages: the same ones bring the same answers, whoever carries."""
 
 from __future__ import annotations
 

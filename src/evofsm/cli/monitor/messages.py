@@ -1,8 +1,4 @@
-"""The messages of a monitor: what a line may hold, checked before anything is done with it.
-
-A message is a JSON object on a line of its own; ``docs/monitor.md`` describes each key. `msgspec`
-checks types and ranges; here the key and the value are added to what it says.
-"""
+"""The messages of a monitor (docs/monitor.md), checked before anything is done with one."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Live rows, read as a log is: in CSV too, which count, what failed, those of a step as one.
-
-The options are those of ``evofsm learn``, `evofsm.io.LogColumns`; what comes is the same.
-"""
+"""Live rows, read as a log is: in CSV too, which count, what failed, those of a step as one."""
 
 from __future__ import annotations
 
@@ -204,10 +201,7 @@ class CsvRows:
         raise MessageError(about, self.unread.removeprefix(f"{about} "))
 
     def _has_units(self, text: str) -> bool:
-        """Whether a line below the names tells units, or the like; the first row tells the dialect.
-
-        That is the first line in which anything is a number, or a date.
-        """
+        """Whether a line below the names tells units, or the like; the first row tells the rest."""
         if self._dialect is not None:
             return False
         self._below.append(text)

@@ -1,9 +1,7 @@
 """How a monitor goes on bit for bit after whatever ended it.
 
 Two files: the guard as it was between two episodes, replaced whole, and beside it a journal of the
-messages since then. A message is in the journal before it is answered; a monitor that begins takes
-them all in again, and is where it was. What was not answered is sent again by whoever sent it. A
-process that is killed loses nothing, a power cut what the system had not yet written.
+messages since then, each written before it is answered, which are taken in again.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """How messages come and go: pipes, files, a UNIX socket, UDP on this computer, Zenoh.
 
-Each transport reads in threads of its own and has a `Server` answer, until the input ends or the
-process is asked to stop. A peer that sends junk, vanishes or does not read is no reason to end.
+A peer that sends junk, vanishes or does not read is no reason to end.
 """
 
 from __future__ import annotations
@@ -88,10 +87,7 @@ class Server:
             return self._line(self.decider.error("line", fault))
 
     def run(self, transport: Transport) -> None:
-        """Serve until the input ends, or SIGTERM, SIGHUP or Ctrl-C comes; no decision is cut short.
-
-        This thread waits, and decides on what waits; another one reads.
-        """
+        """Serve until the input ends, SIGTERM, SIGHUP or Ctrl-C; no decision is cut short."""
         threading.Thread(target=self._serve, args=(transport,), daemon=True).start()
         try:
             with _stoppable():
@@ -169,10 +165,7 @@ class Stream:
 
 
 class SocketTransport:
-    """Answers whoever connects to a UNIX socket; several peers speak of the same car.
-
-    A peer that does not read waits for itself alone.
-    """
+    """Answers whoever connects to a UNIX socket; who does not read waits for itself alone."""
 
     def __init__(self, path: Path) -> None:
         if not hasattr(socket, "AF_UNIX"):
@@ -281,11 +274,7 @@ class UdpTransport:
 
 
 class ZenohTransport:
-    """Takes messages that are put under ``KEY/row``, and puts answers under ``KEY/decision``.
-
-    The session is configured by the file that the variable ``ZENOH_CONFIG`` names, where it is
-    set; else it finds peers and routers of its network by itself.
-    """
+    """Takes messages under ``KEY/row``, and puts answers under ``KEY/decision``."""
 
     def __init__(self, key: str) -> None:
         with needs("eclipse-zenoh", "zenoh", "Zenoh"):

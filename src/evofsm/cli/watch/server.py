@@ -1,10 +1,7 @@
 """The live page's server and its player: one page, one socket, for this computer alone.
 
-Whoever may see and steer a run must know the token in the address. Names other than this
-computer's own are refused (a page elsewhere could have its name point here), and so are pages of
-other origins; its own may come with any port, as through a tunnel or from a container. Nobody who
-looks on can hold the run up: nobody is waited for, and whoever reads too slowly is cut off, comes
-again, and is shown all of it at once.
+Whoever may see and steer a run must know the token in the address; names other than this computer's
+own are refused, and pages of other origins. Who reads too slowly is cut off, and comes again.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Drives a system decision by decision and shows every one; the guard goes on learning.
-
-A system is a family of scenarios for cars, or any environment of Gymnasium with a controller. A log
-is played row by row beside a guard.
-"""
+"""Drives a system decision by decision, or plays a log row by row beside a guard, and shows it."""
 
 from __future__ import annotations
 
@@ -101,9 +97,8 @@ def learn_first(
 ) -> None:
     """Drive a system for a while, in draws that are not watched, to learn.
 
-    An environment's controller drives alone in the first half: it fails more often, which is what
-    is learnt. In the second half the guard acts, and comes to kinds of failure that are farther
-    off; that is over once it prevented all of some in a row.
+    In the first half an environment's controller drives alone: it fails more often. Then the guard
+    acts, until it prevented all of some in a row.
     """
     streak = 0
     for index in range(episodes):
@@ -195,11 +190,7 @@ def system_machine(n_actions: int, seen: NDArray[np.float64]) -> EvolvingFSM:
 
 
 class Simulated:
-    """An environment of Gymnasium and a controller, which acts at random where none is given.
-
-    Its guard is given nothing but which episodes failed: those that are terminated, or of which
-    ``failed`` says so after a step, as in `evofsm.guard.RevisedActions`.
-    """
+    """An environment of Gymnasium and a controller, which acts at random where none is given."""
 
     of_cars = False
 
@@ -319,12 +310,7 @@ def _ends(name: str, space: Any) -> dict[str, Any]:
 
 
 def read_simulated(what: str, **settings: Any) -> Simulated | None:
-    """An environment by its id, or what a file of Python defines; None where it is none.
-
-    The file has a function ``environment()``, and may have ``controller(observation, random)``,
-    which returns an action (``random`` is a NumPy generator), ``failed(step)``, as
-    `evofsm.guard.RevisedActions` takes it, and ``variables``, their names.
-    """
+    """An environment by its id, or as a file of Python defines it (docs/watch.md); None of none."""
     if what.endswith(".py"):
         try:
             definitions = runpy.run_path(what)

@@ -184,10 +184,7 @@ class Graph(NamedTuple):
 
 
 def graph_of(known: EvolvingFSM, judge: LearningJudge | None = None, number: int = 0) -> Graph:
-    """The states, and their usual ways out, from a frame on.
-
-    Only a `LatentRisk` says which are dead ends; else those are marked in which a failure ended.
-    """
+    """The states, and their usual ways out; dead ends are marked, or where failures ended."""
     marks = [count > 0.5 for count in known.endings.tolist()]
     if isinstance(judge, LatentRisk):
         dead_ends = dead_ends_of(known, judge)
