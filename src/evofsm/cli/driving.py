@@ -200,9 +200,6 @@ def _decided(driven: driving.Episode) -> dict[str, list[Any]]:
     return {name: [read(d) for d in driven.decisions] for name, read in columns.items()}
 
 
-# -- In turn --------------------------------------------------------------------------------------
-
-
 def log_of(audit: Path | None, mcap: Path | None) -> AbstractContextManager[Any]:
     """What records the decisions; None where nobody wants them."""
     if mcap is not None:
@@ -232,9 +229,6 @@ def drive_in_turn(
             results.save_guard()
         move(len(results.rows))
     return results.summed_up(episodes)
-
-
-# -- At once --------------------------------------------------------------------------------------
 
 
 def drive_at_once(
@@ -278,9 +272,6 @@ def _begin_work() -> None:
         os._exit(1)
 
     Thread(target=end_with_parent, daemon=True).start()
-
-
-# -- What came of it ------------------------------------------------------------------------------
 
 
 def told_of(row: Row, results: Results) -> Iterator[tuple[str, str]]:

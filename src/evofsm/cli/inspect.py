@@ -46,9 +46,6 @@ def inspect(
     show(facts("Model", of_file), *models.tables_of(model))
 
 
-# -- Of one situation -----------------------------------------------------------------------------
-
-
 def explain(
     file: Saved,
     observation: Annotated[
@@ -110,9 +107,6 @@ def _values(text: str) -> list[float]:
         return [float(value) for value in text.split(",")]
     except ValueError:
         raise ValueError(f"--observation is {text!r}; write numbers, such as 9,24,24") from None
-
-
-# -- For other tools ------------------------------------------------------------------------------
 
 
 def export(

@@ -91,9 +91,6 @@ def draw(model: FSMModel, guard: Guard | None, out: Path, logged: Any, title: st
             plot.states(model, figure.subplots(), variables=(first, second), ways=True, **logged)
 
 
-# -- As a whole -----------------------------------------------------------------------------------
-
-
 def passages(model: FSMModel) -> list[dict[str, Any]]:
     """The transitions between states that were recognised most often.
 

@@ -135,9 +135,6 @@ class _File:
             self._mcap.close()
 
 
-# -- A logger of decisions ------------------------------------------------------------------------
-
-
 class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
     """Shows what a guard sees and decides: ``guard.audit = FoxgloveSink()``.
 

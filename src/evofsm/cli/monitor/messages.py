@@ -138,16 +138,16 @@ class Form:
         try:
             if unknown := [key for key in body if key not in kind.__annotations__]:
                 raise MessageError(unknown[0][:_LETTERS], _unknown(kind.__annotations__))
-            told = msgspec.convert(body, kind)
+            fields = msgspec.convert(body, kind)
             if kind is self._end:
-                return self._of_end(told)
+                return self._of_end(fields)
             if kind is self._scene:
-                return self._of_scene(told)
-            also = tuple(told.get(key) for key in self._others)
-            if (time := self._when(told)) is None:
+                return self._of_scene(fields)
+            also = tuple(fields.get(key) for key in self._others)
+            if (time := self._when(fields)) is None:
                 names = "".join(f", or {name!r}" for name in self._clocks)
                 raise MessageError("time", f"is missing{names}; every message of its kind has it")
-            return Row(time, self._observed(told), _frozen(told), told=also)
+            return Row(time, self._observed(fields), _frozen(fields), told=also)
         except MessageError as error:
             error.time = _time(body)
             raise

@@ -161,9 +161,6 @@ class Stream:
         """Others opened them."""
 
 
-# -- A UNIX socket --------------------------------------------------------------------------------
-
-
 class SocketTransport:
     """Answers whoever connects to a UNIX socket; who does not read waits for itself alone."""
 
@@ -235,9 +232,6 @@ def _make_way(path: Path) -> None:
     path.unlink(missing_ok=True)
 
 
-# -- UDP ------------------------------------------------------------------------------------------
-
-
 class UdpTransport:
     """Answers datagrams from this computer, a line or some of them in each, to their senders."""
 
@@ -268,9 +262,6 @@ class UdpTransport:
     def close(self) -> None:
         """Let others have the port."""
         self._socket.close()
-
-
-# -- Zenoh ----------------------------------------------------------------------------------------
 
 
 class ZenohTransport:

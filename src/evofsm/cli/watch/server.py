@@ -55,9 +55,6 @@ _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # junk on the socket is nobody's traceback
 
 
-# -- The run --------------------------------------------------------------------------------------
-
-
 class Clock(NamedTuple):
     """How the run is being played."""
 
@@ -173,9 +170,6 @@ class Player:
 
     def _clock(self) -> Clock:
         return Clock(self._paused, self._speed, self._watched.revising, self._over)
-
-
-# -- The page -------------------------------------------------------------------------------------
 
 
 def message(kind: str, what: Any, start: Start | None = None) -> str:
