@@ -15,7 +15,7 @@ _KEEP = (
     "Keep the head where the log is not. Without it (--head) neither an end that is cut off nor a "
     "log that is written anew can be detected."
 )
-_FIELDS = 5  # so many fields that differ are shown.
+_FIELDS = 5  # so many fields that differ are shown
 
 
 def audit(

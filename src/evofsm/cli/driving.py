@@ -31,11 +31,11 @@ from evofsm.guard import TOLERANCE, AuditLog, DecisionLogger, Guard, Mode
 
 #: The columns of ``decisions.parquet`` after ``episode``; `driving/naming.py` says which they are.
 DECISION_TABLE = tuple(name for name, column in DECISION_COLUMNS.items() if column.in_table)
-GUARD = "guard.evofsm"  #: the guard in a folder of results.
+GUARD = "guard.evofsm"  #: the guard in a folder of results
 
 _JOURNAL, _DECISIONS, _EPISODES = "episodes.jsonl", "decisions.parquet", "episodes.csv"
-_EVERY = 60.0  # the guard is saved so often while it learns [s].
-_BATCH = 20  # so many episodes are one task of a worker: some 500 ms.
+_EVERY = 60.0  # the guard is saved so often while it learns [s]
+_BATCH = 20  # so many episodes are one task of a worker: some 500 ms
 
 Outcomes = dict[str, Any]
 
@@ -108,8 +108,7 @@ class Results:
     def __init__(self, setup: Setup, guard: Guard, folder: Path | None = None) -> None:
         self.setup = setup
         self.folder = folder
-        #: As the guard is after all `rows`, where it learns.
-        self.guard = guard
+        self.guard = guard  #: as the guard is after all `rows`, where it learns
         self.rows: dict[int, Outcomes] = {}
         self._journal: Journal | None = None
         self._saved = time.monotonic()

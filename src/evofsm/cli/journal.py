@@ -19,7 +19,7 @@ import msgspec
 from evofsm import store
 from evofsm.guard.audit_log import lines
 
-_LONGEST_RECORD = 1 << 20  # a record has at most so many bytes.
+_LONGEST_RECORD = 1 << 20  # a record has at most so many bytes
 
 Record = Mapping[str, Any]
 

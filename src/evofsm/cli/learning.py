@@ -34,7 +34,7 @@ _CALLED = re.compile(_WORD + "((?i:km[/_ ]?p?h|kph|mph|knots|feet|ft|cm|mm|km))[
 _TIME_CALLED = re.compile(_WORD + "((?i:ms|us|ns))(?:ec)?[^A-Za-z]*$")
 # Units of time that logs are in, of which that counts by which a row comes every 0.1 s or so.
 _SHORTER = ("ms", "us", "ns")
-_MATCHES = 0.02  # so near must a unit come to what two columns differ by, to be named.
+_MATCHES = 0.02  # so near must a unit come to what two columns differ by, to be named
 # What is said of what was left out, where it is no row.
 _LEFT_OUT = {
     "comment": "comments between rows were passed over",

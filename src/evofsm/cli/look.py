@@ -29,8 +29,8 @@ _MOST_FIELDS, _ROWS_LOOKED_AT, _MOST_TEXTS = 20_000_000, 500_000, 12
 _EPOCHS = {"ns": 1e9, "us": 1e6, "ms": 1e3, "s": 1.0}  # times since 1970 are larger by far
 _COLUMNS_SHOWN = 40  # columns
 _SIGNS = "<>=! "  # what in a name of a condition is ambiguous
-_FAR = 2.0  # far outside is what lies so many ranges of 99 % of the rows beyond them.
-_NEAR = 3  # rows before a failure that are never proposed to be left out.
+_FAR = 2.0  # far outside is what lies so many ranges of 99 % of the rows beyond them
+_NEAR = 3  # rows before a failure that are never proposed to be left out
 # A larger share of steps, and so many, that are no usual one make no clock.
 _ODD, _MANY = 0.001, 10
 _TIME = re.compile("(ts?|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)

@@ -24,7 +24,7 @@ from evofsm.guard.learnt.failure import telling
 _MODELS = ("guard.evofsm", "model.evofsm")
 # So many states are listed, those with most of the time, and so many transitions between them.
 _STATES_LISTED, _PASSAGES = 20, 12
-_ROWS_SHOWN = 20_000  # of a longer log so many rows are drawn.
+_ROWS_SHOWN = 20_000  # of a longer log so many rows are drawn
 
 
 def load_model(place: Path) -> tuple[FSMModel, store.Header, Guard | None]:

@@ -206,8 +206,7 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
                 raise FileExistsError(f"{fspath(file)} exists; it was left alone") from None
             self._file = _File(writer, context)
             self._open.callback(self._file.close)
-        #: Where it is served; None without a port.
-        self.address: str | None = None
+        self.address: str | None = None  #: where it is served; None without a port
         self._episode = self._start = 0  # its number, and when it began [ns]
         if port is not None:
             server = foxglove.start_server(name="evofsm", host=host, port=port, context=context)

@@ -33,12 +33,12 @@ Bools = NDArray[np.bool_]
 USUAL_EPISODE = ("run", "pair", "segment", "episode")
 #: Steps longer than the usual one times this, or as much shorter, begin a new episode.
 LONGEST_STEP = 1.5
-_FIRST_ROWS = 8192  # rows of a file whose steps tell the usual one.
-SKIPPED = 10  #: bad rows of a file that are left out where nobody said how many.
+_FIRST_ROWS = 8192  # rows of a file whose steps tell the usual one
+SKIPPED = 10  #: bad rows of a file that are left out where nobody said how many
 # Signals are joined where so many values of each and no whole row are among the first ones.
 _FEWEST_VALUES = 5
-OLDEST = 0.5  #: so old may a value be that is held, as `Topics` has it [s].
-_SAME_STEP = 0.05  # share by which the usual steps of two files may differ.
+OLDEST = 0.5  #: so old may a value be that is held, as `Topics` has it [s]
+_SAME_STEP = 0.05  # share by which the usual steps of two files may differ
 # Numbers that stand for none, where they are so many times as far out as all others of a column.
 _STAND_INS = [999, 9999, 99999, 999999, 32767, 32768, 65535, 2**31 - 1, 2**31, 2**32 - 1]
 _FAR_OUT = 3.0
@@ -59,9 +59,9 @@ _NO_ACTION = f" (a missing or failed measurement, or {_HELD}"
 _LEFT_OUT = "? --no-leader end leaves such rows out; or " + _HELD
 _MISSING = " (a missing or failed measurement" + _LEFT_OUT
 _NO_LEADER = " (a missing or failed measurement, or no leader" + _LEFT_OUT
-_MANY_TEXTS = 10  # so many texts of a column are shown.
-BECOME = ("mean", "last", "max", "min")  #: what the values of a step may become.
-_HOLE = 10.0  # in steps of what is resampled, the longest hole within an episode.
+_MANY_TEXTS = 10  # so many texts of a column are shown
+BECOME = ("mean", "last", "max", "min")  #: what the values of a step may become
+_HOLE = 10.0  # in steps of what is resampled, the longest hole within an episode
 # A value in quotes; and what stands between conditions, outside of quotes.
 _IN_QUOTES = re.compile(r"""(["'])(.*)\1$""")
 _OUTSIDE = r"""(?=(?:[^"']|"[^"]*"|'[^']*')*$)"""
@@ -83,8 +83,7 @@ class Chunk(NamedTuple):
     jumps: int = 0  #: episodes that begin because of a hole in time
     #: (K,) rows with which an episode ended in failure; None where nothing tells of failures
     failures: NDArray[np.int64] | None = None
-    #: (E,) who followed whom in them, in a recording of many vehicles
-    names: Sequence[str] = ()
+    names: Sequence[str] = ()  #: (E,) who followed whom in them, in a recording of many vehicles
 
     @property
     def failed(self) -> bool:

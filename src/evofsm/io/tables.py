@@ -78,7 +78,7 @@ SI = {unit: base for base, group in _GROUPS.items() for unit in group}
 _SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": "m/s", "sec": "s"}
 _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
 _COMMENT = re.compile(r"\A\s*(#|%|//)+\s*")  # what stands before the last line of a comment
-MISSING = ("", "na", "n/a", "null", "none")  #: what stands in a field where there is no number.
+MISSING = ("", "na", "n/a", "null", "none")  #: what stands in a field where there is no number
 # By which a comma is known to be a decimal one; groups of three digits it may separate as well.
 _DECIMAL_COMMA = re.compile(r"\s*-?\d+,(\d\d?|\d{4,})\s*")
 # What no text holds.
@@ -290,8 +290,7 @@ class Piece:
     #: Rows that begin an episode, of a table that knows; None where columns tell episodes apart.
     starts: Sequence[int] | None = None
     names: Sequence[str] = ()  #: of these episodes, of a table that knows
-    #: Rows before which something was left out; behind the last one too.
-    anew: Sequence[int] = ()
+    anew: Sequence[int] = ()  #: rows before which something was left out; behind the last one too
     bad: NDArray[np.bool_] = field(init=False)  #: (T,) rows to leave out
 
     def __post_init__(self) -> None:

@@ -28,7 +28,7 @@ from evofsm.store import LARGEST_OBSERVATION
 
 #: The action of a pair of vehicles: what the follower did until the next time.
 ACTION = "a_follower"
-COLUMNS = ("time", *VARIABLES, ACTION)  #: what is known of a pair at one time.
+COLUMNS = ("time", *VARIABLES, ACTION)  #: what is known of a pair at one time
 
 _ROWS_AT_ONCE = 8192
 # Rows that pairs on the road may have waiting before all are handed on, each of 32 bytes. It
@@ -390,7 +390,7 @@ def _refuse_lack(place: str, name: str) -> NoReturn:
 #: The columns that a table of objects has, and by which it is known. ``x`` and ``y`` are of the
 #: middle of the box; units are those of the SI.
 OBJECT_COLUMNS = ("id", "t", "x", "y", "vx", "vy", "length", "lane")
-_TURNS_ABOVE = 0.1  # whoever is slower [m/s] points where it pointed before.
+_TURNS_ABOVE = 0.1  # whoever is slower [m/s] points where it pointed before
 
 
 class Object(NamedTuple):

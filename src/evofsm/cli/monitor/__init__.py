@@ -12,8 +12,8 @@ from typing import Annotated
 from evofsm.cli import options
 from evofsm.cli.options import Reading, argument, option
 
-_SAME_STEP = 0.05  # share by which the step of a log may differ from that of the guard.
-_INTERVAL = 0.1  # of rows of cars, where nobody said another one [s].
+_SAME_STEP = 0.05  # share by which the step of a log may differ from that of the guard
+_INTERVAL = 0.1  # of rows of cars, where nobody said another one [s]
 # What other files end with holds live rows; so does CSV without --summary.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
 # In the beginning of what was saved.

@@ -21,15 +21,15 @@ from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
 from evofsm.io.tables import TIMES, is_number, seconds_of_date
 from evofsm.store import LARGEST_OBSERVATION
 
-SCHEMA = 1  #: the version of the messages.
-LONGEST = 1 << 16  #: a longer line is refused unread [byte].
+SCHEMA = 1  #: the version of the messages
+LONGEST = 1 << 16  #: a longer line is refused unread [byte]
 # Objects that a guard of whole scenes has room for; of more the closest along the road count.
 _MOST_OBJECTS = 64
-_LETTERS = 40  # so much of what is refused is shown, and so long may a name be [letters].
-_LATEST = 1e11  # what is later than this is in another unit [s].
+_LETTERS = 40  # so much of what is refused is shown, and so long may a name be [letters]
+_LATEST = 1e11  # what is later than this is in another unit [s]
 #: What is said of lines of another kind.
 NO_ROW = "rows are JSON, one per line, or CSV below a line that names columns (tail -n +1 -f LOG)"
-_USUAL_WIDTH = 1.8  # where a width is not given [m].
+_USUAL_WIDTH = 1.8  # where a width is not given [m]
 
 _Number = Annotated[float, Meta(ge=-LARGEST_OBSERVATION, le=LARGEST_OBSERVATION)]
 _Place = Annotated[float, Meta(ge=PLACES[0], le=PLACES[1])]

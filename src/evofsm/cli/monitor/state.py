@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 # The guard is written once so many messages are in the journal, as an episode ends.
 _EVERY = 600
 _PROVENANCE = "monitor"
-_NEW = -1  # the mark of a journal that was made just now.
+_NEW = -1  # the mark of a journal that was made just now
 
 
 class State:
@@ -34,8 +34,7 @@ class State:
     def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
         self.path = path.resolve()
         self.settings = dict(settings)
-        #: Why nothing is saved any more; empty as long as it is.
-        self.failure = ""
+        self.failure = ""  #: why nothing is saved any more; empty as long as it is
         self._journal = Journal(
             self.path.with_name(f"{self.path.name}.journal"), {"mark": _NEW}, "name another file"
         )

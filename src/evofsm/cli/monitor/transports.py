@@ -25,10 +25,10 @@ from evofsm.cli.monitor.messages import LONGEST
 from evofsm.extras import needs
 from evofsm.fsm.naming import visible
 
-_CHUNK = 1 << 16  # so much is read at once [byte].
-_MOST_LINES = 100  # so many lines may come in one datagram or sample.
-_POLL = 0.005  # what would block is tried again after so long [s].
-_LONGEST_WAIT = 0.5  # a signal that another thread took is seen after so long [s].
+_CHUNK = 1 << 16  # so much is read at once [byte]
+_MOST_LINES = 100  # so many lines may come in one datagram or sample
+_POLL = 0.005  # what would block is tried again after so long [s]
+_LONGEST_WAIT = 0.5  # a signal that another thread took is seen after so long [s]
 
 
 def json_line(answer: Answer) -> bytes:

@@ -41,15 +41,15 @@ _FOREIGN = (
     "This page answers to the names of its own computer only. From another one, forward a port to "
     "it, ssh -L 9000:127.0.0.1:{} NAME, and open the same address with localhost:9000."
 )
-_MOST_FRAMES = 20_000  # a run keeps so many frames.
+_MOST_FRAMES = 20_000  # a run keeps so many frames
 # Who leaves more unread is cut off, all of a run is less; a command is short [bytes].
 _MOST_UNREAD, _LONGEST_COMMAND = 1 << 26, 512
 _KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
-_NOT_TEXT, _NOT_UNDERSTOOD = 1003, 1008  # close codes (RFC 6455).
+_NOT_TEXT, _NOT_UNDERSTOOD = 1003, 1008  # close codes (RFC 6455)
 
-_GRAPH_EVERY = 8  # between two graphs, unless a state was created [decisions].
-_FOLLOWED = 12.5  # decisions in a second that can be followed.
-_LATE = 0.1  # who is late by more does not hurry to make up for it [s].
+_GRAPH_EVERY = 8  # between two graphs, unless a state was created [decisions]
+_FOLLOWED = 12.5  # decisions in a second that can be followed
+_LATE = 0.1  # who is late by more does not hurry to make up for it [s]
 
 _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # junk on the socket is nobody's traceback

@@ -57,8 +57,8 @@ _STOOD = 3.0
 # Steps of an environment in a second where it does not say; wishes that are tolerable for so many
 # decisions are no danger any more.
 _STEPS_PER_SECOND, _CALM = 10.0, 8
-_SAME_ACTION = 0.02  # a change of an action by less is none [half ranges].
-_LASTED = 10  # so many episodes in a row without a failure tell that a guard has learnt.
+_SAME_ACTION = 0.02  # a change of an action by less is none [half ranges]
+_LASTED = 10  # so many episodes in a row without a failure tell that a guard has learnt
 # An environment that does not end by itself is left after so many decisions, where nobody looks on.
 _MOST_DECISIONS = 2000
 # Seeds of episodes that are learnt from are so far from those that are watched.
@@ -75,7 +75,7 @@ _PLAYED, _A_SECOND = 400, 10.0
 _SHOWS, _TICK, _OTHER_STEP = 10, 5e-4, 0.1
 # What a file may define besides its environment.
 _PARTS = ("controller", "failed", "variables")
-_FEW_VARIABLES = 4  # of more variables only those of the plane are named.
+_FEW_VARIABLES = 4  # of more variables only those of the plane are named
 # What Gymnasium's documentation calls the variables of its environments, with units.
 _ENV_NAMES = {
     "CartPole": "cart position [m], cart velocity [m/s], pole angle [rad], "

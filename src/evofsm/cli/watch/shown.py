@@ -24,13 +24,13 @@ _TTC, _HEADWAY = TimeToCollision(), TimeHeadway()
 # Of each state so many ways out are shown, and none that is rarer.
 _MOST_WAYS, _LEAST_SHARE = 3, 0.02
 
-_MOST_SURVIVED = 500  # observations of what was survived that are shown.
+_MOST_SURVIVED = 500  # observations of what was survived that are shown
 
 #: What is observed of cars.
 OF_CARS = ("gap [m]", "follower's speed [m/s]", "leader's speed [m/s]")
-CALM = 2.0  #: danger is over once wishes were tolerable for so long [s].
-_DEAD_END = 0.5  # a dead end: the best that can be done would as likely as not be too late.
-_LEADER_BRAKES = -2.5  # softer braking is no full brake [m/s²].
+CALM = 2.0  #: danger is over once wishes were tolerable for so long [s]
+_DEAD_END = 0.5  # a dead end: the best that can be done would as likely as not be too late
+_LEADER_BRAKES = -2.5  # softer braking is no full brake [m/s²]
 
 
 class Danger(NamedTuple):

@@ -22,7 +22,7 @@ _BESIDE = (
     "have replaced."
 )
 _ALONE = "This was recorded, and nobody acts. A guard that learnt from the log alarms."
-_COMPONENTS = 3  # components of an action that are told.
+_COMPONENTS = 3  # components of an action that are told
 # A number and its unit stay on one line.
 _UNIT = re.compile(r"(?<=\d) (?=(?:s|m|m/s|m/s²)\b)")
 _HEADLINES = {
