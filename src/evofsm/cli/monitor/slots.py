@@ -130,9 +130,9 @@ class CsvRows:
         #: What messages call the columns that are read.
         self._called = dict(zip(names, names, strict=True)) | dict.fromkeys(action, "proposal")
         self._called[columns.time] = "time"
-        self._header, self._count, self._factors = "", 0, dict[str, float]()
-        self._dialect: Dialect | None = None
-        self._below: list[str] = []  # lines below the names, to the first row
+        self._count, self._factors = 0, dict[str, float]()
+        self._head: list[str] = []  # the line with the names, and those below to the first row
+        self._dialect: Dialect | None = None  # once that row has come
         self._acts, self._may_be_title = acts, not acts  # who drives along sends no log
         self._needs = *variables, *columns.time.split(",")
         self._above: Sequence[str] = ()  # fields of the line before
@@ -153,28 +153,24 @@ class CsvRows:
         except ValueError:
             return line
         self.in_csv = True
-        if is_header := self._names_columns(text):
-            self._header, self._dialect, self._below = text, None, []
+        may_name = any(name in text for name in self._variables)
+        columns = {*Dialect(text, ()).columns} if may_name else set()
+        if may_name and {*self._needs} <= columns:
+            self._head, self._dialect = [text], None
             self._may_be_title, self.unread = False, ""
-        if not self._header:
+            return None
+        if {*self._variables} & columns:  # the names of another log
+            self._head = []
+        if not self._head:
             self._refuse_unnamed(text)
             return None if self._may_be_title or self.unread else line
         try:
-            if is_header or self._has_units(text):
+            if self._dialect is None and self._has_units(text):
                 return None
             assert self._dialect is not None
             return dict(self._told(self._dialect, text))
         except csv.Error as error:
             raise MessageError("line", f"{error} (an unclosed quote?)") from None
-
-    def _names_columns(self, text: str) -> bool:
-        """Whether it names the time and all variables; what names some alone is no header more."""
-        if not any(name in text for name in self._variables):
-            return False
-        columns = Dialect(text, ()).columns
-        if {*self._variables} & {*columns} and not {*self._needs} <= {*columns}:
-            self._header = ""
-        return {*self._needs} <= {*columns}
 
     def _refuse_unnamed(self, text: str) -> None:
         """Raise where a line tells that names are missing above the rows; then now and then."""
@@ -202,19 +198,18 @@ class CsvRows:
 
     def _has_units(self, text: str) -> bool:
         """Whether a line below the names tells units, or the like; the first row tells the rest."""
-        if self._dialect is not None:
-            return False
-        self._below.append(text)
-        dialect, log_units = Dialect(self._header, self._below), self._columns.units
+        self._head.append(text)
+        header, *below = self._head
+        dialect = Dialect(header, below)
         fields = next(csv.reader([text], delimiter=dialect.separator, strict=True))
-        if not any(map(is_value, fields)) and len(self._below) <= Dialect.most_below:
+        if not any(map(is_value, fields)) and len(below) <= Dialect.most_below:
             return True
         numbers = [name for name in dialect.columns if name in self._numbers]
-        units = {name: unit for name, unit in log_units.items() if "%" not in unit}
+        units = {name: unit for name, unit in self._columns.units.items() if "%" not in unit}
         units = {**dialect.units, **units_of(units, numbers)}
         self._factors = {name: UNITS.get(units.get(name, ""), 1.0) for name in numbers}
         self._dialect = dialect
-        return dialect.n_told == len(self._below)
+        return dialect.n_told == len(below)
 
     def _told(self, dialect: Dialect, text: str) -> Iterator[tuple[str, Any]]:
         """What a row tells, by the keys of messages."""
