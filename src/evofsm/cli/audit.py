@@ -69,16 +69,7 @@ def _facts(found: Audit) -> Iterator[tuple[str, str]]:
     if contents.settings:
         text += f", {counted(contents.settings, 'setting change')}"
     yield "holds", text + ("" if breach is None else ", so far")
-    yield from _of_replay(found)
-    if breach is None:
-        yield "head", str(found.head)
-
-
-def _of_replay(found: Audit) -> Iterator[tuple[str, str]]:
-    from evofsm.fsm.validation import counted
-
     difference, n_matches = found.difference, found.replayed
-    decisions = found.contents.decisions
     text = f"{counted(n_matches, 'decision')} as recorded, to the last bit"
     if difference is None:
         yield "replay", text
@@ -89,11 +80,13 @@ def _of_replay(found: Audit) -> Iterator[tuple[str, str]]:
         yield "", f"before it {text}"
     for why in dict.fromkeys(found.not_replayed):
         yield "", f"{counted(found.not_replayed.count(why), 'session')} not replayed: {why}"
-    if difference is None and n_matches < decisions:
-        yield "", f"{counted(decisions - n_matches, 'decision')} compared with nothing"
+    if difference is None and n_matches < contents.decisions:
+        yield "", f"{counted(contents.decisions - n_matches, 'decision')} compared with nothing"
     if difference is not None and found.other_makers:
         makers = ", ".join(f"{field.name} {field.recorded}" for field in found.other_makers)
         yield "", f"it was recorded with {makers}: floats may differ there"
+    if breach is None:
+        yield "head", str(found.head)
 
 
 def check(

@@ -46,21 +46,13 @@ def guard_where_nobody_acts(
     settings: dict[str, Any] = {"dt": float(episodes[0].dt), "horizon": horizon, "hold": hold}
     settings |= {"names": labels.names, "units": labels.units}
     judge = Foresight.learn_log(rows, failed, **settings)
-    return _guard_of(judge, false_a_day, machine, learn=False)
+    return guard_of_alarms(judge, false_a_day, machine, learn=False)
 
 
-def guard_from_zero(
-    dt: float, names: Sequence[str], horizon: float | None, hold: float, false_a_day: float | None
-) -> Guard:
-    """The same, of one that has seen nothing, and learns as it goes."""
-    judge = Foresight.from_zero(dt=dt, names=names, horizon=horizon, hold=hold)
-    machine = EvolvingFSM(1, max_states=200)
-    return _guard_of(judge, false_a_day, machine, learn=True)
-
-
-def _guard_of(
+def guard_of_alarms(
     judge: Foresight, false_a_day: float | None, machine: EvolvingFSM | None, *, learn: bool
 ) -> Guard:
+    """A guard where nobody acts, with so many false alarms a day that are stated."""
     judge.stated = RATE if false_a_day is None else false_a_day
     reviser = ActionReviser(judge, Choices(1), tolerance=_ANY_ALARM, mode=Mode.SHADOW)
     return Guard.of(reviser, interval=judge.dt, machine=machine, learn=learn)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial, wraps
 from importlib.util import find_spec
 from inspect import Parameter, Signature, signature
@@ -311,11 +311,10 @@ def seconds(name: str, text: str) -> float:
     from evofsm.io.tables import TIMES
 
     match = re.fullmatch(r"\s*([0-9.]+)\s*([a-z]*)\s*", text)
-    try:
-        assert match is not None
-        return positive(name, float(match[1])) * (TIMES | {"d": 86400.0})[match[2] or "s"]
-    except (AssertionError, ValueError, KeyError):
-        raise ValueError(f"{name} is {text!r}; write how long, such as 30s, 10min or 1h") from None
+    number, unit = match.groups() if match else ("", "")
+    with suppress(ValueError, KeyError):
+        return positive(name, float(number)) * (TIMES | {"d": 86400.0})[unit or "s"]
+    raise ValueError(f"{name} is {text!r}; write how long, such as 30s, 10min or 1h")
 
 
 def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:

@@ -462,7 +462,12 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
                 )
                 continue
             names.add(obj.id)
-            lanes[obj.lane].append(_pointing(obj, headings))
+            heading = obj.heading
+            if not math.isfinite(heading):
+                moves = math.hypot(obj.vx, obj.vy) >= _TURNS_ABOVE
+                heading = math.atan2(obj.vy, obj.vx) if moves else headings.get(obj.id, math.nan)
+            headings[obj.id] = heading
+            lanes[obj.lane].append(obj._replace(heading=heading))
         has_lanes = has_lanes or bool(lanes)
         pairs = [pair for lane in lanes.values() for pair in _following(scene, lane)]
         yield Moment(scene.time, scene.place, pairs)
@@ -471,15 +476,6 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
             f"{path}: no object is on a lane, and who follows whom is told by lanes (recorded "
             "without a map? assign the lanes first)"
         )
-
-
-def _pointing(obj: Object, pointed: dict[str, float]) -> Object:
-    heading = obj.heading
-    if not math.isfinite(heading):
-        moves = math.hypot(obj.vx, obj.vy) >= _TURNS_ABOVE
-        heading = math.atan2(obj.vy, obj.vx) if moves else pointed.get(obj.id, math.nan)
-    pointed[obj.id] = heading
-    return obj._replace(heading=heading)
 
 
 def _following(scene: Scene, lane: Sequence[Object]) -> Iterator[Following]:

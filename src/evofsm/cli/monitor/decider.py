@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli.foreseen import guard_from_zero
+from evofsm.cli.foreseen import guard_of_alarms
 from evofsm.cli.monitor.messages import (
     NO_ROW,
     SCHEMA,
@@ -33,6 +33,7 @@ from evofsm.cli.show import plain
 from evofsm.driving import Object, Scene
 from evofsm.driving.judge import SLIGHT, LatentRisk
 from evofsm.driving.traffic import COLUMNS, TrafficRisk
+from evofsm.fsm import EvolvingFSM
 from evofsm.fsm.validation import probability
 from evofsm.guard import (
     ActionReviser,
@@ -422,7 +423,9 @@ def begun(
     if not acts and told:
         raise ValueError("--action '' says that nobody acts, and goes with no range of actions")
     if not acts:
-        return guard_from_zero(step, names, *alarms)
+        horizon, hold, false_a_day = alarms
+        judge = Foresight.from_zero(dt=step, names=names, horizon=horizon, hold=hold)
+        return guard_of_alarms(judge, false_a_day, EvolvingFSM(1, max_states=200), learn=True)
     if not told:
         raise ValueError("say who acts: --low and --high, --n-actions; or --action '', if nobody")
     for name in {"low", "high"} & {*told}:
@@ -437,11 +440,10 @@ def begun(
         return condition.holds_of(dict(zip(names, z, strict=True)))
 
     is_told = columns.failed and {term.column for term in condition.terms} <= {*names}
-    judge = LearntRisk(step, horizon=alarms[0], names=names, **told)
     return Guard(
         **told,
         interval=step,
-        judge=judge,
+        judge=LearntRisk(step, horizon=alarms[0], names=names, **told),
         failed=failed if is_told else None,
         tolerance=TOLERANCE if tolerance is None else tolerance,
         mode=Mode.SHADOW,
