@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from rich.console import RenderableType
 
 from evofsm.cli.options import picture
 from evofsm.cli.show import facts, print_json, show, table
@@ -19,11 +21,7 @@ from evofsm.guard.foresight import DATES, RATE, RATES, Runs, false_times, span
 from evofsm.io import Chunk
 from evofsm.io.tables import date
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from rich.console import RenderableType
-
-    Floats = NDArray[np.float64]
+Floats = NDArray[np.float64]
 
 # Less than the share of alarms of any kind that are right: which alarm it is the judge says.
 _ANY_ALARM = 1e-6

@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from evofsm.cli import options
 from evofsm.cli.options import Reading, argument, option
-
-if TYPE_CHECKING:
-    from evofsm.guard import Guard
-    from evofsm.io import Chunk
 
 
 @options.reads_logs
@@ -60,8 +56,8 @@ def learn(
     from evofsm.cli import foreseen, learning
     from evofsm.cli.models import tables_of
     from evofsm.cli.show import facts, print_json, progress, say, show, warn
-    from evofsm.guard import Foresight
-    from evofsm.io import episodes_of
+    from evofsm.guard import Foresight, Guard
+    from evofsm.io import Chunk, episodes_of
     from evofsm.io.logs import Noted
 
     learning.check_out(out)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
+from rich.console import RenderableType
 
 from evofsm.cli.learning import refusing
 from evofsm.cli.monitor.decider import HOLE, Answer, Decider
@@ -18,10 +19,6 @@ from evofsm.guard.audit_log import lines
 from evofsm.guard.foresight import span
 from evofsm.io.logs import Chunk
 from evofsm.io.tables import date
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from rich.console import RenderableType
 
 # A line of more bytes is of another kind of file; one that is longer than a message is refused.
 _LONGEST_MESSAGE = 1 << 20

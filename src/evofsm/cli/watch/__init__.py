@@ -9,13 +9,10 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from evofsm.cli import options
 from evofsm.cli.options import Reading, argument, option
-
-if TYPE_CHECKING:
-    from evofsm.cli.watch.session import Session
 
 
 @options.reads_logs
@@ -52,7 +49,19 @@ def watch(
     options.require(websockets="watch")
     from evofsm.cli.show import say
     from evofsm.cli.watch import session
+    from evofsm.cli.watch.server import LivePage, Player
     from evofsm.guard import Guard
+
+    async def serve(run: session.Session) -> None:
+        async with LivePage() as page:
+            page.player = Player(run, page)
+            may = "steer the run" if run.start.live else "look on"
+            say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
+            print(f"  {page.address}", flush=True)
+            if not no_browser:
+                webbrowser.open(page.address)
+            await page.player.play()
+            await asyncio.Event().wait()  # it broke off; the page says why
 
     is_log, log_options = _is_log(what), options.given_of(reading)
     if not is_log and (log_options or guard):
@@ -76,23 +85,8 @@ def watch(
                 what, case or 1, world, judge, tolerance=tolerance, seed=seed, learnt=learn_first
             )
         with run:
-            asyncio.run(_serve(run, browse=not no_browser))
+            asyncio.run(serve(run))
     say("\nThe page is closed.")
-
-
-async def _serve(watched: Session, *, browse: bool) -> None:
-    from evofsm.cli.show import say
-    from evofsm.cli.watch.server import LivePage, Player
-
-    async with LivePage() as page:
-        page.player = Player(watched, page)
-        may = "steer the run" if watched.start.live else "look on"
-        say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
-        print(f"  {page.address}", flush=True)
-        if browse:
-            webbrowser.open(page.address)
-        await page.player.play()
-        await asyncio.Event().wait()  # it broke off; the page says why
 
 
 def _is_log(what: str) -> bool:

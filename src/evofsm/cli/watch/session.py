@@ -26,10 +26,8 @@ from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.driving.sumo import open_world
 from evofsm.driving.world import GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
 from evofsm.extras import needs
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.naming import Labels
+from evofsm.fsm import EvolvingFSM, Labels, Novelty
 from evofsm.fsm.proportions import usual_range
-from evofsm.fsm.rules import Novelty
 from evofsm.guard import (
     BELIEF_TOLERANCE,
     TOLERANCE,
