@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from evofsm.io import Chunk, LogColumns, Topics, VehicleLengths
     from evofsm.io.logs import Noted, Resample
 
-#: Where to drive.
-World = Literal["sumo", "kinematic"]
 #: What a judge was given.
 Judge = Literal["kinematic", "learnt"]
 #: How far a guard goes, as `evofsm.guard.Mode`.
@@ -50,7 +48,9 @@ Saved = Annotated[
     Path, argument("A saved machine, model or guard, or a folder that evofsm drive wrote.")
 ]
 Seed = Annotated[int, option("Seed of all random draws.", min=0)]
-InWorld = Annotated[World, option("SUMO itself, or the same motion in closed form.")]
+InWorld = Annotated[
+    Literal["sumo", "kinematic"], option("SUMO itself, or the same motion in closed form.")
+]
 ByJudge = Annotated[
     Judge, option("Given how cars follow each other, or nothing but which episodes failed.")
 ]

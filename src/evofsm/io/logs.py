@@ -384,7 +384,7 @@ def read_traces(
     paths: Iterable[str],
     columns: LogColumns | None = None,
     lengths: VehicleLengths | None = None,
-    on_read: tables.OnRead = tables.silent,
+    on_read: tables.OnRead = lambda count: None,
     noted: Noted | None = None,
     topics: Topics | None = None,
 ) -> Iterator[Chunk]:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.io.mcap import messages
+from evofsm.io import tables
 from evofsm.io.tables import UNITS, Piece, RefusedError, Skips, Table, Wanted, readable
 from evofsm.io.vehicles import ACTION
 
@@ -315,7 +315,7 @@ class BagTable(Table):
                 return
 
     def _of_mcap(self, file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
-        for schema, channel, message in messages(file, _MOST_BYTES, self.skips):
+        for schema, channel, message in tables.mcap_messages(file, _MOST_BYTES, self.skips):
             there.add(channel.topic)
             if channel.topic in wanted:
                 parts = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")

@@ -1,4 +1,4 @@
-"""Tables in CSV and Parquet, read with polars piece by piece; and what kind of file a file is."""
+"""Tables in CSV and Parquet, read piece by piece; messages of MCAP; what kind a file is of."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import gzip
 import io
 import os
 import re
+import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -24,6 +25,7 @@ from evofsm.store import LARGEST_OBSERVATION
 
 if TYPE_CHECKING:
     import polars
+    from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 
 Numbers = dict[str, NDArray[np.float64]]
 Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag"]
@@ -115,10 +117,6 @@ def quoted_name(text: str) -> tuple[str, str]:
     return (quotation[1].replace('""', '"'), text[quotation.end() :]) if quotation else ("", text)
 
 
-def silent(count: int) -> None:
-    """Nobody wants to know how much was read."""
-
-
 def file_kind(path: str) -> Kind:
     """What the file holds, judged by how it begins.
 
@@ -155,7 +153,7 @@ class Skips:
         most: int = 0,
         kinds: dict[str, tuple[int, str]] | None = None,
         told: list[str] | None = None,
-        on_read: OnRead = silent,
+        on_read: OnRead = lambda count: None,
     ) -> None:
         self.told, self.on_read = [] if told is None else told, on_read
         self._left = self._most = most
@@ -273,6 +271,73 @@ def readable(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
         if why.startswith(os.fspath(path)):
             raise
         raise ValueError(f"{os.fspath(path)} cannot be read as {kind}: {why}") from error
+
+
+# -- MCAP ----------------------------------------------------------------------------------------
+
+
+def mcap_messages(
+    path: str | os.PathLike[str], largest: int, skips: Skips
+) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """All messages of any MCAP file, in their order, with the schemas and channels before them.
+
+    None of its chunks is larger than so [byte]; where it ends early, so do they.
+    """
+    with needs("mcap", "mcap", f"{os.fspath(path)}: MCAP"):
+        from mcap.records import Channel, Message, Schema
+    schemas, channels = dict[int, Schema](), dict[int, Channel]()
+    with readable(path, "MCAP (damaged, cut off, or still being written?)"):
+        for record in _mcap_records(path, largest, skips):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                if (channel := channels.get(record.channel_id)) is None:
+                    raise RefusedError(f"there is no channel {record.channel_id} of a message")
+                yield schemas.get(channel.schema_id), channel, record
+
+
+def _mcap_records(path: str | os.PathLike[str], largest: int, skips: Skips) -> Iterator[McapRecord]:
+    from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    with open(path, "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
+        records = reader.records
+        while True:
+            try:
+                record = next(records, None)
+            except (EndOfFile, RecordLengthLimitExceeded, struct.error) as error:
+                why = f"it ends within a record, or is damaged there {error}".strip()
+                skips.leave_out("cut", f"{os.fspath(path)}, byte {file.tell():,}: {why}")
+                return
+            if record is None:
+                return
+            if not isinstance(record, Chunk):
+                yield record
+                continue
+            data = _mcap_chunk(record, largest)
+            if len(data) > largest:
+                raise ValueError(f"a chunk unpacks to more than the {largest:,} bytes it may have")
+            yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
+
+
+def _mcap_chunk(chunk: Chunk, largest: int) -> bytes:
+    """What is in a chunk, or at least the beginning of what is too large."""
+    from lz4.frame import LZ4FrameDecompressor
+    from zstandard import ZstdDecompressor
+
+    if chunk.compression == "zstd":
+        unpacker = ZstdDecompressor(max_window_size=largest)
+        return bytes(unpacker.stream_reader(chunk.data).read(largest + 1))
+    if chunk.compression == "lz4":
+        return bytes(LZ4FrameDecompressor().decompress(chunk.data, max_length=largest + 1))
+    if chunk.compression:
+        raise ValueError(f"its chunks are packed as {chunk.compression!r}, which is not known")
+    return chunk.data
 
 
 # -- Pieces of tables -----------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving.naming import VARIABLES
 from evofsm.extras import needs
-from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained
+from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained, mcap_messages
 from evofsm.store import LARGEST_OBSERVATION
 
 #: The action of a pair of vehicles: what the follower did until the next time.
@@ -539,11 +539,9 @@ def scenes_of_osi(path: str, skips: Skips) -> Iterator[Scene]:
 
 def scenes_of_mcap(path: str, skips: Skips) -> Iterator[Scene]:
     """Read OSI in MCAP: the first channel of ground truth or of sensor views."""
-    from evofsm.io.mcap import messages
-
     osi = _osi(path)
     channel_id, number, kinds = None, 0, set[str]()
-    for schema, channel, message in messages(path, _MOST_BYTES, skips):
+    for schema, channel, message in mcap_messages(path, _MOST_BYTES, skips):
         kind = "" if schema is None else schema.name.rpartition(".")[2]
         kinds.add(kind)
         if channel_id is None and kind in ("GroundTruth", "SensorView"):
