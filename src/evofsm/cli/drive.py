@@ -92,9 +92,9 @@ def drive(
             if value is not None:
                 text = "is for families of scenarios, not for a configuration"
                 raise ValueError(f"--{name} {text}")
-        from evofsm.cli.sumocfg import run_configuration
+        from evofsm.cli import driving
 
-        run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
+        driving.run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
     if workers is not None and (audit or mcap):
         raise ValueError("--audit and --mcap go with no --workers: workers send no decisions")

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm import driving
+from evofsm.cli.driving import trace_configuration
 from evofsm.cli.learning import episodes_read, learn_chunk
 from evofsm.cli.options import BRAKES, Reading, refuse_other_limit, require_world
 from evofsm.cli.show import progress, warn
-from evofsm.cli.sumocfg import trace_configuration
 from evofsm.cli.watch import shown
 from evofsm.driving.cars import assumptions, guard_of_monitor, name_judge
 from evofsm.driving.naming import UNITS, VARIABLES
