@@ -25,10 +25,7 @@ Record = Mapping[str, Any]
 
 
 class Journal:
-    """Records in a file that no other process writes. Close it after use.
-
-    A file that is no journal, or is damaged elsewhere than at its end, is refused.
-    """
+    """Records in a file that no other process writes; of another kind it is refused. Close it."""
 
     def __init__(
         self, path: Path, settings: Record, otherwise: str = "name another folder"

@@ -75,10 +75,7 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
 
 
 def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
-    """What the first rows hold, by column and in all, and options that could be asked for.
-
-    Last what is to be done with all rows before, as polars calls it.
-    """
+    """What the first rows hold, options that could be asked for, and how polars sorts before."""
     skips, odd, asides = dict[str, tuple[int, str]](), dict[str, int](), Pairs()
     table.skips = Skips(1 << 60, skips)
     frame, clock, form = _first_rows(table, odd, asides)
@@ -205,10 +202,7 @@ def _first_rows(
 
 
 def _clock_of(frame: polars.DataFrame, names: Sequence[str]) -> tuple[str, str, str]:
-    """The column of numbers that is a clock, by its values or its name; its unit, and since when.
-
-    Times since 1970 are of some years, and go on by little, of each machine at least.
-    """
+    """The column of numbers that is a clock, by values or name; its unit, and since when."""
     epochs = dict[str, str]()
     for name in names:
         z = frame[name].drop_nans().to_numpy()
@@ -257,10 +251,7 @@ def _odd(steps: Floats) -> NDArray[np.bool_]:
 
 
 def _episodes(frame: polars.DataFrame, clock: str, names: Sequence[str]) -> tuple[str, Rows]:
-    """The column that tells episodes apart, if any, and the order of rows in which time runs on.
-
-    Where rows of several are mixed, each of its values has a clock of its own.
-    """
+    """The column that tells episodes apart, if any, and the order of rows in which time runs on."""
     at, rows = frame[clock].to_numpy() if clock else np.zeros(0), np.arange(len(frame))
     if group := next((name for name in names if _is_in_blocks(frame[name])), ""):
         return group, rows

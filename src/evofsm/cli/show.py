@@ -26,11 +26,7 @@ if TYPE_CHECKING:
 
 
 def show(*parts: RenderableType) -> None:
-    """Print texts and tables, without the spaces that fill lines up.
-
-    A table may be wider than the terminal (80 columns in a pipe): no number is ever cut in two.
-    Nothing in a text from a file is markup.
-    """
+    """Print texts and tables; no number is cut in two, and no text from a file is markup."""
     for part in parts:
         out = Console(markup=False, highlight=False, emoji=False)
         any_width = out.options.update(max_width=10_000)

@@ -192,10 +192,7 @@ class Noted:
 
 
 def units_of(units: Mapping[str, str], used: Sequence[str]) -> dict[str, str]:
-    """The unit of each column in use that was given one.
-
-    A name that is no column's is the beginning of all that it fits; the longest one counts.
-    """
+    """The unit of each column in use that was given one, by its name or the beginning of it."""
     column_units: dict[str, str] = {}
     for name in sorted(units, key=lambda name: (name in used, len(name))):
         fit = [name] if name in used else [column for column in used if column.startswith(name)]
@@ -873,10 +870,7 @@ class _Reader:
             yield last_chunk
 
     def _fill(self, piece: Piece, times: Floats) -> NDArray[np.int64] | None:
-        """Fill in the latest values of each signal, and say which rows count: those with an action.
-
-        Nothing where the table has one clock: some row of the first ones has all that is wanted.
-        """
+        """Fill in the latest values of signals, and say which rows count; None of one clock."""
         there = {name: np.isfinite(values) for name, values in piece.numbers.items()}
         if self._hold is None:
             is_whole = np.logical_and.reduce(list(there.values())).any()

@@ -118,12 +118,7 @@ def quoted_name(text: str) -> tuple[str, str]:
 
 
 def file_kind(path: str) -> Kind:
-    """What the file holds, judged by how it begins.
-
-    A trace of OSI begins with nothing of its own and is known by its name, ``.osi``. The folder of
-    a bag of ROS 2 is ``"bag"``, as its files are. A ValueError says what a file is that is of a
-    foreign kind, and how it can be read.
-    """
+    """What the file holds, by how it begins or is called (``.osi``); what is foreign is refused."""
     if os.path.isfile(os.path.join(path, "metadata.yaml")):
         return "bag"
     if path.removesuffix(".gz").endswith(".osi"):
@@ -143,10 +138,7 @@ def file_kind(path: str) -> Kind:
 
 
 class Skips:
-    """Rows of a file that cannot be right: so many are left out, and counted; more are refused.
-
-    What else is to be said of a file, and how much of it was read, is told to it as well.
-    """
+    """Rows of a file that cannot be right: so many are left out, and counted; more are refused."""
 
     def __init__(
         self,
@@ -279,10 +271,7 @@ def readable(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
 def mcap_messages(
     path: str | os.PathLike[str], largest: int, skips: Skips
 ) -> Iterator[tuple[Schema | None, Channel, Message]]:
-    """All messages of any MCAP file, in their order, with the schemas and channels before them.
-
-    None of its chunks is larger than so [byte]; where it ends early, so do they.
-    """
+    """All messages of an MCAP file, whose chunks may have so many bytes; where it ends, they do."""
     with needs("mcap", "mcap", f"{os.fspath(path)}: MCAP"):
         from mcap.records import Channel, Message, Schema
     schemas, channels = dict[int, Schema](), dict[int, Channel]()

@@ -143,9 +143,8 @@ class Decider:
     def _sent_before(self, told: Message) -> int | None:
         """Where among the recent messages one is that is sent again; None if it is a new one.
 
-        Who plays a recording once more begins with its first row, or does what was done before
-        after the same: that is no repetition. Nor is a row that is newer than the latest, where
-        time went back meanwhile, as clocks do once a year.
+        Who plays a recording once more begins with its first row, or as was begun before: that is
+        no repetition. Nor is a row that is newer than the latest, as clocks go back once a year.
         """
         recent, latest = self._recent, self.latest
         next_place = len(recent) if self._next is None else self._next + 1

@@ -65,11 +65,10 @@ class Clock(NamedTuple):
 
 
 class Player:
-    """Plays what is watched at a pace, and does as it is told before the next decision.
+    """Plays what is watched at a pace, once someone attends, and does as it is told.
 
-    ``audience`` is told what happens: "start" with a `Start`, "frame" with a `Frame`, "graph" with
-    a `Graph`, "known" with what is `Known`, "clock" with a `Clock`, and "failed" with why it broke
-    off. It waits until someone attends.
+    ``audience`` is told "start", "frame", "graph", "known" and "clock", with what is called so, and
+    "failed" with why it broke off.
     """
 
     def __init__(self, watched: Session, audience: Callable[[str, Any], object]) -> None:

@@ -418,9 +418,8 @@ def watched_log(
 ) -> Session:
     """The episodes of a log, with a guard; of cars without one with what `evofsm monitor` has.
 
-    Of cars an episode is over with a contact; where they come apart again, another one begins. So
-    it is with ``collisions`` that a simulation counted [s], by the name of who follows whom.
-    ``case`` is the number of the episode to begin with, from 1.
+    Of cars one is over with a contact, or one of ``collisions`` [s] that a simulation counted, by
+    the name of who follows whom. ``case`` is the number of the one to begin with, from 1.
     """
     names = reading.columns.observe.names
     of_cars = reading.acts and len(names) == len(VARIABLES) and (not guard or names == VARIABLES)
