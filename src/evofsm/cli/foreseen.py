@@ -23,10 +23,8 @@ from evofsm.io.tables import date
 
 Floats = NDArray[np.float64]
 
-# Less than the share of alarms of any kind that are right: which alarm it is the judge says.
-_ANY_ALARM = 1e-6
-# Alarms that are listed.
-_LISTED = 12
+_ANY_ALARM = 1e-6  # a lower share of alarms is right for none: which it is the judge says
+_LISTED = 12  # alarms
 _CAME = ("ahead", "false/day")
 _HEADER = ("stated", "foreseen", *_CAME, "thresholds", *_CAME)
 

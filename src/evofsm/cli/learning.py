@@ -42,13 +42,11 @@ _LEFT_OUT = {
     "stand-in": "numbers of the action are far from all others, and were read as missing",
     "cut": "file ends early, and what is whole was read",
 }
-# What reaches so far is no car's speed in any unit [m/s]: revolutions, perhaps.
-_NO_SPEED = 500.0
+_NO_SPEED = 500.0  # no car's speed in any unit [m/s]: revolutions, perhaps
 #: Columns of more different numbers are no choice among some; and the most intervals for those.
 MOST_LEVELS, _MOST_INTERVALS = 12, 50
 _MOST_ACTIONS = 1000
-# Numbers that stand for nobody in many recordings.
-_NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
+_NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)  # stand for that in many recordings
 
 
 @dataclass

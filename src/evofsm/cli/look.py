@@ -82,10 +82,11 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     if not len(frame):
         table.skips.refuse_nothing(f"{table.path} has a header but no rows")
     numbers = [name for name, kind in frame.schema.items() if kind.is_numeric() and name != clock]
-    values = {name: frame[name].to_numpy() for name in numbers}
-    values = {name: z for name, z in values.items() if np.isfinite(z).any()}
-    stand_ins = {name: np.unique(z[are_stand_ins(z)]) for name, z in values.items()}
-    values = {name: np.where(are_stand_ins(z), np.nan, z) for name, z in values.items()}
+    values, stand_ins = dict[str, Floats](), dict[str, Floats]()
+    for name, z in ((name, frame[name].to_numpy()) for name in numbers):
+        if np.isfinite(z).any():
+            for_none = are_stand_ins(z)
+            values[name], stand_ins[name] = np.where(for_none, np.nan, z), np.unique(z[for_none])
     texts = [name for name in frame.columns if frame[name].dtype == polars.String]
     runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
     limit = _round(0.1 * float(np.nanquantile(np.abs(values[still]), 0.95))) if still else 0.0

@@ -25,10 +25,8 @@ if TYPE_CHECKING:
     from evofsm.io import Chunk, LogColumns, Topics, VehicleLengths
     from evofsm.io.logs import Noted, Resample
 
-#: What a judge was given.
-Judge = Literal["kinematic", "learnt"]
-#: How far a guard goes, as `evofsm.guard.Mode`.
-ModeName = Literal["off", "shadow", "act"]
+Judge = Literal["kinematic", "learnt"]  #: what a judge was given
+ModeName = Literal["off", "shadow", "act"]  #: how far a guard goes, as `evofsm.guard.Mode`
 
 
 def option(about: str, *names: str, **limits: Any) -> Any:
@@ -58,8 +56,7 @@ Tolerance = Annotated[
     float, option("Share of hard brakes (learnt: of disturbances) that need not be survived.")
 ]
 TOLERANCE = 0.02  #: as `evofsm.guard.TOLERANCE`, without what that loads.
-#: What a car's brakes are reckoned with where nobody said [m/s²].
-BRAKES = 6.0
+BRAKES = 6.0  #: what a car's brakes are reckoned with where nobody said [m/s²]
 Brakes = Annotated[
     float,
     option("Hardest braking of the own car, that a guard reckons with [m/s²].", min=0.5, max=20.0),

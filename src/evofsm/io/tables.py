@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 
 Numbers = dict[str, NDArray[np.float64]]
 Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag"]
-#: Called with the number of bytes each time some were read from a file.
-OnRead = Callable[[int], object]
+OnRead = Callable[[int], object]  #: called with the number of bytes each time some were read
 #: Place of a row, for a message, and what stands there in a column.
 Find = Callable[[int, "str | None"], tuple[str, str]]
 
@@ -62,8 +61,7 @@ _FOREIGN = {
     "numpy.savetxt('drive.csv', numpy.load('FILE'), delimiter=',', header='time,gap,...')",
     b"{": "is JSON; write its rows as CSV: polars.read_ndjson('FILE').write_csv('drive.csv')",
 }
-# Where an MCAP file has its profile: behind the mark, an opcode and two lengths.
-_PROFILE = len(_MCAP) + 1 + 8 + 4
+_PROFILE = len(_MCAP) + 1 + 8 + 4  # of MCAP, behind the mark, an opcode and two lengths
 
 #: Factors that turn units of time into s, and all units into s, m, m/s or m/s².
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
@@ -83,14 +81,12 @@ _COMMENT = re.compile(r"\A\s*(#|%|//)+\s*")  # what stands before the last line 
 MISSING = ("", "na", "n/a", "null", "none")  #: what stands in a field where there is no number
 # By which a comma is known to be a decimal one; groups of three digits it may separate as well.
 _DECIMAL_COMMA = re.compile(r"\s*-?\d+,(\d\d?|\d{4,})\s*")
-# What no text holds.
-_CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")
+_CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")  # what no text holds
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
 # The day first, as only dots tell; whether its year has a century, and whether seconds follow.
 _DAY_FIRST = re.compile(r"\d\d?\.\d\d?\.(?:(\d{4})|\d\d),?[T ]+\d\d?:\d\d(:)?")
 _DATE_LIKE = re.compile(r"\s*\d{1,4}([.:/-])\d\d?\1\d")
-# From here on no year has four digits [s].
-_NO_DATE = 253_402_300_799.0
+_NO_DATE = 253_402_300_799.0  # from here on no year has four digits [s]
 _ISO = "in ISO 8601, such as 2026-03-14T09:26:53.5+01:00, or as 14.03.2026 09:26:53"
 _SAYS_HOW = "; --unit 'COLUMN=%m/%d/%Y %I:%M:%S %p' says how others are written"
 

@@ -26,19 +26,16 @@ from evofsm.extras import needs
 from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained, mcap_messages
 from evofsm.store import LARGEST_OBSERVATION
 
-#: The action of a pair of vehicles: what the follower did until the next time.
-ACTION = "a_follower"
+ACTION = "a_follower"  #: of a pair of vehicles: what the follower did until the next time
 COLUMNS = ("time", *VARIABLES, ACTION)  #: what is known of a pair at one time
 
 _ROWS_AT_ONCE = 8192
 # Rows that pairs on the road may have waiting before all are handed on, each of 32 bytes. It
 # bounds memory, at the price of one transition for each pair cut.
 _MOST_WAITING = 1_000_000
-# More on one lane at one time are no recording of a road, and would fill the memory.
-_MOST_ON_A_LANE = 1000
+_MOST_ON_A_LANE = 1000  # more at one time are no recording of a road, and fill the memory
 
-#: Says where something stands, for a message.
-Place = Callable[[], str]
+Place = Callable[[], str]  #: says where something stands, for a message
 
 
 class Following(NamedTuple):

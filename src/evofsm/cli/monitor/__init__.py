@@ -16,8 +16,7 @@ _SAME_STEP = 0.05  # share by which the step of a log may differ from that of th
 _INTERVAL = 0.1  # of rows of cars, where nobody said another one [s]
 # What other files end with holds live rows; so does CSV without --summary.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
-# In the beginning of what was saved.
-_SAVED = b'{"__metadata__"'
+_SAVED = b'{"__metadata__"'  # in the beginning of what was saved
 
 
 @options.reads_logs

@@ -53,12 +53,10 @@ from evofsm.io.tables import date
 
 _log = logging.getLogger(__name__)
 
-#: Rows after which an episode ends, as soon as no alarm is on; at twice as many it ends anyway.
-EPISODE = 6000
+EPISODE = 6000  #: rows until an episode ends; with an alarm on, at most twice as many
 _RECENT = 256  # so many of the latest messages are known again when they are sent again
 _FAST = 60.0  # nothing on a road is faster [m/s]
-# What is older by less is late; what is older by more comes from a sender that began anew [s].
-_LATE = 1.0
+_LATE = 1.0  # what is older by less is late, by more from a sender that began anew [s]
 HOLE, _OFTEN = 1.5, 0.5  #: a gap in time, and rows that come too often, in intervals
 _VX, _AX = COLUMNS.index("vx"), COLUMNS.index("ax")
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")

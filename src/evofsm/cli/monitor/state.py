@@ -22,8 +22,7 @@ from evofsm.guard import Guard
 
 _log = logging.getLogger(__name__)
 
-# The guard is written once so many messages are in the journal, as an episode ends.
-_EVERY = 600
+_EVERY = 600  # messages in the journal, from which on the guard is written as an episode ends
 _PROVENANCE = "monitor"
 _NEW = -1  # the mark of a journal that was made just now
 

@@ -20,8 +20,7 @@ from evofsm.guard.foresight import span
 from evofsm.io.logs import Chunk
 from evofsm.io.tables import date
 
-# A line of more bytes is of another kind of file; one that is longer than a message is refused.
-_LONGEST_MESSAGE = 1 << 20
+_LONGEST_MESSAGE = 1 << 20  # a line of more bytes is of another kind of file
 _TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)  # beside the guard's own tolerance
 # So many moments and variables are shown; without an alarm a moment lasts so long [s].
 _WORST, _MOST_VARIABLES, _MOMENT = 10, 4, 5.0

@@ -48,19 +48,15 @@ from evofsm.io.tables import date
 #: The state rule for looking on: coarse enough that each state can be told from the others.
 WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
 
-# What can be chosen among where there are no cases.
-_DRAWS = tuple(f"draw {number}" for number in range(1, 13))
-# After a leader's full brake there is nothing left to see once all have stood for so long [s].
-_STOOD = 3.0
+_DRAWS = tuple(f"draw {number}" for number in range(1, 13))  # where there are no cases
+_STOOD = 3.0  # so long after a leader's full brake nothing is left to see [s]
 # Steps of an environment in a second where it does not say; wishes that are tolerable for so many
 # decisions are no danger any more.
 _STEPS_PER_SECOND, _CALM = 10.0, 8
 _SAME_ACTION = 0.02  # a change of an action by less is none [half ranges]
 _LASTED = 10  # so many episodes in a row without a failure tell that a guard has learnt
-# An environment that does not end by itself is left after so many decisions, where nobody looks on.
-_MOST_DECISIONS = 2000
-# Seeds of episodes that are learnt from are so far from those that are watched.
-_APART = 1_000_000
+_MOST_DECISIONS = 2000  # of an episode where nobody looks on
+_APART = 1_000_000  # of seeds of episodes that are learnt from and those that are watched
 # Episodes from which is known how far variables spread; states are so many spreads apart, times the
 # root of the number of variables, and there are at most so many.
 _LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
@@ -71,8 +67,7 @@ _PLAYED, _A_SECOND = 400, 10.0
 # Rows of an episode that shows something; fewer of cars are not watched. Times of a log that
 # differ by less are one [s], and its step may differ from that of a guard by this share.
 _SHOWS, _TICK, _OTHER_STEP = 10, 5e-4, 0.1
-# What a file may define besides its environment.
-_PARTS = ("controller", "failed", "variables")
+_PARTS = ("controller", "failed", "variables")  # of a file, besides its environment
 _FEW_VARIABLES = 4  # of more variables only those of the plane are named
 # What Gymnasium's documentation calls the variables of its environments, with units.
 _ENV_NAMES = {
