@@ -39,9 +39,6 @@ _SECOND = 1_000_000_000  # [ns]
 _PAUSE = _SECOND  # from the end of an episode to the start of the next
 
 
-# -- Channels -------------------------------------------------------------------------------------
-
-
 def columns_by_topic(names: Sequence[str] = VARIABLES) -> dict[str, tuple[str, ...]]:
     """The columns of decisions by channel; the channel of risks has them without ``risk_``."""
     of_cars = tuple(names) == VARIABLES
@@ -224,8 +221,6 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    # -- As the decision logger of a guard --------------------------------------------------------
-
     def begin(self, guard: Guard) -> None:
         """An episode begins."""
         self._time, self._begun = 0.0, False
@@ -267,8 +262,6 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
         self._event("episode ended")
         self._start = self._now() + _PAUSE
         self._episode += 1
-
-    # -- Inside -----------------------------------------------------------------------------------
 
     def _now(self) -> int:
         return self._start + round(self._time * _SECOND)

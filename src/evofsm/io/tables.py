@@ -261,9 +261,6 @@ def readable(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
         raise ValueError(f"{os.fspath(path)} cannot be read as {kind}: {why}") from error
 
 
-# -- MCAP ----------------------------------------------------------------------------------------
-
-
 def mcap_messages(
     path: str | os.PathLike[str], largest: int, skips: Skips
 ) -> Iterator[tuple[Schema | None, Channel, Message]]:

@@ -30,8 +30,7 @@ ACTION = "a_follower"  #: of a pair of vehicles: what the follower did until the
 COLUMNS = ("time", *VARIABLES, ACTION)  #: what is known of a pair at one time
 
 _ROWS_AT_ONCE = 8192
-# Rows that pairs on the road may have waiting before all are handed on, each of 32 bytes. It
-# bounds memory, at the price of one transition for each pair cut.
+# Rows that may wait before all are handed on, of 32 bytes each; a pair that is cut loses one step.
 _MOST_WAITING = 1_000_000
 _MOST_ON_A_LANE = 1000  # more at one time are no recording of a road, and fill the memory
 

@@ -16,17 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.cli.foreseen import guard_of_alarms
-from evofsm.cli.monitor.messages import (
-    NO_ROW,
-    SCHEMA,
-    End,
-    Form,
-    Message,
-    MessageError,
-    Pause,
-    Row,
-    Taken,
-)
+from evofsm.cli.monitor import messages
+from evofsm.cli.monitor.messages import End, Form, Message, MessageError, Pause, Row, Taken
 from evofsm.cli.monitor.slots import CsvRows, Slots
 from evofsm.cli.options import TOLERANCE, ModeName, Reading, refuse_other_limit
 from evofsm.cli.show import plain
@@ -35,19 +26,10 @@ from evofsm.driving.judge import SLIGHT, LatentRisk
 from evofsm.driving.traffic import COLUMNS, TrafficRisk
 from evofsm.fsm import EvolvingFSM
 from evofsm.fsm.validation import probability
-from evofsm.guard import (
-    ActionReviser,
-    AuditLog,
-    BoxActions,
-    Foresight,
-    Guard,
-    LearntRisk,
-    Mode,
-    Proposal,
-    Revision,
-    is_spoken,
-    make_usable,
-)
+from evofsm.guard import ActionReviser, BoxActions, Foresight, Guard, LearntRisk, Mode
+from evofsm.guard.api import Proposal, Revision
+from evofsm.guard.audit_log import AuditLog
+from evofsm.guard.reviser import is_spoken, make_usable
 from evofsm.io.logs import Condition
 from evofsm.io.tables import date
 
@@ -100,8 +82,6 @@ class Decider:
             twin.decide(observation + 0.1 * k, None)
         twin.end(observation=observation)
 
-    # -- Messages -------------------------------------------------------------------------------
-
     def answer(self, line: bytes) -> Answer:
         """What is answered to a line: a decision, an end, or an error that names the key.
 
@@ -109,7 +89,8 @@ class Decider:
         """
         try:
             if (body := self._csv.read(line)) is None:
-                return self._of("waiting", alarm=self._alarm, reason=self._csv.unread or NO_ROW)
+                why = self._csv.unread or messages.NO_ROW
+                return self._of("waiting", alarm=self._alarm, reason=why)
             message = self.form.read(body)
             beyond = self.guard.beyond(np.array(message.observation or (), np.float64))
             if beyond is not None:
@@ -166,9 +147,7 @@ class Decider:
         return self._of("error", **when, about=about, error=what)
 
     def _of(self, kind: str, **said: Any) -> Answer:
-        return {"schema": SCHEMA, "kind": kind, "n": self.n, **said}
-
-    # -- What it does ---------------------------------------------------------------------------
+        return {"schema": messages.SCHEMA, "kind": kind, "n": self.n, **said}
 
     def act(self, told: Taken) -> Answer:
         """Take in what was accepted, and answer it."""
@@ -344,8 +323,6 @@ class Decider:
         wish = make_usable(Proposal(revision.proposed), reviser.actions, reviser.fallback).action
         change = abs(float(revision.advised) - float(wish))
         return bool(reviser.refuses and not 0.0 < change <= SLIGHT)
-
-    # -- Its end, and its beginning -------------------------------------------------------------
 
     def memory(self) -> dict[str, Any]:
         """What it knows between two episodes, beside the guard: for JSON."""

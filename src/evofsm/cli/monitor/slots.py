@@ -11,18 +11,9 @@ from statistics import fmean
 from typing import Any
 
 from evofsm.cli.monitor.messages import NO_ROW, Message, MessageError, Row
-from evofsm.io import LogColumns
+from evofsm.io import LogColumns, tables
 from evofsm.io.logs import Condition, units_of
-from evofsm.io.tables import (
-    MISSING,
-    UNITS,
-    Dialect,
-    decoded,
-    explained,
-    is_date,
-    is_number,
-    is_value,
-)
+from evofsm.io.tables import Dialect, decoded, explained, is_date, is_number, is_value
 
 # Lines that are no rows are told of as the first came, and then as so many had.
 _SAID_AT = [10**k for k in range(1, 10)]
@@ -207,7 +198,7 @@ class CsvRows:
         numbers = [name for name in dialect.columns if name in self._numbers]
         units = {name: unit for name, unit in self._columns.units.items() if "%" not in unit}
         units = {**dialect.units, **units_of(units, numbers)}
-        self._factors = {name: UNITS.get(units.get(name, ""), 1.0) for name in numbers}
+        self._factors = {name: tables.UNITS.get(units.get(name, ""), 1.0) for name in numbers}
         self._dialect = dialect
         return dialect.n_told == len(below)
 
@@ -224,7 +215,7 @@ class CsvRows:
 
     def _number(self, name: str, text: str, dialect: Dialect) -> float | None:
         """What stands in a field, in units of the SI; None where nothing does."""
-        if text.lower() in MISSING:
+        if text.lower() in tables.MISSING:
             return None
         if not is_number(plain := text.replace(",", ".") if dialect.has_commas else text):
             raise MessageError(name, explained(text))

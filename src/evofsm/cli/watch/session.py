@@ -28,19 +28,9 @@ from evofsm.driving.world import GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, 
 from evofsm.extras import needs
 from evofsm.fsm import EvolvingFSM, Labels, Novelty
 from evofsm.fsm.proportions import usual_range
-from evofsm.guard import (
-    BELIEF_TOLERANCE,
-    TOLERANCE,
-    Foresight,
-    Guard,
-    Judgement,
-    LearntRisk,
-    Mode,
-    Proposal,
-    Revision,
-    Situation,
-)
+from evofsm.guard import Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.actions import Action, Choices, change, is_usable, limits, put_into
+from evofsm.guard.api import BELIEF_TOLERANCE, TOLERANCE, Judgement, Proposal, Revision, Situation
 from evofsm.guard.foresight import DATES
 from evofsm.io.logs import LONGEST_STEP, Chunk, Noted
 from evofsm.io.tables import date
@@ -50,22 +40,19 @@ WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
 
 _DRAWS = tuple(f"draw {number}" for number in range(1, 13))  # where there are no cases
 _STOOD = 3.0  # so long after a leader's full brake nothing is left to see [s]
-# Steps of an environment in a second where it does not say; wishes that are tolerable for so many
-# decisions are no danger any more.
+# Steps of an environment in a second, if it says none; tolerable wishes that end a danger.
 _STEPS_PER_SECOND, _CALM = 10.0, 8
 _SAME_ACTION = 0.02  # a change of an action by less is none [half ranges]
 _LASTED = 10  # so many episodes in a row without a failure tell that a guard has learnt
 _MOST_DECISIONS = 2000  # of an episode where nobody looks on
 _APART = 1_000_000  # of seeds of episodes that are learnt from and those that are watched
-# Episodes from which is known how far variables spread; states are so many spreads apart, times the
-# root of the number of variables, and there are at most so many.
+# Episodes that tell spreads of variables; spreads between states, by the root of their number.
 _LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
 # Of a simulation of somebody else's that are watched [s], and positions of cars in them.
 _SECONDS, _ENOUGH = 600.0, 100_000
 # So many rows of a long episode are played one by one, and so many in a second.
 _PLAYED, _A_SECOND = 400, 10.0
-# Rows of an episode that shows something; fewer of cars are not watched. Times of a log that
-# differ by less are one [s], and its step may differ from that of a guard by this share.
+# Rows of an episode that shows something; what is one time [s]; by what share steps may differ.
 _SHOWS, _TICK, _OTHER_STEP = 10, 5e-4, 0.1
 _PARTS = ("controller", "failed", "variables")  # of a file, besides its environment
 _FEW_VARIABLES = 4  # of more variables only those of the plane are named
