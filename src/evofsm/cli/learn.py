@@ -76,15 +76,15 @@ def learn(
     machine = learning.machine_of(actions.n_actions, rule, scale, max_states, encoder)
     kind = None if guard is None else learning.judge_of(judge if acts else "learnt", columns)
     notes = Noted()
-    sizes = {file: learning.size_of(file) for file in files}
-    with progress("Learning", sum(sizes.values())) as move:
+    sizes = [learning.size_of(file) for file in files]
+    with progress("Learning", sum(sizes)) as move:
         chunks: Iterable[Chunk] = read.traces(files, notes, lambda count: move(advance=count))
         chunks = list(chunks) if guard is not None and not acts else chunks
         units_of = partial(notes.si_units, encoder.names)
         lesson = learning.learn_traces(chunks, machine, actions, encoder.names, units_of)
     model = lesson.model
     provenance = {
-        "files": [{"name": file, "bytes": size} for file, size in sizes.items()],
+        "files": [{"name": n, "bytes": size} for n, size in zip(files, sizes, strict=True)],
         "rows": lesson.rows,
         "episodes": lesson.episodes,
         "transitions": lesson.transitions,
