@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from operator import itemgetter
-from typing import Annotated, Any, Literal, NotRequired, TypedDict
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -109,25 +109,34 @@ class Form:
         self.count = len(self.variables) or n_variables
         length = Meta(min_length=self.count or 1, max_length=self.count or None)
         several: Any = Annotated[list[_Seen], length]
-        self._names = self.variables or ("observation",)
-        self._others = others
+        # By keys of our own: a column may be called "Tank 1 [mm]", which no attribute can be.
+        self._keys = {f"v{k}": name for k, name in enumerate(self.variables or ["observation"])}
+        self._others = {f"w{k}": name for k, name in enumerate(others)}
         clocks = dict.fromkeys([clock, *clock.split(",")])  # of date and time of day
-        self._clocks = [name for name in clocks if name not in {"time", *self._names, *others}]
+        names = {"time", *self._keys.values(), *others}
+        self._clocks = {f"x{k}": name for k, name in enumerate(clocks) if name not in names}
         self._form, self._unit = unit if "%" in unit else "", TIMES.get(unit, 1.0)
-        variables = dict.fromkeys(self._names, _Seen if self.variables else several)
-        action = _action(guard)
+        variables = [(key, _Seen if self.variables else several) for key in self._keys]
+        action: Any = ("proposal", _action(guard))
         if isinstance(guard.actions, Choices) and guard.actions.n_actions == 1:  # nobody acts
-            action = NotRequired[action]
-        also: dict[str, Any] = dict.fromkeys(others, NotRequired[float | bool | str | None])
-        also |= {"schema": NotRequired[Literal[1]]}
-        when = dict.fromkeys(("time", *self._clocks), NotRequired[_Number | str])
-        last = {name: NotRequired[kind] for name, kind in variables.items()}
-        vehicles = {"ego": _Vehicle, "objects": list[_Vehicle]}
-        end = {"end": bool, "failed": NotRequired[bool], "time": NotRequired[_Seen | str]}
-        kind: Any = TypedDict
-        self._row = kind("Row", {**when, "proposal": action, **variables, **also})
-        self._scene = kind("Scene", {"time": _Number, "proposal": action, **vehicles, **also})
-        self._end = kind("End", {**when, **end, **last, **also})
+            action = (*action, 0)
+        version = ("schema", Literal[1], SCHEMA)
+        also = [(key, float | bool | str | None, None) for key in self._others]
+        when = [(key, _Number | str | UnsetType, UNSET) for key in ("time", *self._clocks)]
+        self._row = self._struct("Row", *when, action, *variables, *also, version)
+        vehicles = ("ego", _Vehicle), ("objects", list[_Vehicle])
+        self._scene = self._struct("Scene", ("time", _Number), action, *vehicles, version)
+        last = [(key, kind | UnsetType, UNSET) for key, kind in variables]
+        end = ("end", bool), ("failed", bool, False), ("time", _Seen | str | UnsetType, UNSET)
+        self._end = self._struct("End", *end, *when[1:], *last, *also, version)
+
+    def _struct(self, name: str, *fields: Any) -> Any:
+        strict: Any = {
+            "forbid_unknown_fields": True,
+            "kw_only": True,
+            "rename": self._keys | self._others | self._clocks,
+        }
+        return msgspec.defstruct(name, fields, **strict)
 
     def read(self, line: bytes | dict[str, Any]) -> Message:
         """The message on a line, or with these keys."""
@@ -135,28 +144,27 @@ class Form:
         kind = self._scene if self.scenes or body.keys() & {"ego", "objects"} else self._row
         kind = self._end if "end" in body else kind
         try:
-            if unknown := [key for key in body if key not in kind.__annotations__]:
-                raise MessageError(unknown[0][:_LETTERS], _unknown(kind.__annotations__))
             fields = msgspec.convert(body, kind)
             if kind is self._end:
                 return self._of_end(fields)
             if kind is self._scene:
                 return self._of_scene(fields)
-            also = tuple(fields.get(key) for key in self._others)
+            also = tuple(getattr(fields, key) for key in self._others)
             if (time := self._when(fields)) is None:
-                names = "".join(f", or {name!r}" for name in self._clocks)
+                names = "".join(f", or {name!r}" for name in self._clocks.values())
                 raise MessageError("time", f"is missing{names}; every message of its kind has it")
-            return Row(time, self._observed(fields), _frozen(fields), told=also)
+            return Row(time, self._observed(fields), _frozen(fields.proposal), told=also)
         except MessageError as error:
             error.time = _time(body)
             raise
         except msgspec.ValidationError as error:
-            raise _refusal(body, str(error)) from None
+            raise self._refused(body, kind, str(error)) from None
 
-    def _when(self, told: dict[str, Any]) -> float | None:
+    def _when(self, told: Any) -> float | None:
         """The time of a message [s], as it or a log has it."""
-        names = ("time", *self._clocks)
-        times = {name: told[name] for name in names if told.get(name) is not None}
+        keys = {"time": "time", **self._clocks}
+        fields = {name: getattr(told, key) for key, name in keys.items()}
+        times = {name: value for name, value in fields.items() if value not in (UNSET, None)}
         name, time = next(iter(times.items()), ("time", None))
         if isinstance(time, str):
             try:
@@ -169,28 +177,28 @@ class Form:
             raise MessageError(name, f"is {time:.15g}: milliseconds? It must be in seconds", time)
         return seconds
 
-    def _observed(self, told: dict[str, Any]) -> tuple[float | None, ...]:
-        return tuple(map(told.get, self.variables) if self.variables else told["observation"])
+    def _observed(self, told: Any) -> tuple[float | None, ...]:
+        values = [getattr(told, key) for key in self._keys]
+        return tuple(values if self.variables else values[0])
 
-    def _of_end(self, told: dict[str, Any]) -> End:
-        if not told["end"]:
+    def _of_end(self, told: Any) -> End:
+        if not told.end:
             raise MessageError("end", "is false; it must be true")
-        failed, time = told.get("failed", False), self._when(told)
-        omissions = [name for name in self._names if name not in told]
-        if len(omissions) == len(self._names):
-            return End(failed, time=time)
+        omissions = [name for key, name in self._keys.items() if getattr(told, key) is UNSET]
+        if len(omissions) == len(self._keys):
+            return End(told.failed, time=self._when(told))
         if omissions:
             raise MessageError(omissions[0], "is missing; a variable that was not seen is null")
-        return End(failed, self._observed(told), time)
+        return End(told.failed, self._observed(told), self._when(told))
 
-    def _of_scene(self, told: dict[str, Any]) -> Row:
+    def _of_scene(self, told: Any) -> Row:
         if not (self.scenes or self.variables == VARIABLES):
             raise MessageError(
                 "objects", "are for guards of car following; send a row of this guard's variables"
             )
-        ego, cars = told["ego"], told["objects"]
+        ego = told.ego
         _refuse_nowhere(ego, "ego")
-        for k, car in enumerate(cars):
+        for k, car in enumerate(told.objects):
             where = f"objects[{k}]"
             _refuse_nowhere(car, where)
             if car.id is UNSET:
@@ -199,19 +207,41 @@ class Form:
             if not in_lanes and (car.y is UNSET or ego.y is UNSET):
                 fault = "is given for it or for ego, but not for both; nor is y"
                 raise MessageError(f"{where}.lane", fault)
-        proposal = _frozen(told)
+        proposal = _frozen(told.proposal)
         if self.scenes:
-            objects = [_object(car, f"objects[{k}]") for k, car in enumerate(cars)]
+            objects = [_object(car, f"objects[{k}]") for k, car in enumerate(told.objects)]
             scene = Scene(_object(ego, "ego"), objects)
             names = tuple(obj.id for obj in scene.objects[1 : _MOST_OBJECTS + 1])
             rows = (None if math.isnan(z) else z for z in scene.rows(_MOST_OBJECTS).tolist())
-            return Row(told["time"], tuple(rows), proposal, objects=names)
-        if (ahead := _nearest_ahead(ego, cars)) is None:
-            return Row(told["time"], None, proposal)
+            return Row(told.time, tuple(rows), proposal, objects=names)
+        if (ahead := _nearest_ahead(ego, told.objects)) is None:
+            return Row(told.time, None, proposal)
         gap, car = ahead
-        return Row(
-            told["time"], (gap, ego.vx, car.vx), proposal, None if car.id is UNSET else car.id
-        )
+        return Row(told.time, (gap, ego.vx, car.vx), proposal, None if car.id is UNSET else car.id)
+
+    def _refused(self, body: dict[str, Any], kind: Any, error: str) -> MessageError:
+        """What msgspec refused, with the key and the value, in a sentence."""
+        text, _, place = error.partition(" - at `$")
+        place, time = place.removesuffix("`").removeprefix("."), _time(body)
+        if text == "Number out of range":
+            return MessageError(place, "is too large", time)
+        if match := re.fullmatch(r"Object (missing|contains).* field `(.*)`", text):
+            about = f"{place}.{match[2]}".removeprefix(".")
+            if match[1] == "missing":
+                return MessageError(about, f"is missing{_missing(about)}", time)
+            fields = msgspec.structs.fields(_Vehicle if place else kind)
+            names = ", ".join(sorted(field.encode_name for field in fields))
+            return MessageError(about[:_LETTERS], f"is not known; known are {names}", time)
+        value = _shown(_at(body, place))
+        if place == "schema":
+            fault = f"is {value}; this monitor knows version {SCHEMA} alone"
+        else:
+            demand = re.sub("^Expected |, got .*|`", "", text).replace(" | ", " or ")
+            fault = f"is {value}; it must be {demand}"
+            if isinstance(word := _at(body, place), str) and is_number(word.replace(",", ".")):
+                cause = "a decimal comma" if "," in word else "a number in quotes"
+                fault += f" ({cause}? send {word.replace(',', '.')})"
+        return MessageError(place or "line", fault, time)
 
 
 def _action(guard: Guard) -> Any:
@@ -225,8 +255,7 @@ def _action(guard: Guard) -> Any:
     return _Number | None
 
 
-def _frozen(told: dict[str, Any]) -> Any:
-    proposal = told.get("proposal", 0)  # where nobody acts there is one action
+def _frozen(proposal: Any) -> Any:
     return tuple(proposal) if isinstance(proposal, list) else proposal
 
 
@@ -265,33 +294,6 @@ def _in_lane(ego: Any, car: Any) -> bool:
 
 
 # -- What was wrong with a line -------------------------------------------------------------------
-
-
-def _refusal(body: dict[str, Any], error: str) -> MessageError:
-    """What msgspec refused, with the key and the value, in a sentence."""
-    text, _, place = error.partition(" - at `$")
-    place, time = place.removesuffix("`").removeprefix("."), _time(body)
-    if text == "Number out of range":
-        return MessageError(place, "is too large", time)
-    if match := re.fullmatch(r"Object (missing|contains).* field `(.*)`", text):
-        about = f"{place}.{match[2]}".removeprefix(".")
-        if match[1] == "missing":
-            return MessageError(about, f"is missing{_missing(about)}", time)
-        return MessageError(about[:_LETTERS], _unknown(_Vehicle.__annotations__), time)
-    value = _shown(_at(body, place))
-    if place == "schema":
-        fault = f"is {value}; this monitor knows version {SCHEMA} alone"
-    else:
-        demand = re.sub("^Expected |, got .*|`", "", text).replace(" | ", " or ")
-        fault = f"is {value}; it must be {demand}"
-        if isinstance(word := _at(body, place), str) and is_number(word.replace(",", ".")):
-            cause = "a decimal comma" if "," in word else "a number in quotes"
-            fault += f" ({cause}? send {word.replace(',', '.')})"
-    return MessageError(place or "line", fault, time)
-
-
-def _unknown(fields: Iterable[str]) -> str:
-    return f"is not known; known are {', '.join(sorted(fields))}"
 
 
 def _parsed(line: bytes) -> dict[str, Any]:
