@@ -92,9 +92,8 @@ def driving(folder: Path) -> Work:
 def _drive(path: Path) -> bytes:
     setup = Setup(load_family("emergency"))
     with closing(Results(setup, make_guard(setup), path)) as results:
-        driving = drive_in_turn(results, 4)
-    told = json.dumps(asdict(driving.row))
-    return (path / "episodes.csv").read_bytes() + _saved(driving.guard.machine) + told.encode()
+        told = json.dumps(asdict(drive_in_turn(results, 4)))
+    return (path / "episodes.csv").read_bytes() + _saved(results.guard.machine) + told.encode()
 
 
 def _saved(learnt: Any) -> bytes:

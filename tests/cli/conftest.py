@@ -69,8 +69,7 @@ def pump():
 def shown():
     """Serve a page in a thread, and play on it, as it is set."""
     pytest.importorskip("websockets")
-    from evofsm.cli.watch.player import Player
-    from evofsm.cli.watch.server import LivePage
+    from evofsm.cli.watch.server import LivePage, Player
 
     @contextmanager
     def show(opened, **settings):

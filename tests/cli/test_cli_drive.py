@@ -8,6 +8,7 @@ import sys
 import time
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -39,13 +40,13 @@ def begun(folder, setup):
 def in_turn(folder=None, episodes=6, **options):
     setup = Setup(options.pop("family", EMERGENCY), **options)
     with begun(folder, setup) as results:
-        return drive_in_turn(results, episodes)
+        return SimpleNamespace(row=drive_in_turn(results, episodes), guard=results.guard)
 
 
 def at_once(folder=None, episodes=6, workers=2, **options):
     setup = Setup(options.pop("family", EMERGENCY), learn=False, **options)
     with begun(folder, setup) as results:
-        return drive_at_once(results, episodes, workers)
+        return SimpleNamespace(row=drive_at_once(results, episodes, workers))
 
 
 # -- In turn --------------------------------------------------------------------------------------

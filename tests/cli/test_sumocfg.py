@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip("typer")
 pytest.importorskip("libsumo")
 
+from evofsm.cli.driving import trace_configuration
 from evofsm.cli.options import reading_of
-from evofsm.cli.sumocfg import trace_configuration
 from evofsm.cli.watch import _is_log
 from evofsm.cli.watch.session import watched_log
 from evofsm.cli.watch.words import tell

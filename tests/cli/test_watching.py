@@ -7,7 +7,7 @@ from functools import cache
 import pytest
 
 from evofsm.cli.options import reading_of
-from evofsm.cli.watch.player import Player
+from evofsm.cli.watch.server import Player
 from evofsm.cli.watch.session import (
     OnRoads,
     Session,

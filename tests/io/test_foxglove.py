@@ -22,8 +22,7 @@ from evofsm.driving import IDM, Leader, Scenario, drive, guard_for_cars
 from evofsm.guard import Guard
 from evofsm.guard.reviser import Mode
 from evofsm.io.foxglove import FOXGLOVE_LAYOUT, FoxgloveSink, schemas_of
-from evofsm.io.mcap import messages as messages_of
-from evofsm.io.tables import Skips
+from evofsm.io.tables import Skips, mcap_messages
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -146,7 +145,7 @@ def test_a_small_log_that_unpacks_to_hundreds_of_megabytes_is_refused(packing, t
     tracemalloc.start()
     try:
         with pytest.raises(ValueError, match=r"bomb\.mcap.*a chunk unpacks to more than"):
-            list(messages_of(path, 1 << 24, Skips()))
+            list(mcap_messages(path, 1 << 24, Skips()))
         assert tracemalloc.get_traced_memory()[1] < (96 << 20) + 8 * path.stat().st_size
     finally:
         tracemalloc.stop()

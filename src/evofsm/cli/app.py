@@ -10,15 +10,11 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from evofsm.cli.audit import audit
-from evofsm.cli.check import check
-from evofsm.cli.drive import drive
-from evofsm.cli.export import export
-from evofsm.cli.inspect import explain, inspect
+from evofsm.cli.audit import audit, check
+from evofsm.cli.drive import drive, paper
+from evofsm.cli.inspect import explain, export, inspect
 from evofsm.cli.learn import learn
 from evofsm.cli.monitor import monitor
-from evofsm.cli.paper import paper
-from evofsm.cli.show import message, warn
 from evofsm.cli.watch import watch
 
 # What Typer raises where a command is called wrongly, whoever it takes it from.
@@ -30,22 +26,32 @@ class Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> None:
         """Run a command; the number that it returns is the exit status."""
+        fault = ""
         try:
             status = super().invoke(ctx)
         except KeyboardInterrupt:
-            warn("stopped before the end")
-            status = 130
+            status, fault = 130, "stopped before the end"
         except BrokenPipeError:  # whoever read the output had enough
             raise
         except _CalledWrongly as error:
             command = error.ctx.command_path if getattr(error, "ctx", None) else "evofsm"
-            warn(f"{error.format_message()} ({command} --help)")
-            status = 2
+            status, fault = 2, f"{error.format_message()} ({command} --help)"
         except (ValueError, TypeError, OSError, ImportError) as error:
-            warn(message(error))
-            status = 2
+            status, fault = 2, _message(error)
+        if fault:
+            from evofsm.cli.show import warn
+
+            warn(fault)
         if status:
             raise typer.Exit(status) from None
+
+
+def _message(error: BaseException) -> str:
+    """What an error says, in one line, and what it happened in."""
+    text = str(error) or type(error).__name__
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        text = f"{error.filename}: {error.strerror.lower()}"
+    return " ".join(", ".join([text, *getattr(error, "__notes__", ())]).split())
 
 
 def group(about: str, *commands: Any) -> typer.Typer:

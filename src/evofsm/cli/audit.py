@@ -1,4 +1,4 @@
-"""`evofsm audit`."""
+"""`evofsm audit` and `evofsm check`: whether a log, or a class, is as it should be."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import Json, argument, imported, option
-from evofsm.cli.show import facts, print_json, show
 
 if TYPE_CHECKING:
     from evofsm.guard.audit_log import Audit
@@ -16,8 +15,7 @@ _KEEP = (
     "Keep the head where the log is not. Without it (--head) neither an end that is cut off nor a "
     "log that is written anew can be detected."
 )
-# So many fields that differ are shown.
-_FIELDS = 5
+_FIELDS = 5  # so many fields that differ are shown
 
 
 def audit(
@@ -35,6 +33,7 @@ def audit(
     bit. Ends with 0 if all is well, 1 if the log was tampered with or a decision comes out
     otherwise, and 2 if it cannot be read.
     """
+    from evofsm.cli.show import facts, print_json, show
     from evofsm.guard import Head
     from evofsm.guard import audit as examine
 
@@ -70,16 +69,7 @@ def _facts(found: Audit) -> Iterator[tuple[str, str]]:
     if contents.settings:
         text += f", {counted(contents.settings, 'setting change')}"
     yield "holds", text + ("" if breach is None else ", so far")
-    yield from _of_replay(found)
-    if breach is None:
-        yield "head", str(found.head)
-
-
-def _of_replay(found: Audit) -> Iterator[tuple[str, str]]:
-    from evofsm.fsm.validation import counted
-
     difference, n_matches = found.difference, found.replayed
-    decisions = found.contents.decisions
     text = f"{counted(n_matches, 'decision')} as recorded, to the last bit"
     if difference is None:
         yield "replay", text
@@ -90,8 +80,40 @@ def _of_replay(found: Audit) -> Iterator[tuple[str, str]]:
         yield "", f"before it {text}"
     for why in dict.fromkeys(found.not_replayed):
         yield "", f"{counted(found.not_replayed.count(why), 'session')} not replayed: {why}"
-    if difference is None and n_matches < decisions:
-        yield "", f"{counted(decisions - n_matches, 'decision')} compared with nothing"
+    if difference is None and n_matches < contents.decisions:
+        yield "", f"{counted(contents.decisions - n_matches, 'decision')} compared with nothing"
     if difference is not None and found.other_makers:
         makers = ", ".join(f"{field.name} {field.recorded}" for field in found.other_makers)
         yield "", f"it was recorded with {makers}: floats may differ there"
+    if breach is None:
+        yield "head", str(found.head)
+
+
+def check(
+    name: Annotated[str, argument("module:Class, module:instance, or a function that makes one.")],
+    as_json: Json = False,
+) -> int:
+    """Check a class of your own against the contract of its kind.
+
+    A state rule, a reviser, a controller or a judge; its methods tell which. The module is
+    imported, from the present folder too, so that its code is run: check code that you trust. Ends
+    with 1 if a check fails.
+    """
+    from rich.padding import Padding
+
+    from evofsm.cli.show import print_json, say, show
+    from evofsm.guard.check import check_results, kind_of
+
+    part = imported(name)
+    kind, results = kind_of(part), check_results(part)
+    failed = sum(not result.passed for result in results)
+    if as_json:
+        print_json(results)
+    else:
+        say(f"{name}, checked against the contract of a {kind}")
+        for result in results:
+            say(f"  {'passed' if result.passed else 'failed'}  {result.check}")
+            if result.message:
+                show(Padding(result.message, (0, 0, 0, 10)))
+        say(f"{len(results)} checks: {len(results) - failed} passed, {failed} failed")
+    return int(failed > 0)

@@ -1,31 +1,46 @@
-"""`evofsm drive`."""
+"""`evofsm paper` and `evofsm drive`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, closing, nullcontext
+import shlex
+import sys
+from contextlib import closing
 from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from evofsm.cli.options import (
-    ByJudge,
-    InWorld,
-    Json,
-    ModeName,
-    Seed,
-    Tolerance,
-    argument,
-    option,
-    require,
-    require_world,
-)
-from evofsm.cli.show import facts, print_json, progress, say, show, warn
+from evofsm.cli import options
+from evofsm.cli.options import argument, option
 
-if TYPE_CHECKING:
-    from evofsm.cli.driving import Driving, Results, Setup
-    from evofsm.guard import Guard
+
+def paper(
+    world: options.InWorld = "sumo",
+    rounds: Annotated[int, option("How often the four cases are driven.", min=1)] = 20,
+    out: Annotated[Path, option("Folder for the page and the model.")] = Path("evofsm-paper"),
+    as_json: options.Json = False,
+) -> int:
+    """Reproduce the paper: drive its 80 runs, and hold every claim against them.
+
+    Ends with 0 if all claims hold, with 1 if any does not.
+    """
+    options.require_world(world, polars="tables", matplotlib="plot", jinja2="plot")
+    out.mkdir(parents=True, exist_ok=True)  # where that fails nothing is driven first
+    from evofsm.cli.show import print_json, print_page, progress
+    from evofsm.driving.sumo import open_world
+    from evofsm.paper import Settings, check_claims, run_paper
+    from evofsm.paper.reproduction import page_of, write
+
+    with progress(f"Driving and learning ({world})") as move:
+        study = run_paper(open_world(world), world, Settings.load(), rounds, move)
+    command, claims = shlex.join(["evofsm", *sys.argv[1:]]), check_claims(study)
+    page = write(study, out, command)
+    if as_json:
+        print_json([claim._asdict() for claim in claims])
+    else:
+        print_page(page_of(study, command))
+        print(f"\nPage with all figures: {page}")
+    return 0 if all(claim.holds for claim in claims) else 1
 
 
 def drive(
@@ -33,14 +48,14 @@ def drive(
         str, argument("Scenarios (emergency, paper+noise, ...), your own file, or a .sumocfg.")
     ],
     episodes: Annotated[int, option("How many are driven.", min=1, max=2**32)] = 100,
-    world: InWorld = "kinematic",
+    world: options.InWorld = "kinematic",
     reviser: Annotated[
         Literal["least-risk", "none"], option("The filter, or none.")
     ] = "least-risk",
-    judge: ByJudge = "kinematic",
-    mode: Annotated[ModeName, option("How far least-risk goes.")] = "act",
-    tolerance: Tolerance = 0.02,
-    seed: Seed = 0,
+    judge: options.ByJudge = "kinematic",
+    mode: Annotated[options.ModeName, option("How far least-risk goes.")] = "act",
+    tolerance: options.Tolerance = options.TOLERANCE,
+    seed: options.Seed = 0,
     frozen: Annotated[
         Path | None, option("Drive held-out draws with what this folder holds; learn nothing.")
     ] = None,
@@ -55,7 +70,7 @@ def drive(
         str, option("Of a SUMO configuration: all, a share, type:NAME, or ids with commas.")
     ] = "10%",
     mcap: Annotated[Path | None, option("Log every episode for Foxglove.")] = None,
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> int | None:
     """Drive scenarios under a safety filter, which learns on the way.
 
@@ -69,41 +84,48 @@ def drive(
     A SUMO configuration (my.sumocfg) is run as it is, once, with guards in the cars that --vehicles
     names; of all else only --mode (act or shadow), --tolerance and --json hold then.
     """
-    options = {"frozen": frozen, "workers": workers, "out": out, "audit": audit, "mcap": mcap}
-    options = {name: value for name, value in options.items() if value is not None}
-    if family.endswith(".sumocfg"):
-        if options:
-            text = "is for families of scenarios, not for a configuration"
-            raise ValueError(f"--{next(iter(options))} {text}")
-        from evofsm.cli.sumocfg import run_configuration
+    from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
-        run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
+    if family.endswith(".sumocfg"):
+        parts = {"frozen": frozen, "workers": workers, "out": out, "audit": audit, "mcap": mcap}
+        for name, value in parts.items():
+            if value is not None:
+                text = "is for families of scenarios, not for a configuration"
+                raise ValueError(f"--{name} {text}")
+        from evofsm.cli import driving
+
+        driving.run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
     if workers is not None and (audit or mcap):
         raise ValueError("--audit and --mcap go with no --workers: workers send no decisions")
-    require_world(world, **({"polars": "tables"} if out is not None and workers is None else {}))
-    require(**({} if mcap is None else {"mcap": "mcap"}))
-    from evofsm.cli.driving import GUARD, Results, Setup, drive_at_once, load_guard, make_guard
+    needs_table = out is not None and workers is None
+    options.require_world(world, **({"polars": "tables"} if needs_table else {}))
+    options.require(**({} if mcap is None else {"mcap": "mcap"}))
+    from evofsm.cli import driving
     from evofsm.driving import load_family
     from evofsm.guard import Mode
 
     before, digest = None, ""
     if frozen is not None:
-        before, _ = load_guard(frozen)
-        digest = sha256((frozen / GUARD).read_bytes()).hexdigest()
+        before, _ = driving.load_guard(frozen)
+        digest = sha256((frozen / driving.GUARD).read_bytes()).hexdigest()
     learns = frozen is None and workers is None
     choices = load_family(family), reviser, judge, Mode(mode), tolerance, seed, world
-    setup = Setup(*choices, learns, digest)
-    with closing(Results(setup, make_guard(setup, before), out)) as results:
+    setup = driving.Setup(*choices, learns, digest)
+    guard = driving.make_guard(setup, before)
+    with closing(driving.Results(setup, guard, out)) as results:
         if mcap is not None and results.rows:
             fault = f"{out} has {len(results.rows):,} episodes already; name another folder"
             raise ValueError(f"--mcap holds what one run drives, but {fault}")
         try:
             if workers is not None:
                 with progress("Driving", episodes) as move:
-                    summary = drive_at_once(results, episodes, workers, move)
+                    summary = driving.drive_at_once(results, episodes, workers, move)
             else:
-                summary = _drive_in_turn(results, episodes, audit, mcap)
+                with driving.log_of(audit, mcap) as log, progress("Driving", episodes) as move:
+                    summary = driving.drive_in_turn(results, episodes, move, log)
+                if audit is not None:
+                    warn(f"head of {audit}, to be kept elsewhere: {log.head}")
         except KeyboardInterrupt:
             if out is None:
                 raise
@@ -111,73 +133,11 @@ def drive(
             warn(f"stopped after {how_far}; the same command goes on from there")
             return 130
     if as_json:
-        print_json(asdict(summary.row))
+        print_json(asdict(summary))
         return None
-    show(facts("What came of driving", _summary(summary, setup)))
+    show(facts("What came of driving", driving.told_of(summary, results)))
     if out is not None:
         say(f"What was learnt, and every episode: {out}")
     if mcap is not None:
         say(f"Every decision, for Foxglove: {mcap}")
     return None
-
-
-# -- Driving --------------------------------------------------------------------------------------
-
-
-def _drive_in_turn(
-    results: Results, episodes: int, audit: Path | None, mcap: Path | None
-) -> Driving:
-    from evofsm.cli.driving import drive_in_turn
-
-    with _log_of(audit, mcap) as log, progress("Driving", episodes) as move:
-        summary = drive_in_turn(results, episodes, move, log)
-    if audit is not None:
-        warn(f"head of {audit}, to be kept elsewhere: {log.head}")
-    return summary
-
-
-def _log_of(audit: Path | None, mcap: Path | None) -> AbstractContextManager[Any]:
-    """What records the decisions; None where nobody wants them."""
-    if mcap is not None:
-        from evofsm.io import FoxgloveSink
-
-        return FoxgloveSink(None, mcap)
-    from evofsm.guard import AuditLog
-
-    return AuditLog(audit) if audit else nullcontext()
-
-
-# -- What came of it ------------------------------------------------------------------------------
-
-
-def _summary(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
-    """Collisions and their price, and what was learnt."""
-    from evofsm.driving.cars import TOLD
-
-    row = driving.row
-    kind = "training" if setup.learn else "held-out"
-    yield "family", f"{row.family}, {row.episodes:,} {kind} episodes"
-    yield "reviser", f"{setup.reviser}, {setup.mode.value}"
-    yield "judge", f"{setup.judge}, given {TOLD[setup.judge]}"
-    interval = f"(95 %: {row.collision_low:.1%} to {row.collision_high:.1%})"
-    share = f"{row.collisions:,} of {row.episodes:,}: {row.collision_rate:.1%}"
-    yield "collisions", f"{share} {interval}"
-    yield "rate", str(row.failures)
-    if row.rear_ends:
-        yield "rear-ended", f"{row.rear_ends}"
-    yield "mobility", f"{row.mobility:.2f} of the way that the controller makes by itself"
-    interventions = f"{row.intervention_rate:.1%} of decisions"
-    yield "interventions", f"{interventions}; mean change {row.mean_change:.2f} m/s²"
-    yield "comfort", f"RMS jerk {row.jerk:.2f} m/s³"
-    yield "learnt", _learnt(driving.guard)
-
-
-def _learnt(guard: Guard) -> str:
-    from evofsm.driving import LatentRisk, dead_ends_of, learners_of
-
-    machine, judge = learners_of(guard)
-    states = f"{machine.n_states} states"
-    if isinstance(judge, LatentRisk):
-        states += f", {len(dead_ends_of(machine, judge))} of them dead ends"
-    experience = getattr(judge, "told_by_experience", "")
-    return f"{states}; {experience}" if experience else states

@@ -1,8 +1,4 @@
-"""Drive a family of scenarios under a reviser: in turn and learning, or many episodes at once.
-
-What came of an episode is a row. Where there is a folder, rows are written as they come, and the
-same work goes on from them after whatever ended it.
-"""
+"""Drive a family of scenarios, in turn or many episodes at once; or a configuration of SUMO."""
 
 from __future__ import annotations
 
@@ -12,48 +8,36 @@ import math
 import os
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from threading import Thread
-from typing import Any, NamedTuple
+from typing import Any
 
-from evofsm import store
+from evofsm import driving, store
 from evofsm.cli.journal import Journal
-from evofsm.cli.show import Advance
-from evofsm.driving import (
-    Episode,
-    Family,
-    Outcome,
-    Unrevised,
-    drive,
-    guard_for_family,
-    learners_of,
-    outcome_of,
-    reference_of,
-    summarise,
-)
-from evofsm.driving.cars import name_judge
+from evofsm.cli.options import split_names
+from evofsm.cli.show import Advance, print_json, progress, show, table
+from evofsm.driving.cars import TOLD, name_judge
 from evofsm.driving.naming import DECISION_COLUMNS
 from evofsm.driving.sumo import open_world
 from evofsm.driving.trials import Row
 from evofsm.driving.world import World
 from evofsm.extras import needs
-from evofsm.guard import TOLERANCE, DecisionLogger, Guard, Mode
+from evofsm.guard import TOLERANCE, AuditLog, DecisionLogger, Guard, Mode
 
 #: The columns of ``decisions.parquet`` after ``episode``; `driving/naming.py` says which they are.
 DECISION_TABLE = tuple(name for name, column in DECISION_COLUMNS.items() if column.in_table)
-#: The guard in a folder of results.
-GUARD = "guard.evofsm"
+GUARD = "guard.evofsm"  #: the guard in a folder of results
 
 _JOURNAL, _DECISIONS, _EPISODES = "episodes.jsonl", "decisions.parquet", "episodes.csv"
-# The guard is saved so often while it learns [s].
-_EVERY = 60.0
-# So many episodes are one task of a worker: some 500 ms.
-_BATCH = 20
+_EVERY = 60.0  # the guard is saved so often while it learns [s]
+_BATCH = 20  # so many episodes are one task of a worker: some 500 ms
 
 Outcomes = dict[str, Any]
 
@@ -62,7 +46,7 @@ Outcomes = dict[str, Any]
 class Setup:
     """What is asked for."""
 
-    family: Family
+    family: driving.Family
     reviser: str = "least-risk"
     judge: str = "kinematic"
     mode: Mode = Mode.ACT
@@ -80,20 +64,13 @@ class Setup:
         file = source and Path(source).read_text("utf-8")
         return {**settings, "mode": self.mode.value, "file": file}
 
-    def drive(self, guard: Guard, world: World, number: int) -> tuple[Episode, Outcomes]:
+    def drive(self, guard: Guard, world: World, number: int) -> tuple[driving.Episode, Outcomes]:
         """An episode, of a training draw while it learns, of a held-out one else; and its row."""
         draw = self.family.draw(self.seed, number, "train" if self.learn else "test")
-        alone = reference_of(self.family, draw, world)
-        episode = drive(guard, draw, world)
-        outcome = outcome_of(episode, alone)
+        alone = driving.reference_of(self.family, draw, world)
+        episode = driving.drive(guard, draw, world)
+        outcome = driving.outcome_of(episode, alone)
         return episode, {"episode": number, "variant": draw.variant, **outcome._asdict()}
-
-
-class Driving(NamedTuple):
-    """What came of it."""
-
-    row: Row
-    guard: Guard  #: with what it learnt
 
 
 def load_guard(folder: Path) -> tuple[Guard, int]:
@@ -105,10 +82,10 @@ def load_guard(folder: Path) -> tuple[Guard, int]:
 def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     """A guard whose reviser and judge have the setup's names, with what was learnt before."""
     family = setup.family
-    machine, judge = (None, None) if before is None else learners_of(before)
+    machine, judge = (None, None) if before is None else driving.learners_of(before)
     if judge is not None and (kind := name_judge(judge)) != setup.judge:
         raise ValueError(f"what was learnt is of the judge {kind!r}, not of {setup.judge!r}")
-    guard = guard_for_family(
+    guard = driving.guard_for_family(
         family,
         tolerance=setup.tolerance,
         mode=setup.mode,
@@ -120,7 +97,7 @@ def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     if setup.reviser == "least-risk":
         return guard
     learners: dict[str, Any] = {"machine": guard.machine, "judge": guard.judge}
-    reviser = Unrevised(family.actions)
+    reviser = driving.Unrevised(family.actions)
     return Guard.of(reviser, interval=family.interval, learn=setup.learn, **learners)
 
 
@@ -133,8 +110,7 @@ class Results:
     def __init__(self, setup: Setup, guard: Guard, folder: Path | None = None) -> None:
         self.setup = setup
         self.folder = folder
-        #: As the guard is after all `rows`, where it learns.
-        self.guard = guard
+        self.guard = guard  #: as the guard is after all `rows`, where it learns
         self.rows: dict[int, Outcomes] = {}
         self._journal: Journal | None = None
         self._saved = time.monotonic()
@@ -179,18 +155,20 @@ class Results:
             raise
         self._saved = time.monotonic()
 
-    def summed_up(self, episodes: int) -> Driving:
+    def summed_up(self, episodes: int) -> Row:
         """What came of so many episodes; written to the folder, if there is one."""
         setup, rows = self.setup, [self.rows[number] for number in range(episodes)]
-        outcomes = [Outcome(*(row[name] for name in Outcome._fields)) for row in rows]
-        row = summarise(setup.family.name, setup.reviser, outcomes, setup.family.interval)
+        outcomes = [
+            driving.Outcome(*(row[name] for name in driving.Outcome._fields)) for row in rows
+        ]
+        row = driving.summarise(setup.family.name, setup.reviser, outcomes, setup.family.interval)
         if self.folder is not None:
             self._write(self.folder, rows)
-        return Driving(row, self.guard)
+        return row
 
     def _write(self, folder: Path, rows: Sequence[Outcomes]) -> None:
         self.save_guard(now=True)
-        names = ["episode", "variant", *Outcome._fields]
+        names = ["episode", "variant", *driving.Outcome._fields]
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\n")
         table.writerows([names, *([row[name] for name in names] for row in rows)])
@@ -218,12 +196,18 @@ def _write_decisions(path: Path, rows: Sequence[Outcomes]) -> None:
         table.write_parquet(file)
 
 
-def _decided(driven: Episode) -> dict[str, list[Any]]:
+def _decided(driven: driving.Episode) -> dict[str, list[Any]]:
     columns = {name: DECISION_COLUMNS[name].read for name in DECISION_TABLE}
     return {name: [read(d) for d in driven.decisions] for name, read in columns.items()}
 
 
-# -- In turn --------------------------------------------------------------------------------------
+def log_of(audit: Path | None, mcap: Path | None) -> AbstractContextManager[Any]:
+    """What records the decisions; None where nobody wants them."""
+    if mcap is not None:
+        from evofsm.io import FoxgloveSink
+
+        return FoxgloveSink(None, mcap)
+    return AuditLog(audit) if audit else nullcontext()
 
 
 def drive_in_turn(
@@ -231,7 +215,7 @@ def drive_in_turn(
     episodes: int,
     move: Advance = lambda *_, **__: None,
     audit: DecisionLogger | None = None,
-) -> Driving:
+) -> Row:
     """Drive those episodes that the results lack, one after the other."""
     setup, guard, n_episodes = results.setup, results.guard, len(results.rows)
     if setup.learn and n_episodes > episodes:
@@ -248,16 +232,10 @@ def drive_in_turn(
     return results.summed_up(episodes)
 
 
-# -- At once --------------------------------------------------------------------------------------
-
-
 def drive_at_once(
     results: Results, episodes: int, workers: int, move: Advance = lambda *_, **__: None
-) -> Driving:
-    """Drive those held-out episodes that the results lack, by many workers.
-
-    What comes of it does not depend on who drives, nor on what happens to them.
-    """
+) -> Row:
+    """Drive those held-out episodes that the results lack; who drives them makes no odds."""
     guard = results.guard.copy(states=False)  # what is decided does not depend on them
     guard.freeze()
     numbers = [number for number in range(episodes) if number not in results.rows]
@@ -295,3 +273,140 @@ def _begin_work() -> None:
         os._exit(1)
 
     Thread(target=end_with_parent, daemon=True).start()
+
+
+def told_of(row: Row, results: Results) -> Iterator[tuple[str, str]]:
+    """Collisions and their price, and what was learnt."""
+    setup = results.setup
+    kind = "training" if setup.learn else "held-out"
+    yield "family", f"{row.family}, {row.episodes:,} {kind} episodes"
+    yield "reviser", f"{setup.reviser}, {setup.mode.value}"
+    yield "judge", f"{setup.judge}, given {TOLD[setup.judge]}"
+    interval = f"(95 %: {row.collision_low:.1%} to {row.collision_high:.1%})"
+    share = f"{row.collisions:,} of {row.episodes:,}: {row.collision_rate:.1%}"
+    yield "collisions", f"{share} {interval}"
+    yield "rate", str(row.failures)
+    if row.rear_ends:
+        yield "rear-ended", f"{row.rear_ends}"
+    yield "mobility", f"{row.mobility:.2f} of the way that the controller makes by itself"
+    interventions = f"{row.intervention_rate:.1%} of decisions"
+    yield "interventions", f"{interventions}; mean change {row.mean_change:.2f} m/s²"
+    yield "comfort", f"RMS jerk {row.jerk:.2f} m/s³"
+    machine, judge = driving.learners_of(results.guard)
+    states = f"{machine.n_states} states"
+    if isinstance(judge, driving.LatentRisk):
+        states += f", {len(driving.dead_ends_of(machine, judge))} of them dead ends"
+    experience = getattr(judge, "told_by_experience", "")
+    yield "learnt", f"{states}; {experience}" if experience else states
+
+
+# -- A configuration of somebody else's ----------------------------------------------------------
+
+
+def run_configuration(
+    file: Path, vehicles: str, mode: str, tolerance: float, *, as_json: bool
+) -> None:
+    """Run it to its end, or until all cars have arrived, and print `Attachment.summary` of it."""
+    if mode not in ("act", "shadow"):
+        raise ValueError(f"--mode is {mode!r}; for a configuration it is act or shadow")
+    by_ids = not (vehicles == "all" or vehicles.startswith("type:") or vehicles.endswith("%"))
+    choice = split_names(vehicles) if by_ids else vehicles
+
+    def driven(how: str) -> dict[str, Any]:
+        with progress("Driving") as move, _running(file) as (sumo, steps):
+            cars = driving.attach(sumo, choice, mode=how, tolerance=tolerance)
+            for seconds in steps:
+                if seconds == int(seconds):
+                    collisions = f"{len(cars.collisions)} collisions"
+                    move(description=f"Driving, {how} ({seconds:,.0f} s, {collisions})")
+            seconds, kinds = float(sumo.simulation.getTime()), sumo.vehicletype.getIDList()
+        if not cars.ever:
+            types = ", ".join(kind for kind in kinds if not kind.startswith("DEFAULT_"))
+            raise ValueError(
+                f"--vehicles {vehicles}: in {seconds:,.0f} s there was no such car, so nothing was "
+                f"guarded; types are {types or 'those of SUMO alone'}"
+            )
+        return {"seconds": seconds, **cars.summary()}
+
+    alone = driven("watch") if mode == "act" else None
+    outcome = driven(mode)
+    if as_json:
+        settings = {"configuration": str(file), "vehicles": vehicles, "mode": mode}
+        print_json({**settings, **outcome, "alone": alone})
+        return
+    title = f"What came of {outcome['seconds']:,.0f} s"
+    runs = (outcome,) if alone is None else (alone, outcome)
+    rows = [(name, *map(tell, runs)) for name, tell in _TOLD.items()]
+    rows = [row for row in rows if any(row[1:])]
+    header = ("", "in shadow") if alone is None else ("", "alone", "guarded")
+    show(table(title, header, rows))
+
+
+def _share(what: str) -> Callable[[Mapping[str, Any]], str]:
+    """How many of the decisions; empty where nobody decided."""
+    return lambda came: f"{came[what] / came['decisions']:.1%}" if "decisions" in came else ""
+
+
+# What is told of a simulation, by what it is called.
+_TOLD: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "cars chosen": lambda came: f"{came['cars']:,}",
+    "collisions": lambda came: f"{came['collisions']:,}",
+    "  by chosen cars": lambda came: f"{came['of_guarded']:,}",
+    "  into chosen cars": lambda came: f"{came['into_guarded']:,}",
+    "hard brakes": lambda came: f"{came['hard_brakes']:,}",
+    "mean speed [m/s]": lambda came: f"{came['speed']:.2f}",
+    "time lost [s]": lambda came: f"{came['time_lost']:,.0f}",
+    "RMS jerk [m/s³]": lambda came: f"{came['jerk']:.2f}",
+    "decisions": lambda came: f"{came['decisions']:,}" if "decisions" in came else "",
+    "  speed limited": _share("limited"),
+    "  driving changed": _share("revised"),
+    "  µs each": lambda came: f"{came['microseconds']:.0f}" if "decisions" in came else "",
+}
+
+
+def trace_configuration(
+    file: Path, out: Path, seconds: float, enough: int
+) -> tuple[float, bool, dict[str, list[float]]]:
+    """Run a configuration as it is, and write where its cars were as an FCD file.
+
+    So many seconds at most, and no more once so many positions were written. Returns how long [s],
+    whether it would have gone on, and when there were collisions [s], by who was behind whom.
+    """
+    crashes: dict[str, list[float]] = {}
+    with _running(file, "--fcd-output", str(out)) as (sumo, steps):
+        start, n_positions, is_cut = float(sumo.simulation.getTime()), 0, False
+        now, dt = start, float(sumo.simulation.getDeltaT())
+        for now in steps:
+            for crash in sumo.simulation.getCollisions():
+                # A step is written with the time at which it began.
+                crashes.setdefault(f"{crash.collider} behind {crash.victim}", []).append(now - dt)
+            n_positions += sumo.vehicle.getIDCount()
+            if is_cut := now >= start + seconds or n_positions >= enough:
+                break
+        return now - start, is_cut, crashes
+
+
+@contextmanager
+def _running(file: Path, *options: str) -> Iterator[tuple[Any, Iterator[float]]]:
+    """SUMO, and the times after each of its steps [s]."""
+    if not file.is_file():
+        raise FileNotFoundError(2, "no such file", str(file))
+    with needs("libsumo", "sumo", "a SUMO configuration"):
+        sumo: Any = import_module("libsumo")
+    try:
+        sumo.start(["sumo", "-c", str(file), "--no-step-log", "true", *options])
+    except sumo.TraCIException as error:
+        raise ValueError(f"{file}: SUMO refuses it: {str(error).strip()}") from error
+
+    def steps() -> Iterator[float]:
+        end = sumo.simulation.getEndTime()
+        while not 0.0 <= end <= sumo.simulation.getTime():
+            if sumo.simulation.getMinExpectedNumber() <= 0:
+                return
+            sumo.simulationStep()
+            yield sumo.simulation.getTime()
+
+    try:
+        yield sumo, steps()
+    finally:
+        sumo.close()

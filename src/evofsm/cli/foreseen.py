@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from rich.console import RenderableType
 
 from evofsm.cli.options import picture
 from evofsm.cli.show import facts, print_json, show, table
@@ -18,19 +19,12 @@ from evofsm.fsm.validation import counted
 from evofsm.guard import ActionReviser, Choices, Foresight, Guard, Mode
 from evofsm.guard.foresight import DATES, RATE, RATES, Runs, false_times, span
 from evofsm.io import Chunk
+from evofsm.io.tables import date
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from rich.console import RenderableType
+Floats = NDArray[np.float64]
 
-    Floats = NDArray[np.float64]
-
-# Less than the share of alarms of any kind that are right: which alarm it is the judge says.
-_ANY_ALARM = 1e-6
-# From here on no year has four digits [s].
-_NO_DATE = 253_402_300_799.0
-# Alarms that are listed.
-_LISTED = 12
+_ANY_ALARM = 1e-6  # a lower share of alarms is right for none: which it is the judge says
+_LISTED = 12  # alarms
 _CAME = ("ahead", "false/day")
 _HEADER = ("stated", "foreseen", *_CAME, "thresholds", *_CAME)
 
@@ -48,21 +42,13 @@ def guard_where_nobody_acts(
     settings: dict[str, Any] = {"dt": float(episodes[0].dt), "horizon": horizon, "hold": hold}
     settings |= {"names": labels.names, "units": labels.units}
     judge = Foresight.learn_log(rows, failed, **settings)
-    return _guard_of(judge, false_a_day, machine, learn=False)
+    return guard_of_alarms(judge, false_a_day, machine, learn=False)
 
 
-def guard_from_zero(
-    dt: float, names: Sequence[str], horizon: float | None, hold: float, false_a_day: float | None
-) -> Guard:
-    """The same, of one that has seen nothing, and learns as it goes."""
-    judge = Foresight.from_zero(dt=dt, names=names, horizon=horizon, hold=hold)
-    machine = EvolvingFSM(1, max_states=200)
-    return _guard_of(judge, false_a_day, machine, learn=True)
-
-
-def _guard_of(
+def guard_of_alarms(
     judge: Foresight, false_a_day: float | None, machine: EvolvingFSM | None, *, learn: bool
 ) -> Guard:
+    """A guard where nobody acts, with so many false alarms a day that are stated."""
     judge.stated = RATE if false_a_day is None else false_a_day
     reviser = ActionReviser(judge, Choices(1), tolerance=_ANY_ALARM, mode=Mode.SHADOW)
     return Guard.of(reviser, interval=judge.dt, machine=machine, learn=learn)
@@ -242,14 +228,6 @@ def alarms_of(judge: Foresight, worse: Collection[int] = ()) -> Iterator[Rendera
 def _last(hits: Sequence[Any], what: str) -> str:
     n = len(hits)
     return f"\n{what}: {'all' if n <= _LISTED else f'the last {_LISTED} of'} {n:,}"
-
-
-def date(time: float, unit: str = "") -> str:
-    """A time [s], as people read it; with its unit, where it is no date."""
-    if not DATES <= time < _NO_DATE:
-        return f"{time:.13g}{unit}"
-    text = f"{datetime.fromtimestamp(round(time, 3), UTC):%Y-%m-%d %H:%M:%S.%f}"
-    return text[:-3].removesuffix(".000").removesuffix(":00")
 
 
 def _draw(

@@ -1,32 +1,14 @@
-"""`evofsm inspect` and `evofsm explain`: what was learnt, as a whole and of one situation."""
+"""`evofsm inspect`, `explain` and `export`: what was learnt, of a situation, for other tools."""
 
 from __future__ import annotations
 
-import math
+import sys
 import textwrap
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, Literal
 
-from evofsm.cli.options import Json, Saved, option, picture, quoted, reading_of, typed
-from evofsm.cli.show import facts, print_json, say, show, table
+from evofsm.cli.options import Json, ModeName, Saved, option
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-    from rich.console import RenderableType
-
-    from evofsm.fsm.explanation import Explanation
-    from evofsm.fsm.model import FSMModel
-    from evofsm.guard import Guard
-    from evofsm.store import Header
-
-# What folders of results hold, in the order in which it is looked for.
-_MODELS = ("guard.evofsm", "model.evofsm")
-# So many states are listed, those with most of the time, and so many transitions between them.
-_STATES_LISTED, _PASSAGES = 20, 12
-# Of a longer log so many rows are drawn.
-_ROWS_SHOWN = 20_000
 _UNTOLD = (
     "Which episodes failed is not known: nothing said so. From a log, evofsm learn "
     "--failed COLUMN or --failed 'gap<=0' says it."
@@ -43,222 +25,25 @@ def inspect(
 
     evofsm explain says what came of one situation.
     """
-    model, header, guard = load_model(file)
+    from evofsm.cli import models
+    from evofsm.cli.show import facts, print_json, show
+
+    model, header, guard = models.load_model(file)
     provenance = header.provenance
     if plot is not None:
         title = f"States of {file.name}" + (f" over {Path(log).name}" if log else "")
-        rows = _logged(log, model, provenance.get("read with", {}))
-        _draw(model, guard, plot, rows, title)
+        rows = models.logged(log, model, provenance.get("read with", {}))
+        models.draw(model, guard, plot, rows, title)
     experience = getattr(guard and guard.judge, "told_by_experience", None)
     pairs = [] if experience is None else [("experience", str(experience))]
     if as_json:
         head = {"file": file, "provenance": provenance, **dict(pairs)}
-        print_json({**head, **model_document(model)})
+        print_json({**head, **models.model_document(model)})
         return
     of_file = [("file", str(file))]
     of_file += [("holds", f"a {header.kind}, written by evofsm {header.library}")]
-    of_file += [*_learnt_from(provenance), *_model_facts(model), *pairs]
-    show(facts("Model", of_file), *tables_of(model))
-
-
-def load_model(place: Path) -> tuple[FSMModel, Header, Guard | None]:
-    """A model from wherever one was left, what its file says of itself, and the guard it is of."""
-    from evofsm import store
-    from evofsm.driving import FAMILIES, load_family
-    from evofsm.fsm.actions import IntervalActions
-    from evofsm.fsm.machine import EvolvingFSM
-    from evofsm.fsm.model import FSMModel
-    from evofsm.fsm.naming import Labels
-    from evofsm.guard import Guard
-
-    if place.is_dir():
-        path = next((place / name for name in _MODELS if (place / name).exists()), None)
-        if path is None:
-            raise FileNotFoundError(f"{place}: there is neither {' nor '.join(_MODELS)} in it")
-        return load_model(path)
-    header, guard = store.read_header(place), None
-    if header.kind == "guard":
-        guard = Guard.load(place, failed=lambda seen: False)
-        machine = guard.machine
-        if machine is None:
-            raise ValueError(f"{place}: this guard has no machine")
-    elif header.kind == "machine":
-        machine = EvolvingFSM.load(place)
-    else:
-        return FSMModel.load(place), header, None
-    family = str(header.provenance.get("family"))
-    if not machine.n_states:
-        raise ValueError(f"{place} has seen nothing yet: an episode has to be over")
-    labels = getattr(guard and guard.judge, "labels", Labels())
-    if isinstance(actions := getattr(guard and guard.reviser, "actions", None), IntervalActions):
-        labels = labels._replace(actions=actions)
-    if family in FAMILIES:
-        labels = load_family(family).labels
-    return machine.model(**labels._asdict()), header, guard
-
-
-def _logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> dict[str, Any]:
-    """Rows of a log, some tens of thousands, and with which of them an episode failed."""
-    import numpy as np
-
-    if log is None:
-        return {}
-    rows, failed = list[Any](), list[Any]()
-    options = {**read_with} if read_with else {"observe": quoted(model.names)}
-    for chunk in reading_of(**options).traces([log]):
-        rows.append(chunk.observations)
-        failed.append(chunk.fails)
-    every, failures = np.concatenate(rows), np.concatenate(failed)
-    is_shown = failures | (np.arange(len(every)) % (1 + len(every) // _ROWS_SHOWN) == 0)
-    return {"rows": every[is_shown], "failed": failures[is_shown]}
-
-
-def _draw(model: FSMModel, guard: Guard | None, out: Path, logged: Any, title: str) -> None:
-    """States in the plane of two variables, and what a guard has learnt of failure."""
-    import numpy as np
-
-    from evofsm import plot
-    from evofsm.guard import Foresight, LearntRisk
-    from evofsm.guard.learnt.failure import telling
-
-    judge, order = guard and guard.judge, list[int]()
-    if isinstance(judge, Foresight):
-        rate = judge.alarm
-        logged["alarm"] = () if rate is None else judge.where(rate)
-        order = [] if rate is None else telling(judge.where(rate))
-    away = (model.centers - np.median(model.centers, axis=0)) ** 2  # then what differs at failures
-    order += np.argsort(-(model.endings @ away) / (away.sum(0) + 1e-12), kind="stable").tolist()
-    with picture(out, 7.2, 5.0) as figure:
-        figure.suptitle(title, x=0.01, ha="left")
-        if guard is not None and isinstance(judge, LearntRisk):
-            plot.experience(guard, figure.subplots())
-        elif model.n_variables == 1:
-            plot.graph(model, figure.subplots())
-        else:
-            first, second = [*dict.fromkeys(order)][:2]
-            plot.states(model, figure.subplots(), variables=(first, second), ways=True, **logged)
-
-
-# -- As a whole -----------------------------------------------------------------------------------
-
-
-def passages(model: FSMModel) -> list[dict[str, Any]]:
-    """The transitions between states that were recognised most often.
-
-    Their share is that of all steps from the state of origin; what was learnt is the probability
-    per step that the matrices give, actions as often as they were used.
-    """
-    import numpy as np
-
-    counts = model.changes - np.diag(np.diag(model.changes))
-    steps = model.changes.sum(axis=1)
-    learnt = model.averaged_matrix
-    most_first = np.argsort(-counts, axis=None, kind="stable")[:_PASSAGES].tolist()
-    places = (divmod(place, model.n_states) for place in most_first)
-    return [
-        {"origin": i, "target": j, "times": int(counts[i, j])}
-        | {"share": float(counts[i, j] / steps[i]), "learnt": float(learnt[i, j])}
-        for i, j in places
-        if counts[i, j] > 0.0
-    ]
-
-
-def model_document(model: FSMModel) -> dict[str, Any]:
-    """All that is printed of a model, for JSON; states and actions from 0."""
-    states = zip(model.centers, model.visits.tolist(), model.created.tolist(), strict=True)
-    intervals = [model.actions and model.actions.interval(r) for r in range(model.n_actions)]
-    uses = enumerate(zip(intervals, model.uses.tolist(), strict=True))
-    return {
-        **{name: getattr(model, name) for name in ("dt", "names", "units", "failures_told")},
-        "settings": dict(model.settings),
-        "states": [
-            {"state": i, "center": center, "visits": visits, "first_seen": int(row)}
-            for i, (center, visits, row) in enumerate(states)
-        ],
-        "transitions": passages(model),
-        "actions": [{"action": r, "interval": of, "uses": count} for r, (of, count) in uses],
-    }
-
-
-def tables_of(model: FSMModel) -> Iterator[RenderableType]:
-    """Its states, and the transitions that matter."""
-    import numpy as np
-
-    total = max(float(model.visits.sum()), 1.0)
-    stays = np.diag(model.changes) / np.maximum(model.changes.sum(axis=1), 1.0)
-    heads = map(model.labels.variable, range(model.n_variables))
-    centers = zip(*map(_aligned, model.centers.T), strict=True)
-    states = [
-        (f"#{i + 1}", *center, f"{visits / total:.1%}", f"{stays[i]:.3f}", f"{row:,.0f}")
-        for i, (center, visits, row) in enumerate(
-            zip(centers, model.visits.tolist(), model.created.tolist(), strict=True)
-        )
-    ]
-    title = "States (stays: share of its steps; first seen: at which row)"
-    most = sorted(np.argsort(-model.visits, kind="stable")[:_STATES_LISTED].tolist())
-    yield ""
-    header = ("", *heads, "share of time", "stays", "first seen")
-    yield table(title, header, [states[k] for k in most])
-    if (rest := model.n_states - len(most)) > 0:
-        share = 1.0 - float(model.visits[most].sum()) / total
-        yield (
-            f"and {rest:,} more states, together {share:.1%} of the time (--json prints all, "
-            "evofsm explain says what came of one)"
-        )
-    yield ""
-    transitions = passages(model)
-    if not transitions:
-        yield "The recognised state never changed."
-        return
-    rows = [
-        (f"#{i + 1} → #{j + 1}", f"{times:,}", f"{share:.4f}", f"{learnt:.3f}")
-        for i, j, times, share, learnt in map(dict.values, transitions)
-    ]
-    title = f"Transitions that matter: the {len(transitions)} most frequent"
-    yield table(title, ("from → to", "times", "share", "learnt"), rows)
-    yield (
-        "\nTimes and share: of the steps from that state, as recognised. Learnt: probability per "
-        "step that the matrices give. Where it is far above the share, beliefs are wide."
-    )
-
-
-def _model_facts(model: FSMModel) -> list[tuple[str, str]]:
-    settings = ", ".join(f"{name} {value:g}" for name, value in model.settings.items())
-    step = "the step is not known" if model.dt is None else f"one every {model.dt:g} s"
-    failures = f"{model.endings.sum():,.0f} episodes ended in one"
-    actions = f"{model.labels.action(0)} to {model.labels.action(model.n_actions - 1)}"
-    return [
-        ("observations", f"{model.visits.sum():,.0f}, {step}"),
-        ("transitions", f"{model.uses.sum():,.0f}, under actions {actions}"),
-        ("states", f"{model.n_states}, of {model.n_variables} variables"),
-        ("settings", settings or "not known"),
-        ("failures", failures if model.failures_told else "which there were is not known"),
-    ]
-
-
-def _learnt_from(provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """What a file says of where it comes from, line by line."""
-    for name, value in provenance.items():
-        if name == "monitor":  # what one goes on from
-            continue
-        text = f"{value:,}" if isinstance(value, int) else str(value)
-        if name == "files":
-            more = f" and {len(value) - 3:,} more" if len(value) > 3 else ""
-            text = ", ".join(file["name"] for file in value[:3]) + more
-        if name == "read with":
-            text = typed(value)
-        is_amount = name in ("files", "rows", "episodes", "transitions")
-        yield f"learnt from {name}" if is_amount else name, text
-
-
-def _aligned(values: NDArray[np.float64]) -> list[str]:
-    """Numbers with the same number of decimals, such that the largest has four digits."""
-    largest = float(abs(values).max(initial=0.0))
-    decimals = max(3 - math.floor(math.log10(largest)), 0) if largest > 0.0 else 2
-    return [f"{value:.{decimals}f}" for value in values]
-
-
-# -- Of one situation -----------------------------------------------------------------------------
+    of_file += [*models.learnt_from(provenance), *models.model_facts(model), *pairs]
+    show(facts("Model", of_file), *models.tables_of(model))
 
 
 def explain(
@@ -275,25 +60,36 @@ def explain(
     All numbers were counted, once for each episode that came to a state; intervals are of 90 %.
     That one action ended better than another does not say that it was the reason.
     """
+    from evofsm.cli import models
+    from evofsm.cli.show import print_json, say
+
     if (observation is None) == (state is None):
         raise ValueError("name one situation, by --observation or by --state")
-    model, _, guard = load_model(file)
+    model, _, guard = models.load_model(file)
     index = None if action is None else _index("--action", action, model.n_actions)
+    here = ""
     if observation is not None:
-        if (count := len(_values(observation))) != model.n_variables:
+        values = _values(observation)
+        if len(values) != model.n_variables:
             names = ", ".join(map(model.labels.variable, range(model.n_variables)))
-            raise ValueError(f"--observation has {count} values; it needs {names}, in this order")
-        explanations = [model.explain(action=index, observation=_values(observation))]
-    elif state == "all":
-        explanations = [model.explain(k, index) for k in range(model.n_states)]
+            fault = f"has {len(values)} values; it needs {names}, in this order"
+            raise ValueError(f"--observation {fault}")
+        explanations = [model.explain(action=index, observation=values)]
+        here = guard.told_here(values) if guard else ""
     else:
-        explanations = [model.explain(_index("--state", state, model.n_states), index)]
+        is_each = state == "all"
+        states = range(model.n_states) if is_each else [_index("--state", state, model.n_states)]
+        explanations = [model.explain(k, index) for k in states]
     if as_json:
-        print_json({"file": file, "situations": [_document(model, e) for e in explanations]})
+        print_json(
+            {
+                "file": file,
+                "situations": [models.situation_document(model, e) for e in explanations],
+            }
+        )
         return
     if not model.failures_told:
         print(textwrap.fill(_UNTOLD, 80))
-    here = guard.told_here(_values(observation)) if guard and observation is not None else ""
     for explanation in explanations:
         say(textwrap.fill(f"{explanation.text} {here}", 80, subsequent_indent="   "))
 
@@ -313,10 +109,68 @@ def _values(text: str) -> list[float]:
         raise ValueError(f"--observation is {text!r}; write numbers, such as 9,24,24") from None
 
 
-def _document(model: FSMModel, found: Explanation) -> dict[str, Any]:
-    document = found._asdict()
-    document["center"] = None if found.state is None else model.centers[found.state]
-    for name in ("here", "action", "after_better"):
-        if (tally := getattr(found, name)) is not None:
-            document[name] = {**tally._asdict(), "interval": tally.interval}
-    return document
+def export(
+    file: Saved,
+    to: Annotated[
+        Literal["dot", "prism", "c99", "fmu"],
+        option("Graph for Graphviz, process for PRISM and Storm; the guard in C, or as an FMU."),
+    ],
+    out: Annotated[Path | None, option("File to write, else printed; of c99 a folder.")] = None,
+    prefix: Annotated[str, option("Of c99: how all names in it begin.")] = "evofsm",
+    mode: Annotated[ModeName | None, option("Of c99, fmu: act filters. [default: saved]")] = None,
+    least: Annotated[
+        float | None,
+        option("Leave out what is less probable. [default: dot 0.001]", min=0.0, max=1.0),
+    ] = None,
+    evidence: Annotated[
+        float | None, option("Leave out what was seen less often. [default: 1]", min=0.0)
+    ] = None,
+) -> None:
+    """Write what was learnt, or driven, in the formats of other tools."""
+    _refuse_learnt(out)
+    if to in ("c99", "fmu"):
+        from evofsm.guard import Foresight, Guard, Mode
+        from evofsm.guard.export import write_c99, write_fmu
+
+        if out is None:
+            raise ValueError(f"--to {to} prints nothing: name a file, of c99 a folder, by --out")
+        path = file / "guard.evofsm" if file.is_dir() else file
+        guard = Guard.load(path, failed=lambda seen: False)
+        if isinstance(guard.judge, Foresight):
+            why = "a guard where nobody acts (--action '') cannot be exported"
+            raise ValueError(f"{file}: {why}; run `evofsm monitor` beside the machine")
+        if mode and hasattr(guard.reviser, "mode"):
+            guard.reviser.mode = Mode(mode)
+        return write_c99(guard, out, prefix) if to == "c99" else write_fmu(guard, out)
+    from evofsm import store
+    from evofsm.cli import models
+    from evofsm.driving import LatentRisk, dead_ends_of
+    from evofsm.fsm.naming import visible
+    from evofsm.io import graphs
+
+    model, _, made_by = models.load_model(file)
+    judge = made_by and made_by.judge
+    style: dict[str, Any] = {"least": least, "evidence": evidence}
+    if to == "dot" and isinstance(judge, LatentRisk):
+        style["dead_ends"] = dead_ends_of(model, judge)
+    arguments = {name: value for name, value in style.items() if value is not None}
+    text = visible(getattr(graphs, f"to_{to}")(model, **arguments))
+    if out is None:
+        sys.stdout.write(text)
+        return
+    with store.replacing(out) as stream:
+        stream.write(text.encode())
+
+
+def _refuse_learnt(out: Path | None) -> None:
+    """Raise where a graph would take the place of what cannot be had again."""
+    from evofsm.store import read_header
+
+    if out is None or not out.is_file():
+        return
+    if not out.read_bytes().startswith(b"\x89MCAP"):  # as logs of runs do
+        try:
+            read_header(out)
+        except ValueError:
+            return
+    raise ValueError(f"--out {out}: what was learnt or driven is kept there; it was left alone")

@@ -1,14 +1,8 @@
 """A journal: what is in it survives whatever happens to the process that writes it.
 
-It is a file of JSON objects, one on each line. The first is the header, with the settings that all
-others belong to::
-
-    {"settings":{"seed":0},"crc":"0a8b2dd9"}
-    {"episode":3,"collided":false,"mobility":0.93,"crc":"1f0c4a66"}
-
-``crc`` is the CRC-32 of the line up to the comma before it, in hexadecimal: a record that was half
-written when the process was killed, or the disk full, does not have the right one. It is cut off
-when the journal is opened again.
+It is a file of JSON objects, one on each line; the first is the header, with the settings that all
+others belong to. A line that was half written when the process was killed, or the disk full, is cut
+off when the journal is opened again.
 """
 
 from __future__ import annotations
@@ -19,25 +13,19 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from zlib import crc32
 
 import msgspec
 
 from evofsm import store
 from evofsm.guard.audit_log import lines
 
-_SEAL = b',"crc":"'
-# A record has at most so many bytes.
-_LONGEST_RECORD = 1 << 20
+_LONGEST_RECORD = 1 << 20  # a record has at most so many bytes
 
 Record = Mapping[str, Any]
 
 
 class Journal:
-    """Records in a file that no other process writes. Close it after use.
-
-    A file that is no journal, or is damaged elsewhere than at its end, is refused.
-    """
+    """Records in a file that no other process writes; of another kind it is refused. Close it."""
 
     def __init__(
         self, path: Path, settings: Record, otherwise: str = "name another folder"
@@ -58,11 +46,11 @@ class Journal:
 
     def go_on(self, settings: Record, otherwise: str) -> None:
         """Refuse, saying what to do, where it has records of other settings."""
-        if not (changes := differences(self.settings, settings)):
-            return
-        if self.records:
+        changes = differences(self.settings, settings)
+        if changes and self.records:
             raise ValueError(f"{self.path} was begun with other settings: {changes}; {otherwise}")
-        self.begin_anew(settings)
+        if changes:
+            self.begin_anew(settings)
 
     def append(self, *records: Record, sync: bool = True) -> None:
         """Add records, which then survive the process, with ``sync`` a power cut too."""
@@ -98,10 +86,10 @@ class Journal:
 
     def _read(self) -> int:
         """Read what is there, and say up to where it is good; without a record, nothing is."""
-        good, bad_line, settings = 0, 0, self.settings
+        good, bad_line = 0, 0
         for number, line in enumerate(lines(self.path, _LONGEST_RECORD), 1):
             record = _record(line)
-            if record is None:
+            if record is None or (number == 1 and "settings" not in record):
                 if number == 1 and not _line({"settings": self.settings}).startswith(line):
                     raise ValueError(f"{self.path} is no journal")
                 bad_line = bad_line or number
@@ -112,11 +100,10 @@ class Journal:
                     "and what it said is done again"
                 )
             if number == 1:
-                settings = record["settings"]
+                self.settings = record["settings"]
             else:
                 self.records.append(record)
             good += len(line)
-        self.settings = settings
         return good
 
 
@@ -134,16 +121,15 @@ def _opened(path: Path, otherwise: str) -> io.FileIO:
 
 
 def _line(record: Record) -> bytes:
-    text = msgspec.json.encode(record)[:-1]
-    return text + _SEAL + f'{crc32(text):08x}"}}\n'.encode()
+    return msgspec.json.encode(record) + b"\n"
 
 
 def _record(line: bytes) -> dict[str, Any] | None:
     """What a line holds; None where it is not whole."""
-    text, _, seal = line.rpartition(_SEAL)
-    if seal != f'{crc32(text):08x}"}}\n'.encode():
+    try:
+        record = json.loads(line) if line.endswith(b"\n") else None
+    except ValueError:
         return None
-    record = json.loads(text + b"}")
     return record if isinstance(record, dict) else None
 
 

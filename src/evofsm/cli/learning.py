@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from shlex import quote
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from evofsm.cli.options import Reading
+from evofsm import store
+from evofsm.cli.models import model_document
+from evofsm.cli.options import Judge, Reading, imported
 from evofsm.cli.show import warn
+from evofsm.driving import SAFETY_RULE
+from evofsm.driving.cars import guard_of_monitor
 from evofsm.driving.naming import VARIABLES
-from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.model import FSMModel
-from evofsm.guard import ActionReviser, Guard
-from evofsm.io import Chunk, episodes_of
-from evofsm.io.logs import LogColumns, Noted
-from evofsm.io.tables import SI, TIMES, UNITS
+from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, Novelty, ObservationEncoder
+from evofsm.fsm.rules import describe_rule, rule_named
+from evofsm.fsm.validation import positive
+from evofsm.guard import ActionReviser, Foresight, Guard, LearntRisk, Mode
+from evofsm.guard.foresight import span
+from evofsm.io import Chunk, LogColumns, episodes_of
+from evofsm.io.logs import Noted
+from evofsm.io.tables import SI, TIMES, UNITS, quoted_name
 
 # A unit at the end of a column's name, behind another letter or as a word of its own.
 _WORD = "(?:^|[^A-Za-z]|(?<=[a-z])(?=[A-Z]))"
@@ -27,8 +34,7 @@ _CALLED = re.compile(_WORD + "((?i:km[/_ ]?p?h|kph|mph|knots|feet|ft|cm|mm|km))[
 _TIME_CALLED = re.compile(_WORD + "((?i:ms|us|ns))(?:ec)?[^A-Za-z]*$")
 # Units of time that logs are in, of which that counts by which a row comes every 0.1 s or so.
 _SHORTER = ("ms", "us", "ns")
-# So near must a unit come to what two columns differ by, to be named.
-_MATCHES = 0.02
+_MATCHES = 0.02  # so near must a unit come to what two columns differ by, to be named
 # What is said of what was left out, where it is no row.
 _LEFT_OUT = {
     "comment": "comments between rows were passed over",
@@ -36,18 +42,19 @@ _LEFT_OUT = {
     "stand-in": "numbers of the action are far from all others, and were read as missing",
     "cut": "file ends early, and what is whole was read",
 }
-# What reaches so far is no car's speed in any unit [m/s]: revolutions, perhaps.
-_NO_SPEED = 500.0
+_NO_SPEED = 500.0  # no car's speed in any unit [m/s]: revolutions, perhaps
 #: Columns of more different numbers are no choice among some; and the most intervals for those.
 MOST_LEVELS, _MOST_INTERVALS = 12, 50
-# Numbers that stand for nobody in many recordings.
-_NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
+_MOST_ACTIONS = 1000
+_NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)  # stand for that in many recordings
 
 
 @dataclass
-class Read:
-    """What was read."""
+class Learning:
+    """What was learnt, and from what."""
 
+    machine: EvolvingFSM  #: can go on learning
+    actions: IntervalActions
     rows: int = 0  #: observations
     episodes: int = 0
     seconds: float = 0.0  #: time between the first and the last row of the episodes, together [s]
@@ -58,15 +65,29 @@ class Read:
     dt: float = np.nan  #: usual time between two rows [s]
     last_time: float = np.nan  #: of the latest row [s]
     levels: set[float] = field(default_factory=set)  #: numbers of the action, while they are few
+    model: FSMModel = field(init=False)  #: once all is learnt
 
+    @property
+    def transitions(self) -> int:
+        """How many were learnt."""
+        return int(self.model.uses.sum())
 
-class Learning(NamedTuple):
-    """What was learnt, and from what."""
-
-    machine: EvolvingFSM  #: can go on learning
-    model: FSMModel
-    read: Read
-    transitions: int
+    def take(self, chunk: Chunk) -> None:
+        """Learn a chunk, and count what is in it."""
+        learn_chunk(self.machine, chunk, self.actions)
+        self.dt = chunk.dt
+        steps = np.diff(chunk.times, prepend=self.last_time)
+        steps[chunk.starts] = 0.0
+        self.last_time = float(chunk.times[-1])
+        self.seconds += float(steps.sum())
+        self.rows += len(steps)
+        self.episodes += len(chunk.starts)
+        self.jumps += chunk.jumps
+        self.failures += 0 if chunk.failures is None else len(chunk.failures)
+        self.clipped_below += int((chunk.actions < self.actions.low).sum())
+        self.clipped_above += int((chunk.actions > self.actions.high).sum())
+        if len(self.levels) <= MOST_LEVELS:
+            self.levels.update(np.unique(chunk.actions[~np.isnan(chunk.actions)]).tolist())
 
 
 def learn_traces(
@@ -77,19 +98,17 @@ def learn_traces(
     units: Callable[[], Sequence[str]] = tuple,
 ) -> Learning:
     """Learn all chunks in their order, each row once; units are known once they are read."""
-    machine, read = machine.copy(), Read()
+    lesson = Learning(machine.copy(), actions)
     for chunk in chunks:
-        learn_chunk(machine, chunk, actions)
-        _count(read, chunk, actions)
-    model = machine.model(
-        actions=actions, names=names, units=units(), dt=None if np.isnan(read.dt) else read.dt
-    )
-    if (transitions := int(model.uses.sum())) == 0:
+        lesson.take(chunk)
+    dt = None if np.isnan(lesson.dt) else lesson.dt
+    lesson.model = lesson.machine.model(actions=actions, names=names, units=units(), dt=dt)
+    if lesson.transitions == 0:
         raise ValueError(
             "no transition could be learnt: no row with an action is followed by another row of "
             "its episode (is every row an episode? are the rows sorted by episode and time?)"
         )
-    return Learning(machine, model, read, transitions)
+    return lesson
 
 
 # -- What was noticed in reading ------------------------------------------------------------------
@@ -197,10 +216,7 @@ def episodes_read(
     dated: bool,
     fewest: int = 2,
 ) -> Iterator[Chunk]:
-    """The episodes of a log that have so many rows; then what was noticed.
-
-    They have dates where these are wanted, and where the log has some.
-    """
+    """The episodes of a log of so many rows, dated if they shall be; then what was noticed."""
     for episode in episodes_of(reading.traces([path], notes)):
         if len(episode.times) >= fewest:
             yield episode._replace(times=episode.times + notes.began) if dated else episode
@@ -209,6 +225,21 @@ def episodes_read(
 
 
 # -- A guard --------------------------------------------------------------------------------------
+
+
+def guard_of_log(
+    kind: Judge, model: FSMModel, machine: EvolvingFSM, brakes: float, tolerance: float
+) -> Guard:
+    """A guard that is to be taught what somebody did, in shadow mode."""
+    assert model.dt is not None
+    assert model.actions is not None
+    if kind == "kinematic":
+        return guard_of_monitor(model.dt, brakes, tolerance)
+    actions, labels = model.actions, model.labels
+    ends: dict[str, Any] = {"low": actions.low, "high": actions.high}
+    learnt = LearntRisk(model.dt, **ends, names=labels.names, units=labels.units)
+    reviser = ActionReviser(learnt, actions, tolerance=tolerance, mode=Mode.SHADOW)
+    return Guard.of(reviser, interval=model.dt, machine=machine)
 
 
 def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) -> float:
@@ -240,23 +271,6 @@ def learn_chunk(machine: EvolvingFSM, chunk: Chunk, actions: Any) -> None:
     machine.learn_many(chunk.observations, indices, chunk.starts, chunk.failures)
 
 
-def _count(read: Read, chunk: Chunk, actions: IntervalActions) -> None:
-    """Count what is in a chunk."""
-    read.dt = chunk.dt
-    steps = np.diff(chunk.times, prepend=read.last_time)
-    steps[chunk.starts] = 0.0
-    read.last_time = float(chunk.times[-1])
-    read.seconds += float(steps.sum())
-    read.rows += len(steps)
-    read.episodes += len(chunk.starts)
-    read.jumps += chunk.jumps
-    read.failures += 0 if chunk.failures is None else len(chunk.failures)
-    read.clipped_below += int((chunk.actions < actions.low).sum())
-    read.clipped_above += int((chunk.actions > actions.high).sum())
-    if len(read.levels) <= MOST_LEVELS:
-        read.levels.update(np.unique(chunk.actions[~np.isnan(chunk.actions)]).tolist())
-
-
 def range_of(levels: Sequence[float]) -> str:
     """The --action-range in which each of some rising numbers is an action; or nothing.
 
@@ -267,3 +281,208 @@ def range_of(levels: Sequence[float]) -> str:
     if len(levels) > MOST_LEVELS or not levels[-1] - levels[0] < _MOST_INTERVALS * width:
         return ""
     return f"{levels[0] - width / 2.0:.6g}:{levels[-1] + width / 2.0:.6g}:{width:.6g}"
+
+
+# -- What was asked for ---------------------------------------------------------------------------
+
+
+def actions_of(text: str) -> IntervalActions:
+    """The intervals of --action-range."""
+    try:
+        low, high, width = map(float, text.split(":"))
+        if width > 0.0 and (high - low) / width > _MOST_ACTIONS:
+            raise ValueError(f"more than {_MOST_ACTIONS} intervals; make them wider")
+        return IntervalActions(low, high, width, outside="clip")
+    except ValueError as error:
+        hint = "write LOW:HIGH:WIDTH, such as -2.5:2.5:0.3"
+        raise ValueError(f"--action-range is {text!r}: {error}; {hint}") from None
+
+
+def machine_of(
+    n_actions: int,
+    rule: str,
+    scale: list[str] | None,
+    max_states: int | None,
+    encoder: ObservationEncoder,
+) -> EvolvingFSM:
+    """A machine that has seen nothing, with the rule of states that was named."""
+    if scale and rule != "novelty":
+        raise ValueError(f"--scale is for --rule novelty, not {rule}")
+    if rule == "novelty":
+        part: Any = Novelty(1.0, _scales(scale, encoder))
+    else:
+        part = imported(rule) if ":" in rule else rule_named(rule)
+    state_rule = part() if isinstance(part, type) else part
+    return EvolvingFSM(n_actions, max_states=max_states, rule=state_rule)
+
+
+def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]:
+    """The difference that counts as 1, for each number that is observed."""
+    scales = {}
+    for text in scale or ():
+        column, _, number = text.rpartition("=")
+        try:
+            scales["".join(quoted_name(column))] = positive("it", float(number))
+        except ValueError:
+            hint = "write COLUMN=NUMBER, such as gap=4"
+            raise ValueError(f"--scale is {text!r}; {hint}") from None
+    single = [name for name in encoder.variables if isinstance(name, str)]
+    if unknown := [column for column in scales if column not in single]:
+        raise ValueError(f"--scale names {unknown[0]!r}; observed are {', '.join(single)}")
+    scales = dict(zip(VARIABLES, SAFETY_RULE.scales, strict=True)) | scales
+    if omissions := [column for column in single if column not in scales]:
+        raise ValueError(
+            f"--rule novelty has to know the difference that counts as 1 in {omissions[0]!r}: "
+            f"--scale {quote(omissions[0])}=2 (a fifth of what it spans, or so)"
+        )
+    return [scales.get(name, 1.0) for name in encoder.names]
+
+
+def size_of(file: str) -> int:
+    """Bytes of a file, or of those in a folder."""
+    path = Path(file)
+    return sum(part.stat().st_size for part in (path.iterdir() if path.is_dir() else [path]))
+
+
+def judge_of(judge: Judge | None, columns: LogColumns) -> Judge:
+    """By what the guard is to judge, from what is observed where nobody said."""
+    names = columns.observe.names
+    if any(not isinstance(variable, str) for variable in columns.observe.variables):
+        raise ValueError("--guard takes numbers alone, and --observe names a discrete column")
+    judge = judge or ("kinematic" if names == VARIABLES else "learnt")
+    if judge == "kinematic" and len(names) != len(VARIABLES):
+        raise ValueError(
+            f"--judge kinematic knows cars by their {', '.join(VARIABLES)}; --observe has to name "
+            f"the three columns in this order, and names {', '.join(names)}"
+        )
+    if judge == "learnt" and columns.failed is None:
+        raise ValueError(
+            "--guard learns from failures, and which there were is not known: --failed COLUMN or "
+            "--failed 'gap<=0' says it (of times or last rows docs/logs.md makes one); of cars in "
+            "pairs --judge kinematic needs none"
+        )
+    return judge
+
+
+def check_out(out: Path | None, option: str = "--out") -> None:
+    """Refuse before the long work what could not be saved after it."""
+    if out is None:
+        return
+    if not out.parent.is_dir():
+        raise FileNotFoundError(f"{option} {out}: there is no folder {out.parent}")
+    if not (os.access(out.parent, os.W_OK) or os.access(out, os.W_OK)):
+        raise PermissionError(f"{option} {out}: the folder {out.parent} may not be written")
+    if out.is_dir():
+        raise IsADirectoryError(f"{option} {out} is a folder; name a file in it")
+    if out.exists() and out.suffix != ".evofsm":  # so are ours called, whatever wrote them
+        try:
+            store.read_header(out)
+        except (ValueError, OSError):
+            fault = "exists and is no file of evofsm; it was left alone"
+            raise ValueError(f"{option} {out}: {fault}") from None
+
+
+# -- What came of it ------------------------------------------------------------------------------
+
+
+def told_of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
+    """Where it is, what it takes, and what it reckons with."""
+    assert guard.judge is not None
+    names = map(guard.judge.labels.variable, range(len(guard.variables)))
+    keys = ", ".join(["time [s]", *names])
+    also = "" if isinstance(guard.judge, Foresight) else ", and proposal, the action"
+    takes = f"evofsm monitor --guard {path} takes rows of {keys}{also}."
+    yield f"The guard was saved to {path}. {takes}"
+    if isinstance(guard.judge, Foresight):
+        soon = f"up to {span(guard.judge.horizon * guard.judge.dt)} before a failure (--horizon)"
+        words = guard.judge.alarm_in_words
+        if guard.judge.alarm is None:
+            hint = " (fewer columns, or a longer --horizon?)" * ("chance" in words)
+            yield f"It never alarms: {words}{hint}."
+        else:
+            yield f"{words.capitalize()} (--false-a-day), {soon}."
+        judges = "evofsm monitor LOG --summary, with the same options, judges such alarms held out"
+        yield f"{judges}; evofsm inspect {path} prints its states."
+        return
+    if not isinstance(guard.judge, LearntRisk):
+        yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
+        return
+    note = "" if len(guard.judge.state.forms) else " nothing yet"
+    yield f"It judges{note}: {guard.judge.told_by_experience}."
+    if beyond:
+        yield f"It knows no action beyond --action-range, where {beyond:.1%} of the log's are."
+
+
+def document_of(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """All that is printed, for JSON; states and actions from 0."""
+    names = ("rows", "episodes", "seconds", "clipped_below", "clipped_above", "jumps", "failures")
+    totals = {name: getattr(learning, name) for name in names}
+    if not learning.model.failures_told:
+        totals["failures"] = None
+    model = {**model_document(learning.model), "provenance": provenance}
+    return {**totals, "transitions": learning.transitions, "model": model}
+
+
+def read_of(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
+    """What was read, and the actions and the rule that it was learnt with."""
+    actions = learning.actions
+    yield "rows", f"{learning.rows:,}, one every {learning.model.dt:g} s"
+    minutes = learning.seconds / 60.0
+    together = f"{learning.seconds:.1f} s" if minutes < 2.0 else f"{minutes:,.1f} min"
+    yield "episodes", f"{learning.episodes:,}, together {together}"
+    yield "transitions", f"{learning.transitions:,}"
+    text = f"{actions.n_actions} intervals of {action} from {actions.low:g} to {actions.high:g}"
+    if n_beyond := learning.clipped_below + learning.clipped_above:
+        text += f"; {learning.clipped_below:,} below and {learning.clipped_above:,} above "
+        text += f"({n_beyond / learning.rows:.1%} of rows) were put into the end intervals"
+    text = text if n_beyond else f"{text}; none was beyond"
+    numbers = sorted(learning.levels) if len(learning.levels) <= MOST_LEVELS else []
+    places = [actions.encode(number) for number in numbers]
+    meanings = [f"{n:g} is a({k + 1})" for n, k in zip(numbers, places, strict=True)]
+    text += f"; {', '.join(meanings)}" * (len(numbers) > 1)
+    if len({*places}) < len(places):
+        apart = range_of(numbers)
+        text += ": several are one action"
+        text += f" (--action-range {apart} tells them apart)" * bool(apart)
+    yield "actions", text if action else "none: nobody acts (--action '')"
+    settings = describe_rule(learning.machine.rule)
+    for name in ("radius", "spread"):  # which the rule may have itself
+        settings.setdefault(name, learning.machine.settings[name])
+    rule = settings.pop("name")
+    texts = (f"{name} {value}" for name, value in settings.items())
+    yield "rule", f"{rule} (--rule), {', '.join(texts)}"
+
+
+def read_otherwise(
+    noted: Noted, columns: LogColumns, learning: Learning
+) -> Iterator[tuple[str, str]]:
+    """What was not learnt as it stands in the files."""
+    if columns.failed is None:
+        yield "failures", "not known; --failed COLUMN or --failed 'gap<=0' says them"
+    else:
+        several = "" if learning.failures == 1 else "s"
+        text = f"{learning.failures:,} episode{several} ended with {columns.failed}"
+        left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
+        yield "failures", text + (left_out if noted.after_failure else "")
+    hole = columns.longest_hole
+    if columns.resample:
+        step, ways = columns.resample
+        extras = "".join(f", the {way} of {name}" for name, way in ways.items())
+        means = f"{noted.resampled:,} became means of {step:g} s{extras}"
+        yield "resampled", f"{means} (--resample {step:g}s,NAME=max: others are min, last)"
+    if noted.crossed:
+        yield "holes", f"{noted.crossed:,} of at most {hole:g} s (--hole) cost a transition each"
+    if jumps := learning.jumps:
+        yield "time jumps", f"{jumps:,}; each begins an episode (a longer --hole bridges them)"
+    if noted.leaderless:
+        nobody = columns.no_leader not in (None, "end")
+        why = "a number is missing" + f", or {columns.no_leader}" * nobody
+        ends = "" if hole and not columns.no_leader else "; there an episode ends"
+        yield "left out", f"{noted.leaderless:,} rows: {why}{ends}"
+    if noted.elsewhere:
+        why = f"--where {columns.where} does not hold; there an episode ends"
+        yield "left out", f"{noted.elsewhere:,} rows: {why}"
+    conversions = {name: unit for name, unit in noted.units.items() if UNITS.get(unit, 1.0) != 1.0}
+    if conversions:
+        texts = (f"{name} from {unit}" for name, unit in conversions.items())
+        yield "converted", f"{', '.join(texts)} to units of the SI"

@@ -29,10 +29,8 @@ _MOST_FIELDS, _ROWS_LOOKED_AT, _MOST_TEXTS = 20_000_000, 500_000, 12
 _EPOCHS = {"ns": 1e9, "us": 1e6, "ms": 1e3, "s": 1.0}  # times since 1970 are larger by far
 _COLUMNS_SHOWN = 40  # columns
 _SIGNS = "<>=! "  # what in a name of a condition is ambiguous
-# Far outside is what lies so many ranges of 99 % of the rows beyond them.
-_FAR = 2.0
-# Rows before a failure that are never proposed to be left out.
-_NEAR = 3
+_FAR = 2.0  # far outside is what lies so many ranges of 99 % of the rows beyond them
+_NEAR = 3  # rows before a failure that are never proposed to be left out
 # A larger share of steps, and so many, that are no usual one make no clock.
 _ODD, _MANY = 0.001, 10
 _TIME = re.compile("(ts?|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
@@ -77,20 +75,18 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
 
 
 def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
-    """What the first rows hold, by column and in all, and options that could be asked for.
-
-    Last what is to be done with all rows before, as polars calls it.
-    """
+    """What the first rows hold, options that could be asked for, and how polars sorts before."""
     skips, odd, asides = dict[str, tuple[int, str]](), dict[str, int](), Pairs()
     table.skips = Skips(1 << 60, skips)
     frame, clock, form = _first_rows(table, odd, asides)
     if not len(frame):
         table.skips.refuse_nothing(f"{table.path} has a header but no rows")
     numbers = [name for name, kind in frame.schema.items() if kind.is_numeric() and name != clock]
-    values = {name: frame[name].to_numpy() for name in numbers}
-    values = {name: z for name, z in values.items() if np.isfinite(z).any()}
-    stand_ins = {name: np.unique(z[are_stand_ins(z)]) for name, z in values.items()}
-    values = {name: np.where(are_stand_ins(z), np.nan, z) for name, z in values.items()}
+    values, stand_ins = dict[str, Floats](), dict[str, Floats]()
+    for name, z in ((name, frame[name].to_numpy()) for name in numbers):
+        if np.isfinite(z).any():
+            for_none = are_stand_ins(z)
+            values[name], stand_ins[name] = np.where(for_none, np.nan, z), np.unique(z[for_none])
     texts = [name for name in frame.columns if frame[name].dtype == polars.String]
     runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
     limit = _round(0.1 * float(np.nanquantile(np.abs(values[still]), 0.95))) if still else 0.0
@@ -207,10 +203,7 @@ def _first_rows(
 
 
 def _clock_of(frame: polars.DataFrame, names: Sequence[str]) -> tuple[str, str, str]:
-    """The column of numbers that is a clock, by its values or its name; its unit, and since when.
-
-    Times since 1970 are of some years, and go on by little, of each machine at least.
-    """
+    """The column of numbers that is a clock, by values or name; its unit, and since when."""
     epochs = dict[str, str]()
     for name in names:
         z = frame[name].drop_nans().to_numpy()
@@ -259,10 +252,7 @@ def _odd(steps: Floats) -> NDArray[np.bool_]:
 
 
 def _episodes(frame: polars.DataFrame, clock: str, names: Sequence[str]) -> tuple[str, Rows]:
-    """The column that tells episodes apart, if any, and the order of rows in which time runs on.
-
-    Where rows of several are mixed, each of its values has a clock of its own.
-    """
+    """The column that tells episodes apart, if any, and the order of rows in which time runs on."""
     at, rows = frame[clock].to_numpy() if clock else np.zeros(0), np.arange(len(frame))
     if group := next((name for name in names if _is_in_blocks(frame[name])), ""):
         return group, rows

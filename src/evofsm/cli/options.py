@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial, wraps
 from importlib.util import find_spec
 from inspect import Parameter, Signature, signature
@@ -25,12 +25,8 @@ if TYPE_CHECKING:
     from evofsm.io import Chunk, LogColumns, Topics, VehicleLengths
     from evofsm.io.logs import Noted, Resample
 
-#: Where to drive.
-World = Literal["sumo", "kinematic"]
-#: What a judge was given.
-Judge = Literal["kinematic", "learnt"]
-#: How far a guard goes, as `evofsm.guard.Mode`.
-ModeName = Literal["off", "shadow", "act"]
+Judge = Literal["kinematic", "learnt"]  #: what a judge was given
+ModeName = Literal["off", "shadow", "act"]  #: how far a guard goes, as `evofsm.guard.Mode`
 
 
 def option(about: str, *names: str, **limits: Any) -> Any:
@@ -50,17 +46,17 @@ Saved = Annotated[
     Path, argument("A saved machine, model or guard, or a folder that evofsm drive wrote.")
 ]
 Seed = Annotated[int, option("Seed of all random draws.", min=0)]
-InWorld = Annotated[World, option("SUMO itself, or the same motion in closed form.")]
+InWorld = Annotated[
+    Literal["sumo", "kinematic"], option("SUMO itself, or the same motion in closed form.")
+]
 ByJudge = Annotated[
     Judge, option("Given how cars follow each other, or nothing but which episodes failed.")
 ]
 Tolerance = Annotated[
     float, option("Share of hard brakes (learnt: of disturbances) that need not be survived.")
 ]
-#: As `evofsm.guard.TOLERANCE`, without what that loads.
-TOLERANCE = 0.02
-#: What a car's brakes are reckoned with where nobody said [m/s²].
-BRAKES = 6.0
+TOLERANCE = 0.02  #: as `evofsm.guard.TOLERANCE`, without what that loads.
+BRAKES = 6.0  #: what a car's brakes are reckoned with where nobody said [m/s²]
 Brakes = Annotated[
     float,
     option("Hardest braking of the own car, that a guard reckons with [m/s²].", min=0.5, max=20.0),
@@ -85,7 +81,7 @@ def picture(out: Path, width: float, height: float) -> Iterator[Figure]:
         figure.savefig(out)
 
 
-def require_world(world: World, **extras: str) -> None:
+def require_world(world: str, **extras: str) -> None:
     """The same for a drive: SciPy is for SUMO's distributions and exact intervals."""
     require(scipy="study", **({"libsumo": "sumo"} if world == "sumo" else {}), **extras)
 
@@ -260,6 +256,20 @@ def given_of(reading: partial[Reading]) -> dict[str, Any]:
     return {k: v for k, v in reading.keywords.items() if v not in (usual[k].default, [])}
 
 
+def read_with(learnt: Path | None) -> dict[str, Any]:
+    """The options with which the log was read that a file is learnt from; none where it is not."""
+    from evofsm.store import read_header
+
+    if learnt is None or not learnt.is_file():
+        return {}
+    return dict(read_header(learnt).provenance.get("read with", {}))
+
+
+def with_defaults(reading: partial[Reading], defaults: Mapping[str, Any]) -> partial[Reading]:
+    """`reading_of` with what was typed, else with these."""
+    return partial(reading_of, **{**reading.keywords, **defaults, **given_of(reading)})
+
+
 def typed(given: Mapping[str, Any]) -> str:
     """The same, as they are typed."""
     several = ((k, v if isinstance(v, list) else [v]) for k, v in given.items())
@@ -298,11 +308,10 @@ def seconds(name: str, text: str) -> float:
     from evofsm.io.tables import TIMES
 
     match = re.fullmatch(r"\s*([0-9.]+)\s*([a-z]*)\s*", text)
-    try:
-        assert match is not None
-        return positive(name, float(match[1])) * (TIMES | {"d": 86400.0})[match[2] or "s"]
-    except (AssertionError, ValueError, KeyError):
-        raise ValueError(f"{name} is {text!r}; write how long, such as 30s, 10min or 1h") from None
+    number, unit = match.groups() if match else ("", "")
+    with suppress(ValueError, KeyError):
+        return positive(name, float(number)) * (TIMES | {"d": 86400.0})[unit or "s"]
+    raise ValueError(f"{name} is {text!r}; write how long, such as 30s, 10min or 1h")
 
 
 def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
@@ -320,10 +329,7 @@ def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
 
 
 def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
-    """A command that has the options of `reading_of` in place of its parameter ``reading``.
-
-    That is given `reading_of` with what was typed; an option that a command has itself is its own.
-    """
+    """A command that has the options of `reading_of`, but for its own, in place of ``reading``."""
     parameters = signature(command, eval_str=True).parameters
     options = signature(reading_of, eval_str=True).parameters
     log_options = {name: parameter for name, parameter in options.items() if name not in parameters}

@@ -12,21 +12,21 @@ from enum import Enum
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from rich.console import RenderableType
+from rich import box
+from rich.console import Console, RenderableType
+from rich.measure import Measurement
+from rich.progress import Progress
+from rich.table import Table
+from rich.text import Text
 
-    from evofsm.paper import Page, Table
+from evofsm.fsm.naming import visible
+
+if TYPE_CHECKING:
+    from evofsm import paper
 
 
 def show(*parts: RenderableType) -> None:
-    """Print texts and tables, without the spaces that fill lines up.
-
-    A table may be wider than the terminal (80 columns in a pipe): no number is ever cut in two.
-    Nothing in a text from a file is markup.
-    """
-    from rich.console import Console
-    from rich.measure import Measurement
-
+    """Print texts and tables; no number is cut in two, and no text from a file is markup."""
     for part in parts:
         out = Console(markup=False, highlight=False, emoji=False)
         any_width = out.options.update(max_width=10_000)
@@ -38,25 +38,16 @@ def show(*parts: RenderableType) -> None:
 
 def say(text: object) -> None:
     """Print a line, however long, that may hold texts from files."""
-    from evofsm.fsm.naming import visible
-
     print(visible(str(text)))
 
 
 def warn(text: object) -> None:
     """Print a line on standard error."""
-    from evofsm.fsm.naming import visible
-
     print(f"evofsm: {visible(str(text))}", file=sys.stderr, flush=True)
 
 
 def facts(title: str, pairs: Iterable[tuple[str, str]]) -> RenderableType:
     """Names with a text each, which is folded below itself."""
-    from rich.table import Table
-    from rich.text import Text
-
-    from evofsm.fsm.naming import visible
-
     grid = Table.grid(padding=(0, 2))
     grid.title, grid.title_justify, grid.title_style = Text(title, "bold"), "left", ""
     grid.add_column(no_wrap=True)
@@ -75,16 +66,7 @@ def table(
     bold: Collection[int] = (),
     whole: bool = False,
 ) -> RenderableType:
-    """Cells below one another; ``left`` are the columns set to the left, ``bold`` rows set off.
-
-    With ``whole`` only those to the left may be folded.
-    """
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    from evofsm.fsm.naming import visible
-
+    """Cells below one another; ``left`` are columns to the left, which alone fold if ``whole``."""
     grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1, 0, 0))
     grid.title, grid.title_justify, grid.title_style = Text(title, "bold"), "left", ""
     for place, name in enumerate(header):
@@ -100,7 +82,7 @@ def table(
     return grid
 
 
-def print_page(*pages: Page) -> None:
+def print_page(*pages: paper.Page) -> None:
     """Print what a page says: its targets, tables, and where it loses; many in a line each.
 
     Rows that are ours begin with ``>``, those that fail with ``!``.
@@ -119,7 +101,7 @@ def print_page(*pages: Page) -> None:
         _show_table(item)
 
 
-def _show_table(item: Table) -> None:
+def _show_table(item: paper.Table) -> None:
     signs = {"ours": "> ", "fails": "! "}
     marks = [signs.get(mark or "", "") for mark in item.marks]
     rows = [(mark + row[0], *row[1:]) for mark, row in zip(marks, item.cells, strict=True)]
@@ -133,8 +115,6 @@ def _show_table(item: Table) -> None:
 
 def print_json(document: object) -> None:
     """Print one document for programs, with null for NaN and the infinite."""
-    from evofsm.fsm.naming import visible
-
     text = json.dumps(plain(document), allow_nan=False, ensure_ascii=False, indent=2)
     print(visible(text))
 
@@ -167,24 +147,10 @@ Advance = Callable[..., None]
 
 @contextmanager
 def progress(text: str, total: float | None = None) -> Iterator[Advance]:
-    """A bar on standard error, none where nobody watches; yields a function that moves it.
-
-    The function takes how much is done, or `advance`, `total` and `description`.
-    """
-    from rich.console import Console
-    from rich.progress import Progress
-
+    """A bar on standard error, if somebody watches; yields what moves it: done, or `advance=`."""
     is_unwatched = not sys.stderr.isatty()
     with Progress(console=Console(stderr=True), transient=True, disable=is_unwatched) as bars:
         task = bars.add_task(text, total=total)
         yield lambda done=None, total=None, **more: bars.update(
             task, completed=done, total=total, **more
         )
-
-
-def message(error: BaseException) -> str:
-    """What an error says, in one line, and what it happened in."""
-    text = str(error) or type(error).__name__
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        text = f"{error.filename}: {error.strerror.lower()}"
-    return " ".join(", ".join([text, *getattr(error, "__notes__", ())]).split())

@@ -1,11 +1,7 @@
 """Decisions written as MCAP, or shown live in Foxglove or Lichtblick, by Foxglove's own library.
 
-What was seen (``/observation``), where that is (``/belief``), how dangerous (``/risk``), and what
-was done about it (``/decision``); ``/event``, and ``/log`` for Foxglove's log panel. The messages
-are JSON with schemas that name every unit, those of ``/log`` Foxglove's own type. What is not
-known is left out of a message: JSON has no NaN, and the schemas have one type for each field.
-`FOXGLOVE_LAYOUT` shows files and what is live alike. Nothing leaves this computer unless another
-host is told.
+The messages are JSON with schemas that name every unit. What is not known is left out of one: JSON
+has no NaN, and the schemas have one type for each field. `FOXGLOVE_LAYOUT` shows them.
 """
 
 from __future__ import annotations
@@ -41,9 +37,6 @@ FOXGLOVE_LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 
 _SECOND = 1_000_000_000  # [ns]
 _PAUSE = _SECOND  # from the end of an episode to the start of the next
-
-
-# -- Channels -------------------------------------------------------------------------------------
 
 
 def columns_by_topic(names: Sequence[str] = VARIABLES) -> dict[str, tuple[str, ...]]:
@@ -139,9 +132,6 @@ class _File:
             self._mcap.close()
 
 
-# -- A logger of decisions ------------------------------------------------------------------------
-
-
 class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
     """Shows what a guard sees and decides: ``guard.audit = FoxgloveSink()``.
 
@@ -213,8 +203,7 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
                 raise FileExistsError(f"{fspath(file)} exists; it was left alone") from None
             self._file = _File(writer, context)
             self._open.callback(self._file.close)
-        #: Where it is served; None without a port.
-        self.address: str | None = None
+        self.address: str | None = None  #: where it is served; None without a port
         self._episode = self._start = 0  # its number, and when it began [ns]
         if port is not None:
             server = foxglove.start_server(name="evofsm", host=host, port=port, context=context)
@@ -231,8 +220,6 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-    # -- As the decision logger of a guard --------------------------------------------------------
 
     def begin(self, guard: Guard) -> None:
         """An episode begins."""
@@ -275,8 +262,6 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
         self._event("episode ended")
         self._start = self._now() + _PAUSE
         self._episode += 1
-
-    # -- Inside -----------------------------------------------------------------------------------
 
     def _now(self) -> int:
         return self._start + round(self._time * _SECOND)

@@ -110,9 +110,6 @@ def _where(model: FSMModel, state: int) -> list[str]:
     ]
 
 
-# -- PRISM ----------------------------------------------------------------------------------------
-
-
 def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     """The model as a Markov decision process in the language of PRISM, which Storm reads as well.
 

@@ -20,24 +20,8 @@ from numpy.typing import NDArray
 from evofsm.driving.naming import RANGES, VARIABLES
 from evofsm.driving.naming import UNITS as CAR_UNITS
 from evofsm.fsm.observations import Category, ObservationEncoder
-from evofsm.io import vehicles
-from evofsm.io.tables import (
-    SI,
-    TIMES,
-    UNITS,
-    CsvTable,
-    OnRead,
-    ParquetTable,
-    Piece,
-    Skips,
-    Table,
-    Wanted,
-    file_kind,
-    is_date,
-    is_number,
-    quoted_name,
-    silent,
-)
+from evofsm.io import tables, vehicles
+from evofsm.io.tables import Piece, Skips, Table, Wanted, is_number
 from evofsm.io.vehicles import ACTION, PairTable, VehicleLengths
 
 if TYPE_CHECKING:
@@ -49,16 +33,12 @@ Bools = NDArray[np.bool_]
 USUAL_EPISODE = ("run", "pair", "segment", "episode")
 #: Steps longer than the usual one times this, or as much shorter, begin a new episode.
 LONGEST_STEP = 1.5
-# Rows of a file whose steps tell the usual one.
-_FIRST_ROWS = 8192
-#: Bad rows of a file that are left out where nobody said how many.
-SKIPPED = 10
+_FIRST_ROWS = 8192  # rows of a file whose steps tell the usual one
+SKIPPED = 10  #: bad rows of a file that are left out where nobody said how many
 # Signals are joined where so many values of each and no whole row are among the first ones.
 _FEWEST_VALUES = 5
-#: So old may a value be that is held, as `Topics` has it [s].
-OLDEST = 0.5
-# Share by which the usual steps of two files may differ.
-_SAME_STEP = 0.05
+OLDEST = 0.5  #: so old may a value be that is held, as `Topics` has it [s]
+_SAME_STEP = 0.05  # share by which the usual steps of two files may differ
 # Numbers that stand for none, where they are so many times as far out as all others of a column.
 _STAND_INS = [999, 9999, 99999, 999999, 32767, 32768, 65535, 2**31 - 1, 2**31, 2**32 - 1]
 _FAR_OUT = 3.0
@@ -79,12 +59,9 @@ _NO_ACTION = f" (a missing or failed measurement, or {_HELD}"
 _LEFT_OUT = "? --no-leader end leaves such rows out; or " + _HELD
 _MISSING = " (a missing or failed measurement" + _LEFT_OUT
 _NO_LEADER = " (a missing or failed measurement, or no leader" + _LEFT_OUT
-# So many texts of a column are shown.
-_MANY_TEXTS = 10
-#: What the values of a step may become.
-BECOME = ("mean", "last", "max", "min")
-# In steps of what is resampled, the longest hole within an episode.
-_HOLE = 10.0
+_MANY_TEXTS = 10  # so many texts of a column are shown
+BECOME = ("mean", "last", "max", "min")  #: what the values of a step may become
+_HOLE = 10.0  # in steps of what is resampled, the longest hole within an episode
 # A value in quotes; and what stands between conditions, outside of quotes.
 _IN_QUOTES = re.compile(r"""(["'])(.*)\1$""")
 _OUTSIDE = r"""(?=(?:[^"']|"[^"]*"|'[^']*')*$)"""
@@ -106,8 +83,7 @@ class Chunk(NamedTuple):
     jumps: int = 0  #: episodes that begin because of a hole in time
     #: (K,) rows with which an episode ended in failure; None where nothing tells of failures
     failures: NDArray[np.int64] | None = None
-    #: (E,) who followed whom in them, in a recording of many vehicles
-    names: Sequence[str] = ()
+    names: Sequence[str] = ()  #: (E,) who followed whom in them, in a recording of many vehicles
 
     @property
     def failed(self) -> bool:
@@ -170,7 +146,7 @@ class Noted:
     def si_units(self, names: Sequence[str]) -> list[str]:
         """The units of columns as they were read: of the SI, if they have one there."""
         told_units = dict(zip(VARIABLES, CAR_UNITS, strict=True)) | self.units
-        return [SI.get(unit, unit) for unit in (told_units.get(name, "") for name in names)]
+        return [tables.SI.get(unit, unit) for unit in (told_units.get(name, "") for name in names)]
 
     def see(self, chunk: Chunk, names: Sequence[str], *, first: bool = False) -> None:
         """Look for what is beyond belief; in the first rows also for what contradicts itself."""
@@ -216,10 +192,7 @@ class Noted:
 
 
 def units_of(units: Mapping[str, str], used: Sequence[str]) -> dict[str, str]:
-    """The unit of each column in use that was given one.
-
-    A name that is no column's is the beginning of all that it fits; the longest one counts.
-    """
+    """The unit of each column in use that was given one, by its name or the beginning of it."""
     column_units: dict[str, str] = {}
     for name in sorted(units, key=lambda name: (name in used, len(name))):
         fit = [name] if name in used else [column for column in used if column.startswith(name)]
@@ -242,7 +215,7 @@ class Term(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> Term:
         """From ``collided``, ``gap<=0`` or ``Status=='off'``; a ValueError if it is none."""
-        name, rest = quoted_name(text)
+        name, rest = tables.quoted_name(text)
         column, sign, value, *_ = *re.split("([<>]=?|[=!]=|=)", rest, maxsplit=1), "", ""
         column, value, quotation = name + column.strip(), value.strip(), _IN_QUOTES.match(value)
         sign = "==" if sign == "=" else sign
@@ -408,7 +381,7 @@ def read_traces(
     paths: Iterable[str],
     columns: LogColumns | None = None,
     lengths: VehicleLengths | None = None,
-    on_read: OnRead = silent,
+    on_read: tables.OnRead = lambda count: None,
     noted: Noted | None = None,
     topics: Topics | None = None,
 ) -> Iterator[Chunk]:
@@ -675,7 +648,7 @@ def open_table(
     skips: Skips,
 ) -> Table:
     """The rows of a file, whatever it holds."""
-    kind = file_kind(path)
+    kind = tables.file_kind(path)
     if kind == "bag" or (kind == "mcap" and topics is not None):  # whatever its profile says
         if topics is None:
             raise ValueError(
@@ -685,28 +658,30 @@ def open_table(
         from evofsm.io.rosbag import BagTable
 
         return BagTable(path, topics, skips)
-    moments = None
+    steps, scenes = None, None
     if kind in ("osi", "mcap"):
         read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap
-        moments = vehicles.pairs_of_scenes(path, read(path, skips), skips)
+        scenes = read(path, skips)
     elif kind == "xml":
         steps = vehicles.fcd_of_xml(path, skips)
-        moments = vehicles.pairs_of_fcd(path, steps, lengths, skips)
-    if moments is not None:
-        return PairTable(path, moments, skips)
-    log_names = {*columns.observe.names, columns.action, columns.time}
-    names = log_names.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
-    is_csv = kind == "csv"
-    table: Table = CsvTable(path, names, skips) if is_csv else ParquetTable(path, skips)
-    there = set(table.columns)
-    if set(columns.observe.names) <= there:
-        return table
-    if (fcd := vehicles.fcd_of_table(table)) is not None:
-        return PairTable(path, vehicles.pairs_of_fcd(path, fcd, lengths, skips), skips)
-    if set(vehicles.OBJECT_COLUMNS) <= there:
+    else:
+        log_names = {*columns.observe.names, columns.action, columns.time}
+        names = log_names.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
+        of_parquet = kind == "parquet"
+        table: Table = (
+            tables.ParquetTable(path, skips) if of_parquet else tables.CsvTable(path, names, skips)
+        )
+        if {*columns.observe.names} <= {*table.columns}:
+            return table
+        steps = vehicles.fcd_of_table(table)
+        if steps is None and not {*vehicles.OBJECT_COLUMNS} <= {*table.columns}:
+            return table
         scenes = vehicles.scenes_of_table(table)
-        return PairTable(path, vehicles.pairs_of_scenes(path, scenes, skips), skips)
-    return table
+    if steps is not None:
+        moments = vehicles.pairs_of_fcd(path, steps, lengths, skips)
+    else:
+        moments = vehicles.pairs_of_scenes(path, scenes or (), skips)
+    return PairTable(path, moments, skips)
 
 
 def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
@@ -777,7 +752,7 @@ class _Clock:
             if late[row]:
                 summer = "summer time that ends? a larger --skip-bad leaves its hour out; or "
                 cause = summer if began and 1800.0 < latest - time <= 3600.0 else ""
-                step = f"from {_moment(latest, began)} to {_moment(time, began)}"
+                step = f"from {tables.date(began + latest)} to {tables.date(began + time)}"
                 piece.skips.leave_out(
                     "time",
                     f"{piece.at(row)}: time goes {step} within an episode; it must run forward "
@@ -895,10 +870,7 @@ class _Reader:
             yield last_chunk
 
     def _fill(self, piece: Piece, times: Floats) -> NDArray[np.int64] | None:
-        """Fill in the latest values of each signal, and say which rows count: those with an action.
-
-        Nothing where the table has one clock: some row of the first ones has all that is wanted.
-        """
+        """Fill in the latest values of signals, and say which rows count; None of one clock."""
         there = {name: np.isfinite(values) for name, values in piece.numbers.items()}
         if self._hold is None:
             is_whole = np.logical_and.reduce(list(there.values())).any()
@@ -959,14 +931,14 @@ class _Reader:
                 )
         form = columns.units.get(columns.time, "")
         form = form if "%" in form else ""
-        is_dated = clock and (form or is_date(" ".join(map(table.first, clock))))
+        is_dated = clock and (form or tables.is_date(" ".join(map(table.first, clock))))
         numbers = [*learnt, *term_numbers, *([] if is_dated else clock)]
         try:
             column_units = {name: unit for name in numbers if (unit := table.units.get(name))}
             units = {name: unit for name, unit in columns.units.items() if unit != form}
             column_units |= units_of(units, numbers)
             for name, unit in column_units.items():
-                if unit in UNITS and (unit in TIMES) != (name == columns.time):
+                if unit in tables.UNITS and (unit in tables.TIMES) != (name == columns.time):
                     raise ValueError(
                         f"column {name!r} has the unit {unit}; the column of the time needs a unit "
                         "of time, and no other one may have it (--unit says which it has)"
@@ -978,14 +950,16 @@ class _Reader:
         self._noted.untold += [name for name in numbers if name not in column_units]
         texts = [*self._episode, *categories, *term_texts]
         request = Wanted(numbers, texts, clock if is_dated else (), form)
-        return request, {name: UNITS[unit] for name, unit in column_units.items() if unit in UNITS}
+        factors = {n: tables.UNITS[u] for n, u in column_units.items() if u in tables.UNITS}
+        return request, factors
 
     def _compare_units(self, units: Mapping[str, str], numbers: Sequence[str]) -> None:
         """Raise where a column has a unit that is not that of the files before, as both tell."""
         for name in {*numbers} & {*self._noted.units, *self._noted.untold}:
             pair = now, before = units.get(name, ""), self._noted.units.get(name, "")
-            factor = UNITS.get(now or before, 1.0)
-            if len({SI.get(unit, unit) for unit in pair}) > 1 and (all(pair) or factor != 1.0):
+            factor = tables.UNITS.get(now or before, 1.0)
+            bases = {tables.SI.get(unit, unit) for unit in pair}
+            if len(bases) > 1 and (all(pair) or factor != 1.0):
                 remedy = f"--unit {quote(f'{name}={now or before}')} says one for all"
                 remedy = remedy if factor != 1.0 else "learn them apart"
                 raise ValueError(
@@ -1120,11 +1094,6 @@ class _Reader:
         for row in np.flatnonzero(unknown[:-1] & ~starts[1:]).tolist():
             piece.skips.leave_out("action", partial(message, row))
         self._unknown = partial(message, piece.rows - 1) if unknown[-1] else None
-
-
-def _moment(time: float, began: float) -> str:
-    """A time for a message [s], as a date where they are some."""
-    return f"{datetime.fromtimestamp(began + time, UTC):%F %T}" if began else f"{time:g}"
 
 
 def _encoded(piece: Piece, variable: str | Category) -> Floats:

@@ -1,9 +1,7 @@
 """Bags of ROS 2 (sqlite3 and MCAP) as tables: which field of which topic is which variable.
 
-Topics send when they like, and rows have one clock. A row holds the latest value of each variable
-that came before it or with it (a zero-order hold): nothing is interpolated, and nothing is known
-before it was. Rows begin once all variables are known. A row with a value that is too old is left
-out, which makes a hole in time, and the row after it begins a new episode.
+Rows have one clock. A row holds the latest value of each variable (a zero-order hold); where one is
+too old there is none, and the hole in time begins a new episode.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.io.mcap import messages
+from evofsm.io import tables
 from evofsm.io.tables import UNITS, Piece, RefusedError, Skips, Table, Wanted, readable
 from evofsm.io.vehicles import ACTION
 
@@ -196,11 +194,9 @@ class Topics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class BagTable(Table):
-    """A bag as a table with a row for each tick of one clock.
+    """A bag as a table: ``time`` [s] from its first message on, and the variables at each tick.
 
-    Its columns are ``time`` [s], from the bag's first message on, and the variables; where
-    ``v_follower`` is one of them and ``a_follower`` is not, also the change of the former to the
-    next row.
+    Where the action is not mapped it is the change of ``v_follower`` to the next row.
     """
 
     def __init__(self, path: str, topics: Topics, skips: Skips) -> None:
@@ -319,7 +315,7 @@ class BagTable(Table):
                 return
 
     def _of_mcap(self, file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
-        for schema, channel, message in messages(file, _MOST_BYTES, self.skips):
+        for schema, channel, message in tables.mcap_messages(file, _MOST_BYTES, self.skips):
             there.add(channel.topic)
             if channel.topic in wanted:
                 parts = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")

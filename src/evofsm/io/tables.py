@@ -1,4 +1,4 @@
-"""Tables in CSV and Parquet, read with polars piece by piece; and what kind of file a file is."""
+"""Tables in CSV and Parquet, read piece by piece; messages of MCAP; what kind a file is of."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import gzip
 import io
 import os
 import re
+import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -19,15 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
+from evofsm.guard.foresight import DATES
 from evofsm.store import LARGEST_OBSERVATION
 
 if TYPE_CHECKING:
     import polars
+    from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 
 Numbers = dict[str, NDArray[np.float64]]
 Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag"]
-#: Called with the number of bytes each time some were read from a file.
-OnRead = Callable[[int], object]
+OnRead = Callable[[int], object]  #: called with the number of bytes each time some were read
 #: Place of a row, for a message, and what stands there in a column.
 Find = Callable[[int, "str | None"], tuple[str, str]]
 
@@ -59,8 +61,7 @@ _FOREIGN = {
     "numpy.savetxt('drive.csv', numpy.load('FILE'), delimiter=',', header='time,gap,...')",
     b"{": "is JSON; write its rows as CSV: polars.read_ndjson('FILE').write_csv('drive.csv')",
 }
-# Where an MCAP file has its profile: behind the mark, an opcode and two lengths.
-_PROFILE = len(_MCAP) + 1 + 8 + 4
+_PROFILE = len(_MCAP) + 1 + 8 + 4  # of MCAP, behind the mark, an opcode and two lengths
 
 #: Factors that turn units of time into s, and all units into s, m, m/s or m/s².
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
@@ -77,16 +78,15 @@ SI = {unit: base for base, group in _GROUPS.items() for unit in group}
 _SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": "m/s", "sec": "s"}
 _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
 _COMMENT = re.compile(r"\A\s*(#|%|//)+\s*")  # what stands before the last line of a comment
-#: What stands in a field where there is no number.
-MISSING = ("", "na", "n/a", "null", "none")
+MISSING = ("", "na", "n/a", "null", "none")  #: what stands in a field where there is no number
 # By which a comma is known to be a decimal one; groups of three digits it may separate as well.
 _DECIMAL_COMMA = re.compile(r"\s*-?\d+,(\d\d?|\d{4,})\s*")
-# What no text holds.
-_CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")
+_CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")  # what no text holds
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
 # The day first, as only dots tell; whether its year has a century, and whether seconds follow.
 _DAY_FIRST = re.compile(r"\d\d?\.\d\d?\.(?:(\d{4})|\d\d),?[T ]+\d\d?:\d\d(:)?")
 _DATE_LIKE = re.compile(r"\s*\d{1,4}([.:/-])\d\d?\1\d")
+_NO_DATE = 253_402_300_799.0  # from here on no year has four digits [s]
 _ISO = "in ISO 8601, such as 2026-03-14T09:26:53.5+01:00, or as 14.03.2026 09:26:53"
 _SAYS_HOW = "; --unit 'COLUMN=%m/%d/%Y %I:%M:%S %p' says how others are written"
 
@@ -113,17 +113,8 @@ def quoted_name(text: str) -> tuple[str, str]:
     return (quotation[1].replace('""', '"'), text[quotation.end() :]) if quotation else ("", text)
 
 
-def silent(count: int) -> None:
-    """Nobody wants to know how much was read."""
-
-
 def file_kind(path: str) -> Kind:
-    """What the file holds, judged by how it begins.
-
-    A trace of OSI begins with nothing of its own and is known by its name, ``.osi``. The folder of
-    a bag of ROS 2 is ``"bag"``, as its files are. A ValueError says what a file is that is of a
-    foreign kind, and how it can be read.
-    """
+    """What the file holds, by how it begins or is called (``.osi``); what is foreign is refused."""
     if os.path.isfile(os.path.join(path, "metadata.yaml")):
         return "bag"
     if path.removesuffix(".gz").endswith(".osi"):
@@ -143,17 +134,14 @@ def file_kind(path: str) -> Kind:
 
 
 class Skips:
-    """Rows of a file that cannot be right: so many are left out, and counted; more are refused.
-
-    What else is to be said of a file, and how much of it was read, is told to it as well.
-    """
+    """Rows of a file that cannot be right: so many are left out, and counted; more are refused."""
 
     def __init__(
         self,
         most: int = 0,
         kinds: dict[str, tuple[int, str]] | None = None,
         told: list[str] | None = None,
-        on_read: OnRead = silent,
+        on_read: OnRead = lambda count: None,
     ) -> None:
         self.told, self.on_read = [] if told is None else told, on_read
         self._left = self._most = most
@@ -273,6 +261,67 @@ def readable(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
         raise ValueError(f"{os.fspath(path)} cannot be read as {kind}: {why}") from error
 
 
+def mcap_messages(
+    path: str | os.PathLike[str], largest: int, skips: Skips
+) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """All messages of an MCAP file, whose chunks may have so many bytes; where it ends, they do."""
+    with needs("mcap", "mcap", f"{os.fspath(path)}: MCAP"):
+        from mcap.records import Channel, Message, Schema
+    schemas, channels = dict[int, Schema](), dict[int, Channel]()
+    with readable(path, "MCAP (damaged, cut off, or still being written?)"):
+        for record in _mcap_records(path, largest, skips):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                if (channel := channels.get(record.channel_id)) is None:
+                    raise RefusedError(f"there is no channel {record.channel_id} of a message")
+                yield schemas.get(channel.schema_id), channel, record
+
+
+def _mcap_records(path: str | os.PathLike[str], largest: int, skips: Skips) -> Iterator[McapRecord]:
+    from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    with open(path, "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
+        records = reader.records
+        while True:
+            try:
+                record = next(records, None)
+            except (EndOfFile, RecordLengthLimitExceeded, struct.error) as error:
+                why = f"it ends within a record, or is damaged there {error}".strip()
+                skips.leave_out("cut", f"{os.fspath(path)}, byte {file.tell():,}: {why}")
+                return
+            if record is None:
+                return
+            if not isinstance(record, Chunk):
+                yield record
+                continue
+            data = _mcap_chunk(record, largest)
+            if len(data) > largest:
+                raise ValueError(f"a chunk unpacks to more than the {largest:,} bytes it may have")
+            yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
+
+
+def _mcap_chunk(chunk: Chunk, largest: int) -> bytes:
+    """What is in a chunk, or at least the beginning of what is too large."""
+    from lz4.frame import LZ4FrameDecompressor
+    from zstandard import ZstdDecompressor
+
+    if chunk.compression == "zstd":
+        unpacker = ZstdDecompressor(max_window_size=largest)
+        return bytes(unpacker.stream_reader(chunk.data).read(largest + 1))
+    if chunk.compression == "lz4":
+        return bytes(LZ4FrameDecompressor().decompress(chunk.data, max_length=largest + 1))
+    if chunk.compression:
+        raise ValueError(f"its chunks are packed as {chunk.compression!r}, which is not known")
+    return chunk.data
+
+
 # -- Pieces of tables -----------------------------------------------------------------------------
 
 
@@ -288,8 +337,7 @@ class Piece:
     #: Rows that begin an episode, of a table that knows; None where columns tell episodes apart.
     starts: Sequence[int] | None = None
     names: Sequence[str] = ()  #: of these episodes, of a table that knows
-    #: Rows before which something was left out; behind the last one too.
-    anew: Sequence[int] = ()
+    anew: Sequence[int] = ()  #: rows before which something was left out; behind the last one too
     bad: NDArray[np.bool_] = field(init=False)  #: (T,) rows to leave out
 
     def __post_init__(self) -> None:
@@ -440,11 +488,11 @@ class Dialect:
         self.columns = _fields(header, self.separator)
         self.units: Mapping[str, str] = {}  #: as a row below the names says
         rows = [_fields(row, self.separator) for row in below]
-        values = next((row for row in rows if any(map(_is_value, row))), [])
+        values = next((row for row in rows if any(map(is_value, row))), [])
         above = rows[: rows.index(values)] if values else rows[:1]
         units = [unit_of(text) for row in above[:1] for text in row]
         pairs = zip(units, values, strict=False)
-        over = any(_is_value(value) and text.lower() not in MISSING for text, value in pairs)
+        over = any(is_value(value) and text.lower() not in MISSING for text, value in pairs)
         #: How many rows below the names say what numbers are, such as their units.
         self.n_told = len(above) if over or any(unit in UNITS for unit in units) else 0
         if self.n_told:
@@ -460,14 +508,11 @@ class Dialect:
 
 
 class CsvTable(Table):
-    """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
+    """A CSV file, gzipped or not, with a header; fields end at a comma, semicolon, tab or space.
 
-    Without any of these they end at a space. At a semicolon, a number may have a decimal comma; at
-    a tab where the first rows have one. The header is the line that has most of the names that are
-    looked for; what stands above is passed over, and one further down, as in files that were
-    appended to another, names the columns anew.
-    polars reads blocks of plain lines; Python's own reader, which is slower, blocks with anything
-    odd, such as a line break within quotes, and what a message is to name.
+    The header is the line that has most of the names that are looked for; one further down names
+    the columns anew. polars reads blocks of plain lines; Python's own reader, which is slower,
+    blocks with anything odd, such as a line break within quotes, and what a message is to name.
     """
 
     def __init__(self, path: str, names: Collection[str] = (), skips: Skips | None = None) -> None:
@@ -768,6 +813,14 @@ def is_date(text: str) -> bool:
     return (_DATE.match(text) or _DAY_FIRST.match(text.strip())) is not None
 
 
+def date(time: float, unit: str = "") -> str:
+    """A time [s], as people read it; with its unit, where it is no date."""
+    if not DATES <= time < _NO_DATE:
+        return f"{time:.13g}{unit}"
+    text = f"{datetime.fromtimestamp(round(time, 3), UTC):%Y-%m-%d %H:%M:%S.%f}"
+    return text[:-3].removesuffix(".000").removesuffix(":00")
+
+
 def seconds_of_date(text: str, form: str = "") -> float:
     """Since 1970, of one date as logs are read; a ValueError if it is none.
 
@@ -794,7 +847,8 @@ def is_number(text: str) -> bool:
     return True
 
 
-def _is_value(text: str) -> bool:
+def is_value(text: str) -> bool:
+    """Whether it is a number, perhaps with a decimal comma, or a date."""
     return is_number(text.replace(",", ".")) or is_date(text)
 
 

@@ -23,23 +23,18 @@ from numpy.typing import NDArray
 
 from evofsm.driving.naming import VARIABLES
 from evofsm.extras import needs
-from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained
+from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained, mcap_messages
 from evofsm.store import LARGEST_OBSERVATION
 
-#: The action of a pair of vehicles: what the follower did until the next time.
-ACTION = "a_follower"
-#: What is known of a pair at one time.
-COLUMNS = ("time", *VARIABLES, ACTION)
+ACTION = "a_follower"  #: of a pair of vehicles: what the follower did until the next time
+COLUMNS = ("time", *VARIABLES, ACTION)  #: what is known of a pair at one time
 
 _ROWS_AT_ONCE = 8192
-# Rows that pairs on the road may have waiting before all are handed on, each of 32 bytes. It
-# bounds memory, at the price of one transition for each pair cut.
+# Rows that may wait before all are handed on, of 32 bytes each; a pair that is cut loses one step.
 _MOST_WAITING = 1_000_000
-# More on one lane at one time are no recording of a road, and would fill the memory.
-_MOST_ON_A_LANE = 1000
+_MOST_ON_A_LANE = 1000  # more at one time are no recording of a road, and fill the memory
 
-#: Says where something stands, for a message.
-Place = Callable[[], str]
+Place = Callable[[], str]  #: says where something stands, for a message
 
 
 class Following(NamedTuple):
@@ -251,10 +246,7 @@ def _queues(cars: Sequence[_Car], lengths: VehicleLengths) -> Iterator[Following
 
 
 def _across(apart: Any, headings: Any) -> Any:
-    """How far two are apart across the way, in the complex plane.
-
-    On a bend a chord has the mean of the headings at its ends, of which this is given the sum.
-    """
+    """How far apart two are across the way, in the complex plane, by the sum of their headings."""
     return abs((apart * headings.conjugate()).imag) / (abs(headings) + 1e-9)
 
 
@@ -319,11 +311,9 @@ def fcd_of_xml(path: str, skips: Skips) -> Iterator[_Timestep]:
 
 
 def fcd_of_table(table: Table) -> Iterator[_Timestep] | None:
-    """Read FCD in CSV or Parquet: a row per vehicle, consecutive rows of a time together.
+    """Read FCD in CSV or Parquet, rows of a time together; None of another table.
 
-    Nothing where a table is none. SUMO names columns after what it writes first, be it a person;
-    with --output.column-header full by all tags around it, with plain by none; its xml2csv names
-    vehicles and persons apart.
+    SUMO names columns after what it writes first, be it a person; or by --output.column-header.
     """
     columns = table.columns
     if list(columns) == ["timestep_time"]:  # all that SUMO writes of an empty road
@@ -396,8 +386,7 @@ def _refuse_lack(place: str, name: str) -> NoReturn:
 #: The columns that a table of objects has, and by which it is known. ``x`` and ``y`` are of the
 #: middle of the box; units are those of the SI.
 OBJECT_COLUMNS = ("id", "t", "x", "y", "vx", "vy", "length", "lane")
-# Whoever is slower [m/s] points where it pointed before.
-_TURNS_ABOVE = 0.1
+_TURNS_ABOVE = 0.1  # whoever is slower [m/s] points where it pointed before
 
 
 class Object(NamedTuple):
@@ -469,7 +458,12 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
                 )
                 continue
             names.add(obj.id)
-            lanes[obj.lane].append(_pointing(obj, headings))
+            heading = obj.heading
+            if not math.isfinite(heading):
+                moves = math.hypot(obj.vx, obj.vy) >= _TURNS_ABOVE
+                heading = math.atan2(obj.vy, obj.vx) if moves else headings.get(obj.id, math.nan)
+            headings[obj.id] = heading
+            lanes[obj.lane].append(obj._replace(heading=heading))
         has_lanes = has_lanes or bool(lanes)
         pairs = [pair for lane in lanes.values() for pair in _following(scene, lane)]
         yield Moment(scene.time, scene.place, pairs)
@@ -478,15 +472,6 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterato
             f"{path}: no object is on a lane, and who follows whom is told by lanes (recorded "
             "without a map? assign the lanes first)"
         )
-
-
-def _pointing(obj: Object, pointed: dict[str, float]) -> Object:
-    heading = obj.heading
-    if not math.isfinite(heading):
-        moves = math.hypot(obj.vx, obj.vy) >= _TURNS_ABOVE
-        heading = math.atan2(obj.vy, obj.vx) if moves else pointed.get(obj.id, math.nan)
-    pointed[obj.id] = heading
-    return obj._replace(heading=heading)
 
 
 def _following(scene: Scene, lane: Sequence[Object]) -> Iterator[Following]:
@@ -550,11 +535,9 @@ def scenes_of_osi(path: str, skips: Skips) -> Iterator[Scene]:
 
 def scenes_of_mcap(path: str, skips: Skips) -> Iterator[Scene]:
     """Read OSI in MCAP: the first channel of ground truth or of sensor views."""
-    from evofsm.io.mcap import messages
-
     osi = _osi(path)
     channel_id, number, kinds = None, 0, set[str]()
-    for schema, channel, message in messages(path, _MOST_BYTES, skips):
+    for schema, channel, message in mcap_messages(path, _MOST_BYTES, skips):
         kind = "" if schema is None else schema.name.rpartition(".")[2]
         kinds.add(kind)
         if channel_id is None and kind in ("GroundTruth", "SensorView"):

@@ -97,7 +97,7 @@ def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path,
     state.close()
     journal = state._journal.path
     whole = journal.read_bytes()
-    journal.write_bytes(whole.replace(b"0.1", b"0.2", 1))
+    journal.write_bytes(whole.replace(b'":0.1', b'"0.1', 1))
     with pytest.raises(ValueError, match="line 3 is damaged"):
         opened(path)
     for lose in (lambda: journal.write_bytes(b""), journal.unlink):

@@ -2,53 +2,24 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import ExitStack, nullcontext
 from functools import partial
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
-from evofsm.cli.options import (
-    BRAKES,
-    TOLERANCE,
-    Brakes,
-    FalseADay,
-    Horizon,
-    Json,
-    ModeName,
-    Persist,
-    Reading,
-    argument,
-    given_of,
-    option,
-    quoted,
-    reading_of,
-    reads_logs,
-    refuse_other_limit,
-    require,
-    split_names,
-    typed,
-)
-from evofsm.cli.show import show, warn
+from evofsm.cli import options
+from evofsm.cli.options import Reading, argument, option
 
-if TYPE_CHECKING:
-    from evofsm.cli.monitor.decider import Decider
-    from evofsm.cli.monitor.transports import Transport
-    from evofsm.guard import Guard
-
-# Share by which the step of a log may differ from that of the guard.
-_SAME_STEP = 0.05
-# Of rows of cars, where nobody said another one [s].
-_INTERVAL = 0.1
+_SAME_STEP = 0.05  # share by which the step of a log may differ from that of the guard
+_INTERVAL = 0.1  # of rows of cars, where nobody said another one [s]
 # What other files end with holds live rows; so does CSV without --summary.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
-# In the beginning of what was saved.
-_SAVED = b'{"__metadata__"'
+_SAVED = b'{"__metadata__"'  # in the beginning of what was saved
 
 
-@reads_logs
+@options.reads_logs
 def monitor(
     files: Annotated[
         list[Path] | None,
@@ -68,12 +39,12 @@ def monitor(
         float | None,
         option("Time between two rows [s], without --guard. [default: of cars 0.1]", min=0.0),
     ] = None,
-    brakes: Brakes = BRAKES,
+    brakes: options.Brakes = options.BRAKES,
     tolerance: Annotated[
         float | None, option("Highest risk that is accepted. [default: of --guard, or 0.02]")
     ] = None,
     traffic: Annotated[bool, option("Judge all objects of scenes.", "--traffic")] = False,
-    mode: Annotated[ModeName, option("How far it goes: in shadow all passes.")] = "shadow",
+    mode: Annotated[options.ModeName, option("How far it goes: in shadow all passes.")] = "shadow",
     learn: Annotated[bool, option("Learn from what comes.", "--learn")] = False,
     state: Annotated[Path | None, option("Save all in this file, and go on from it.")] = None,
     audit: Annotated[Path | None, option("Write an audit log to this file.")] = None,
@@ -95,14 +66,14 @@ def monitor(
     observe: Annotated[str | None, option("Variables of rows. [default: the guard's]")] = None,
     *,
     reading: partial[Reading],
-    horizon: Horizon = None,
-    persist: Persist = 0.0,
-    false_a_day: FalseADay = None,
+    horizon: options.Horizon = None,
+    persist: options.Persist = 0.0,
+    false_a_day: options.FalseADay = None,
     split: Annotated[
         float, option("Of --summary without --guard: the share that is learnt from.", min=0, max=1)
     ] = 0.6,
     plot: Annotated[Path | None, option("Of --summary, where nobody acts: a picture.")] = None,
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> int | None:
     """Decide alongside a stack of your own: rows in, decisions out, a JSON line each.
 
@@ -130,24 +101,24 @@ def monitor(
     if sum(source is not None for source in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
     if plot is not None:
-        require(matplotlib="plot")
+        options.require(matplotlib="plot")
     if traffic and (guard or state or learn):
         raise ValueError("--traffic learns nothing: it goes with no --guard, --state or --learn")
     if summary and (file is None or state or audit):
         raise ValueError("--summary needs FILE, and goes with no --state or --audit")
-    from evofsm.cli.monitor.decider import EPISODE, Decider
+    from evofsm.cli.monitor.decider import EPISODE, Decider, begun, prepare
     from evofsm.cli.monitor.slots import Slots
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.summary import Text
-    from evofsm.cli.monitor.transports import Server, json_line
+    from evofsm.cli.monitor.transports import Server, json_line, transport_of
+    from evofsm.cli.show import show, warn
     from evofsm.driving.cars import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
     from evofsm.guard import Foresight, Guard
-    from evofsm.store import read_header
 
-    if guard is not None and brakes != BRAKES:
+    if guard is not None and brakes != options.BRAKES:
         raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
-    accepted_risk = TOLERANCE if tolerance is None else tolerance
+    accepted_risk = options.TOLERANCE if tolerance is None else tolerance
     alarms = horizon, persist, false_a_day
 
     def fresh() -> Guard:
@@ -160,18 +131,17 @@ def monitor(
 
     is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
     parts = {"low": low, "high": high, "n_actions": n_actions, "observe": observe}
-    options, new_guard = {name: part for name, part in parts.items() if part is not None}, None
-    if guard is None and not is_log and (options or "action" in given_of(reading)):
+    system, new_guard = {name: part for name, part in parts.items() if part is not None}, None
+    if guard is None and not is_log and (system or "action" in options.given_of(reading)):
         if traffic:
             raise ValueError("--traffic is of cars, and goes with no --observe or --action")
-        new_guard, learn = _begun({**options}, reading, interval, tolerance, alarms), True
-    defaults, learnt = dict[str, Any](), guard or state
-    if learnt is not None and learnt.is_file():
-        defaults = dict(read_header(learnt).provenance.get("read with", {}))
+        new_guard, learn = begun({**system}, reading, interval, tolerance, alarms), True
+    defaults = options.read_with(guard or state)
+    defaults.pop("observe", None)
+    log_episode = defaults.pop("episode", None)
     if is_log and episode is None:
-        episode = defaults.get("episode")
-    arguments = {k: v for k, v in defaults.items() if k not in ("observe", "episode")}
-    reader = partial(reading_of, **{**reading.keywords, **arguments, **given_of(reading)})
+        episode = log_episode
+    reader = options.with_defaults(reading, defaults)
     if episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
         raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns of a log")
     rows = EPISODE if episode is None or is_log else int(episode)
@@ -185,8 +155,8 @@ def monitor(
             sentry = fresh() if guard else None
             alone = not reader.keywords["action"] or isinstance(sentry and sentry.judge, Foresight)
             names = sentry.variables if sentry else VARIABLES
-            if observe is None or set(split_names(observe)) == set(names):  # in its own order
-                observe = quoted(names)
+            if observe is None or {*options.split_names(observe)} == {*names}:  # in its own order
+                observe = options.quoted(names)
             if alone:
                 reader = partial(reader, action="")
             log_format = reader(observe=observe, episode=episode)
@@ -200,7 +170,7 @@ def monitor(
                 warning = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
                 warn(f"warning: {warning} {sentry.interval:g} s: --resample {sentry.interval:g}s")
             if alone:
-                refuse_other_limit(False, false_a_day, tolerance)
+                options.refuse_other_limit(False, false_a_day, tolerance)
                 every, names = list(chunks), log_format.columns.observe.names
                 about = names, notes.si_units(names), alarms, split, plot
                 show_foreseen(file, every, sentry, *about, as_json=as_json)
@@ -213,16 +183,17 @@ def monitor(
             basics = {"interval": interval, "brakes": brakes} if guard is None else {}
             how = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
             how["false_a_day"] = false_a_day
-            columns = {k: v for k, v in given_of(reader).items() if k != "topics"}
-            keeper = State(state, {"guard": digest, **basics, **how, **options, **columns})
+            columns = {k: v for k, v in options.given_of(reader).items() if k != "topics"}
+            keeper = State(state, {"guard": digest, **basics, **how, **system, **columns})
             stack.callback(keeper.close)
         elif learn and not summary:
             warn("nothing of what is learnt is saved; --state FILE saves it")
         failed = new_guard.failed if new_guard else None
         sentry = fresh() if keeper is None else keeper.guard(fresh, failed)
-        _prepare(sentry, mode, (tolerance, false_a_day), audit, stack, learn=learn)
+        prepare(sentry, mode, (tolerance, false_a_day), audit, stack, learn=learn)
         if not (is_log or traffic):
-            slots = Slots(reader(observe=quoted(sentry.variables or VARIABLES), dt=None).columns)
+            observe = options.quoted(sentry.variables or VARIABLES)
+            slots = Slots(reader(observe=observe, dt=None).columns)
         decider = Decider(sentry, episode=rows, slots=slots)
         notice = assumptions(brakes, accepted_risk)
         if guard is not None:
@@ -237,17 +208,18 @@ def monitor(
             show(*summary_of(decider, answers, str(file)))
             return None
         if warm:
-            _compile(decider)
+            decider.warm()
+            warn("compiled")
         if keeper is not None:
             again = keeper.begin(decider)
             if decider.n:
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
         line = Text().line if text else json_line
         server = Server(decider, keeps=keeper is not None, line=line)
-        transport, where = _transport(file, socket, udp, zenoh, stack)
+        transport, where = transport_of(file, socket, udp, zenoh, stack)
         warn(notice)
-        if slots is not None and (log_options := given_of(reader)):
-            warn(f"rows are read as in a log: {typed(log_options)}")
+        if slots is not None and (log_options := options.given_of(reader)):
+            warn(f"rows are read as in a log: {options.typed(log_options)}")
         warn(f"ready: {where}")
         try:
             server.run(transport)
@@ -260,116 +232,3 @@ def monitor(
             elif decider.rows:
                 decider.end()
     return None
-
-
-def _prepare(
-    guard: Guard,
-    mode: ModeName,
-    limits: tuple[float | None, float | None],
-    audit: Path | None,
-    stack: ExitStack,
-    *,
-    learn: bool,
-) -> None:
-    """Set how far it goes, whether it learns, and who writes it down."""
-    from evofsm.fsm.validation import probability
-    from evofsm.guard import ActionReviser, AuditLog, Foresight, Mode
-
-    tolerance, false_a_day = limits
-    refuse_other_limit(not isinstance(guard.judge, Foresight), false_a_day, tolerance)
-    if isinstance(guard.judge, Foresight) and false_a_day is not None:
-        guard.judge.stated = false_a_day
-    if isinstance(guard.reviser, ActionReviser):
-        guard.reviser.mode = Mode(mode)
-        if tolerance is not None:
-            guard.reviser.tolerance = probability("--tolerance", tolerance)
-    elif mode != "act":
-        name = type(guard.reviser).__name__
-        raise ValueError(f"a {name} knows no --mode {mode}: what it says is executed")
-    guard.learn = learn
-    if audit is not None:
-        guard.audit = stack.enter_context(AuditLog(audit, sync="episode"))
-
-
-def _begun(
-    told: dict[str, Any],
-    reading: partial[Reading],
-    interval: float | None,
-    tolerance: float | None,
-    alarms: tuple[float | None, float, float | None],
-) -> Guard:
-    """A guard that knows nothing yet, from what was told of a system."""
-    from evofsm.cli.foreseen import guard_from_zero
-    from evofsm.guard import Guard, LearntRisk, Mode
-    from evofsm.io.logs import Condition
-
-    if "observe" not in told:
-        raise ValueError("say what is observed, the keys of rows: --observe temperature,load")
-    columns, *_, acts = reading(observe=told.pop("observe"), dt=None)
-    names, scheme = columns.observe.names, columns.resample
-    if (step := scheme.step if scheme else interval) is None:
-        raise ValueError("say how often rows come [s]: --interval 1; or --resample 10s of jittered")
-    if not acts and told:
-        raise ValueError("--action '' says that nobody acts, and goes with no range of actions")
-    if not acts:
-        return guard_from_zero(step, names, *alarms)
-    if not told:
-        raise ValueError("say who acts: --low and --high, --n-actions; or --action '', if nobody")
-    for name in {"low", "high"} & {*told}:
-        try:
-            ends = [float(end) for end in told[name].split(",")]
-        except ValueError:
-            raise ValueError(f"--{name} is {told[name]!r}; write a number, or -1,-1") from None
-        told[name] = ends if len(ends) > 1 else ends[0]
-    condition = Condition.parse(columns.failed or names[0])
-
-    def failed(z: Any) -> bool:
-        return condition.holds_of(dict(zip(names, z, strict=True)))
-
-    is_told = columns.failed and {term.column for term in condition.terms} <= {*names}
-    judge = LearntRisk(step, horizon=alarms[0], names=names, **told)
-    return Guard(
-        **told,
-        interval=step,
-        judge=judge,
-        failed=failed if is_told else None,
-        tolerance=TOLERANCE if tolerance is None else tolerance,
-        mode=Mode.SHADOW,
-    )
-
-
-def _transport(
-    file: Path | None, socket: Path | None, udp: int | None, zenoh: str | None, stack: ExitStack
-) -> tuple[Transport, str]:
-    """Where rows come from, and that in words."""
-    from evofsm.cli.monitor.transports import SocketTransport, Stream, UdpTransport, ZenohTransport
-
-    if socket is not None:
-        return SocketTransport(socket), f"listens to {socket}"
-    if udp is not None:
-        by_udp = UdpTransport(udp)
-        return by_udp, f"listens to UDP port {by_udp.port}"
-    if zenoh is not None:
-        return ZenohTransport(zenoh), f"listens to {zenoh}/row"
-    if file is None and sys.stdin is None:
-        raise ValueError("standard input is closed; give FILE, --socket, --udp or --zenoh")
-    if sys.stdout is None:
-        raise ValueError("standard output is closed; give --socket, --udp or --zenoh")
-    source = sys.stdin.buffer if file is None else stack.enter_context(file.open("rb"))
-    return Stream(source, sys.stdout.buffer), f"reads {file or 'standard input'}"
-
-
-def _compile(decider: Decider) -> None:
-    """Decide a few times on a copy, which then is thrown away."""
-    import numpy as np
-
-    from evofsm.driving import Object, Scene
-
-    twin, observation = decider.guard.copy(), np.ones(decider.form.count or 1)
-    if decider.form.scenes:
-        ego, car = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
-        observation = Scene(ego, [car, car._replace(x=-20.0)]).rows(2)
-    for k in range(4):
-        twin.decide(observation + 0.1 * k, None)
-    twin.end(observation=observation)
-    warn("compiled")

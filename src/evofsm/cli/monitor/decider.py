@@ -1,8 +1,4 @@
-"""A guard that is asked by messages: a message in, an answer out, and no input or output.
-
-The same messages bring the same answers, whatever carried them; what is refused leaves the guard
-as it was.
-"""
+"""A guard that is asked by messages: the same ones bring the same answers, whoever carries."""
 
 from __future__ import annotations
 
@@ -10,52 +6,40 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli.foreseen import date
-from evofsm.cli.monitor.messages import (
-    NO_ROW,
-    SCHEMA,
-    End,
-    Form,
-    Message,
-    MessageError,
-    Pause,
-    Row,
-    Taken,
-)
+from evofsm.cli.foreseen import guard_of_alarms
+from evofsm.cli.monitor import messages
+from evofsm.cli.monitor.messages import End, Form, Message, MessageError, Pause, Row, Taken
 from evofsm.cli.monitor.slots import CsvRows, Slots
+from evofsm.cli.options import TOLERANCE, ModeName, Reading, refuse_other_limit
 from evofsm.cli.show import plain
+from evofsm.driving import Object, Scene
 from evofsm.driving.judge import SLIGHT, LatentRisk
 from evofsm.driving.traffic import COLUMNS, TrafficRisk
-from evofsm.guard import (
-    ActionReviser,
-    BoxActions,
-    Foresight,
-    Guard,
-    Mode,
-    Proposal,
-    Revision,
-    is_spoken,
-    make_usable,
-)
+from evofsm.fsm import EvolvingFSM
+from evofsm.fsm.validation import probability
+from evofsm.guard import ActionReviser, BoxActions, Foresight, Guard, LearntRisk, Mode
+from evofsm.guard.api import Proposal, Revision
+from evofsm.guard.audit_log import AuditLog
+from evofsm.guard.reviser import is_spoken, make_usable
+from evofsm.io.logs import Condition
+from evofsm.io.tables import date
 
 _log = logging.getLogger(__name__)
 
-#: Rows after which an episode ends, as soon as no alarm is on; at twice as many it ends anyway.
-EPISODE = 6000
-# So many of the latest messages are known again when they are sent again.
-_RECENT = 256
-# Nothing on a road is faster [m/s].
-_FAST = 60.0
-# What is older by less is late; what is older by more comes from a sender that began anew [s].
-_LATE = 1.0
-#: A gap in time, and rows that come too often, in intervals.
-HOLE, _OFTEN = 1.5, 0.5
+EPISODE = 6000  #: rows until an episode ends; with an alarm on, at most twice as many
+_RECENT = 256  # so many of the latest messages are known again when they are sent again
+_FAST = 60.0  # nothing on a road is faster [m/s]
+_LATE = 1.0  # what is older by less is late, by more from a sender that began anew [s]
+HOLE, _OFTEN = 1.5, 0.5  #: a gap in time, and rows that come too often, in intervals
 _VX, _AX = COLUMNS.index("vx"), COLUMNS.index("ax")
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
 
@@ -88,7 +72,15 @@ class Decider:
         if isinstance(judge, Foresight):
             judge.bridges = self.slots.hole or 0.0
 
-    # -- Messages -------------------------------------------------------------------------------
+    def warm(self) -> None:
+        """Compile what decides, by a few decisions of a copy, which then is thrown away."""
+        twin, observation = self.guard.copy(), np.ones(self.form.count or 1)
+        if self.form.scenes:
+            ego, car = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
+            observation = Scene(ego, [car, car._replace(x=-20.0)]).rows(2)
+        for k in range(4):
+            twin.decide(observation + 0.1 * k, None)
+        twin.end(observation=observation)
 
     def answer(self, line: bytes) -> Answer:
         """What is answered to a line: a decision, an end, or an error that names the key.
@@ -96,9 +88,10 @@ class Decider:
         Messages that are sent again, as after a connection was lost, get the answers of before.
         """
         try:
-            if (json_line := self._csv.read(line)) is None:
-                return self._of("waiting", alarm=self._alarm, reason=self._csv.unread or NO_ROW)
-            message = self.form.read(json_line)
+            if (body := self._csv.read(line)) is None:
+                why = self._csv.unread or messages.NO_ROW
+                return self._of("waiting", alarm=self._alarm, reason=why)
+            message = self.form.read(body)
             beyond = self.guard.beyond(np.array(message.observation or (), np.float64))
             if beyond is not None:
                 raise MessageError(*beyond, message.time)
@@ -129,9 +122,8 @@ class Decider:
     def _sent_before(self, told: Message) -> int | None:
         """Where among the recent messages one is that is sent again; None if it is a new one.
 
-        Who plays a recording once more begins with its first row, or does what was done before
-        after the same: that is no repetition. Nor is a row that is newer than the latest, where
-        time went back meanwhile, as clocks do once a year.
+        Who plays a recording once more begins with its first row, or as was begun before: that is
+        no repetition. Nor is a row that is newer than the latest, as clocks go back once a year.
         """
         recent, latest = self._recent, self.latest
         next_place = len(recent) if self._next is None else self._next + 1
@@ -155,9 +147,7 @@ class Decider:
         return self._of("error", **when, about=about, error=what)
 
     def _of(self, kind: str, **said: Any) -> Answer:
-        return {"schema": SCHEMA, "kind": kind, "n": self.n, **said}
-
-    # -- What it does ---------------------------------------------------------------------------
+        return {"schema": messages.SCHEMA, "kind": kind, "n": self.n, **said}
 
     def act(self, told: Taken) -> Answer:
         """Take in what was accepted, and answer it."""
@@ -334,8 +324,6 @@ class Decider:
         change = abs(float(revision.advised) - float(wish))
         return bool(reviser.refuses and not 0.0 < change <= SLIGHT)
 
-    # -- Its end, and its beginning -------------------------------------------------------------
-
     def memory(self) -> dict[str, Any]:
         """What it knows between two episodes, beside the guard: for JSON."""
         queues = {"recent": list(self._recent), "waiting": self.slots.waiting}
@@ -387,3 +375,76 @@ def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None
     if observation is None:
         return None
     return [math.nan if value is None else value for value in observation]
+
+
+# -- Its guard ------------------------------------------------------------------------------------
+
+
+def begun(
+    told: dict[str, Any],
+    reading: partial[Reading],
+    interval: float | None,
+    tolerance: float | None,
+    alarms: tuple[float | None, float, float | None],
+) -> Guard:
+    """A guard that knows nothing yet, from what was told of a system."""
+    if "observe" not in told:
+        raise ValueError("say what is observed, the keys of rows: --observe temperature,load")
+    columns, *_, acts = reading(observe=told.pop("observe"), dt=None)
+    names, scheme = columns.observe.names, columns.resample
+    if (step := scheme.step if scheme else interval) is None:
+        raise ValueError("say how often rows come [s]: --interval 1; or --resample 10s of jittered")
+    if not acts and told:
+        raise ValueError("--action '' says that nobody acts, and goes with no range of actions")
+    if not acts:
+        horizon, hold, false_a_day = alarms
+        judge = Foresight.from_zero(dt=step, names=names, horizon=horizon, hold=hold)
+        return guard_of_alarms(judge, false_a_day, EvolvingFSM(1, max_states=200), learn=True)
+    if not told:
+        raise ValueError("say who acts: --low and --high, --n-actions; or --action '', if nobody")
+    for name in {"low", "high"} & {*told}:
+        try:
+            ends = [float(end) for end in told[name].split(",")]
+        except ValueError:
+            raise ValueError(f"--{name} is {told[name]!r}; write a number, or -1,-1") from None
+        told[name] = ends if len(ends) > 1 else ends[0]
+    condition = Condition.parse(columns.failed or names[0])
+
+    def failed(z: Any) -> bool:
+        return condition.holds_of(dict(zip(names, z, strict=True)))
+
+    is_told = columns.failed and {term.column for term in condition.terms} <= {*names}
+    return Guard(
+        **told,
+        interval=step,
+        judge=LearntRisk(step, horizon=alarms[0], names=names, **told),
+        failed=failed if is_told else None,
+        tolerance=TOLERANCE if tolerance is None else tolerance,
+        mode=Mode.SHADOW,
+    )
+
+
+def prepare(
+    guard: Guard,
+    mode: ModeName,
+    limits: tuple[float | None, float | None],
+    audit: Path | None,
+    stack: ExitStack,
+    *,
+    learn: bool,
+) -> None:
+    """Set how far it goes, whether it learns, and who writes it down."""
+    tolerance, false_a_day = limits
+    refuse_other_limit(not isinstance(guard.judge, Foresight), false_a_day, tolerance)
+    if isinstance(guard.judge, Foresight) and false_a_day is not None:
+        guard.judge.stated = false_a_day
+    if isinstance(guard.reviser, ActionReviser):
+        guard.reviser.mode = Mode(mode)
+        if tolerance is not None:
+            guard.reviser.tolerance = probability("--tolerance", tolerance)
+    elif mode != "act":
+        name = type(guard.reviser).__name__
+        raise ValueError(f"a {name} knows no --mode {mode}: what it says is executed")
+    guard.learn = learn
+    if audit is not None:
+        guard.audit = stack.enter_context(AuditLog(audit, sync="episode"))

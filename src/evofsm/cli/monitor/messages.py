@@ -1,8 +1,4 @@
-"""The messages of a monitor: what a line may hold, checked before anything is done with it.
-
-A message is a JSON object on a line of its own; ``docs/monitor.md`` describes each key. `msgspec`
-checks types and ranges; here the key and the value are added to what it says.
-"""
+"""The messages of a monitor (docs/monitor.md), checked before anything is done with one."""
 
 from __future__ import annotations
 
@@ -25,20 +21,14 @@ from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
 from evofsm.io.tables import TIMES, is_number, seconds_of_date
 from evofsm.store import LARGEST_OBSERVATION
 
-#: The version of the messages.
-SCHEMA = 1
-#: A longer line is refused unread [byte].
-LONGEST = 1 << 16
-# Objects that a guard of whole scenes has room for; of more the closest along the road count.
-_MOST_OBJECTS = 64
-# So much of what is refused is shown, and so long may a name be [letters].
-_LETTERS = 40
-# What is later than this is in another unit [s].
-_LATEST = 1e11
+SCHEMA = 1  #: the version of the messages
+LONGEST = 1 << 16  #: a longer line is refused unread [byte]
+_MOST_OBJECTS = 64  # of a whole scene; of more the closest along the road count
+_LETTERS = 40  # so much of what is refused is shown, and so long may a name be [letters]
+_LATEST = 1e11  # what is later than this is in another unit [s]
 #: What is said of lines of another kind.
 NO_ROW = "rows are JSON, one per line, or CSV below a line that names columns (tail -n +1 -f LOG)"
-# Where a width is not given [m].
-_USUAL_WIDTH = 1.8
+_USUAL_WIDTH = 1.8  # where a width is not given [m]
 
 _Number = Annotated[float, Meta(ge=-LARGEST_OBSERVATION, le=LARGEST_OBSERVATION)]
 _Place = Annotated[float, Meta(ge=PLACES[0], le=PLACES[1])]
@@ -139,7 +129,6 @@ class Form:
         last = [(key, kind | UnsetType, UNSET) for key, kind in variables]
         end = ("end", bool), ("failed", bool, False), ("time", _Seen | str | UnsetType, UNSET)
         self._end = self._struct("End", *end, *when[1:], *last, *also, version)
-        self._decoders = {kind: msgspec.json.Decoder(kind) for kind in (self._row, self._scene)}
 
     def _struct(self, name: str, *fields: Any) -> Any:
         strict: Any = {
@@ -149,31 +138,27 @@ class Form:
         }
         return msgspec.defstruct(name, fields, **strict)
 
-    def read(self, line: bytes) -> Message:
-        """The message on a line."""
-        line = line.removeprefix(b"\xef\xbb\xbf")  # a byte order mark, before the first line
-        if len(line) > LONGEST:
-            raise MessageError("line", f"is longer than {LONGEST} bytes")
-        kind = self._row
+    def read(self, line: bytes | dict[str, Any]) -> Message:
+        """The message on a line, or with these keys."""
+        body = line if isinstance(line, dict) else _parsed(line)
+        kind = self._scene if self.scenes or body.keys() & {"ego", "objects"} else self._row
+        kind = self._end if "end" in body else kind
         try:
-            if self.scenes or b'"objects"' in line or b'"ego"' in line:
-                kind = self._scene
-            if b'"end"' in line and "end" in (body := _parsed(line)):
-                kind = self._end
-                return self._of_end(msgspec.convert(body, kind))
-            body = self._decoders[kind].decode(line)
+            fields = msgspec.convert(body, kind)
+            if kind is self._end:
+                return self._of_end(fields)
             if kind is self._scene:
-                return self._of_scene(body)
-            also = tuple(getattr(body, key) for key in self._others)
-            if (time := self._when(body)) is None:
+                return self._of_scene(fields)
+            also = tuple(getattr(fields, key) for key in self._others)
+            if (time := self._when(fields)) is None:
                 names = "".join(f", or {name!r}" for name in self._clocks.values())
                 raise MessageError("time", f"is missing{names}; every message of its kind has it")
-            return Row(time, self._observed(body), _frozen(body.proposal), told=also)
+            return Row(time, self._observed(fields), _frozen(fields.proposal), told=also)
         except MessageError as error:
-            error.time = _time(_parsed(line))
+            error.time = _time(body)
             raise
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            raise self._refused(line, kind, str(error)) from None
+        except msgspec.ValidationError as error:
+            raise self._refused(body, kind, str(error)) from None
 
     def _when(self, told: Any) -> float | None:
         """The time of a message [s], as it or a log has it."""
@@ -234,14 +219,12 @@ class Form:
         gap, car = ahead
         return Row(told.time, (gap, ego.vx, car.vx), proposal, None if car.id is UNSET else car.id)
 
-    def _refused(self, line: bytes, kind: Any, error: str) -> MessageError:
+    def _refused(self, body: dict[str, Any], kind: Any, error: str) -> MessageError:
         """What msgspec refused, with the key and the value, in a sentence."""
         text, _, place = error.partition(" - at `$")
-        place = place.removesuffix("`").removeprefix(".")
+        place, time = place.removesuffix("`").removeprefix("."), _time(body)
         if text == "Number out of range":
-            return MessageError(place or "line", "is too large")
-        body = _parsed(line)
-        time = _time(body)
+            return MessageError(place, "is too large", time)
         if match := re.fullmatch(r"Object (missing|contains).* field `(.*)`", text):
             about = f"{place}.{match[2]}".removeprefix(".")
             if match[1] == "missing":
@@ -315,6 +298,9 @@ def _in_lane(ego: Any, car: Any) -> bool:
 
 def _parsed(line: bytes) -> dict[str, Any]:
     """Whatever JSON it is."""
+    line = line.removeprefix(b"\xef\xbb\xbf")  # a byte order mark, before the first line
+    if len(line) > LONGEST:
+        raise MessageError("line", f"is longer than {LONGEST} bytes")
     try:
         body = msgspec.json.decode(line)
     except RecursionError:
@@ -326,6 +312,8 @@ def _parsed(line: bytes) -> dict[str, Any]:
             name = match[0].decode()
             fault = f"holds {name}, which is no JSON; a number that was not seen is null"
             raise MessageError("line", fault) from None
+        if str(error).startswith("Number out of range"):
+            raise MessageError("line", "holds a number that is too large") from None
         kind = "not UTF-8" if isinstance(error, UnicodeDecodeError) else "no JSON"
         hint = "" if line.lstrip().startswith(b"{") else f"; {NO_ROW}"
         raise MessageError("line", f"is {kind}: {error}{hint}") from None

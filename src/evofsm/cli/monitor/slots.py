@@ -1,7 +1,4 @@
-"""Live rows, read as a log is: in CSV too, which count, what failed, those of a step as one.
-
-The options are those of ``evofsm learn``, `evofsm.io.LogColumns`; what comes is the same.
-"""
+"""Live rows, read as a log is: in CSV too, which count, what failed, those of a step as one."""
 
 from __future__ import annotations
 
@@ -13,12 +10,10 @@ from operator import itemgetter
 from statistics import fmean
 from typing import Any
 
-import msgspec
-
 from evofsm.cli.monitor.messages import NO_ROW, Message, MessageError, Row
-from evofsm.io import LogColumns
+from evofsm.io import LogColumns, tables
 from evofsm.io.logs import Condition, units_of
-from evofsm.io.tables import MISSING, UNITS, Dialect, decoded, explained, is_date, is_number
+from evofsm.io.tables import Dialect, decoded, explained, is_date, is_number, is_value
 
 # Lines that are no rows are told of as the first came, and then as so many had.
 _SAID_AT = [10**k for k in range(1, 10)]
@@ -126,9 +121,9 @@ class CsvRows:
         #: What messages call the columns that are read.
         self._called = dict(zip(names, names, strict=True)) | dict.fromkeys(action, "proposal")
         self._called[columns.time] = "time"
-        self._header, self._count, self._factors = "", 0, dict[str, float]()
-        self._dialect: Dialect | None = None
-        self._below: list[str] = []  # lines below the names, to the first row
+        self._count, self._factors = 0, dict[str, float]()
+        self._head: list[str] = []  # the line with the names, and those below to the first row
+        self._dialect: Dialect | None = None  # once that row has come
         self._acts, self._may_be_title = acts, not acts  # who drives along sends no log
         self._needs = *variables, *columns.time.split(",")
         self._above: Sequence[str] = ()  # fields of the line before
@@ -136,8 +131,8 @@ class CsvRows:
         self._n_unread = 0
         self.place, self.in_csv = "", False  #: of a line, as what is said of it begins
 
-    def read(self, line: bytes) -> bytes | None:
-        """The message on a line; None where it names the columns, or is a title or units."""
+    def read(self, line: bytes) -> bytes | dict[str, Any] | None:
+        """The keys of a row, or JSON as it is; None of names of columns, a title or units."""
         self._count += 1
         self.place, self.in_csv = f"line {self._count}: ", False
         begin = line.lstrip(b"\xef\xbb\xbf \t")[:1]
@@ -149,28 +144,24 @@ class CsvRows:
         except ValueError:
             return line
         self.in_csv = True
-        if is_header := self._names_columns(text):
-            self._header, self._dialect, self._below = text, None, []
+        may_name = any(name in text for name in self._variables)
+        columns = {*Dialect(text, ()).columns} if may_name else set()
+        if may_name and {*self._needs} <= columns:
+            self._head, self._dialect = [text], None
             self._may_be_title, self.unread = False, ""
-        if not self._header:
+            return None
+        if {*self._variables} & columns:  # the names of another log
+            self._head = []
+        if not self._head:
             self._refuse_unnamed(text)
             return None if self._may_be_title or self.unread else line
         try:
-            if is_header or self._has_units(text):
+            if self._dialect is None and self._has_units(text):
                 return None
             assert self._dialect is not None
-            return msgspec.json.encode(dict(self._told(self._dialect, text)))
+            return dict(self._told(self._dialect, text))
         except csv.Error as error:
             raise MessageError("line", f"{error} (an unclosed quote?)") from None
-
-    def _names_columns(self, text: str) -> bool:
-        """Whether it names the time and all variables; what names some alone is no header more."""
-        if not any(name in text for name in self._variables):
-            return False
-        columns = Dialect(text, ()).columns
-        if {*self._variables} & {*columns} and not {*self._needs} <= {*columns}:
-            self._header = ""
-        return {*self._needs} <= {*columns}
 
     def _refuse_unnamed(self, text: str) -> None:
         """Raise where a line tells that names are missing above the rows; then now and then."""
@@ -197,23 +188,19 @@ class CsvRows:
         raise MessageError(about, self.unread.removeprefix(f"{about} "))
 
     def _has_units(self, text: str) -> bool:
-        """Whether a line below the names tells units, or the like; the first row tells the dialect.
-
-        That is the first line in which anything is a number, or a date.
-        """
-        if self._dialect is not None:
-            return False
-        self._below.append(text)
-        dialect, log_units = Dialect(self._header, self._below), self._columns.units
+        """Whether a line below the names tells units, or the like; the first row tells the rest."""
+        self._head.append(text)
+        header, *below = self._head
+        dialect = Dialect(header, below)
         fields = next(csv.reader([text], delimiter=dialect.separator, strict=True))
-        if not any(map(_is_value, fields)) and len(self._below) <= Dialect.most_below:
+        if not any(map(is_value, fields)) and len(below) <= Dialect.most_below:
             return True
         numbers = [name for name in dialect.columns if name in self._numbers]
-        units = {name: unit for name, unit in log_units.items() if "%" not in unit}
+        units = {name: unit for name, unit in self._columns.units.items() if "%" not in unit}
         units = {**dialect.units, **units_of(units, numbers)}
-        self._factors = {name: UNITS.get(units.get(name, ""), 1.0) for name in numbers}
+        self._factors = {name: tables.UNITS.get(units.get(name, ""), 1.0) for name in numbers}
         self._dialect = dialect
-        return dialect.n_told == len(self._below)
+        return dialect.n_told == len(below)
 
     def _told(self, dialect: Dialect, text: str) -> Iterator[tuple[str, Any]]:
         """What a row tells, by the keys of messages."""
@@ -228,7 +215,7 @@ class CsvRows:
 
     def _number(self, name: str, text: str, dialect: Dialect) -> float | None:
         """What stands in a field, in units of the SI; None where nothing does."""
-        if text.lower() in MISSING:
+        if text.lower() in tables.MISSING:
             return None
         if not is_number(plain := text.replace(",", ".") if dialect.has_commas else text):
             raise MessageError(name, explained(text))
@@ -236,12 +223,8 @@ class CsvRows:
         return int(number) if self._called[name] == "proposal" and number.is_integer() else number
 
 
-def _is_value(text: str) -> bool:
-    return is_number(text.replace(",", ".")) or is_date(text)
-
-
 def _begins_row(fields: Sequence[str]) -> bool:
-    return _is_value(next(filter(None, fields), ""))
+    return is_value(next(filter(None, fields), ""))
 
 
 def _joined(how: str | None, values: Sequence[Any]) -> Any:

@@ -1,9 +1,7 @@
 """How a monitor goes on bit for bit after whatever ended it.
 
 Two files: the guard as it was between two episodes, replaced whole, and beside it a journal of the
-messages since then. A message is in the journal before it is answered; a monitor that begins takes
-them all in again, and is where it was. What was not answered is sent again by whoever sent it. A
-process that is killed loses nothing, a power cut what the system had not yet written.
+messages since then, each written before it is answered, which are taken in again.
 """
 
 from __future__ import annotations
@@ -24,11 +22,9 @@ from evofsm.guard import Guard
 
 _log = logging.getLogger(__name__)
 
-# The guard is written once so many messages are in the journal, as an episode ends.
-_EVERY = 600
+_EVERY = 600  # messages in the journal, from which on the guard is written as an episode ends
 _PROVENANCE = "monitor"
-# The mark of a journal that was made just now.
-_NEW = -1
+_NEW = -1  # the mark of a journal that was made just now
 
 
 class State:
@@ -37,8 +33,7 @@ class State:
     def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
         self.path = path.resolve()
         self.settings = dict(settings)
-        #: Why nothing is saved any more; empty as long as it is.
-        self.failure = ""
+        self.failure = ""  #: why nothing is saved any more; empty as long as it is
         self._journal = Journal(
             self.path.with_name(f"{self.path.name}.journal"), {"mark": _NEW}, "name another file"
         )

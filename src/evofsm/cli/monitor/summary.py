@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
+from rich.console import RenderableType
 
-from evofsm.cli.foreseen import date
 from evofsm.cli.learning import refusing
 from evofsm.cli.monitor.decider import HOLE, Answer, Decider
 from evofsm.cli.monitor.messages import End, Row
@@ -18,15 +18,10 @@ from evofsm.fsm.naming import visible
 from evofsm.guard.audit_log import lines
 from evofsm.guard.foresight import span
 from evofsm.io.logs import Chunk
+from evofsm.io.tables import date
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from rich.console import RenderableType
-
-# A line of more bytes is of another kind of file; one that is longer than a message is refused.
-_LONGEST_MESSAGE = 1 << 20
-# Beside the guard's own tolerance.
-_TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+_LONGEST_MESSAGE = 1 << 20  # a line of more bytes is of another kind of file
+_TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)  # beside the guard's own tolerance
 # So many moments and variables are shown; without an alarm a moment lasts so long [s].
 _WORST, _MOST_VARIABLES, _MOMENT = 10, 4, 5.0
 

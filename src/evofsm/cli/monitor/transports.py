@@ -1,7 +1,6 @@
 """How messages come and go: pipes, files, a UNIX socket, UDP on this computer, Zenoh.
 
-Each transport reads in threads of its own and has a `Server` answer, until the input ends or the
-process is asked to stop. A peer that sends junk, vanishes or does not read is no reason to end.
+A peer that sends junk, vanishes or does not read is no reason to end.
 """
 
 from __future__ import annotations
@@ -10,10 +9,11 @@ import math
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -25,14 +25,10 @@ from evofsm.cli.monitor.messages import LONGEST
 from evofsm.extras import needs
 from evofsm.fsm.naming import visible
 
-# So much is read at once [byte].
-_CHUNK = 1 << 16
-# So many lines may come in one datagram or sample.
-_MOST_LINES = 100
-# What would block is tried again after so long [s].
-_POLL = 0.005
-# A signal that another thread took is seen after so long [s].
-_LONGEST_WAIT = 0.5
+_CHUNK = 1 << 16  # so much is read at once [byte]
+_MOST_LINES = 100  # so many lines may come in one datagram or sample
+_POLL = 0.005  # what would block is tried again after so long [s]
+_LONGEST_WAIT = 0.5  # a signal that another thread took is seen after so long [s]
 
 
 def json_line(answer: Answer) -> bytes:
@@ -91,10 +87,7 @@ class Server:
             return self._line(self.decider.error("line", fault))
 
     def run(self, transport: Transport) -> None:
-        """Serve until the input ends, or SIGTERM, SIGHUP or Ctrl-C comes; no decision is cut short.
-
-        This thread waits, and decides on what waits; another one reads.
-        """
+        """Serve until the input ends, SIGTERM, SIGHUP or Ctrl-C; no decision is cut short."""
         threading.Thread(target=self._serve, args=(transport,), daemon=True).start()
         try:
             with _stoppable():
@@ -168,14 +161,8 @@ class Stream:
         """Others opened them."""
 
 
-# -- A UNIX socket --------------------------------------------------------------------------------
-
-
 class SocketTransport:
-    """Answers whoever connects to a UNIX socket; several peers speak of the same car.
-
-    A peer that does not read waits for itself alone.
-    """
+    """Answers whoever connects to a UNIX socket; who does not read waits for itself alone."""
 
     def __init__(self, path: Path) -> None:
         if not hasattr(socket, "AF_UNIX"):
@@ -245,9 +232,6 @@ def _make_way(path: Path) -> None:
     path.unlink(missing_ok=True)
 
 
-# -- UDP ------------------------------------------------------------------------------------------
-
-
 class UdpTransport:
     """Answers datagrams from this computer, a line or some of them in each, to their senders."""
 
@@ -280,15 +264,8 @@ class UdpTransport:
         self._socket.close()
 
 
-# -- Zenoh ----------------------------------------------------------------------------------------
-
-
 class ZenohTransport:
-    """Takes messages that are put under ``KEY/row``, and puts answers under ``KEY/decision``.
-
-    The session is configured by the file that the variable ``ZENOH_CONFIG`` names, where it is
-    set; else it finds peers and routers of its network by itself.
-    """
+    """Takes messages under ``KEY/row``, and puts answers under ``KEY/decision``."""
 
     def __init__(self, key: str) -> None:
         with needs("eclipse-zenoh", "zenoh", "Zenoh"):
@@ -324,3 +301,22 @@ class ZenohTransport:
 
 
 Transport = Stream | SocketTransport | UdpTransport | ZenohTransport
+
+
+def transport_of(
+    file: Path | None, unix: Path | None, udp: int | None, zenoh: str | None, stack: ExitStack
+) -> tuple[Transport, str]:
+    """Where rows come from, and that in words."""
+    if unix is not None:
+        return SocketTransport(unix), f"listens to {unix}"
+    if udp is not None:
+        by_udp = UdpTransport(udp)
+        return by_udp, f"listens to UDP port {by_udp.port}"
+    if zenoh is not None:
+        return ZenohTransport(zenoh), f"listens to {zenoh}/row"
+    if file is None and sys.stdin is None:
+        raise ValueError("standard input is closed; give FILE, --socket, --udp or --zenoh")
+    if sys.stdout is None:
+        raise ValueError("standard output is closed; give --socket, --udp or --zenoh")
+    source = sys.stdin.buffer if file is None else stack.enter_context(file.open("rb"))
+    return Stream(source, sys.stdout.buffer), f"reads {file or 'standard input'}"

@@ -9,37 +9,13 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
-from evofsm.cli.options import (
-    BRAKES,
-    TOLERANCE,
-    Brakes,
-    ByJudge,
-    InWorld,
-    Judge,
-    Reading,
-    Seed,
-    Tolerance,
-    World,
-    argument,
-    given_of,
-    option,
-    reading_of,
-    reads_logs,
-    require,
-    require_world,
-)
-from evofsm.cli.show import progress, say, warn
-
-if TYPE_CHECKING:
-    from evofsm.cli.watch.session import Session
-
-# Of a simulation of somebody else's that are watched [s], and positions of cars in them.
-_SECONDS, _ENOUGH = 600.0, 100_000
+from evofsm.cli import options
+from evofsm.cli.options import Reading, argument, option
 
 
-@reads_logs
+@options.reads_logs
 def watch(
     what: Annotated[
         str,
@@ -50,13 +26,13 @@ def watch(
         ),
     ] = "paper",
     case: Annotated[int | None, option("Which case, draw or episode.", min=1)] = None,
-    world: InWorld = "kinematic",
-    judge: ByJudge = "kinematic",
-    tolerance: Tolerance = TOLERANCE,
+    world: options.InWorld = "kinematic",
+    judge: options.ByJudge = "kinematic",
+    tolerance: options.Tolerance = options.TOLERANCE,
     guard: Annotated[Path | None, option("Of a log: a saved guard. [default: of cars]")] = None,
-    seed: Seed = 0,
+    seed: options.Seed = 0,
     learn_first: Annotated[int, option("Episodes to learn from before, at most.", min=0)] = 60,
-    brakes: Brakes = BRAKES,
+    brakes: options.Brakes = options.BRAKES,
     *,
     reading: partial[Reading],
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
@@ -70,46 +46,47 @@ def watch(
     The page is served to this computer only, at the address that is printed, and the run begins
     when it is first opened. Ctrl-C ends it.
     """
-    require(websockets="watch")
+    options.require(websockets="watch")
+    from evofsm.cli.show import say
+    from evofsm.cli.watch import session
+    from evofsm.cli.watch.server import LivePage, Player
     from evofsm.guard import Guard
-    from evofsm.store import read_header
 
-    is_log = _is_log(what)
-    if not is_log and (given_of(reading) or guard):
+    async def serve(run: session.Session) -> None:
+        async with LivePage() as page:
+            page.player = Player(run, page)
+            may = "steer the run" if run.start.live else "look on"
+            say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
+            print(f"  {page.address}", flush=True)
+            if not no_browser:
+                webbrowser.open(page.address)
+            await page.player.play()
+            await asyncio.Event().wait()  # it broke off; the page says why
+
+    is_log, log_options = _is_log(what), options.given_of(reading)
+    if not is_log and (log_options or guard):
         raise ValueError(f"--guard and options of columns are for a log, and {what} is none")
-    defaults = {} if guard is None else read_header(guard).provenance.get("read with", {})
-    reader = partial(reading_of, **{**reading.keywords, **defaults, **given_of(reading)})
     with suppress(KeyboardInterrupt):
         if is_log:
-            risk = None if tolerance == TOLERANCE else tolerance
+            risk = None if tolerance == options.TOLERANCE else tolerance
             log_guard = None if guard is None else Guard.load(guard)
             try:
-                run = _logged(what, reader(), risk, case, log_guard, brakes=brakes)
+                log_format = options.with_defaults(reading, options.read_with(guard))()
+                is_simulation = what.endswith(".sumocfg")
+                show = session.watched_simulation if is_simulation else session.watched_log
+                run = show(what, log_format, risk, case, log_guard, brakes=brakes)
             except ValueError as error:
-                if given_of(reading) or "has no column" not in str(error):
+                if log_options or "has no column" not in str(error):
                     raise
                 look = f"evofsm learn {quote(what)} says what it holds, and what to name"
                 raise ValueError(f"{error}. Is it no log of cars? {look}") from error
         else:
-            run = _driven(what, case or 1, world, judge, tolerance, seed, learn_first)
+            run = session.watched_run(
+                what, case or 1, world, judge, tolerance=tolerance, seed=seed, learnt=learn_first
+            )
         with run:
-            asyncio.run(_serve(run, browse=not no_browser))
+            asyncio.run(serve(run))
     say("\nThe page is closed.")
-
-
-async def _serve(watched: Session, *, browse: bool) -> None:
-    from evofsm.cli.watch.player import Player
-    from evofsm.cli.watch.server import LivePage
-
-    async with LivePage() as page:
-        page.player = Player(watched, page)
-        may = "steer the run" if watched.start.live else "look on"
-        say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
-        print(f"  {page.address}", flush=True)
-        if browse:
-            webbrowser.open(page.address)
-        await page.player.play()
-        await asyncio.Event().wait()  # it broke off; the page says why
 
 
 def _is_log(what: str) -> bool:
@@ -127,55 +104,3 @@ def _is_log(what: str) -> bool:
             "environment of Gymnasium is named with its version: CartPole-v1"
         )
     return place.suffix != ".py"
-
-
-def _logged(what: str, reading: Reading, *asked: Any, **settings: Any) -> Session:
-    """A log, or what a configuration of SUMO drives."""
-    from tempfile import TemporaryDirectory
-
-    from evofsm.cli.sumocfg import trace_configuration
-    from evofsm.cli.watch.session import watched_log
-
-    if not what.endswith(".sumocfg"):
-        return watched_log(what, reading, *asked, **settings)
-    with TemporaryDirectory() as folder:
-        log = Path(folder) / Path(what).name
-        duration, is_cut, crashes = trace_configuration(Path(what), log, _SECONDS, _ENOUGH)
-        if is_cut:
-            warn(f"watched are the first {duration:,.0f} s of the simulation")
-        return watched_log(str(log), reading, *asked, collisions=crashes, **settings)
-
-
-def _driven(
-    what: str,
-    case: int,
-    world: World,
-    judge: Judge,
-    tolerance: float,
-    seed: int,
-    episodes: int,
-) -> Session:
-    """A session of cars in a world of their own, or of an environment."""
-    from evofsm.cli.watch.session import (
-        OnRoads,
-        Session,
-        System,
-        learn_first,
-        read_simulated,
-        watched_guard,
-    )
-
-    environment = read_simulated(what, seed=seed, tolerance=tolerance)
-    if environment is None:
-        require_world(world)
-        from evofsm.driving import load_family
-        from evofsm.driving.sumo import open_world
-
-        family = load_family(what)
-        system: System = OnRoads(family, open_world(world), seed)
-        guard = watched_guard(family, judge=judge, tolerance=tolerance)
-    else:
-        system, guard = environment, environment.guard
-    with progress("Learning first", episodes) as move:
-        learn_first(guard, system, episodes, move)
-    return Session(system, guard, case=case - 1)

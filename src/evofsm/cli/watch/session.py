@@ -1,8 +1,4 @@
-"""Drives a system decision by decision and shows every one; the guard goes on learning.
-
-A system is a family of scenarios for cars, or any environment of Gymnasium with a controller. A log
-is played row by row beside a guard.
-"""
+"""Drives a system decision by decision, or plays a log row by row beside a guard, and shows it."""
 
 from __future__ import annotations
 
@@ -12,102 +8,54 @@ import runpy
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import MappingProxyType, SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli.foreseen import date
+from evofsm import driving
+from evofsm.cli.driving import trace_configuration
 from evofsm.cli.learning import episodes_read, learn_chunk
-from evofsm.cli.options import BRAKES, Reading, refuse_other_limit
-from evofsm.cli.show import warn
-from evofsm.cli.watch.shown import (
-    CALM,
-    OF_CARS,
-    Cars,
-    Frame,
-    Graph,
-    Judged,
-    Known,
-    Start,
-    Story,
-    cars_of,
-    first_of_its_kind,
-    go_on,
-    graph_of,
-    known_of,
-    numbers,
-)
-from evofsm.driving import (
-    Family,
-    LatentRisk,
-    drive,
-    guard_for_family,
-    learners_of,
-    teach,
-    unrevised_guard,
-)
+from evofsm.cli.options import BRAKES, Reading, refuse_other_limit, require_world
+from evofsm.cli.show import progress, warn
+from evofsm.cli.watch import shown
 from evofsm.driving.cars import assumptions, guard_of_monitor, name_judge
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.driving.world import (
-    GAP_BEHIND,
-    LEADER_ACCELERATION,
-    LEADER_SPEED,
-    SPEED,
-    World,
-)
+from evofsm.driving.sumo import open_world
+from evofsm.driving.world import GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
 from evofsm.extras import needs
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.naming import Labels
+from evofsm.fsm import EvolvingFSM, Labels, Novelty
 from evofsm.fsm.proportions import usual_range
-from evofsm.fsm.rules import Novelty
-from evofsm.guard import (
-    BELIEF_TOLERANCE,
-    TOLERANCE,
-    Foresight,
-    Guard,
-    Judgement,
-    LearntRisk,
-    Mode,
-    Proposal,
-    Revision,
-    Situation,
-)
+from evofsm.guard import Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.actions import Action, Choices, change, is_usable, limits, put_into
+from evofsm.guard.api import BELIEF_TOLERANCE, TOLERANCE, Judgement, Proposal, Revision, Situation
 from evofsm.guard.foresight import DATES
 from evofsm.io.logs import LONGEST_STEP, Chunk, Noted
+from evofsm.io.tables import date
 
 #: The state rule for looking on: coarse enough that each state can be told from the others.
 WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
 
-# What can be chosen among where there are no cases.
-_DRAWS = tuple(f"draw {number}" for number in range(1, 13))
-# After a leader's full brake there is nothing left to see once all have stood for so long [s].
-_STOOD = 3.0
-# Steps of an environment in a second where it does not say; wishes that are tolerable for so many
-# decisions are no danger any more.
+_DRAWS = tuple(f"draw {number}" for number in range(1, 13))  # where there are no cases
+_STOOD = 3.0  # so long after a leader's full brake nothing is left to see [s]
+# Steps of an environment in a second, if it says none; tolerable wishes that end a danger.
 _STEPS_PER_SECOND, _CALM = 10.0, 8
-# A change of an action by less is none [half ranges].
-_SAME_ACTION = 0.02
-# So many episodes in a row without a failure tell that a guard has learnt.
-_LASTED = 10
-# An environment that does not end by itself is left after so many decisions, where nobody looks on.
-_MOST_DECISIONS = 2000
-# Seeds of episodes that are learnt from are so far from those that are watched.
-_APART = 1_000_000
-# Episodes from which is known how far variables spread; states are so many spreads apart, times the
-# root of the number of variables, and there are at most so many.
+_SAME_ACTION = 0.02  # a change of an action by less is none [half ranges]
+_LASTED = 10  # so many episodes in a row without a failure tell that a guard has learnt
+_MOST_DECISIONS = 2000  # of an episode where nobody looks on
+_APART = 1_000_000  # of seeds of episodes that are learnt from and those that are watched
+# Episodes that tell spreads of variables; spreads between states, by the root of their number.
 _LOOKED_AT, _STATES_APART, _MOST_STATES = 3, 0.6, 60
+# Of a simulation of somebody else's that are watched [s], and positions of cars in them.
+_SECONDS, _ENOUGH = 600.0, 100_000
 # So many rows of a long episode are played one by one, and so many in a second.
 _PLAYED, _A_SECOND = 400, 10.0
-# Rows of an episode that shows something; fewer of cars are not watched. Times of a log that
-# differ by less are one [s], and its step may differ from that of a guard by this share.
+# Rows of an episode that shows something; what is one time [s]; by what share steps may differ.
 _SHOWS, _TICK, _OTHER_STEP = 10, 5e-4, 0.1
-# What a file may define besides its environment.
-_PARTS = ("controller", "failed", "variables")
-# Of more variables only those of the plane are named.
-_FEW_VARIABLES = 4
+_PARTS = ("controller", "failed", "variables")  # of a file, besides its environment
+_FEW_VARIABLES = 4  # of more variables only those of the plane are named
 # What Gymnasium's documentation calls the variables of its environments, with units.
 _ENV_NAMES = {
     "CartPole": "cart position [m], cart velocity [m/s], pole angle [rad], "
@@ -119,9 +67,9 @@ _ENV_NAMES = {
 }
 
 
-def watched_guard(family: Family, **settings: Any) -> Guard:
+def watched_guard(family: driving.Family, **settings: Any) -> Guard:
     """A guard for cars that has seen nothing, with few enough states to look at."""
-    return guard_for_family(family, rule=WATCHED_RULE, **settings)
+    return driving.guard_for_family(family, rule=WATCHED_RULE, **settings)
 
 
 def learn_first(
@@ -129,9 +77,8 @@ def learn_first(
 ) -> None:
     """Drive a system for a while, in draws that are not watched, to learn.
 
-    An environment's controller drives alone in the first half: it fails more often, which is what
-    is learnt. In the second half the guard acts, and comes to kinds of failure that are farther
-    off; that is over once it prevented all of some in a row.
+    In the first half an environment's controller drives alone: it fails more often. Then the guard
+    acts, until it prevented all of some in a row.
     """
     streak = 0
     for index in range(episodes):
@@ -153,7 +100,7 @@ class OnRoads:
 
     of_cars = True
 
-    def __init__(self, family: Family, world: World, seed: int = 0) -> None:
+    def __init__(self, family: driving.Family, world: World, seed: int = 0) -> None:
         self.family, self.world, self.seed = family, world, seed
         self.name, self.about, self.interval = family.name, family.about, family.interval
         self.labels = family.labels
@@ -162,14 +109,14 @@ class OnRoads:
 
     def teach(self, guard: Guard, index: int) -> None:
         """Let a guard learn from a draw that nobody watches."""
-        teach(guard, [self.family.draw(self.seed + 1, index)])
+        driving.teach(guard, [self.family.draw(self.seed + 1, index)])
 
     def begin(self, case: int) -> None:
         """Put the cars on the road."""
         self.close()
         draw = self.family.draw(self.seed, case)
         self._controller = draw.controller
-        alone = drive(unrevised_guard(self.family), draw, self.world)
+        alone = driving.drive(driving.unrevised_guard(self.family), draw, self.world)
         self.alone = float(alone.time[-1]) if alone.collided else math.inf
         self._road = self._closing.enter_context(self.world.open(draw.scenario))
         self._steps = draw.scenario.steps(self.interval)
@@ -194,12 +141,12 @@ class OnRoads:
         self._road.advance(float(revision.executed), self._steps)
         self._look()
 
-    def cars(self) -> Cars:
+    def cars(self) -> shown.Cars:
         """Where they are, by what there was at each decision."""
         episode = self._road.episode()
         last = len(episode.time) - 1
         rows = [*range(0, last, self._steps), last]
-        *_, now = cars_of(episode.time[rows], episode.observations[rows])
+        *_, now = shown.cars_of(episode.time[rows], episode.observations[rows])
         gap_behind = float(episode.record[-1, GAP_BEHIND])
         return now._replace(gap_behind=gap_behind, rear_ended=episode.rear_ended)
 
@@ -223,11 +170,7 @@ def system_machine(n_actions: int, seen: NDArray[np.float64]) -> EvolvingFSM:
 
 
 class Simulated:
-    """An environment of Gymnasium and a controller, which acts at random where none is given.
-
-    Its guard is given nothing but which episodes failed: those that are terminated, or of which
-    ``failed`` says so after a step, as in `evofsm.guard.RevisedActions`.
-    """
+    """An environment of Gymnasium and a controller, which acts at random where none is given."""
 
     of_cars = False
 
@@ -347,12 +290,7 @@ def _ends(name: str, space: Any) -> dict[str, Any]:
 
 
 def read_simulated(what: str, **settings: Any) -> Simulated | None:
-    """An environment by its id, or what a file of Python defines; None where it is none.
-
-    The file has a function ``environment()``, and may have ``controller(observation, random)``,
-    which returns an action (``random`` is a NumPy generator), ``failed(step)``, as
-    `evofsm.guard.RevisedActions` takes it, and ``variables``, their names.
-    """
+    """An environment by its id, or as a file of Python defines it (docs/watch.md); None of none."""
     if what.endswith(".py"):
         try:
             definitions = runpy.run_path(what)
@@ -421,7 +359,7 @@ class Logged:
         self._rows, fails = self._played[case].rows, self._played[case].fails
         times = self._rows.times - self._rows.times[0]
         self._times, self._fails = times.tolist(), fails
-        self._cars = list(cars_of(times, self._rows.observations)) if self.of_cars else None
+        self._cars = list(shown.cars_of(times, self._rows.observations)) if self.of_cars else None
         begins = self._times[max(len(times) - _PLAYED, 0)]
         began = float(self._rows.times[0])
         clock = math.nan if self.of_cars or self.interval < 1.0 else 0.0
@@ -442,7 +380,7 @@ class Logged:
         """Go to the next row."""
         self._go_to(self._row + 1)
 
-    def cars(self) -> Cars | None:
+    def cars(self) -> shown.Cars | None:
         """Where they are, if it is of cars."""
         return None if self._cars is None else self._cars[self._row]
 
@@ -462,9 +400,8 @@ def watched_log(
 ) -> Session:
     """The episodes of a log, with a guard; of cars without one with what `evofsm monitor` has.
 
-    Of cars an episode is over with a contact; where they come apart again, another one begins. So
-    it is with ``collisions`` that a simulation counted [s], by the name of who follows whom.
-    ``case`` is the number of the episode to begin with, from 1.
+    Of cars one is over with a contact, or one of ``collisions`` [s] that a simulation counted, by
+    the name of who follows whom. ``case`` is the number of the one to begin with, from 1.
     """
     names = reading.columns.observe.names
     of_cars = reading.acts and len(names) == len(VARIABLES) and (not guard or names == VARIABLES)
@@ -497,6 +434,16 @@ def watched_log(
         stretches = list(_alarmed(guard.judge, guard.judge.alarm, stretches))
     system = Logged(path, stretches, labels, acts=reading.acts, of_cars=of_cars)
     return Session(system, guard, case=system.first if case is None else case - 1, on=False)
+
+
+def watched_simulation(path: str, reading: Reading, *choices: Any, brakes: float) -> Session:
+    """What a configuration of SUMO drives, as a log."""
+    with TemporaryDirectory() as folder:
+        log = Path(folder) / Path(path).name
+        duration, is_cut, crashes = trace_configuration(Path(path), log, _SECONDS, _ENOUGH)
+        if is_cut:
+            warn(f"watched are the first {duration:,.0f} s of the simulation")
+        return watched_log(str(log), reading, *choices, brakes=brakes, collisions=crashes)
 
 
 def _alarmed(judge: Foresight, rate: int | None, found: Sequence[Played]) -> Iterator[Played]:
@@ -556,7 +503,7 @@ class Session(AbstractContextManager["Session"]):
         self, system: System | Logged, guard: Guard, *, case: int = 0, on: bool = True
     ) -> None:
         self.system, self.case = system, case
-        self.machine, self.judge = learners_of(guard)
+        self.machine, self.judge = driving.learners_of(guard)
         self._guard, self._reviser = guard, guard.reviser
         self._tolerance = float(self._reviser.tolerance)  # type: ignore[attr-defined]
         guard.explaining = True
@@ -565,7 +512,7 @@ class Session(AbstractContextManager["Session"]):
         logger: Any = SimpleNamespace(decided=self._ask, **hooks)
         guard.audit = logger
         self.revising = on
-        self.start = self.restart()
+        self.restart()
 
     @property
     def revising(self) -> bool:
@@ -584,7 +531,7 @@ class Session(AbstractContextManager["Session"]):
         why = "was not shown to help yet" if reason == "shadow" else reason
         return reason and f"the guard {why}, so what is proposed passes"
 
-    def restart(self, case: int | None = None) -> Start:
+    def restart(self, case: int | None = None) -> None:
         """Begin a run anew, or another one; one that is under way is broken off."""
         case, system = self.case if case is None else case, self.system
         if not 0 <= case < len(system.cases):
@@ -592,15 +539,32 @@ class Session(AbstractContextManager["Session"]):
         self.case = case
         system.begin(case)
         self._guard.begin()
-        self._story = Story(alone=system.alone)
+        self._story = shown.Story(alone=system.alone)
         self._number = 0
-        self.start = self._begun()
-        return self.start
+        actions = self._guard.actions
+        low, high = limits(actions)
+        names = tuple(map(system.labels.variable, range(len(system.observation))))
+        self.start = shown.Start(
+            **(system.told if isinstance(system, Logged) else {}),
+            system=system.name,
+            about=system.about,
+            cases=system.cases,
+            case=case,
+            tolerance=self._tolerance,
+            interval=system.interval,
+            names=shown.OF_CARS if system.of_cars else names,
+            low=shown.numbers(low),
+            high=shown.numbers(high),
+            discrete=isinstance(actions, Choices),
+            cars=system.of_cars,
+            learnt=self._guard.n_episodes,
+            judge="learnt" if isinstance(self.judge, Foresight) else name_judge(self.judge),
+        )
 
-    def step(self) -> Frame:
+    def step(self) -> shown.Frame:
         """One decision, and what came of the one before."""
         observation, cars = self.system.observation, self.system.cars()
-        frame = Frame(
+        frame = shown.Frame(
             number=self._number,
             time=self.system.time,
             observation=tuple(observation.tolist()),
@@ -610,17 +574,17 @@ class Session(AbstractContextManager["Session"]):
         )
         frame = self._end(frame) if self.system.over else self._decide(frame)
         self._number += 1
-        calm = min(CALM, _CALM * self.system.interval)
-        self._story = go_on(self._story, frame, self._tolerance, calm)
+        calm = min(shown.CALM, _CALM * self.system.interval)
+        self._story = shown.go_on(self._story, frame, self._tolerance, calm)
         return frame._replace(story=self._story)
 
-    def graph(self) -> Graph:
+    def graph(self) -> shown.Graph:
         """The states found so far."""
-        return graph_of(self.machine, self.judge, self._number)
+        return shown.graph_of(self.machine, self.judge, self._number)
 
-    def known(self) -> Known:
+    def known(self) -> shown.Known:
         """What is known of failure."""
-        return known_of(self.judge)
+        return shown.known_of(self.judge)
 
     def __exit__(self, *error: object) -> None:
         self.system.close()
@@ -634,42 +598,21 @@ class Session(AbstractContextManager["Session"]):
             labels, center = Labels(names=names, units=units, dt=labels.dt), center[two]
         return labels.place(center)
 
-    def _begun(self) -> Start:
-        system, actions = self.system, self._guard.actions
-        low, high = limits(actions)
-        names = tuple(map(system.labels.variable, range(len(system.observation))))
-        return Start(
-            **(system.told if isinstance(system, Logged) else {}),
-            system=system.name,
-            about=system.about,
-            cases=system.cases,
-            case=self.case,
-            tolerance=self._tolerance,
-            interval=system.interval,
-            names=OF_CARS if system.of_cars else names,
-            low=numbers(low),
-            high=numbers(high),
-            discrete=isinstance(actions, Choices),
-            cars=system.of_cars,
-            learnt=self._guard.n_episodes,
-            judge="learnt" if isinstance(self.judge, Foresight) else name_judge(self.judge),
-        )
-
-    def _decide(self, frame: Frame) -> Frame:
+    def _decide(self, frame: shown.Frame) -> shown.Frame:
         guard = self._guard
         revision = guard.decide(self.system.observation, self.system.propose(), frame.time)
         situation, judgement = guard.situation, self._judged
         self.system.advance(revision)
         rows = zip(judgement.risk, judgement.low, judgement.high, judgement.critical, strict=True)
-        wish, act, best = (Judged(*map(float, values)) for values in rows)
+        wish, act, best = (shown.Judged(*map(float, values)) for values in rows)
         return frame._replace(
             state=situation.state,
             proposed_risk=wish,
             executed_risk=act,
             least_risk=math.nan if isinstance(self.judge, Foresight) else best.risk,
-            proposed=numbers(revision.proposed),
-            executed=numbers(revision.executed),
-            advised=numbers(revision.advised),
+            proposed=shown.numbers(revision.proposed),
+            executed=shown.numbers(revision.executed),
+            advised=shown.numbers(revision.advised),
             revised=change(guard.actions, self._wanted, revision.executed) > _SAME_ACTION,
             advises=change(guard.actions, self._wanted, revision.advised) > _SAME_ACTION,
             reason=revision.reason,
@@ -682,7 +625,7 @@ class Session(AbstractContextManager["Session"]):
         actions, self._wanted = self._guard.actions, revision.executed
         if is_usable(actions, revision.proposed):
             self._wanted = put_into(actions, revision.proposed)
-        safest = actions.low if isinstance(self.judge, LatentRisk) else revision.advised
+        safest = actions.low if isinstance(self.judge, driving.LatentRisk) else revision.advised
         candidates = np.array([self._wanted, revision.executed, safest], np.float64)
         self._judged = self.judge.judge(situation, candidates)
 
@@ -691,16 +634,33 @@ class Session(AbstractContextManager["Session"]):
         if isinstance(judge, Foresight):
             return {}
         why = judge.why(judged) if judged.risk[0] > self._tolerance else ""
-        if isinstance(judge, LatentRisk):
+        if isinstance(judge, driving.LatentRisk):
             quantile = judge.manoeuvres.exceeded_by
             return {"needed": quantile(self._tolerance), "usual": quantile(0.5), "why": why}
         assert isinstance(judge, LearntRisk)
         return {"needed": judge.margin, "why": why}
 
-    def _end(self, frame: Frame) -> Frame:
+    def _end(self, frame: shown.Frame) -> shown.Frame:
         system, before = self.system, self.known()
         self._guard.end(system.failed, system.observation, terminated=system.terminated)
         novel = ""
         if system.failed:
-            novel = first_of_its_kind(frame.observation, before, self.known())
+            novel = shown.first_of_its_kind(frame.observation, before, self.known())
         return frame._replace(over=True, failed=system.failed, novel=novel)
+
+
+def watched_run(
+    what: str, case: int, world: str, judge: str, *, tolerance: float, seed: int, learnt: int
+) -> Session:
+    """Cars in a world of their own, or an environment, after so many episodes to learn from."""
+    system: System | None = read_simulated(what, seed=seed, tolerance=tolerance)
+    if isinstance(system, Simulated):
+        guard = system.guard
+    else:
+        require_world(world)
+        family = driving.load_family(what)
+        system = OnRoads(family, open_world(world), seed)
+        guard = watched_guard(family, judge=judge, tolerance=tolerance)
+    with progress("Learning first", learnt) as move:
+        learn_first(guard, system, learnt, move)
+    return Session(system, guard, case=case - 1)

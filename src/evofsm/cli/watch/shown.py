@@ -24,17 +24,13 @@ _TTC, _HEADWAY = TimeToCollision(), TimeHeadway()
 # Of each state so many ways out are shown, and none that is rarer.
 _MOST_WAYS, _LEAST_SHARE = 3, 0.02
 
-# Observations of what was survived that are shown.
-_MOST_SURVIVED = 500
+_MOST_SURVIVED = 500  # observations of what was survived that are shown
 
 #: What is observed of cars.
 OF_CARS = ("gap [m]", "follower's speed [m/s]", "leader's speed [m/s]")
-#: Danger is over once wishes were tolerable for so long [s].
-CALM = 2.0
-# A dead end: the best that can be done would as likely as not be too late.
-_DEAD_END = 0.5
-# Softer braking is no full brake [m/s²].
-_LEADER_BRAKES = -2.5
+CALM = 2.0  #: danger is over once wishes were tolerable for so long [s]
+_DEAD_END = 0.5  # a dead end: the best that can be done would as likely as not be too late
+_LEADER_BRAKES = -2.5  # softer braking is no full brake [m/s²]
 
 
 class Danger(NamedTuple):
@@ -188,10 +184,7 @@ class Graph(NamedTuple):
 
 
 def graph_of(known: EvolvingFSM, judge: LearningJudge | None = None, number: int = 0) -> Graph:
-    """The states, and their usual ways out, from a frame on.
-
-    Only a `LatentRisk` says which are dead ends; else those are marked in which a failure ended.
-    """
+    """The states, and their usual ways out; dead ends are marked, or where failures ended."""
     marks = [count > 0.5 for count in known.endings.tolist()]
     if isinstance(judge, LatentRisk):
         dead_ends = dead_ends_of(known, judge)

@@ -22,10 +22,8 @@ _BESIDE = (
     "have replaced."
 )
 _ALONE = "This was recorded, and nobody acts. A guard that learnt from the log alarms."
-# Components of an action that are told.
-_COMPONENTS = 3
-# A number and its unit stay on one line.
-_UNIT = re.compile(r"(?<=\d) (?=(?:s|m|m/s|m/s²)\b)")
+_COMPONENTS = 3  # components of an action that are told
+_UNIT = re.compile(r"(?<=\d) (?=(?:s|m|m/s|m/s²)\b)")  # stays with its number
 _HEADLINES = {
     "unjudged": "Nothing is judged",
     "safe": "No danger known",
@@ -35,8 +33,7 @@ _HEADLINES = {
     "failure": "Failure",
     "ended": "No failure",
 }
-# Where the judge was told how leaders brake.
-_OF_LEADERS = {"dead end": "Dead end, if the leader brakes hard now"}
+_OF_LEADERS = {"dead end": "Dead end, if the leader brakes hard now"}  # of a judge of these
 _FIRST_FAILURE = "A guard cannot prevent the first failure of a kind; this one is learnt now"
 
 
