@@ -149,6 +149,11 @@ def test_a_first_look_says_what_is_odd_in_a_log(evofsm, refused):
         "--observe heat,oil",
     ):
         assert part in found
+    rows = [f"{k},{k // 3},{k % 40 / 9:.2f},{int(k % 40 == 39)}" for k in range(400)]
+    Path("km.csv").write_text("\n".join(["t,km,level,failed", *rows]))
+    found = evofsm("learn", "km.csv").stdout
+    assert "km: never comes back" in found
+    assert "--observe level " in found
     Path("bare.csv").write_text("10.03.2025 06:00:00;6,5;on\n10.03.2025 06:00:10;6,6;on\n")
     assert "is no header" in refused("learn", "bare.csv")
     read = "learn", "odd.csv", "--action", "", "--time", "t"

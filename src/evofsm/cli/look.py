@@ -144,8 +144,13 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     spans = {n: np.nanquantile(z, (0.02, 0.98)) for n, z in spans.items()}
     if still in spans and spans[still][1] < 1.05 * spans[still][0]:  # it is always the same
         del spans[still]
+    moves = {n: np.diff(values[n][order][np.isfinite(values[n][order])]) for n in spans}
     # What goes on by the same from row to row is a count of them.
-    steady = {n: e.tolist() for n, e in spans.items() if e[1] > e[0] and np.ptp(np.diff(values[n]))}
+    steady = {n: e.tolist() for n, e in spans.items() if e[1] > e[0] and np.ptp(moves[n])}
+    one_way = [n for n in steady if len(last) > 2 and len(set(np.sign(moves[n])) - {0.0}) == 1]
+    if one_way and len(one_way) < len(steady):
+        facts.append(("left out", f"{', '.join(one_way)}: never comes back, as an odometer"))
+        steady = {n: ends for n, ends in steady.items() if n not in one_way}
     action = next(filter(_SET.search, steady), "")  # else nobody acts
     nobody = [f"{_named(n, _SIGNS)}=={x:g}" for n in steady if n != action for x in stand_ins[n]]
     options += [("--no-leader", " or ".join(nobody))] if nobody else []
