@@ -210,22 +210,24 @@ def _drifted(
         doubt=doubt,
         since=np.where(doubt > 0.0, state.since, float(n)),
     )
-    new_drifters = np.flatnonzero(doubt > settings.drift)
-    drifters = np.unique(np.append(new_drifters, state.drifts[young, 0])).astype(int)
-    if not len(drifters):
+    is_new = doubt > settings.drift
+    drifts = is_new.copy()
+    drifts[state.drifts[young, 0].astype(int)] = True
+    if not drifts.any():
         return state
-    products, doubt, since = state.products.copy(), doubt.copy(), state.since.copy()
-    least, most = state.least.copy(), state.most.copy()
+    products = state.products.copy()
     weights = known.weights + _correction(state, known)
-    products[:, drifters] = state.squares @ weights[:, drifters]
+    products[:, drifts] = state.squares @ weights[:, drifts]
     moves = np.where(model.jumps(moves, state.unit) | ~np.isfinite(moves), 0.0, moves)
-    least[new_drifters], most[new_drifters] = moves.min(0)[new_drifters], moves.max(0)[new_drifters]
-    drifts = np.vstack([state.drifts, *[[j, since[j], n] for j in new_drifters]])
-    doubt[drifters], since[drifters] = 0.0, float(n)
     state = state._replace(
-        drifts=drifts, products=products, doubt=doubt, since=since, least=least, most=most
+        products=products,
+        least=np.where(is_new, moves.min(0), state.least),
+        most=np.where(is_new, moves.max(0), state.most),
+        drifts=np.vstack([state.drifts, *[[j, state.since[j], n] for j in np.flatnonzero(is_new)]]),
+        doubt=np.where(drifts, 0.0, doubt),
+        since=np.where(drifts, float(n), state.since),
     )
-    return _anew(state, settings) if len(new_drifters) else state
+    return _anew(state, settings) if is_new.any() else state
 
 
 def _anew(state: State, settings: LearntSettings) -> State:
