@@ -27,21 +27,10 @@ from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, Searchi
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import rollout, words
 from evofsm.guard.learnt.backups import basis
-from evofsm.guard.learnt.learn import disturbance_scale, learn
+from evofsm.guard.learnt.learn import learn
 from evofsm.guard.learnt.motion import used_at
-from evofsm.guard.learnt.rollout import CUT_SHORT, Floats, Ints, Model, search
-from evofsm.guard.learnt.state import (
-    KIND,
-    Episode,
-    Given,
-    LearntSettings,
-    State,
-    forms_of,
-    model_of,
-    packed,
-    residuals_of,
-    unpacked,
-)
+from evofsm.guard.learnt.rollout import CUT_SHORT, Floats, Ints, search
+from evofsm.guard.learnt.state import KIND, Episode, Given, LearntSettings, Parts, State, unpacked
 from evofsm.guard.learnt.words import Remembered
 from evofsm.store import Place
 
@@ -53,35 +42,6 @@ _MAX_STEPS = 10_000
 _MAX_CHOICES = 1_000
 # What a backup says to an action that is not allowed.
 _NEVER = -1e300
-
-
-class Parts(NamedTuple):
-    """What decides, made of a state."""
-
-    model: Model
-    daring: Model  #: while it learns
-    residuals: Floats  #: (H, m, 1 + K) of disturbances; number 0 is none
-    scale: float  #: how much harder than they were disturbances are taken to be
-    n_asked: int  #: backups that a search asks
-    n_tried: int  #: and while a rival is tried, by which another may save
-    n_judged: int  #: and those by which a risk is found
-    most: float  #: steps of rollouts after which a search is cut short
-
-    @classmethod
-    def of(cls, state: State, settings: LearntSettings, dt: float) -> Parts | None:
-        """Make them; None as long as there are no backups."""
-        if not len(state.policies):
-            return None
-        model = model_of(state, settings)
-        daring_model = model._replace(forms=forms_of(state, settings, daring=True))
-        rest, scale = residuals_of(state, model, state.horizon), disturbance_scale(state, settings)
-        few = settings.n_asked if len(rollout.pairs(len(state.origin))[0]) else 2
-        cost = (model.weights.size + model.dead_ends.size) * rest.shape[2]
-        most = max(min(settings.work, settings.work_rate * dt) / cost, few * state.horizon)
-        n_backups = 1 if most < 2 * few * state.horizon else few
-        n_policies = len(state.policies)
-        n_tried = few if state.held >= 0 or most < n_policies * state.horizon else n_policies
-        return cls(model, daring_model, rest, scale, few, n_tried, n_backups, most)
 
 
 class Outcome(NamedTuple):
@@ -649,7 +609,7 @@ class LearntRisk(LearningJudge, SearchingJudge):
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
-        numbers, arrays = packed(self.state)
+        numbers, arrays = self.state.packed()
         settings = {
             **{name: getattr(self, name) for name in ("dt", "seed", "given_horizon")},
             **{name: getattr(self, name).tolist() for name in ("low", "high")},

@@ -90,15 +90,9 @@ def learn(state: State, episode: Episode, given: Given) -> State:
         state = fitted(state, motion_model, given.backup)
     if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
         numbers = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
-        rest, scale = np.ascontiguousarray(rest[:, :, numbers]), disturbance_scale(state, settings)
+        rest, scale = np.ascontiguousarray(rest[:, :, numbers]), state.disturbance_scale(settings)
         state = evolved(state, motion_model, rest, scale, settings, random)
     return state._replace(n_episodes=state.n_episodes + 1)
-
-
-def disturbance_scale(state: State, settings: LearntSettings) -> float:
-    """How much harder than they were disturbances are taken to be, while little was seen."""
-    most = settings.caution_again if len(state.drifts) else settings.caution_max
-    return 1.0 + min(most, settings.caution / max(1, state.n_scanned))
 
 
 def doubted(state: State, episode: Episode, settings: LearntSettings, *, tried: bool) -> State:
@@ -187,7 +181,7 @@ def disturbances(
     if len(state.windows) <= settings.n_disturbances:
         return state
     if looks:
-        scale = disturbance_scale(state, settings)
+        scale = state.disturbance_scale(settings)
         ends = _worst(known, S, state.policies[:2], residuals, scale)
         keep = _chosen(ends, settings.n_disturbances)
     else:

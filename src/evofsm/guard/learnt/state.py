@@ -206,6 +206,16 @@ class State(NamedTuple):
             stride=1,
         )
 
+    def disturbance_scale(self, settings: LearntSettings) -> float:
+        """How much harder than they were disturbances are taken to be, while little was seen."""
+        most = settings.caution_again if len(self.drifts) else settings.caution_max
+        return 1.0 + min(most, settings.caution / max(1, self.n_scanned))
+
+    def packed(self) -> tuple[dict[str, Any], dict[str, Floats]]:
+        """Numbers and arrays, by name."""
+        fields = self._asdict()
+        return {name: fields[name] for name in _NUMBERS}, {name: fields[name] for name in _ARRAYS}
+
 
 def sizes(state: State) -> Survived:
     """What was survived, as forms are fitted to it."""
@@ -288,6 +298,36 @@ def residuals_of(state: State, known: Model, steps: int) -> Floats:
     return model.trimmed(residuals)
 
 
+class Parts(NamedTuple):
+    """What decides, made of a state."""
+
+    model: Model
+    daring: Model  #: while it learns
+    residuals: Floats  #: (H, m, 1 + K) of disturbances; number 0 is none
+    scale: float  #: how much harder than they were disturbances are taken to be
+    n_asked: int  #: backups that a search asks
+    n_tried: int  #: and while a rival is tried, by which another may save
+    n_judged: int  #: and those by which a risk is found
+    most: float  #: steps of rollouts after which a search is cut short
+
+    @classmethod
+    def of(cls, state: State, settings: LearntSettings, dt: float) -> Parts | None:
+        """Make them; None as long as there are no backups."""
+        if not len(state.policies):
+            return None
+        known = model_of(state, settings)
+        daring = known._replace(forms=forms_of(state, settings, daring=True))
+        residuals = residuals_of(state, known, state.horizon)
+        few = settings.n_asked if len(rollout.pairs(len(state.origin))[0]) else 2
+        cost = (known.weights.size + known.dead_ends.size) * residuals.shape[2]
+        most = max(min(settings.work, settings.work_rate * dt) / cost, few * state.horizon)
+        n_judged = 1 if most < 2 * few * state.horizon else few
+        n_policies = len(state.policies)
+        n_tried = few if state.held >= 0 or most < n_policies * state.horizon else n_policies
+        scale = state.disturbance_scale(settings)
+        return cls(known, daring, residuals, scale, few, n_tried, n_judged, most)
+
+
 # -- In a file -----------------------------------------------------------------------------------
 
 # What a field holds: its type, and which numbers.
@@ -314,16 +354,10 @@ KIND = Kind(
 )
 
 
-def packed(state: State) -> tuple[dict[str, Any], dict[str, Floats]]:
-    """Numbers and arrays of a state, by name."""
-    fields = state._asdict()
-    return {name: fields[name] for name in _NUMBERS}, {name: fields[name] for name in _ARRAYS}
-
-
 def unpacked(
     numbers: Mapping[str, Any], arrays: Mapping[str, Any], blank: State, settings: LearntSettings
 ) -> State:
-    """Make a state of what `packed` gave, of actions as of one that learnt nothing (``blank``).
+    """Make a state of what `State.packed` gave, of actions as of a ``blank`` one.
 
     A ValueError if sizes or indices contradict each other, or the actions: kernels trust them.
     """
