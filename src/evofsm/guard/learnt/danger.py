@@ -169,9 +169,9 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
 
     def differs(table: Floats) -> float:
         """The share of observations of which the function says otherwise."""
-        missed = ~failure.inside(table, failures).any(0)
-        wrong = (failure.distances(table, rows) < 0.0).any(0)
-        return float(np.append(missed, wrong).mean()) if hits else 0.0
+        outside = ~failure.inside(table, failures).any(0)
+        within = (failure.distances(table, rows) < 0.0).any(0)
+        return float(np.append(outside, within).mean()) if hits else 0.0
 
     table = state.forms
     if differs(table) > 0.0:
@@ -191,16 +191,13 @@ def dead_ends(state: State, known: Model, z: Floats, episode: Episode, before: F
     steps = np.flatnonzero(episode.certified[: len(z) - 1]) if episode.failed else np.empty(0, int)
     rows = z[steps[-1] + 1 :] if len(steps) else z[:0]
     rows = rows[np.isfinite(rows).all(1)]
-    if len(rows):
-        counts = counts + (_between(rows, centres, inverse) < _LARGEST_RADIUS).any(0)
-        n = len(centres)
-        for row in rows:
-            far = _between(row[None], centres, inverse)[0]
-            if far.min(initial=np.inf) >= _APART:
-                count = counts[:n][far[:n] < _LARGEST_RADIUS].max(initial=1.0)
-                centres, counts = np.vstack([centres, row]), np.append(counts, count)
-    if not len(centres):
-        return state
+    counts = counts + (_between(rows, centres, inverse) < _LARGEST_RADIUS).any(0)
+    n = len(centres)
+    for row in rows:
+        far = _between(row[None], centres, inverse)[0]
+        if far.min(initial=np.inf) >= _APART:
+            count = counts[:n][far[:n] < _LARGEST_RADIUS].max(initial=1.0)
+            centres, counts = np.vstack([centres, row]), np.append(counts, count)
     radii = np.minimum(_LARGEST_RADIUS, _APART * 2.0 ** (np.minimum(counts, 9.0) - 1.0))
     went_on = before  # of a failed episode it is not known from where it went on
     if not episode.failed:
@@ -219,8 +216,8 @@ def barred(state: State) -> State:
     if not len(state.fatal) or not len(went_on):
         return state
     ends = failure.explain(DEAD, state.fatal, failure.boxed(sizes(state), went_on), bends=False)
-    others = failure.saying(state.forms, FAILS, ENDS, CRASHES)
-    return state._replace(forms=np.concatenate([others, failure.nearer(ends, state.fatal, 1.0)]))
+    rest = failure.saying(state.forms, FAILS, ENDS, CRASHES)
+    return state._replace(forms=np.concatenate([rest, failure.nearer(ends, state.fatal, 1.0)]))
 
 
 def _between(a: Floats, b: Floats, inverse: Floats) -> Floats:

@@ -189,10 +189,10 @@ def _ellipses(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
     around = np.linalg.inv(2.0 * x.T @ x / len(x) + np.eye(2))
     for off in (0.0, *_INWARDS):
         shape = np.diag(wide**-2.0) if off else around
-        most, least = (
-            float(f(np.einsum("ni,ij,nj->n", v - off * inwards, shape, v - off * inwards)))
-            for f, v in ((np.max, x), (np.min, y))
+        far, away = (
+            np.einsum("ni,ij,nj->n", v, shape, v) for v in (x - off * inwards, y - off * inwards)
         )
+        most, least = float(far.max()), float(away.min())
         size = min(1.1 * most if off else max(1.0, 1.1 * most), 0.99 * least)
         if size >= most:
             new = row.copy()
@@ -351,7 +351,7 @@ def _bent(
     says: int, failures: Floats, survived: Survived, fewer: float = np.inf
 ) -> tuple[Floats, bool]:
     """Bent forms that explain failures, and whether these are ``fewer`` and explain all of them."""
-    candidates, n = _asked(failures, survived), len(survived.rows)
+    candidates, n = _candidates(failures, survived), len(survived.rows)
     sample = survived.rows[np.linspace(0, n - 1, min(n, _FIT_ROWS)).astype(int)]
     bent_rows: list[Floats] = []
     groups, whole = [np.arange(len(failures))], True
@@ -404,7 +404,7 @@ def _in_two(F: Floats, asked: Ints, score: Floats, survived: Survived) -> tuple[
     return best_split
 
 
-def _asked(failures: Floats, survived: Survived) -> Ints:
+def _candidates(failures: Floats, survived: Survived) -> Ints:
     """(c, 3) variables and kinds of forms that are tried: of many variables those that tell most.
 
     A variable tells failed observations from survived ones where they have another mean or spread;
@@ -457,7 +457,8 @@ def _split(x: Floats) -> Flags:
 
 def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, Floats]:
     """(c, SIZE) the forms that are asked of failures (k, m); which are inside; and scores."""
-    rows, k, pairs, kinds = survived.rows, len(F), asked[:, :2], _KINDS[asked[:, 2]]
+    rows, k = survived.rows, len(F)
+    pairs, kinds = asked[:, :2], _KINDS[asked[:, 2]]
     unit, scale, points = (
         survived.unit[pairs],
         survived.spread[pairs],
