@@ -164,9 +164,16 @@ class LearntRisk(LearningJudge, SearchingJudge):
         #: Number of actions; 0 where the action is a box.
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
         if self.choices > _MAX_CHOICES:
-            takes = f"a learnt judge takes at most {_MAX_CHOICES:,} actions"
-            raise ValueError(f"n_actions is {n_actions}; {takes}")
-        self.low, self.high = _range(low, high, is_none=n_actions is not None)
+            raise ValueError(
+                f"n_actions is {n_actions}; a learnt judge takes at most {_MAX_CHOICES:,} actions"
+            )
+        if {low is None, high is None} != {n_actions is not None}:
+            raise ValueError("give either low and high, or n_actions")
+        self.low: Floats = np.zeros(0)
+        self.high: Floats = np.zeros(0)
+        if low is not None and high is not None:
+            ends: Any = np.atleast_1d(low), np.atleast_1d(high)
+            self.low, self.high = BoxActions(*ends).bounds
         self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         #: How many numbers an action has.
         self.size = self.choices or len(self.low)
@@ -283,12 +290,12 @@ class LearntRisk(LearningJudge, SearchingJudge):
             trial = self._untried(action, mask) if is_alike else None
             action = action if trial is None else trial
         outcomes = [self._foresee(here, proposal, policies)] if self._refused else []
-        is_known = passes and not allowance
-        outcomes.append(
-            Outcome(0.0, slack, 0.0) if is_known else self._foresee(here, action, policies)
-        )
+        if passes and not allowance:  # the search says what is left
+            outcomes.append(Outcome(0.0, slack, 0.0))
+        else:
+            outcomes.append(self._foresee(here, action, policies))
         self._lost = math.isinf(outcomes[-1].unsurvived)
-        self._fails_after = max(self._fails_after, *(each.fails_after for each in outcomes))
+        self._fails_after = max(self._fails_after, *(outcome.fails_after for outcome in outcomes))
         judgement = self._judged(situation, outcomes)
         backup = self.backup_text(best, policies)
         if not self._refused:
@@ -337,13 +344,13 @@ class LearntRisk(LearningJudge, SearchingJudge):
 
     def _judged(self, situation: Situation, outcomes: Sequence[Outcome]) -> Judgement:
         """Of some actions; of the first it is kept why it is dangerous (`why`)."""
-        counts = [each.unsurvived for each in outcomes]
+        counts = [outcome.unsurvived for outcome in outcomes]
         self._unsurvived = -1 if math.isinf(counts[0]) else int(counts[0])
         memory = self.remembered
         soon = self._soon(memory.seconds)
         risk, low, high = np.array([self._risk(n, soon) for n in counts]).T
-        left = np.array([each.left for each in outcomes])
-        return Judgement(risk, low, high, left, float(memory.number), situation.seen)
+        distances = np.array([outcome.left for outcome in outcomes])
+        return Judgement(risk, low, high, distances, float(memory.number), situation.seen)
 
     def _soon(self, exposure: float) -> float:
         """The horizon, as a share of the time in which all that is remembered was seen."""
@@ -435,7 +442,8 @@ class LearntRisk(LearningJudge, SearchingJudge):
         ValueError
             If it has another number of variables than before.
         """
-        if (m := len(self._z[0]) if self._z else self.n_variables) not in (0, len(observation)):
+        m = len(self._z[0]) if self._z else self.n_variables
+        if m not in (0, len(observation)):
             has = f"observation has {len(observation)} variables"
             raise ValueError(f"{has}, but the judge learnt of {m}")
         if len(self._z) > len(self._u):  # nothing was executed: it does not follow
@@ -540,14 +548,13 @@ class LearntRisk(LearningJudge, SearchingJudge):
         self._z, self._u, self._notes = [], [], []
         if not len(z) or not np.isfinite(z).all(1).any() or not (n or failed):
             return
-        refused, lost, certified = notes.T
+        refusals, losses, certificates = notes.T
         ends = failed, terminated
-        episode = Episode(z, u, *ends, refused, lost, certified, self._fails_after)
+        episode = Episode(z, u, *ends, refusals, losses, certificates, self._fails_after)
         if not self.n_variables:
             now = self.state
-            blank = State.none(z.shape[1], self.size, self.choices, self.settings, None)
-            kept_names = ("horizon", "stride", "margin", "n_failed")
-            self.state = blank._replace(**{name: getattr(now, name) for name in kept_names})
+            blank = State.none(z.shape[1], self.size, self.choices, self.settings, now.horizon)
+            self.state = blank._replace(stride=now.stride, margin=now.margin, n_failed=now.n_failed)
         n_drifts = len(self.state.drifts)
         self.state = learn(self.state, episode, self._given)
         if len(self.state.drifts) > n_drifts:  # another system: how one fares alone is not known
@@ -641,19 +648,6 @@ class LearntRisk(LearningJudge, SearchingJudge):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
-
-
-def _range(
-    low: ArrayLike | None, high: ArrayLike | None, *, is_none: bool
-) -> tuple[Floats, Floats]:
-    """The ends of the range of actions, (d,) each; empty where there is to be none."""
-    if is_none != (low is None) or (low is None) != (high is None):
-        raise ValueError("give either low and high, or n_actions")
-    if low is None or high is None:
-        return np.zeros(0), np.zeros(0)
-    ends: Any = np.atleast_1d(low), np.atleast_1d(high)
-    lowest, highest = BoxActions(*ends).bounds
-    return lowest, highest
 
 
 def _unjudged(count: int) -> Judgement:

@@ -10,7 +10,7 @@ from numpy.random import Generator
 
 from evofsm.guard.learnt import danger, failure, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups, fitted
-from evofsm.guard.learnt.rollout import DEAD, FAILS, Flags, Floats, Model, value_of
+from evofsm.guard.learnt.rollout import DEAD, FAILS, Flags, Floats, Ints, Model, value_of
 from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State, model_of, residuals_of
 
 # Actions of an episode that says how a system moves, at least, if three observations in a row were
@@ -118,7 +118,7 @@ def noted(
 
     One anywhere in an episode, one where a proposal was refused, and some before failure.
     """
-    T, rows = len(z) - 1, state.situations
+    T, rows = len(z) - 1, [*state.situations]
     steps = [int(random.integers(1, T))]
     if len(tight := np.flatnonzero(episode.refused[1:T]) + 1):
         steps.append(int(random.choice(tight)))
@@ -130,11 +130,10 @@ def noted(
         if not np.isfinite(row).all():
             continue
         if len(rows) < settings.n_situations:
-            rows = np.vstack([rows, row])
+            rows.append(row)
         else:
-            rows = rows.copy()
             rows[int(random.integers(len(rows)))] = row
-    return state._replace(situations=rows)
+    return state._replace(situations=np.reshape(rows, (-1, state.situations.shape[1])))
 
 
 def looks_for_harm(state: State) -> bool:
@@ -208,21 +207,21 @@ def _fatal(
     state = danger.barred(state._replace(fatal=fatal_rows))
     within = failure.inside(failure.saying(state.forms, DEAD), rows).any(0)
     keep = np.setdiff1d(np.arange(len(state.windows)), fatal[within])
-    return _kept(state, keep.tolist()), found[:, :, np.append(0, 1 + keep)]
+    return _kept(state, keep), found[:, :, np.append(0, 1 + keep)]
 
 
-def _kept(state: State, keep: list[int]) -> State:
+def _kept(state: State, keep: Ints) -> State:
     """Forget all disturbances but these, by their numbers from 0."""
     of = {name: getattr(state, name)[keep] for name in ("windows", "lengths", "seen_in")}
     return state._replace(**of)
 
 
-def _sizes(rest: Floats, state: State) -> list[int]:
+def _sizes(rest: Floats, state: State) -> Ints:
     """Of residuals (H, m, K), and landings, the largest first."""
     m = len(state.unit)
     size = np.abs(rest[:, :m] / (state.unit[:, None] + 1e-300)).sum((0, 1))
     size += model.JUMP * np.isfinite(rest[:, m:]).sum((0, 1))
-    return [int(k) for k in np.argsort(-size, kind="stable")]
+    return np.argsort(-size, kind="stable")
 
 
 def _worst(
@@ -235,16 +234,17 @@ def _worst(
     return np.asarray(np.minimum(ends, _BY_FAR))
 
 
-def _chosen(ends: Floats, most: int) -> list[int]:
+def _chosen(ends: Floats, most: int) -> Ints:
     """Which are worst in some situation (S, K), and of others those that are worst in the mean."""
+    keep: Ints = np.arange(ends.shape[1])
     if not len(ends):
-        return list(range(ends.shape[1]))[-most:]
-    keep, mean = np.arange(ends.shape[1]), ends.mean(0)
+        return keep[-most:]
+    mean = ends.mean(0)
     while len(keep) > most:  # what is worst nowhere goes first
         free = np.delete(keep, ends[:, keep].argmin(1))
         free = free if len(free) else keep
         keep = keep[keep != free[mean[free].argmax()]]
-    return [int(k) for k in keep]
+    return keep
 
 
 def look_ahead(

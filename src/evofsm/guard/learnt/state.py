@@ -315,17 +315,17 @@ class Parts(NamedTuple):
         """Make them; None as long as there are no backups."""
         if not len(state.policies):
             return None
-        known = model_of(state, settings)
-        daring = known._replace(forms=forms_of(state, settings, daring=True))
-        residuals = residuals_of(state, known, state.horizon)
+        motion = model_of(state, settings)
+        daring_model = motion._replace(forms=forms_of(state, settings, daring=True))
+        residuals = residuals_of(state, motion, state.horizon)
         few = settings.n_asked if len(rollout.pairs(len(state.origin))[0]) else 2
-        cost = (known.weights.size + known.dead_ends.size) * residuals.shape[2]
+        cost = (motion.weights.size + motion.dead_ends.size) * residuals.shape[2]
         most = max(min(settings.work, settings.work_rate * dt) / cost, few * state.horizon)
         n_judged = 1 if most < 2 * few * state.horizon else few
         n_policies = len(state.policies)
         n_tried = few if state.held >= 0 or most < n_policies * state.horizon else n_policies
         scale = state.disturbance_scale(settings)
-        return cls(known, daring, residuals, scale, few, n_tried, n_judged, most)
+        return cls(motion, daring_model, residuals, scale, few, n_tried, n_judged, most)
 
 
 # -- In a file -----------------------------------------------------------------------------------
