@@ -109,20 +109,10 @@ def linearised(state: State, model: Model) -> tuple[Floats, Floats, Floats]:
 def regulator(A: Floats, B: Floats, cost: Floats, effort: float, steps: int) -> Floats:
     """(a, 1 + m) linear feedback u = -K x of the least sum of x'Qx + effort u'u over the steps.
 
-    By Riccati's recursion (Kalman, "Contributions to the theory of optimal control", Boletin de la
-    Sociedad Matematica Mexicana 5, 1960). Where mutants alone rarely hit on feedback of many
-    variables, it begins there.
-
-    Parameters
-    ----------
-    A, B : (1 + m, 1 + m) and (1 + m, a) ndarray
-        Linear dynamics.
-    cost : (1 + m, 1 + m) ndarray
-        Q.
-    effort : float
-        What actions cost.
-    steps : int
-        How far ahead; it ends where what is to come costs too much to be told.
+    Of dynamics A x + B u (`linearised`), with Q the ``cost`` (1 + m, 1 + m), by Riccati's recursion
+    (Kalman, "Contributions to the theory of optimal control", Boletin de la Sociedad Matematica
+    Mexicana 5, 1960). It ends where what is to come costs too much to be told. Mutants alone rarely
+    hit on feedback of many variables.
     """
     K: Floats = np.zeros(B.T.shape)
     P = cost

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from evofsm.guard.learnt import failure, model
-from evofsm.guard.learnt.failure import HELD, SAYS, B, I, Survived
+from evofsm.guard.learnt.failure import HELD, B, I, Survived
 from evofsm.guard.learnt.rollout import CRASHES, DEAD, ENDS, FAILS, Floats, Model
 from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State, sizes
 
@@ -71,25 +71,23 @@ def _explained(state: State, settings: LearntSettings, *, failed: bool, bends: b
     survival, table = sizes(state), state.forms
     if len(state.ended) >= _ENDED:
         table = _endings(state, table, survival)
-    ends, crashes = table[table[:, SAYS] == ENDS], table[table[:, SAYS] == CRASHES]
-    is_end = failure.inside(ends, state.failures).any(0)
-    failures = state.failures[~(is_end & failure.inside(crashes, state.failures, 0.0).any(0))]
+    failures = state.failures[~failure.crashed(table, state.failures)]
     blur = np.where(state.reached < 2, state.scale[:, None], 0.0)
     survival = survival._replace(rows=np.concatenate([survival.rows, state.ended]))
-    was = table[table[:, SAYS] == FAILS]
+    was = failure.saying(table, FAILS)
     are_sides = failure.are_sides(was)
     bent = failure.without(was[~are_sides], survival.rows)
     sides = failure.explain(FAILS, failures, survival, blur, bends=False)
     if len(bent):  # others come with other bent forms
-        old_sides = set(map(tuple, was[are_sides][:, [I, B]]))
-        sides = sides[[row in old_sides for row in map(tuple, sides[:, [I, B]])]]
+        sides = sides[failure.among(sides, was[are_sides])]
     rows = np.concatenate([sides, bent])
     is_told = not len(failures) or failure.inside(rows, failures).any(0).all()
     if bends and (failed or not is_told):
         rows = failure.explain(FAILS, failures, survival, blur)
-    rows[:, HELD] = failure.inside(rows, failures).sum(1)
+    rows = failure.counted(rows, failures)
     state = state._replace(dropped=_dropped(state, was, rows, survival, settings))
-    forms = np.concatenate([ends, crashes, rows, table[table[:, SAYS] == DEAD]])
+    ends, dead = failure.saying(table, ENDS, CRASHES), failure.saying(table, DEAD)
+    forms = np.concatenate([ends, rows, dead])
     if state.held < 0 and failed and not _foreseen(state, table, survival):
         return state._replace(forms=forms, held=0, wrong=state.wrong + 1)
     has_changed = state.held >= 0 and (failed or _shape(was) != _shape(rows))
@@ -105,14 +103,14 @@ def _dropped(
     older[:, HELD] -= 1.0
     table = failure.without(np.concatenate([older[older[:, HELD] > 0.0], sides]), known.rows)
     holds = failure.inside(table, state.failures).any(1)
-    return np.asarray(table[holds & ~(table[:, None, [I, B]] == rows[:, [I, B]]).all(2).any(1)])
+    return np.asarray(table[holds & ~failure.among(table, rows)])
 
 
 def _foreseen(state: State, table: Floats, known: Survived) -> bool:
     """Whether rivals of a table hold the latest failure, too."""
     rows, latest = failure.rivals(table, state.failures[:-1], known), state.failures[-1:]
     fails, ends, crashes = (
-        failure.inside(rows[rows[:, SAYS] == says], latest).any() for says in (FAILS, ENDS, CRASHES)
+        failure.inside(failure.saying(rows, says), latest).any() for says in (FAILS, ENDS, CRASHES)
     )
     return bool(fails or (ends and crashes))
 
@@ -124,18 +122,18 @@ def _shape(table: Floats) -> tuple[list[list[float]], int]:
 
 def _endings(state: State, table: Floats, known: Survived) -> Floats:
     """Where it ends by itself: nowhere where it went on, nor where it failed like that."""
-    rows, endings = failure.without(table[table[:, SAYS] == ENDS], known.rows), state.ended
+    rows, endings = failure.without(failure.saying(table, ENDS), known.rows), state.ended
     if len(known.rows) and not failure.inside(rows, endings).any(0).all():
         rows = failure.explain(ENDS, endings, failure.boxed(known, known.rows))
     rows = rows[failure.inside(rows, endings).sum(1) >= _ENDED]
     # What fails as others do elsewhere does not fail for how it ends.
     at_end = failure.inside(rows, state.failures).any(0)
-    by = failure.inside(table[table[:, SAYS] == FAILS], state.failures)
+    by = failure.inside(failure.saying(table, FAILS), state.failures)
     failed = state.failures[at_end & ~by[(by & ~at_end).any(1)].any(0)]
     crashes = failure.crashing(failed, endings, known, *set(rows[:, I].astype(int).tolist()))
     is_crash = failure.inside(crashes, state.failures, 0.0).any(0)
     rows = failure.without(rows, state.failures[at_end & ~is_crash])
-    return np.concatenate([rows, crashes, table[np.isin(table[:, SAYS], [FAILS, DEAD])]])
+    return np.concatenate([rows, crashes, failure.saying(table, FAILS, DEAD)])
 
 
 def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> State:
@@ -143,7 +141,8 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
 
     Looked for in drawn directions, farther along variables that change slowly.
     """
-    survival, safe_rows, spread = sizes(state), state.survived, sizes(state).spread
+    survival, safe_rows = sizes(state), state.survived
+    spread = survival.spread
     if not len(safe_rows) or not spread.any():
         return state
     pace = np.abs(np.diff(safe_rows, axis=0)).mean(0) / np.where(spread > 0.0, spread, np.inf)
@@ -170,11 +169,9 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
 
     def differs(table: Floats) -> float:
         """The share of observations of which the function says otherwise."""
-        wrong = (
-            ~failure.inside(table, failures).any(0),
-            (failure.distances(table, rows) < 0.0).any(0),
-        )
-        return float(np.concatenate(wrong).mean()) if hits else 0.0
+        outside = ~failure.inside(table, failures).any(0)
+        within = (failure.distances(table, rows) < 0.0).any(0)
+        return float(np.append(outside, within).mean()) if hits else 0.0
 
     table = state.forms
     if differs(table) > 0.0:
@@ -194,16 +191,13 @@ def dead_ends(state: State, known: Model, z: Floats, episode: Episode, before: F
     steps = np.flatnonzero(episode.certified[: len(z) - 1]) if episode.failed else np.empty(0, int)
     rows = z[steps[-1] + 1 :] if len(steps) else z[:0]
     rows = rows[np.isfinite(rows).all(1)]
-    if len(rows):
-        counts = counts + (_between(rows, centres, inverse) < _LARGEST_RADIUS).any(0)
-        n = len(centres)
-        for row in rows:
-            far = _between(row[None], centres, inverse)[0]
-            if far.min(initial=np.inf) >= _APART:
-                count = counts[:n][far[:n] < _LARGEST_RADIUS].max(initial=1.0)
-                centres, counts = np.vstack([centres, row]), np.append(counts, count)
-    if not len(centres):
-        return state
+    counts = counts + (_between(rows, centres, inverse) < _LARGEST_RADIUS).any(0)
+    n = len(centres)
+    for row in rows:
+        far = _between(row[None], centres, inverse)[0]
+        if far.min(initial=np.inf) >= _APART:
+            count = counts[:n][far[:n] < _LARGEST_RADIUS].max(initial=1.0)
+            centres, counts = np.vstack([centres, row]), np.append(counts, count)
     radii = np.minimum(_LARGEST_RADIUS, _APART * 2.0 ** (np.minimum(counts, 9.0) - 1.0))
     went_on = before  # of a failed episode it is not known from where it went on
     if not episode.failed:
@@ -218,12 +212,12 @@ def dead_ends(state: State, known: Model, z: Floats, episode: Episode, before: F
 
 def barred(state: State) -> State:
     """Learn beyond which ends of what was survived began what nothing survives (`State.fatal`)."""
-    went_on, table = state.survived[state.proven > 0.0], state.forms
+    went_on = state.survived[state.proven > 0.0]
     if not len(state.fatal) or not len(went_on):
         return state
     ends = failure.explain(DEAD, state.fatal, failure.boxed(sizes(state), went_on), bends=False)
-    ends = failure.nearer(ends, state.fatal, 1.0)
-    return state._replace(forms=np.concatenate([table[table[:, SAYS] != DEAD], ends]))
+    rest = failure.saying(state.forms, FAILS, ENDS, CRASHES)
+    return state._replace(forms=np.concatenate([rest, failure.nearer(ends, state.fatal, 1.0)]))
 
 
 def _between(a: Floats, b: Floats, inverse: Floats) -> Floats:

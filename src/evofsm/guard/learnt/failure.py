@@ -88,9 +88,26 @@ def are_sides(table: Floats) -> Flags:
     return np.asarray((table[:, I] == table[:, J]) & (table[:, P] == 0.0))
 
 
+def saying(table: Floats, *says: int) -> Floats:
+    """The forms that say one of these."""
+    return np.asarray(table[np.isin(table[:, SAYS], says)])
+
+
 def inside(table: Floats, z: Floats, blur: float = BLUR) -> Flags:
     """(r, n) which observations (n, m) are in which forms, but for a ``blur`` of bent ones."""
     return distances(table, z) <= np.where(are_sides(table), 0.0, blur)[:, None]
+
+
+def crashed(table: Floats, z: Floats) -> Flags:
+    """(n,) which observations (n, m) are where it ends, and there where it crashes."""
+    is_end = inside(saying(table, ENDS), z).any(0)
+    return np.asarray(is_end & inside(saying(table, CRASHES), z, 0.0).any(0))
+
+
+def counted(table: Floats, failures: Floats) -> Floats:
+    """Forms, with how many failures each holds."""
+    table[:, HELD] = inside(table, failures).sum(1)
+    return table
 
 
 def telling(table: Floats) -> list[int]:
@@ -110,6 +127,11 @@ def prepared(table: Floats) -> Floats:
     rows[flat, C : D + 1] /= np.where(length > 0.0, length, 1.0)[flat, None]
     rows[flat & (rows[:, I] != rows[:, J]) & (rows[:, SAYS] == FAILS), C] += GROWN
     return rows
+
+
+def among(table: Floats, others: Floats) -> Flags:
+    """(r,) which thresholds are of a variable and a direction of one of others."""
+    return np.asarray((table[:, None, [I, B]] == others[:, [I, B]]).all(2).any(1))
 
 
 def without(table: Floats, z: Floats) -> Floats:
@@ -136,22 +158,18 @@ def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
     what was survived; and so where a form says that it crashes, as few endings tell little.
     """
     rows: list[Floats] = []
-    # What crashes is told of the ends just before it: others come behind.
-    fails, ends, crashes = (table[table[:, SAYS] == says] for says in (FAILS, ENDS, CRASHES))
+    fails, ends, crashes = (saying(table, says) for says in (FAILS, ENDS, CRASHES))
     for row, is_side, holds in zip(fails, are_sides(fails), inside(fails, failures), strict=True):
-        held_failures = failures[holds]
-        if not len(held_failures) or not len(survived.rows):
+        if not holds.any() or not len(survived.rows):
             rows.append(row)
-        elif is_side:
-            rows += _as_failed(row, held_failures, survived)
         else:
-            rows += _ellipses(row, held_failures, survived)
-    at_end = inside(ends, failures).any(0) & inside(crashes, failures, 0.0).any(0)
+            rows += (_as_failed if is_side else _ellipses)(row, failures[holds], survived)
+    at_end = crashed(table, failures)
     if at_end.any() and len(survived.rows):
         rare = _rare(failures[at_end], survived, *ends[:, I].astype(int).tolist())
         crashes = rare if len(rare) else crashes
-    rows += [*ends, *crashes, *table[table[:, SAYS] == DEAD]]
-    return np.array(rows).reshape(-1, SIZE)
+    # What crashes is told of the ends just before it: others come behind.
+    return np.array([*rows, *ends, *crashes, *saying(table, DEAD)]).reshape(-1, SIZE)
 
 
 def _ellipses(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
@@ -171,10 +189,10 @@ def _ellipses(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
     around = np.linalg.inv(2.0 * x.T @ x / len(x) + np.eye(2))
     for off in (0.0, *_INWARDS):
         shape = np.diag(wide**-2.0) if off else around
-        most, least = (
-            float(f(np.einsum("ni,ij,nj->n", v - off * inwards, shape, v - off * inwards)))
-            for f, v in ((np.max, x), (np.min, y))
+        far, away = (
+            np.einsum("ni,ij,nj->n", v, shape, v) for v in (x - off * inwards, y - off * inwards)
         )
+        most, least = float(far.max()), float(away.min())
         size = min(1.1 * most if off else max(1.0, 1.1 * most), 0.99 * least)
         if size >= most:
             new = row.copy()
@@ -208,17 +226,23 @@ def _rare(held: Floats, survived: Survived, *at: int) -> Floats:
     off = (np.abs(held - centre).min(0) - BLUR * unit).clip(0.0)
     share = np.array([rows >= low, rows <= high, np.abs(rows - centre) >= off]).mean(1)
     share[:, (survived.spread == 0.0) | np.isin(np.arange(m), at)] = np.inf
-    table = np.zeros((m, SIZE))
-    table[:, SAYS], table[:, [I, J]] = CRASHES, np.arange(m)[:, None]
-    table[:, [ONE, OTHER]], table[:, HELD] = 1.0 / unit[:, None], len(held)
-    for k, side in enumerate(share.argmin(0)):
-        table[k, [AT, TO]] = (low, high, centre)[side][k]
-        table[k, [C, B, P]] = (
-            (0.0, 1.0, 0.0),
-            (0.0, -1.0, 0.0),
-            (-((off[k] / unit[k]) ** 2), 0.0, 1.0),
-        )[side]
-    return np.asarray(table[share.min(0) < _RARE])
+    table = np.empty((0, SIZE))
+    for j in np.flatnonzero(share.min(0) < _RARE).tolist():
+        sides = (
+            _of_one(CRASHES, j, low[j], unit[j], b=1.0),
+            _of_one(CRASHES, j, high[j], unit[j], b=-1.0),
+            _of_one(CRASHES, j, centre[j], unit[j], c=-((off[j] / unit[j]) ** 2), p=1.0),
+        )
+        table = np.vstack([table, sides[share[:, j].argmin()]])
+    table[:, HELD] = len(held)
+    return table
+
+
+def _of_one(
+    says: int, j: int, at: float, unit: float, *, c: float = 0.0, b: float = 0.0, p: float = 0.0
+) -> list[float]:
+    """A form of one variable, by its coefficients of 1, x and x x; it holds no failure yet."""
+    return [says, j, j, at, at, 1.0 / unit, 1.0 / unit, c, b, 0.0, p, 0.0, 0.0, 0.0]
 
 
 def boxed(known: Survived, rows: Floats) -> Survived:
@@ -231,11 +255,10 @@ def crashing(failed: Floats, ended: Floats, survived: Survived, *at: int) -> Flo
     """How it fails where it ends: by variables other than those ``at`` which it ends, if it can."""
     alike = failed.copy()
     alike[:, at] = ended[:, at].mean(0)
-    end_box = boxed(survived, ended)
-    table = explain(CRASHES, alike, end_box, least=1.0)
-    if not inside(table, alike, 0.0).any(0).all():
-        table = explain(CRASHES, failed, end_box, least=1.0)
-    return table
+    table = explain(CRASHES, alike, boxed(survived, ended), least=1.0)
+    if inside(table, alike, 0.0).any(0).all():
+        return table
+    return explain(CRASHES, failed, boxed(survived, ended), least=1.0)
 
 
 # -- Which forms there are ------------------------------------------------------------------------
@@ -261,7 +284,7 @@ def explain(
     stay = _sides(says, failures, survived, blur, least)
     by, k = inside(stay, failures), len(failures)
     if not bends or by.any(0).all() or not len(survived.rows) or not k:
-        return _counted(stay, failures)
+        return counted(stay, failures)
     share = _SHARE if len(stay) <= _FEW_SIDES else 0.5 / len(stay)
     strong = by.sum(1) >= max(_FEW_FAILURES, share * k)
     bent, _ = _bent(says, failures[by[strong].sum(0) == 0], survived)
@@ -271,12 +294,7 @@ def explain(
             bent, strong = alone, np.zeros(len(strong), bool)
     within: Flags = np.asarray(inside(bent, failures).any(0))
     keep = [bool(s or not within[holds].all()) for s, holds in zip(strong, by, strict=True)]
-    return _counted(np.concatenate([stay[keep], bent]), failures)
-
-
-def _counted(table: Floats, failures: Floats) -> Floats:
-    table[:, HELD] = inside(table, failures).sum(1)
-    return table
+    return counted(np.concatenate([stay[keep], bent]), failures)
 
 
 def _sides(says: int, failures: Floats, survived: Survived, blur: Floats, least: float) -> Floats:
@@ -314,10 +332,10 @@ def _sides(says: int, failures: Floats, survived: Survived, blur: Floats, least:
         among = failures[is_explained[:, best], best % m]
         thresholds[best] = float(among.max() if best < m else among.min())  # the innermost
     rows = [
-        [says, k % m, k % m, at, at, 1 / unit[k % m], 1 / unit[k % m], 0, (1, -1)[k < m], *[0] * 5]
+        _of_one(says, k % m, at, unit[k % m], b=-1.0 if k < m else 1.0)
         for k, at in thresholds.items()
     ]
-    return np.array(rows, np.float64).reshape(-1, SIZE)
+    return np.array(rows).reshape(-1, SIZE)
 
 
 def _most_telling(explained: Flags, perhaps: Flags, beyond: Floats) -> tuple[list[int], int]:
@@ -333,7 +351,7 @@ def _bent(
     says: int, failures: Floats, survived: Survived, fewer: float = np.inf
 ) -> tuple[Floats, bool]:
     """Bent forms that explain failures, and whether these are ``fewer`` and explain all of them."""
-    candidates, n = _asked(failures, survived), len(survived.rows)
+    candidates, n = _candidates(failures, survived), len(survived.rows)
     sample = survived.rows[np.linspace(0, n - 1, min(n, _FIT_ROWS)).astype(int)]
     bent_rows: list[Floats] = []
     groups, whole = [np.arange(len(failures))], True
@@ -386,7 +404,7 @@ def _in_two(F: Floats, asked: Ints, score: Floats, survived: Survived) -> tuple[
     return best_split
 
 
-def _asked(failures: Floats, survived: Survived) -> Ints:
+def _candidates(failures: Floats, survived: Survived) -> Ints:
     """(c, 3) variables and kinds of forms that are tried: of many variables those that tell most.
 
     A variable tells failed observations from survived ones where they have another mean or spread;
@@ -439,29 +457,30 @@ def _split(x: Floats) -> Flags:
 
 def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, Floats]:
     """(c, SIZE) the forms that are asked of failures (k, m); which are inside; and scores."""
-    rows, unit = survived.rows, survived.unit
-    scale, points = survived.spread[asked[:, :2]], F[:, asked[:, :2]].transpose(1, 0, 2)
-    at, k = points.mean(1), len(F)
-    near: dict[tuple[int, int], Ints] = {}
-    for i, j, _ in asked.tolist():
-        if (i, j) not in near:
-            near[i, j] = _near(rows[:, [i, j]], F[:, [i, j]], survived.spread[[i, j]])
-    index = np.array([near[i, j] for i, j, _ in asked.tolist()])
+    rows, k = survived.rows, len(F)
+    pairs, kinds = asked[:, :2], _KINDS[asked[:, 2]]
+    unit, scale, points = (
+        survived.unit[pairs],
+        survived.spread[pairs],
+        F[:, pairs].transpose(1, 0, 2),
+    )
+    at = points.mean(1)
+    different, of_them = np.unique(pairs, axis=0, return_inverse=True)
+    near = [_near(rows[:, pair], F[:, pair], survived.spread[pair]) for pair in different]
+    index = np.array(near)[of_them.ravel()]
     table, likelihood = np.zeros((len(asked), SIZE)), np.zeros(len(asked))
     again = np.arange(len(asked))
     for _ in range(_REFITS):  # with what the fit before has wrongly inside
-        neighbours = rows[index[..., None], asked[again][:, None, :2]]
+        neighbours = rows[index[..., None], pairs[again][:, None]]
         x = np.concatenate([points[again], neighbours], 1) - at[again][:, None]
         u, v = (x / scale[again][:, None]).transpose(2, 0, 1)
-        phi = np.stack([u, v, u * u, u * v, v * v], 2) * _KINDS[asked[again, 2]][:, None]
+        phi = np.stack([u, v, u * u, u * v, v * v], 2) * kinds[again][:, None]
         w, likelihood[again] = _logistic(phi, np.append(np.ones(k), np.zeros(index.shape[1])))
-        times = unit[asked[again, :2]] / scale[again]
+        s, t = (unit / scale)[again].T
         fits = np.zeros((len(again), SIZE))
-        fits[:, I:AT], fits[:, AT:ONE] = asked[again, :2], at[again]
-        fits[:, ONE:C] = 1.0 / unit[asked[again, :2]]
-        fits[:, C], fits[:, B:P] = w[:, 5], w[:, :2] * times
-        fits[:, P], fits[:, R] = w[:, 2] * times[:, 0] ** 2, w[:, 4] * times[:, 1] ** 2
-        fits[:, Q] = w[:, 3] * times[:, 0] * times[:, 1]
+        fits[:, I:AT], fits[:, AT:ONE], fits[:, ONE:C] = pairs[again], at[again], 1.0 / unit[again]
+        fits[:, C], fits[:, B], fits[:, D] = w[:, 5], w[:, 0] * s, w[:, 1] * t
+        fits[:, P], fits[:, Q], fits[:, R] = w[:, 2] * s**2, w[:, 3] * s * t, w[:, 4] * t**2
         form = forms(fits, rows)[0]
         most = form.max(1)  # as large as it may be with none of them inside
         wrong = (most > 0.0) & (likelihood[again] > -_UNLIKELY * k)
@@ -473,7 +492,7 @@ def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, 
         index = np.hstack([index, np.argpartition(-form, _WORST, 1)[:, :_WORST]])
     within = inside(table, F)
     within[2 * (within & (distances(table, F) < 0.0)).sum(1) < within.sum(1)] = False
-    score = likelihood - 0.5 * _KINDS[asked[:, 2]].sum(1) * np.log(k + 1.0)
+    score = likelihood - 0.5 * kinds.sum(1) * np.log(k + 1.0)
     return table, within, score
 
 

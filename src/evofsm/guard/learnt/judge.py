@@ -25,34 +25,12 @@ from evofsm.fsm.validation import action_name, function, positive, whole
 from evofsm.guard.actions import BoxActions, Mask
 from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, SearchingJudge, Situation
 from evofsm.guard.harm import SETTINGS, Harm
-from evofsm.guard.learnt import words
+from evofsm.guard.learnt import rollout, words
 from evofsm.guard.learnt.backups import basis
-from evofsm.guard.learnt.learn import disturbance_scale, learn
+from evofsm.guard.learnt.learn import learn
 from evofsm.guard.learnt.motion import used_at
-from evofsm.guard.learnt.rollout import (
-    CUT_SHORT,
-    KEPT,
-    NO_LONGER,
-    Floats,
-    Ints,
-    Model,
-    expected,
-    pairs,
-    search,
-    value_of,
-)
-from evofsm.guard.learnt.state import (
-    KIND,
-    Episode,
-    Given,
-    LearntSettings,
-    State,
-    forms_of,
-    model_of,
-    packed,
-    residuals_of,
-    unpacked,
-)
+from evofsm.guard.learnt.rollout import CUT_SHORT, Floats, Ints, search
+from evofsm.guard.learnt.state import KIND, Episode, Given, LearntSettings, Parts, State, unpacked
 from evofsm.guard.learnt.words import Remembered
 from evofsm.store import Place
 
@@ -66,33 +44,12 @@ _MAX_CHOICES = 1_000
 _NEVER = -1e300
 
 
-class Parts(NamedTuple):
-    """What decides, made of a state."""
+class Outcome(NamedTuple):
+    """What comes of an action if the best of some backups follows."""
 
-    model: Model
-    daring: Model  #: while it learns
-    residuals: Floats  #: (H, m, 1 + K) of disturbances; number 0 is none
-    scale: float  #: how much harder than they were disturbances are taken to be
-    n_asked: int  #: backups that a search asks
-    n_tried: int  #: and while a rival is tried, by which another may save
-    n_judged: int  #: and those by which a risk is found
-    most: float  #: steps of rollouts after which a search is cut short
-
-    @classmethod
-    def of(cls, state: State, settings: LearntSettings, dt: float) -> Parts | None:
-        """Make them; None as long as there are no backups."""
-        if not len(state.policies):
-            return None
-        model = model_of(state, settings)
-        daring_model = model._replace(forms=forms_of(state, settings, daring=True))
-        rest, scale = residuals_of(state, model, state.horizon), disturbance_scale(state, settings)
-        few = settings.n_asked if len(pairs(len(state.origin))[0]) else 2
-        cost = (model.weights.size + model.dead_ends.size) * rest.shape[2]
-        most = max(min(settings.work, settings.work_rate * dt) / cost, few * state.horizon)
-        n_backups = 1 if most < 2 * few * state.horizon else few
-        n_policies = len(state.policies)
-        n_tried = few if state.held >= 0 or most < n_policies * state.horizon else n_policies
-        return cls(model, daring_model, rest, scale, few, n_tried, n_backups, most)
+    unsurvived: float  #: disturbances that are not survived; infinite if it fails without any
+    left: float  #: least distance to failure under the worst of them [typical steps]
+    fails_after: float  #: steps after which it fails, at the latest; 0 if it does not
 
 
 class LearntRisk(LearningJudge, SearchingJudge):
@@ -142,13 +99,7 @@ class LearntRisk(LearningJudge, SearchingJudge):
     The risk of an action is the probability that within the horizon something begins that no
     backup survives after it: ``1 - exp(-unsurvived / exposure * horizon)``, from the number of
     remembered disturbances that are not survived and the time in which they were seen; 1 where not
-    even an undisturbed future is survived. Its 90 % interval is that of a Poisson count (Garwood
-    1936); it ends at 1 where all disturbances that it may remember are unsurvived, as those that it
-    forgot may be, too. It speaks of what was seen: what never began is not in it.
-
-    The margin follows adaptive conformal inference (Gibbs & Candes 2021): each violated certificate
-    (a step ago some backup survived all, now none does even without a margin) adds to it, and it
-    fades else.
+    even an undisturbed future is survived. What never began is not in it.
 
     Examples
     --------
@@ -213,9 +164,16 @@ class LearntRisk(LearningJudge, SearchingJudge):
         #: Number of actions; 0 where the action is a box.
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
         if self.choices > _MAX_CHOICES:
-            takes = f"a learnt judge takes at most {_MAX_CHOICES:,} actions"
-            raise ValueError(f"n_actions is {n_actions}; {takes}")
-        self.low, self.high = _range(low, high, is_none=n_actions is not None)
+            raise ValueError(
+                f"n_actions is {n_actions}; a learnt judge takes at most {_MAX_CHOICES:,} actions"
+            )
+        if {low is None, high is None} != {n_actions is not None}:
+            raise ValueError("give either low and high, or n_actions")
+        self.low: Floats = np.zeros(0)
+        self.high: Floats = np.zeros(0)
+        if low is not None and high is not None:
+            ends: Any = np.atleast_1d(low), np.atleast_1d(high)
+            self.low, self.high = BoxActions(*ends).bounds
         self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         #: How many numbers an action has.
         self.size = self.choices or len(self.low)
@@ -316,13 +274,13 @@ class LearntRisk(LearningJudge, SearchingJudge):
             policies = policies.copy()
             policies[:, ~mask, 0] = _NEVER
         inputs = model, here, policies, ranks, parts.residuals, scale
-        longer = self.settings.longer if self.learning else NO_LONGER
+        longer = self.settings.longer if self.learning else rollout.NO_LONGER
         how, action, best, slack = search(*inputs, proposal, margin, allowance, most, longer=longer)
         trial = None
         if best != ranks[0]:  # what passed now is asked first the next time
             self._ranks = np.append(best, self._ranks[self._ranks != best])
-        passes, self._refused, cut = how < CUT_SHORT, how != KEPT, how == CUT_SHORT
-        self._holds = passes
+        passes, cut = how < CUT_SHORT, how == CUT_SHORT
+        self._holds, self._refused = passes, how != rollout.KEPT
         if not passes:
             if self._certified and not cut:
                 how = search(*inputs, action, 0.0, allowance, most, lasting=False)[0]
@@ -331,10 +289,14 @@ class LearntRisk(LearningJudge, SearchingJudge):
             is_alike = self.learning and slack < self.settings.alike
             trial = self._untried(action, mask) if is_alike else None
             action = action if trial is None else trial
-        pair = [proposal, action] if self._refused else [proposal]
-        rest = slack if passes and not allowance else None
-        judgement, self._lost, fails_after = self._judged(situation, here, policies, pair, rest)
-        self._fails_after = max(self._fails_after, fails_after)
+        outcomes = [self._foresee(here, proposal, policies)] if self._refused else []
+        if passes and not allowance:  # the search says what is left
+            outcomes.append(Outcome(0.0, slack, 0.0))
+        else:
+            outcomes.append(self._foresee(here, action, policies))
+        self._lost = math.isinf(outcomes[-1].unsurvived)
+        self._fails_after = max(self._fails_after, *(outcome.fails_after for outcome in outcomes))
+        judgement = self._judged(situation, outcomes)
         backup = self.backup_text(best, policies)
         if not self._refused:
             return Search(options, judgement, 0, words.kept(backup, memory, slack, allowance))
@@ -357,8 +319,9 @@ class LearntRisk(LearningJudge, SearchingJudge):
         options, here = np.asarray(actions, np.float64), self._here(situation.observation)
         if here is None or self.parts is None or not len(self.state.forms):
             return _unjudged(len(options))
-        inner = [self.encode(action) for action in options]
-        return self._judged(situation, here, self.state.policies, inner)[0]
+        policies = self.state.policies
+        outcomes = [self._foresee(here, self.encode(action), policies) for action in options]
+        return self._judged(situation, outcomes)
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
@@ -366,47 +329,28 @@ class LearntRisk(LearningJudge, SearchingJudge):
         why = words.refused(self._unsurvived, self.remembered, self.margin, scale)
         return words.alone(why) if self.choices == 1 else why
 
-    def _judged(
-        self,
-        situation: Situation,
-        here: Floats,
-        policies: Floats,
-        actions: Sequence[Floats],
-        passes: float | None = None,
-    ) -> tuple[Judgement, bool, float]:
-        """Of some actions; ``passes`` is what is left after the last, if that is known to pass.
-
-        And whether the last is lost for good, and after how many steps any of them fails at the
-        latest.
-        """
+    def _foresee(self, here: Floats, action: Floats, policies: Floats) -> Outcome:
+        """What comes of a situation and an action, by those backups that passed last."""
         assert self.parts is not None
-        options = actions if passes is None else actions[:-1]
+        model, rest = self.parts.model, self.parts.residuals
         best = policies[self._ranks[: self.parts.n_judged]]
-        outcomes = [self._foresee(here, action[None], best) for action in options]
-        if passes is not None:
-            outcomes.append((0.0, passes, 0.0))
-        counts, slacks, after = zip(*outcomes, strict=True)
+        ends = rollout.value_of(model, here[None], best, rest, 1.0, action[None], 0.0)[0]
+        fails = ends[ends < 0.0]
+        count = math.inf if ends[0] < 0.0 else float(len(fails))
+        steps = len(rest)
+        return Outcome(
+            count, float(ends.min()), float(fails.max(initial=-1.0 - steps)) + 1.0 + steps
+        )
+
+    def _judged(self, situation: Situation, outcomes: Sequence[Outcome]) -> Judgement:
+        """Of some actions; of the first it is kept why it is dangerous (`why`)."""
+        counts = [outcome.unsurvived for outcome in outcomes]
         self._unsurvived = -1 if math.isinf(counts[0]) else int(counts[0])
         memory = self.remembered
         soon = self._soon(memory.seconds)
         risk, low, high = np.array([self._risk(n, soon) for n in counts]).T
-        number = float(memory.number)
-        judgement = Judgement(risk, low, high, np.array(slacks), number, situation.seen)
-        return judgement, math.isinf(counts[-1]), max(after)
-
-    def _foresee(self, here: Floats, plan: Floats, policies: Floats) -> tuple[float, float, float]:
-        """What comes of a situation and an action if the best of some backups follows.
-
-        How many disturbances are not survived, infinite if it fails without any; the least distance
-        to failure under the worst of them; and the steps after which it fails at the latest.
-        """
-        assert self.parts is not None
-        model, rest = self.parts.model, self.parts.residuals
-        ends = value_of(model, here[None], policies, rest, 1.0, plan, 0.0)[0]
-        fails = ends[ends < 0.0]
-        count = math.inf if ends[0] < 0.0 else float(len(fails))
-        steps = len(rest)
-        return count, float(ends.min()), float(fails.max(initial=-1.0 - steps)) + 1.0 + steps
+        distances = np.array([outcome.left for outcome in outcomes])
+        return Judgement(risk, low, high, distances, float(memory.number), situation.seen)
 
     def _soon(self, exposure: float) -> float:
         """The horizon, as a share of the time in which all that is remembered was seen."""
@@ -433,23 +377,18 @@ class LearntRisk(LearningJudge, SearchingJudge):
 
     def _here(self, z: Floats) -> Floats | None:
         """The situation, if that is seen; what was not is taken to be as was expected."""
-        row, n = self._filled(z), len(self._done)
-        if not n or row is None:
-            return None if row is None else np.append(row, np.zeros(len(z) + self.size))
-        change = (row - self._past[0]) * (self.state.stride / n)
-        return np.concatenate([row, change, sum(self._done) / n])
-
-    def _filled(self, z: Floats) -> Floats | None:
-        """An observation, in which what was not seen is as was expected; None at first."""
-        if not math.isnan(z.dot(z)):
-            return z
-        if self._before is None:
-            return None
-        situation, action = self._before
-        row = situation[: len(z)]
-        if self.parts is not None:
-            row = row + (expected(self.parts.model, situation, action) - row) / self.state.stride
-        return np.where(np.isnan(z), row, z)
+        row, stride, n = z, self.state.stride, len(self._done)
+        if math.isnan(z.dot(z)):
+            if self._before is None:
+                return None
+            situation, action = self._before
+            row = situation[: len(z)]
+            if self.parts is not None:
+                row = row + (rollout.expected(self.parts.model, situation, action) - row) / stride
+            row = np.where(np.isnan(z), row, z)
+        if not n:
+            return np.append(row, np.zeros(len(z) + self.size))
+        return np.concatenate([row, (row - self._past[0]) * (stride / n), sum(self._done) / n])
 
     def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
@@ -503,7 +442,8 @@ class LearntRisk(LearningJudge, SearchingJudge):
         ValueError
             If it has another number of variables than before.
         """
-        if (m := len(self._z[0]) if self._z else self.n_variables) not in (0, len(observation)):
+        m = len(self._z[0]) if self._z else self.n_variables
+        if m not in (0, len(observation)):
             has = f"observation has {len(observation)} variables"
             raise ValueError(f"{has}, but the judge learnt of {m}")
         if len(self._z) > len(self._u):  # nothing was executed: it does not follow
@@ -597,7 +537,7 @@ class LearntRisk(LearningJudge, SearchingJudge):
             return self.encode(action[0] if self.choices else np.clip(action, self.low, self.high))
 
         numbers = self.settings, self.seed, self.without, self.given_horizon
-        return Given(*numbers, self.failed, move and model, act and backup)
+        return Given(*numbers, self.failed, model if move else None, backup if act else None)
 
     def _study(self, *, failed: bool, terminated: bool) -> None:
         """Learn from the rows of an episode, and forget them."""
@@ -609,13 +549,12 @@ class LearntRisk(LearningJudge, SearchingJudge):
         if not len(z) or not np.isfinite(z).all(1).any() or not (n or failed):
             return
         refusals, losses, certificates = notes.T
-        inputs = z, u, failed, terminated
-        episode = Episode(*inputs, refusals, losses, certificates, self._fails_after)
+        ends = failed, terminated
+        episode = Episode(z, u, *ends, refusals, losses, certificates, self._fails_after)
         if not self.n_variables:
             now = self.state
-            blank = State.none(z.shape[1], self.size, self.choices, self.settings, None)
-            kept_names = ("horizon", "stride", "margin", "n_failed")
-            self.state = blank._replace(**{name: getattr(now, name) for name in kept_names})
+            blank = State.none(z.shape[1], self.size, self.choices, self.settings, now.horizon)
+            self.state = blank._replace(stride=now.stride, margin=now.margin, n_failed=now.n_failed)
         n_drifts = len(self.state.drifts)
         self.state = learn(self.state, episode, self._given)
         if len(self.state.drifts) > n_drifts:  # another system: how one fares alone is not known
@@ -677,7 +616,7 @@ class LearntRisk(LearningJudge, SearchingJudge):
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
-        numbers, arrays = packed(self.state)
+        numbers, arrays = self.state.packed()
         settings = {
             **{name: getattr(self, name) for name in ("dt", "seed", "given_horizon")},
             **{name: getattr(self, name).tolist() for name in ("low", "high")},
@@ -702,27 +641,13 @@ class LearntRisk(LearningJudge, SearchingJudge):
                 keywords |= {"low": settings["low"], "high": settings["high"]}
             keywords |= {"horizon": settings["given_horizon"]}
             judge = cls(settings["dt"], settings=LearntSettings(**settings["settings"]), **keywords)
-            of = judge.choices, judge.size, judge.settings
-            judge.state = unpacked(settings["state"], arrays, *of)
+            judge.state = unpacked(settings["state"], arrays, judge.state, judge.settings)
             judge.harm = Harm.restored(settings["harm"], arrays["harm"])
             judge.remake()
         return judge
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
-
-
-def _range(
-    low: ArrayLike | None, high: ArrayLike | None, *, is_none: bool
-) -> tuple[Floats, Floats]:
-    """The ends of the range of actions, (d,) each; empty where there is to be none."""
-    if is_none != (low is None) or (low is None) != (high is None):
-        raise ValueError("give either low and high, or n_actions")
-    if low is None or high is None:
-        return np.zeros(0), np.zeros(0)
-    ends: Any = np.atleast_1d(low), np.atleast_1d(high)
-    lowest, highest = BoxActions(*ends).bounds
-    return lowest, highest
 
 
 def _unjudged(count: int) -> Judgement:

@@ -10,21 +10,12 @@ from numpy.random import Generator
 
 from evofsm.guard.learnt import danger, failure, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups, fitted
-from evofsm.guard.learnt.failure import SAYS
-from evofsm.guard.learnt.rollout import DEAD, FAILS, Flags, Floats, Model, value_of
-from evofsm.guard.learnt.state import (
-    Episode,
-    Given,
-    LearntSettings,
-    State,
-    model_of,
-    residuals_of,
-)
+from evofsm.guard.learnt.rollout import DEAD, FAILS, Flags, Floats, Ints, Model, value_of
+from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State, model_of, residuals_of
 
 # Actions of an episode that says how a system moves, at least, if three observations in a row were
-# whole; situations from which on
-# disturbances are looked for and backups evolve; those that are drawn to look for some;
-# disturbances that mutants are tried on, besides none.
+# whole; situations from which on disturbances are looked for and backups evolve; those that are
+# drawn to look for some; disturbances that mutants are tried on, besides none.
 _FEWEST_STEPS, _ENOUGH, _TRIED_IN, _TRIED_ON = 3, 3, 8, 5
 # What is lost in so few steps, whatever one does, is no argument; nor is what is survived by more
 # [typical steps].
@@ -77,7 +68,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
         state = first_backups(state, u, settings.n_linear)
     state = noted(state, safe, episode, settings, random)
     if "rivals" not in without and given.failed is None:
-        was_tried = failure.inside(before.forms[before.forms[:, SAYS] == FAILS], safe, 0.0).any()
+        was_tried = failure.inside(failure.saying(before.forms, FAILS), safe, 0.0).any()
         state = doubted(state, episode, settings, tried=bool(was_tried))
     refutations = 1 + np.flatnonzero(episode.lost[1 : max(1, len(safe) - state.horizon)])
     if len(refutations):
@@ -89,7 +80,8 @@ def learn(state: State, episode: Episode, given: Given) -> State:
         state = disturbances(state, motion_model, safe, u, settings, random)
     rest = residuals_of(state, motion_model, state.horizon)
     if looks and given.horizon is None:
-        if is_too_short(state, motion_model, episode, settings):
+        # A certified episode failed later than it looks ahead, and it looks as far as it may.
+        if late(episode) > state.horizon >= int(farthest(motion_model, settings)):
             decisions = decisions._replace(fails_after=0.5 * decisions.fails_after)
             return learn(coarser(before, settings), decisions, given)
         state = look_ahead(state, motion_model, rest, episode, settings)
@@ -98,15 +90,9 @@ def learn(state: State, episode: Episode, given: Given) -> State:
         state = fitted(state, motion_model, given.backup)
     if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
         numbers = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
-        rest, scale = np.ascontiguousarray(rest[:, :, numbers]), disturbance_scale(state, settings)
+        rest, scale = np.ascontiguousarray(rest[:, :, numbers]), state.disturbance_scale(settings)
         state = evolved(state, motion_model, rest, scale, settings, random)
     return state._replace(n_episodes=state.n_episodes + 1)
-
-
-def disturbance_scale(state: State, settings: LearntSettings) -> float:
-    """How much harder than they were disturbances are taken to be, while little was seen."""
-    most = settings.caution_again if len(state.drifts) else settings.caution_max
-    return 1.0 + min(most, settings.caution / max(1, state.n_scanned))
 
 
 def doubted(state: State, episode: Episode, settings: LearntSettings, *, tried: bool) -> State:
@@ -132,7 +118,7 @@ def noted(
 
     One anywhere in an episode, one where a proposal was refused, and some before failure.
     """
-    T, rows = len(z) - 1, state.situations
+    T, rows = len(z) - 1, [*state.situations]
     steps = [int(random.integers(1, T))]
     if len(tight := np.flatnonzero(episode.refused[1:T]) + 1):
         steps.append(int(random.choice(tight)))
@@ -144,11 +130,10 @@ def noted(
         if not np.isfinite(row).all():
             continue
         if len(rows) < settings.n_situations:
-            rows = np.vstack([rows, row])
+            rows.append(row)
         else:
-            rows = rows.copy()
             rows[int(random.integers(len(rows)))] = row
-    return state._replace(situations=rows)
+    return state._replace(situations=np.reshape(rows, (-1, state.situations.shape[1])))
 
 
 def looks_for_harm(state: State) -> bool:
@@ -165,7 +150,7 @@ def disturbances(
     known, the largest ones.
     """
     H, S, (T, a), m = state.horizon, state.situations, u.shape, z.shape[1]
-    looks = looks_for_harm(state)
+    looks, longest = looks_for_harm(state), settings.horizon_max + 2
     starts = np.arange(0, max(1, T - 4), max(1, (T - 1) // settings.n_starts))
     rest = model.undisturbed(len(u) + H, m, 1)[..., 0]
     rest[: T - 1] = model.disturbed(known, z, u, state.unit)
@@ -177,10 +162,8 @@ def disturbances(
         sample = S[random.permutation(len(S))[:_TRIED_IN]]
         ends = _worst(known, sample, state.policies[:1], with_none, 1.0)
     harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_MOST_WINDOWS]
-    starts = starts[harmful]
-    longest = settings.horizon_max + 2
     windows, lengths = list(state.windows), state.lengths.tolist()
-    for t in starts:
+    for t in starts[harmful]:
         is_seen: Flags = np.asarray(np.isfinite(z[t : t + longest]).all(1))
         n = len(is_seen) if is_seen.all() else int(is_seen.argmin())
         if n > _AT_ONCE + 1:
@@ -197,7 +180,7 @@ def disturbances(
     if len(state.windows) <= settings.n_disturbances:
         return state
     if looks:
-        scale = disturbance_scale(state, settings)
+        scale = state.disturbance_scale(settings)
         ends = _worst(known, S, state.policies[:2], residuals, scale)
         keep = _chosen(ends, settings.n_disturbances)
     else:
@@ -222,23 +205,23 @@ def _fatal(
     is_new = ~(rows[:, None] == state.fatal).all(2).any(1)
     fatal_rows = np.concatenate([state.fatal, rows[is_new]])[-settings.max_failures :]
     state = danger.barred(state._replace(fatal=fatal_rows))
-    within = failure.inside(state.forms[state.forms[:, SAYS] == DEAD], rows).any(0)
+    within = failure.inside(failure.saying(state.forms, DEAD), rows).any(0)
     keep = np.setdiff1d(np.arange(len(state.windows)), fatal[within])
-    return _kept(state, keep.tolist()), found[:, :, np.append(0, 1 + keep)]
+    return _kept(state, keep), found[:, :, np.append(0, 1 + keep)]
 
 
-def _kept(state: State, keep: list[int]) -> State:
+def _kept(state: State, keep: Ints) -> State:
     """Forget all disturbances but these, by their numbers from 0."""
     of = {name: getattr(state, name)[keep] for name in ("windows", "lengths", "seen_in")}
     return state._replace(**of)
 
 
-def _sizes(rest: Floats, state: State) -> list[int]:
+def _sizes(rest: Floats, state: State) -> Ints:
     """Of residuals (H, m, K), and landings, the largest first."""
     m = len(state.unit)
     size = np.abs(rest[:, :m] / (state.unit[:, None] + 1e-300)).sum((0, 1))
     size += model.JUMP * np.isfinite(rest[:, m:]).sum((0, 1))
-    return [int(k) for k in np.argsort(-size, kind="stable")]
+    return np.argsort(-size, kind="stable")
 
 
 def _worst(
@@ -251,16 +234,17 @@ def _worst(
     return np.asarray(np.minimum(ends, _BY_FAR))
 
 
-def _chosen(ends: Floats, most: int) -> list[int]:
+def _chosen(ends: Floats, most: int) -> Ints:
     """Which are worst in some situation (S, K), and of others those that are worst in the mean."""
+    keep: Ints = np.arange(ends.shape[1])
     if not len(ends):
-        return list(range(ends.shape[1]))[-most:]
-    keep, mean = np.arange(ends.shape[1]), ends.mean(0)
+        return keep[-most:]
+    mean = ends.mean(0)
     while len(keep) > most:  # what is worst nowhere goes first
         free = np.delete(keep, ends[:, keep].argmin(1))
         free = free if len(free) else keep
         keep = keep[keep != free[mean[free].argmax()]]
-    return [int(k) for k in keep]
+    return keep
 
 
 def look_ahead(
@@ -304,11 +288,6 @@ def farthest(known: Model, settings: LearntSettings) -> float:
     """How far it looks ahead at most [steps]: less where a rollout costs more."""
     cost = known.weights.size * (1 + settings.n_disturbances)
     return min(settings.horizon_max, settings.work / cost / settings.n_asked)
-
-
-def is_too_short(state: State, known: Model, episode: Episode, settings: LearntSettings) -> bool:
-    """Whether a certified episode failed later than it looks ahead, as far as that may be."""
-    return late(episode) > state.horizon >= int(farthest(known, settings))
 
 
 def coarser(state: State, settings: LearntSettings) -> State:

@@ -152,17 +152,13 @@ def rows_of(model: Model, z: Floats, u: Floats) -> tuple[Floats, Floats, Flags]:
     return phi, np.diff(z[1:], axis=0), is_seen
 
 
-def residuals(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
-    """(T, m) what was not expected from the second of T + 2 observations on, under actions u.
-
-    It is 0 where something was not seen, nothing moved, a variable jumped, or is expected beyond
-    where it saturates and stays there: how far it would have gone is not known.
-    """
-    return disturbed(model, z, u, unit)[:, : len(unit)]
-
-
 def disturbed(model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
-    """(T, 2m) `residuals`, and where variables landed that jumped unexpectedly, else inf."""
+    """(T, 2m) residuals from the second of T + 2 observations on, under actions u, and landings.
+
+    A residual is 0 where something was not seen, nothing moved, a variable jumped, or is expected
+    beyond where it saturates and stays there: how far it would have gone is not known. A landing is
+    where a variable jumped to unexpectedly, else inf.
+    """
     phi, change, is_seen = rows_of(model, z, u)
     move, after = phi @ model.weights, z[2:]
     to = z[1:-1] + move

@@ -83,14 +83,13 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
     used; jumps, and what is held at an end of a variable, are left out.
     """
     phi, change, is_seen = model.rows_of(known, z, u)
-    if not is_seen.any():
-        return state
-    rest, is_jump = model.residuals(known, z, u, state.unit), model.are_jumps(z, state.unit)
+    m = len(state.unit)
+    rest = model.disturbed(known, z, u, state.unit)[:, :m]
     after, rests = z[2:], z[2:] == z[1:-1]
     to, is_known = z[1:-1] + phi @ known.weights, bool(state.scale.any())
     is_beyond = np.abs(to - after) > state.scale if is_known else rests.mean(0) <= _MOSTLY
     is_held = rests & _held(state, to, after).any(0) & is_beyond
-    weight = np.where(is_jump | is_held.any(1), 0.0, 1.0)
+    weight = np.where(model.are_jumps(z, state.unit) | is_held.any(1), 0.0, 1.0)
     if is_known:
         off = np.abs(rest) / np.maximum(state.scale, model.FLOOR * state.unit + 1e-300)
         is_new = (used_at(u[1:], state.choices) & (state.used < settings.rare)).any((1, 2))
@@ -109,7 +108,7 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
     if (here := is_moving.any(1)).sum() < _FEWEST_CHANGES:
         return state
     now = model_of(state, settings)
-    rest = np.abs(model.residuals(now, z, u, state.unit))
+    rest = np.abs(model.disturbed(now, z, u, state.unit)[:, :m])
     size = [
         1.4826 * np.median(r[h]) if h.sum() >= _FEWEST_CHANGES else 0.0
         for r, h in zip(rest.T, is_moving.T, strict=True)
@@ -210,22 +209,24 @@ def _drifted(
         doubt=doubt,
         since=np.where(doubt > 0.0, state.since, float(n)),
     )
-    new_drifters = np.flatnonzero(doubt > settings.drift)
-    drifters = np.unique(np.append(new_drifters, state.drifts[young, 0])).astype(int)
-    if not len(drifters):
+    is_new = doubt > settings.drift
+    drifts = is_new.copy()
+    drifts[state.drifts[young, 0].astype(int)] = True
+    if not drifts.any():
         return state
-    products, doubt, since = state.products.copy(), doubt.copy(), state.since.copy()
-    least, most = state.least.copy(), state.most.copy()
+    products = state.products.copy()
     weights = known.weights + _correction(state, known)
-    products[:, drifters] = state.squares @ weights[:, drifters]
+    products[:, drifts] = state.squares @ weights[:, drifts]
     moves = np.where(model.jumps(moves, state.unit) | ~np.isfinite(moves), 0.0, moves)
-    least[new_drifters], most[new_drifters] = moves.min(0)[new_drifters], moves.max(0)[new_drifters]
-    drifts = np.vstack([state.drifts, *[[j, since[j], n] for j in new_drifters]])
-    doubt[drifters], since[drifters] = 0.0, float(n)
     state = state._replace(
-        drifts=drifts, products=products, doubt=doubt, since=since, least=least, most=most
+        products=products,
+        least=np.where(is_new, moves.min(0), state.least),
+        most=np.where(is_new, moves.max(0), state.most),
+        drifts=np.vstack([state.drifts, *[[j, state.since[j], n] for j in np.flatnonzero(is_new)]]),
+        doubt=np.where(drifts, 0.0, doubt),
+        since=np.where(drifts, float(n), state.since),
     )
-    return _anew(state, settings) if len(new_drifters) else state
+    return _anew(state, settings) if is_new.any() else state
 
 
 def _anew(state: State, settings: LearntSettings) -> State:

@@ -7,20 +7,11 @@ from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.guard.harm import OUTCOMES, SETTINGS
-from evofsm.guard.learnt import failure, model
+from evofsm.guard.learnt import failure, model, rollout
 from evofsm.guard.learnt.failure import HELD, ONE, OTHER, SAYS, B, I, J, Survived
-from evofsm.guard.learnt.rollout import (
-    CRASHES,
-    DEAD,
-    FAILS,
-    Floats,
-    Model,
-    n_features,
-    refuse_too_many,
-)
+from evofsm.guard.learnt.rollout import CRASHES, DEAD, FAILS, Floats, Model
 from evofsm.store import COUNT, FROM_1, SHARE, SIZE, SMALLEST, Kind, Numbers
 
 #: From an observation and an encoded action (a,) to the observation a decision later.
@@ -35,109 +26,59 @@ _BOUNDS = Numbers(least=-np.inf, most=np.inf)
 class LearntSettings:
     """Numbers of the learnt judge.
 
-    Parameters
-    ----------
-    n_disturbances, n_situations : int
-        Disturbances that are remembered, and situations on which these and backups are tried.
-    n_asked : int
-        Backups that are asked in a decision; of more than 12 variables 2.
-    n_linear, n_mutants, n_regulators : int
-        Linear backups, and mutants and, where actions are a box, regulators that are tried after an
-        episode.
-    n_starts : int
-        Steps of an episode in which a disturbance may begin, at most.
-    max_failures, max_survived : int
-        Observations in which it failed, and that were survived, of which it is learnt; of the
-        latter every second one is left out where there are more.
-    margin, margin_max : float
-        What has to be left of the distance to failure, at first and at most [typical steps].
-    margin_fade : float
-        The share of the margin that is left an episode later.
-    margin_step, violation_rate : float
-        What a violated certificate adds to the margin, which is also the least one [typical
-        steps], and for which share of decisions (adaptive conformal inference, Gibbs & Candes
-        2021).
-    caution, caution_max, caution_again : float
-        Disturbances are taken to be harder than they were by ``caution`` over the number of
-        episodes; by the others at most, at first and after the system changed: a change half as
-        large again as any there was has no sequel.
-    horizon, horizon_min, horizon_max : int
-        How far it looks ahead: at first, at least and at most [steps].
-    ahead : float
-        It looks so many times as far as it takes to fail.
-    latest, refuted : float
-        Of the time that it takes to fail, what is left an episode later, and after one that went on
-        from where nothing seemed to help.
-    tries, alike : float
-        Where backups are alike up to such a share of the horizon, an action that was used less
-        often is tried.
-    prior, shy, lags : float
-        By how many observations weights are held to 0, those of bends and products, and so many
-        times more those of the latest change and the action before.
-    misled : float
-        Those are left out where they foresaw failures that did not come: from so much on that was
-        missed more with them [ln(1 + square in typical steps)].
-    outlier : float
-        From so many scales on residuals weigh less (Huber 1964).
-    rare : int
-        But not of an action at an end of its range that was used less often.
-    drift, drift_fade : float
-        It moves otherwise from so much gained log likelihood on (Page 1954); of the latest episodes
-        what is left an episode later.
-    refused, patience, again, settled : float
-        What refuses more than this share of proposals, in so many episodes without failure, is
-        doubted: while it learns its smallest rival is tried, ``again`` times as late each time that
-        was wrong. After so many episodes without failure in which it was tried it counts, also
-        frozen; so long thresholds count, frozen, that fewer forms took the place of.
-    work, work_rate : float
-        Products in the rollouts of a decision at most: altogether, and in a second of the interval.
-
-    Notes
-    -----
     They were chosen on the systems of the studies, with other draws than those that results are
     given of.
     """
 
-    n_disturbances: int = 10
-    n_situations: int = 32
-    n_asked: int = 3
-    n_linear: int = 3
-    n_mutants: int = 40
-    n_regulators: int = 4
-    n_starts: int = 100
-    max_failures: int = 200
-    max_survived: int = 8000
-    margin: float = 3.0
-    margin_max: float = 8.0
-    margin_fade: float = 0.9
+    n_disturbances: int = 10  #: disturbances that are remembered
+    n_situations: int = 32  #: situations on which disturbances and backups are tried
+    n_asked: int = 3  #: backups that are asked in a decision; of more than 12 variables 2
+    n_linear: int = 3  #: linear backups
+    n_mutants: int = 40  #: backups that are tried after an episode
+    n_regulators: int = 4  #: and those beside them where actions are a box
+    n_starts: int = 100  #: steps of an episode in which a disturbance may begin, at most
+    max_failures: int = 200  #: observations in which it failed, of which it is learnt
+    max_survived: int = 8000  #: and that were survived: of more every second one is left out
+    margin: float = 3.0  #: what has to be left of the distance to failure at first [typical steps]
+    margin_max: float = 8.0  #: and at most
+    margin_fade: float = 0.9  #: the share of the margin that is left an episode later
+    #: what a violated certificate adds to it, and the least margin [typical steps] ...
     margin_step: float = 0.25
+    #: ... for which share of decisions (adaptive conformal inference, Gibbs & Candes 2021)
     violation_rate: float = 0.001
+    #: how much harder disturbances are taken to be than they were, over the number of episodes ...
     caution: float = 4.0
-    caution_max: float = 2.0
+    caution_max: float = 2.0  #: ... by so much at most, at first
+    #: and after the system changed: a change half as large again as any there was has no sequel
     caution_again: float = 0.44
-    horizon: int = 64
-    horizon_min: int = 32
-    horizon_max: int = 144
-    ahead: float = 1.5
-    latest: float = 0.98
-    refuted: float = 0.8
-    tries: int = 8
-    alike: float = 0.02
-    prior: float = 0.01
-    shy: float = 20.0
-    lags: float = 10.0
+    horizon: int = 64  #: how far it looks ahead at first [steps]
+    horizon_min: int = 32  #: at least
+    horizon_max: int = 144  #: at most
+    ahead: float = 1.5  #: it looks so many times as far as it takes to fail
+    latest: float = 0.98  #: of the time that it takes to fail, what is left an episode later
+    refuted: float = 0.8  #: and after one that went on from where nothing seemed to help
+    tries: int = 8  #: an action that was used less often is tried ...
+    alike: float = 0.02  #: ... where backups are alike up to such a share of the horizon
+    prior: float = 0.01  #: by how many observations weights are held to 0
+    shy: float = 20.0  #: and those of bends and products
+    lags: float = 10.0  #: so many times more those of the latest change and the action before
+    #: which are left out from so much on that was missed more with them where failures that they
+    #: foresaw did not come [ln(1 + square in typical steps)]
     misled: float = 1.0
-    outlier: float = 4.0
-    rare: int = 30
-    drift: float = 30.0
-    drift_fade: float = 0.95
-    refused: float = 0.1
+    outlier: float = 4.0  #: from so many scales on residuals weigh less (Huber 1964)
+    rare: int = 30  #: but not of an action at an end of its range that was used less often
+    drift: float = 30.0  #: gained log likelihood from which on it moves otherwise (Page 1954)
+    drift_fade: float = 0.95  #: of the latest episodes, what is left an episode later
+    refused: float = 0.1  #: forms that refuse more than this share of proposals ...
+    #: ... in so many episodes without failure are doubted: a rival is tried while it learns
     patience: int = 6
-    again: int = 2
+    again: int = 2  #: so many times as late each time that this was wrong
+    #: episodes without failure from which on a rival that was tried counts frozen, too; so long
+    #: thresholds count, frozen, that fewer forms took the place of
     settled: int = 20
-    longer: float = 0.002
-    work: float = 7e6
-    work_rate: float = 8.75e8
+    longer: float = 0.002  #: share of the horizon that who takes over has to last longer
+    work: float = 7e6  #: products in the rollouts of a decision at most
+    work_rate: float = 8.75e8  #: and in a second of the interval
 
 
 class Given(NamedTuple):
@@ -245,7 +186,7 @@ class State(NamedTuple):
         cls, m: int, a: int, choices: int, settings: LearntSettings, horizon: int | None
     ) -> State:
         """Before anything was learnt: zeros, and no rows, but for what is named here."""
-        p, steps = n_features(m, a, box=not choices), settings.horizon_max + 2
+        p, steps = rollout.n_features(m, a, box=not choices), settings.horizon_max + 2
         size = {"m": m, "a": a, "p": p, "policy": 1 + m, "situation": 2 * m + a}
         size |= {"seen": m + a, "steps": steps}
         fields: dict[str, Any] = {
@@ -264,6 +205,16 @@ class State(NamedTuple):
             horizon=settings.horizon if horizon is None else horizon,
             stride=1,
         )
+
+    def disturbance_scale(self, settings: LearntSettings) -> float:
+        """How much harder than they were disturbances are taken to be, while little was seen."""
+        most = settings.caution_again if len(self.drifts) else settings.caution_max
+        return 1.0 + min(most, settings.caution / max(1, self.n_scanned))
+
+    def packed(self) -> tuple[dict[str, Any], dict[str, Floats]]:
+        """Numbers and arrays, by name."""
+        fields = self._asdict()
+        return {name: fields[name] for name in _NUMBERS}, {name: fields[name] for name in _ARRAYS}
 
 
 def sizes(state: State) -> Survived:
@@ -299,12 +250,12 @@ def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
 
 def model_of(state: State, settings: LearntSettings) -> Model:
     """Make what rollouts take."""
-    spread, table = _spread(state), state.forms
+    spread = _spread(state)
     inverse = 1.0 / np.where(spread > 0.0, spread, 1.0)
     lowest = np.where(state.reached[:, 0] >= 2, state.lowest[0], -np.inf)
     highest = np.where(state.reached[:, 1] >= 2, state.highest[0], np.inf)
-    fails = table[:, SAYS] == FAILS
-    for j, sign in table[failure.are_sides(table) & fails][:, [I, B]].tolist():
+    fails = failure.saying(state.forms, FAILS)
+    for j, sign in fails[failure.are_sides(fails)][:, [I, B]].tolist():
         (lowest if sign < 0.0 else highest)[int(j)] = sign * np.inf  # nothing is held there
     typical = 1.25 * float(np.sqrt(np.mean((state.unit * inverse) ** 2))) if len(spread) else 1.0
     share = state.noise / np.where(state.power > 0.0, state.power, 1.0)
@@ -347,6 +298,36 @@ def residuals_of(state: State, known: Model, steps: int) -> Floats:
     return model.trimmed(residuals)
 
 
+class Parts(NamedTuple):
+    """What decides, made of a state."""
+
+    model: Model
+    daring: Model  #: while it learns
+    residuals: Floats  #: (H, m, 1 + K) of disturbances; number 0 is none
+    scale: float  #: how much harder than they were disturbances are taken to be
+    n_asked: int  #: backups that a search asks
+    n_tried: int  #: and while a rival is tried, by which another may save
+    n_judged: int  #: and those by which a risk is found
+    most: float  #: steps of rollouts after which a search is cut short
+
+    @classmethod
+    def of(cls, state: State, settings: LearntSettings, dt: float) -> Parts | None:
+        """Make them; None as long as there are no backups."""
+        if not len(state.policies):
+            return None
+        motion = model_of(state, settings)
+        daring_model = motion._replace(forms=forms_of(state, settings, daring=True))
+        residuals = residuals_of(state, motion, state.horizon)
+        few = settings.n_asked if len(rollout.pairs(len(state.origin))[0]) else 2
+        cost = (motion.weights.size + motion.dead_ends.size) * residuals.shape[2]
+        most = max(min(settings.work, settings.work_rate * dt) / cost, few * state.horizon)
+        n_judged = 1 if most < 2 * few * state.horizon else few
+        n_policies = len(state.policies)
+        n_tried = few if state.held >= 0 or most < n_policies * state.horizon else n_policies
+        scale = state.disturbance_scale(settings)
+        return cls(motion, daring_model, residuals, scale, few, n_tried, n_judged, most)
+
+
 # -- In a file -----------------------------------------------------------------------------------
 
 # What a field holds: its type, and which numbers.
@@ -373,29 +354,18 @@ KIND = Kind(
 )
 
 
-def packed(state: State) -> tuple[dict[str, Any], dict[str, Floats]]:
-    """Numbers and arrays of a state, by name."""
-    fields = state._asdict()
-    return {name: fields[name] for name in _NUMBERS}, {name: fields[name] for name in _ARRAYS}
-
-
 def unpacked(
-    numbers: Mapping[str, Any],
-    arrays: Mapping[str, NDArray[Any]],
-    choices: int,
-    size: int,
-    settings: LearntSettings,
+    numbers: Mapping[str, Any], arrays: Mapping[str, Any], blank: State, settings: LearntSettings
 ) -> State:
-    """Make a state of what `packed` gave.
+    """Make a state of what `State.packed` gave, of actions as of a ``blank`` one.
 
     A ValueError if sizes or indices contradict each other, or the actions: kernels trust them.
     """
-    fields: dict[str, Any] = {**numbers, **{name: arrays[name] for name in _ARRAYS}}
-    state = State(**fields)
-    m, a = len(state.origin), len(state.used)
-    if (state.choices, a) != (choices, size):
-        raise ValueError(f"it is of actions of {a} numbers, but they have {size}")
-    refuse_too_many(m, a, box=not choices)
+    state = State(**numbers, **{name: arrays[name] for name in _ARRAYS})
+    m, a, choices = len(state.origin), len(state.used), state.choices
+    if (choices, a) != (blank.choices, len(blank.used)):
+        raise ValueError(f"it is of actions of {a} numbers, but they have {len(blank.used)}")
+    rollout.refuse_too_many(m, a, box=not choices)
     for name, array in State.none(m, a, choices, settings, None)._asdict().items():
         shape, rows = np.shape(getattr(state, name)), int(name != "squares")
         if shape[rows:] != np.shape(array)[rows:]:
