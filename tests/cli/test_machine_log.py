@@ -62,10 +62,7 @@ def written(pump):
     return write
 
 
-@pytest.mark.parametrize(
-    "form",
-    ["titles", "units", "american", "parquet", "codes"],
-)
+@pytest.mark.parametrize("form", ["titles", "units", "american", "parquet", "codes"])
 def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, written, form):
     path = written(form)
     first = evofsm("learn", path)

@@ -8,13 +8,7 @@ pytest.importorskip("scipy")
 from evofsm.driving.cars import TOLD, guard_for_cars, guard_for_family, learners_of, name_judge
 from evofsm.driving.family import held_out, load_family
 from evofsm.driving.judge import LatentRisk
-from evofsm.driving.trials import (
-    drive,
-    outcome_of,
-    reference_of,
-    summarise,
-    unrevised_guard,
-)
+from evofsm.driving.trials import drive, outcome_of, reference_of, summarise, unrevised_guard
 from evofsm.guard.learnt.judge import LearntRisk
 
 pytestmark = pytest.mark.usefixtures("compiled")

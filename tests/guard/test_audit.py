@@ -15,13 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from evofsm import IntervalActions
-from evofsm.driving import (
-    EnvelopeReviser,
-    LatentRisk,
-    Unrevised,
-    guard_for_cars,
-    measures,
-)
+from evofsm.driving import EnvelopeReviser, LatentRisk, Unrevised, guard_for_cars, measures
 from evofsm.guard import ActionReviser, AuditLog, Guard, Head, Mode, audit, audit_log
 from evofsm.guard.audit_log import NOTHING, Chain, canonical, seal, unseal
 

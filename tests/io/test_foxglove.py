@@ -125,10 +125,7 @@ def test_a_full_disk_is_told(monkeypatch):
     )
     monkeypatch.setattr("evofsm.io.foxglove.io", full)
     guard = guard_for_cars(low=-4.0, high=2.5)
-    with (
-        pytest.raises(OSError, match="No space"),
-        FoxgloveSink(None, "any") as guard.audit,
-    ):
+    with pytest.raises(OSError, match="No space"), FoxgloveSink(None, "any") as guard.audit:
         drive(guard, Scenario(LEADER, 8.0, duration=60.0), controller=HASTY)
 
 

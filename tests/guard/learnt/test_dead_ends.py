@@ -53,10 +53,10 @@ def test_where_a_certificate_was_refuted_is_a_dead_end_that_is_named_and_kept_aw
     assert "that had been certified failed. Its centre is in #" in explained[-1]
 
 
-@pytest.mark.parametrize(("held", "learns"), [(0, True), (-1, False)])
-def test_a_failure_while_a_rival_is_tried_refutes_that_and_no_certificate(held, learns):
+@pytest.mark.parametrize(("n_doubted", "learns"), [(0, True), (-1, False)])
+def test_a_failure_while_a_rival_is_tried_refutes_that_and_no_certificate(n_doubted, learns):
     guard = taught(times=0)
-    guard.judge.state = guard.judge.state._replace(held=held)
+    guard.judge.state = guard.judge.state._replace(n_doubted=n_doubted)
     guard.judge.remake()
     assert play(guard, ICE, 10)[1]
     assert bool(len(guard.judge.state.centres)) == learns

@@ -91,3 +91,14 @@ def test_a_side_on_which_episodes_fail_is_never_a_saturation():
     assert judge.state.reached[0, 0] >= 2
     assert judge.told_by_experience.startswith("fails where variable 1 is below 0")
     assert judge.parts.model.lowest[0] == -np.inf
+
+
+def test_a_flag_that_comes_and_goes_leaves_what_is_learnt_of_others():
+    draw = np.random.default_rng(3)
+    plain, flagged = LearntRisk(0.25, -2.5, 2.5), LearntRisk(0.25, -2.5, 2.5)
+    for braking in (None, 60, None, 60):
+        Z, U = drive(draw, braking=braking)
+        follow(plain, Z, U)
+        follow(flagged, np.column_stack([Z, draw.random(len(Z)) < 0.5]), U)
+    rows, of_flagged = plain.state.squares[0, 0], flagged.state.squares[0, 0]
+    assert of_flagged > 0.9 * rows

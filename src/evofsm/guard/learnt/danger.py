@@ -13,7 +13,7 @@ import numpy as np
 
 from evofsm.guard.learnt import failure, model
 from evofsm.guard.learnt.failure import HELD, B, I, Survived
-from evofsm.guard.learnt.rollout import CRASHES, DEAD, ENDS, FAILS, Floats, Model
+from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, FATAL, Floats, Model
 from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State, sizes
 
 # Episodes of which the end tells where there are any; observations so near the last one [typical
@@ -72,26 +72,26 @@ def _explained(state: State, settings: LearntSettings, *, failed: bool, bends: b
     if len(state.ended) >= _ENDED:
         table = _endings(state, table, survival)
     failures = state.failures[~failure.crashed(table, state.failures)]
-    blur = np.where(state.reached < 2, state.scale[:, None], 0.0)
+    noise = np.where(state.reached < 2, state.scale[:, None], 0.0)
     survival = survival._replace(rows=np.concatenate([survival.rows, state.ended]))
     was = failure.saying(table, FAILS)
     are_sides = failure.are_sides(was)
     bent = failure.without(was[~are_sides], survival.rows)
-    sides = failure.explain(FAILS, failures, survival, blur, bends=False)
+    sides = failure.explain(FAILS, failures, survival, noise, bends=False)
     if len(bent):  # others come with other bent forms
         sides = sides[failure.among(sides, was[are_sides])]
     rows = np.concatenate([sides, bent])
     is_told = not len(failures) or failure.inside(rows, failures).any(0).all()
     if bends and (failed or not is_told):
-        rows = failure.explain(FAILS, failures, survival, blur)
+        rows = failure.explain(FAILS, failures, survival, noise)
     rows = failure.counted(rows, failures)
     state = state._replace(dropped=_dropped(state, was, rows, survival, settings))
-    ends, dead = failure.saying(table, ENDS, CRASHES), failure.saying(table, DEAD)
-    forms = np.concatenate([ends, rows, dead])
-    if state.held < 0 and failed and not _foreseen(state, table, survival):
-        return state._replace(forms=forms, held=0, wrong=state.wrong + 1)
-    has_changed = state.held >= 0 and (failed or _shape(was) != _shape(rows))
-    return state._replace(forms=forms, held=0 if has_changed else state.held)
+    ends, fatal = failure.saying(table, ENDS, CRASHES), failure.saying(table, FATAL)
+    forms = np.concatenate([ends, rows, fatal])
+    if state.on_trial and failed and not _foreseen(state, table, survival):
+        return state._replace(forms=forms, n_doubted=0, wrong=state.wrong + 1)
+    has_changed = not state.on_trial and (failed or _shape(was) != _shape(rows))
+    return state._replace(forms=forms, n_doubted=0 if has_changed else state.n_doubted)
 
 
 def _dropped(
@@ -133,7 +133,7 @@ def _endings(state: State, table: Floats, known: Survived) -> Floats:
     crashes = failure.crashing(failed, endings, known, *set(rows[:, I].astype(int).tolist()))
     is_crash = failure.inside(crashes, state.failures, 0.0).any(0)
     rows = failure.without(rows, state.failures[at_end & ~is_crash])
-    return np.concatenate([rows, crashes, failure.saying(table, FAILS, DEAD)])
+    return np.concatenate([rows, crashes, failure.saying(table, FAILS, FATAL)])
 
 
 def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> State:
@@ -210,12 +210,12 @@ def dead_ends(state: State, known: Model, z: Floats, episode: Episode, before: F
     return state._replace(centres=centres[index], radii=radii[index], counts=counts[index])
 
 
-def barred(state: State) -> State:
+def fatal_sides(state: State) -> State:
     """Learn beyond which ends of what was survived began what nothing survives (`State.fatal`)."""
     went_on = state.survived[state.proven > 0.0]
     if not len(state.fatal) or not len(went_on):
         return state
-    ends = failure.explain(DEAD, state.fatal, failure.boxed(sizes(state), went_on), bends=False)
+    ends = failure.explain(FATAL, state.fatal, failure.boxed(sizes(state), went_on), bends=False)
     rest = failure.saying(state.forms, FAILS, ENDS, CRASHES)
     return state._replace(forms=np.concatenate([rest, failure.nearer(ends, state.fatal, 1.0)]))
 

@@ -19,7 +19,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evofsm.guard.learnt.rollout import CRASHES, DEAD, ENDS, FAILS, FLAT, GROWN, Flags, Floats, Ints
+from evofsm.guard.learnt.rollout import (
+    CRASHES,
+    ENDS,
+    FAILS,
+    FATAL,
+    FLAT,
+    GROWN,
+    Flags,
+    Floats,
+    Ints,
+)
 
 #: Columns of a form: what it says, variables i and j, from where each is counted, the inverse of
 #: its unit, coefficients of 1, x, y, x x, x y, y y; how many failures it holds.
@@ -34,8 +44,9 @@ _FEW_FAILURES, _SHARE, _FEW_SIDES = 3, 0.25, 4
 # So many failures may leave two sides undecided.
 _MOST_UNDECIDED = 2
 # Beyond an end is what is so many typical steps beyond; blurred ends are so wide [scales], unless
-# a scale is a larger share of the spread: a variable that is noise alone explains no failure.
-_BEYOND, _BLURRED, _NOISY = 1e-12, 5.0, 0.5
+# a scale is a larger share of the spread, as of noise alone, or what was survived is at the end
+# in a larger share, as of a flag: by noise these explain no failure.
+_BEYOND, _BLURRED, _NOISY, _PILED = 1e-12, 5.0, 0.5, 0.05
 # Survived observations of a fit; steps of Newton, and the ridge for each of them.
 _FIT_ROWS, _NEWTON, _RIDGE = 400, 40, 1e-9
 # Fits of what explains failures with more likelihood than this each; how many survived ones that
@@ -169,7 +180,7 @@ def rivals(table: Floats, failures: Floats, survived: Survived) -> Floats:
         rare = _rare(failures[at_end], survived, *ends[:, I].astype(int).tolist())
         crashes = rare if len(rare) else crashes
     # What crashes is told of the ends just before it: others come behind.
-    return np.array([*rows, *ends, *crashes, *saying(table, DEAD)]).reshape(-1, SIZE)
+    return np.array([*rows, *ends, *crashes, *saying(table, FATAL)]).reshape(-1, SIZE)
 
 
 def _ellipses(row: Floats, held: Floats, survived: Survived) -> list[Floats]:
@@ -268,20 +279,21 @@ def explain(
     says: int,
     failures: Floats,
     survived: Survived,
-    blur: Floats | None = None,
+    noise: Floats | None = None,
     least: float = 0.0,
     *,
     bends: bool = True,
 ) -> Floats:
     """Fit the fewest forms (r, SIZE) that hold what failed, or ended (k, m), as it ``says``.
 
-    What was survived is outside; noise may ``blur`` the lowest and the highest of it by scales
-    (m, 2). Sides that some failures are beyond by ``least`` [typical steps] come first. Where forms
-    may be bent (``bends``), sides that explain few may go if bent forms explain the same failures;
-    and all of them, if bent forms alone explain all and are fewer.
+    What was survived is outside. Of sides, ``noise`` may have blurred the lowest and the highest of
+    it by scales (m, 2); bent forms are blurred by `BLUR`. Sides that some failures are beyond by
+    ``least`` [typical steps] come first. Where forms may be bent (``bends``), sides that explain
+    few may go if bent forms explain the same failures; and all of them, if bent forms alone explain
+    all and are fewer.
     """
-    blur = np.zeros((len(survived.unit), 2)) if blur is None else blur
-    stay = _sides(says, failures, survived, blur, least)
+    noise = np.zeros((len(survived.unit), 2)) if noise is None else noise
+    stay = _sides(says, failures, survived, noise, least)
     by, k = inside(stay, failures), len(failures)
     if not bends or by.any(0).all() or not len(survived.rows) or not k:
         return counted(stay, failures)
@@ -297,7 +309,7 @@ def explain(
     return counted(np.concatenate([stay[keep], bent]), failures)
 
 
-def _sides(says: int, failures: Floats, survived: Survived, blur: Floats, least: float) -> Floats:
+def _sides(says: int, failures: Floats, survived: Survived, noise: Floats, least: float) -> Floats:
     """The fewest ends of the box of what was survived that explain failures.
 
     Of two that explain the first ones alike both hold until another failure tells them apart. A
@@ -315,7 +327,9 @@ def _sides(says: int, failures: Floats, survived: Survived, blur: Floats, least:
     )
     with np.errstate(over="ignore"):  # of a variable that never changed it is far enough
         beyond = far / np.tile(unit, 2)
-    wide = _BLURRED * np.where(blur < _NOISY * survived.spread[:, None], blur, 0.0)
+    at_ends = np.array([survived.rows <= survived.lowest[0], survived.rows >= survived.highest[0]])
+    is_blurred = (noise < _NOISY * survived.spread[:, None]) & (at_ends.mean(1).T < _PILED)
+    wide = _BLURRED * np.where(is_blurred, noise, 0.0)
     perhaps = (far > -wide.T.ravel()) | ((again > 0.0) & np.isfinite(again))
     is_open = np.ones(len(failures), bool)
     thresholds: dict[int, float] = {}

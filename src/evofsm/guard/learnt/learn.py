@@ -10,7 +10,7 @@ from numpy.random import Generator
 
 from evofsm.guard.learnt import danger, failure, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups, fitted
-from evofsm.guard.learnt.rollout import DEAD, FAILS, Flags, Floats, Ints, Model, value_of
+from evofsm.guard.learnt.rollout import FAILS, FATAL, Flags, Floats, Ints, Model, value_of
 from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State, model_of, residuals_of
 
 # Actions of an episode that says how a system moves, at least, if three observations in a row were
@@ -32,7 +32,8 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     decisions, before, settings, without = episode, state, given.settings, given.without
     rows = model.filled(episode.observations, failed=episode.failed)
     decisions = decisions._replace(observations=rows)
-    if -settings.settled <= state.held < 0:  # what a rival certified says nothing of the model
+    # What a rival certified says nothing of the model.
+    if state.on_trial and not state.is_settled(settings):
         decisions = decisions._replace(certified=np.zeros(len(decisions.certified)))
     episode = decisions.every(state.stride)
     random = np.random.default_rng([given.seed, state.n_episodes])
@@ -82,6 +83,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     if looks and given.horizon is None:
         # A certified episode failed later than it looks ahead, and it looks as far as it may.
         if late(episode) > state.horizon >= int(farthest(motion_model, settings)):
+            # All of above is learnt anew of what was before, in steps twice as long.
             decisions = decisions._replace(fails_after=0.5 * decisions.fails_after)
             return learn(coarser(before, settings), decisions, given)
         state = look_ahead(state, motion_model, rest, episode, settings)
@@ -100,12 +102,12 @@ def doubted(state: State, episode: Episode, settings: LearntSettings, *, tried: 
 
     An episode speaks for rivals only if it was where they allow what forms refuse (``tried``).
     """
-    if state.held < 0:
-        return state._replace(held=state.held - (tried and not episode.failed))
+    if state.on_trial:
+        return state._replace(n_doubted=state.n_doubted - (tried and not episode.failed))
     much = episode.refused.sum() > settings.refused * len(episode.actions)
-    count = state.held + bool(much and not episode.failed)
+    count = state.n_doubted + bool(much and not episode.failed)
     patience = settings.patience * settings.again**state.wrong
-    return state._replace(held=-1 if count >= patience else count)
+    return state._replace(n_doubted=-1 if count >= patience else count)
 
 
 # -- Disturbances ---------------------------------------------------------------------------------
@@ -204,8 +206,8 @@ def _fatal(
     rows = state.windows[fatal, (size >= _ONSET * size.max(0)).argmax(0), :m]
     is_new = ~(rows[:, None] == state.fatal).all(2).any(1)
     fatal_rows = np.concatenate([state.fatal, rows[is_new]])[-settings.max_failures :]
-    state = danger.barred(state._replace(fatal=fatal_rows))
-    within = failure.inside(failure.saying(state.forms, DEAD), rows).any(0)
+    state = danger.fatal_sides(state._replace(fatal=fatal_rows))
+    within = failure.inside(failure.saying(state.forms, FATAL), rows).any(0)
     keep = np.setdiff1d(np.arange(len(state.windows)), fatal[within])
     return _kept(state, keep), found[:, :, np.append(0, 1 + keep)]
 

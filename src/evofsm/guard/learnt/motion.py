@@ -88,7 +88,9 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
     after, rests = z[2:], z[2:] == z[1:-1]
     to, is_known = z[1:-1] + phi @ known.weights, bool(state.scale.any())
     is_beyond = np.abs(to - after) > state.scale if is_known else rests.mean(0) <= _MOSTLY
-    is_held = rests & _held(state, to, after).any(0) & is_beyond
+    at_ends = np.array([after <= state.lowest[0], after >= state.highest[0]])
+    is_flag = at_ends.any(0).all(0) & at_ends.any(1).all(0)  # it is nowhere else
+    is_held = rests & _held(state, to, after).any(0) & is_beyond & ~is_flag
     weight = np.where(model.are_jumps(z, state.unit) | is_held.any(1), 0.0, 1.0)
     if is_known:
         off = np.abs(rest) / np.maximum(state.scale, model.FLOOR * state.unit + 1e-300)

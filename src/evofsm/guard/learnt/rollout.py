@@ -34,7 +34,7 @@ MAX_PRODUCTS = 80
 _MAX_VARIABLES, _MAX_FEATURES = 64, 256
 #: What a form says of where it is above 0: that it fails there, that an episode ends by itself, or
 #: that it fails where it ends, or that what begins there is fatal.
-FAILS, ENDS, CRASHES, DEAD = 0, 1, 2, 3
+FAILS, ENDS, CRASHES, FATAL = 0, 1, 2, 3
 #: The square of a gradient that is none: a form that does not change is far from 0.
 FLAT = 1e-300
 #: Bent forms of failure reach so much farther than they were learnt, and where it ends by itself

@@ -11,7 +11,7 @@ import numpy as np
 from evofsm.guard.harm import OUTCOMES, SETTINGS
 from evofsm.guard.learnt import failure, model, rollout
 from evofsm.guard.learnt.failure import HELD, ONE, OTHER, SAYS, B, I, J, Survived
-from evofsm.guard.learnt.rollout import CRASHES, DEAD, FAILS, Floats, Model
+from evofsm.guard.learnt.rollout import CRASHES, FAILS, FATAL, Floats, Model
 from evofsm.store import COUNT, FROM_1, SHARE, SIZE, SMALLEST, Kind, Numbers
 
 #: From an observation and an encoded action (a,) to the observation a decision later.
@@ -154,8 +154,8 @@ class State(NamedTuple):
     #: thresholds that fewer forms took the place of, for so many episodes more (``HELD``)
     dropped: Annotated[Floats, Numbers(("dropped", failure.SIZE))]
     differs: Annotated[float, SHARE]  #: of what was asked, where a given function says otherwise
-    #: episodes without failure in which much was refused; below 0 those of doubt
-    held: Annotated[int, COUNT._replace(least=-COUNT.most)]
+    #: episodes without failure in which much was refused; below 0 those in which a rival was tried
+    n_doubted: Annotated[int, COUNT._replace(least=-COUNT.most)]
     wrong: Annotated[int, COUNT]  #: how often a rival was wrong
     misled: Annotated[float, _ABOVE_0]  #: how much more was missed with lags than without
     # dead ends
@@ -206,6 +206,15 @@ class State(NamedTuple):
             stride=1,
         )
 
+    @property
+    def on_trial(self) -> bool:
+        """Whether its forms are doubted: while it learns rivals are tried."""
+        return self.n_doubted < 0
+
+    def is_settled(self, settings: LearntSettings) -> bool:
+        """Whether rivals were tried for so long without a failure that they count, also frozen."""
+        return self.n_doubted < -settings.settled
+
     def disturbance_scale(self, settings: LearntSettings) -> float:
         """How much harder than they were disturbances are taken to be, while little was seen."""
         most = settings.caution_again if len(self.drifts) else settings.caution_max
@@ -241,7 +250,7 @@ def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
         crash = table[:, SAYS] == CRASHES
         table = table.copy()
         table[crash] = failure.nearer(table[crash], state.failures, 0.5)
-    if state.held < (0 if daring else -settings.settled):
+    if state.on_trial and (daring or state.is_settled(settings)):
         table = failure.rivals(table, state.failures, sizes(state))
     if not daring:
         table = np.concatenate([table, state.dropped])
@@ -249,7 +258,7 @@ def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
 
 
 def model_of(state: State, settings: LearntSettings) -> Model:
-    """Make what rollouts take."""
+    """Make what rollouts take; weights are solved of the sums each time."""
     spread = _spread(state)
     inverse = 1.0 / np.where(spread > 0.0, spread, 1.0)
     lowest = np.where(state.reached[:, 0] >= 2, state.lowest[0], -np.inf)
@@ -323,7 +332,7 @@ class Parts(NamedTuple):
         most = max(min(settings.work, settings.work_rate * dt) / cost, few * state.horizon)
         n_judged = 1 if most < 2 * few * state.horizon else few
         n_policies = len(state.policies)
-        n_tried = few if state.held >= 0 or most < n_policies * state.horizon else n_policies
+        n_tried = few if not state.on_trial or most < n_policies * state.horizon else n_policies
         scale = state.disturbance_scale(settings)
         return cls(motion, daring_model, residuals, scale, few, n_tried, n_judged, most)
 
@@ -374,7 +383,7 @@ def unpacked(
             )
     forms, steps = np.concatenate([state.forms, state.dropped]), state.windows.shape[1]
     indices = forms[:, [SAYS, I, J]]
-    if ((indices != np.rint(indices)) | (indices < 0.0) | (indices >= [DEAD + 1, m, m])).any():
+    if ((indices != np.rint(indices)) | (indices < 0.0) | (indices >= [FATAL + 1, m, m])).any():
         raise ValueError("forms are of variables that there are not")
     if (forms[:, [ONE, OTHER]] <= 0.0).any() or (forms[:, HELD] < 0.0).any():
         raise ValueError("forms have units that are not positive")

@@ -31,7 +31,7 @@ from evofsm.fsm.validation import counted
 from evofsm.guard.harm import Harm
 from evofsm.guard.learnt import failure
 from evofsm.guard.learnt.failure import HELD, SAYS, I
-from evofsm.guard.learnt.rollout import CRASHES, DEAD, ENDS, FAILS, Floats, Model
+from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, FATAL, Floats, Model
 from evofsm.guard.learnt.state import State, sizes
 
 #: Said as long as there is nothing to judge by.
@@ -51,7 +51,7 @@ _HARDER = 1.05
 # Of more dead ends, those from where most failed are counted.
 _ENDS_SHOWN = 3
 # What was seen in a form, by what it says.
-_WHAT = {FAILS: "failure", CRASHES: "failure", ENDS: "ending", DEAD: "time"}
+_WHAT = {FAILS: "failure", CRASHES: "failure", ENDS: "ending", FATAL: "time"}
 
 
 class Remembered(NamedTuple):
@@ -157,7 +157,7 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
     if state.differs:
         more += f"; failed= says otherwise in {state.differs:.1%} of the states around, where this "
         more += "decides"
-    if state.held < 0:
+    if state.on_trial:
         rivals, *_ = _where(failure.rivals(state.forms, state.failures, sizes(state)), names)
         more += "; much was refused without a failure: while it learns it tries whether it only "
         more += f"fails {' or '.join(rivals)}"
@@ -170,7 +170,7 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
 
 def _where(table: Floats, names: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
     """Where it fails, where it ends by itself, and where nothing survives what begins."""
-    places: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: [], DEAD: []}
+    places: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: [], FATAL: []}
     sides = []
     for row, is_side in zip(table, failure.are_sides(table), strict=True):
         text = region(names, row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])])
@@ -180,7 +180,7 @@ def _where(table: Floats, names: Sequence[str]) -> tuple[list[str], list[str], l
             places[int(row[SAYS])].append(text)
     there = [f"where {' or '.join(sides)}"] if sides else []
     there += places[FAILS] + [f"if it ends {place}" for place in places[CRASHES]]
-    return there, places[ENDS], places[DEAD]
+    return there, places[ENDS], places[FATAL]
 
 
 def here(
