@@ -106,11 +106,6 @@ def test_failures_are_explained_by_ends_of_what_was_survived(failures, blur, end
     assert sides(np.array(failures), rows, np.ones(2), blur) == ends
 
 
-def test_a_flag_is_not_blurred():
-    rows = np.column_stack([np.linspace(-1.0, 1.0, 40), np.linspace(-1.0, 1.0, 40) > 0.0])
-    assert sides(np.array([[-0.1, 0.0]]), rows, np.ones(2), EXACT + 0.1) == set()
-
-
 # -- As guards learn them -----------------------------------------------------------------------
 
 

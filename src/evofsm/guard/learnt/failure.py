@@ -44,9 +44,8 @@ _FEW_FAILURES, _SHARE, _FEW_SIDES = 3, 0.25, 4
 # So many failures may leave two sides undecided.
 _MOST_UNDECIDED = 2
 # Beyond an end is what is so many typical steps beyond; blurred ends are so wide [scales], unless
-# a scale is a larger share of the spread, as of noise alone, or what was survived is at the end
-# in a larger share, as of a flag: by noise these explain no failure.
-_BEYOND, _BLURRED, _NOISY, _PILED = 1e-12, 5.0, 0.5, 0.05
+# a scale is a larger share of the spread: a variable that is noise alone explains no failure.
+_BEYOND, _BLURRED, _NOISY = 1e-12, 5.0, 0.5
 # Survived observations of a fit; steps of Newton, and the ridge for each of them.
 _FIT_ROWS, _NEWTON, _RIDGE = 400, 40, 1e-9
 # Fits of what explains failures with more likelihood than this each; how many survived ones that
@@ -327,9 +326,7 @@ def _sides(says: int, failures: Floats, survived: Survived, noise: Floats, least
     )
     with np.errstate(over="ignore"):  # of a variable that never changed it is far enough
         beyond = far / np.tile(unit, 2)
-    at_ends = np.array([survived.rows <= survived.lowest[0], survived.rows >= survived.highest[0]])
-    is_blurred = (noise < _NOISY * survived.spread[:, None]) & (at_ends.mean(1).T < _PILED)
-    wide = _BLURRED * np.where(is_blurred, noise, 0.0)
+    wide = _BLURRED * np.where(noise < _NOISY * survived.spread[:, None], noise, 0.0)
     perhaps = (far > -wide.T.ravel()) | ((again > 0.0) & np.isfinite(again))
     is_open = np.ones(len(failures), bool)
     thresholds: dict[int, float] = {}

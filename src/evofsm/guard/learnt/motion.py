@@ -25,6 +25,8 @@ _FEWEST_CHANGES, _LATEST = 5, 0.2
 # A variable that rests in more of the steps, such as a contact, is not held at an end as long as
 # nothing is known.
 _MOSTLY = 0.5
+# What rests in fewer of the steps, and is at one end or the other, is a flag.
+_RARELY = 0.9
 # What rests at an end, and was expected to go on by so many scales, is held there.
 _STOPS = 4.0
 # Episodes before it may move otherwise, and after it did, in which it is learnt how; transitions
@@ -88,8 +90,8 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
     after, rests = z[2:], z[2:] == z[1:-1]
     to, is_known = z[1:-1] + phi @ known.weights, bool(state.scale.any())
     is_beyond = np.abs(to - after) > state.scale if is_known else rests.mean(0) <= _MOSTLY
-    at_ends = np.array([after <= state.lowest[0], after >= state.highest[0]])
-    is_flag = at_ends.any(0).all(0) & at_ends.any(1).all(0)  # it is nowhere else
+    at_ends = (after <= state.lowest[0]) | (after >= state.highest[0])
+    is_flag = at_ends.all(0) & (rests.mean(0) < _RARELY)  # it is nowhere else, and comes and goes
     is_held = rests & _held(state, to, after).any(0) & is_beyond & ~is_flag
     weight = np.where(model.are_jumps(z, state.unit) | is_held.any(1), 0.0, 1.0)
     if is_known:
