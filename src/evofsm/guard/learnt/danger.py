@@ -88,9 +88,9 @@ def _explained(state: State, settings: LearntSettings, *, failed: bool, bends: b
     state = state._replace(dropped=_dropped(state, was, rows, survival, settings))
     ends, fatal = failure.saying(table, ENDS, CRASHES), failure.saying(table, FATAL)
     forms = np.concatenate([ends, rows, fatal])
-    if state.on_trial and failed and not _foreseen(state, table, survival):
+    if state.is_doubted and failed and not _foreseen(state, table, survival):
         return state._replace(forms=forms, n_doubted=0, wrong=state.wrong + 1)
-    has_changed = not state.on_trial and (failed or _shape(was) != _shape(rows))
+    has_changed = not state.is_doubted and (failed or _shape(was) != _shape(rows))
     return state._replace(forms=forms, n_doubted=0 if has_changed else state.n_doubted)
 
 

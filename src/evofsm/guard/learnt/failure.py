@@ -265,10 +265,11 @@ def crashing(failed: Floats, ended: Floats, survived: Survived, *at: int) -> Flo
     """How it fails where it ends: by variables other than those ``at`` which it ends, if it can."""
     alike = failed.copy()
     alike[:, at] = ended[:, at].mean(0)
-    table = explain(CRASHES, alike, boxed(survived, ended), least=1.0)
+    end_box = boxed(survived, ended)
+    table = explain(CRASHES, alike, end_box, least=1.0)
     if inside(table, alike, 0.0).any(0).all():
         return table
-    return explain(CRASHES, failed, boxed(survived, ended), least=1.0)
+    return explain(CRASHES, failed, end_box, least=1.0)
 
 
 # -- Which forms there are ------------------------------------------------------------------------
@@ -470,11 +471,8 @@ def _fitted(F: Floats, asked: Ints, survived: Survived) -> tuple[Floats, Flags, 
     """(c, SIZE) the forms that are asked of failures (k, m); which are inside; and scores."""
     rows, k = survived.rows, len(F)
     pairs, kinds = asked[:, :2], _KINDS[asked[:, 2]]
-    unit, scale, points = (
-        survived.unit[pairs],
-        survived.spread[pairs],
-        F[:, pairs].transpose(1, 0, 2),
-    )
+    unit, scale = survived.unit[pairs], survived.spread[pairs]
+    points = F[:, pairs].transpose(1, 0, 2)
     at = points.mean(1)
     different, of_them = np.unique(pairs, axis=0, return_inverse=True)
     near = [_near(rows[:, pair], F[:, pair], survived.spread[pair]) for pair in different]

@@ -44,7 +44,7 @@ _MAX_CHOICES = 1_000
 _NEVER = -1e300
 
 
-class Outcome(NamedTuple):
+class Consequence(NamedTuple):
     """What comes of an action if the best of some backups follows."""
 
     unsurvived: float  #: disturbances that are not survived; infinite if it fails without any
@@ -291,7 +291,7 @@ class LearntRisk(LearningJudge, SearchingJudge):
             action = action if trial is None else trial
         outcomes = [self._foresee(here, proposal, policies)] if self._refused else []
         if passes and not allowance:  # the search says what is left
-            outcomes.append(Outcome(0.0, slack, 0.0))
+            outcomes.append(Consequence(0.0, slack, 0.0))
         else:
             outcomes.append(self._foresee(here, action, policies))
         self._lost = math.isinf(outcomes[-1].unsurvived)
@@ -329,7 +329,7 @@ class LearntRisk(LearningJudge, SearchingJudge):
         why = words.refused(self._unsurvived, self.remembered, self.margin, scale)
         return words.alone(why) if self.choices == 1 else why
 
-    def _foresee(self, here: Floats, action: Floats, policies: Floats) -> Outcome:
+    def _foresee(self, here: Floats, action: Floats, policies: Floats) -> Consequence:
         """What comes of a situation and an action, by those backups that passed last."""
         assert self.parts is not None
         model, rest = self.parts.model, self.parts.residuals
@@ -338,11 +338,11 @@ class LearntRisk(LearningJudge, SearchingJudge):
         fails = ends[ends < 0.0]
         count = math.inf if ends[0] < 0.0 else float(len(fails))
         steps = len(rest)
-        return Outcome(
+        return Consequence(
             count, float(ends.min()), float(fails.max(initial=-1.0 - steps)) + 1.0 + steps
         )
 
-    def _judged(self, situation: Situation, outcomes: Sequence[Outcome]) -> Judgement:
+    def _judged(self, situation: Situation, outcomes: Sequence[Consequence]) -> Judgement:
         """Of some actions; of the first it is kept why it is dangerous (`why`)."""
         counts = [outcome.unsurvived for outcome in outcomes]
         self._unsurvived = -1 if math.isinf(counts[0]) else int(counts[0])

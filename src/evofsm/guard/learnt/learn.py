@@ -33,7 +33,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     rows = model.filled(episode.observations, failed=episode.failed)
     decisions = decisions._replace(observations=rows)
     # What a rival certified says nothing of the model.
-    if state.on_trial and not state.is_settled(settings):
+    if state.is_doubted and not state.is_settled(settings):
         decisions = decisions._replace(certified=np.zeros(len(decisions.certified)))
     episode = decisions.every(state.stride)
     random = np.random.default_rng([given.seed, state.n_episodes])
@@ -102,7 +102,7 @@ def doubted(state: State, episode: Episode, settings: LearntSettings, *, tried: 
 
     An episode speaks for rivals only if it was where they allow what forms refuse (``tried``).
     """
-    if state.on_trial:
+    if state.is_doubted:
         return state._replace(n_doubted=state.n_doubted - (tried and not episode.failed))
     much = episode.refused.sum() > settings.refused * len(episode.actions)
     count = state.n_doubted + bool(much and not episode.failed)

@@ -207,7 +207,7 @@ class State(NamedTuple):
         )
 
     @property
-    def on_trial(self) -> bool:
+    def is_doubted(self) -> bool:
         """Whether its forms are doubted: while it learns rivals are tried."""
         return self.n_doubted < 0
 
@@ -250,7 +250,7 @@ def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
         crash = table[:, SAYS] == CRASHES
         table = table.copy()
         table[crash] = failure.nearer(table[crash], state.failures, 0.5)
-    if state.on_trial and (daring or state.is_settled(settings)):
+    if state.is_doubted and (daring or state.is_settled(settings)):
         table = failure.rivals(table, state.failures, sizes(state))
     if not daring:
         table = np.concatenate([table, state.dropped])
@@ -332,7 +332,7 @@ class Parts(NamedTuple):
         most = max(min(settings.work, settings.work_rate * dt) / cost, few * state.horizon)
         n_judged = 1 if most < 2 * few * state.horizon else few
         n_policies = len(state.policies)
-        n_tried = few if not state.on_trial or most < n_policies * state.horizon else n_policies
+        n_tried = few if not state.is_doubted or most < n_policies * state.horizon else n_policies
         scale = state.disturbance_scale(settings)
         return cls(motion, daring_model, residuals, scale, few, n_tried, n_judged, most)
 

@@ -157,7 +157,7 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
     if state.differs:
         more += f"; failed= says otherwise in {state.differs:.1%} of the states around, where this "
         more += "decides"
-    if state.on_trial:
+    if state.is_doubted:
         rivals, *_ = _where(failure.rivals(state.forms, state.failures, sizes(state)), names)
         more += "; much was refused without a failure: while it learns it tries whether it only "
         more += f"fails {' or '.join(rivals)}"
