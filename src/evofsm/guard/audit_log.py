@@ -304,7 +304,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         self._learnt: dict[str, float] | None = None  # as that episode ended
         self._settings: dict[str, Any] = {}
         self._before: list[list[Any]] = []
-        self._seen: list[Any] = []  # what a proposal is waited for
         try:
             store.only_writer(self._file, path, "name another file")
             self._find_end()
@@ -334,7 +333,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         """An episode begins."""
         self._raise()
         self._flush()  # of an episode that was broken off
-        self._seen = []
         parts = (guard.reviser, guard.machine, guard.judge, guard.failed)
         if list(map(id, parts)) != list(map(id, self._who)) or self._learnt != sums_of(guard):
             self._write("start", **_start(guard))
@@ -348,24 +346,21 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         """An observation came in, at ``time`` [s]."""
         if self._guard is None:
             raise ValueError("the log was given to a guard within an episode; give it before one")
-        if self._seen:  # nothing was proposed to what came in last
-            self._before.append(self._seen)
-        self._seen = [float(time), observation.tolist()]
+        self._before.append([float(time), observation.tolist()])
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
         """A decision was made. When this returns it is written down, if it said something."""
         if self._guard is None:
             return
+        time, observation = self._before.pop()
         now = settings_now(self._guard)
         if now != self._settings:
             self._flush()
             self._write("settings", settings=now)
             self._settings = now
-        (time, observation), self._seen = self._seen, []
         if is_spoken(self._guard.reviser, revision):
             decision = decision_of(situation, proposal, revision)
-            before = self._take_before()
-            self._write("decision", before=before, time=time, observation=observation, **decision)
+            self._write("decision", time=time, observation=observation, **decision)
         else:
             masks = [] if proposal.mask is None else [proposal.mask.tolist()]
             self._before.append([time, observation, written(proposal.action), *masks])
@@ -378,14 +373,10 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         """The episode ended; an OSError if something could not be written since it began."""
         if self._guard is None:
             return
-        if self._seen:
-            self._before.append(self._seen)
-        self._seen = []
         self._learnt = sums_of(self._guard)
         last = None if observation is None else observation.tolist()
-        before = self._take_before()
         how = {"failed": bool(failed), "terminated": terminated, "score": score}
-        self._write("end", before=before, learnt=self._learnt, observation=last, **how)
+        self._write("end", learnt=self._learnt, observation=last, **how)
         self._force()
         self._guard = None
         self._raise()
@@ -430,13 +421,11 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
 
     def _flush(self) -> None:
         if self._before:
-            self._write("quiet", before=self._take_before())
-
-    def _take_before(self) -> list[list[Any]]:
-        rows, self._before = self._before, []
-        return rows
+            self._write("quiet")
 
     def _write(self, kind: str, **content: Any) -> None:
+        if "before" in FIELDS[kind]:
+            content["before"], self._before = self._before, []
         if self._failure is not None:
             return
         clock = datetime.now(UTC).isoformat()
@@ -683,7 +672,6 @@ class _Player:
         self.other_makers: dict[str, Field] = {}
         self._failed = failed
         self._guard: Guard | None = None  # None while a session cannot be replayed
-        self._is_under_way = False
 
     def play(self, record: Record) -> Finding | None:
         """What differs; None where it comes out as it was recorded."""
@@ -697,34 +685,30 @@ class _Player:
         return None
 
     def _play(self, content: Mapping[str, Any]) -> None:
-        kind, before = content["kind"], content.get("before", ())
+        kind, before, guard = content["kind"], content.get("before", ()), self._guard
         if kind == "start":
             self._start(content)
-            return
-        if self._guard is None:
-            return
-        if not self._is_under_way and (before or kind in ("decision", "end")):
-            raise ValueError("it belongs to no episode")
-        for row in before:
-            self._row(self._guard, None, row)
-        if kind in ("begin", "settings"):
-            self._set(self._guard, content["settings"])
-        if kind == "begin":
-            self._guard.begin()
-            self._is_under_way = True
-        elif kind == "decision":
-            names = ("time", "observation", "proposed", "mask")
-            self._row(self._guard, content, [content[name] for name in names])
-        elif kind == "end":
-            self._end(self._guard, content)
+        elif guard is not None:
+            if not guard._under_way and (before or kind in ("decision", "end")):
+                raise ValueError("it belongs to no episode")
+            for row in before:
+                self._row(guard, None, row)
+            if kind in ("begin", "settings"):
+                self._set(guard, content["settings"])
+            if kind == "begin":
+                guard.begin()
+            elif kind == "decision":
+                names = ("time", "observation", "proposed", "mask")
+                self._row(guard, content, [content[name] for name in names])
+            elif kind == "end":
+                self._end(guard, content)
 
     def _start(self, content: Mapping[str, Any]) -> None:
         now = made_by()
         for name, then in content["made_by"].items():
             if then != now.get(name):
                 self.other_makers[name] = Field(name, str(then), now.get(name, ""))
-        self._guard, self._is_under_way = None, False
-        needs_code = content["told_failures"]
+        self._guard, needs_code = None, content["told_failures"]
         if content["guard"] is None:
             self.not_replayed.append(
                 f"{content['reviser']} is no reviser that is known here, or asks a judge that is "
@@ -769,11 +753,11 @@ class _Player:
             raise _DiffersError(f"{when} changed nothing")
         self.decisions += 1
 
-    def _end(self, guard: Guard, content: Mapping[str, Any]) -> None:
+    @staticmethod
+    def _end(guard: Guard, content: Mapping[str, Any]) -> None:
         last = content["observation"]
         how = {name: content[name] for name in ("failed", "terminated", "score")}
         guard.end(observation=None if last is None else _floats(last), **how)
-        self._is_under_way = False
         if fields := _differing(content["learnt"], sums_of(guard)):
             raise _DiffersError("something else was learnt until its end", fields)
 
