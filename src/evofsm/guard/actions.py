@@ -224,9 +224,7 @@ def checked_mask(actions: ActionSet, mask: ArrayLike | None) -> Mask | None:
 
 def limits(actions: ActionSet) -> tuple[Action, Action]:
     """Lowest and highest action: floats, or (d,) arrays."""
-    if isinstance(actions, BoxActions):
-        return actions.bounds[0], actions.bounds[1]
-    return actions.low, actions.high
+    return put_into(actions, -math.inf), put_into(actions, math.inf)
 
 
 def written(action: Action) -> Any:
@@ -267,13 +265,13 @@ def nearest_bounds(actions: ActionSet) -> tuple[NDArray[np.float64], NDArray[np.
 
     Then each interval or cell, and last the limits alone: where the nearest is not enough.
     """
+    low, high = limits(actions)
     if isinstance(actions, BoxActions):
         lowest, highest = actions.cells
-        return np.vstack([actions.bounds[:1], lowest]), np.vstack([actions.bounds[1:], highest])
-    if isinstance(actions, Choices):
-        every = np.arange(actions.n_actions, dtype=np.float64)
-        return np.append(0.0, every), np.append(actions.high, every)
-    lowest, highest = actions.edges[:-1].copy(), actions.edges[1:].copy()
-    highest[:-1] = np.nextafter(highest[:-1], -math.inf)
-    low, high = actions.low, actions.high
-    return np.array([low, *lowest, low, high]), np.array([high, *highest, low, high])
+    elif isinstance(actions, Choices):
+        lowest = highest = np.arange(actions.n_actions, dtype=np.float64)
+    else:
+        edges = actions.edges
+        lowest = np.array([*edges[:-1], low, high])
+        highest = np.array([*np.nextafter(edges[1:-1], -math.inf), high, low, high])
+    return np.concatenate([[low], lowest]), np.concatenate([[high], highest])

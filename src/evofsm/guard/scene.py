@@ -18,6 +18,8 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Mapping, Sequence
+from copy import copy
+from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -134,8 +136,7 @@ class SceneRisk(LearningJudge, SearchingJudge):
     'no failure with an object in sight is known yet, so nothing is refused'
     """
 
-    _seen: list[Seen]
-    _actions: list[int]
+    _seen: list[Seen]  # of the episode under way
     fallback = Fallback(0.0, "the first action")  #: without a usable proposal, revised like any
 
     def __init__(
@@ -152,7 +153,7 @@ class SceneRisk(LearningJudge, SearchingJudge):
         self.relative = relative
         #: What was learnt.
         self.memory = Memory(operator.index(n_actions), self.columns - 1 - _P)
-        self._seen, self._actions = [], []
+        self._seen = []
 
     def refuse_unfit(self, low: Action, high: Action) -> None:
         """Raise a ValueError if there are other actions than it was made for."""
@@ -191,10 +192,9 @@ class SceneRisk(LearningJudge, SearchingJudge):
             shares = forecast.lasting[good].max(1)
             good = good[shares >= shares.max() - tolerance]
             reason = "nothing can, the one that lasts longest"
+        best = int(good[self.memory.apart(after[good], after[proposed]).argmin()])
         if proposed in good:
             best, reason = proposed, "nothing can, nor does anything last longer"
-        else:
-            best = int(good[self.memory.apart(after[good], after[proposed]).argmin()])
         judgement = self._judged(risks[[proposed, best]])
         options = np.array([wanted, float(best)])
         return Search(options, judgement, int(best != proposed), f"{why}; {reason}")
@@ -249,8 +249,7 @@ class SceneRisk(LearningJudge, SearchingJudge):
         if not np.isfinite(scene.own).all():  # what follows begins anew
             self._remember(failed=False)
             return
-        self._seen.append(scene)
-        self._actions.append(int(action))
+        self._seen = [*self._seen, scene._replace(action=int(action))]
 
     watch = learn
 
@@ -261,32 +260,25 @@ class SceneRisk(LearningJudge, SearchingJudge):
         """What comes does not follow from what was; with ``learn`` that is still learnt from."""
         if learn:
             self._remember(failed=False)
-        self._seen, self._actions = [], []
+        self._seen = []
 
     def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
         """Learn from an episode, and from its last observation if there is one."""
         if observation is not None:
             last = self._read(observation)
             if np.isfinite(last.own).all():
-                self._seen.append(last)
+                self._seen = [*self._seen, last]
         self._remember(failed=failed)
 
     def savepoint(self) -> Rollback:
         """What takes back all that it learns from now on."""
-        scenes, actions, memory = [*self._seen], [*self._actions], {**vars(self.memory)}
-
-        def rollback() -> None:
-            self._seen, self._actions = [*scenes], [*actions]
-            vars(self.memory).update(memory)
-
-        return rollback
+        return partial(vars(self).update, _seen=self._seen, memory=copy(self.memory))
 
     def _remember(self, *, failed: bool) -> None:
         """Add what was seen to the memory, if it was more than a moment."""
         if len(self._seen) > 1:
-            actions = self._actions[: len(self._seen) - 1]
-            self.memory.add(Past.of(self._seen, self.columns - 1 - _P, actions, failed))
-        self._seen, self._actions = [], []
+            self.memory.add(Past.of(self._seen, self.columns - 1 - _P, failed))
+        self._seen = []
 
     def sums(self, n_states: int) -> dict[str, float]:
         """A few sums that change with whatever is learnt."""
@@ -314,10 +306,9 @@ class SceneRisk(LearningJudge, SearchingJudge):
         with store.explained(path):
             counts = {name: int(settings.pop(name)) for name in ("failures", "fitted")}
             judge = cls(settings.pop("dt"), settings.pop("n_actions"), **settings)
-            whole_numbers = ("actions", "counts", "links")
-            arrays |= {name: arrays[name].astype(np.int64) for name in whole_numbers}
-            history = Past(**arrays | {"lost": arrays["lost"].astype(bool)})
-            history.refuse_damaged(judge.memory.past, judge.memory.n_actions)
+            none = judge.memory.past
+            history = Past(*(arrays[name].astype(of.dtype) for name, of in none._asdict().items()))
+            history.refuse_damaged(none, judge.memory.n_actions)
             judge.memory.restore(history, **counts)
         return judge
 
@@ -328,6 +319,7 @@ class Seen(NamedTuple):
     own: _Floats  #: (p + q,) place, then all else
     away: _Floats  #: (k, p) places of the objects, relative to one's own
     other: _Floats  #: (k, q) all else of them, not relative
+    action: int = -1  #: that followed, if any
 
 
 class Past(NamedTuple):
@@ -342,10 +334,8 @@ class Past(NamedTuple):
     links: _Ints  #: (M,) index of the same object a step later; -1 where it is not known
 
     @classmethod
-    def of(
-        cls, seen: Sequence[Seen], q: int, actions: Sequence[int] = (), failed: bool = False
-    ) -> Past:
-        """An episode, from what was seen at each moment; actions are one fewer."""
+    def of(cls, seen: Sequence[Seen], q: int, failed: bool = False) -> Past:
+        """An episode, from what was seen at each moment; what followed the last is left out."""
         losses = np.zeros(len(seen), bool)
         losses[-2:-1] = failed
         # In the order in which a file holds them: sums are then the same to the last bit.
@@ -354,7 +344,8 @@ class Past(NamedTuple):
             np.ascontiguousarray(np.concatenate([np.zeros((0, width)), *rows]))
             for width, rows in ((_P, [s.away for s in seen]), (q, [s.other for s in seen]))
         )
-        choices = np.array([*actions, -1][: len(seen)], np.int64)
+        choices = np.array([s.action for s in seen], np.int64)
+        choices[-1:] = -1
         counts = np.array([len(s.away) for s in seen], np.int64)
         return cls(ego, choices, counts, losses, away, rest, np.full(len(away), -1))
 
@@ -383,13 +374,9 @@ class Past(NamedTuple):
         """Some of the episodes."""
         begin, end = self.ends[[first, last]]
         start, stop = self.objects[[begin, end]]
-        links = np.where(self.links >= 0, self.links - start, -1)
-        cut: dict[str, Any] = {
-            name: getattr(self, name)[begin:end] for name in ("own", "actions", "counts", "lost")
-        }
-        return Past(
-            **cut, away=self.away[start:stop], other=self.other[start:stop], links=links[start:stop]
-        )
+        cut: list[Any] = [array[begin:end] for array in self[:4]]
+        part = Past(*cut, *(array[start:stop] for array in self[4:]))
+        return part._replace(links=np.where(part.links >= 0, part.links - start, -1))
 
     def refuse_damaged(self, none: Past, n_actions: int) -> None:
         """Raise a ValueError where arrays contradict each other, or are of other rows than none."""
