@@ -151,10 +151,9 @@ def _listed(
             false = false_times(onset, stop, fails, horizon)
             right = bool(runs.failed[k]) and false * horizon < stop - onset
             foreseen |= right
-            limits = judge.passed(columns[:, onset])
             row = {"episode": k, "row": onset, "time": times[onset], "failed": right}
             row |= {"lasts": (stop - onset) * judge.dt, "false": int(false)}
-            yield {**row, "reason": judge.reason(runs.rows[onset], limits)}
+            yield {**row, "reason": judge.reason(runs.rows[onset], columns[:, onset])}
         if not foreseen:
             row = {"episode": k, "row": fails, "time": times[fails]}
             yield {**row, "reason": f"no alarm within {span(horizon * judge.dt)} before it{why}"}

@@ -254,10 +254,8 @@ def change(actions: ActionSet, one: Action, other: Action) -> float:
         return 0.0
     if isinstance(actions, Choices):
         return 1.0
-    apart = distances(actions, np.asarray(one, np.float64), other)
-    if isinstance(actions, BoxActions):
-        return float(apart)
-    return float(apart) / (0.5 * (actions.high - actions.low))
+    half = 1.0 if isinstance(actions, BoxActions) else 0.5 * (actions.high - actions.low)
+    return float(distances(actions, np.asarray(one, np.float64), other)) / half
 
 
 def nearest_bounds(actions: ActionSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

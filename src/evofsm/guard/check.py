@@ -29,13 +29,6 @@ Clause = Callable[[Make], None]
 
 _DT = 0.25  # between two rows [s]
 _ACTIONS = np.array([-2.5, -0.7, 0.0, 1.3, 2.5])
-# A part is of the first kind whose methods it has.
-_METHODS = {
-    "rule": ("table", "scales"),
-    "reviser": ("revise", "start_episode"),
-    "controller": ("propose",),
-    "judge": ("judge", "why"),
-}
 
 
 class Result(NamedTuple):
@@ -54,16 +47,16 @@ def check_results(part: object) -> list[Result]:
     arguments.
     """
     make = _maker(part)
-    return [_result(clause, make) for clause in _CONTRACTS[kind_of(part)]]
+    return [_result(clause, make) for clause in _KINDS[kind_of(part)][1]]
 
 
 def kind_of(part: object) -> str:
     """Of which kind a class, an instance, or a function that makes one is."""
     instance = part if inspect.isclass(part) else _maker(part)()
-    for kind, names in _METHODS.items():
+    for kind, (names, _) in _KINDS.items():
         if all(hasattr(instance, name) for name in names):
             return kind
-    kinds = "; ".join(f"a {kind} has {', '.join(names)}" for kind, names in _METHODS.items())
+    kinds = "; ".join(f"a {kind} has {', '.join(names)}" for kind, (names, _) in _KINDS.items())
     raise TypeError(f"{part!r} has the methods of no kind: {kinds}")
 
 
@@ -77,8 +70,7 @@ def _maker(part: Any) -> Make:
     if needed:
         needs = f"{part.__name__} needs arguments ({', '.join(needed)})"
         raise TypeError(f"{needs}; give an instance, or a function that makes one")
-    make: Make = part
-    return make
+    return part
 
 
 def _result(clause: Clause, make: Make) -> Result:
@@ -303,14 +295,16 @@ def a_machine_takes_it(make: Make) -> None:
     _insist(again == rule, f"from a file it comes back as {again}")
 
 
-_CONTRACTS: dict[str, tuple[Clause, ...]] = {
-    "rule": (is_frozen, a_machine_takes_it),
-    "reviser": (revises_what_is_proposed, an_episode_starts_anew, _common(_revisions)),
-    "controller": (proposes_numbers, _common(_proposals)),
+# Of each kind its methods, and its contract; a part is of the first kind whose methods it has.
+_KINDS: dict[str, tuple[tuple[str, ...], tuple[Clause, ...]]] = {
+    "rule": (("table", "scales"), (is_frozen, a_machine_takes_it)),
+    "reviser": (
+        ("revise", "start_episode"),
+        (revises_what_is_proposed, an_episode_starts_anew, _common(_revisions)),
+    ),
+    "controller": (("propose",), (proposes_numbers, _common(_proposals))),
     "judge": (
-        judges_each_action,
-        learns_only_from_what_happens,
-        a_file_keeps_it,
-        _common(_judgements),
+        ("judge", "why"),
+        (judges_each_action, learns_only_from_what_happens, a_file_keeps_it, _common(_judgements)),
     ),
 }

@@ -462,17 +462,13 @@ class Foresight(LearningJudge):
             return variable, f"{beyond}{soon}"
         return "distance to failure", f"below {changes(0.0 - at)}{soon} (it fails {there})"
 
-    def passed(self, column: Floats) -> Floats:
-        """(n, 6) the limits that a row passes, of which this is the one of `columns`."""
-        return self._limits[self._passed(column[:, None], self._limits)[:, 0]]
-
-    def reason(self, z: Floats, passed: Floats) -> str:
-        """Why the alarm is on at an observation (m,), with the limits (n, 6) that are passed."""
+    def reason(self, z: Floats, column: Floats) -> str:
+        """Why the alarm is on at an observation (m,), of which `columns` has this one."""
         rate = self.alarm
         assert rate is not None
         right, false, *_ = self.held_out[rate].tolist()
-        limits, why = passed[passed[:, _RATE] == rate], "the alarm stays on for a while"
-        if len(limits):
+        limits, why = self.of_rate(rate), "the alarm stays on for a while"
+        if len(limits := limits[self._passed(column[:, None], limits)[:, 0]]):
             name, there = self._words(limits[0])
             why = f"{name} {self._value(limits[0], z):.4g}: {there}"
         came = f"after {right:.0f} of {right + false:.0f} such alarms it failed"
@@ -562,26 +558,26 @@ class Foresight(LearningJudge):
         # Variables smoothed once and twice; rows since limits were passed, and not; what is on.
         self._now: tuple[Any, ...] = None, *np.zeros((3, len(self.held_out)), int)
 
-    def _next(self, z: Floats) -> tuple[Flags, tuple[Any, ...]]:
-        """Which limits are passed, and the state after an observation (m,)."""
+    def _next(self, z: Floats) -> tuple[Floats, tuple[Any, ...]]:
+        """Of an observation (m,) the one of `columns`, and the state after it."""
         memory, up, down, on = self._now
         memory = np.full((2, len(z) + len(self.forms)), np.nan) if memory is None else memory.copy()
         columns = self.columns(_nothing(0)._replace(rows=z[None]), memory)
-        is_passed, soon = (self._passed(columns, self._limits, soon=k)[:, 0] for k in (False, True))
-        rates = (self._limits[flags, _RATE].astype(int) for flags in (is_passed, soon))
+        passes = (self._passed(columns, self._limits, soon=k)[:, 0] for k in (False, True))
+        rates = (self._limits[flags, _RATE].astype(int) for flags in passes)
         above, near = (np.bincount(rate, minlength=len(up)) > 0 for rate in rates)
         up, down = np.where(above, up + 1, 0), np.where(above | (near & (on > 0)), 0, down + 1)
         on = (up >= self.hold) | ((on > 0) & (down < self._spans[2]))
-        return is_passed, (memory, up, down, on)
+        return columns[:, 0], (memory, up, down, on)
 
     def search(self, situation: Situation, wanted: Action, /, **others: Any) -> Search:
         """Keep what is proposed, as nobody acts; the risk is that of the alarm that is on."""
-        is_passed, (*_, on) = self._next(situation.observation)
+        column, (*_, on) = self._next(situation.observation)
         rate, risk, reason = self.alarm, 0.0, "no alarm is on"
         evidence = 0.0 if rate is None else float(self.held_out[rate, :2].sum())
         if rate is not None and on[rate]:
             risk = float(self.shares[rate])
-            reason = self.reason(situation.observation, self._limits[is_passed])
+            reason = self.reason(situation.observation, column)
         low, high = wilson_bounds(risk, evidence) if risk else (0.0, 1.0)
         risks, lows, highs, slack = np.array([[risk], [low], [high], [np.nan]])
         judgement = Judgement(risks, lows, highs, slack, evidence)

@@ -407,14 +407,14 @@ class Lane:
     def end(self, *, failed: bool, terminated: bool = False, score: float | None = None) -> None:
         """The guard's episode ends, if one is under way."""
         decider, guard = self._guard, self.terms.guard
-        if decider is not None and decider is not guard and guard.learn:
-            self._episode = guard.begin(decider)
+        if decider is not None and (decider is guard or guard.learn):
+            if decider is not guard:
+                self._episode = guard.begin(decider)
             for step, (observation, proposal, executed) in enumerate(self._past):
                 situation = guard.recognise(observation, step * guard.interval)
                 guard.revise(situation, proposal, executed)
-        if decider is guard or (decider is not None and guard.learn):
-            episode = self._episode
-            guard.end(failed, self._seen, terminated=terminated, score=score, episode=episode)
+            how: dict[str, Any] = {"terminated": terminated, "score": score}
+            guard.end(failed, self._seen, episode=self._episode, **how)
         self._guard, self._past = None, []
 
 

@@ -90,9 +90,8 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
                 continue
             is_over, has_left = bool(terminated.get(agent)), agent not in alive
             ends = is_over, bool(truncated.get(agent)) or (has_left and not is_over)
-            info = infos.get(agent, {})
             row, reward = observations.get(agent), rewards.get(agent, math.nan)
-            lane.follow(StepResult(row, reward, *ends, info))
+            lane.follow(StepResult(row, reward, *ends, infos.get(agent, {})))
             if agent not in decisions:  # what it does now follows from no action of before
                 lane.end(failed=False)
         for agent, decision in decisions.items():
