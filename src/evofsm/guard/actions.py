@@ -156,8 +156,7 @@ class BoxActions:
 
         The last component counts fastest.
         """
-        values = self.checked("action", action)
-        share = (self.clip(values) - self.bounds[0]) / (2.0 * self.half)
+        share = (self.clip(self.checked("action", action)) - self.bounds[0]) / (2.0 * self.half)
         index = 0
         for part, count in zip(share.tolist(), self.levels, strict=True):
             index = index * count + min(int(part * count), count - 1)

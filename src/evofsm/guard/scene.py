@@ -623,16 +623,13 @@ class Memory:
             if 2 * len(astray) < len(rows):  # else what failed met in one point, as in cells
                 links[astray], moves[astray] = -1, np.nan
                 rows = np.flatnonzero(links >= 0)
-        total, at = np.zeros_like(past.away), np.arange(len(past.away))
-        paths = np.empty((len(past.away), _STEPS_AHEAD, _P))
+        at, steps = np.arange(len(past.away)), np.empty((len(past.away), _STEPS_AHEAD, _P))
         for h in range(_STEPS_AHEAD):
             here = np.where((at >= 0)[:, None], moves[at], np.nan)
-            step = np.where(np.isnan(here), step, here)
-            total = total + step
-            paths[:, h] = total
+            steps[:, h] = step = np.where(np.isnan(here), step, here)
             at = np.where(at >= 0, links[at], -1)
         self._objects = self._features(past.own[moment], past.away, past.other)[rows]
-        self._paths, self._others = paths[rows], past.other[rows]
+        self._paths, self._others = np.cumsum(steps, 1)[rows], past.other[rows]
 
     def _features(self, own: _Floats, away: _Floats, other: _Floats) -> _Floats:
         far, rest, ego = self._spreads
@@ -670,8 +667,6 @@ class Memory:
         at = np.broadcast_to(own, (r, n * n, len(own)))
         moves = np.zeros((r, n * n, _STEPS_AHEAD, _P))
         shares = np.full((r, n * n), 1.0 / r)
-        total = np.zeros((r * n * n, _P))
-        course = np.arange(r)[:, None, None]
         for h in range(_STEPS_AHEAD):
             to = at.copy()
             for action, (before, change) in enumerate(self._own):
@@ -680,16 +675,16 @@ class Memory:
                     continue
                 here = (at[:, rows] / self._spreads[2]).reshape(-1, len(own))
                 like, share = (of.reshape(r, len(rows), -1) for of in _nearest(before, here, r))
-                index = np.minimum(course, like.shape[-1] - 1)
-                to[:, rows] += change[np.take_along_axis(like, index, -1)[..., 0]]
+                own_analog = np.arange(r), slice(None), np.arange(r).clip(max=like.shape[-1] - 1)
+                to[:, rows] += change[like[own_analog]]
                 if h == 0:
-                    shares[:, rows] = np.take_along_axis(share, index, -1)[..., 0]
-            total = total + self._mine(at.reshape(-1, len(own)), to.reshape(-1, len(own)))
-            moves[:, :, h] = total.reshape(r, n * n, _P)
+                    shares[:, rows] = share[own_analog]
+            mine = self._mine(at.reshape(-1, len(own)), to.reshape(-1, len(own)))
+            moves[:, :, h] = mine.reshape(r, n * n, _P)
             if h == 0:
                 after = to[0, ::n]
             at = to
-        return moves, shares / shares.sum(0), after
+        return np.cumsum(moves, 2), shares / shares.sum(0), after
 
 
 def _terms(before: _Floats, after: _Floats) -> _Floats:
