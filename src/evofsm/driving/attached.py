@@ -322,8 +322,7 @@ class Guarding:
         self.decisions += 1
         worst = judge.worst if isinstance(judge := _judge(car.guard), TrafficRisk) else None
         neighbour = car.around[worst.number - 1 if worst else 0]
-        role = worst.role if worst else Role.AHEAD
-        car.about = (neighbour.id, role) if neighbour else ("", None)
+        car.about = (neighbour.id, worst.role if worst else Role.AHEAD) if neighbour else ("", None)
 
     def _act(self, car: _Car, speed: float) -> None:
         """Set the speed, where the guard allows less than the car might want."""
@@ -357,8 +356,7 @@ class Guarding:
         if car.mode is not None and speed > car.limit + _FASTER:
             self.overruled += 1
             if self.overruled == _OFTEN:
-                text = _OVERRULED.format(car.id, _OFTEN)
-                warnings.warn(text, RuntimeWarning, stacklevel=4)
+                warnings.warn(_OVERRULED.format(car.id, _OFTEN), RuntimeWarning, stacklevel=4)
         # Slower than the limit is what SUMO itself wanted, such as to stop at a red light.
         if car.mode is not None and speed >= car.limit - _SAME_SPEED:
             desired_speed = max(car.wish, speed)

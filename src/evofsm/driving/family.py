@@ -16,7 +16,6 @@ import runpy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import count
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex
@@ -291,9 +290,9 @@ def _paper(numbers: Numbers) -> tuple[Scenario, IDM | ChangingIDM]:
     """
     leader = Leader(_LEADER_MODEL, brake_decel=9.0, brake_speed=24.2)
     hasty, calm = _aggressive(-4.0), _normal(-4.0)
-    changing_drivers = ChangingIDM(hasty, ((15.0, calm),)), ChangingIDM(calm, ((10.0, hasty),))
-    drivers = hasty, calm, *changing_drivers
-    return Scenario(leader, initial_gap=5.0, duration=60.0), drivers[numbers.variant]
+    changing = ChangingIDM(hasty, ((15.0, calm),)), ChangingIDM(calm, ((10.0, hasty),))
+    driver = (hasty, calm, *changing)[numbers.variant]
+    return Scenario(leader, initial_gap=5.0, duration=60.0), driver
 
 
 def _emergency(
@@ -327,11 +326,9 @@ def _emergency_as(
 
 def _waves(numbers: Numbers, duration: float) -> tuple[tuple[float, float], ...]:
     """Accelerations of a leader who goes from a slow to a fast speed and back, from rest."""
-    time, speed, waves = 0.0, 0.0, []
-    for k in count():
-        if time >= duration:
-            break
-        at = f"leader.traffic.{k}"
+    time, speed, waves = 0.0, 0.0, list[tuple[float, float]]()
+    while time < duration:
+        at = f"leader.traffic.{len(waves) // 4}"
         fast = numbers.between(f"{at}.fast", 8.0, 20.0)
         slow = numbers.one_of(f"{at}.slow", (0.0, None))
         slow = numbers.between(f"{at}.slow", 0.0, 6.0) if slow is None else slow

@@ -62,15 +62,13 @@ class _ShortTime(_Measure):
     """Danger where a time is short: finite also where the time is infinite."""
 
     threshold: float
+    _time: ClassVar[staticmethod[[Floats, float], Floats]]
 
     def score(self, observations: Floats, dt: float) -> Floats:
         """1 / time − 1 / threshold [1/s]; infinite where the cars have met."""
         time = self._time(observations, dt)
         with np.errstate(divide="ignore", over="ignore"):
             return np.asarray(1.0 / time - 1.0 / self.threshold)
-
-    def _time(self, observations: Floats, dt: float) -> Floats:
-        raise NotImplementedError
 
 
 def time_to_collision(observations: Floats) -> Floats:
@@ -95,9 +93,7 @@ class TimeToCollision(_ShortTime):
     """
 
     threshold: float = 1.5
-
-    def _time(self, observations: Floats, dt: float) -> Floats:
-        return time_to_collision(observations)
+    _time = staticmethod(lambda observations, _: time_to_collision(observations))
 
 
 def modified_time_to_collision(observations: Floats, dt: float) -> Floats:
@@ -121,9 +117,7 @@ class ModifiedTimeToCollision(_ShortTime):
     """Danger where the modified time to collision is below a ``threshold`` [s]."""
 
     threshold: float = 1.5
-
-    def _time(self, observations: Floats, dt: float) -> Floats:
-        return modified_time_to_collision(observations, dt)
+    _time = staticmethod(modified_time_to_collision)
 
 
 def time_headway(observations: Floats) -> Floats:
@@ -140,9 +134,7 @@ class TimeHeadway(_ShortTime):
     """Danger where the time headway is below a ``threshold`` [s] (Vogel 2003)."""
 
     threshold: float = 1.0
-
-    def _time(self, observations: Floats, dt: float) -> Floats:
-        return time_headway(observations)
+    _time = staticmethod(lambda observations, _: time_headway(observations))
 
 
 def deceleration_to_avoid_collision(observations: Floats) -> Floats:

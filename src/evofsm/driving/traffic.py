@@ -193,18 +193,16 @@ class TrafficRisk(ActionJudge):
         """Risk of each acceleration [m/s²]: the highest of all pairs."""
         actions = np.ascontiguousarray(actions, np.float64)
         zeros = np.zeros(len(actions))
-        worst: Judgement | None = None
+        worst = Judgement(zeros, zeros, zeros, zeros + math.inf, 0.0)
         self.worst, hardest, pairs = None, -float(actions.min()), pairs_of(situation.observation)
         for pair in pairs:
             if pair.role is Role.BEHIND:
                 continue
             here = Situation(pair.observation, _ONE, None, math.nan, 0.0)
             judgement = self.ahead.judge(here, actions)
-            if worst is None or judgement.risk[0] > worst.risk[0]:
+            if self.worst is None or judgement.risk[0] > worst.risk[0]:
                 self.worst = pair
-            worst = judgement if worst is None else _worse(worst, judgement)
-        if worst is None:
-            worst = Judgement(zeros, zeros, zeros, zeros + math.inf, 0.0)
+            worst = _worse(worst, judgement)
         # Who does not brake is hit by nobody that it has to mind.
         limit, follower = self._survived(pairs) if hardest > 0.0 else (math.inf, None)
         if hardest <= limit:
