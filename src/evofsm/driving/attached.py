@@ -334,8 +334,7 @@ class Guarding:
         # Nor faster than it would drive on a free road.
         car.limit = min(next_speed, self._vehicle.getAllowedSpeed(car.id))
         car.wish = self._seeing.wish(car.id, speed, car.around[0])
-        late = self._seeing.body(car.id).late
-        if not late and car.wish <= car.limit + _COARSE * self._seeing.dt:
+        if not self._seeing.body(car.id).late and car.wish <= car.limit + _COARSE * self._seeing.dt:
             self._hand_back(car)  # it drives as it would by itself, with its imperfections
             return
         if car.mode is None:
@@ -431,8 +430,7 @@ def choose(vehicles: str | float | Iterable[str]) -> Callable[[Any, str], bool]:
                 f"vehicles is {vehicles!r}; it is 'all', 'type:NAME', a share above 0 up to 1, "
                 "such as 0.1 or '10%', or a list of ids"
             )
-        limit = share * 2.0**32
-        return lambda _, car: zlib.crc32(f"0:{car}".encode()) < limit
+        return lambda _, car: zlib.crc32(f"0:{car}".encode()) < share * 2.0**32
     ids = frozenset(vehicles)
     return lambda _, car: car in ids
 
@@ -616,8 +614,7 @@ class Attachment:
 
     def _begin_anew(self) -> None:
         """Forget the cars, which are other ones, or are elsewhere; who is here is handed back."""
-        here = set(self._sumo.vehicle.getIDList())
-        for car in here.intersection(self.cars):
+        for car in set(self._sumo.vehicle.getIDList()).intersection(self.cars):
             self._cars.remove(car)
         self._cars.cars.clear()
         self._ride.latest.clear()

@@ -278,6 +278,13 @@ def _normal(lowest: float) -> IDM:
     return IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=lowest, highest=2.5)
 
 
+def _at_speed(leader: Leader, gap: float, duration: float, speed: float) -> tuple[Scenario, IDM]:
+    """An aggressive driver who wants no more than the speed at which it begins."""
+    body = Body(-4.0, 2.5)
+    scenario = Scenario(leader, gap, duration, initial_speed=speed, body=body)
+    return scenario, _aggressive(-4.0, speed)
+
+
 _THIRD_CAR = Behind(_normal(-6.0), gap=10.0)  # where that is switched on
 
 
@@ -384,9 +391,7 @@ def _cut_in(numbers: Numbers) -> tuple[Scenario, IDM]:
         brake_decel=numbers.between("leader.brake_decel", 3.0, 6.0),
         cut_in=CutIn(time, gap, max(0.0, speed - slower)),
     )
-    body = Body(-4.0, 2.5)  # a free road at first
-    scenario = Scenario(leader, 150.0, duration=25.0, initial_speed=speed, body=body)
-    return scenario, _aggressive(-4.0, speed)
+    return _at_speed(leader, 150.0, 25.0, speed)  # a free road at first
 
 
 def _ncap(numbers: Numbers) -> tuple[Scenario, IDM]:
@@ -410,9 +415,7 @@ def _ncap(numbers: Numbers) -> tuple[Scenario, IDM]:
         decel = numbers.one_of("leader.brake_decel", (2.0, 6.0))
         leader = keeps(brake_decel=decel, brake_time=0.0, initial_speed=speed)
         gap = numbers.one_of("scenario.initial_gap", (12.0, 40.0))
-    body = Body(-4.0, 2.5)
-    scenario = Scenario(leader, gap, duration=20.0, initial_speed=speed, body=body)
-    return scenario, _aggressive(-4.0, speed)
+    return _at_speed(leader, gap, 20.0, speed)
 
 
 # Speeds of both cars [m/s], and the time headways [s] that the regulation allows at them.
@@ -429,9 +432,7 @@ def _r157(numbers: Numbers) -> tuple[Scenario, IDM]:
     """
     speed, headway = list(_R157.values())[numbers.variant]
     leader = Leader(_LEADER_MODEL, initial_speed=speed, brake_time=0.0, brake_decel=6.0)
-    body, gap = Body(-4.0, 2.5), headway * speed
-    scenario = Scenario(leader, gap, duration=15.0, initial_speed=speed, body=body)
-    return scenario, _aggressive(-4.0, speed)
+    return _at_speed(leader, headway * speed, 15.0, speed)
 
 
 def shift() -> Family:

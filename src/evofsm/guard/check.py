@@ -203,8 +203,7 @@ def _judgements(judge: Any, rows: Rows) -> Answers:
 def _taught(make: Make, *, ask: bool = False) -> tuple[Guard, Any]:
     """A guard with the judge, after episodes of which every other one failed."""
     judge = make()
-    interval = getattr(judge, "dt", _DT)
-    guard = Guard(_ACTIONS[0], _ACTIONS[-1], interval=interval, judge=judge)
+    guard = Guard(_ACTIONS[0], _ACTIONS[-1], interval=getattr(judge, "dt", _DT), judge=judge)
     _go_on(guard, judge, range(6), ask=ask)
     return guard, judge
 

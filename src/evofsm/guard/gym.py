@@ -176,8 +176,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         """Execute the guard's revision of ``action``."""
         was_open, decision = self._lane.is_open, self._lane.decide(action)
         observation, reward, terminated, truncated, info = self.env.step(decision.executed)
-        ends = bool(terminated), bool(truncated)
-        self._lane.follow(StepResult(observation, reward, *ends, info))
+        self._lane.follow(StepResult(observation, reward, bool(terminated), bool(truncated), info))
         if self._lane.is_open and not was_open and not self._resets_itself:
             self._resets_itself = True
             warnings.warn(_BY_ITSELF, stacklevel=2)
@@ -291,9 +290,8 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
 def _of_one(infos: Mapping[str, Any], k: int, count: int) -> dict[str, Any]:
     info = {}
     for name, value in infos.items():
-        if (name[:1] == "_" and name[1:] in infos) or (
-            f"_{name}" in infos and not infos[f"_{name}"][k]
-        ):
+        is_mask = name[:1] == "_" and name[1:] in infos
+        if is_mask or (f"_{name}" in infos and not infos[f"_{name}"][k]):
             continue
         if isinstance(value, dict):
             info[name] = _of_one(value, k, count)

@@ -435,7 +435,6 @@ class Contact(NamedTuple):
 
 def _closest(start: _Floats, end: _Floats, sides: _Floats) -> _Floats:
     """How close it comes between two places: the least of ``max(abs(x) / sides)`` on the line."""
-    start, end = np.broadcast_arrays(start, end)
     least = np.empty(start.shape[:-1])
     first, last = (np.ascontiguousarray(of).reshape(-1, len(sides)) for of in (start, end))
     _closest_on_lines(first, last, sides, least.reshape(-1))
@@ -652,8 +651,7 @@ class Memory:
             faster = (seen.other[i] - self._others[like]) @ self._steady
             path = self._paths[like] + faster[:, None] * np.arange(1, _STEPS_AHEAD + 1)[:, None]
             to = seen.away[i] + path + moves[:, :, None]
-            start = np.broadcast_to(seen.away[i], (*to.shape[:3], 1, _P))
-            safe *= share @ (1.0 - self.contact.of(np.concatenate([start, to], axis=-2)))
+            safe *= share @ (1.0 - self.contact.of(np.insert(to, 0, seen.away[i], axis=-2)))
         losses = ((1.0 - safe) * weights[:, :, None]).sum(0).reshape(n, n, _STEPS_AHEAD)
         return Foreseen(losses[:, :, -1], 1.0 - losses.mean(-1), after)
 
@@ -712,14 +710,13 @@ def _nearest(points: _Floats, around: _Floats, most: int) -> tuple[_Ints, _Float
 @compiled
 def _nearest_into(points: _Floats, around: _Floats, like: _Ints, apart: _Floats) -> None:
     """The nearest points and their squared distances; of two equally near ones the first."""
-    last = apart.shape[1] - 1
     for k in range(len(around)):
         for j in range(len(points)):
             far = 0.0
             for i in range(points.shape[1]):
                 off = points[j, i] - around[k, i]
                 far += off * off
-            at = last
+            at = apart.shape[1] - 1
             if far >= apart[k, at]:
                 continue
             while at and apart[k, at - 1] > far:
