@@ -153,7 +153,7 @@ def _listed(
             foreseen |= right
             row = {"episode": k, "row": onset, "time": times[onset], "failed": right}
             row |= {"lasts": (stop - onset) * judge.dt, "false": int(false)}
-            yield {**row, "reason": judge.reason(rate, runs.rows[onset], columns[:, onset])}
+            yield {**row, "reason": judge.reason(runs.rows[onset], columns[:, onset])}
         if not foreseen:
             row = {"episode": k, "row": fails, "time": times[fails]}
             yield {**row, "reason": f"no alarm within {span(horizon * judge.dt)} before it{why}"}

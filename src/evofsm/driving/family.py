@@ -297,8 +297,8 @@ def _paper(numbers: Numbers) -> tuple[Scenario, IDM | ChangingIDM]:
     """
     leader = Leader(_LEADER_MODEL, brake_decel=9.0, brake_speed=24.2)
     hasty, calm = _aggressive(-4.0), _normal(-4.0)
-    changing = ChangingIDM(hasty, ((15.0, calm),)), ChangingIDM(calm, ((10.0, hasty),))
-    driver = (hasty, calm, *changing)[numbers.variant]
+    changing_drivers = ChangingIDM(hasty, ((15.0, calm),)), ChangingIDM(calm, ((10.0, hasty),))
+    driver = (hasty, calm, *changing_drivers)[numbers.variant]
     return Scenario(leader, initial_gap=5.0, duration=60.0), driver
 
 

@@ -47,16 +47,16 @@ def check_results(part: object) -> list[Result]:
     arguments.
     """
     make = _maker(part)
-    return [_result(clause, make) for clause in _KINDS[kind_of(part)][1]]
+    return [_result(clause, make) for clause in _CONTRACTS[kind_of(part)][1]]
 
 
 def kind_of(part: object) -> str:
     """Of which kind a class, an instance, or a function that makes one is."""
     instance = part if inspect.isclass(part) else _maker(part)()
-    for kind, (names, _) in _KINDS.items():
+    for kind, (names, _) in _CONTRACTS.items():
         if all(hasattr(instance, name) for name in names):
             return kind
-    kinds = "; ".join(f"a {kind} has {', '.join(names)}" for kind, (names, _) in _KINDS.items())
+    kinds = "; ".join(f"a {kind} has {', '.join(names)}" for kind, (names, _) in _CONTRACTS.items())
     raise TypeError(f"{part!r} has the methods of no kind: {kinds}")
 
 
@@ -295,7 +295,7 @@ def a_machine_takes_it(make: Make) -> None:
 
 
 # Of each kind its methods, and its contract; a part is of the first kind whose methods it has.
-_KINDS: dict[str, tuple[tuple[str, ...], tuple[Clause, ...]]] = {
+_CONTRACTS: dict[str, tuple[tuple[str, ...], tuple[Clause, ...]]] = {
     "rule": (("table", "scales"), (is_frozen, a_machine_takes_it)),
     "reviser": (
         ("revise", "start_episode"),

@@ -462,8 +462,10 @@ class Foresight(LearningJudge):
             return variable, f"{beyond}{soon}"
         return "distance to failure", f"below {changes(0.0 - at)}{soon} (it fails {there})"
 
-    def reason(self, rate: int, z: Floats, column: Floats) -> str:
+    def reason(self, z: Floats, column: Floats) -> str:
         """Why the alarm is on at an observation (m,), of which `columns` has this one."""
+        rate = self.alarm
+        assert rate is not None
         right, false, *_ = self.held_out[rate].tolist()
         limits, why = self.of_rate(rate), "the alarm stays on for a while"
         if len(limits := limits[self._passed(column[:, None], limits)[:, 0]]):
@@ -575,7 +577,7 @@ class Foresight(LearningJudge):
         evidence = 0.0 if rate is None else float(self.held_out[rate, :2].sum())
         if rate is not None and on[rate]:
             risk = float(self.shares[rate])
-            reason = self.reason(rate, situation.observation, column)
+            reason = self.reason(situation.observation, column)
         low, high = wilson_bounds(risk, evidence) if risk else (0.0, 1.0)
         risks, lows, highs, slack = np.array([[risk], [low], [high], [np.nan]])
         judgement = Judgement(risks, lows, highs, slack, evidence)

@@ -306,9 +306,9 @@ class SceneRisk(LearningJudge, SearchingJudge):
         with store.explained(path):
             counts = {name: int(settings.pop(name)) for name in ("failures", "fitted")}
             judge = cls(settings.pop("dt"), settings.pop("n_actions"), **settings)
-            none = judge.memory.past
-            history = Past(*(arrays[name].astype(of.dtype) for name, of in none._asdict().items()))
-            history.refuse_damaged(none, judge.memory.n_actions)
+            fresh = judge.memory.past
+            history = Past(*(arrays[name].astype(of.dtype) for name, of in fresh._asdict().items()))
+            history.refuse_damaged(fresh, judge.memory.n_actions)
             judge.memory.restore(history, **counts)
         return judge
 
@@ -677,8 +677,8 @@ class Memory:
                 to[:, rows] += change[like[own_analog]]
                 if h == 0:
                     shares[:, rows] = share[own_analog]
-            mine = self._mine(at.reshape(-1, len(own)), to.reshape(-1, len(own)))
-            moves[:, :, h] = mine.reshape(r, n * n, _P)
+            own_moves = self._mine(at.reshape(-1, len(own)), to.reshape(-1, len(own)))
+            moves[:, :, h] = own_moves.reshape(r, n * n, _P)
             if h == 0:
                 after = to[0, ::n]
             at = to
