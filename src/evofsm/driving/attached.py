@@ -23,7 +23,6 @@ from itertools import chain, count
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.driving.judge import REGAIN, SLIGHT, LatentRisk
 from evofsm.driving.leaders import BrakeWatch, Manoeuvres
@@ -31,6 +30,7 @@ from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_col
 from evofsm.driving.naming import VARIABLES
 from evofsm.driving.scenarios import steps_between
 from evofsm.driving.traffic import COLUMNS, Role, TrafficRisk, guard_for_traffic
+from evofsm.fsm.validation import Floats
 from evofsm.guard import TOLERANCE, ActionJudge, ActionReviser, Guard, Mode, Revision
 
 # What is done with the chosen cars.
@@ -179,7 +179,7 @@ class Seeing:
 
     def rows(
         self, car: str, speed: float, ahead: Neighbour | None, behind: Neighbour | None
-    ) -> NDArray[np.float64]:
+    ) -> Floats:
         """The scene as `Scene.rows` has it, x counted from the front bumper of the car."""
         rows = np.zeros((3, len(COLUMNS)))  # oneself, ahead and behind
         length = self.body(car).length
@@ -214,7 +214,7 @@ class _Car:
     limit: float = 0.0  # the speed that was set
     wish: float = 0.0  # the speed that its model wants instead
     time: float = 0.0
-    seen: NDArray[np.float64] | None = None  # what is decided on
+    seen: Floats | None = None  # what is decided on
     around: tuple[Neighbour | None, Neighbour | None] = (None, None)
     revision: Revision | None = None
     about: tuple[str, Role | None] = ("", None)

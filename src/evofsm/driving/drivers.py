@@ -12,9 +12,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.fsm.kernels import compiled
+from evofsm.fsm.validation import Floats
 from evofsm.guard import Proposal
 
 
@@ -28,9 +28,7 @@ def refuse_others(settings: object, whose: str, positive: str, not_negative: str
 
 
 @compiled
-def idm_kernel(
-    phases: NDArray[np.float64], time: float, gap: float, speed: float, leader_speed: float
-) -> float:
+def idm_kernel(phases: Floats, time: float, gap: float, speed: float, leader_speed: float) -> float:
     """The paper's IDM equations, by the last phase that has begun."""
     now = 0
     while now + 1 < len(phases) and phases[now + 1, 0] <= time:
@@ -47,14 +45,14 @@ def idm_kernel(
 
 class _Driver:
     @cached_property
-    def parameters(self) -> NDArray[np.float64]:
+    def parameters(self) -> Floats:
         """(k, 9) ndarray: of each phase its begin [s], then the arguments of `IDM` in order."""
         phases: Any = ((0.0, self),)
         if isinstance(self, ChangingIDM):
             phases = ((0.0, self.first), *self.changes)
         return np.array([[at, *astuple(driver)] for at, driver in phases])
 
-    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+    def propose(self, observation: Floats, time: float = 0.0) -> Proposal:
         """Acceleration [m/s²] for ``[gap, v_follower, v_leader]`` at ``time`` [s]."""
         return Proposal(idm_kernel(self.parameters, float(time), *map(float, observation)))
 

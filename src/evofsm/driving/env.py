@@ -13,12 +13,13 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evofsm.driving.family import Draw, Family, load_family
 from evofsm.driving.sumo import open_world
 from evofsm.driving.world import Episode, Road
 from evofsm.extras import needs
+from evofsm.fsm.validation import Floats
 
 with needs("gymnasium", "gym", "an environment of Gymnasium"):
     import gymnasium
@@ -36,7 +37,7 @@ HIGH = (2000.0, 100.0, 100.0)
 _INDICES = 2**31
 
 
-class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
+class CarFollowing(gymnasium.Env[Floats, Floats]):
     """Drive behind a leader who may brake, in scenarios of a family.
 
     An observation is ``[gap [m], v_follower [m/s], v_leader [m/s]]``, the gap from bumper to
@@ -95,7 +96,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+    ) -> tuple[Floats, dict[str, Any]]:
         """Begin a scenario, drawn by ``seed`` or with ``split`` and ``index`` of ``options``."""
         super().reset(seed=seed)
         choices = dict(options or {})
@@ -112,9 +113,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         road.every, self._road = scenario.steps(self.family.interval), road
         return np.clip(road.observation, LOW, HIGH), self._info(road.episode())
 
-    def step(
-        self, action: ArrayLike
-    ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Drive for one interval with ``action`` commanded, which must be a finite number."""
         road = self._road
         if road is None or road.over:

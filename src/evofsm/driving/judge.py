@@ -35,7 +35,7 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.sharing import Retraced, step
-from evofsm.fsm.validation import positive, real_array, refuse_unusable
+from evofsm.fsm.validation import Floats, positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import Action, nearest_bounds
 from evofsm.guard.api import LearningJudge, Trial
@@ -296,14 +296,14 @@ class LatentRisk(Retraced, LearningJudge):
         activity = "braking in full to learn them"
         return Trial(self.lowest, "own brakes not known yet", "in full", activity, assumption)
 
-    def effective(self, situation: Situation, actions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def effective(self, situation: Situation, actions: Floats) -> Floats:
         """What actions come to here: where the car stands, to stay is enough."""
         return effective(situation.observation[1], actions)
 
     def choose(
         self,
         situation: Situation,
-        options: NDArray[np.float64],
+        options: Floats,
         judged: Judgement,
         tolerances: tuple[float, float],
     ) -> tuple[int, str] | None:
@@ -323,7 +323,7 @@ class LatentRisk(Retraced, LearningJudge):
         self,
         observation: Three,
         braking: float,
-        options: NDArray[np.float64],
+        options: Floats,
         tolerance: float,
         hardest: float = 0.0,
     ) -> NDArray[np.bool_]:
@@ -373,7 +373,7 @@ class LatentRisk(Retraced, LearningJudge):
         triple = _three_finite(observation, whole=False)
         return self.perception.estimate(triple, self._expected, sure=self.brakes.known)
 
-    def critical(self, observation: ArrayLike, accelerations: ArrayLike) -> NDArray[np.float64]:
+    def critical(self, observation: ArrayLike, accelerations: ArrayLike) -> Floats:
         """(k,) ndarray: hardest braking of the leader, from now on, that is survived [m/s²].
 
         0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where none is.
@@ -388,7 +388,7 @@ class LatentRisk(Retraced, LearningJudge):
         """What the follower is able to do, as far as was learnt."""
         return Body(self.brakes.decel, self.brakes.lag, self.margin)
 
-    def score(self, observations: NDArray[np.float64], dt: float = 0.25) -> NDArray[np.float64]:
+    def score(self, observations: Floats, dt: float = 0.25) -> Floats:
         """How surely each row is a dead end if the leader brakes now, as a `RiskMeasure` [m/s²].
 
         By how much the hardest braking of a leader that is survived by braking in full now falls
@@ -463,14 +463,14 @@ class LatentRisk(Retraced, LearningJudge):
         return {name: getattr(self, name) for name in _RISK.settings}
 
 
-def effective(speed: float, actions: NDArray[np.float64]) -> NDArray[np.float64]:
+def effective(speed: float, actions: Floats) -> Floats:
     """(k,) what accelerations come to at a speed [m/s], the first of which is the proposal."""
     return np.maximum(actions, min(float(actions[0]), 0.0)) if speed < _STANDS else actions
 
 
 def in_proportion(
-    options: NDArray[np.float64],
-    risk: NDArray[np.float64],
+    options: Floats,
+    risk: Floats,
     tolerances: tuple[float, float],
     comfort: float,
     avoids: NDArray[np.bool_],
@@ -523,7 +523,7 @@ def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     return gap, speed, leader_speed
 
 
-def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
+def _finite(name: str, values: ArrayLike) -> Floats:
     array = real_array(name, values, 1)
     refuse_unusable(name, array)
     return array
@@ -532,13 +532,13 @@ def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
 @compiled
 def _judge(
     observation: Three,
-    accelerations: NDArray[np.float64],
+    accelerations: Floats,
     before: float,
     body: Body,
     dt: float,
-    table: NDArray[np.float64],
+    table: Floats,
     evidence: float,
-    judged: NDArray[np.float64],
+    judged: Floats,
 ) -> None:
     critical_decelerations(observation, accelerations, before, body, dt, judged[3])
     for k in range(len(accelerations)):
@@ -547,7 +547,7 @@ def _judge(
 
 
 @inner_kernel
-def _interpolated(x: float, table: NDArray[np.float64]) -> float:
+def _interpolated(x: float, table: Floats) -> float:
     """What `numpy.interp` returns for a number, which takes long to compile."""
     low, high = 0, table.shape[1] - 1
     if x <= table[0, low]:

@@ -14,10 +14,10 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evofsm.driving.rehearsal import HARDEST, Three
-from evofsm.fsm.validation import positive
+from evofsm.fsm.validation import Floats, positive
 
 # Of a manoeuvre the hardest second counts; it shows in the latest half, and takes at least three
 # quarters: less may be noise [s].
@@ -98,7 +98,7 @@ class Manoeuvres:
             self.decels = deque([*self.decels, *hard], self.decels.maxlen)
             self._tabulate()
 
-    def harder(self, decel: ArrayLike) -> NDArray[np.float64]:
+    def harder(self, decel: ArrayLike) -> Floats:
         """Probability that the next hard manoeuvre is harder than these decelerations [m/s²]."""
         grid, harder = self.table
         return np.asarray(np.interp(np.asarray(decel, dtype=np.float64), grid, harder))
@@ -119,7 +119,7 @@ class Manoeuvres:
             harder += (0.5 + offset * (0.75 - 0.25 * offset * offset)).sum(axis=1)
         harder[grid >= HARDEST] = 0.0
         #: Decelerations [m/s²], and the chance that the next hard manoeuvre is harder.
-        self.table: NDArray[np.float64] = np.array([grid, harder / (len(self.decels) + 1)])
+        self.table: Floats = np.array([grid, harder / (len(self.decels) + 1)])
 
 
 class BrakeWatch:

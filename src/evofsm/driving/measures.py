@@ -16,10 +16,8 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.validation import positive
+from evofsm.fsm.validation import Floats, positive
 from evofsm.guard import RiskMeasure
-
-Floats = NDArray[np.float64]
 
 _GRAVITY = 9.81
 

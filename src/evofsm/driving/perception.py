@@ -16,10 +16,10 @@ from math import isnan, nan, sqrt
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.driving.rehearsal import Three
 from evofsm.fsm.kernels import compiled
+from evofsm.fsm.validation import Floats
 
 # Gap [m], speed of the follower and of the leader [m/s], or what is said of each of them.
 Matrix: TypeAlias = tuple[Three, Three, Three]
@@ -120,7 +120,7 @@ class Perception:
             self._sizes[2].add(leader - last)
         self.noise = _noise(self._sizes, dt)
 
-    def learnt(self) -> dict[str, NDArray[np.float64]]:
+    def learnt(self) -> dict[str, Floats]:
         """The residuals by name, the oldest first, for a file."""
         return {
             name: np.array(sizes.latest, dtype=np.float64)

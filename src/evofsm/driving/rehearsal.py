@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.fsm.kernels import compiled, kernel
+from evofsm.fsm.validation import Floats
 
 #: A leader who brakes harder is beyond physics; no critical deceleration is higher [m/s²].
 HARDEST = 15.0
@@ -37,12 +38,12 @@ class Body(NamedTuple):
 
 @compiled
 def critical_decelerations(
-    observation: Three | NDArray[np.float64],
-    accelerations: NDArray[np.float64],
+    observation: Three | Floats,
+    accelerations: Floats,
     before: float,
     body: Body,
     dt: float,
-    critical: NDArray[np.float64],
+    critical: Floats,
 ) -> None:
     """Write the critical deceleration under each acceleration that could be commanded now.
 
@@ -67,9 +68,9 @@ def critical_decelerations(
 
 @compiled
 def foresee(
-    observation: Three | NDArray[np.float64],
+    observation: Three | Floats,
     braking: float,
-    accelerations: NDArray[np.float64],
+    accelerations: Floats,
     before: float,
     body: Body,
     dt: float,
@@ -101,7 +102,7 @@ def foresee(
 
 @kernel
 def survives(
-    observation: Three | NDArray[np.float64],
+    observation: Three | Floats,
     acceleration: float,
     before: float,
     body: Body,

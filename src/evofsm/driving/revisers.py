@@ -9,13 +9,12 @@ from functools import partial
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.driving import measures
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.sharing import Rollback
-from evofsm.fsm.validation import positive
+from evofsm.fsm.validation import Floats, positive
 from evofsm.guard import Fallback, Proposal, Revision, RiskMeasure, Situation, make_usable
 from evofsm.guard.parts import part_class, part_name
 from evofsm.guard.reviser import unjudged_revision, unseen_text
@@ -49,7 +48,7 @@ class EnvelopeReviser:
 
     def start_episode(self) -> None:
         """What was seen before belongs to another episode."""
-        self._seen: list[NDArray[np.float64]] = []
+        self._seen: list[Floats] = []
 
     def savepoint(self) -> Rollback:
         """What takes back all that is seen from now on."""

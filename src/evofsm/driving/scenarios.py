@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.driving.drivers import IDM, refuse_others
+from evofsm.fsm.validation import Floats
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Scenario:
             )
 
     @property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> Floats:
         """(steps,) ndarray: when a full run is observed [s], as decimals: 0.07, not 7 * 0.01."""
         return np.round(np.arange(self.steps(self.duration)) * self.dt, 9)
 

@@ -14,19 +14,17 @@ from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evofsm.driving.judge import LatentRisk, effective, in_proportion
 from evofsm.driving.naming import SPEEDS
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.validation import real_array
+from evofsm.fsm.validation import Floats, real_array
 from evofsm.guard.actions import Action
 from evofsm.guard.api import TOLERANCE, ActionJudge, Fallback, Judgement, Situation
 from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser, Mode
-
-_Floats = NDArray[np.float64]
 
 #: What a row of a scene holds; the first is 1 where the row is in use.
 COLUMNS = ("present", "x", "y", "vx", "vy", "length", "width", "ax")
@@ -79,7 +77,7 @@ class Pair(NamedTuple):
     braking: float = 0.0  #: of the leader [m/s²]
 
     @property
-    def observation(self) -> NDArray[np.float64]:
+    def observation(self) -> Floats:
         """(3,) ndarray: gap [m], speed of the follower and of the leader [m/s]."""
         return np.array(self[2:5])
 
@@ -106,7 +104,7 @@ class Scene:
         #: Oneself, then the others, the closest along the road first.
         self.objects = (own, *sorted(others, key=lambda obj: abs(obj.x - own.x)))
 
-    def rows(self, most: int) -> NDArray[np.float64]:
+    def rows(self, most: int) -> Floats:
         """((most + 1) * 8,) ndarray: `COLUMNS` of oneself and the closest others; zeros else."""
         rows = np.zeros((most + 1, len(COLUMNS)))
         for row, obj in zip(rows, self.objects, strict=False):
@@ -221,7 +219,7 @@ class TrafficRisk(ActionJudge):
     def choose(
         self,
         situation: Situation,
-        options: _Floats,
+        options: Floats,
         judged: Judgement,
         tolerances: tuple[float, float],
     ) -> tuple[int, str] | None:
@@ -247,7 +245,7 @@ class TrafficRisk(ActionJudge):
             return softest, "nothing can, the softest for ahead"
         return int(options.argmin()), "nothing can, the hardest braking"
 
-    def effective(self, situation: Situation, actions: _Floats) -> _Floats:
+    def effective(self, situation: Situation, actions: Floats) -> Floats:
         """What actions come to here: where the car stands, to stay is enough."""
         return effective(situation.observation[_SPEED], actions)
 

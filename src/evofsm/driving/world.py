@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from evofsm.driving.drivers import idm_kernel
 from evofsm.driving.scenarios import Scenario, steps_between
 from evofsm.fsm.kernels import compiled
+from evofsm.fsm.validation import Floats
 from evofsm.guard import Controller, Decision, Proposal
 
 #: What a row of the record holds.
@@ -34,29 +35,29 @@ ACCELERATIONS = [REALISED, LEADER_ACCELERATION, ACCELERATION_BEHIND]
 # Actions that differ by less are the same [m/s²].
 _SAME_ACTION = 1e-9
 
-Drives = Controller | Callable[[NDArray[np.float64]], float | Proposal]
+Drives = Controller | Callable[[Floats], float | Proposal]
 
 
 @dataclass(frozen=True, eq=False)
 class Episode:
     """One run, a row every ``dt``; the last row of a collision is the first gap of 0 or less."""
 
-    time: NDArray[np.float64]  #: (T,) [s]
-    record: NDArray[np.float64]  #: (T, 9) the columns of `evofsm.driving.world.RUN_COLUMNS`
+    time: Floats  #: (T,) [s]
+    record: Floats  #: (T, 9) the columns of `evofsm.driving.world.RUN_COLUMNS`
     decisions: tuple[Decision, ...] = ()  #: of the guard that it was driven under, if any
 
     @property
-    def observations(self) -> NDArray[np.float64]:
+    def observations(self) -> Floats:
         """(T, 3) ndarray: gap [m], v_follower [m/s], v_leader [m/s], as they truly were."""
         return np.ascontiguousarray(self.record[:, [GAP, SPEED, LEADER_SPEED]])
 
     @property
-    def accelerations(self) -> NDArray[np.float64]:
+    def accelerations(self) -> Floats:
         """(T,) ndarray: commanded to the follower after each row [m/s²]."""
         return self.record[:, COMMANDED].copy()
 
     @property
-    def leader_accelerations(self) -> NDArray[np.float64]:
+    def leader_accelerations(self) -> Floats:
         """(T,) ndarray: commanded to the leader after each row [m/s²]."""
         return self.record[:, LEADER_ACCELERATION].copy()
 
@@ -71,12 +72,12 @@ class Episode:
         return bool(self.record[-1, GAP_BEHIND] <= 0.0)
 
     @property
-    def proposed(self) -> NDArray[np.float64]:
+    def proposed(self) -> Floats:
         """(D,) ndarray: what the controller wanted at each decision [m/s²]."""
         return np.array([decision.revision.proposed for decision in self.decisions])
 
     @property
-    def executed(self) -> NDArray[np.float64]:
+    def executed(self) -> Floats:
         """(D,) ndarray: what was commanded at each decision [m/s²]."""
         return np.array([decision.revision.executed for decision in self.decisions])
 
@@ -90,14 +91,14 @@ class Episode:
 class Plan(NamedTuple):
     """A scenario as kernels take it, for one run."""
 
-    times: NDArray[np.float64]  # (rows,)
+    times: Floats  # (rows,)
     dt: float
-    leader: NDArray[np.float64]  # (1, 9) parameters of its driver
-    waves: NDArray[np.float64]  # (k, 2) from a time on, an acceleration
-    brake: NDArray[np.float64]  # (4,) decel, speed, time, and 1 once it brakes
-    cut_in: NDArray[np.float64]  # (3,) row, gap, speed
-    body: NDArray[np.float64]  # (4,) lowest, highest, delay in steps, jerk times dt
-    behind: NDArray[np.float64]  # (1, 9) parameters of the driver behind; (0, 9) for none
+    leader: Floats  # (1, 9) parameters of its driver
+    waves: Floats  # (k, 2) from a time on, an acceleration
+    brake: Floats  # (4,) decel, speed, time, and 1 once it brakes
+    cut_in: Floats  # (3,) row, gap, speed
+    body: Floats  # (4,) lowest, highest, delay in steps, jerk times dt
+    behind: Floats  # (1, 9) parameters of the driver behind; (0, 9) for none
 
     @classmethod
     def of(cls, scenario: Scenario) -> Plan:
@@ -126,13 +127,13 @@ def move(position: float, speed: float, acceleration: float, dt: float) -> tuple
 
 
 @compiled
-def is_over(record: NDArray[np.float64], row: int) -> bool:
+def is_over(record: Floats, row: int) -> bool:
     """Whether a run ends with this row: two cars have met, or it is the last."""
     return bool(record[row, GAP] <= 0.0 or record[row, GAP_BEHIND] <= 0.0 or row + 1 == len(record))
 
 
 @compiled
-def decide(plan: Plan, record: NDArray[np.float64], row: int, command: float) -> None:
+def decide(plan: Plan, record: Floats, row: int, command: float) -> None:
     """Write into a row what each car does until the next, the follower being told ``command``."""
     now, brake, body, time = record[row], plan.brake, plan.body, plan.times[row]
     if now[LEADER_SPEED] >= brake[1] or time >= brake[2]:
@@ -164,12 +165,7 @@ def decide(plan: Plan, record: NDArray[np.float64], row: int, command: float) ->
 
 @compiled
 def advance(
-    plan: Plan,
-    record: NDArray[np.float64],
-    positions: NDArray[np.float64],
-    row: int,
-    command: float,
-    steps: int,
+    plan: Plan, record: Floats, positions: Floats, row: int, command: float, steps: int
 ) -> int:
     """Some steps under one command, in closed form; returns the row reached.
 
@@ -233,7 +229,7 @@ class Road:
         return float(self._plan.times[self.row])
 
     @property
-    def observation(self) -> NDArray[np.float64]:
+    def observation(self) -> Floats:
         """(3,) ndarray: gap [m], v_follower [m/s], v_leader [m/s], as the follower sees them."""
         observation = self._record[max(0, self.row - self._delay), GAP : LEADER_SPEED + 1].copy()
         if self._noise is not None:
@@ -258,13 +254,11 @@ class Road:
 
     # -- As an environment for `evofsm.guard.run_episode` -----------------------------------------
 
-    def reset(self, **_: Any) -> tuple[NDArray[np.float64], dict[str, Any]]:
+    def reset(self, **_: Any) -> tuple[Floats, dict[str, Any]]:
         """The road as it is."""
         return self.observation, {"time": self.time}
 
-    def step(
-        self, action: float, /
-    ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+    def step(self, action: float, /) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Drive on; of two collisions that end a run, running into the leader is a failure."""
         start, speed = self.time, self._record[self.row, SPEED]
         self.advance(action, self.every)

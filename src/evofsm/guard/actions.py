@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.validation import real_array, whole
+from evofsm.fsm.validation import Floats, real_array, whole
 
 # Cells that a box is divided into for the machine, at most: 9 x 9.
 _CELLS = 81
@@ -122,17 +122,17 @@ class BoxActions:
         return math.prod(self.levels)
 
     @cached_property
-    def bounds(self) -> NDArray[np.float64]:
+    def bounds(self) -> Floats:
         """(2, d) the lowest and the highest value of each component."""
         return np.array([self.low, self.high])
 
     @cached_property
-    def half(self) -> NDArray[np.float64]:
+    def half(self) -> Floats:
         """(d,) ndarray: half the range of each component."""
         return np.asarray(0.5 * (self.bounds[1] - self.bounds[0]))
 
     @cached_property
-    def cells(self) -> NDArray[np.float64]:
+    def cells(self) -> Floats:
         """(2, n, d) ndarray: the lowest and the highest corner of each cell, in their order.
 
         After them stand the corners of the whole box, cells of no width.
@@ -147,7 +147,7 @@ class BoxActions:
         boxes = [*itertools.product(*sides), *itertools.product(*ends)]
         return np.ascontiguousarray(np.moveaxis(np.array(boxes), 2, 0))
 
-    def clip(self, action: ArrayLike) -> NDArray[np.float64]:
+    def clip(self, action: ArrayLike) -> Floats:
         """(..., d) ndarray: the actions of the set that are closest; NaN stays."""
         return np.asarray(np.minimum(np.maximum(action, self.bounds[0]), self.bounds[1]))
 
@@ -162,7 +162,7 @@ class BoxActions:
             index = index * count + min(int(part * count), count - 1)
         return index
 
-    def checked(self, name: str, action: ArrayLike) -> NDArray[np.float64]:
+    def checked(self, name: str, action: ArrayLike) -> Floats:
         """A new (d,) array of an action, whatever its values; another length is refused."""
         values = real_array(name, np.atleast_1d(action), 1)
         if len(values) != len(self.low):
@@ -238,9 +238,7 @@ def action_text(action: Action) -> str:
     return f"({', '.join(f'{number:g}' for number in action)})"
 
 
-def distances(
-    actions: ActionSet, options: NDArray[np.float64], action: Action
-) -> NDArray[np.float64]:
+def distances(actions: ActionSet, options: Floats, action: Action) -> Floats:
     """(k,) how far options are from an action, in its unit; in a box, as vectors of half ranges."""
     if isinstance(actions, BoxActions):
         return np.asarray(np.sqrt((((options - action) / actions.half) ** 2).sum(axis=-1)))
@@ -257,7 +255,7 @@ def change(actions: ActionSet, one: Action, other: Action) -> float:
     return float(distances(actions, np.asarray(one, np.float64), other)) / half
 
 
-def nearest_bounds(actions: ActionSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def nearest_bounds(actions: ActionSet) -> tuple[Floats, Floats]:
     """Between which values the nearest ones to a proposal are options: first the whole set.
 
     Then each interval or cell, and last the limits alone: where the nearest is not enough.

@@ -34,11 +34,11 @@ from typing import Any, Literal, NamedTuple, Self
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 import evofsm
 from evofsm import store
 from evofsm.fsm.sharing import Rollback
+from evofsm.fsm.validation import Floats
 from evofsm.guard.actions import checked_mask, written
 from evofsm.guard.api import Proposal, Revision, Situation
 from evofsm.guard.guard import DecisionLogger, Guard
@@ -342,7 +342,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         self._force()
         self._raise()
 
-    def seen(self, observation: NDArray[np.float64], time: float) -> None:
+    def seen(self, observation: Floats, time: float) -> None:
         """An observation came in, at ``time`` [s]."""
         if self._guard is None:
             raise ValueError("the log was given to a guard within an episode; give it before one")
@@ -548,7 +548,7 @@ _NO_FUNCTION = (
 _DEAF: Any = SimpleNamespace(
     **dict.fromkeys(("begin", "seen", "decided", "ended"), lambda *told, **rest: None)
 )
-_Failed = Callable[[NDArray[np.float64]], bool]
+_Failed = Callable[[Floats], bool]
 
 
 class Contents(NamedTuple):
@@ -770,7 +770,7 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-def _floats(values: Sequence[Any]) -> NDArray[np.float64]:
+def _floats(values: Sequence[Any]) -> Floats:
     return np.array([_number(value) for value in values])
 
 

@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.validation import Floats
 from evofsm.guard.api import Judgement, Proposal, Revision, Situation
 from evofsm.guard.guard import Guard
 
 Make = Callable[[], Any]
-Rows = Sequence[NDArray[np.float64]]
+Rows = Sequence[Floats]
 Answers = list[tuple[Any, ...]]
 Clause = Callable[[Make], None]
 
@@ -101,7 +101,7 @@ def _same(one: object, other: object) -> bool:
     return a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
-def _drive(rows: int = 40, seed: int = 0) -> NDArray[np.float64]:
+def _drive(rows: int = 40, seed: int = 0) -> Floats:
     """(rows, 3) gap, speed, leader's speed: behind a leader that brakes now and then."""
     draw = np.random.default_rng(seed)
     leader = np.clip(15.0 + np.cumsum(draw.normal(0.0, 0.8, rows)), 5.0, 30.0)
@@ -149,7 +149,7 @@ def proposes_numbers(make: Make) -> None:
         _insist(math.isfinite(proposal.action), f"it proposes {proposal.action} {where} {why}")
 
 
-def _situation(row: NDArray[np.float64], k: int) -> Situation:
+def _situation(row: Floats, k: int) -> Situation:
     """As a machine of one state recognises it; of none at first."""
     return Situation(row, np.ones(1), None if k == 0 else 0, math.nan, k * _DT)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.extras import needs
-from evofsm.fsm.validation import function
+from evofsm.fsm.validation import Floats, function
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -40,7 +40,6 @@ with needs("gymnasium", "gym", "a wrapper for Gymnasium"):
     from gymnasium.vector import VectorEnv, VectorWrapper
     from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-_Seen = NDArray[np.float64] | None
 Observe = Callable[[Any], ArrayLike | None]
 _Convert = Callable[[Any], Any]
 # Each value of ``Discrete`` is a variable of its own; more of them would take too long.
@@ -325,9 +324,9 @@ class Lane:
         self._shared, self._allowed = shared, action_masks(env)
         self._guard: Guard | None = None  # that decides, within an episode of the guard
         self._episode = 0  # the number of that
-        self._seen: _Seen = None
+        self._seen: Floats | None = None
         self._mask: Mask | None = None
-        self._past: list[tuple[NDArray[np.float64], Proposal, Action]] = []
+        self._past: list[tuple[Floats, Proposal, Action]] = []
         self._score = 0.0
 
     def begin(self, observation: Any, info: Mapping[str, Any]) -> None:
@@ -493,7 +492,7 @@ class Terms:
             raise TypeError(f"failed returned {reply!r}; it must be True or False")
         return bool(reply)
 
-    def look(self, observation: Any) -> _Seen:
+    def look(self, observation: Any) -> Floats | None:
         """What the guard observes; None where there is nothing to judge."""
         reply = None if observation is None else self._observe(observation)
         return None if reply is None else np.array(reply, dtype=np.float64)

@@ -9,8 +9,8 @@ from time import perf_counter
 from typing import Any, NamedTuple, Protocol, SupportsFloat
 
 import numpy as np
-from numpy.typing import NDArray
 
+from evofsm.fsm.validation import Floats
 from evofsm.guard.actions import Action, Choices, no_action
 from evofsm.guard.api import Controller, Proposal, Revision, Situation
 from evofsm.guard.guard import Guard
@@ -51,7 +51,7 @@ class Decision(NamedTuple):
 def run_episode(
     environment: Environment,
     guard: Guard,
-    controller: Controller | Callable[[NDArray[np.float64]], Action | Proposal],
+    controller: Controller | Callable[[Floats], Action | Proposal],
     *,
     seed: int | None = None,
     options: dict[str, Any] | None = None,
@@ -126,7 +126,7 @@ def action_masks(environment: Any) -> Callable[[Any, Mapping[str, Any]], Any]:
     return now
 
 
-def _whole(observation: Any, held: NDArray[np.float64] | None) -> NDArray[np.float64]:
+def _whole(observation: Any, held: Floats | None) -> Floats:
     """The latest value of each variable; NaN of one that was never observed."""
     now = np.array(observation, dtype=np.float64).ravel()
     absent = np.isnan(now)
@@ -134,9 +134,7 @@ def _whole(observation: Any, held: NDArray[np.float64] | None) -> NDArray[np.flo
 
 
 def _asked(
-    propose: Callable[[NDArray[np.float64], float], Action | Proposal],
-    seen: NDArray[np.float64],
-    time: float,
+    propose: Callable[[Floats, float], Action | Proposal], seen: Floats, time: float
 ) -> Proposal | None:
     """What the controller proposes; None where it fails to: someone has to go on driving."""
     try:

@@ -30,14 +30,13 @@ from evofsm.fsm.kernels import compiled
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.sharing import Rollback
-from evofsm.fsm.validation import positive, whole
+from evofsm.fsm.validation import Floats, positive, whole
 from evofsm.guard.actions import Action, Mask
 from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, SearchingJudge, Situation
 from evofsm.store import COUNT, FLAG, FROM_1, MOST_COUNTED, SIZE, Kind, Numbers, Place
 
-_Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
-_Steps = tuple[_Floats, _Floats]  # places before and after
+_Steps = tuple[Floats, Floats]  # places before and after
 
 # Numbers of a place.
 _P = 2
@@ -226,13 +225,13 @@ class SceneRisk(LearningJudge, SearchingJudge):
             return "own row is not seen"
         return self.memory.foresee(scene)
 
-    def _judged(self, risks: _Floats) -> Judgement:
+    def _judged(self, risks: Floats) -> Judgement:
         bounds = [wilson_bounds(float(risk), _ANALOGS) for risk in risks]
         low, high = np.where(np.isnan(risks), math.nan, np.transpose(bounds))
         evidence = 0.0 if np.isnan(risks).any() else float(self.memory.failures)
         return Judgement(risks, low, high, np.full(len(risks), math.nan), evidence)
 
-    def _read(self, observation: _Floats) -> Seen:
+    def _read(self, observation: Floats) -> Seen:
         if not observation.size or observation.size % self.columns:
             raise ValueError(f"{observation.size} numbers are no rows of {self.columns}")
         rows = observation.reshape(-1, self.columns)
@@ -262,7 +261,7 @@ class SceneRisk(LearningJudge, SearchingJudge):
             self._remember(failed=False)
         self._seen = []
 
-    def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+    def end(self, observation: Floats | None, *, failed: bool) -> None:
         """Learn from an episode, and from its last observation if there is one."""
         if observation is not None:
             last = self._read(observation)
@@ -316,21 +315,21 @@ class SceneRisk(LearningJudge, SearchingJudge):
 class Seen(NamedTuple):
     """A scene at one time, of k objects in any order."""
 
-    own: _Floats  #: (p + q,) place, then all else
-    away: _Floats  #: (k, p) places of the objects, relative to one's own
-    other: _Floats  #: (k, q) all else of them, not relative
+    own: Floats  #: (p + q,) place, then all else
+    away: Floats  #: (k, p) places of the objects, relative to one's own
+    other: Floats  #: (k, q) all else of them, not relative
     action: int = -1  #: that followed, if any
 
 
 class Past(NamedTuple):
     """N moments of one or more episodes, one after the other, and M objects in all of them."""
 
-    own: _Floats  #: (N, p + q)
+    own: Floats  #: (N, p + q)
     actions: _Ints  #: (N,); -1 at the last moment of an episode
     counts: _Ints  #: (N,) number of objects
     lost: NDArray[np.bool_]  #: (N,) whether failure came in the step from this moment
-    away: _Floats  #: (M, p)
-    other: _Floats  #: (M, q)
+    away: Floats  #: (M, p)
+    other: Floats  #: (M, q)
     links: _Ints  #: (M,) index of the same object a step later; -1 where it is not known
 
     @classmethod
@@ -401,13 +400,13 @@ class Contact(NamedTuple):
     and is high where little was survived although nothing failed.
     """
 
-    sides: _Floats  #: (p,) half sides of the box in which closeness is counted
-    closeness: _Floats  #: (n,) rising; 1 is at the side of the box
-    risk: _Floats  #: (n,) probability of failure, falling
+    sides: Floats  #: (p,) half sides of the box in which closeness is counted
+    closeness: Floats  #: (n,) rising; 1 is at the side of the box
+    risk: Floats  #: (n,) probability of failure, falling
     met: float  #: median closeness of what failed
 
     @classmethod
-    def learn(cls, survived: _Steps, failed: list[_Steps], spread: _Floats) -> Contact:
+    def learn(cls, survived: _Steps, failed: list[_Steps], spread: Floats) -> Contact:
         """From steps, (s, p) places before and after, of objects survived and at each failure.
 
         The closest object in a failure was met. Of the shapes of a box of this ``spread``, that is
@@ -425,7 +424,7 @@ class Contact(NamedTuple):
         risk = failures / (failures + np.searchsorted(near, at, "right"))
         return cls(sides, np.append(0.0, at), np.append(1.0, risk), float(np.median(met)))
 
-    def of(self, path: _Floats) -> _Floats:
+    def of(self, path: Floats) -> Floats:
         """(..., n) probability of failure by each step of paths, (..., n + 1, p) places."""
         come = _closest(path[..., :-1, :], path[..., 1:, :], self.sides)
         # What is not known of how close is too close is not drawn anew in each step.
@@ -433,7 +432,7 @@ class Contact(NamedTuple):
         return np.asarray(np.interp(so_far, self.closeness, self.risk))
 
 
-def _closest(start: _Floats, end: _Floats, sides: _Floats) -> _Floats:
+def _closest(start: Floats, end: Floats, sides: Floats) -> Floats:
     """How close it comes between two places: the least of ``max(abs(x) / sides)`` on the line."""
     least = np.empty(start.shape[:-1])
     first, last = (np.ascontiguousarray(of).reshape(-1, len(sides)) for of in (start, end))
@@ -442,7 +441,7 @@ def _closest(start: _Floats, end: _Floats, sides: _Floats) -> _Floats:
 
 
 @compiled
-def _closest_on_lines(start: _Floats, end: _Floats, sides: _Floats, least: _Floats) -> None:
+def _closest_on_lines(start: Floats, end: Floats, sides: Floats, least: Floats) -> None:
     for k in range(len(least)):
         least[k] = np.inf
         for point in range(_POINTS):
@@ -457,9 +456,9 @@ def _closest_on_lines(start: _Floats, end: _Floats, sides: _Floats, least: _Floa
 class Foreseen(NamedTuple):
     """What comes of each of n actions, if each action follows it for good."""
 
-    risks: _Floats  #: (n, n) probability of failure within the horizon
-    lasting: _Floats  #: (n, n) expected share of the horizon that is survived
-    after: _Floats  #: (n, p + q) oneself a step later
+    risks: Floats  #: (n, n) probability of failure within the horizon
+    lasting: Floats  #: (n, n) expected share of the horizon that is survived
+    after: Floats  #: (n, p + q) oneself a step later
 
 
 class Memory:
@@ -474,7 +473,7 @@ class Memory:
         self.failures = 0
         #: How many of the episodes were learnt from.
         self.fitted = 0
-        self._motion: _Floats | None = None
+        self._motion: Floats | None = None
 
     def add(self, episode: Past) -> None:
         """Remember an episode; learn from it at once if it failed, else now and then."""
@@ -567,14 +566,14 @@ class Memory:
             weights = 1.0 / (1.0 + off / (_HALF * middle))
         self._motion = np.asarray(motion, np.float64)
 
-    def _moved(self, own: _Floats, other: _Floats) -> _Floats:
+    def _moved(self, own: Floats, other: Floats) -> Floats:
         """(k, p) expected change of relative places in a step; ``own`` is before and after it."""
         ego = np.repeat(_terms(own[:1], own[1:]), len(other), axis=0)
         x = np.hstack([ego, other, other, np.ones((len(other), 1))])
         motion = _first_motion(x.shape[1]) if self._motion is None else self._motion
         return np.asarray(x @ motion)
 
-    def _mine(self, before: _Floats, after: _Floats) -> _Floats:
+    def _mine(self, before: Floats, after: Floats) -> Floats:
         """(k, p) how oneself moves all relative places in a step."""
         assert self._motion is not None
         terms = _terms(before, after)
@@ -630,12 +629,12 @@ class Memory:
         self._objects = self._features(past.own[moment], past.away, past.other)[rows]
         self._paths, self._others = np.cumsum(steps, 1)[rows], past.other[rows]
 
-    def _features(self, own: _Floats, away: _Floats, other: _Floats) -> _Floats:
+    def _features(self, own: Floats, away: Floats, other: Floats) -> Floats:
         far, rest, ego = self._spreads
         near = _NEAR_TO * away / far, _NEAR_TO * other / rest
         return np.hstack([*near, (away + own[:, :_P]) / far, own[:, _P:] / ego[_P:]])
 
-    def apart(self, own: _Floats, one: _Floats) -> _Floats:
+    def apart(self, own: Floats, one: Floats) -> Floats:
         """(k,) squared distance of states of oneself from one, each number by its spread."""
         return np.asarray((((own - one) / self._spreads[2]) ** 2).sum(1))
 
@@ -655,7 +654,7 @@ class Memory:
         losses = ((1.0 - safe) * weights[:, :, None]).sum(0).reshape(n, n, _STEPS_AHEAD)
         return Foreseen(losses[:, :, -1], 1.0 - losses.mean(-1), after)
 
-    def _own_courses(self, own: _Floats) -> tuple[_Floats, _Floats, _Floats]:
+    def _own_courses(self, own: Floats) -> tuple[Floats, Floats, Floats]:
         """How r courses move relative places, by action and by that which follows for good.
 
         (r, n², H, p) moves, (r, n²) shares, and the (n, p + q) states a step later in the first.
@@ -685,19 +684,19 @@ class Memory:
         return np.cumsum(moves, 2), shares / shares.sum(0), after
 
 
-def _terms(before: _Floats, after: _Floats) -> _Floats:
+def _terms(before: Floats, after: Floats) -> Floats:
     """(k, p + 2 q) what of oneself moves all relative places in a step."""
     return np.hstack([after[:, :_P] - before[:, :_P], before[:, _P:], after[:, _P:]])
 
 
-def _first_motion(terms: int) -> _Floats:
+def _first_motion(terms: int) -> Floats:
     """The prior of how places change, without which rare moves of one's own are never learnt."""
     motion = np.zeros((terms, _P))
     motion[:_P] = -np.eye(_P)
     return motion
 
 
-def _nearest(points: _Floats, around: _Floats, most: int) -> tuple[_Ints, _Floats]:
+def _nearest(points: Floats, around: Floats, most: int) -> tuple[_Ints, Floats]:
     """(k, most) indices of the points nearest to each of k, nearest first, and their weights."""
     most = min(most, len(points))
     like = np.empty((len(around), most), np.int64)
@@ -708,7 +707,7 @@ def _nearest(points: _Floats, around: _Floats, most: int) -> tuple[_Ints, _Float
 
 
 @compiled
-def _nearest_into(points: _Floats, around: _Floats, like: _Ints, apart: _Floats) -> None:
+def _nearest_into(points: Floats, around: Floats, like: _Ints, apart: Floats) -> None:
     """The nearest points and their squared distances; of two equally near ones the first."""
     for k in range(len(around)):
         for j in range(len(points)):
