@@ -61,7 +61,7 @@ def test_where_one_limit_depends_on_another_it_foresees_more_than_thresholds(sur
     ours, thresholds = (surge.tally(then, rate, plain=plain)[0] for plain in (None, True))
     assert ours.foreseen == ours.failures > 10
     assert ours.lead > thresholds.lead + DT
-    assert ours.rate < 3.0
+    assert ours.false / ours.days < 3.0
     assert re.search(r"0\.\d+ flow above 0\.\d+", surge.told_by_experience)
 
 
@@ -172,3 +172,10 @@ def test_what_counts_as_foreseen_and_as_false(heat, failed, hold, told):
 def test_a_log_without_failures_is_refused():
     with pytest.raises(ValueError, match="no episode failed"):
         Foresight.learn_log([[1.0, 2.0]], [False], dt=DT, horizon=HORIZON)
+
+
+def test_an_episode_of_which_nothing_was_seen_ends_and_teaches_nothing():
+    judge = Foresight.from_zero(dt=DT, names=NAMES)
+    guard = Guard.of(ActionReviser(judge, Choices(1)), interval=DT, judge=judge)
+    guard.end()
+    assert not len(judge.log.starts)

@@ -113,7 +113,7 @@ def _document(judge: Foresight, runs: Runs, times: Floats, columns: Floats) -> d
         row: dict[str, Any] = {"stated": budget, "is_own": rate == own_rate}
         for kind, plain in (("learnt", None), ("plain", True)):
             tally, _ = judge.tally(runs, rate, plain=plain, columns=columns)
-            row[kind] = {**tally._asdict(), "false_a_day": tally.rate}
+            row[kind] = {**tally._asdict(), "false_a_day": tally.false / tally.days}
         alarms.append(row)
         row = {"stated": budget, "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 3])]}
         row |= {"share_right": judge.shares[rate], "learnt": judge.words(rate) or "none"}

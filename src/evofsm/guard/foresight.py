@@ -136,11 +136,6 @@ class Tally(NamedTuple):
     false: int
     days: float
 
-    @property
-    def rate(self) -> float:
-        """False alarms a day."""
-        return self.false / self.days
-
 
 class Foresight(LearningJudge):
     """Says that a failure is near, where nobody acts.
@@ -550,9 +545,7 @@ class Foresight(LearningJudge):
 
     def start_episode(self, *, learn: bool = True) -> None:
         """Nothing was seen yet; what was before, of an episode that nobody ended, went well."""
-        if self._seen and self.log is not None:
-            observations, self._seen = self._seen, []
-            self._learn_from(observations, self.log, failed=False)
+        self._learn_from(self._seen, failed=False)
         kinds = self.held_out[self.limits[:, _RATE].astype(int), 3]
         self._limits: Floats = self.limits[self.limits[:, _KIND] == kinds]
         # Variables smoothed once and twice; rows since limits were passed, and not; what is on.
@@ -607,30 +600,27 @@ class Foresight(LearningJudge):
 
     def end(self, observation: Floats | None, *, failed: bool) -> None:
         """The episode is over; it learns anew where it learns as it goes, and there is enough."""
-        if self.log is not None:
-            last = [] if observation is None else [np.asarray(observation, np.float64)]
-            self._learn_from([*self._seen, *last], self.log, failed=failed)
-        self._seen = []
+        last = [] if observation is None else [observation]
+        self._learn_from([*self._seen, *last], failed=failed)
         self.start_episode()
 
-    def _learn_from(self, seen: Sequence[Floats], log: Runs, *, failed: bool) -> None:
+    def _learn_from(self, seen: Sequence[Floats], *, failed: bool) -> None:
         """Add an episode, of whose rows those are left out in which something was not seen."""
-        rows = np.array(seen).reshape(len(seen), -1)
-        rows = rows[np.isfinite(rows).all(axis=1)][-_HELD_ROWS // 4 :]
-        if not len(rows):
-            return
-        episodes = np.concatenate([log.rows, rows]), np.append(log.starts, len(log.rows))
-        log = Runs(*episodes, np.append(log.failed, failed))
-        if len(log.rows) > _HELD_ROWS:  # of failures and of others the latest
-            sides = [np.where(side, log.lengths, 0) for side in (log.failed, ~log.failed)]
-            recent = [np.cumsum(side[::-1])[::-1] <= _HELD_ROWS // 2 for side in sides]
-            log = log.part(np.where(log.failed, *recent))
-        count = int(log.failed.sum()), len(log.rows)
-        if count[0] and any(np.array(count) > np.multiply(_MORE, self._learnt)):
-            new = self._of_log(log, self.dt, self.asked, self.hold, self.labels)
-            self.horizon, self.forms, self.limits = new.horizon, new.forms, new.limits
-            self.held_out, self._learnt = new.held_out, count
-        self.log = log
+        rows = [row for row in seen if np.isfinite(row).all()][-_HELD_ROWS // 4 :]
+        if (log := self.log) is not None and rows:
+            episodes = np.concatenate([log.rows, rows]), np.append(log.starts, len(log.rows))
+            log = Runs(*episodes, np.append(log.failed, failed))
+            if len(log.rows) > _HELD_ROWS:  # of failures and of others the latest
+                sides = [np.where(side, log.lengths, 0) for side in (log.failed, ~log.failed)]
+                recent = [np.cumsum(side[::-1])[::-1] <= _HELD_ROWS // 2 for side in sides]
+                log = log.part(np.where(log.failed, *recent))
+            count = int(log.failed.sum()), len(log.rows)
+            if count[0] and any(np.array(count) > np.multiply(_MORE, self._learnt)):
+                new = self._of_log(log, self.dt, self.asked, self.hold, self.labels)
+                self.horizon, self.forms, self.limits = new.horizon, new.forms, new.limits
+                self.held_out, self._learnt = new.held_out, count
+            self.log = log
+        self._seen = []
 
     def sums(self, n_states: int, /) -> dict[str, float]:
         """What it has learnt, in a few sums."""
