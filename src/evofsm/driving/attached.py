@@ -284,7 +284,7 @@ class Guarding:
             if car.seen is not None:
                 self._look_back(car, speed)
             if decides:
-                self._look(car, speed, time)
+                self._look(car, speed)
                 if car.around[0] is not None:
                     seen_leaders[car.around[0].id] = car.around[0].speed
                 if car.seen is not None and self._acts:
@@ -295,7 +295,7 @@ class Guarding:
         if decides:
             self._watch(seen_leaders)
 
-    def _look(self, car: _Car, speed: float, time: float) -> None:
+    def _look(self, car: _Car, speed: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
         ahead, before = self._seeing.neighbour(car.id, speed), car.around[0]
         scene = isinstance(_judge(car.guard), TrafficRisk)
@@ -307,22 +307,20 @@ class Guarding:
         car.around = ahead, behind
         if (ahead and ahead.id) != (before and before.id):
             car.guard.begin()  # what is known of the one before does not hold of this one
-        car.revision = None
-        if ahead is None and behind is None:
-            car.seen = None
-        elif scene:
+        car.revision = car.seen = None
+        if scene and (ahead or behind):
             car.seen = self._seeing.rows(car.id, speed, ahead, behind)
-        else:
-            assert ahead is not None
+        elif ahead:
             car.seen = np.array([ahead.room, speed, ahead.speed])
 
-    def _decide(self, car: _Car, proposal: float) -> None:
+    def _decide(self, car: _Car, proposal: float) -> Revision:
         assert car.seen is not None
-        car.revision = car.guard.decide(car.seen, proposal)
+        revision = car.revision = car.guard.decide(car.seen, proposal)
         self.decisions += 1
         worst = judge.worst if isinstance(judge := _judge(car.guard), TrafficRisk) else None
         neighbour = car.around[worst.number - 1 if worst else 0]
         car.about = (neighbour.id, worst.role if worst else Role.AHEAD) if neighbour else ("", None)
+        return revision
 
     def _act(self, car: _Car, speed: float) -> None:
         """Set the speed, where the guard allows less than the car might want."""
@@ -360,10 +358,7 @@ class Guarding:
         if car.mode is not None and speed >= car.limit - _SAME_SPEED:
             desired_speed = max(car.wish, speed)
         wish, acceleration = ((v - car.speed) / self._seeing.dt for v in (desired_speed, speed))
-        if not self._acts and car.revision is None:
-            self._decide(car, wish)
-        revision = car.revision
-        assert revision is not None
+        revision = car.revision or self._decide(car, wish)  # where it acts, that was decided before
         stands = max(car.speed, speed, desired_speed) < _STANDS
         outcome = acceleration if self._acts else float(revision.advised)
         self.revised += not stands and outcome < wish - SLIGHT

@@ -20,6 +20,7 @@ from evofsm.driving.sumo import open_world
 from evofsm.driving.world import Episode, Road
 from evofsm.extras import needs
 from evofsm.fsm.validation import Floats
+from evofsm.guard.actions import put_into
 
 with needs("gymnasium", "gym", "an environment of Gymnasium"):
     import gymnasium
@@ -121,10 +122,8 @@ class CarFollowing(gymnasium.Env[Floats, Floats]):
         acceleration = float(np.asarray(action, dtype=np.float64).reshape(()))
         if not math.isfinite(acceleration):
             raise ValueError(f"action is {acceleration}; an acceleration must be finite")
-        actions, row = self.family.actions, road.row
-        observation, _, terminated, truncated, outcome = road.step(
-            min(max(acceleration, actions.low), actions.high)
-        )
+        row, command = road.row, put_into(self.family.actions, acceleration)
+        observation, _, terminated, truncated, outcome = road.step(command)
         info = self._info(road.episode(first=row)) | {"realised": outcome["realised"]}
         reward = info["distance"] - (self.collision_cost if terminated else 0.0)
         return np.clip(observation, LOW, HIGH), reward, terminated, truncated, info
