@@ -157,7 +157,7 @@ _FOUND = ("failed", "failed_while_learning", "failed_late", "kept", "goals", "sc
 
 def _shifted(case: Case, seed: int, base: int, parts: Sequence[str]) -> dict[str, Any]:
     """A family of cars that changes once it was learnt: ten episodes later, and those ten."""
-    from studies.judges import learnt_guard
+    from studies.judges import learnt_guard, taken_out
 
     family = load_family(case.system)
     assert family.shifted is not None
@@ -171,9 +171,10 @@ def _shifted(case: Case, seed: int, base: int, parts: Sequence[str]) -> dict[str
     )
     drives: list[Draw] = [*training(family, base, seed, case.train)]
     drives += training(family.shifted, base, seed, 10, first=case.train)
-    collided = [drive(guard, one).collided for one in drives]
-    guard.freeze()
-    found = list(teach(guard, held_out(family.shifted, base, case.test)))
+    with taken_out(parts):
+        collided = [drive(guard, one).collided for one in drives]
+        guard.freeze()
+        found = list(teach(guard, held_out(family.shifted, base, case.test)))
     return {
         "failed": sum(one.collided for one in found),
         "failed_while_learning": sum(collided),

@@ -769,23 +769,14 @@ def _parts(study: ClosedLoop, found: Frames, lines: pl.DataFrame) -> Iterator[Ta
         )
 
 
-def _spread(name: str) -> list[pl.Expr]:
-    """Median and range over seeds."""
-    column = pl.col(name)
-    return [
-        column.median().alias(name),
-        column.min().alias(f"{name}_low"),
-        column.max().alias(f"{name}_high"),
-    ]
-
-
 def learning_curve(curve: pl.DataFrame) -> pl.DataFrame:
     """Tests on the way: median and range over learning seeds."""
     curve = curve.with_columns(rate=pl.col("collisions") / pl.col("held_out"))
-    names = ("rate", "mobility", "states", "train_collisions")
+    over = pl.col("rate", "mobility", "states", "train_collisions")
+    low, high = over.min().name.suffix("_low"), over.max().name.suffix("_high")
     return (
         curve.group_by("policy", "episodes", "held_out", maintain_order=True)
-        .agg([one for name in names for one in _spread(name)], seeds=pl.len())
+        .agg(over.median(), low, high, seeds=pl.len())
         .sort("policy", "episodes")
     )
 

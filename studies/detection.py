@@ -342,12 +342,10 @@ class Watcher:
     def watch(self, draws: Iterable[tuple[Family, Draw]]) -> Self:
         """Learn from unrevised episodes, each with the family it is of."""
         for family, draw in draws:
-            drive_ = partial(_drive, family, draw)
-            if not self.states:
-                drive_(None, self.risk)
-                continue
-            drive_(self.default.machine, self.risk)
-            self.paper.count(drive_(self.paper.machine, None), family.interval)
+            _drive(family, draw, self.default.machine if self.states else None, self.risk)
+            if self.states:
+                driven = _drive(family, draw, self.paper.machine, None)
+                self.paper.count(driven, family.interval)
         return self
 
     def scores(self) -> Scores:

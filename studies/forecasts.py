@@ -49,10 +49,7 @@ from studies import lib
 from studies.lib import Frames, Study, at_least
 
 Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
-
-_NO_ACTION = -1
 
 # -- Drives ---------------------------------------------------------------------------------------
 
@@ -123,7 +120,7 @@ def _driven(family: Family, pace: Pace, draw: Draw) -> Episode:
 
 
 def _encode(actions: IntervalActions, taken: Floats) -> NDArray[np.int64]:
-    indices = np.full(len(taken), _NO_ACTION)
+    indices = np.full(len(taken), -1)
     known = np.isfinite(taken)
     indices[known] = actions.encode(taken[known])
     return indices

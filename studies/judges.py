@@ -19,9 +19,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
+from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from unittest.mock import patch
 
 import numpy as np
 import polars as pl
@@ -57,6 +60,18 @@ PARTS: dict[str, str] = {
     "scan": "a disturbance begins with the episode",
     "horizon": "it looks 64 steps ahead",
     "exploration": "no action is tried to learn what it does",
+    "misled": "lags stay in the model whatever they foresee",
+    "regulators": "feedback evolves by mutants alone",
+    "settled": "frozen, a rival never counts",
+    "glitches": "what jumps there and back counts",
+    "gaps": "what was not seen is not filled in",
+    "held": "what rests at an end of a variable is learnt from, too",
+    "witness": "what one episode alone survived takes back a failure",
+    "blur": "an end that was seen once is as sharp as others",
+    "dropped": "thresholds that fewer forms take the place of are forgotten",
+    "endings": "what ended by itself counts as cut off",
+    "fatal": "what nothing survives may begin anywhere",
+    "landings": "a variable that jumps does not land where it did",
 }
 #: What stands in its settings where a part has no other switch.
 _GONE: dict[str, dict[str, Any]] = {
@@ -69,12 +84,42 @@ _GONE: dict[str, dict[str, Any]] = {
     "scan": {"n_starts": 1},
     "horizon": {"horizon_min": 64, "horizon_max": 64},
     "exploration": {"tries": 0},
+    "misled": {"misled": math.inf},
+    "regulators": {"n_regulators": 0},
+    "settled": {"settled": 10**6},
 }
+# What stands in the place of functions and numbers of its modules where there is not even that.
+_INSTEAD: dict[str, tuple[str, Any]] = {
+    "glitches": ("model.without_glitches", lambda z, unit: z),
+    "gaps": ("model.filled", lambda z, failed: z),
+    "held": ("motion._held", lambda state, to, after: np.zeros((2, *after.shape), bool)),
+    "witness": ("motion._extremes", lambda known, new, close: (_both(known, new), new < known[0])),
+    "blur": ("failure._BLURRED", 0.0),
+    "dropped": ("danger._dropped", lambda state, was, *rest: was[:0]),
+    "endings": ("danger._ENDED", math.inf),
+    "fatal": ("learn._fatal", lambda state, known, found, settings: (state, found)),
+    "landings": ("model.trimmed", lambda found: found[:, : found.shape[1] // 2].copy()),
+}
+
+
+def _both(known: Vector, new: Vector) -> Vector:
+    """(2, m) the least of all, twice."""
+    return np.tile(np.minimum(known[0], new), (2, 1))
+
+
 _SETTINGS = asdict(LearntSettings())
-#: Each number of its settings, halved and doubled; of what is near 1 how much it lacks.
+_LEARNT = "evofsm.guard.learnt"
+# Private numbers of its modules.
+_NUMBERS = {
+    f"{module}.{name}": value
+    for module in ("backups", "danger", "failure", "learn", "model", "motion")
+    for name, value in vars(resolve_name(f"{_LEARNT}.{module}")).items()
+    if name.startswith("_") and type(value) in (int, float)
+}
+#: Each number of the learnt judge, halved and doubled; of what is near 1 how much it lacks.
 SWEEP = tuple(
     f"{name}={1.0 - times * (1.0 - value) if 0.5 < value < 1.0 else type(value)(times * value):g}"
-    for name, value in _SETTINGS.items()
+    for name, value in (_SETTINGS | _NUMBERS).items()
     for times in (0.5, 2.0)
 )
 #: Our judges: of variables, and of scenes.
@@ -157,7 +202,9 @@ def learnt_guard(
     """
     parts = [part for part in without if part in LearntRisk.PARTS]
     gone = [_GONE.get(part) or setting(part) for part in without if part not in LearntRisk.PARTS]
-    settings = LearntSettings(**{name: value for one in gone for name, value in one.items()})
+    settings = LearntSettings(
+        **{name: value for one in gone for name, value in one.items() if name in _SETTINGS}
+    )
     told |= {"horizon": horizon, "seed": seed}
     judge = LearntRisk(interval, **told, without=parts, settings=settings)
     guard = Guard(**told, interval=interval, judge=judge, failed=failed)
@@ -168,17 +215,27 @@ def learnt_guard(
 
 
 def setting(part: str) -> dict[str, Any]:
-    """A number of `LearntSettings` by NAME=VALUE; nothing of another part.
+    """A number of the learnt judge by NAME=VALUE; nothing of another part.
 
-    >>> setting("horizon=32"), setting("harm")
-    ({'horizon': 32}, {})
+    >>> setting("horizon=32"), setting("motion._LATEST=0.4"), setting("harm")
+    ({'horizon': 32}, {'motion._LATEST': 0.4}, {})
     """
     name, is_set, value = part.partition("=")
     if not is_set:
         return {}
-    if (default := _SETTINGS.get(name)) is None:
-        raise ValueError(f"there is no setting {name!r}; there are {', '.join(_SETTINGS)}")
+    if (default := (known := _SETTINGS | _NUMBERS).get(name)) is None:
+        raise ValueError(f"there is no number {name!r}; there are {', '.join(known)}")
     return {name: type(default)(float(value))}
+
+
+def taken_out(parts: Sequence[str]) -> ExitStack:
+    """Within it what has no switch is left out of the learnt judge, or is another number."""
+    stack = ExitStack()
+    for part in parts:
+        numbers = [(name, value) for name, value in setting(part).items() if name in _NUMBERS]
+        for place, instead in [_INSTEAD[part]] if part in _INSTEAD else numbers:
+            stack.enter_context(patch(f"{_LEARNT}.{place}", instead))
+    return stack
 
 
 def told_to(judge: Any) -> str:
@@ -274,11 +331,12 @@ def trial(
     """
     system: Any = make_system(name, controller)
     system = benchmark.Changed(system, change) if change else system
-    made = make_judge(judge, system, lib.names_in(without), seed)
     train = system.train if train is None else train
-    learnt = [run(system, made, Start.training(base, seed, k)) for k in range(train)]
-    made.freeze()
-    held_out = [run(system, made, Start.held_out(base, k)) for k in range(test)]
+    with taken_out(parts := lib.names_in(without)):
+        made = make_judge(judge, system, parts, seed)
+        learnt = [run(system, made, Start.training(base, seed, k)) for k in range(train)]
+        made.freeze()
+        held_out = [run(system, made, Start.held_out(base, k)) for k in range(test)]
     failures = [place for place, one in enumerate(learnt, start=1) if one.failed]
     by_late = [one.score for one in learnt[max(0, late - 10) : late]]
     scores = np.array([one.score for one in held_out])
@@ -419,7 +477,7 @@ class Judges(Study):
         str,
         Option(
             help="Parts to take away, each by itself, with commas; all, or none. NAME=VALUE is "
-            "another setting of the learnt judge, sweep each of them halved and doubled."
+            "another number of the learnt judge, sweep each of them halved and doubled."
         ),
     ] = ALL
     controllers: Annotated[

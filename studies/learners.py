@@ -20,7 +20,7 @@ from evofsm.extras import needs
 from evofsm.guard import Guard, RevisedActions
 from studies.peers import ALONE, FIRST_STATE, GOAL, LEAN, TASKS, WAYS
 from studies.rivals import Rival, States, cart_shield, pendulum_shield
-from studies.systems import Action, Box, Discrete, Vector
+from studies.systems import Action, Box, Discrete, Vector, actions_of
 
 with needs("stable-baselines3", "rl", "the study of peers"):
     import gymnasium
@@ -263,13 +263,6 @@ class SafetyCritic(Rival):
 
     def _input(self, states: States, options: States) -> Any:
         return torch.as_tensor(np.hstack([states / self._scale, options]), dtype=torch.float32)
-
-
-def actions_of(space: Any) -> Box | Discrete:
-    """Actions of an environment, as rivals have them."""
-    if isinstance(space, gymnasium.spaces.Discrete):
-        return Discrete(int(space.n))
-    return Box(tuple(space.low.tolist()), tuple(space.high.tolist()))
 
 
 def rival(kind: str, task: str, env: Env, seed: int) -> Rival:

@@ -251,17 +251,14 @@ class Peers(lib.Study):
             "At least half of the proposals are changed in the last quarter": pl.col("changed_last")
             >= 0.5,
         }
-        return Page(
-            name=self.name,
-            about=_ABOUT,
-            parts=[*tables, said],
-            command=lib.command_line(),
+        return self.shown(
+            _ABOUT,
+            [*tables, said],
             lost=[
                 Table(title, both.filter(which), {"task": "{task}", **_SHOWN, **_OF_ALONE})
                 for title, which in lost.items()
             ],
-            targets=lib.frame_of(targets),
-            facts=self.facts,
+            targets=targets,
             packages=("gymnasium", "stable-baselines3", "torch", "mujoco"),
         )
 

@@ -47,7 +47,7 @@ from evofsm.guard import (
 from evofsm.paper import Page, Table
 from studies import lib
 from studies.drives import Episode, checksums_in, read_runs, runs_in
-from studies.lib import Frames, Study, Target, at_least, frame_of
+from studies.lib import Frames, Study, at_least, frame_of
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -413,6 +413,7 @@ class Real(Study):
         is_ours = pl.col("measure").str.starts_with("evofsm")
         enough = rows.filter("enough")
         shown = enough.filter(measure=SHOWN)
+        clear = int((shown["over_ttc_low"] > 0.0).sum())
         both = lib.compared(enough, pl.col("measure") == SHOWN, ["target", "horizon"])
         better = (pl.col("auroc") > pl.col("auroc_ours")) | (pl.col("auprc") > pl.col("auprc_ours"))
         asked = {"event": "{target}", "within [s]": "{horizon:g}"}
@@ -460,7 +461,7 @@ class Real(Study):
                     asked | columns,
                 ),
             ],
-            targets=_targets(shown) if len(shown) else [],
+            targets=[at_least(_ASKED, clear, len(shown))] if len(shown) else [],
             facts={"checksums": f"{len(checksums_in(self.data))} in the list"},
             verdict="" if len(shown) else "Too few events in these runs to compare anything",
         )
@@ -477,12 +478,7 @@ the event is under way already, and those whose outcome the end of an episode hi
 Nobody commanded anything that could be seen, so only watching is possible: full braking is never
 observed, and {-LOWEST:g} m/s² is assumed to be commandable. Only logistic and ours learn anything
 from the training runs."""
-
-
-def _targets(shown: pl.DataFrame) -> Iterator[Target]:
-    clear = int((shown["over_ttc_low"] > 0.0).sum())
-    what = f"questions in which {SHOWN} surely ranks better than time to collision"
-    yield at_least(what, clear, len(shown))
+_ASKED = f"questions in which {SHOWN} surely ranks better than time to collision"
 
 
 def _dealt(cases: Sequence[Case], folds: int, seed: int) -> list[tuple[list[Case], list[int]]]:

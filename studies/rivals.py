@@ -80,11 +80,11 @@ class Unrevised(Rival):
         return proposal
 
 
-def tried(actions: Box | Discrete) -> States:
-    """(k,) or (k, d) actions that stand for all; of a box a grid, ends included."""
+def tried(actions: Box | Discrete, each: int | None = None) -> States:
+    """(k,) or (k, d) actions that stand for all; of a box so many of each number, ends included."""
     if isinstance(actions, Discrete):
         return np.arange(actions.n_actions, dtype=np.float64)
-    each = {1: 41, 2: 9}[len(actions.low)]
+    each = each or {1: 41, 2: 9}[len(actions.low)]
     ends = zip(actions.low, actions.high, strict=True)
     axes = [np.linspace(low, high, each) for low, high in ends]
     return axes[0] if len(axes) == 1 else np.array(list(product(*axes)))
@@ -100,79 +100,48 @@ def as_action(value: States, actions: Box | Discrete) -> Action:
 # -- Keep what a backup policy, or a regulator, can save ------------------------------------------
 
 
-class BackupShield(Rival):
-    """Executes the closest action after which a backup policy does not fail for a while.
+class ObstacleShield(Rival):
+    """Stops before masa-safe-rl's obstacle, whose corners are (0, 2) and (1, 3).
 
-    Where there is none, the action is taken after which the failure comes last. This is a
-    predictive safety filter (Wabersich and Zeilinger 2021) with a single backup and no disturbance.
-
-    Parameters
-    ----------
-    actions : Box or Discrete
-    move : callable
-        From (k, m) states and k actions to the next states.
-    fails : callable
-        From (k, m) states to whether each has failed.
-    backup : callable
-        From (k, m) states to k actions.
-    steps : int
-        That the backup has to last.
+    It executes the closest action that is survived if full brakes follow. Where there is none, the
+    action is taken after which the failure comes last. This is a predictive safety filter
+    (Wabersich and Zeilinger 2021) with a single backup and no disturbance.
     """
 
     told = "dynamics and limits"
+    _STEPS = 12  # that have to be survived
+    # Of an action, of a speed, way of a step at speed 1; and the package counts in 32 bits.
+    _GAIN, _FASTEST, _AHEAD, _ROUNDING = 0.005, 0.05, 2.0, 1e-6
 
-    def __init__(
-        self,
-        actions: Box | Discrete,
-        move: Callable[[States, States], States],
-        fails: Callable[[States], NDArray[np.bool_]],
-        backup: Callable[[States], States],
-        steps: int,
-    ) -> None:
-        self._move, self._fails, self._backup = move, fails, backup
-        self._steps = steps
+    def __init__(self, actions: Box) -> None:
         self._actions, self._tried = actions, tried(actions)
 
     def action(self, observation: Vector, proposal: Action) -> Action:
-        """The proposal, or the closest action after which the backup lasts."""
-        if self._lasts(observation, np.array([proposal], np.float64))[0] == self._steps:
+        """The proposal, or the closest action after which braking lasts."""
+        if self._lasts(observation, np.array([proposal], np.float64))[0] == self._STEPS:
             return proposal
         lasts = self._lasts(observation, self._tried)
-        away = np.abs(self._tried - proposal).reshape(len(self._tried), -1).sum(axis=1)
-        best = int(np.lexsort((away, -lasts))[0])
-        return as_action(self._tried[best], self._actions)
+        away = np.abs(self._tried - proposal).sum(axis=1)
+        return as_action(self._tried[int(np.lexsort((away, -lasts))[0])], self._actions)
 
     def _lasts(self, state: Vector, first: States) -> NDArray[np.int64]:
         """(k,) steps that are survived after each action."""
         states = self._move(np.repeat(state[None], len(first), axis=0), first)
-        lasts = np.zeros(len(first), np.int64)
-        alive = ~self._fails(states)
-        for _ in range(self._steps):
+        lasts, alive = np.zeros(len(first), np.int64), ~self._fails(states)
+        for _ in range(self._STEPS):
             lasts += alive
-            if not alive.any() or lasts.max() == self._steps:
-                break
-            states = self._move(states, self._backup(states))
+            brakes = np.clip(-states[:, 2:] / self._GAIN, self._actions.low, self._actions.high)
+            states = self._move(states, brakes)
             alive &= ~self._fails(states)
         return lasts
 
+    def _move(self, states: States, taken: States) -> States:
+        speed = np.clip(states[:, 2:] + self._GAIN * taken, -self._FASTEST, self._FASTEST)
+        return np.hstack([states[:, :2] + self._AHEAD * speed, speed])
 
-def obstacle_shield(actions: Box) -> BackupShield:
-    """Stops before masa-safe-rl's obstacle, whose corners are (0, 2) and (1, 3)."""
-    gain, fastest, ahead = 0.005, 0.05, 2.0  # of an action, of a speed, way of a step at speed 1
-    rounding = 1e-6  # for the package counts in 32 bits
-
-    def move(states: States, taken: States) -> States:
-        speed = np.clip(states[:, 2:] + gain * taken, -fastest, fastest)
-        return np.hstack([states[:, :2] + ahead * speed, speed])
-
-    def brake(states: States) -> States:
-        return np.asarray(np.clip(-states[:, 2:] / gain, actions.low, actions.high))
-
-    def fails(states: States) -> NDArray[np.bool_]:
-        low, high = np.array([0.0, 2.0]) - rounding, np.array([1.0, 3.0]) + rounding
+    def _fails(self, states: States) -> NDArray[np.bool_]:
+        low, high = np.array([0.0, 2.0]) - self._ROUNDING, np.array([1.0, 3.0]) + self._ROUNDING
         return np.asarray(np.all((states[:, :2] >= low) & (states[:, :2] <= high), axis=1))
-
-    return BackupShield(actions, move, fails, brake, steps=12)
 
 
 class LevelSet(Rival):
@@ -296,9 +265,6 @@ class ToldOfAcc(Rival):
         drift = self._SURE * self._noise * self._dt**2 * math.sqrt(steps**3 / 3.0)
         return drift + faster * (0.5 * faster / self._limit + self._dt)
 
-    def _clipped(self, action: float) -> float:
-        return min(max(action, -self._limit), self._limit)
-
 
 class StoppingDistance(ToldOfAcc):
     """The largest acceleration up to the proposal after which it can still stop short of 0."""
@@ -345,7 +311,7 @@ class Barrier(ToldOfAcc):
         largest = (-b + math.sqrt(inside)) / (2.0 * a) if inside >= 0.0 else -self._limit
         if v + self._time * largest < 0.0 and self._to_place:  # it opens: no distance to stop
             largest = -(x + self._time * v + margin + kept * safe) / self._to_place
-        return min(float(proposal), self._clipped(largest))
+        return min(float(proposal), max(largest, -self._limit), self._limit)
 
 
 # -- States and counted matrices alone ------------------------------------------------------------
@@ -374,13 +340,9 @@ class Counted(Rival):
 
     def __init__(self, system: System) -> None:
         self._discrete = isinstance(system.actions, Discrete)
-        if isinstance(system.actions, Discrete):
-            self._actions = tried(system.actions)[:, None]
-        else:
-            low, high = system.actions.low, system.actions.high
-            each = max(2, round(self._LEVELS ** (1.0 / len(low))))
-            axes = (np.linspace(*ends, each) for ends in zip(low, high, strict=True))
-            self._actions = np.array(list(product(*axes)))
+        numbers = 1 if self._discrete else len(system.actions.low)
+        levels = tried(system.actions, max(2, round(self._LEVELS ** (1.0 / numbers))))
+        self._actions = levels.reshape(len(levels), -1)
         self._machine: EvolvingFSM | None = None
         self._failed_at: Vector = np.empty(0)
         self._risk: States = np.empty((0, 0))  # (actions, states)
@@ -628,7 +590,7 @@ def rivals_of(system: System) -> Mapping[str, Callable[[], Any]]:
             told = system.actions, system.fails, system.circular
             return {"lqr-shield": partial(pendulum_shield, *told)}
         case Masa():
-            return {"brake-shield": partial(obstacle_shield, system.actions)}
+            return {"brake-shield": partial(ObstacleShield, system.actions)}
         case Highway():
             lanes = "left" in system.names
             fit = {name: one for name, one in _ON_THE_ROAD.items() if lanes or not one.needs_lanes}

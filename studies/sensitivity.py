@@ -192,8 +192,7 @@ class Parameter:
 
     def moved(self, setting: Setting, value: Any) -> Setting:
         """The same setting with another value."""
-        changes: dict[str, Any] = {self.name: value}
-        return replace(setting, **changes)
+        return replace(setting, **{self.name: value})
 
 
 _TYRE = "firm braking to the best a tyre can do"

@@ -14,7 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from studies.systems import Action, Box, Controllers, Discrete, Start, System, Vector, gymnasium_of
+from studies.systems import (
+    Action,
+    Box,
+    Controllers,
+    Discrete,
+    Start,
+    System,
+    Vector,
+    actions_of,
+    gymnasium_of,
+)
 
 
 class Careless(System):
@@ -349,11 +359,7 @@ class Peer(Careless):
 
     def __init__(self, controller: str | None = None, *, task: str, name: str) -> None:
         self.name, self._env = name, gymnasium_of(task)
-        space = self._env.action_space
-        discrete = hasattr(space, "n")
-        self.actions = (
-            Discrete(int(space.n)) if discrete else Box(_row(space.low), _row(space.high))
-        )
+        self.actions = actions_of(self._env.action_space)
         self.variables = tuple(f"z{k}" for k in range(self._env.observation_space.shape[0]))
         self.interval = float(getattr(self._env, "dt", 0.02))
         self._careless, self.has_failed = _CARELESS[task]
@@ -386,10 +392,6 @@ class Peer(Careless):
     def _has_arrived(self) -> bool:
         lander = getattr(self._env, "lander", None)
         return bool(self._ended) and lander is not None and not lander.awake
-
-
-def _row(numbers: Any) -> tuple[float, ...]:
-    return tuple(map(float, numbers))
 
 
 # By task: what the careless one wants, of an observation and a whim from -1 to 1 that it has in an

@@ -110,6 +110,13 @@ class Discrete:
         return int(chance.integers(self.n_actions))
 
 
+def actions_of(space: Any) -> Box | Discrete:
+    """The actions of a space of Gymnasium."""
+    if hasattr(space, "n"):
+        return Discrete(int(space.n))
+    return Box(tuple(map(float, space.low)), tuple(map(float, space.high)))
+
+
 class System(ABC):
     """A system with one of its `controllers`: the first, unless another one is named."""
 
@@ -577,13 +584,11 @@ class Cars(System):
         return outcome_of(self.road.episode(), _alone(self.name, self._start)).mobility
 
 
+_family = lru_cache(load_family)
+
+
 def _draw(family: Family, start: Start) -> Draw:
     return family.draw(start.seed, start.episode, split=start.split)
-
-
-@lru_cache
-def _family(name: str) -> Family:
-    return load_family(name)
 
 
 @lru_cache(maxsize=4096)
@@ -621,8 +626,7 @@ class Masa(System):
         with warnings.catch_warnings():  # that its boxes are cast to 32 bits
             warnings.simplefilter("ignore", UserWarning)
             self._env: Any = found.Obstacle()
-        space = self._env.action_space
-        self.actions = Box(tuple(map(float, space.low)), tuple(map(float, space.high)))
+        self.actions = actions_of(self._env.action_space)
         super().__init__(controller)
 
     @property

@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Iterable
 from copy import deepcopy
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,8 +17,8 @@ from studies import lib
 from studies.benchmark import Case
 from studies.good import GOOD
 from studies.judges import trial
-from studies.rivals import Rival
-from studies.systems import Action, Discrete, System, Vector
+from studies.rivals import Rival, as_action, tried
+from studies.systems import Action, System, Vector
 
 #: A row for each system and controller, and how many held-out episodes of which draws.
 CEILINGS = Path(__file__).parents[1] / "docs" / "results" / "ceiling.json"
@@ -141,12 +140,7 @@ class Ceiling(Rival):
 
 
 def _grid(actions: Any, each: int) -> list[Action]:
-    """All of discrete actions; of a box so many of each number, ends included."""
-    if isinstance(actions, Discrete):
-        return list(range(actions.n_actions))
-    ends = zip(actions.low, actions.high, strict=True)
-    found = [np.array(one) for one in product(*(np.linspace(*end, each) for end in ends))]
-    return found if len(actions.low) > 1 else [float(one[0]) for one in found]
+    return [as_action(one, actions) for one in tried(actions, each)]
 
 
 # -- Beside the learnt guard ----------------------------------------------------------------------

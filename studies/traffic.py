@@ -288,8 +288,7 @@ class Traffic(Study):
             partial(cut_in, regain, self.seed + k, *self.episodes)
             for regain, k in product(self.regains, range(self.seeds))
         ]
-        parts = found[: len(tasks)], found[len(tasks) :]
-        rows, points = map(frame_of, parts)
+        rows, points = frame_of(found[: len(tasks)]), frame_of(found[len(tasks) :])
         driven = frame_of(lib.parallel(families, workers, "Learning"))
         return {"rows": rows, "curve": points, "cut_in": driven}
 

@@ -194,10 +194,6 @@ def methods(cls):
                     yield name, method
 
 
-def sections(thing):
-    return re.findall(r"^([A-Z]\w+)\n-+$", inspect.cleandoc(thing.__doc__ or ""), re.MULTILINE)
-
-
 def missing(thing):
     """Sections that the docstring of a class, function or method lacks, or leaves empty.
 
@@ -209,8 +205,9 @@ def missing(thing):
     given = () if inspect.isclass(thing) else set(inspect.signature(thing).parameters) - {"self"}
     if len(given) > is_method:
         lacks.add("Parameters")
-    lacks -= set(sections(thing))
-    if not (is_method or doctest.DocTestParser().get_examples(thing.__doc__ or "")):
+    text = inspect.cleandoc(thing.__doc__ or "")
+    lacks -= set(re.findall(r"^([A-Z]\w+)\n-+$", text, re.MULTILINE))
+    if not (is_method or doctest.DocTestParser().get_examples(text)):
         lacks.add("Examples")
     return lacks
 

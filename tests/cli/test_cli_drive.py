@@ -29,8 +29,9 @@ EMERGENCY = load_family("emergency")
 EPISODES = 400
 
 
-def command(*words):
-    return [sys.executable, "-m", "evofsm", "drive", *map(str, words)]
+def started(*words, **how):
+    command = [sys.executable, "-m", "evofsm", "drive", *map(str, words)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, **how)
 
 
 def begun(folder, setup):
@@ -218,13 +219,6 @@ def workers_of(process):
     ]
 
 
-def wait_until(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
-
-
 def is_alive(process):
     try:
         return "\nState:\tZ" not in Path(f"/proc/{process}/status").read_text()
@@ -247,24 +241,23 @@ def test_it_is_what_driving_in_turn_makes_of_the_same_episodes(tmp_path, world):
 @pytest.mark.slow
 def test_killed_workers_and_a_killed_parent_change_nothing(evofsm, tmp_path, undisturbed):
     journal, words = tmp_path / "episodes.jsonl", unrevised(tmp_path, "--workers", 2)
-    with subprocess.Popen(
-        command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
+    with started(*words, stdout=subprocess.DEVNULL) as process:
         wait_for(journal, 2, process)
         os.kill(workers_of(process)[0], signal.SIGKILL)
         assert process.wait() == 2
         assert b"a worker died (out of memory?" in process.stderr.read()
     done = lines(journal)
     assert done <= EPISODES
-    with subprocess.Popen(
-        command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
+    with started(*words, stdout=subprocess.DEVNULL) as process:
         wait_for(journal, done + 60, process)
         workers = workers_of(process)
         process.kill()
     assert workers
     assert lines(journal) <= EPISODES
-    wait_until(lambda: not any(map(is_alive, workers)))
+    end = time.monotonic() + 60.0
+    while any(map(is_alive, workers)):
+        assert time.monotonic() < end
+        time.sleep(0.005)
     with open(journal, "ab") as file:
         file.write(b'{"episode":5,"varia')
     again = evofsm("drive", *unrevised(tmp_path, "--workers", 1), "--json")
@@ -276,9 +269,7 @@ def test_killed_workers_and_a_killed_parent_change_nothing(evofsm, tmp_path, und
 @pytest.mark.slow
 def test_an_interruption_is_quiet_and_says_how_to_go_on(tmp_path):
     words = unrevised(tmp_path, "--workers", 2, "--episodes", 10_000)
-    with subprocess.Popen(
-        command(*words), stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as process:
+    with started(*words, text=True, start_new_session=True) as process:
         wait_for(tmp_path / "episodes.jsonl", 2, process)
         os.killpg(process.pid, signal.SIGINT)
         said = process.stderr.read()

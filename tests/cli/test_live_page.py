@@ -52,6 +52,7 @@ window.touching = () => [...words].flatMap(([id, all]) => all.flatMap((a, k) => 
   .filter((b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom)
   .map((b) => `${id}: ${a.text} / ${b.text}`)));
 """
+SCALES = "[...document.querySelectorAll('canvas')].map((one) => one.height - one.clientHeight)"
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -235,21 +236,15 @@ def test_words_never_touch_and_nothing_is_larger_than_the_screen(seen, session):
         playwright.expect(status).to_have_attribute(
             "data-status", re.compile("ended|failure"), timeout=60_000
         )
-        fits(page, width, height, ["headline", "pause", *(["reviser"] * (session is not logged))])
-
-
-def fits(page, width, height, in_view):
-    """It does, at first and with all that can be unfolded."""
-    page.wait_for_timeout(300)
-    assert page.evaluate("touching()") == []
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    assert width < 1280 or page.evaluate("document.documentElement.scrollHeight") <= height
-    for name in in_view:
-        playwright.expect(page.locator(f"#{name}")).to_be_in_viewport()
-    for fold in page.locator("summary").all():
-        fold.click()
-    playwright.expect(page.locator("#decision")).not_to_be_empty()
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    page.wait_for_timeout(300)  # drawings keep their scale where folds take their room
-    scales = "[...document.querySelectorAll('canvas')].map((one) => one.height - one.clientHeight)"
-    assert {*page.evaluate(scales)} <= {0, 150}  # which is that of a canvas that is not drawn
+        page.wait_for_timeout(300)
+        assert page.evaluate("touching()") == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert width < 1280 or page.evaluate("document.documentElement.scrollHeight") <= height
+        for name in ("headline", "pause", *(["reviser"] * (session is not logged))):
+            playwright.expect(page.locator(f"#{name}")).to_be_in_viewport()
+        for fold in page.locator("summary").all():
+            fold.click()
+        playwright.expect(page.locator("#decision")).not_to_be_empty()
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        page.wait_for_timeout(300)  # drawings keep their scale where folds take their room
+        assert {*page.evaluate(SCALES)} <= {0, 150}  # which is that of a canvas that is not drawn

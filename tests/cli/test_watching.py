@@ -22,22 +22,18 @@ from evofsm.driving import KinematicWorld, load_family, teach
 pytestmark = pytest.mark.usefixtures("compiled")
 
 PAPER = load_family("paper")
-ROADS = OnRoads(PAPER, KinematicWorld())
+EMERGENCY = load_family("emergency")
 
 
 @cache
-def taught():
-    guard = watched_guard(PAPER)
-    learn_first(guard, ROADS, 6)
+def taught(family=PAPER, episodes=6, judge="kinematic"):
+    guard = watched_guard(family, judge=judge)
+    learn_first(guard, OnRoads(family, KinematicWorld()), episodes)
     return guard
 
 
-def learnt():
-    return taught().copy()
-
-
 def opened(family=PAPER, guard=None, **settings):
-    return Session(OnRoads(family, KinematicWorld()), guard or learnt(), **settings)
+    return Session(OnRoads(family, KinematicWorld()), guard or taught().copy(), **settings)
 
 
 def drive(session):
@@ -137,17 +133,16 @@ def test_a_file_holds_an_environment_of_ones_own(tmp_path):
         read_simulated(str(path))
 
 
-# What a run was: whether it acts, or passes all, or is switched off, and why nothing is done.
-MODES = [
-    ("on", ""),
-    ("passing", "was not shown to help yet, so what is proposed passes"),
-    ("off", "the reviser is off"),
-]
-
-
-@pytest.mark.parametrize(("how", "idle"), MODES)
+@pytest.mark.parametrize(
+    ("how", "idle"),  # whether it acts, or passes all, or is off, and why nothing is done
+    [
+        ("on", ""),
+        ("passing", "was not shown to help yet, so what is proposed passes"),
+        ("off", "the reviser is off"),
+    ],
+)
 def test_every_sentence_says_what_was_so(how, idle):
-    guard = learnt()
+    guard = taught().copy()
     teach(guard, [PAPER.draw(0, 1)])
     if how == "passing":  # as one of which is known that it fails sooner than the controller alone
         guard._why_passing = lambda: "shadow"
@@ -259,20 +254,13 @@ def test_a_run_that_breaks_off_says_why():
 
 # -- A judge that was told nothing but which episodes failed --------------------------------------
 
-EMERGENCY = load_family("emergency")
 LEADERS = ("leader brake", "leaders", "latent risk", "braking in full")
-
-
-@cache
-def told_nothing(episodes):
-    guard = watched_guard(EMERGENCY, judge="learnt")
-    learn_first(guard, OnRoads(EMERGENCY, KinematicWorld()), episodes)
-    return guard
 
 
 def told_over(episodes, *, on=True):
     """Frames of a run under a learnt judge, each with its story in words."""
-    with opened(EMERGENCY, told_nothing(episodes).copy(), case=1, on=on) as session:
+    guard = taught(EMERGENCY, episodes, "learnt").copy()
+    with opened(EMERGENCY, guard, case=1, on=on) as session:
         return [(frame, tell(frame, session.start)) for frame in drive(session)]
 
 

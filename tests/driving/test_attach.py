@@ -73,11 +73,6 @@ def drive(sumo, seconds, brakes_at=15.0):
     return speeds
 
 
-def test_a_mesoscopic_simulation_has_nobody_to_see_and_is_refused(road):
-    with pytest.raises(ValueError, match="--mesosim"):
-        attach(road("--mesosim"), "all")
-
-
 def test_what_a_guard_made_a_car_do_is_not_learnt_as_what_leaders_do(road):
     behind = '<vehicle id="last" type="calm" route="along" depart="0" departPos="20"/>'
     sumo = road(*NO_GAP, others=behind)
@@ -346,16 +341,17 @@ def test_sumo_as_referee_measures_the_same(road, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("options", "given", "said"),
     [
-        ({"mode": "brake"}, "no mode 'brake'"),
-        ({"guard": guard_for_traffic(-9.0, 3.5, 4.5, 0.25)}, "no multiple"),
-        ({"mode": "watch", "guard": guard_for_traffic(-9.0, 3.5, 4.5, 0.1)}, "asks no guard"),
+        (NO_GAP, {"mode": "brake"}, "no mode 'brake'"),
+        (NO_GAP, {"guard": guard_for_traffic(-9.0, 3.5, 4.5, 0.25)}, "no multiple"),
+        ((), {"mode": "watch", "guard": guard_for_traffic(-9.0, 3.5, 4.5, 0.1)}, "asks no guard"),
+        (("--mesosim",), {}, "--mesosim"),  # in which there is nobody to see
     ],
 )
-def test_what_cannot_be_is_refused(road, given, said):
+def test_what_cannot_be_is_refused(road, options, given, said):
     with pytest.raises(ValueError, match=said):
-        attach(road(*NO_GAP), "all", **given)
+        attach(road(*options), "all", **given)
 
 
 # -- Which vehicles are meant ---------------------------------------------------------------------

@@ -175,21 +175,12 @@ def traffic(decisions, seed=0):
     return np.array(rows), done
 
 
-def noisy(rows, seed=1):
-    seen = rows + np.random.default_rng(seed).normal(scale=NOISE, size=rows.shape)
-    seen[:, 1:] = np.maximum(seen[:, 1:], 0.0)
-    return seen
-
-
-def estimates(perception, seen, done):
-    before = [0.0, *done[:-1]]
-    return [perception.see(tuple(row), did) for row, did in zip(seen, before, strict=True)]
-
-
 def test_estimates_are_better_than_observations_and_know_how_good_they_are():
     rows, done = traffic(2000)
-    seen = noisy(rows)
-    found = estimates(Perception(DT), seen, done)[500:]
+    seen = rows + np.random.default_rng(1).normal(scale=NOISE, size=rows.shape)
+    seen[:, 1:] = np.maximum(seen[:, 1:], 0.0)
+    perception, before = Perception(DT), [0.0, *done[:-1]]
+    found = [perception.see(tuple(z), did) for z, did in zip(seen, before, strict=True)][500:]
     off = np.array([estimate.mean for estimate in found]) - rows[500:]
     raw = seen[500:] - rows[500:]
     assert np.all(off.std(axis=0) < [0.6, 0.6, 1.0] * raw.std(axis=0))

@@ -35,10 +35,6 @@ def last_score(measure, episode):
     return measure.score(episode, DT)[-1]
 
 
-def at_least(larger, smaller):
-    return larger >= smaller or np.isclose(larger, smaller, rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.slow
 @EVERY_MEASURE
 @given(EPISODES)
@@ -68,7 +64,8 @@ def test_closer_faster_or_behind_a_slower_leader_is_not_safer(measure, episode, 
     worse = episode.copy()
     worse[-1, column] += sign * much
     if column != 2 or worse[-1, 2] >= 0.0:
-        assert at_least(last_score(measure, worse), last_score(measure, episode))
+        larger, smaller = last_score(measure, worse), last_score(measure, episode)
+        assert larger >= smaller or np.isclose(larger, smaller, rtol=1e-9, atol=1e-9)
 
 
 @EVERY_MEASURE

@@ -201,8 +201,6 @@ def test_who_is_asked_at_an_interval_keeps_its_command_between():
     seldom = KinematicWorld().run(FULL, SETTINGS.drivers[1], 0.25)
     commands = seldom.accelerations[:100].reshape(4, 25)
     assert (commands == commands[:, :1]).all()
-    with pytest.raises(ValueError, match="no multiple of the simulation's step"):
-        KinematicWorld().run(FULL, SETTINGS.drivers[1], 0.123456)
 
 
 # -- Who drives: the Intelligent Driver Model ------------------------------------------------------

@@ -18,16 +18,6 @@ from evofsm.fsm.rules import Novelty
 COUNTS = ("episodes", "failed_soon", "tried", "failed_after")
 
 
-def drives(seed, rows=60, places=4):
-    """Rows over a few places, cut into episodes of which some fail."""
-    rng = np.random.default_rng(seed)
-    Z = rng.integers(0, places, size=(rows, 1)) * 10.0
-    I = rng.integers(-1, 3, size=rows)
-    starts = np.flatnonzero(rng.random(rows) < 0.1)
-    failures = np.flatnonzero(rng.random(rows) < 0.1)
-    return Z, I, starts, failures
-
-
 def by_hand(states, I, starts, failures, horizon, n):
     """The same counts, episode by episode, as their definitions have them."""
     cut = sorted({0, *starts.tolist(), *(failures + 1).tolist(), len(states)})
@@ -53,7 +43,10 @@ def by_hand(states, I, starts, failures, horizon, n):
 @settings(max_examples=60)
 @given(seed=st.integers(0, 10_000), horizon=st.sampled_from([1, 3, 8, None]))
 def test_an_episode_counts_once_for_each_state_and_action(seed, horizon):
-    Z, I, starts, failures = drives(seed)
+    """Rows over a few places, cut into episodes of which some fail."""
+    rng = np.random.default_rng(seed)
+    Z, I = rng.integers(0, 4, size=(60, 1)) * 10.0, rng.integers(-1, 3, size=60)
+    starts, failures = (np.flatnonzero(rng.random(60) < 0.1) for _ in range(2))
     machine = EvolvingFSM(3, rule=Novelty(radius=1.0), failure_horizon=horizon)
     states = machine.learn_many(Z, I, starts, failures).state
     limit = np.inf if horizon is None else horizon

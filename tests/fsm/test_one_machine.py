@@ -11,14 +11,6 @@ import pytest
 import one_machine
 
 
-def elsewhere(work):
-    """Do it in another thread, for which nobody waits longer than some seconds."""
-    done = threading.Event()
-    thread = threading.Thread(target=lambda: (work(), done.set()), daemon=True)
-    thread.start()
-    return done.wait(20.0)
-
-
 @pytest.mark.parametrize("interval", [sys.getswitchinterval(), 1e-6])
 def test_threads_on_one_machine_lose_no_observation(interval):
     one_machine.compile_all()
@@ -55,5 +47,8 @@ def test_a_copy_goes_its_own_way_and_has_a_lock_of_its_own(grown, snapshot, twin
     with grown._lock:
         another = twin(grown)
         assert snapshot(another) == before
-        assert elsewhere(lambda: another.learn_one([0.1, 0.2], 0))
+        elsewhere = threading.Thread(target=another.learn_one, args=([0.1, 0.2], 0), daemon=True)
+        elsewhere.start()
+        elsewhere.join(20.0)
+        assert not elsewhere.is_alive()
     assert snapshot(another) != before == snapshot(grown)

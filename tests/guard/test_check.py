@@ -147,12 +147,8 @@ class NotRegistered(Paper):
     pass
 
 
-A_NUMBER = driver(lambda seen: 0.0)
 BROKEN = {
-    "proposes_numbers": [
-        A_NUMBER,
-        driver(lambda seen: Proposal(seen[0] * -1.0)),
-    ],
+    "proposes_numbers": [driver(lambda seen: 0.0), driver(lambda seen: Proposal(-seen[0]))],
     "revises_what_is_proposed": [
         reviser(lambda revision, action: revision._replace(executed=action)),
         reviser(lambda revision, action: revision._replace(seen=round(action))),

@@ -59,8 +59,8 @@ class Balance(ActionJudge):
     def why(self, judged):
         return "it would fall"
 
-    def refuse_unfit(self, low, high):
-        if self.index and high != len(PUSHES) - 1:
+    def refuse_unfit(self, actions):
+        if self.index and actions.high != len(PUSHES) - 1:
             raise ValueError(f"there are {len(PUSHES)} pushes")
 
     def learn(self, observation, action, belief):

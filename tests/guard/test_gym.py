@@ -138,10 +138,6 @@ def drive(env, policy, **reset):
     return steps
 
 
-def infos_of(steps):
-    return [step[-1] for step in steps]
-
-
 def above_half(action):
     return bool(np.max(action) > 0.5)
 
@@ -153,14 +149,14 @@ def test_it_decides_and_learns_bit_for_bit_as_a_loop_of_ones_own(snapshot):
     env, plain = of_cars(CarFollowing()), CarFollowing()
     guard = guard_for_cars(-2.5, 2.5)
     for index in range(3):
-        revised = infos_of(drive(env, lambda *_: np.array([2.5]), options={"index": index}))
+        revised = drive(env, lambda *_: np.array([2.5]), options={"index": index})
         (seen, _), over, executed = plain.reset(options={"index": index}), False, []
         while not over:
             executed.append(guard.decide(seen, 2.5).executed)
             seen, _, terminated, truncated, info = plain.step(np.array([executed[-1]]))
             over = terminated or truncated
         guard.end(info["failed"], seen)
-        assert [info["reviser/executed_action"][0] for info in revised] == executed
+        assert [step[-1]["reviser/executed_action"][0] for step in revised] == executed
     assert snapshot(env.guard.machine) == snapshot(guard.machine)
 
 
@@ -202,8 +198,8 @@ def test_gymnasium_finds_nothing_to_complain_of(own):
 
 def test_where_nothing_is_ahead_a_usable_proposal_is_kept_and_nothing_is_learnt():
     env = of_cars(Script(None, None, FAR, None, FAR, FAR))
-    infos = infos_of(drive(env, lambda seen, info: np.array([2.5 if seen is None else 9.0])))
-    kept = [info["reviser/reason"].startswith("nothing is ahead") for info in infos]
+    steps = drive(env, lambda seen, info: np.array([2.5 if seen is None else 9.0]))
+    kept = [step[-1]["reviser/reason"].startswith("nothing is ahead") for step in steps]
     assert kept == [True, True, False, True, False]
     assert env.env.executed[0] == [2.5]
     assert env.guard.machine.model().uses.sum() == 1  # FAR to FAR: what is not seen is not
@@ -403,11 +399,8 @@ def test_more_values_than_a_guard_can_take_are_refused_at_once():
 # -- Whoever wraps, resets, takes turns or forbids ----------------------------------------------
 
 
-def cart(*wraps, steps=None):
-    env = gymnasium.make("CartPole-v1", max_episode_steps=steps)
-    for wrap in wraps:
-        env = wrap(env)
-    return env
+def cart(steps=None):
+    return gymnasium.make("CartPole-v1", max_episode_steps=steps)
 
 
 @pytest.mark.parametrize(
@@ -444,7 +437,7 @@ def test_statistics_that_change_no_more_are_as_good_as_none():
     frozen = wrappers.NormalizeObservation(cart())
     frozen.update_running_mean = False
     RevisedActions(frozen, guard_for(Discrete(2)))
-    RevisedActions(cart(wrappers.NormalizeReward), guard_for(Discrete(2)))  # nobody looks at it
+    RevisedActions(wrappers.NormalizeReward(cart()), guard_for(Discrete(2)))  # nobody looks at it
 
 
 @pytest.mark.parametrize("high", [2.5, 3.0])

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from evofsm import Labels
 from evofsm.guard import AuditLog, Guard, LearntRisk, Mode, audit
-from evofsm.guard.api import Search
+from evofsm.guard.api import Fallback, Judgement, ObservingJudge, Search
 from evofsm.guard.export import write_c99
 from evofsm.guard.harm import Harm, Outcome
 from evofsm.guard.learnt.judge import _unjudged
@@ -126,6 +127,51 @@ def test_where_someone_else_acts_the_controller_is_alone(wrong):
     guard.freeze()  # it was never tried
     guard.reviser.mode = Mode.ACT
     assert drive(guard, 2) == [(1, "")] * 2
+
+
+class Cautious(ObservingJudge):
+    """Of someone's own: it lets nothing of one end of the range pass, so that it always fails."""
+
+    dt, fallback, labels = 0.1, Fallback(0.0, "nothing"), Labels()
+
+    def __init__(self):
+        self.harm, self.seen, self.done, self.ends = Harm(), [], [], []
+
+    def judge(self, situation, actions):
+        risk = np.where(np.asarray(actions) < 1.0, 1.0, 0.0)
+        return Judgement(risk, risk, risk, risk, 1.0)
+
+    def why(self, judged):
+        return "it must"
+
+    def refuse_unfit(self, actions):
+        assert (actions.low, actions.high) == (-1.0, 1.0)
+
+    def learn(self, observation, action, belief): ...
+
+    watch = learn
+
+    def observe(self, observation):
+        self.seen.append(float(observation[0]))
+
+    def act(self, action):
+        self.done.append(float(action))
+
+    def end(self, observation, *, failed, terminated):
+        self.ends.append((failed, terminated))
+
+
+def test_a_judge_of_ones_own_sees_all_and_is_found_to_do_harm():
+    judge = Cautious()
+    guard = make(judge=judge)
+    rows = drive(guard, 12)
+    assert rows[0] == (1, "")
+    assert {why for _, why in rows} == {"", "shadow"}
+    assert max(steps for steps, _ in rows) == 20
+    assert len(judge.done) == sum(steps for steps, _ in rows) == len(judge.seen) - 12
+    assert judge.ends == [(True, False)] * 12
+    with pytest.warns(UserWarning, match="was not shown to help: frozen so, proposals pass"):
+        guard.freeze()
 
 
 def test_a_score_that_is_no_number_is_refused_and_nothing_ends():

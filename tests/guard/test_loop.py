@@ -22,18 +22,15 @@ LEADER = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=6.0)
 HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
 
 
-def scenario(duration=10.0, **others):
-    return Scenario(LEADER, initial_gap=8.0, duration=duration, **others)
-
-
-def driven(controller=HASTY, reviser=None, *, on=None, **others):
-    guard = Guard.of(reviser or Unrevised(ACTIONS), interval=0.25, **others)
-    return drive(guard, on or scenario(), controller=controller)
+def driven(reviser, judge, controller=HASTY, duration=10.0):
+    guard = Guard.of(reviser, interval=0.25, judge=judge)
+    scenario = Scenario(LEADER, initial_gap=8.0, duration=duration)
+    return drive(guard, scenario, controller=controller)
 
 
 def test_decisions_are_those_of_the_record():
     risk = LatentRisk(lowest=-2.5)
-    told = driven(reviser=ActionReviser(risk, ACTIONS), judge=risk)
+    told = driven(ActionReviser(risk, ACTIONS), risk)
     record, time = told.record, told.time
     starts = [round(d.situation.time / 0.01) for d in told.decisions]
     assert starts == list(range(0, starts[-1] + 1, 25))
@@ -56,7 +53,7 @@ def test_a_controller_that_fails_once_is_driven_on_without(line, caplog):
         return said
 
     with caplog.at_level(logging.WARNING, logger="evofsm"):
-        told = driven(propose, Unrevised(ACTIONS), judge=risk, on=scenario(3.0))
+        told = driven(Unrevised(ACTIONS), risk, propose, 3.0)
     assert len(caplog.records) == 1
     assert "controller" in caplog.text
     assert "0.5 s" in caplog.text

@@ -37,12 +37,6 @@ class Told(LatentRisk):
         """Leave it to the reviser."""
 
 
-def nearest_values(actions, wanted):
-    """For each interval the value in it that is nearest to what is wanted, and both limits."""
-    lowest, highest = nearest_bounds(actions)
-    return np.minimum(np.maximum(wanted, lowest), highest)[1:].tolist()
-
-
 @st.composite
 def risks(draw):
     """Any risk at all: waves on a slope, around the tolerance."""
@@ -58,7 +52,8 @@ def test_the_proposal_else_the_closest_that_is_tolerable_else_the_least_risky_is
     risk, wanted
 ):
     revision = ActionReviser(Told(risk), ACTIONS).revise(HERE, Proposal(wanted))
-    could = np.array([wanted, *nearest_values(ACTIONS, wanted)])
+    lowest, highest = nearest_bounds(ACTIONS)  # of each interval, and both limits
+    could = np.array([wanted, *np.minimum(np.maximum(wanted, lowest), highest)[1:]])
     danger = np.array([risk(a) for a in could])
     assert revision.executed in could
     tolerable = could[danger <= TOLERANCE]

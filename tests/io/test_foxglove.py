@@ -151,12 +151,6 @@ def test_a_small_log_that_unpacks_to_hundreds_of_megabytes_is_refused(packing, t
 # -- Live -----------------------------------------------------------------------------------------
 
 
-def decide(guard):
-    for observation in ROWS:
-        guard.decide(observation, proposal=1.0)
-    guard.end(failed=True, observation=[-0.1, 20.0, 12.0])
-
-
 def test_any_system_is_shown_by_its_own_names_and_vectors_are_left_to_the_log(tmp_path):
     guard = Guard(low=[-1.0, -1.0], high=[1.0, 1.0], interval=0.1)
     with FoxgloveSink(None, tmp_path / "a.mcap", names=["angle"], units=["rad"]) as guard.audit:
@@ -188,7 +182,9 @@ def test_whoever_connects_sees_the_decisions_as_they_are_made():
             while not isinstance(data, bytes):  # until the server has heard that somebody listens
                 tries += 1
                 assert tries < 600
-                decide(guard)
+                for observation in ROWS:
+                    guard.decide(observation, proposal=1.0)
+                guard.end(failed=True, observation=[-0.1, 20.0, 12.0])
                 with suppress(TimeoutError):
                     data = client.recv(timeout=0.1)
     opcode, subscription, at = struct.unpack("<BIQ", data[:13])

@@ -59,8 +59,8 @@ def together(*paths, noted=None, **columns):
 
 def refusal(*paths, **columns):
     """What is said where no bad row is left out."""
-    with pytest.raises(ValueError, match=re.escape(paths[-1])) as caught:
-        read(*paths, skip_bad=0, **columns)
+    with pytest.raises(ValueError, match=re.escape(str(paths[-1]))) as caught:
+        read(*map(str, paths), skip_bad=0, **columns)
     return str(caught.value)
 
 

@@ -3,7 +3,6 @@
 import gzip
 import json
 import math
-import re
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.io.test_logs import refusal
 
 from evofsm.cli.learning import warnings_of
 from evofsm.cli.options import lengths_given
@@ -32,13 +32,6 @@ def episodes(path, lengths=None, **columns):
     """Every episode as (observations, actions, times)."""
     chunks = read_traces([str(path)], LogColumns(**columns), lengths)
     return [(one.observations, one.actions, one.times) for one in episodes_of(chunks)]
-
-
-def refusal(path, **columns):
-    """What is said where no bad row is left out."""
-    with pytest.raises(ValueError, match=re.escape(str(path))) as caught:
-        list(read_traces([str(path)], LogColumns(skip_bad=0, **columns)))
-    return str(caught.value)
 
 
 # -- FCD ------------------------------------------------------------------------------------------

@@ -4,33 +4,23 @@ import matplotlib.text
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from tests.paper.test_paper import drive
 
-from evofsm.driving import KinematicWorld
 from evofsm.paper.figures import draw_case
 from evofsm.paper.figures import figures as figures_of
-from evofsm.paper.runs import Settings, run_paper
 
 pytestmark = pytest.mark.slow
 
 
-def study_of(rounds=1, **changes):
-    settings = Settings.load(changes)
-    return run_paper(KinematicWorld(), "kinematic", settings, rounds=rounds)
-
-
 @pytest.fixture(scope="module")
 def study():
-    return study_of(rounds=2)
-
-
-def texts(figure):
-    return [text.get_text() for text in figure.findobj(matplotlib.text.Text)]
+    return drive(rounds=2)
 
 
 def test_a_case_shows_what_it_was_its_moments_its_states_and_its_collision(study):
     for run in study.last_round:
         figure = draw_case(study, run)
-        said = texts(figure)
+        said = [text.get_text() for text in figure.findobj(matplotlib.text.Text)]
         assert any(text.startswith("leader brakes, ") for text in said)
         assert any(text.startswith("collision, ") for text in said) == (run.case in (1, 4))
         turns = [text for text in said if text.startswith("driver turns")]
@@ -67,7 +57,7 @@ def test_a_dead_end_is_tinted_as_long_as_a_brake_could_not_be_survived(study):
     ],
 )
 def test_any_study_can_be_drawn(changes, n_states):
-    study = study_of(**changes)
+    study = drive(**changes)
     assert study.dead_end == -1 if n_states is None else study.model.n_states == n_states
     for one in figures_of(study):
         FigureCanvasAgg(one.draw()).draw()

@@ -37,7 +37,7 @@ from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.sharing import Retraced, step
 from evofsm.fsm.validation import Floats, positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
-from evofsm.guard.actions import Action, nearest_bounds
+from evofsm.guard.actions import ActionSet, BoxActions, nearest_bounds
 from evofsm.guard.api import LearningJudge, Trial
 from evofsm.store import COUNT, FLAG, SIZE, SMALLEST, Kind, Numbers, Place
 
@@ -340,17 +340,17 @@ class LatentRisk(Retraced, LearningJudge):
             return 0.0
         return max(0.0, (before.mean[2] - now[2]) / self.dt)
 
-    def refuse_unfit(self, low: Action, high: Action) -> None:
+    def refuse_unfit(self, actions: ActionSet) -> None:
         """Raise a ValueError if it counts on harder braking than there is."""
-        if np.ndim(low):
+        if isinstance(actions, BoxActions):
             raise ValueError(
-                f"the risk judges one acceleration, but an action is a vector of {np.size(low)}; "
-                "give low and high as numbers"
+                "the risk judges one acceleration, but an action is a vector of "
+                f"{len(actions.low)}; give low and high as numbers"
             )
-        if self.lowest < low:
+        if self.lowest < actions.low:
             raise ValueError(
                 f"the risk counts on braking down to {self.lowest:g}, but the set of "
-                f"actions ends at {low:g}"
+                f"actions ends at {actions.low:g}"
             )
 
     def sums(self, n_states: int) -> dict[str, float]:

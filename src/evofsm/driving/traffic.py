@@ -21,7 +21,7 @@ from evofsm.driving.naming import SPEEDS
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.validation import Floats, real_array
-from evofsm.guard.actions import Action
+from evofsm.guard.actions import ActionSet
 from evofsm.guard.api import TOLERANCE, ActionJudge, Fallback, Judgement, Situation
 from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser, Mode
@@ -259,9 +259,9 @@ class TrafficRisk(ActionJudge):
             return f"{text}, survives no braking harder than {self._survived([pair])[0]:.1f} m/s²"
         return f"{text}: {self.ahead.why(judged)}"
 
-    def refuse_unfit(self, low: Action, high: Action) -> None:
+    def refuse_unfit(self, actions: ActionSet) -> None:
         """Raise a ValueError if it counts on harder braking than there is."""
-        self.ahead.refuse_unfit(low, high)
+        self.ahead.refuse_unfit(actions)
 
 
 def _worse(a: Judgement, b: Judgement) -> Judgement:

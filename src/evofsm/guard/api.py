@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:  # whoever asks for a number here waits for no compiler
     from evofsm.fsm.naming import Labels
     from evofsm.guard.actions import Action, ActionSet, Mask
+    from evofsm.guard.harm import Harm
     from evofsm.store import Place
 
 #: The highest risk, a probability of failure, that a reviser lets pass.
@@ -190,8 +191,8 @@ class ActionJudge(Protocol):
         """
         return None
 
-    def refuse_unfit(self, low: Action, high: Action, /) -> None:
-        """Raise a ValueError if it counts on actions outside ``low`` to ``high``."""
+    def refuse_unfit(self, actions: ActionSet, /) -> None:
+        """Raise a ValueError if it counts on others than these actions."""
 
 
 class Search(NamedTuple):
@@ -278,6 +279,29 @@ class LearningJudge(ActionJudge, Protocol):
     @classmethod
     def load(cls, path: Place) -> Self:
         """Read what was learnt, between two episodes."""
+
+
+@runtime_checkable
+class ObservingJudge(LearningJudge, Protocol):
+    """A learning judge that is shown each observation, asked or not, and may be found to do harm.
+
+    While it learns, the controller drives some episodes alone (`evofsm.guard.harm`). Its `end` also
+    takes ``terminated``, as `Guard.end`; its `save` keeps `harm`.
+    """
+
+    harm: Harm  #: how episodes ended, guarded and alone: `Harm()` at first, then the guard's
+
+    def observe(self, observation: NDArray[np.float64], /) -> None:
+        """Take in an observation (m,), NaN where something was not seen."""
+
+    def act(self, action: Action, /) -> None:
+        """Take in what was executed after it; another one replaces it."""
+
+    def told_here(
+        self, observation: NDArray[np.float64], /
+    ) -> tuple[str, NDArray[np.float64] | None]:
+        """What it knows of failure near an observation, and the centre of the dead end there."""
+        return "", None
 
 
 class RiskMeasure(Protocol):

@@ -40,16 +40,16 @@ from evofsm.guard.api import (
     Fallback,
     Intake,
     LearningJudge,
+    ObservingJudge,
     Proposal,
     Reviser,
     Revision,
     Situation,
 )
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.learnt.rollout import refuse_too_many
 from evofsm.guard.parts import outline, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
-from evofsm.guard.warming import warm_judge, warm_machine
+from evofsm.guard.warming import warm_machine
 from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
 
 # Intervals that a range of actions is divided into for the machine.
@@ -324,7 +324,7 @@ class Guard:
         self.process = os.getpid()  #: in which it was made; a copy elsewhere learns for itself
         self.actions = reviser.actions
         self.interval = positive("interval", interval)
-        action_judge = reviser.risk if isinstance(reviser, ActionReviser) else judge
+        action_judge: Any = getattr(reviser, "risk", judge)
         if judge is None and isinstance(action_judge, LearningJudge):
             judge = action_judge
         elif judge is None and hasattr(action_judge, "learn"):
@@ -338,17 +338,13 @@ class Guard:
         if machine is not None and machine.n_actions != self.actions.n_actions:
             counts = f"{machine.n_actions} actions, but the set has {self.actions.n_actions}"
             raise ValueError(f"the machine has {counts}")
-        if isinstance(action_judge, LearntRisk):
-            if bool(action_judge.choices) != isinstance(self.actions, Choices):
-                raise ValueError(
-                    "the judge was made for a range of actions, but the guard has n_actions, or "
-                    "the other way round"
-                )
+        if hasattr(action_judge, "failed"):
             action_judge.failed = failed
-            warm_judge()
+        if hasattr(action_judge, "warm"):
+            action_judge.warm()
         if machine is not None:
             warm_machine()
-        self._observing = judge if isinstance(judge, LearntRisk) else None
+        self._observing = judge if isinstance(judge, ObservingJudge) else None
         self.reviser = reviser
         self.machine = machine
         #: Learns from what happens; None where nothing but the machine does.
@@ -448,8 +444,8 @@ class Guard:
         self._latest = None
         self._decisions = self._acted = self._watched = self._kept = 0
         self.reviser.start_episode()
-        if isinstance(self.reviser, ActionReviser):
-            self._passing = self._why_passing() if twin is None else twin._passing
+        self._passing = self._why_passing() if twin is None else twin._passing
+        if hasattr(self.reviser, "passing"):
             self.reviser.passing = self._passing
         if self.judge is not None:
             self.judge.start_episode(learn=False)
@@ -573,8 +569,6 @@ class Guard:
             raise ValueError(f"observation has {len(z)} variables; it must have {count}{names}")
         if fault := self.beyond(z):
             raise ValueError(" ".join(fault))
-        if (judge := self._observing) and len(z) != judge.n_variables:
-            refuse_too_many(len(z), judge.size, box=not judge.choices)
         self._count_missing(z)
         return z
 
@@ -657,14 +651,13 @@ class Guard:
             return
         if not self._learn:
             self.judge.follow(situation.observation, executed)
-        elif isinstance(self.reviser, ActionReviser) and not self.reviser.acts:
+        elif getattr(self.reviser, "acts", True):
+            self.judge.learn(situation.observation, executed, situation.belief)
+            self._acted += 1
+            self._kept += not getattr(self.reviser, "refuses", False)
+        else:
             self.judge.watch(situation.observation, executed, situation.belief)
             self._watched += 1
-        else:
-            self.judge.learn(situation.observation, executed, situation.belief)
-            if isinstance(self.reviser, ActionReviser):
-                self._acted += 1
-                self._kept += not self.reviser.refuses
 
     def _explained(self, situation: Situation, revision: Revision) -> Revision:
         """With what the machine has seen come of what is executed, where that is asked for."""
@@ -755,8 +748,8 @@ class Guard:
             machine.start_episode()
         if self.judge is not None:
             if self._learn:
-                options = {"terminated": terminated} if self._observing is not None else {}
-                self.judge.end(z, failed=failed, **options)
+                how = {"terminated": terminated} if self._observing is not None else {}
+                self.judge.end(z, failed=failed, **how)
             else:
                 self.judge.start_episode(learn=False)
         self._under_way = False
@@ -778,10 +771,10 @@ class Guard:
         else:
             span = f"actions from {actions.low} to {actions.high}"
         how = type(self.reviser).__name__
-        if isinstance(self.reviser, ActionReviser):
-            how += f", tolerance {self.reviser.tolerance:g}, mode {self.reviser.mode.value}"
-            if self.reviser.risk is self._observing and (self._learn or not self.shadow):
-                how += ", in shadow where in doubt" if self.shadow else ", harm is not noticed"
+        if settings := getattr(self.reviser, "settings_text", ""):
+            how += f", {settings}"
+        if self._observing is not None and (self._learn or not self.shadow):
+            how += ", in shadow where in doubt" if self.shadow else ", harm is not noticed"
         latest = [] if self._observing is None else self._observing.harm.guarded
         of_late = f" ({sum(o.failed for o in latest)} of the latest {len(latest)} guarded)"
         lines = [

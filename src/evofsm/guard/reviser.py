@@ -150,7 +150,7 @@ class ActionReviser:
         tolerance: float = TOLERANCE,
         mode: Mode = Mode.ACT,
     ) -> None:
-        risk.refuse_unfit(*limits(actions))
+        risk.refuse_unfit(actions)
         self.risk = risk
         self.actions = actions
         self.tolerance = probability("tolerance", tolerance)
@@ -176,6 +176,11 @@ class ActionReviser:
     def fallback(self) -> Fallback:
         """What is done without a usable proposal."""
         return self.risk.fallback
+
+    @property
+    def settings_text(self) -> str:
+        """How it was set, in words."""
+        return f"tolerance {self.tolerance:g}, mode {self.mode.value}"
 
     @property
     def acts(self) -> bool:

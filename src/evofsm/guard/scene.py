@@ -31,7 +31,7 @@ from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import Floats, positive, whole
-from evofsm.guard.actions import Action, Mask
+from evofsm.guard.actions import Action, ActionSet, Mask
 from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, SearchingJudge, Situation
 from evofsm.store import COUNT, FLAG, FROM_1, MOST_COUNTED, SIZE, Kind, Numbers, Place
 
@@ -154,12 +154,12 @@ class SceneRisk(LearningJudge, SearchingJudge):
         self.memory = Memory(operator.index(n_actions), self.columns - 1 - _P)
         self._seen = []
 
-    def refuse_unfit(self, low: Action, high: Action) -> None:
+    def refuse_unfit(self, actions: ActionSet) -> None:
         """Raise a ValueError if there are other actions than it was made for."""
-        if (low, high) != (0.0, self.memory.n_actions - 1.0):
+        if (actions.low, actions.high) != (0.0, self.memory.n_actions - 1.0):
             raise ValueError(
                 f"the judge was made for {self.memory.n_actions} choices, but actions lie from "
-                f"{low} to {high}"
+                f"{actions.low} to {actions.high}"
             )
 
     def search(

@@ -6,7 +6,6 @@ import numpy as np
 
 from evofsm.fsm.kernels import COMPILES, announce_compiling
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.guard.api import TOLERANCE, Situation
 from evofsm.guard.learnt.judge import LearntRisk
 
 
@@ -22,7 +21,7 @@ def warm() -> None:
     >>> warm()
     """
     warm_machine()
-    warm_judge()
+    LearntRisk.warm()
 
 
 @cache
@@ -34,20 +33,3 @@ def warm_machine() -> None:
     machine = EvolvingFSM(1)
     machine.learn_many([[0.0, 0.0], [9.0, 0.0]], [0, 0])
     machine.observe([np.nan, 0.0], partial=True, failed=True)
-
-
-@cache
-def warm_judge() -> None:
-    """Compile what learnt judges need."""
-    if not COMPILES:
-        return
-    announce_compiling()
-    judge, random = LearntRisk(1.0, -1.0, 1.0), np.random.default_rng(0)
-    for _ in range(3):
-        for z in random.normal(size=(12, 2)).cumsum(axis=0):
-            judge.observe(z)
-            here = Situation(z, np.ones(1), None, 0.0, 0.0)
-            judge.search(here, 0.5, tolerance=TOLERANCE, revising=False)
-            judge.act(0.5)
-            judge.learn(z, 0.5, here.belief)
-        judge.end(None, failed=True)

@@ -83,21 +83,16 @@ def test_gaps_in_time_and_rows_that_come_too_often_are_noted():
     assert notes[4] is None
 
 
-def in_flight():
-    """Two episodes that end alike, the second of which begins at 0 s again; and an end by time."""
-    rows_told = [line(row | {"gap": 60.0 + row["time"]}) for row in rows(30)]
-    end = b'{"end": true, "failed": true}'
-    messages = [*rows_told[:20], end, *[line(row) for row in rows(4)], end]
-    messages += [line(row | {"gap": 61.0}) for row in rows(2)]
-    messages.append(b'{"end": true, "failed": true, "time": 0.2}')
-    messages.append(line(next(rows(1)) | {"gap": 62.0}))
-    return messages
-
-
 @pytest.mark.parametrize("answered", [1, 2, 10, 19, 22, 23, 24, 27, 28])
 @pytest.mark.parametrize("decided", [24, 26, 28, 29])
 def test_what_was_in_flight_and_is_sent_again_is_decided_once(answered, decided):
-    messages = in_flight()
+    """Two episodes end alike, the second of which begins at 0 s again; then one by its time."""
+    end = b'{"end": true, "failed": true}'
+    messages = [line(row | {"gap": 60.0 + row["time"]}) for row in rows(20)]
+    messages += [end, *map(line, rows(4)), end]
+    messages += [line(row | {"gap": 61.0}) for row in rows(2)]
+    messages.append(b'{"end": true, "failed": true, "time": 0.2}')
+    messages.append(line(next(rows(1)) | {"gap": 62.0}))
     plain, guard = Decider(made(learn=True)), made(learn=True)
     expected = [plain.answer(message) for message in messages]
     decider = Decider(guard)
@@ -134,20 +129,13 @@ def test_episodes_of_one_length_end_at_the_same_time_and_each_end_counts(length)
 
 
 def test_an_episode_ends_by_itself_while_there_is_no_alarm():
-    decider = Decider(made(), episode=10)
     calm = next(iter(rows(1)))
-    begun = []
-    for k in range(25):
-        decider.answer(line(calm | {"time": 0.1 * k}))
-        begun.append(decider.rows)
-    assert begun == [*range(1, 10), 0, *range(1, 10), 0, *range(1, 6)]
-    decider = Decider(made(), episode=10)
     close = calm | {"gap": 3.0, "v_leader": 5.0}
-    begun = []
-    for k in range(25):
-        assert decider.answer(line(close | {"time": 0.1 * k}))["alarm"]
-        begun.append(decider.rows)
-    assert begun == [*range(1, 20), 0, *range(1, 6)]
+    for row, alarms, length in ((calm, False, 10), (close, True, 20)):
+        decider = Decider(made(), episode=10)
+        for k in range(25):
+            assert decider.answer(line(row | {"time": 0.1 * k}))["alarm"] == alarms
+            assert decider.rows == (k + 1) % length
 
 
 def test_a_scene_names_who_is_ahead_and_a_change_begins_anew():

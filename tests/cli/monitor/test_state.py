@@ -13,8 +13,6 @@ from evofsm.io import LogColumns
 from evofsm.io.logs import Resample
 from monitor_rows import JUNK, line, scenes, traffic
 
-SETTINGS = {"learn": True, "guard": None}
-
 
 def made(learn=True, mode=Mode.SHADOW):
     guard = guard_of_monitor(0.1, 6.0)
@@ -33,7 +31,7 @@ def opened(tmp_path):
     states = []
 
     def open_state(path=tmp_path / "state.evofsm", learn=True, fresh=made, **settings):
-        states.append(state := State(path, SETTINGS))
+        states.append(state := State(path, {"learn": True, "guard": None}))
         try:
             guard = state.guard(fresh)
         except ValueError:

@@ -36,13 +36,6 @@ SHAPES = {
 UNIT = np.full(3, 0.1)
 
 
-def seen(shape, seed=0):
-    """Failures and what was survived, in three variables."""
-    z = np.random.default_rng(seed).uniform(-2.0, 2.0, (2000, 3))
-    fails = SHAPES[shape](z)
-    return z[fails][:40], z[~fails]
-
-
 def survived_as(rows, unit, ended=()):
     """What was survived, as it is asked of."""
     lowest, highest = np.array([rows.min(0)] * 2), np.array([rows.max(0)] * 2)
@@ -52,7 +45,9 @@ def survived_as(rows, unit, ended=()):
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_forms_explain_failures_and_nothing_that_was_survived_is_inside(shape):
-    failures, survived = seen(shape)
+    seen = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 3))
+    fails = SHAPES[shape](seen)
+    failures, survived = seen[fails][:40], seen[~fails]
     forms = explain(FAILS, failures, survived_as(survived, UNIT))
     assert len(forms) <= 3
     assert not are_sides(forms).any()

@@ -59,18 +59,17 @@ def test_what_is_wrong_with_a_given_function_is_said_and_nothing_is_learnt():
 
 @pytest.mark.parametrize("n_actions", [2, None])
 def test_a_given_backup_is_fitted_for_choices_and_for_many_numbers(n_actions):
-    m = 2
-    how = {"n_actions": 2} if n_actions else {"low": [-1.0] * m, "high": [1.0] * m}
+    how = {"n_actions": 2} if n_actions else {"low": [-1.0] * 2, "high": [1.0] * 2}
 
     def backup(z):
         return int(z[0] > 0.0) if n_actions else np.clip(-z, -1.0, 1.0)
 
     guard, rng = Guard(interval=0.1, backup=backup, **how), np.random.default_rng(0)
     for k in range(3):
-        z = rng.normal(size=m)
+        z = rng.normal(size=2)
         for _ in range(30):
-            guard.decide(z, int(rng.integers(2)) if n_actions else rng.uniform(-1.0, 1.0, m))
-            z = 0.9 * z + 0.3 * rng.normal(size=m)
+            guard.decide(z, int(rng.integers(2)) if n_actions else rng.uniform(-1.0, 1.0, 2))
+            z = 0.9 * z + 0.3 * rng.normal(size=2)
         guard.end(k == 0, z)
     state, model = guard.judge.state, guard.judge.parts.model
     given = state.policies[state.linear == 2.0]

@@ -12,18 +12,20 @@ import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm import store
+from evofsm.fsm.kernels import COMPILES, announce_compiling
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import action_name, function, positive, whole
-from evofsm.guard.actions import BoxActions, Mask
-from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, SearchingJudge, Situation
+from evofsm.guard.actions import ActionSet, BoxActions, Choices, Mask, limits
+from evofsm.guard.api import Fallback, Judgement, ObservingJudge, Search, SearchingJudge, Situation
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import rollout, words
 from evofsm.guard.learnt.backups import basis
@@ -52,7 +54,7 @@ class Consequence(NamedTuple):
     fails_after: float  #: steps after which it fails, at the latest; 0 if it does not
 
 
-class LearntRisk(LearningJudge, SearchingJudge):
+class LearntRisk(ObservingJudge, SearchingJudge):
     """Judges actions by what it has learnt of how the system moves and fails.
 
     It is told neither what variables mean nor how they move. Before the first failure of an episode
@@ -192,6 +194,23 @@ class LearntRisk(LearningJudge, SearchingJudge):
         self.parts: Parts | None = None
         self._forget()
 
+    @staticmethod
+    @cache
+    def warm() -> None:
+        """Compile now what learnt judges need."""
+        if not COMPILES:
+            return
+        announce_compiling()
+        judge, random = LearntRisk(1.0, -1.0, 1.0), np.random.default_rng(0)
+        for _ in range(3):
+            for z in random.normal(size=(12, 2)).cumsum(axis=0):
+                judge.observe(z)
+                here = Situation(z, np.ones(1), None, 0.0, 0.0)
+                judge.search(here, 0.5, tolerance=0.02, revising=False)
+                judge.act(0.5)
+                judge.learn(z, 0.5, here.belief)
+            judge.end(None, failed=True)
+
     @property
     def n_variables(self) -> int:
         """Number of variables of an observation; 0 before the first."""
@@ -215,8 +234,14 @@ class LearntRisk(LearningJudge, SearchingJudge):
         middle = self.middle
         return Fallback(middle if len(middle) > 1 else float(middle[0]), "the middle of the range")
 
-    def refuse_unfit(self, low: Any, high: Any) -> None:
+    def refuse_unfit(self, actions: ActionSet) -> None:
         """Raise for another range of actions than it learns of."""
+        if bool(self.choices) != isinstance(actions, Choices):
+            raise ValueError(
+                "the judge was made for a range of actions, but the guard has n_actions, or the "
+                "other way round"
+            )
+        low, high = limits(actions)
         ends = (0, self.choices - 1) if self.choices else (self.low, self.high)
         if not all(map(np.array_equal, map(np.atleast_1d, ends), map(np.atleast_1d, (low, high)))):
             raise ValueError(
@@ -440,12 +465,13 @@ class LearntRisk(LearningJudge, SearchingJudge):
         Raises
         ------
         ValueError
-            If it has another number of variables than before.
+            If it has another number of variables than before, or too many.
         """
         m = len(self._z[0]) if self._z else self.n_variables
         if m not in (0, len(observation)):
             has = f"observation has {len(observation)} variables"
             raise ValueError(f"{has}, but the judge learnt of {m}")
+        rollout.refuse_too_many(len(observation), self.size, box=not self.choices)
         if len(self._z) > len(self._u):  # nothing was executed: it does not follow
             self._study(failed=False, terminated=False)
         self._z.append(observation.copy())
