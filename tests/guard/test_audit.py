@@ -298,6 +298,17 @@ def test_sensors_that_fail_come_out_the_same(tmp_path):
     assert result.replayed == len(came)
 
 
+def test_what_came_in_last_before_an_episode_was_broken_off_is_written_and_replayed(tmp_path):
+    with AuditLog(tmp_path / "log") as log:
+        guard = cars(log)
+        for _ in range(2):  # another episode begins; the log is closed
+            guard.begin()
+            guard.recognise([30.0, 15.0, 12.0], 0.0)
+    rows = [record["before"] for record in contents(tmp_path / "log") if "before" in record]
+    assert rows == [[[0.0, [30.0, 15.0, 12.0]]]] * 2
+    assert audit(tmp_path / "log", log.head).is_good
+
+
 class Own(Unrevised):
     """A reviser that no package declares."""
 
