@@ -66,6 +66,7 @@ class Changed:
         self._wrong = start.split == "train" and start.episode == GLITCHED
         self._seen_by = np.random.default_rng([start.seed, start.episode, 77])
         z, info = self._system.reset(seed=seed, options=options)
+        self._latest = z
         return self._seen(z), info
 
     def step(self, action: Any) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
@@ -82,6 +83,9 @@ class Changed:
 
     def _seen(self, z: Vector) -> Vector:
         """What sensors say."""
+        self._latest, before = z, self._latest
+        if self._change == "late":
+            return before
         if self._change == "noise":
             return z + self._seen_by.normal(0.0, _NOISE[self._system.name])
         if not self._wrong:
@@ -98,9 +102,9 @@ class Changed:
 
 
 _VALUES = {"huge": 65535.0, "missing": -999.0, "minus": -1.0}
-#: What may be wrong in one episode, and what changes a system for good.
+#: What may be wrong in one episode, and what is otherwise for good: late is a step.
 GLITCHES = ("huge", "missing", "minus", "label", "dropped", "repeated", "stuck")
-CHANGES = ("noise", "weaker", *GLITCHES)
+CHANGES = ("noise", "late", "weaker", *GLITCHES)
 
 _GLITCHED = (("cartpole", "random"), ("oblique", ""), ("disc", ""), ("emergency", ""))
 CASES: tuple[Case, ...] = (
@@ -115,6 +119,7 @@ CASES: tuple[Case, ...] = (
     *(Case("landing", one) for one in ("careless", "random")),
     *(Case("drift", one) for one in ("skid", "wander")),
     *(Case(name, change="noise") for name in ("acc", "cartpole", "disc")),
+    Case("cartpole", "random", "late"),
     Case("acc", change="weaker", train=60),
     *(Case(name, change="shifted", train=100, test=40) for name in ("shift", "shift_leader")),
     *(

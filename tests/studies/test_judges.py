@@ -3,11 +3,14 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 from studies import benchmark, judges
-from studies.judges import Judges, Tasks, trial
+from studies.judges import PARTS, Judges, Tasks, taken_out, trial
 from studies.rivals import Rival
+
+from evofsm.guard.learnt import model
 
 PAGE = Path(__file__).parents[2] / "docs" / "judges.md"
 
@@ -97,6 +100,24 @@ def test_the_benchmark_names_what_is_less_than_was_accepted():
     missed = benchmark.compared(rows.with_columns(failed=worse)).filter(pl.col("missed") != "")
     assert set(missed["system"]) == {"disc"}
     assert set(missed["missed"]) == {"failed"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("change", "draws"), [("stuck", 131), ("late", 7)])
+def test_a_sensor_that_was_stuck_once_or_is_late_makes_no_guard_useless(change, draws):
+    row = trial(
+        "cartpole", "random", seed=1, train=30, test=5, base=draws, beside=False, change=change
+    )
+    assert row["failed"] == 0
+
+
+def test_what_has_no_switch_is_taken_out_as_long_as_it_is_asked():
+    observations = np.array([[0.0], [np.nan], [2.0]])
+    with taken_out([*PARTS, "model._MAX_GAP=3"]):
+        assert np.isnan(model.filled(observations, failed=False)[1])
+        assert model._MAX_GAP == 3
+    assert model.filled(observations, failed=False)[1] == 1.0
+    assert model._MAX_GAP == 5
 
 
 # -- Tasks and judges of one's own ----------------------------------------------------------------

@@ -43,6 +43,18 @@ def survived_as(rows, unit, ended=()):
     return Survived(rows, lowest, highest, unit, rows.std(0), ended)
 
 
+def test_a_single_failure_amid_what_was_survived_says_nothing_of_where_it_fails():
+    random, at = np.random.default_rng(0), np.array([0.1, 0.2])
+    seen = random.uniform(-1.0, 1.0, (2000, 2))
+    known = survived_as(seen[np.hypot(*(seen - at).T) > 0.05], np.full(2, 0.1))
+    beyond = np.column_stack([random.uniform(1.0, 1.2, 15), random.uniform(-1.0, 1.0, 15)])
+    told = explain(FAILS, np.vstack([beyond, at]), known)
+    assert are_sides(told).all()
+    assert inside(told, beyond).any(0).all()
+    again = np.vstack([beyond, at + random.uniform(-0.02, 0.02, (9, 2))])
+    assert inside(explain(FAILS, again, known), again).any(0).all()
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_forms_explain_failures_and_nothing_that_was_survived_is_inside(shape):
     seen = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 3))

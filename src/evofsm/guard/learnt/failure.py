@@ -58,7 +58,8 @@ _SCREENED, _COUPLED, _IN_TWO, _ROUNDS = 6, 3, 3, 3
 _ALIKE = 1e-6
 # An ellipse may be moved inwards by so much [standard deviations].
 _INWARDS = 0.1 * 1.5 ** np.arange(8)
-# A rival of a threshold, and a bent form once it is grown, hold less of what was survived.
+# A rival of a threshold, and a bent form once it is grown, hold less of what was survived; that
+# also a smaller share of it than of failures.
 _RARE = 0.5
 # Which of x, y, x x, x y, y y a form of one variable has, a line, and a form of two variables.
 _KINDS = np.array([[1, 0, 1, 0, 0], [1, 1, 0, 0, 0], [1, 1, 1, 1, 1]], np.float64)
@@ -299,9 +300,9 @@ def explain(
         return counted(stay, failures)
     share = _SHARE if len(stay) <= _FEW_SIDES else 0.5 / len(stay)
     strong = by.sum(1) >= max(_FEW_FAILURES, share * k)
-    bent, _ = _bent(says, failures[by[strong].sum(0) == 0], survived)
+    bent, _ = _bent(says, failures[by[strong].sum(0) == 0], survived, k)
     if strong.any():
-        alone, whole = _bent(says, failures, survived, len(bent) + int(strong.sum()))
+        alone, whole = _bent(says, failures, survived, k, len(bent) + int(strong.sum()))
         if whole:
             bent, strong = alone, np.zeros(len(strong), bool)
     within: Flags = np.asarray(inside(bent, failures).any(0))
@@ -360,9 +361,14 @@ def _most_telling(explained: Flags, perhaps: Flags, beyond: Floats) -> tuple[lis
 
 
 def _bent(
-    says: int, failures: Floats, survived: Survived, fewer: float = np.inf
+    says: int, failures: Floats, survived: Survived, n_failures: int, fewer: float = np.inf
 ) -> tuple[Floats, bool]:
-    """Bent forms that explain failures, and whether these are ``fewer`` and explain all of them."""
+    """Bent forms that explain failures, and whether these are ``fewer`` and explain all of them.
+
+    One that says it fails holds, once it is grown, a smaller share of what was survived than of all
+    ``n_failures``: a single failure amid what was survived, as of a sensor that was stuck, says
+    nothing of where it fails.
+    """
     candidates, n = _candidates(failures, survived), len(survived.rows)
     sample = survived.rows[np.linspace(0, n - 1, min(n, _FIT_ROWS)).astype(int)]
     bent_rows: list[Floats] = []
@@ -375,8 +381,9 @@ def _bent(
         group = groups.pop(0)
         F = failures[group]
         rows, within, score = _fitted(F, candidates, survived)
-        if says == FAILS:  # one that is grown, and would refuse most of what was survived
-            within[(distances(rows, sample) < GROWN).mean(1) > _RARE] = False
+        if says == FAILS:  # grown, it would refuse more of what was survived than of failures
+            share = (distances(rows, sample) < GROWN).mean(1)
+            within[share > np.minimum(_RARE, within.sum(1) / n_failures)] = False
         count = within.sum(1)
         best = max(range(len(candidates)), key=lambda n: (count[n], score[n]))
         if 2 < len(group) and count[best] < len(group):

@@ -48,6 +48,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     state = state._replace(
         n_seen=state.n_seen + int(is_seen.sum()),
         margin=0.0 if "margin" in without else margin,
+        misled=settings.drift_fade**episode.failed * state.misled,  # so that lags come back
         used=state.used + motion.used_at(u, state.choices).sum(0),
     )
     # Model
