@@ -28,7 +28,6 @@ import numpy as np
 import polars as pl
 import typer
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import isotonic_regression
 from scipy.special import expit
 from scipy.stats import beta
 
@@ -419,30 +418,6 @@ class Ranked:
             ]
         )
         return interval(found[:, 0]), interval(found[:, 1])
-
-
-def isotonic(score: ArrayLike, truth: ArrayLike) -> Callable[[ArrayLike], NDArray[np.float64]]:
-    """Calibrate scores, infinite ones too, by isotonic regression (B. Zadrozny, C. Elkan, 2002).
-
-    What it returns turns scores into probabilities, which never fall as the score rises.
-
-    >>> calibrate = isotonic([1.0, 2.0, 3.0, 4.0], [False, True, False, True])
-    >>> calibrate([0.0, 2.5, 9.0])
-    array([0. , 0.5, 1. ])
-    """
-    values = np.asarray(score, dtype=np.float64)
-    if values.size == 0 or np.isnan(values).any():
-        raise ValueError("isotonic calibration needs one score or more, none of them NaN")
-    scores, which, cases = np.unique(values, return_inverse=True, return_counts=True)
-    came = np.bincount(which, weights=np.asarray(truth, dtype=np.float64)) / cases
-    fitted = isotonic_regression(came, weights=cases.astype(np.float64)).x
-    probabilities = np.clip(fitted, 0.0, 1.0)
-
-    def calibrate(score: ArrayLike) -> NDArray[np.float64]:
-        place = np.searchsorted(scores, np.asarray(score, dtype=np.float64), side="right") - 1
-        return np.asarray(probabilities[np.maximum(place, 0)])
-
-    return calibrate
 
 
 def logistic(rows: ArrayLike, came: ArrayLike, ridge: ArrayLike) -> NDArray[np.float64]:

@@ -106,7 +106,7 @@ def test_the_benchmark_names_what_is_less_than_was_accepted():
 @pytest.mark.parametrize(("change", "draws"), [("stuck", 131), ("late", 7)])
 def test_a_sensor_that_was_stuck_once_or_is_late_makes_no_guard_useless(change, draws):
     row = trial(
-        "cartpole", "random", seed=1, train=30, test=5, base=draws, beside=False, change=change
+        "cartpole", "random", seed=4, train=30, test=5, base=draws, beside=False, change=change
     )
     assert row["failed"] == 0
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:  # whoever asks for a number here waits for no compiler
     from evofsm.fsm.naming import Labels
+    from evofsm.fsm.validation import Floats
     from evofsm.guard.actions import Action, ActionSet, Mask
     from evofsm.guard.harm import Harm
     from evofsm.store import Place
@@ -161,9 +162,7 @@ class ActionJudge(Protocol):
         """What it has to try before its judgement can be relied on; None if nothing."""
         return None
 
-    def effective(
-        self, situation: Situation, actions: NDArray[np.float64], /
-    ) -> NDArray[np.float64]:
+    def effective(self, situation: Situation, actions: Floats, /) -> Floats:
         """What actions come to here, where some of them would change nothing."""
         return actions
 
@@ -297,9 +296,7 @@ class ObservingJudge(LearningJudge, Protocol):
     def act(self, action: Action, /) -> None:
         """Take in what was executed after it; another one replaces it."""
 
-    def told_here(
-        self, observation: NDArray[np.float64], /
-    ) -> tuple[str, NDArray[np.float64] | None]:
+    def told_here(self, observation: Floats, /) -> tuple[str, Floats | None]:
         """What it knows of failure near an observation, and the centre of the dead end there."""
         return "", None
 

@@ -45,10 +45,11 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     safe = z[:-1] if episode.failed else z
     u = episode.actions[: max(0, len(safe) - 1)]
     margin = max(settings.margin_step, settings.margin_fade * state.margin)
+    is_lost = episode.failed and 2.0 * episode.lost.sum() > len(episode.lost)
     state = state._replace(
         n_seen=state.n_seen + int(is_seen.sum()),
         margin=0.0 if "margin" in without else margin,
-        misled=settings.drift_fade**episode.failed * state.misled,  # so that lags come back
+        misled=(settings.drift_fade if is_lost else 1.0) * state.misled,  # so that lags come back
         used=state.used + motion.used_at(u, state.choices).sum(0),
     )
     # Model

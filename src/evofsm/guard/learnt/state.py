@@ -69,6 +69,7 @@ class LearntSettings:
     rare: int = 30  #: but not of an action at an end of its range that was used less often
     drift: float = 30.0  #: gained log likelihood from which on it moves otherwise (Page 1954)
     #: of the latest episodes, what is left an episode later; of ``misled`` after one that failed
+    #: and in most of which nothing seemed to help
     drift_fade: float = 0.95
     refused: float = 0.1  #: forms that refuse more than this share of proposals ...
     #: ... in so many episodes without failure are doubted: a rival is tried while it learns
