@@ -66,7 +66,6 @@ class Changed:
         self._wrong = start.split == "train" and start.episode == GLITCHED
         self._seen_by = np.random.default_rng([start.seed, start.episode, 77])
         z, info = self._system.reset(seed=seed, options=options)
-        self._latest = z
         return self._seen(z), info
 
     def step(self, action: Any) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
@@ -83,9 +82,9 @@ class Changed:
 
     def _seen(self, z: Vector) -> Vector:
         """What sensors say."""
-        self._latest, before = z, self._latest
         if self._change == "late":
-            return before
+            seen, self._held = z if self._held is None else self._held, z
+            return seen
         if self._change == "noise":
             return z + self._seen_by.normal(0.0, _NOISE[self._system.name])
         if not self._wrong:

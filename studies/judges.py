@@ -73,7 +73,14 @@ PARTS: dict[str, str] = {
     "fatal": "what nothing survives may begin anywhere",
     "landings": "a variable that jumps does not land where it did",
 }
-#: What stands in its settings where a part has no other switch.
+
+
+def _both(known: Vector, new: Vector) -> Vector:
+    """(2, m) the least of all, twice."""
+    return np.tile(np.minimum(known[0], new), (2, 1))
+
+
+# What stands in its settings, or in its modules, where a part has no other switch.
 _GONE: dict[str, dict[str, Any]] = {
     "lags": {"lags": 1e12},
     "products": {"shy": 1e12},
@@ -87,26 +94,16 @@ _GONE: dict[str, dict[str, Any]] = {
     "misled": {"misled": math.inf},
     "regulators": {"n_regulators": 0},
     "settled": {"settled": 10**6},
+    "glitches": {"model.without_glitches": lambda z, unit: z},
+    "gaps": {"model.filled": lambda z, failed: z},
+    "held": {"motion._held": lambda state, to, after: np.zeros((2, *after.shape), bool)},
+    "witness": {"motion._extremes": lambda known, new, _: (_both(known, new), new < known[0])},
+    "blur": {"failure._BLURRED": 0.0},
+    "dropped": {"danger._dropped": lambda state, was, *rest: was[:0]},
+    "endings": {"danger._ENDED": math.inf},
+    "fatal": {"learn._fatal": lambda state, known, found, settings: (state, found)},
+    "landings": {"model.trimmed": lambda found: found[:, : found.shape[1] // 2].copy()},
 }
-# What stands in the place of functions and numbers of its modules where there is not even that.
-_INSTEAD: dict[str, tuple[str, Any]] = {
-    "glitches": ("model.without_glitches", lambda z, unit: z),
-    "gaps": ("model.filled", lambda z, failed: z),
-    "held": ("motion._held", lambda state, to, after: np.zeros((2, *after.shape), bool)),
-    "witness": ("motion._extremes", lambda known, new, close: (_both(known, new), new < known[0])),
-    "blur": ("failure._BLURRED", 0.0),
-    "dropped": ("danger._dropped", lambda state, was, *rest: was[:0]),
-    "endings": ("danger._ENDED", math.inf),
-    "fatal": ("learn._fatal", lambda state, known, found, settings: (state, found)),
-    "landings": ("model.trimmed", lambda found: found[:, : found.shape[1] // 2].copy()),
-}
-
-
-def _both(known: Vector, new: Vector) -> Vector:
-    """(2, m) the least of all, twice."""
-    return np.tile(np.minimum(known[0], new), (2, 1))
-
-
 _SETTINGS = asdict(LearntSettings())
 _LEARNT = "evofsm.guard.learnt"
 # Private numbers of its modules.
@@ -201,10 +198,7 @@ def learnt_guard(
     Without ``harm`` no episode is driven in shadow.
     """
     parts = [part for part in without if part in LearntRisk.PARTS]
-    gone = [_GONE.get(part) or setting(part) for part in without if part not in LearntRisk.PARTS]
-    settings = LearntSettings(
-        **{name: value for one in gone for name, value in one.items() if name in _SETTINGS}
-    )
+    settings = LearntSettings(**_changes(without, in_modules=False))
     told |= {"horizon": horizon, "seed": seed}
     judge = LearntRisk(interval, **told, without=parts, settings=settings)
     guard = Guard(**told, interval=interval, judge=judge, failed=failed)
@@ -228,13 +222,17 @@ def setting(part: str) -> dict[str, Any]:
     return {name: type(default)(float(value))}
 
 
+def _changes(parts: Sequence[str], *, in_modules: bool) -> dict[str, Any]:
+    """What parts change, by name: in the modules of the learnt judge, or in its settings."""
+    changes = [item for part in parts for item in (_GONE.get(part) or setting(part)).items()]
+    return {name: value for name, value in changes if ("." in name) == in_modules}
+
+
 def taken_out(parts: Sequence[str]) -> ExitStack:
     """Within it what has no switch is left out of the learnt judge, or is another number."""
     stack = ExitStack()
-    for part in parts:
-        numbers = [(name, value) for name, value in setting(part).items() if name in _NUMBERS]
-        for place, instead in [_INSTEAD[part]] if part in _INSTEAD else numbers:
-            stack.enter_context(patch(f"{_LEARNT}.{place}", instead))
+    for place, instead in _changes(parts, in_modules=True).items():
+        stack.enter_context(patch(f"{_LEARNT}.{place}", instead))
     return stack
 
 

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, Self, runtime_checkable
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 if TYPE_CHECKING:  # whoever asks for a number here waits for no compiler
     from evofsm.fsm.naming import Labels
@@ -55,8 +54,8 @@ STALE = Intake.REPEATED | Intake.LATE
 class Situation(NamedTuple):
     """Where the system is, as it was observed and as the machine recognised it."""
 
-    observation: NDArray[np.float64]  #: (m,) in the judge's units; NaN where not seen
-    belief: NDArray[np.float64]  #: (n,) distribution over states
+    observation: Floats  #: (m,) in the judge's units; NaN where not seen
+    belief: Floats  #: (n,) distribution over states
     state: int | None  #: index of the most probable state; None where there is none yet
     surprise: float  #: divergence of forecast and belief [bit]; NaN where nothing was forecast
     time: float  #: [s]
@@ -86,7 +85,7 @@ class Revision(NamedTuple):
 class Controller(Protocol):
     """Anything that proposes actions."""
 
-    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+    def propose(self, observation: Floats, time: float = 0.0) -> Proposal:
         """What it wants to do at ``time`` [s], seeing ``observation``, as `Guard.decide` has it."""
 
 
@@ -111,10 +110,10 @@ class Judgement(NamedTuple):
     with its 90 % interval from ``low`` to ``high``.
     """
 
-    risk: NDArray[np.float64]  #: (k,)
-    low: NDArray[np.float64]  #: (k,)
-    high: NDArray[np.float64]  #: (k,)
-    critical: NDArray[np.float64]  #: (k,) hardest disturbance that is survived, in its own unit
+    risk: Floats  #: (k,)
+    low: Floats  #: (k,)
+    high: Floats  #: (k,)
+    critical: Floats  #: (k,) hardest disturbance that is survived, in its own unit
     evidence: float  #: number of disturbances it rests on
     seen: float = math.nan  #: time spent in states like this one [s]; NaN where that is not known
 
@@ -169,7 +168,7 @@ class ActionJudge(Protocol):
     def choose(
         self,
         situation: Situation,
-        options: NDArray[np.float64],
+        options: Floats,
         judged: Judgement,
         tolerances: tuple[float, float],
         /,
@@ -197,7 +196,7 @@ class ActionJudge(Protocol):
 class Search(NamedTuple):
     """What a judge found that looks for an action itself."""
 
-    options: NDArray[np.float64]  #: (k,) or (k, d), in the set of actions; the proposal first
+    options: Floats  #: (k,) or (k, d), in the set of actions; the proposal first
     judged: Judgement  #: with an entry for each of them
     best: int  #: index of what should be executed; 0 where the proposal will do
     reason: str  #: in a few words
@@ -266,7 +265,7 @@ class LearningJudge(ActionJudge, Protocol):
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was."""
 
-    def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+    def end(self, observation: Floats | None, *, failed: bool) -> None:
         """Learn how an episode ended, with the last observation if there is one."""
 
     def sums(self, n_states: int, /) -> dict[str, float]:
@@ -290,7 +289,7 @@ class ObservingJudge(LearningJudge, Protocol):
 
     harm: Harm  #: how episodes ended, guarded and alone: `Harm()` at first, then the guard's
 
-    def observe(self, observation: NDArray[np.float64], /) -> None:
+    def observe(self, observation: Floats, /) -> None:
         """Take in an observation (m,), NaN where something was not seen."""
 
     def act(self, action: Action, /) -> None:
@@ -304,7 +303,7 @@ class ObservingJudge(LearningJudge, Protocol):
 class RiskMeasure(Protocol):
     """Anything that says how dangerous a situation is."""
 
-    def score(self, observations: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+    def score(self, observations: Floats, dt: float) -> Floats:
         """(T,) danger of each row of an episode, from it and the rows before it only.
 
         Rows are gap [m], speed of the follower and of the leader [m/s], ``dt`` [s] apart. Danger is

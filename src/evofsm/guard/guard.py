@@ -651,13 +651,14 @@ class Guard:
             return
         if not self._learn:
             self.judge.follow(situation.observation, executed)
-        elif getattr(self.reviser, "acts", True):
-            self.judge.learn(situation.observation, executed, situation.belief)
-            self._acted += 1
-            self._kept += not getattr(self.reviser, "refuses", False)
-        else:
+        elif not getattr(self.reviser, "acts", True):
             self.judge.watch(situation.observation, executed, situation.belief)
             self._watched += 1
+        else:
+            self.judge.learn(situation.observation, executed, situation.belief)
+            if (refuses := getattr(self.reviser, "refuses", None)) is not None:
+                self._acted += 1
+                self._kept += not refuses
 
     def _explained(self, situation: Situation, revision: Revision) -> Revision:
         """With what the machine has seen come of what is executed, where that is asked for."""
@@ -773,7 +774,8 @@ class Guard:
         how = type(self.reviser).__name__
         if settings := getattr(self.reviser, "settings_text", ""):
             how += f", {settings}"
-        if self._observing is not None and (self._learn or not self.shadow):
+        is_tested = hasattr(self.reviser, "passing") and self._observing is not None
+        if is_tested and (self._learn or not self.shadow):
             how += ", in shadow where in doubt" if self.shadow else ", harm is not noticed"
         latest = [] if self._observing is None else self._observing.harm.guarded
         of_late = f" ({sum(o.failed for o in latest)} of the latest {len(latest)} guarded)"

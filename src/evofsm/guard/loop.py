@@ -129,7 +129,8 @@ def action_masks(environment: Any) -> Callable[[Any, Mapping[str, Any]], Any]:
 def _whole(observation: Any, held: Floats | None) -> Floats:
     """The latest value of each variable; NaN of one that was never observed."""
     now = np.array(observation, dtype=np.float64).ravel()
-    return now if held is None else np.where(np.isnan(now), held, now)
+    absent = np.isnan(now)
+    return np.where(absent, held, now) if held is not None and absent.any() else now
 
 
 def _asked(

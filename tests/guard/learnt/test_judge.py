@@ -165,6 +165,9 @@ def test_too_many_variables_are_refused_before_anything_is_allocated(point, snap
             act(np.zeros(m))
         assert snapshot(guard) == before
     point.play(guard, 0)
+    (frozen := point.guard()).freeze()
+    with pytest.raises(ValueError, match=rf"has {m} variables; .* at most 64"):
+        frozen.decide(np.zeros(m), None)
 
 
 @pytest.mark.parametrize("how", [lambda guard: guard.copy(), copy.deepcopy, pickle.dumps])

@@ -365,9 +365,8 @@ def _bent(
 ) -> tuple[Floats, bool]:
     """Bent forms that explain failures, and whether these are ``fewer`` and explain all of them.
 
-    One that says it fails holds, once it is grown, a smaller share of what was survived than of all
-    ``n_failures``: a single failure amid what was survived, as of a sensor that was stuck, says
-    nothing of where it fails.
+    One that says it fails holds, grown, a smaller share of what was survived than of ``n_failures``
+    in all: one amid what was survived, as of a sensor that was stuck, says nothing.
     """
     candidates, n = _candidates(failures, survived), len(survived.rows)
     sample = survived.rows[np.linspace(0, n - 1, min(n, _FIT_ROWS)).astype(int)]

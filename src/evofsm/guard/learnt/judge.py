@@ -283,6 +283,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         or less, which nobody knows.
         ``revising`` changes nothing: a band in which a proposal is refused longer gained nothing.
         """
+        if not self.n_variables:
+            rollout.refuse_too_many(len(situation.observation), self.size, box=not self.choices)
         here, options, parts = self._here(situation.observation), np.array([wanted]), self.parts
         if parts is None or here is None or not len(self.state.forms):
             self._certified = False
@@ -471,7 +473,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         if m not in (0, len(observation)):
             has = f"observation has {len(observation)} variables"
             raise ValueError(f"{has}, but the judge learnt of {m}")
-        rollout.refuse_too_many(len(observation), self.size, box=not self.choices)
+        if not m:
+            rollout.refuse_too_many(len(observation), self.size, box=not self.choices)
         if len(self._z) > len(self._u):  # nothing was executed: it does not follow
             self._study(failed=False, terminated=False)
         self._z.append(observation.copy())
