@@ -1,6 +1,6 @@
 """Is a good controller left alone? A row for each system, seed, and way: alone, or guarded.
 
-The guard learnt of a careless controller; then a good one takes over, which the guard never saw.
+The guard learnt of a careless controller; then a good one takes over. A fresh one knows nothing.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from studies.rivals import Unrevised
 from studies.shapes import NEEDS
 from studies.systems import Start, System, Vector, make_system
 
-ALONE, FROZEN, LEARNING = "alone", "frozen", "learning"
+ALONE, FRESH, FROZEN, LEARNING = "alone", "fresh", "frozen", "learning"
 #: A system, the careless controller of which is learnt, and what a good one does.
 GOOD: dict[tuple[str, str], Callable[[Any, Vector], Any]] = {
     ("acc", "full throttle"): lambda s, z: np.clip(-1.5 * (z[0] + 0.7) - 2.5 * z[1], -2.0, 2.0),
@@ -146,19 +146,19 @@ class Good(lib.Study):
 _ABOUT = """Is a good controller left alone?
 
 A guard learns of a careless controller; then a good one, which it never saw, drives the same draws
-alone, under the frozen guard, and under one that goes on learning."""
+alone, under the frozen guard, under one that goes on learning, and under a fresh one."""
 
 
 def driven(name: str, careless: str, seed: int, train: int, episodes: int) -> list[dict[str, Any]]:
     """What came of a good controller, alone and under a guard that learnt of a careless one."""
     system = make_system(name, careless)
-    guard = make_judge("learnt", system, (), seed)
+    guard, fresh = (make_judge("learnt", system, (), seed) for _ in range(2))
     for k in range(train):
         run(system, guard, Start.training(0, seed, k))
     frozen = guard.copy()
     frozen.freeze()
     driver, rows = Driver(system, GOOD[name, careless]), []
-    ways: dict[str, Any] = {ALONE: Unrevised(), FROZEN: frozen, LEARNING: guard}
+    ways: dict[str, Any] = {ALONE: Unrevised(), FRESH: fresh, FROZEN: frozen, LEARNING: guard}
     for way, judge in ways.items():
         found = [run(system, judge, Start.training(1, seed, k), driver) for k in range(episodes)]
         rows.append(

@@ -263,6 +263,18 @@ def test_a_controller_that_became_good_drives_on_alone_under_a_guard_that_always
     assert not harm.helps(learning=False)
 
 
+@pytest.mark.parametrize(("kept", "least", "most"), [(3, 1, 8), (57, 30, 30)])
+def test_a_controller_that_failed_by_bad_luck_is_soon_alone_if_most_is_replaced(kept, least, most):
+    """One failure is all that is known of it; the guard keeps so many of 60 proposals."""
+    taken = []
+    for n in range(1, 21):
+        harm = Harm((Outcome(n, 20, failed=True, guarded=False),), n, refuses=True)
+        while not harm.passing(learning=True) and harm.n_episodes < n + 30:
+            harm = harm.after((60, 0, kept), failed=False)
+        taken.append(harm.n_episodes - n)
+    assert least <= np.median(taken) <= most
+
+
 @pytest.mark.parametrize(("how", "least", "most"), [("e", 20, 60), ("", 0, 8)])
 def test_a_good_controller_that_is_kept_from_its_goal_is_tried(how, least, most):
     """It was careless for 40 episodes; under the guard it hovers. Nobody hopes for the unseen."""

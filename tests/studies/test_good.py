@@ -1,7 +1,7 @@
 """Good controllers are good, and the study says what a guard does to them."""
 
 import pytest
-from studies.good import ALONE, FROZEN, GOOD, LEARNING, Driver, Good, driven
+from studies.good import ALONE, FRESH, FROZEN, GOOD, LEARNING, Driver, Good, driven
 from studies.rivals import Unrevised
 from studies.shapes import NEEDS
 from studies.systems import Start, make_system
@@ -27,7 +27,7 @@ def test_a_good_controller_does_not_fail_alone_and_the_careless_one_does(name, c
 @pytest.mark.slow
 def test_a_guard_that_learnt_of_a_careless_controller_leaves_a_good_one_alone():
     rows = driven("pendulum", "random", seed=0, train=12, episodes=3)
-    assert [row["way"] for row in rows] == [ALONE, FROZEN, LEARNING]
+    assert [row["way"] for row in rows] == [ALONE, FRESH, FROZEN, LEARNING]
     assert all(row["failed"] == 0 and row["kept"] > 0.95 for row in rows)
     worse = [row | {"failed": 2 * (row["way"] == FROZEN)} for row in rows]
     page = Good().page({"rows": pytest.importorskip("polars").DataFrame(worse)})

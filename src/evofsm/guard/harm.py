@@ -149,7 +149,8 @@ class Harm(NamedTuple):
         The same for the same record.
         """
         well = Outcome(0, _FOREVER, failed=False, guarded=False, ended=self.ends)
-        arms = [[*self.guarded, well], [*self.lately, well]]
+        ideal = well._replace(ended=self.ends or self._replaces_most)
+        arms = [[*self.guarded, well], [*self.lately, ideal]]
         random = np.random.default_rng([self.n_episodes, draws])
         guarded, alone = (
             random.gamma(
@@ -183,8 +184,15 @@ class Harm(NamedTuple):
             if _all_failed(self.lately) and len(self.guarded) < _TRIES:
                 return ""
         fails = any(outcome.failed for outcome in self.outcomes[-1:])
-        is_drawn = self.refuses and (fails or self._long_ago or not self.helps(learning=True))
+        is_new = self._replaces_most and len(self.lately) < _CAREFUL
+        is_due = fails or is_new or self._long_ago
+        is_drawn = self.refuses and (is_due or not self.helps(learning=True))
         return "shadow" if is_drawn and not self.drives(self._draws) else ""
+
+    @property
+    def _replaces_most(self) -> bool:
+        """Whether it keeps less than half of the proposals: what it takes away may be good."""
+        return self.kept < 0.5 * self.decided
 
     @property
     def _long_ago(self) -> bool:

@@ -19,19 +19,17 @@ import numpy as np
 from numpy.random import Generator
 
 from evofsm.guard.learnt.model import ridge
-from evofsm.guard.learnt.rollout import Floats, Ints, Model, features, rollout
+from evofsm.guard.learnt.rollout import ROUNDING, SMALL, Floats, Ints, Model, features, rollout
 from evofsm.guard.learnt.state import LearntSettings, State
 
 # Of mutants the share that are of the best, the share of numbers that differ, by a size of 10 to a
 # power between these.
 _OF_BEST, _CHANGED, _SIZES = 0.8, 0.6, (-1.5, 0.7)
 # Of regulators the powers of 10 between which costs of variables and of actions are drawn, what
-# counts of a cost a step later, and one that is too large; what their model is held to 0 by.
-_COSTS, _EFFORTS, _LATER, _TOO_LARGE, _TO_0 = (-1.0, 1.0), (-2.0, 1.0), 0.99, 1e12, 1e-6
+# counts of a cost a step later.
+_COSTS, _EFFORTS, _LATER = (-1.0, 1.0), (-2.0, 1.0), 0.99
 # What a backup is worth by itself counts so much, compared with what it adds to the others.
 _BY_ITSELF = 0.01
-# Decimals beyond which numbers are equal; what a choice is preferred by to the next one.
-_ROUNDED, _PREFERRED = 9, 1e-9
 # Observations to which a given backup is fitted, or some more.
 _FITTED = 200
 # Boxes of more dimensions have an action along each axis, not one in each corner.
@@ -57,7 +55,7 @@ def first_backups(state: State, u: Floats, n_linear: int) -> State:
     policies[: len(ends), order, 0] = ends
     policies *= turns[:, None]
     if choices:  # of equals the first in that order, whatever its index
-        policies[:, order, 0] -= _PREFERRED * np.arange(a)
+        policies[:, order, 0] -= ROUNDING * np.arange(a)
     linear = np.append(np.zeros(len(ends)), np.ones(n_linear))
     return state._replace(policies=policies, linear=linear)
 
@@ -80,9 +78,9 @@ def basis(rows: Floats, choices: int = 0) -> tuple[Ints, Floats]:
 
     By their mean size, of equals by the first rows in which they differ.
     """
-    exact = (-rows if choices else np.abs(rows)).round(_ROUNDED)
+    exact = (-rows if choices else np.abs(rows)).round(9)
     turns = np.ones(rows.shape[1]) if choices else np.where((rows**3).sum(0) < 0.0, -1.0, 1.0)
-    return np.lexsort((*exact[::-1], exact.mean(0).round(_ROUNDED))), turns
+    return np.lexsort((*exact[::-1], exact.mean(0).round(9))), turns
 
 
 def linearised(state: State, model: Model) -> tuple[Floats, Floats, Floats]:
@@ -98,7 +96,7 @@ def linearised(state: State, model: Model) -> tuple[Floats, Floats, Floats]:
     phi = features(model, z, rows[:, m : 2 * m], rows[:, 2 * m :], u)
     x = np.column_stack([np.ones(len(z)), (z - model.mean) * model.inverse])
     inputs, changes = np.hstack([x, u]), phi @ model.weights * model.inverse
-    penalty = np.full(1 + m + a, _TO_0 * len(x))
+    penalty = np.full(1 + m + a, SMALL * len(x))
     weights = ridge(inputs.T @ inputs, inputs.T @ changes, penalty).T
     A, B = np.eye(1 + m), np.zeros((1 + m, a))
     A[1:] += weights[:, : 1 + m]
@@ -119,7 +117,7 @@ def regulator(A: Floats, B: Floats, cost: Floats, effort: float, steps: int) -> 
     for _ in range(steps):
         K = np.asarray(np.linalg.solve(effort * np.eye(B.shape[1]) + B.T @ P @ B, B.T @ P @ A))
         P = cost + _LATER * A.T @ P @ (A - B @ K)
-        if np.abs(P).max() > _TOO_LARGE:
+        if ROUNDING * np.abs(P).max() > cost.max():
             break
     return -K
 
@@ -150,7 +148,7 @@ def evolved(
 
     def mutant() -> Floats:
         """Change some numbers of the best backup, or of any."""
-        parent = parents[values[parents].mean(1).round(_ROUNDED).argmax()]
+        parent = parents[values[parents].mean(1).round(9).argmax()]
         if random.random() >= _OF_BEST:
             parent = int(random.integers(len(policies)))
         size = 10.0 ** random.uniform(*_SIZES)
@@ -176,13 +174,13 @@ def evolved(
         variants = np.repeat(values[None], 1 + len(parents), 0)  # as they are, and with the child
         variants[1 + np.arange(len(parents)), parents] = child_values
         together = variants.max(1).mean(1) + _BY_ITSELF * variants.mean(2).sum(1)
-        best = int(together.round(_ROUNDED).argmax())  # of equals the first: nothing changes
+        best = int(together.round(9).argmax())  # of equals the first: nothing changes
         if best:
             policies[parents[best - 1]], values[parents[best - 1]] = child, child_values
     pool, most, order = list(range(len(values))), np.full(values.shape[1], -1.0), []
     while pool:  # first the one that is worth most, then whichever adds most
         adds = np.maximum(values[pool] - most, 0.0).mean(1)
-        adds = (adds + _BY_ITSELF * values[pool].mean(1)).round(_ROUNDED)
+        adds = (adds + _BY_ITSELF * values[pool].mean(1)).round(9)
         order.append(pool.pop(int(adds.argmax())))
         most = np.maximum(most, values[order[-1]])
     return state._replace(policies=policies[order], linear=state.linear[order])

@@ -26,6 +26,8 @@ from evofsm.guard.learnt.rollout import (
     FATAL,
     FLAT,
     GROWN,
+    ROUNDING,
+    SMALL,
     Flags,
     Floats,
     Ints,
@@ -43,19 +45,17 @@ _MAX_FORMS, BLUR = 8, 0.5
 _FEW_FAILURES, _SHARE, _FEW_SIDES = 3, 0.25, 4
 # So many failures may leave two sides undecided.
 _MOST_UNDECIDED = 2
-# Beyond an end is what is so many typical steps beyond; blurred ends are so wide [scales], unless
-# a scale is a larger share of the spread: a variable that is noise alone explains no failure.
-_BEYOND, _BLURRED, _NOISY = 1e-12, 5.0, 0.5
-# Survived observations of a fit; steps of Newton, and the ridge for each of them.
-_FIT_ROWS, _NEWTON, _RIDGE = 400, 40, 1e-9
+# Blurred ends are so wide [scales], unless a scale is a larger share of the spread: a variable that
+# is noise alone explains no failure.
+_BLURRED, _NOISY = 5.0, 0.5
+# Survived observations of a fit; steps of Newton.
+_FIT_ROWS, _NEWTON = 400, 40
 # Fits of what explains failures with more likelihood than this each; how many survived ones that
 # are wrongly inside are added.
 _REFITS, _UNLIKELY, _WORST = 3, 2.0, 100
 # Variables of which all pairs are tried, and how many of others; pairs of which two forms are, and
 # rounds of dealing failures out between two.
 _SCREENED, _COUPLED, _IN_TWO, _ROUNDS = 6, 3, 3, 3
-# What is left of a variance given another variable, at least, as a share.
-_ALIKE = 1e-6
 # An ellipse may be moved inwards by so much [standard deviations].
 _INWARDS = 0.1 * 1.5 ** np.arange(8)
 # A rival of a threshold, and a bent form once it is grown, hold less of what was survived; that
@@ -332,10 +332,10 @@ def _sides(says: int, failures: Floats, survived: Survived, noise: Floats, least
     perhaps = (far > -wide.T.ravel()) | ((again > 0.0) & np.isfinite(again))
     is_open = np.ones(len(failures), bool)
     thresholds: dict[int, float] = {}
-    for clear in (max(least, _BEYOND), _BEYOND):
+    for clear in (max(least, ROUNDING), ROUNDING):
         while (is_explained := (beyond > clear) & is_open[:, None]).any():
             ties, best = _most_telling(is_explained, perhaps, beyond)
-            is_open &= ~(beyond[:, best] > _BEYOND)
+            is_open &= ~(beyond[:, best] > ROUNDING)
             is_undecided = len(failures) <= _MOST_UNDECIDED and len(ties) == 2
             for k in ties if is_undecided else [best]:
                 thresholds[k] = float(ends[k])
@@ -451,8 +451,8 @@ def _tells(failures: Floats, survived: Floats) -> tuple[Floats, Floats]:
     square, R = np.maximum((x * x).mean(0), 1e-12), y.T @ y / len(y)
     S = (x.T @ x + R) / (len(x) + 1.0)
     i, j = np.triu_indices(len(scale), 1)
-    joint, free = S[i, i] + S[j, j], np.maximum(1.0 - R[i, j] ** 2, _ALIKE)
-    remainder = np.maximum(1.0 - S[i, j] ** 2 / (S[i, i] * S[j, j]), _ALIKE)
+    joint, free = S[i, i] + S[j, j], np.maximum(1.0 - R[i, j] ** 2, SMALL)
+    remainder = np.maximum(1.0 - S[i, j] ** 2 / (S[i, i] * S[j, j]), SMALL)
     more = (joint - 2.0 * R[i, j] * S[i, j]) / free - joint - np.log(remainder / free)
     return square - 1.0 - np.log(square), more
 
@@ -532,7 +532,7 @@ def _logistic(phi: Floats, y: Floats) -> tuple[Floats, Floats]:
     (count, n, p), mean, size = phi.shape, phi.mean(1), phi.std(1)
     size = np.where(size > 0.0, size, 1.0)
     X = np.concatenate([(phi - mean[:, None]) / size[:, None], np.ones((count, n, 1))], 2)
-    hold = np.full((count, p + 1), _RIDGE * n)
+    hold = np.full((count, p + 1), ROUNDING * n)
     hold[:, :p][~(phi != 0.0).any(1)] = 1.0  # features that it has not
     w, to = np.zeros((count, p + 1)), np.where(y > 0.0, -1.0, 1.0)
 

@@ -13,20 +13,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from evofsm.guard.learnt.rollout import Flags, Floats, Model, features, lags
+from evofsm.guard.learnt.rollout import SMALL, Flags, Floats, Model, features, lags
 
 # A change so many times those around it, and the typical one, is a jump; so is a row so far from
 # the median of those around it, which is none.
 JUMP = 8.0
 # Of a variable's spread, what a typical step is at least.
 FLOOR = 1e-3
-# The least variance of a feature, and what all weights are held to 0 by, of its mean square: far
-# more than rounding, so that features that did not vary yet share what they explain alike.
-_LEAST, _ALL_ALIKE = 1e-6, 1e-10
 # Rows from one in which a variable was seen to the next, at most, between which it is filled in.
 _MAX_GAP = 5
-# What leaves a feature out.
-_NEVER = 1e15
 # From so many features on BLAS would call threads, which wait where other processes are busy.
 _MANY_FEATURES = 100
 
@@ -104,12 +99,12 @@ def solve(
     many numbers an action has; and ``prior``, ``shy`` and ``lags`` of `LearntSettings`.
     """
     n, size, m = max(1.0, float(squares[0, 0])), np.diag(squares), len(noisy)
-    variance = np.maximum(size - squares[0] ** 2 / n, _LEAST * size)
+    variance = np.maximum(size - squares[0] ** 2 / n, SMALL * size)
     variance[0] = 0.0
     is_plain = np.zeros(len(size), bool)
     is_plain[: 1 + m] = is_plain[1 + 2 * m : 1 + 2 * m + a] = True
     times = np.ones(len(size))
-    times[lags(m, a)] = min(prior[2], _NEVER)
+    times[lags(m, a)] = min(prior[2], 1e15)
     weights = np.empty_like(products)
     for j, share in enumerate(noisy):
         penalty = np.where(is_plain, 1e-6 + share * prior[0] / n, 30e-6 + share * prior[1] / n)
@@ -122,7 +117,7 @@ def ridge(squares: Floats, products: Floats, held: Floats) -> Floats:
     size = np.diag(squares)
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
     matrix = scale[:, None] * (squares + np.diag(held)) * scale
-    matrix[np.diag_indices_from(matrix)] += _ALL_ALIKE
+    matrix[np.diag_indices_from(matrix)] += 1e-10  # features that did not vary yet explain alike
     return np.asarray(scale[:, None] * _solved(matrix, scale[:, None] * products))
 
 

@@ -11,13 +11,11 @@ import numpy as np
 from numpy.random import Generator
 
 from evofsm.guard.learnt import model
-from evofsm.guard.learnt.rollout import Flags, Floats, Ints, Model, features, lags
+from evofsm.guard.learnt.rollout import ROUNDING, SMALL, Flags, Floats, Ints, Model, features, lags
 from evofsm.guard.learnt.state import LearntSettings, Move, State, model_of
 
 # Changes of which the typical step is learnt; a larger one counts as so many times that.
 _MOST_CHANGES, _LARGEST_STEP = 5000.0, 6.0
-# Of what was seen, the share that is the same up to rounding.
-_SAME_SHARE = 1e-9
 # An action is used at the end of its range from so far on.
 _NEAR_END = 0.6
 # Changes of an episode that tell how large residuals are; how much the latest of them counts.
@@ -42,7 +40,7 @@ def steps(state: State, z: Floats) -> State:
     if not len(rows):
         return state
     low, high = rows.min(0), rows.max(0)
-    close = _SAME_SHARE * (high - low)
+    close = ROUNDING * (high - low)
     lowest, new_low = _extremes(state.lowest, low, close)
     highest, new_high = _extremes(-state.highest, -high, close)
     visits = np.where(np.array([new_low, new_high]).T, 0.0, state.reached)
@@ -250,7 +248,7 @@ def _correction(state: State, known: Model) -> Floats:
         return np.zeros_like(known.weights)
     m, a, n = len(state.origin), len(state.used), max(1.0, float(state.squares[0, 0]))
     size = np.diag(state.squares) / n
-    variance = np.maximum(size - (state.squares[0] / n) ** 2, 1e-6 * size)
+    variance = np.maximum(size - (state.squares[0] / n) ** 2, SMALL * size)
     variance[0] = 1.0
     penalty, late = _HELD * variance, lags(m, a)
     penalty[1 + 2 * m + 2 * a :] *= 30.0

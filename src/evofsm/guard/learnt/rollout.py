@@ -48,8 +48,8 @@ _DISTANCE, _FAR = 0.05, 0.05
 _ROUNDED_UP = 1.0 + 1e-9
 # Halvings between a proposal and an action that passes.
 _HALVINGS = 4
-# Of two backups that last as long up to so much the first is taken.
-_EQUAL = 1e-9
+#: Shares that are rounding alone, and so small that nothing of a variance is left.
+ROUNDING, SMALL = 1e-9, 1e-6
 #: Who takes over has to last longer than the proposal by more than that.
 NO_LONGER = 1e-4
 
@@ -531,7 +531,7 @@ def search(
         inputs = model, rows, policies[q], residuals, scale
         lasts = _mean(rollout(*inputs).worth)
         shortest = min(shortest, lasts)
-        if lasts > longest + _EQUAL:
+        if lasts > longest + ROUNDING:
             best, longest = q, lasts
         proposal_worth = max(proposal_worth, _mean(rollout(*inputs, proposal[None]).worth))
     apart = (longest - shortest) / (abs(longest) + 1e-12)
