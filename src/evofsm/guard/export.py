@@ -271,7 +271,7 @@ def _learnt(reviser: ActionReviser) -> Part:
 
 
 # Constants of rollouts, and arrays of a model, that C has, too.
-_OF_ROLLOUTS = ["_RESERVE", "_DISTANCE", "_FAR", "_HALVINGS", "_EQUAL", "NO_LONGER"]
+_OF_ROLLOUTS = ["_RESERVE", "_DISTANCE", "_FAR", "_HALVINGS", "ROUNDING", "NO_LONGER"]
 _OF_ROLLOUTS += ["FLAT", "GROWN", "SHRUNK", "FAILS", "ENDS", "CRASHES"]
 _OF_MODEL = (
     *("weights", "origin", "reach", "lowest", "highest", "least", "most", "forms"),

@@ -395,7 +395,7 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
   *backup = s->ranks[0];
   for (r = 0; r < ASKED; r++) {
     rollout(s, NULL, policies[s->ranks[r]], SCALE, 0.0, K, &distance);
-    if (s->worth > longest + EQUAL) {
+    if (s->worth > longest + ROUNDING) {
       *backup = s->ranks[r];
       longest = s->worth;
     }
