@@ -39,8 +39,8 @@ _KEPT, _FADES, _HOPES = 20, (0.9, 0.98), (0.5, 0.25)
 _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
 _SOONER = 0.3
-# The largest share of the controller's failures per step that a guard leaves which helps, and one
-# which replaces nearly every proposal.
+# The largest share of the controller's failures per step that a guard leaves which helps, if it
+# keeps all proposals, and if it replaces them all.
 _LEFT, _LEFT_BY_ITSELF = 0.5, 0.1
 # Scores that differ by less than this share are equal.
 _SAME_SCORE = 0.05
@@ -127,8 +127,8 @@ class Harm(NamedTuple):
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
 
         Of three episodes at least, a guard that failed in all prevents nothing, however late; nor
-        does one that fails more than half as often per step as the controller alone; more than a
-        tenth, if it replaces nearly every proposal: then it would fly any controller's craft so.
+        does one that fails more than half as often per step as the controller alone; down to a
+        tenth, the more it replaces: one that replaces all would fly any controller's craft so.
         """
         guarded, alone = self.guarded, self._alone(learning=learning)
         if _all_failed(guarded, max(_CAREFUL, len(guarded))):
@@ -138,7 +138,8 @@ class Harm(NamedTuple):
         weights, rates = zip(
             *(self._record(arm, learning) for arm in (guarded, alone)), strict=True
         )
-        most = _LEFT_BY_ITSELF if self.replacing else _LEFT
+        replaced = 1.0 - self.kept / self.decided if self.decided >= _FEWEST_DECISIONS else 0.0
+        most = _LEFT + (_LEFT_BY_ITSELF - _LEFT) * replaced
         if len(guarded) >= _CAREFUL and rates[0] > most * rates[1]:
             return False
         return bool(weights[0] @ better(guarded, alone) @ weights[1] >= 0.0)
