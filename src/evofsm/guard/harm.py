@@ -138,8 +138,8 @@ class Harm(NamedTuple):
         weights, rates = zip(
             *(self._record(arm, learning) for arm in (guarded, alone)), strict=True
         )
-        replaced = 1.0 - self.kept / self.decided if self.decided >= _FEWEST_DECISIONS else 0.0
-        most = _LEFT + (_LEFT_BY_ITSELF - _LEFT) * replaced
+        change = 1.0 - self.kept / self.decided if self.decided >= _FEWEST_DECISIONS else 0.0
+        most = _LEFT + (_LEFT_BY_ITSELF - _LEFT) * change
         if len(guarded) >= _CAREFUL and rates[0] > most * rates[1]:
             return False
         return bool(weights[0] @ better(guarded, alone) @ weights[1] >= 0.0)
