@@ -218,7 +218,7 @@ def test_frozen_it_acts_where_episodes_ended_better(guarded, alone, helps):
 
 @pytest.mark.parametrize(
     ("failed", "kept", "helps"),
-    [(18, 400.0, False), (8, 400.0, True), (8, 0.0, False), (4, 0.0, True)],
+    [(18, 400.0, False), (8, 400.0, True), (8, 30.0, False), (8, 0.0, False), (4, 0.0, True)],
 )
 def test_frozen_it_acts_where_it_prevents_most_failures(failed, kept, helps):
     """A lander's guard: later crashes count for little; one that flies by itself has to do more."""
