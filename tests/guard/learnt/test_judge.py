@@ -38,7 +38,7 @@ def test_after_a_failure_or_two_it_keeps_a_bad_controller_from_failing(point, se
 
 
 def test_it_looks_far_ahead_in_steps_of_several_decisions(point):
-    guard = point.guard(horizon=30.0)
+    guard = point.guard(horizon=30.0, shadow=False)
     assert sum(point.play(guard, k)[1] for k in range(12)) <= 4
     assert sum(point.play(guard, 100 + k)[1] for k in range(5)) <= 1
     assert guard.judge.horizon >= 300
@@ -65,7 +65,7 @@ def test_a_pendulum_that_is_decided_every_5_ms_is_held_by_looking_ahead_in_longe
 
 
 def test_it_learns_beside_a_variable_that_rests_at_an_end(point):
-    guard, failures = point.guard(), []
+    guard, failures = point.guard(shadow=False), []
     for episode in range(7):  # then it doubts the wall
         steps = point.walk(episode)
         z, proposal, failed = next(steps)
