@@ -45,14 +45,14 @@ _LEFT, _LEFT_BY_ITSELF = 0.5, 0.1
 # Scores that differ by less than this share are equal.
 _SAME_SCORE = 0.05
 # The latest guarded episodes, if all failed, are reason enough for one draw to decide; else it
-# takes as many that agree.
+# takes as many that agree; of fewer alone hardly anything is known.
 _CAREFUL = 3
 # A guard that always fails drives so many episodes in a row at most, and so many, where the
 # controller always fails as well, before draws decide.
 _TURN, _TRIES = 2, 12
 # Draws by which it is known how often the guard drives; below that share doubt is said.
 _DRAWS, _SAID = 300, 0.5
-# Decisions over which the share of proposals that are kept is counted, and at least for a word.
+# Decisions over which the share of proposals that are kept is counted; fewer do not tell.
 _DECISIONS, _FEWEST_DECISIONS = 500, 100
 # Where in an episode of so many decisions so much more is kept than before, although none of the
 # latest guarded episodes failed, of which it would have learnt, it is another controller.
@@ -135,14 +135,12 @@ class Harm(NamedTuple):
             return False
         if not guarded or not alone:
             return True
-        weights, rates = zip(
-            *(self._record(arm, learning) for arm in (guarded, alone)), strict=True
-        )
+        (g, rate), (a, rate_alone) = (self._record(arm, learning) for arm in (guarded, alone))
         change = 1.0 - self.kept / self.decided if self.decided >= _FEWEST_DECISIONS else 0.0
         most = _LEFT + (_LEFT_BY_ITSELF - _LEFT) * change
-        if len(guarded) >= _CAREFUL and rates[0] > most * rates[1]:
+        if len(guarded) >= _CAREFUL and rate > most * rate_alone:
             return False
-        return bool(weights[0] @ better(guarded, alone) @ weights[1] >= 0.0)
+        return bool(g @ better(guarded, alone) @ a >= 0.0)
 
     def drives(self, draws: int) -> float:
         """In how many of some draws the guard would drive the next episode, as a share.
@@ -185,10 +183,14 @@ class Harm(NamedTuple):
             if _all_failed(self.lately) and len(self.guarded) < _TRIES:
                 return ""
         fails = any(outcome.failed for outcome in self.outcomes[-1:])
-        is_new = self._replaces_most and len(self.lately) < _CAREFUL
-        is_due = fails or is_new or self._long_ago
+        is_due = fails or (self._replaces_most and self._is_new) or self._long_ago
         is_drawn = self.refuses and (is_due or not self.helps(learning=True))
         return "shadow" if is_drawn and not self.drives(self._draws) else ""
+
+    @property
+    def _is_new(self) -> bool:
+        """Whether hardly anything is known of the controller alone."""
+        return len(self.lately) < _CAREFUL
 
     @property
     def _replaces_most(self) -> bool:
@@ -204,8 +206,7 @@ class Harm(NamedTuple):
     @property
     def _draws(self) -> int:
         """The guard drives if it does in one of so many draws."""
-        is_new = len(self.lately) < _CAREFUL
-        is_bold = is_new or self._long_ago or _all_failed(self.guarded)
+        is_bold = self._is_new or self._long_ago or _all_failed(self.guarded)
         return 1 if is_bold else _CAREFUL
 
     def told(self, *, learning: bool) -> str:

@@ -28,8 +28,8 @@ _OF_BEST, _CHANGED, _SIZES = 0.8, 0.6, (-1.5, 0.7)
 # Of regulators the powers of 10 between which costs of variables and of actions are drawn, what
 # counts of a cost a step later.
 _COSTS, _EFFORTS, _LATER = (-1.0, 1.0), (-2.0, 1.0), 0.99
-# What a backup is worth by itself counts so much, compared with what it adds to the others.
-_BY_ITSELF = 0.01
+# What a backup is worth by itself counts so much beside what it adds to others; its decimals.
+_BY_ITSELF, _DECIMALS = 0.01, 9
 # Observations to which a given backup is fitted, or some more.
 _FITTED = 200
 # Boxes of more dimensions have an action along each axis, not one in each corner.
@@ -78,9 +78,9 @@ def basis(rows: Floats, choices: int = 0) -> tuple[Ints, Floats]:
 
     By their mean size, of equals by the first rows in which they differ.
     """
-    exact = (-rows if choices else np.abs(rows)).round(9)
+    exact = (-rows if choices else np.abs(rows)).round(_DECIMALS)
     turns = np.ones(rows.shape[1]) if choices else np.where((rows**3).sum(0) < 0.0, -1.0, 1.0)
-    return np.lexsort((*exact[::-1], exact.mean(0).round(9))), turns
+    return np.lexsort((*exact[::-1], exact.mean(0).round(_DECIMALS))), turns
 
 
 def linearised(state: State, model: Model) -> tuple[Floats, Floats, Floats]:
@@ -148,7 +148,7 @@ def evolved(
 
     def mutant() -> Floats:
         """Change some numbers of the best backup, or of any."""
-        parent = parents[values[parents].mean(1).round(9).argmax()]
+        parent = parents[values[parents].mean(1).round(_DECIMALS).argmax()]
         if random.random() >= _OF_BEST:
             parent = int(random.integers(len(policies)))
         size = 10.0 ** random.uniform(*_SIZES)
@@ -174,13 +174,13 @@ def evolved(
         variants = np.repeat(values[None], 1 + len(parents), 0)  # as they are, and with the child
         variants[1 + np.arange(len(parents)), parents] = child_values
         together = variants.max(1).mean(1) + _BY_ITSELF * variants.mean(2).sum(1)
-        best = int(together.round(9).argmax())  # of equals the first: nothing changes
+        best = int(together.round(_DECIMALS).argmax())  # of equals the first: nothing changes
         if best:
             policies[parents[best - 1]], values[parents[best - 1]] = child, child_values
     pool, most, order = list(range(len(values))), np.full(values.shape[1], -1.0), []
     while pool:  # first the one that is worth most, then whichever adds most
         adds = np.maximum(values[pool] - most, 0.0).mean(1)
-        adds = (adds + _BY_ITSELF * values[pool].mean(1)).round(9)
+        adds = (adds + _BY_ITSELF * values[pool].mean(1)).round(_DECIMALS)
         order.append(pool.pop(int(adds.argmax())))
         most = np.maximum(most, values[order[-1]])
     return state._replace(policies=policies[order], linear=state.linear[order])

@@ -13,14 +13,15 @@ from evofsm.guard.learnt.backups import evolved, first_backups, fitted
 from evofsm.guard.learnt.rollout import FAILS, FATAL, Flags, Floats, Ints, Model, value_of
 from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State, model_of, residuals_of
 
-# So many actions of an episode, and so many situations, are needed to learn of; what is lost in so
-# few steps, whatever one does, is no argument; so many windows are kept of an episode of which all
-# that is known is their size, and so many situations of a failure.
-_FEW = 3
-# Situations that are drawn to look for disturbances; those that mutants are tried on, besides none.
-_TRIED_IN, _TRIED_ON = 8, 5
-# What is survived by more is no argument [typical steps].
-_BY_FAR = 100.0
+# Actions of an episode that says how a system moves, and situations of which is learnt, at least;
+# situations that are drawn to look for disturbances, and those that mutants are tried on.
+_ENOUGH, _TRIED_IN, _TRIED_ON = 3, 8, 5
+# What is lost in so few steps, whatever one does, is no argument; nor is what is survived by more
+# [typical steps].
+_AT_ONCE, _BY_FAR = 3, 100.0
+# Windows of which all that is known is their size; situations that are kept of a failure, and so
+# many steps before it at least.
+_MOST_WINDOWS, _BEFORE, _EARLIER = 3, 3, 2
 # Of the largest residual of a window, what is large enough to be where it began.
 _ONSET = 0.5
 
@@ -53,7 +54,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     # Model
     state = motion.steps(state, safe)
     whole: Flags = np.asarray(np.isfinite(safe).all(1))
-    moves = len(u) >= _FEW and bool((whole[:-2] & whole[1:-1] & whole[2:]).any())
+    moves = len(u) >= _ENOUGH and bool((whole[:-2] & whole[1:-1] & whole[2:]).any())
     if moves:
         state = motion.dynamics(state, model_of(state, settings), safe, u, settings)
         if given.model is not None:
@@ -90,7 +91,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     # Backups
     if given.backup is not None:
         state = fitted(state, motion_model, given.backup)
-    if fails and len(state.situations) >= _FEW and "backups" not in without:
+    if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
         numbers = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
         rest, scale = np.ascontiguousarray(rest[:, :, numbers]), state.disturbance_scale(settings)
         state = evolved(state, motion_model, rest, scale, settings, random)
@@ -125,7 +126,7 @@ def noted(
     if len(tight := np.flatnonzero(episode.refused[1:T]) + 1):
         steps.append(int(random.choice(tight)))
     if episode.failed:
-        back = random.integers(2, max(3, min(T, state.horizon)), _FEW)
+        back = random.integers(_EARLIER, max(_EARLIER + 1, min(T, state.horizon)), _BEFORE)
         steps += np.maximum(1, T - 1 - back).tolist()
     for t in steps:
         row = np.concatenate([z[t], z[t] - z[t - 1], episode.actions[t - 1]])
@@ -140,7 +141,7 @@ def noted(
 
 def looks_for_harm(state: State) -> bool:
     """Whether it is known where it fails, and enough situations to find what harms there."""
-    return len(state.forms) > 0 and len(state.situations) > _FEW
+    return len(state.forms) > 0 and len(state.situations) > _ENOUGH
 
 
 def disturbances(
@@ -163,12 +164,12 @@ def disturbances(
         with_none = np.concatenate([calm, new], 2)
         sample = S[random.permutation(len(S))[:_TRIED_IN]]
         ends = _worst(known, sample, state.policies[:1], with_none, 1.0)
-    harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_FEW]
+    harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_MOST_WINDOWS]
     windows, lengths = list(state.windows), state.lengths.tolist()
     for t in starts[harmful]:
         is_seen: Flags = np.asarray(np.isfinite(z[t : t + longest]).all(1))
         n = len(is_seen) if is_seen.all() else int(is_seen.argmin())
-        if n > _FEW + 1:
+        if n > _AT_ONCE + 1:
             row = np.zeros((longest, m + a))
             row[:n, :m], row[: n - 1, m:] = z[t : t + n], u[t : t + n - 1]
             windows.append(row)
@@ -232,7 +233,7 @@ def _worst(
     """(S, K) how disturbances end in situations in which nothing else is lost."""
     ends = value_of(known, situations, policies, np.ascontiguousarray(residuals), scale)
     ends = ends[ends[:, 0] >= 0.0, 1:]
-    ends = np.where(ends < _FEW - 1.0 - len(residuals), np.inf, ends)
+    ends = np.where(ends < _AT_ONCE - 1.0 - len(residuals), np.inf, ends)
     return np.asarray(np.minimum(ends, _BY_FAR))
 
 

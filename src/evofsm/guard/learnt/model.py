@@ -104,7 +104,7 @@ def solve(
     is_plain = np.zeros(len(size), bool)
     is_plain[: 1 + m] = is_plain[1 + 2 * m : 1 + 2 * m + a] = True
     times = np.ones(len(size))
-    times[lags(m, a)] = min(prior[2], 1e15)
+    times[lags(m, a)] = min(prior[2], 1e15)  # infinite where they are left out
     weights = np.empty_like(products)
     for j, share in enumerate(noisy):
         penalty = np.where(is_plain, 1e-6 + share * prior[0] / n, 30e-6 + share * prior[1] / n)

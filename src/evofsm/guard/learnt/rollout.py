@@ -44,8 +44,6 @@ GROWN, SHRUNK = 2.0, 0.5
 _RESERVE = 0.01
 # What the distance to failure counts compared with the time survived.
 _DISTANCE, _FAR = 0.05, 0.05
-# Of a square, what rounding may add.
-_ROUNDED_UP = 1.0 + 1e-9
 # Halvings between a proposal and an action that passes.
 _HALVINGS = 4
 #: Shares that are rounding alone, and so small that nothing of a variance is left.
@@ -293,7 +291,7 @@ def _measure(
         radius, worth, nearer = model.dead_ends[s, -2], model.dead_ends[s, -1], 0
         for l in range(n):  # most are farther away than what is nearest: a root less
             within = max(far[l] / worth + radius, 0.0)
-            nearer += 1 if square[l] <= within * within * _ROUNDED_UP else 0
+            nearer += 1 if square[l] <= within * within * (1.0 + ROUNDING) else 0
         for l in range(n if nearer > 0 else 0):
             distance = (np.sqrt(square[l]) - radius) * worth + aside[s, l]
             far[l] = distance if distance < far[l] else far[l]
