@@ -231,16 +231,33 @@ def test_what_refused_for_long_without_a_failure_is_tried_by_its_smallest_rival(
     assert sum(fly(softly) for _ in range(9)) == 9
 
 
-def test_frozen_a_threshold_counts_on_for_a_while_that_fewer_took_the_place_of():
+@pytest.mark.parametrize("ends", [[], [(0.5, 1.3), (0.6, 1.3)]])
+def test_frozen_a_threshold_counts_on_for_a_while_that_fewer_took_the_place_of(ends):
     guard = Guard(-1.0, 1.0, interval=0.1)
 
-    def drive(to, *, failed):
+    def drive(to, last, **how):
         assert all(guard.decide(z, 0.0).executed == 0.0 for z in np.linspace(0.0, to, 30))
-        guard.end(failed, [1.2, to[1] * 1.2])
+        guard.end(observation=last, **how)
 
-    drive((1.0, 1.0), failed=True)
+    drive((1.0, 1.0), (1.2, 2.4), failed=True)
     assert "variable 1 is above 1 or variable 2 is above 1" in str(guard)
-    drive((1.0, 0.2), failed=True)
+    drive((1.0, 0.2), (1.2, 0.24), failed=True)
     assert "frozen it refuses, too, where variable 2 is above 1, as what" in str(guard)
-    drive((0.9, 2.0), failed=False)
+    for last in ends:
+        drive((0.5, 1.0), last, terminated=True)
+    if not ends:
+        drive((0.9, 3.0), None)
     assert "frozen it refuses" not in str(guard)  # that refuted it
+
+
+def test_where_there_is_no_rival_nothing_is_doubted():
+    guard, rng = Guard(-1.0, 1.0, interval=0.1, shadow=False), np.random.default_rng(0)
+    for _ in range(14):
+        place = 0.0
+        for _ in range(60):
+            place += 0.1 * guard.decide([place], rng.uniform(-0.4, 1.0)).executed
+            if place >= 1.0:
+                break
+        guard.end(failed=place >= 1.0, observation=[place])
+    assert guard.judge.state.n_doubted > guard.judge.settings.patience
+    assert "tries whether" not in str(guard)

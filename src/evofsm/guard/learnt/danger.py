@@ -85,9 +85,9 @@ def _explained(state: State, settings: LearntSettings, *, failed: bool, bends: b
     if bends and (failed or not is_told):
         rows = failure.explain(FAILS, failures, survival, noise)
     rows = failure.counted(rows, failures)
-    state = state._replace(dropped=_dropped(state, was, rows, survival, settings))
     ends, fatal = failure.saying(table, ENDS, CRASHES), failure.saying(table, FATAL)
     forms = np.concatenate([ends, rows, fatal])
+    state = state._replace(dropped=_dropped(state, was, forms, survival, settings))
     if state.is_doubted and failed and not _foreseen(state, table, survival):
         return state._replace(forms=forms, n_doubted=0, wrong=state.wrong + 1)
     has_changed = not state.is_doubted and (failed or _shape(was) != _shape(rows))
@@ -95,15 +95,18 @@ def _explained(state: State, settings: LearntSettings, *, failed: bool, bends: b
 
 
 def _dropped(
-    state: State, was: Floats, rows: Floats, known: Survived, settings: LearntSettings
+    state: State, was: Floats, now: Floats, known: Survived, settings: LearntSettings
 ) -> Floats:
-    """(k, SIZE) thresholds that fewer forms took the place of, as long as nothing refutes them."""
+    """(k, SIZE) thresholds that fewer forms took the place of, as long as nothing refutes them.
+
+    One beyond which it ends is refuted: some episodes ended there without failing.
+    """
     sides, older = was[failure.are_sides(was)].copy(), state.dropped.copy()
     sides[:, HELD] = settings.settled
     older[:, HELD] -= 1.0
     table = failure.without(np.concatenate([older[older[:, HELD] > 0.0], sides]), known.rows)
     holds = failure.inside(table, state.failures).any(1)
-    return np.asarray(table[holds & ~failure.among(table, rows)])
+    return np.asarray(table[holds & ~failure.among(table, failure.saying(now, FAILS, ENDS))])
 
 
 def _foreseen(state: State, table: Floats, known: Survived) -> bool:

@@ -11,7 +11,15 @@ from numpy.random import Generator
 from evofsm.guard.learnt import danger, failure, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups, fitted
 from evofsm.guard.learnt.rollout import FAILS, FATAL, Flags, Floats, Ints, Model, value_of
-from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State, model_of, residuals_of
+from evofsm.guard.learnt.state import (
+    Episode,
+    Given,
+    LearntSettings,
+    State,
+    model_of,
+    residuals_of,
+    sizes,
+)
 
 # Actions of an episode that says how a system moves, and situations of which is learnt, at least;
 # situations that are drawn to look for disturbances, and those that mutants are tried on.
@@ -101,14 +109,19 @@ def learn(state: State, episode: Episode, given: Given) -> State:
 def doubted(state: State, episode: Episode, settings: LearntSettings, *, tried: bool) -> State:
     """Doubt forms that refused for long without a failure: rivals are tried (`failure.rivals`).
 
-    An episode speaks for rivals only if it was where they allow what forms refuse (``tried``).
+    If there are any. An episode speaks for them only if it was where they allow what forms refuse
+    (``tried``).
     """
-    if state.is_doubted:
-        return state._replace(n_doubted=state.n_doubted - (tried and not episode.failed))
     much = episode.refused.sum() > settings.refused * len(episode.actions)
     count = state.n_doubted + bool(much and not episode.failed)
-    patience = settings.patience * settings.again**state.wrong
-    return state._replace(n_doubted=-1 if count >= patience else count)
+    if state.is_doubted:
+        count = state.n_doubted - (tried and not episode.failed)
+    elif count < settings.patience * settings.again**state.wrong:
+        return state._replace(n_doubted=count)
+    rivals = failure.rivals(state.forms, state.failures, sizes(state))
+    if {*map(tuple, rivals)} == {*map(tuple, state.forms)}:
+        return state._replace(n_doubted=max(0, count))
+    return state._replace(n_doubted=min(-1, count))
 
 
 # -- Disturbances ---------------------------------------------------------------------------------
