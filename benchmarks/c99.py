@@ -302,7 +302,7 @@ def _asked(learnt: Learnt, decisions: int, chance: np.random.Generator) -> Itera
     names = guard.reviser.risk.labels.names  # type: ignore[attr-defined]
     nothing = np.atleast_1d(no_action(guard.actions))
     low, high = (np.atleast_1d(end) for end in limits(guard.actions))
-    episode, over, time, spread = 0, True, 0.0, np.zeros(1)
+    episode, over, time, spread, blind = 0, True, 0.0, np.zeros(1), 0
     for _ in range(decisions):
         if begins := over:
             episode, time = episode + 1, -guard.interval
@@ -311,8 +311,10 @@ def _asked(learnt: Learnt, decisions: int, chance: np.random.Generator) -> Itera
         spread = np.maximum(spread, np.abs(seen))
         z, wanted = seen.copy(), np.atleast_1d(np.asarray(system.propose(), np.float64))
         kind = chance.integers(40)
-        if kind == 0:
+        blind = chance.choice([1, 8]) if kind == 0 else max(blind - 1, 0)  # also for long
+        if blind:
             z[chance.random(len(z)) < 0.5] = math.nan
+            z[0] = math.nan
         elif kind == 1:
             z[chance.integers(len(z))] = chance.choice([math.inf, -math.inf, 1e31])
         elif kind == 2:

@@ -249,6 +249,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "JUDGED": min(parts.n_judged, n_queries),
         "MOST_DONE": math.ceil(parts.most),
         "EVIDENCE": float(memory.number),
+        "BLIND": risk.BLIND,
         **{name.strip("_"): getattr(rollout, name) for name in _OF_ROLLOUTS},
         **{name: getattr(model, name) for name in _OF_MODEL},
         "dead_ends": model.dead_ends if len(model.dead_ends) else np.zeros((1, m + 2)),

@@ -16,6 +16,7 @@ cross-validated (each third of a log, learnt from the others) and on all of it; 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import groupby, product
@@ -551,27 +552,35 @@ class Foresight(LearningJudge):
         # Variables smoothed once and twice; rows since limits were passed, and not; what is on.
         self._now: tuple[Any, ...] = None, *np.zeros((3, len(self.held_out)), int)
 
-    def _next(self, z: Floats) -> tuple[Floats, tuple[Any, ...]]:
-        """Of an observation (m,) the one of `columns`, and the state after it."""
+    def _next(self, z: Floats) -> tuple[Floats, Flags, tuple[Any, ...]]:
+        """Of an observation (m,) the one of `columns`, the rates blind to it, and the state after.
+
+        An alarm that is on stays on as long as a variable of its limits is not seen.
+        """
         memory, up, down, on = self._now
         memory = np.full((2, len(z) + len(self.forms)), np.nan) if memory is None else memory.copy()
         columns = self.columns(_nothing(0)._replace(rows=z[None]), memory)
+        of, when = self._limits[:, [_OF, _WHEN]].T.astype(int)
+        is_unseen = np.isnan(columns.reshape(len(_AHEAD), -1)[when, of])
         passes = (self._passed(columns, self._limits, soon=k)[:, 0] for k in (False, True))
-        rates = (self._limits[flags, _RATE].astype(int) for flags in passes)
-        above, near = (np.bincount(rate, minlength=len(up)) > 0 for rate in rates)
-        up, down = np.where(above, up + 1, 0), np.where(above | (near & (on > 0)), 0, down + 1)
+        rates = (self._limits[flags, _RATE].astype(int) for flags in (*passes, is_unseen))
+        above, near, blind = (np.bincount(rate, minlength=len(up)) > 0 for rate in rates)
+        stays = above | ((near | blind) & (on > 0))
+        up, down = np.where(above, up + 1, 0), np.where(stays, 0, down + 1)
         on = (up >= self.hold) | ((on > 0) & (down < self._spans[2]))
-        return columns[:, 0], (memory, up, down, on)
+        return columns[:, 0], blind, (memory, up, down, on)
 
     def search(self, situation: Situation, wanted: Action, /, **others: Any) -> Search:
         """Keep what is proposed, as nobody acts; the risk is that of the alarm that is on."""
-        column, (*_, on) = self._next(situation.observation)
+        column, blind, (*_, on) = self._next(situation.observation)
         rate, risk, reason = self.alarm, 0.0, "no alarm is on"
         evidence = 0.0 if rate is None else float(self.held_out[rate, :2].sum())
         if rate is not None and on[rate]:
             risk = float(self.shares[rate])
             reason = self.reason(situation.observation, column)
-        low, high = wilson_bounds(risk, evidence) if risk else (0.0, 1.0)
+        elif rate is not None and blind[rate]:
+            risk, reason = math.nan, "whether an alarm would be on is not known"
+        low, high = wilson_bounds(risk, evidence) if risk > 0.0 else (0.0, 1.0)
         risks, lows, highs, slack = np.array([[risk], [low], [high], [np.nan]])
         judgement = Judgement(risks, lows, highs, slack, evidence)
         return Search(np.array([float(wanted)]), judgement, 0, reason)
@@ -588,7 +597,7 @@ class Foresight(LearningJudge):
 
     def follow(self, observation: ArrayLike, action: Action, /) -> None:
         """Keep up with what happens; it learns from whole logs alone."""
-        self._now = self._next(np.asarray(observation, np.float64))[1]
+        self._now = self._next(np.asarray(observation, np.float64))[-1]
 
     def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike = (), /) -> None:
         """Keep up with what happens, and what it learns from."""

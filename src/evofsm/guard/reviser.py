@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.fsm.naming import Labels
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import probability
 from evofsm.guard.actions import (
@@ -154,7 +155,7 @@ class ActionReviser:
         self.risk = risk
         self.actions = actions
         self.tolerance = probability("tolerance", tolerance)
-        self.mode = mode
+        self.mode = Mode(mode)
         #: Why proposals pass in this episode although it might act; empty where they need not.
         self.passing = ""
         self._searches = isinstance(risk, SearchingJudge)
@@ -282,9 +283,8 @@ class ActionReviser:
 
 def unseen_text(situation: Situation, variables: Sequence[str]) -> str:
     """What is said of a situation that was not seen whole, or not in time."""
-    values = zip(variables, situation.observation, strict=False)
-    if names := [name for name, value in values if math.isnan(value)]:
-        return f"not seen: {', '.join(names)}"
+    if gaps := np.flatnonzero(np.isnan(situation.observation)).tolist():
+        return f"not seen: {', '.join(map(Labels(names=tuple(variables)).variable, gaps))}"
     return "nothing new was seen" if situation.intake & STALE else ""
 
 

@@ -15,7 +15,7 @@ from evofsm.guard.api import Proposal, Situation
 from evofsm.guard.audit_log import AuditLog, audit
 from evofsm.guard.learnt import judge as judging
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.learnt.rollout import search
+from evofsm.guard.learnt.rollout import action_of, search
 
 
 def kept(said):
@@ -79,6 +79,19 @@ def test_it_learns_beside_a_variable_that_rests_at_an_end(point):
     assert not any(failures[-4:])
 
 
+def test_of_what_never_changed_backups_learn_nothing(points):
+    point = points["box"]
+    guard = point.guard(shadow=False, backup=lambda z: -3.0 * z[1])
+    for episode in range(4):  # the mean of 101.3 is rounded
+        point.play(guard, episode, seen=lambda k, z: np.append(z, 101.3))
+    model, policies = guard.judge.parts.model, guard.judge.state.policies
+    done = [
+        [action_of(model, policy, np.array([0.2, 0.1, seen])) for policy in policies]
+        for seen in (101.3, 101.4, 150.0)
+    ]
+    np.testing.assert_array_equal(done[1:], [done[0]] * 2)
+
+
 def test_nothing_is_revised_before_the_first_failure_and_it_says_why(point):
     guard = point.guard()
     said = [one for k in range(3) for one in point.play(guard, k, steps=10)[0]]
@@ -103,6 +116,7 @@ def test_told_what_failure_is_it_keeps_from_the_first_one(point):
         (lambda z: z[0] + z[1] >= 0.4, "variable 1 + 0.707 variable 2 is above 0.283"),
         (lambda z: bool(np.hypot(*(z - [0.8, 0.0])) < 0.4), "inside an ellipse of variable 1 and"),
         (lambda z: bool((z <= -1e9).all()), "true nowhere around"),
+        (lambda z: bool((z > -1e9).all()), "true of all that was observed"),
     ],
 )
 def test_a_function_of_failures_is_asked_around_what_was_survived(points, failed, says):
@@ -251,12 +265,17 @@ def test_what_is_not_seen_now_and_then_does_not_keep_it_from_deciding(point):
     assert not all(kept(said))
     assert all(np.isfinite(one.executed).all() for one in said)
     guard.freeze()
-    nothing = guard.decide(
-        np.full(2 * point.places, math.nan), point.propose(np.random.default_rng(0))
-    )
+    proposal = point.propose(np.random.default_rng(0))
+    nothing = guard.decide(np.full(2 * point.places, math.nan), proposal)
     assert same_action(nothing.executed, nothing.proposed)
     assert math.isnan(nothing.risk_proposed)
     assert "was observed" in nothing.reason
+    risks = [guard.decide(np.zeros(2 * point.places), proposal).risk_executed]
+    for _ in range(5):  # of what was not seen for long nothing is certain
+        blind = guard.decide(np.append(math.nan, np.zeros(2 * point.places - 1)), proposal)
+        assert blind.reason.startswith("not seen: variable 1; ")
+        risks.append(blind.risk_executed)
+    assert np.isnan(risks).tolist() == [*[False] * 5, True]
 
 
 @pytest.mark.parametrize("how", ["every third row", "until it fails"])

@@ -102,6 +102,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     backup survives after it: ``1 - exp(-unsurvived / exposure * horizon)``, from the number of
     remembered disturbances that are not survived and the time in which they were seen; 1 where not
     even an undisturbed future is survived. What never began is not in it.
+    It is NaN from the fifth observation on end that lacks something.
 
     Examples
     --------
@@ -113,6 +114,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
     #: Parts that can be left out, to see what each is worth.
     PARTS = ("margin", "backups", "dead-ends", "stretches", "regions", "rivals")
+    #: From so many observations on end that lack something on, the risk is not known.
+    BLIND = 5
 
     # Of the present episode.
     _past: list[Floats]  # observations of the last step, unseen ones as they were taken to be
@@ -129,6 +132,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     _lost: bool  # whether nothing helped, even without any disturbance
     _fails_after: float  # steps after which what was refused fails, at the latest
     _unsurvived: int
+    _n_blind: int  # observations on end, up to the latest one, that lack something
     _ranks: Ints  # of backups, those first that passed last
 
     def __init__(
@@ -162,6 +166,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self.settings = LearntSettings() if settings is None else settings
         self.model = function("model", model, "lambda z, u: z + 0.1 * u")
         self.backup = function("backup", backup, "lambda z: -1.0")
+        if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+            raise TypeError(f"names is {names!r}; it must be a text for each variable")
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.dt)
         #: Number of actions; 0 where the action is a box.
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
@@ -328,6 +334,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         if not self._refused:
             return Search(options, judgement, 0, words.kept(backup, memory, slack, allowance))
         why = words.refused(self._unsurvived, memory, margin, scale, allowance)
+        why += "" if mask is None else words.IF_NO_MORE
         if passes:
             instead = words.changed(backup, memory, margin, allowance)
         elif trial is not None:
@@ -373,7 +380,9 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         """Of some actions; of the first it is kept why it is dangerous (`why`)."""
         counts = [outcome.unsurvived for outcome in outcomes]
         self._unsurvived = -1 if math.isinf(counts[0]) else int(counts[0])
-        memory = self.remembered
+        memory, z = self.remembered, situation.observation
+        if math.isnan(z.dot(z)) and self._n_blind + 1 >= self.BLIND:
+            return _unjudged(len(counts))
         soon = self._soon(memory.seconds)
         risk, low, high = np.array([self._risk(n, soon) for n in counts]).T
         distances = np.array([outcome.left for outcome in outcomes])
@@ -515,10 +524,12 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
-        here, stride = self._here(np.array(observation, np.float64)), self.state.stride
+        z = np.array(observation, np.float64)
+        here, stride = self._here(z), self.state.stride
+        self._n_blind = self._n_blind + 1 if math.isnan(z.dot(z)) else 0
         if here is not None:
             inner = self.encode(action)
-            self._past = [*self._past, here[: np.size(observation)]][-stride:]
+            self._past = [*self._past, here[: len(z)]][-stride:]
             self._done = [*self._done, inner][-stride:]
             self._before = here, inner
 
@@ -561,7 +572,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         def backup(z: Floats) -> Floats:
             assert act is not None
             action = np.atleast_1d(np.array(act(z), np.float64))
-            if action.shape != ((1,) if self.choices else (self.size,)):
+            if action.shape != ((1,) if self.choices else (self.size,)) or np.isnan(action).any():
                 raise ValueError(f"backup gave {action} at {z}; it has to give an action")
             return self.encode(action[0] if self.choices else np.clip(action, self.low, self.high))
 
@@ -601,7 +612,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self._past, self._done, self._before = [], [], None
         self._z, self._u, self._notes = [], [], []
         self._certified = self._holds = self._refused = self._lost = False
-        self._unsurvived, self._fails_after = 0, 0.0
+        self._unsurvived, self._n_blind, self._fails_after = 0, 0, 0.0
         self._used, self._ranks = np.zeros((self.size, 2)), np.arange(len(self.state.policies))
 
     # -- For people, and in a file --------------------------------------------------------------
@@ -611,7 +622,9 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         """Why nothing is refused."""
         if self.parts is None and self.state.n_failed:
             return words.NEVER_WHOLE
-        return words.no_threshold(self.state.n_failed, is_given=self.failed is not None)
+        n_survived = len(self.state.survived)
+        is_given = self.failed is not None and self.state.n_episodes > 0
+        return words.no_threshold(self.state.n_failed, n_survived, is_given=is_given)
 
     @property
     def told_by_experience(self) -> str:

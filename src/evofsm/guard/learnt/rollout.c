@@ -8,6 +8,7 @@
   /* Observations of the last step, the oldest first, and what was done there. */
   double past[EVOFSM_STRIDE][EVOFSM_VARIABLES], acted[EVOFSM_STRIDE][EVOFSM_NUMBERS];
   int n_past, is_placed;         /* how many there are; and whether one knows where one is now */
+  int n_blind, lacks;            /* observations before that lack something, and whether this */
   int ranks[EVOFSM_BACKUPS];     /* backups, those first that passed last */
   int done;                      /* steps of rollouts in this search */
   /* Room of a rollout. */
@@ -435,8 +436,10 @@ static void situate(evofsm_state *s) {
   const int n = s->n_past;
   int i, j, t;
   s->is_placed = 1;
+  s->lacks = 0;
   for (j = 0; j < M; j++) {
     const double z = s->observation[j], times = n > 0 ? (double)EVOFSM_STRIDE / n : 0.0;
+    s->lacks |= isnan(z) != 0;
     s->here[j] = n > 0 && isnan(z) ? s->next[j] : z;
     s->here[M + j] = n > 0 ? (s->here[j] - s->past[0][j]) * times : 0.0;
     s->is_placed &= !isnan(s->here[j]);
@@ -453,7 +456,7 @@ static void situate(evofsm_state *s) {
 static void forget(evofsm_state *s) {
   int i;
   s->n_past = 0;
-  s->is_placed = 0;
+  s->is_placed = s->n_blind = 0;
   for (i = 0; i < EVOFSM_BACKUPS; i++) {
     s->ranks[i] = i;
   }
@@ -462,13 +465,16 @@ static void forget(evofsm_state *s) {
 /* LearntRisk.search: what to execute of s->proposal, into s->best, and how risky that is. */
 static void revise(evofsm_state *s, evofsm_decision *out) {
   double proposal[A], action[A];
-  int r, unsurvived = 0;
+  int r, is_known, unsurvived = 0;
   memcpy(s->best, s->proposal, sizeof s->best);
   situate(s);
-  if (!s->is_placed) {
+  is_known = s->is_placed && !(s->lacks && s->n_blind + 1 >= BLIND);
+  if (!is_known) {
     out->reason = EVOFSM_NOTHING_SEEN;
     out->risk_proposed = out->risk_executed = out->risk_low = out->risk_high = out->seen = NAN;
     out->evidence = 0.0;
+  }
+  if (!s->is_placed) {
     return;
   }
   encode(s->proposal, proposal);
@@ -477,7 +483,6 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   }
   memmove(s->ranks + 1, s->ranks, (size_t)r * sizeof *s->ranks);
   s->ranks[0] = out->backup; /* what passed now is asked first the next time */
-  out->evidence = EVIDENCE;
   if (out->reason != EVOFSM_KEPT) {
     out->unsurvived = foresee(s, proposal);
     if (out->reason > EVOFSM_CHANGED || ALLOWED > 0) {
@@ -489,7 +494,11 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   } else if (ALLOWED > 0) {
     out->unsurvived = unsurvived = foresee(s, proposal);
   }
+  if (!is_known) {
+    return;
+  }
   unsurvived = ACTS ? unsurvived : out->unsurvived;
+  out->evidence = EVIDENCE;
   out->risk_proposed = risks[1 + out->unsurvived][0];
   out->risk_executed = risks[1 + unsurvived][0];
   out->risk_low = risks[1 + unsurvived][1];
@@ -499,6 +508,7 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
 /* LearntRisk.follow: keep up with what is executed, and what is expected then, undisturbed. */
 static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
   int j;
+  s->n_blind = s->lacks ? s->n_blind + 1 : 0;
   if (s->is_placed) {
     if (s->n_past == EVOFSM_STRIDE) {
       memmove(s->past, s->past + 1, sizeof s->past - sizeof s->past[0]);

@@ -69,7 +69,7 @@ class Model(NamedTuple):
     #: (k, m + 2) dead ends: centre, radius in spreads, and typical steps in a spread
     dead_ends: Floats
     mean: Floats  #: (m,) of what backups take for their middle
-    inverse: Floats  #: (m,) and one over their spread
+    inverse: Floats  #: (m,) and one over their spread; 0 of what never changed
     choices: int  #: number of actions; 0 where the action is a box
 
 

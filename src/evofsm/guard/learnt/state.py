@@ -236,9 +236,11 @@ def sizes(state: State) -> Survived:
 
 
 def _spread(state: State) -> Floats:
-    """(m,) standard deviation of what was survived."""
+    """(m,) standard deviation of what was survived; 0, not rounding, of what never changed."""
     rows = state.survived
-    return np.asarray(rows.std(0) if len(rows) else np.zeros(len(state.origin)))
+    return (
+        np.where((rows != rows[:1]).any(0), rows.std(0), 0.0) if len(rows) else 0.0 * state.origin
+    )
 
 
 def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) -> Floats:
@@ -262,7 +264,7 @@ def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
 def model_of(state: State, settings: LearntSettings) -> Model:
     """Make what rollouts take; weights are solved of the sums each time."""
     spread = _spread(state)
-    inverse = 1.0 / np.where(spread > 0.0, spread, 1.0)
+    inverse = np.divide(1.0, spread, out=np.zeros_like(spread), where=spread > 0.0)
     lowest = np.where(state.reached[:, 0] >= 2, state.lowest[0], -np.inf)
     highest = np.where(state.reached[:, 1] >= 2, state.highest[0], np.inf)
     fails = failure.saying(state.forms, FAILS)

@@ -42,7 +42,9 @@ NO_FAILURE = "no failure is known yet, so nothing is refused"
 #: What is done where all backups look alike and another action was hardly used.
 TRIED = "no action passes; what this one does is hardly known, so it is tried"
 #: What is done where no backup lasts longer than the proposal.
-NO_LONGER = "no action passes, and no backup lasts longer than the proposal, which passes"
+NO_LONGER = "no action passes, and no backup lasts longer than the proposal, so that is kept"
+#: The condition where not all actions are allowed.
+IF_NO_MORE = ", if no more than now is ever allowed"
 #: The same where there is but one action.
 NOBODY = "nobody acts"
 
@@ -127,13 +129,15 @@ def changed(backup: str, remembered: Remembered, margin: float, spared: int = 0)
 def lasting(backup: str, *, cut: bool) -> str:
     """What is done instead, where no action passes."""
     if cut:
-        return f"none passed in time, so the search was cut short; {backup} passed last"
+        return f"the search was cut short, as it took too many steps; {backup} passed last"
     return f"no action passes; {backup} lasts longest"
 
 
-def no_threshold(n_failed: int, *, is_given: bool) -> str:
+def no_threshold(n_failed: int, n_survived: int, *, is_given: bool) -> str:
     """Why nothing is refused where no threshold is known."""
     if is_given:
+        if not n_survived:
+            return "failed= is true of all that was observed (reversed?), so nothing is refused"
         return "failed= is true nowhere around what was survived, so nothing is refused"
     if not n_failed:
         return NO_FAILURE
@@ -158,9 +162,11 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
         more += f"; failed= says otherwise in {state.differs:.1%} of the states around, where this "
         more += "decides"
     if state.is_doubted:
-        rivals, *_ = _where(failure.rivals(state.forms, state.failures, sizes(state)), names)
-        more += "; much was refused without a failure: while it learns it tries whether it only "
-        more += f"fails {' or '.join(rivals)}"
+        rivals = failure.rivals(state.forms, state.failures, sizes(state))
+        fails, ends, _ = _where(rivals, names)
+        more += "; much was refused without a failure: while it learns it tries whether it "
+        more += f"ends by itself {' or '.join(ends)}, and " if ends else ""
+        more += f"only fails {' or '.join(fails)}"
     if len(state.dropped):
         until, *_ = _where(state.dropped, names)
         more += f"; frozen it refuses, too, {until[0]}, as what took its place is new"
