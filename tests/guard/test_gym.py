@@ -7,6 +7,7 @@ import re
 import warnings
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -199,7 +200,7 @@ def test_gymnasium_finds_nothing_to_complain_of(own):
 def test_where_nothing_is_ahead_a_usable_proposal_is_kept_and_nothing_is_learnt():
     env = of_cars(Script(None, None, FAR, None, FAR, FAR))
     steps = drive(env, lambda seen, info: np.array([2.5 if seen is None else 9.0]))
-    kept = [step[-1]["reviser/reason"].startswith("nothing is ahead") for step in steps]
+    kept = [step[-1]["reviser/reason"].startswith("nothing to judge") for step in steps]
     assert kept == [True, True, False, True, False]
     assert env.env.executed[0] == [2.5]
     assert env.guard.machine.model().uses.sum() == 1  # FAR to FAR: what is not seen is not
@@ -783,7 +784,7 @@ def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
 
 
 def test_a_guard_with_an_audit_log_is_not_shared():
-    guard = guard_for(ONE, audit=object())
+    guard = guard_for(ONE, audit=SimpleNamespace(decided=None))
     with pytest.raises(ValueError, match="one episode at a time"):
         RevisedVectorActions(SyncVectorEnv([lambda: Script(FAR)]), guard)
 

@@ -7,7 +7,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from io import BytesIO
 from typing import Any, NamedTuple, Protocol, Self, SupportsFloat
 
@@ -246,6 +246,9 @@ class Guard:
         shadow: bool = True,
     ) -> None:
         actions = _actions(low, high, n_actions)
+        for name, part, method in ("judge", judge, "judge"), ("audit", audit, "decided"):
+            if not (part is None or hasattr(part, method)):
+                raise TypeError(f"{name} is {part!r}, which has no method {method}")
         interval = positive("interval", interval)
         soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
         arguments: dict[str, Any] = {"model": model, "backup": backup, "names": names}
@@ -339,7 +342,7 @@ class Guard:
             counts = f"{machine.n_actions} actions, but the set has {self.actions.n_actions}"
             raise ValueError(f"the machine has {counts}")
         if hasattr(action_judge, "failed"):
-            action_judge.failed = failed
+            action_judge.failed = None if failed is None else partial(asked, failed)
         if hasattr(action_judge, "warm"):
             action_judge.warm()
         if machine is not None:
@@ -379,7 +382,7 @@ class Guard:
     @learn.setter
     @transaction
     def learn(self, learn: bool) -> None:
-        self._learn = learn
+        learn = self._learn = truth("learn is", learn)
         if self.judge is not None and hasattr(self.judge, "learning"):
             self.judge.learning = learn
         self._under_way = False
@@ -564,6 +567,7 @@ class Guard:
         """An observation that judge and machine can take in; NaN stays."""
         z = real_array("observation", observation, 1)
         count = len(self.variables) or (0 if self.machine is None else self.machine.n_variables)
+        count = count or len(self._monitor.held)
         if count and len(z) != count:
             names = f" ({', '.join(self.variables)})" if self.variables else ""
             raise ValueError(f"observation has {len(z)} variables; it must have {count}{names}")
@@ -592,7 +596,7 @@ class Guard:
             warnings.warn(
                 f"none of {_MANY} observations on end was whole, and nothing is learnt from such: "
                 f"missing (NaN) is {names}. Leave it out of what is observed, or see to the sensor",
-                stacklevel=4,
+                stacklevel=7,
             )
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:
@@ -724,7 +728,7 @@ class Guard:
         """
         if episode not in (None, self._begun):
             return
-        failed, terminated = _truth("failed", failed), _truth("terminated", terminated)
+        failed, terminated = truth("failed is", failed), truth("terminated is", terminated)
         if score is not None:
             refuse_unusable("score", real_array("score", [score], 1))
             score = float(score)
@@ -733,7 +737,7 @@ class Guard:
             self._begin()
         last = self._latest.observation if z is None and self._latest is not None else z
         if self.failed is not None and last is not None:
-            failed = failed or bool(self.failed(last))
+            failed = failed or asked(self.failed, last)
         terminated = terminated and not failed
         machine = self.machine if self._learn else None
         if machine is not None:
@@ -799,6 +803,9 @@ class Guard:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         share(self)
+
+    def __copy__(self) -> Self:
+        return self.copy()
 
     @alone
     def copy(self, *, states: bool = True) -> Self:
@@ -905,11 +912,20 @@ def _resized(ranges: tuple[tuple[float, float], ...], m: int) -> NDArray[np.floa
     return np.resize(ranges, (m, 2)).T
 
 
-def _truth(name: str, value: Any) -> bool:
-    """True or False, NumPy's as well."""
-    if np.ndim(value) or np.asarray(value).dtype != np.bool_:
-        raise TypeError(f"{name} is {value!r}; it must be True or False, of one environment")
+def truth(what: str, value: Any, kinds: str = "b") -> bool:
+    """True or False, NumPy's as well, or of other ``kinds``."""
+    if np.ndim(value) or np.asarray(value).dtype.kind not in kinds:
+        raise TypeError(f"{what} {value!r}; it must be True or False, of one environment")
     return bool(value)
+
+
+def asked(failed: Callable[[NDArray[np.float64]], bool], z: NDArray[np.float64]) -> bool:
+    """Whether a function says that an observation is a failure."""
+    try:
+        return truth("failed returned", np.squeeze(failed(z)), "biu")
+    except Exception as error:
+        error.add_note(f"failed was asked of {z}; it is also asked around what was observed")
+        raise
 
 
 def _actions(low: ArrayLike | None, high: ArrayLike | None, n_actions: int | None) -> ActionSet:

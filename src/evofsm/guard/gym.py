@@ -29,7 +29,7 @@ from evofsm.guard.actions import (
     same_action,
 )
 from evofsm.guard.api import Proposal, Revision
-from evofsm.guard.guard import Guard
+from evofsm.guard.guard import Guard, truth
 from evofsm.guard.loop import action_masks
 from evofsm.guard.reviser import make_usable, unjudged_revision
 
@@ -51,7 +51,7 @@ _SILENT = 200
 # Where ``info`` holds the last observation of an episode, as the one returned is of the next.
 _LAST = ("final_obs", "final_observation", "terminal_observation")
 _BY_ITSELF = (
-    "step() went on after an episode ended, without reset(): it is taken that the environment "
+    "step() was called with no episode under way, and no reset(): it is taken that the environment "
     "begins the next one in that step, on which nothing is decided. If it had begun it in the step "
     "before, info['final_obs'] of that has to hold the last observation of the episode"
 )
@@ -345,7 +345,7 @@ class Lane:
         terms, proposal = self.terms, Proposal(self.terms.to_guard(action), self._mask)
         if not self.is_open:
             terms.say_if_silent("no episode was under way: call reset()")
-            decision = terms.decided(action, terms.unjudged(proposal))
+            decision = terms.decided(action, terms.unjudged(proposal, "no episode is under way"))
             return decision._replace(executed=action, cost=0.0)
         if self._seen is None:
             terms.say_if_silent("observe returned None: there was nothing to judge", ever=False)
@@ -456,10 +456,10 @@ class Terms:
         if self._silent == _SILENT:
             warnings.warn(f"nothing was decided in {_SILENT} steps on end: {why}", stacklevel=4)
 
-    def unjudged(self, proposal: Proposal) -> Revision:
+    def unjudged(self, proposal: Proposal, why: str = "nothing to judge") -> Revision:
         """The proposal, made usable, where there is nothing to judge."""
         action, remark = make_usable(proposal, self.guard.actions, self.guard.fallback)
-        return unjudged_revision(action, proposal, f"nothing is ahead; {remark or 'not revised'}")
+        return unjudged_revision(action, proposal, f"{why}; {remark or 'not revised'}")
 
     def decided(self, action: Any, revision: Revision) -> Decided:
         """What is executed, as the environment takes it: the very action where it is kept."""
@@ -483,14 +483,11 @@ class Terms:
         if self._failed is None or isinstance(self._failed, str):
             return step.terminated and (self._failed is not None or self.guard.failed is None)
         try:
-            reply = self._failed(step)
+            return truth("failed returned", np.squeeze(self._failed(step)), "biu")
         except (AttributeError, KeyError, TypeError) as error:
             about = "a step: its observation, reward, terminated, truncated and info"
             error.add_note(f"failed was called with {about}, such as failed={_FAILED}")
             raise
-        if np.size(reply) != 1 or np.asarray(reply).dtype.kind not in "biu":
-            raise TypeError(f"failed returned {reply!r}; it must be True or False")
-        return bool(reply)
 
     def look(self, observation: Any) -> Floats | None:
         """What the guard observes; None where there is nothing to judge."""
@@ -524,7 +521,10 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
     """From an action of the environment to one of the guard, and back."""
     if isinstance(space, Discrete) and actions == Choices(int(space.n)):
         first = int(space.start)
-        return lambda action: float(action) - first, lambda action: first + int(action)
+        return (
+            lambda action: float(np.asarray(action).item()) - first,
+            lambda action: first + int(action),
+        )
     if isinstance(space, MultiDiscrete | MultiBinary):
         sizes: Any = getattr(space, "nvec", np.full(space.shape, 2))
         start = getattr(space, "start", 0)
