@@ -145,6 +145,26 @@ def test_learning_that_is_stopped_goes_on_bit_for_bit(tmp_path, snapshot, monkey
         in_turn(folder, 5)
 
 
+def test_who_asks_it_to_stop_loses_nothing_and_no_episode_stands_twice(
+    evofsm, tmp_path, monkeypatch
+):
+    drive, signals = Setup.drive, {1: signal.SIGINT, 3: signal.SIGTERM}
+    killed = lambda *rest: (os.kill(os.getpid(), signals.pop(rest[-1], 0)), drive(*rest))[1]  # noqa: E731
+    monkeypatch.setattr(Setup, "drive", killed)
+    out, log = tmp_path / "out", tmp_path / "log"
+    words = "drive", "emergency", "--episodes", 5, "--json"
+    for kept in (2, 4):
+        stopped = evofsm(*words, "--out", out, "--audit", log)
+        assert (stopped.exit_code, f"after {kept} of 5" in stopped.stderr) == (130, True)
+    with (out / "episodes.jsonl").open("a") as file:  # as where it is killed before it saves
+        file.write('{"episode": 4}\n')
+    again = evofsm(*words, "--out", out, "--audit", log)
+    assert again.stdout == evofsm(*words).stdout
+    _, *rows = map(json.loads, (out / "episodes.jsonl").read_text().splitlines())
+    assert [row["episode"] for row in rows] == [*range(5)]
+    assert "3 sessions, 5 episodes" in evofsm("audit", log).stdout
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
@@ -181,7 +201,7 @@ def test_a_full_disk_is_named_and_what_was_driven_is_kept(tmp_path, monkeypatch)
         patched.setattr(Guard, "save", lambda *_: (_ for _ in ()).throw(OSError(28, "No space")))
         with pytest.raises(OSError, match="No space") as caught:
             in_turn(tmp_path, 3)
-    assert "what was driven is kept" in caught.value.__notes__[0]
+    assert "what was saved is kept" in caught.value.__notes__[0]
     assert in_turn(tmp_path, 3).row.episodes == 3
 
 

@@ -129,8 +129,9 @@ class Results:
                 if (folder / GUARD).exists():
                     guard, n_learnt = load_guard(folder)
                     self.guard = make_guard(setup, guard)
-                for number in self.rows.keys() - range(n_learnt):
-                    del self.rows[number]  # it came after what was learnt
+                if later := self.rows.keys() - range(n_learnt):  # came after what was learnt
+                    self.rows = {n: row for n, row in self.rows.items() if n not in later}
+                    self._journal.begin_anew(setup.settings, *self.rows.values())
         except BaseException:
             self._journal.close()
             raise
@@ -151,7 +152,7 @@ class Results:
         try:
             self.guard.save(self.folder / GUARD, {**provenance, **learnt_from})
         except OSError as error:
-            error.add_note("what was driven is kept: make room, and run the same command again")
+            error.add_note("what was saved is kept: make room, and run the same command again")
             raise
         self._saved = time.monotonic()
 
@@ -216,20 +217,46 @@ def drive_in_turn(
     move: Advance = lambda *_, **__: None,
     audit: DecisionLogger | None = None,
 ) -> Row:
-    """Drive those episodes that the results lack, one after the other."""
+    """Drive those episodes that the results lack, one after the other.
+
+    Who asks it to stop waits for an episode's end, where the guard is saved; for a log after each.
+    """
     setup, guard, n_episodes = results.setup, results.guard, len(results.rows)
     if setup.learn and n_episodes > episodes:
         raise ValueError(f"{results.folder} has driven {n_episodes} episodes, more than {episodes}")
     guard.audit, world = audit, open_world(setup.world)
-    for number in range(episodes):
-        if number in results.rows:
-            continue
-        episode, row = setup.drive(guard, world, number)
-        results.add({**row, "decided": _decided(episode)})
-        if setup.learn:
-            results.save_guard()
-        move(len(results.rows))
-    return results.summed_up(episodes)
+    with _signals() as signals:
+        for number in range(episodes):
+            if number in results.rows:
+                continue
+            episode, row = setup.drive(guard, world, number)
+            results.add({**row, "decided": _decided(episode)})
+            is_over = bool(signals)
+            if setup.learn:
+                results.save_guard(now=is_over or audit is not None)
+            move(len(results.rows))
+            if is_over:
+                raise KeyboardInterrupt
+        return results.summed_up(episodes)
+
+
+@contextmanager
+def _signals() -> Iterator[list[int]]:
+    """Those that ask to stop, but for what nohup lets it ignore; a second one stops it at once."""
+    names, signals = ("SIGINT", "SIGTERM", "SIGHUP"), list[int]()
+
+    def note(number: int, _: object) -> None:
+        signals.append(number)
+        if len(signals) > 1:
+            raise SystemExit(128 + number)
+
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    before = {n: signal.signal(n, note) for n in numbers if signal.getsignal(n) != signal.SIG_IGN}
+    try:
+        yield signals
+    finally:
+        for number, how in before.items():
+            signal.signal(number, how)
 
 
 def drive_at_once(

@@ -56,15 +56,15 @@ class Journal:
         """Add records, which then survive the process, with ``sync`` a power cut too."""
         self._write(b"".join(map(_line, records)), sync=sync)
 
-    def begin_anew(self, settings: Record) -> None:
-        """Replace all of it by a header, at once or not at all."""
+    def begin_anew(self, settings: Record, *records: dict[str, Any]) -> None:
+        """Replace all of it by a header and these records, at once or not at all."""
         fresh = self.path.with_name(f".{self.path.name}.new")
         fresh.unlink(missing_ok=True)
         before, self._file = self._file, _opened(fresh, "try again")
-        self._write(_line({"settings": settings}))
+        self._write(b"".join(map(_line, ({"settings": settings}, *records))))
         os.replace(fresh, self.path)
         before.close()
-        self.settings, self.records = settings, []
+        self.settings, self.records = settings, [*records]
 
     def sync(self) -> None:
         """Force what was written onto the disk."""
