@@ -59,6 +59,7 @@ _NO_ACTION = f" (a missing or failed measurement, or {_HELD}"
 _LEFT_OUT = "? --no-leader end leaves such rows out; or " + _HELD
 _MISSING = " (a missing or failed measurement" + _LEFT_OUT
 _NO_LEADER = " (a missing or failed measurement, or no leader" + _LEFT_OUT
+_CUT = "{!r} has no line end behind it, and may be cut off: with one it would be a failure"
 _MANY_TEXTS = 10  # so many texts of a column are shown
 BECOME = ("mean", "last", "max", "min")  #: what the values of a step may become
 _HOLE = 10.0  # in steps of what is resampled, the longest hole within an episode
@@ -250,6 +251,13 @@ class Term(NamedTuple):
                 f"needed, or a comparison such as '{self.column}>0' or \"{self.column}=='on'\"",
             )
         return np.asarray(values > 0)
+
+    def may_end(self, piece: Piece) -> bool:
+        """Whether it holds in the last row, perhaps, only as a number was cut off there."""
+        if self.column != piece.cut or not self.of_number:
+            return False
+        longer = math.copysign(math.inf, piece.numbers[self.column][-1])
+        return not _SIGNS[self.sign](longer, self.value)
 
     def fault(self, value: Any) -> str:
         """Why it cannot be told of one value, if that is so."""
@@ -1056,6 +1064,9 @@ class _Reader:
             before = np.append(self._held, holds[:-1]) & ~anew
             self._held = bool(holds[-1])
             fails, still = holds & ~before, holds & before
+            if fails[-1] and any(term.may_end(piece) for term in failed.terms):
+                piece.leave_out(piece.cut, np.arange(piece.rows) == piece.rows - 1, _CUT)
+                fails[-1] = is_kept[-1] = False
             # What fails as it is left out is the end of the episode before.
             prior_ends = fails & ~is_kept & ~starts & np.append(self._kept, is_kept[:-1])
             still |= prior_ends  # it is over

@@ -182,6 +182,7 @@ class Source(AbstractContextManager["Source"]):
             raise ValueError(f"{path} is a pipe or a device; write it to a file first")
         self.path = path
         self.lines = 0  # read so far of one that is gzipped
+        self.is_cut = False  #: whether the last line, once it is read, has no end
         self._skips, self._ended = skips, False
         self._raw = io.BufferedReader(io.FileIO(path))
         self._packed = self._raw.peek(2).startswith(_GZIP)
@@ -207,7 +208,8 @@ class Source(AbstractContextManager["Source"]):
         while block and not (block.endswith(b"\n") and (quotes % 2 == 0 or len(block) > most)):
             line = self._take(_LONGEST_LINE, to_line_end=True)
             if not line:
-                block += b"" if block.endswith(b"\n") else b"\n"
+                self.is_cut = not block.endswith(b"\n")
+                block += b"\n" * self.is_cut
                 break
             block += line
             quotes += line.count(b'"')
@@ -338,6 +340,7 @@ class Piece:
     starts: Sequence[int] | None = None
     names: Sequence[str] = ()  #: of these episodes, of a table that knows
     anew: Sequence[int] = ()  #: rows before which something was left out; behind the last one too
+    cut: str = ""  #: column in which the last row's field may go on, as nothing ends it
     bad: NDArray[np.bool_] = field(init=False)  #: (T,) rows to leave out
 
     def __post_init__(self) -> None:
@@ -400,6 +403,7 @@ class Piece:
             texts={name: texts.gather(rows) for name, texts in self.texts.items()},
             find=lambda row, name: self.find(int(rows[row]), name),
             anew=np.searchsorted(rows, self.anew).tolist(),
+            cut=self.cut if rows[-1:].tolist() == [self.rows - 1] else "",
         )
         piece.bad[:] = self.bad[rows]
         return piece
@@ -582,9 +586,11 @@ class CsvTable(Table):
             for block, lines_before in self._blocks(source):
                 here = partial(self._odd, block, lines_before, columns, wanted)
                 series, anew = self._plain(block, columns, wanted), [0] if behind else []
+                is_cut = source.is_cut
                 if series is None:
                     odd = here()
                     columns, anew = odd.columns, anew + odd.anew
+                    is_cut &= odd.lines[-1:] == [lines_before + block.count(b"\n")]
                     for line, why in odd.left_out:
                         place = f"{self.path}, line {line}: {why or 'a comment'}"
                         self.skips.leave_out("row" if why else "comment", place, bool(why))
@@ -600,7 +606,10 @@ class CsvTable(Table):
                 n_rows = len(series[wanted.all[0]])
                 behind = n_rows in anew
                 if n_rows or anew:
-                    yield wanted.piece(series, partial(self._find, here, wanted), self.skips, anew)
+                    find = partial(self._find, here, wanted)
+                    piece = wanted.piece(series, find, self.skips, anew)
+                    piece.cut = columns[-1] if is_cut else ""
+                    yield piece
 
     def _blocks(self, source: Source) -> Iterator[tuple[bytes, int]]:
         """Lines of the file that are not all empty, and how many were before."""
