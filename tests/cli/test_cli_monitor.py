@@ -319,5 +319,6 @@ def test_where_nobody_acts_a_summary_judges_alarms_on_what_they_did_not_learn_fr
     assert there["where"].startswith(f"{VIBRATION} is above ")
     assert (there["came"], there["failed"]) == (14, 14)
     assert f"{there['where']} 14 14" in printed
-    assert f"14 of 14 failures foreseen, {own['lead'] / 60.0:.3g} min ahead" in printed
+    lead = f"{own['lead'] / 60.0:.3g} min ahead (mean, 30 min at most; not foreseen: 0)"
+    assert f"14 of 14 failures foreseen, {lead}" in printed
     assert "2025-03-11 " in printed

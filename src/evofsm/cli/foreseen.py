@@ -178,7 +178,8 @@ def _tables(
             row[4:6] = "-", "-"
         rows.append(row)
         if alarm["is_own"]:
-            text = f"{row[1]} failures foreseen, {row[2]} ahead (mean; not foreseen: 0)"
+            mean = f"(mean, {horizon} at most; not foreseen: 0)"
+            text = f"{row[1]} failures foreseen, {row[2]} ahead {mean}"
             text += f", {(false := alarm['learnt']['false']):,} false"
             if poisson_bounds(false)[0] > days * alarm["stated"]:
                 text += f": more than the {row[0]} a day that were stated, beyond what is by chance"

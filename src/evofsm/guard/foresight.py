@@ -5,7 +5,7 @@ learns them: now, or as it will be at the present rate in half the horizon, or i
 alarm is on while one of its limits is passed; it comes after a hold time, and stays while one will
 be within the horizon at its rate, and for a quarter of it more. It is right if a failure comes
 within the horizon after it began, on by then or not. Where it stays on, it says so once in each
-horizon, and is false as often as no failure came. A failure is foreseen by the first before it.
+horizon, and is false as often as no failure came; if it is right then, it is ahead by a horizon.
 
 An alarm is of at most so many limits. Those are searched for that warn longest on average (none
 counts as 0), less a price for each false alarm, and beside them plain thresholds in the same way;
@@ -132,8 +132,8 @@ class Tally(NamedTuple):
     """What came of an alarm."""
 
     failures: int
-    foreseen: int  #: with an alarm that began within the horizon before
-    lead: float  #: mean time from the first of them, at most the horizon, 0 if there is none [s]
+    foreseen: int  #: with an alarm that was right
+    lead: float  #: mean time since the first of them began, at most the horizon; else 0 [s]
     false: int
     days: float
 
