@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 
 import pytest
@@ -295,6 +295,25 @@ def test_the_client_in_c_gets_its_alarm(tmp_path):
 
 
 VIBRATION = "Schwingung, mm/s"
+
+
+def test_a_summary_says_where_failures_are_and_how_long_an_alarm_was_on_before(refused, tmp_path):
+    asked = tmp_path / "log.csv", "--summary", "--action", "", "--observe", "heat", "--horizon", 300
+    asked += ("--failed", "hit", "--episode", "run", "--split", 0.5)
+
+    def write(first):  # in minutes 36 to 39 of odd runs from there on
+        lines = ["run,time,heat,hit"]
+        for run, k in product(range(30), range(40)):
+            fails = run > first and run % 2
+            lines.append(f"{run},{60 * k},{k % 9 + 9 * (fails and k > 35)},{int(fails and k > 38)}")
+        asked[0].write_text("\n".join([*lines, ""]))
+
+    write(16)
+    said = "none failed in the first 50% of the rows, which it learns from, but 7 later did"
+    assert f"{said} (--split)" in refused("monitor", *asked)
+    write(0)
+    hits = json.loads(evofsm(*asked, "--json").stdout)["listed"]
+    assert {hit["lasts"] for hit in hits if hit["failed"]} == {180.0}
 
 
 def test_where_nobody_acts_a_summary_judges_alarms_on_what_they_did_not_learn_from(pump, tmp_path):

@@ -75,11 +75,16 @@ def show_foreseen(
         rows = np.cumsum([len(e.times) for e in episodes])
         first = int((rows <= split * rows[-1]).sum())
         first_part, episodes = _of_two_rows(episodes[:first]), episodes[first:]
-        if not (first_part and _of_two_rows(episodes)):
-            why = "it takes two episodes at least, to learn and to judge"
-            if not any(e.failed for e in (*first_part, *episodes)):
-                why = "no episode failed, so there is nothing to foresee (--failed says what did)"
-            raise ValueError(f"{file}: {why}")
+        fault = ""
+        if not any(e.failed for e in (*first_part, *episodes)):
+            fault = "no episode failed, so there is nothing to foresee (--failed says what did)"
+        elif not (first_part and _of_two_rows(episodes)):
+            fault = "it takes two episodes at least, to learn and to judge"
+        elif not any(e.failed for e in first_part):
+            fault = f"none failed in the first {split:.0%} of the rows, which it learns from, but "
+            fault += f"{sum(e.failed for e in episodes):,} later did (--split)"
+        if fault:
+            raise ValueError(f"{file}: {fault}")
         labels = Labels(names=tuple(names), units=tuple(units))
         guard = guard_where_nobody_acts(first_part, labels, *asked)
         learnt_from = "episode" if first == 1 else f"{len(first_part):,} episodes"
@@ -152,7 +157,7 @@ def _listed(
             right = bool(runs.failed[k]) and false * horizon < stop - onset
             foreseen |= right
             row = {"episode": k, "row": onset, "time": times[onset], "failed": right}
-            row |= {"lasts": (stop - onset) * judge.dt, "false": int(false)}
+            row |= {"lasts": (min(stop, fails) - onset) * judge.dt, "false": int(false)}
             yield {**row, "reason": judge.reason(runs.rows[onset], columns[:, onset])}
         if not foreseen:
             row = {"episode": k, "row": fails, "time": times[fails]}
