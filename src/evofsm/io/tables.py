@@ -810,8 +810,9 @@ def explained(text: str, hint: str = "") -> str:
         return f"{text[:40]} cannot be learnt{hint or ' (a missing or failed measurement?)'}"
     if is_number(text.replace(",", ".")):
         return f"{text[:40]!r} is no number (a decimal comma? write 1.5)"
-    if is_number(text.replace(",", "")):
-        return f"{text[:40]!r} is no number (commas between thousands? leave them out)"
+    if "," in text and is_number(text.replace(",", "").replace(".", "")):
+        marks = "points" if -1 < text.find(".") < text.find(",") else "commas"
+        return f"{text[:40]!r} is no number ({marks} between thousands? leave them out)"
     if _DATE_LIKE.match(text):
         return f"{text[:40]!r} is no number (a date? it has to be {_ISO}{_SAYS_HOW})"
     return f"{text[:40]!r} is no number (a text, a date, or a unit behind the number?)"
