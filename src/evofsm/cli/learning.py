@@ -114,7 +114,7 @@ def learn_traces(
 # -- What was noticed in reading ------------------------------------------------------------------
 
 
-def _called(name: str, *, is_time: bool) -> str:
+def unit_in(name: str, *, is_time: bool) -> str:
     """The unit that is part of a column's name, if it is none of the SI."""
     match = (_TIME_CALLED if is_time else _CALLED).search(name)
     if match is None:
@@ -127,7 +127,7 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
     """What is most likely a mistake, and what would mend it."""
     columns = columns or LogColumns()
     time = columns.time
-    units = {name: unit for name in noted.untold if (unit := _called(name, is_time=name == time))}
+    units = {name: unit for name in noted.untold if (unit := unit_in(name, is_time=name == time))}
     warnings = [
         f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
         f"mph? --unit {quote(f'{name}=km/h')} converts it"

@@ -13,10 +13,11 @@ import numpy as np
 import polars
 from numpy.typing import NDArray
 
-from evofsm.cli.learning import range_of
+from evofsm.cli.learning import range_of, unit_in
 from evofsm.cli.options import in_quotes, quoted, seconds
 from evofsm.cli.show import facts, show
 from evofsm.guard.foresight import span
+from evofsm.io import tables
 from evofsm.io.logs import SKIPPED, USUAL_EPISODE, are_stand_ins, are_unusual, hours_unsaid
 from evofsm.io.tables import TIMES, CsvTable, ParquetTable, Skips, Wanted, explained, is_date
 
@@ -82,10 +83,11 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     if not len(frame):
         table.skips.refuse_nothing(f"{table.path} has a header but no rows")
     numbers = [name for name, kind in frame.schema.items() if kind.is_numeric() and name != clock]
+    units = {n: table.units.get(n) or unit_in(n, is_time=False) for n in ("", *numbers)}
     values, stand_ins = dict[str, Floats](), dict[str, Floats]()
     for name, z in ((name, frame[name].to_numpy()) for name in numbers):
         if np.isfinite(z).any():
-            for_none = are_stand_ins(z)
+            for_none, z = are_stand_ins(z), z * tables.UNITS.get(units[name], 1.0)
             values[name], stand_ins[name] = np.where(for_none, np.nan, z), np.unique(z[for_none])
     texts = [name for name in frame.columns if frame[name].dtype == polars.String]
     runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
@@ -110,6 +112,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     }
     for name in (name for name in values if len(stand_ins[name])):
         columns[name] += f"; {', '.join(f'{x:g}' for x in stand_ins[name])} for none"
+    for name in (name for name in values if tables.UNITS.get(units[name], 1.0) != 1.0):
+        columns[name] += f" {tables.SI[units[name]]}, from {units[name]}"
     columns |= {name: _told(frame[name]) for name in texts}
     facts = [*columns.items()][:_COLUMNS_SHOWN]
     if more := len(columns) - len(facts):
@@ -152,8 +156,11 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
         facts.append(("left out", f"{', '.join(one_way)}: never comes back, as an odometer"))
         steady = {n: ends for n, ends in steady.items() if n not in one_way}
     action = next(filter(_SET.search, steady), "")  # else nobody acts
-    nobody = [f"{_named(n, _SIGNS)}=={x:g}" for n in steady if n != action for x in stand_ins[n]]
+    nobody = [f"{_named(n, _SIGNS)}=={x:.17g}" for n in steady if n != action for x in stand_ins[n]]
     options += [("--no-leader", " or ".join(nobody))] if nobody else []
+    for n in dict.fromkeys((*steady, still)):
+        if units[n] and not table.units.get(n):
+            options.append(("--unit", f"{_named(n, '=')}={units[n]}"))
     levels = np.unique(values[action][np.isfinite(values[action])]) if action else np.zeros(0)
     return facts, _of_numbers(steady, action, levels, options), before if is_mixed else ""
 
@@ -194,6 +201,8 @@ def _first_rows(
     since = ""
     if not clock:
         clock, unit, since = _clock_of(frame, numbers)
+        name_unit = table.units.get(clock) or unit_in(clock, is_time=True)
+        unit = name_unit if name_unit in TIMES and not since else unit
         form = f"{_named(clock, '=')}={unit}" if unit != "s" else ""
         frame = frame.with_columns(frame[clock] * TIMES[unit]) if clock else frame
     if dates:
