@@ -58,7 +58,7 @@ def test_it_learns_saves_and_drives_frozen(evofsm, tmp_path):
     learnt = tmp_path / "learnt"
     first = evofsm("drive", "emergency", "--episodes", 12, "--out", learnt)
     assert first.exit_code == 0, first.stderr
-    assert "0 of 12" in first.stdout
+    assert "0 of 12: 0.0% (95 %, two-sided: 0.0% to 26.5%)" in first.stdout
     assert {path.name for path in learnt.iterdir()} == {
         *("guard.evofsm", "episodes.jsonl", "episodes.csv", "decisions.parquet"),
     }

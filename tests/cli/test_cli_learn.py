@@ -244,6 +244,7 @@ def test_files_that_are_none_end_with_one_line(evofsm, refused, log, tmp_path):
     assert refused("inspect", "nosuch") == "evofsm: nosuch: no such file or directory"
     assert "is a folder" in refused("learn", tmp_path)
     assert "another program" in refused("inspect", log)
+    assert "is named twice" in refused("learn", log, log.parent / ".." / log.parent.name / log.name)
 
 
 def test_out_never_overwrites_a_file_of_another_kind(evofsm, refused, log):
@@ -343,6 +344,7 @@ def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
         (["--observe", "hit=0/2"], "column 'hit': '1' is none of the values"),
         (["--action-range", "1:2"], "write LOW:HIGH:WIDTH"),
         (["--action-range", "0:1:1e-9"], "more than 1000 intervals"),
+        (["--horizon", "0"], "greater than or equal to 0.001"),
         (["--dt", "0"], "--dt is 0.0; it must be a positive"),
         (["--out", "/no/such/folder/model"], "there is no folder"),
         (["--failed", "gap<"], "--failed is 'gap<'"),

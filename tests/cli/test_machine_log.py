@@ -183,12 +183,13 @@ def test_a_later_file_is_read_by_its_own_header_or_refused_with_what_differs(evo
         return how("learn", *files, "--observe", "heat", "--time", "t", "--action", "u", *words)
 
     write("a")
+    write("again")
     write("own", "u;note;heat;t\n", "{u};on;{heat},5;{t}\n")
     write("lacks", "t,u\n", "{t},{u}\n")
     write("slow", step=60)
     for unit in ("mm", "cm", "degC", "degF"):
         write(unit, f"t,heat,u\ns,{unit},-\n")
-    same, own = (json.loads(learn(["a.csv", f], "--json").stdout) for f in ("a.csv", "own.csv"))
+    same, own = (json.loads(learn(["a.csv", f], "--json").stdout) for f in ("again.csv", "own.csv"))
     assert own["model"]["states"] == same["model"]["states"]
     assert learn(["mm.csv", "cm.csv"]).exit_code == 0
     for first, other, words, fault in (

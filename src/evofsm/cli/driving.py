@@ -309,7 +309,7 @@ def told_of(row: Row, results: Results) -> Iterator[tuple[str, str]]:
     yield "family", f"{row.family}, {row.episodes:,} {kind} episodes"
     yield "reviser", f"{setup.reviser}, {setup.mode.value}"
     yield "judge", f"{setup.judge}, given {TOLD[setup.judge]}"
-    interval = f"(95 %: {row.collision_low:.1%} to {row.collision_high:.1%})"
+    interval = f"(95 %, two-sided: {row.collision_low:.1%} to {row.collision_high:.1%})"
     share = f"{row.collisions:,} of {row.episodes:,}: {row.collision_rate:.1%}"
     yield "collisions", f"{share} {interval}"
     yield "rate", str(row.failures)

@@ -75,7 +75,9 @@ def learn(
     encoder = columns.observe
     machine = learning.machine_of(actions.n_actions, rule, scale, max_states, encoder)
     kind = None if guard is None else learning.judge_of(judge if acts else "learnt", columns)
-    notes = Noted()
+    notes, places = Noted(), [Path(file).resolve() for file in files]
+    if twice := [f for f, place in zip(files, places, strict=True) if places.count(place) > 1]:
+        raise ValueError(f"{twice[0]} is named twice; what failed there would be learnt twice, too")
     sizes = [learning.size_of(file) for file in files]
     with progress("Learning", sum(sizes)) as move:
         chunks: Iterable[Chunk] = read.traces(files, notes, lambda count: move(advance=count))

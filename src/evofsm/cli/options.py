@@ -281,7 +281,7 @@ Horizon = Annotated[
     option(
         "Where nobody acts: an alarm is right if a failure comes within this [s]. "
         "[default: 5 % of an episode]",
-        min=0.0,
+        min=1e-3,
     ),
 ]
 Persist = Annotated[

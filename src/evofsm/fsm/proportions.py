@@ -104,9 +104,9 @@ class FailureRecord(NamedTuple):
                 exposures.append(f"{few if exposure < 10.0 else many} {unit}")
             if exposure:
                 rates.append(_rate(self.failures, exposure / per, words))
-        verdict = f"{', '.join(rates)}, 90 %" if rates else "nothing is known"
+        verdict = f"{', '.join(rates)}, 90 %, two-sided" if rates else "nothing is known"
         if rates and self.failures == 0:
-            verdict = f"at most {', '.join(rates)}, 95 %"
+            verdict = f"at most {', '.join(rates)}, 95 %, one-sided"
         return f"{counted(self.failures, 'failure')} in {', '.join(exposures)}: {verdict}"
 
 
