@@ -86,13 +86,15 @@ def test_gaps_in_time_and_rows_that_come_too_often_are_noted():
 @pytest.mark.parametrize("answered", [1, 2, 10, 19, 22, 23, 24, 27, 28])
 @pytest.mark.parametrize("decided", [24, 26, 28, 29])
 def test_what_was_in_flight_and_is_sent_again_is_decided_once(answered, decided):
-    """Two episodes end alike, the second of which begins at 0 s again; then one by its time."""
+    """Episodes by one clock, the first two of which end alike; then one by its time."""
     end = b'{"end": true, "failed": true}'
-    messages = [line(row | {"gap": 60.0 + row["time"]}) for row in rows(20)]
-    messages += [end, *map(line, rows(4)), end]
-    messages += [line(row | {"gap": 61.0}) for row in rows(2)]
-    messages.append(b'{"end": true, "failed": true, "time": 0.2}')
-    messages.append(line(next(rows(1)) | {"gap": 62.0}))
+    told = [row | {"gap": 60.0 + row["time"]} for row in rows(20)]
+    for count, gap in ((4, 50.0), (2, 61.0), (1, 62.0)):
+        told += [row | {"gap": gap} for row in rows(count)]
+    told = [row | {"time": 0.1 * k} for k, row in enumerate(told)]
+    messages = [line(row) for row in told]
+    messages[26:26] = [line({"end": True, "failed": True, "time": told[25]["time"]})]
+    messages[24:24] = messages[20:20] = [end]
     plain, guard = Decider(made(learn=True)), made(learn=True)
     expected = [plain.answer(message) for message in messages]
     decider = Decider(guard)
@@ -101,6 +103,22 @@ def test_what_was_in_flight_and_is_sent_again_is_decided_once(answered, decided)
     again = min(answered, decided)
     assert [decider.answer(message) for message in messages[again:]] == expected[again:]
     assert guard.machine.endings.sum() == plain.guard.machine.endings.sum() == 3.0
+
+
+@pytest.mark.parametrize("end", [[], [b'{"end": true, "failed": true, "time": 2}']])
+def test_rows_of_a_clock_that_begins_anew_are_none_of_an_episode_before(end):
+    """One row in the middle differs; the rest, and the end, are as in the episode before."""
+    decider = Decider(made(learn=True))
+    for k in range(4):
+        told = [row | {"gap": 60.0 + k * (n == 9)} for n, row in enumerate(rows(20))]
+        lap = [*map(line, told), *end]
+        for n, message in enumerate(lap):
+            answer = decider.answer(message)
+            assert answer["n"] == 20 * k + min(n + 1, 20)
+            if n in (5, 15):  # a connection is lost within the episode
+                sent = [decider.answer(one) for one in lap[n - 3 : n + 1]]
+                assert sent[-1] == answer
+    assert decider.guard.n_failed == 4 * len(end)
 
 
 @pytest.mark.parametrize("end", [[], [b'{"end": true}']])
@@ -122,8 +140,9 @@ def test_episodes_of_one_length_end_at_the_same_time_and_each_end_counts(length)
         answers = [decider.answer(message) for message in [*map(line, told), end, end]]
     assert (decider.n, answers[-1]["n"]) == (3 * length, 3 * length)
     assert guard.n_failed == 3
-    assert decider.answer(line(told[0] | {"gap": 90.0}))["kind"] == "decision"
-    if 1 < length < 255:
+    later = told[-1]["time"] + 0.1
+    assert decider.answer(line(told[0] | {"time": later}))["kind"] == "decision"
+    if length < 255:
         assert decider.answer(end) == answers[-1]  # sent again, after a row of another episode
         assert guard.n_failed == 3
 

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -122,24 +123,39 @@ class Decider:
     def _sent_before(self, told: Message) -> int | None:
         """Where among the recent messages one is that is sent again; None if it is a new one.
 
-        Who plays a recording once more begins with its first row, or as was begun before: that is
-        no repetition. Nor is a row that is newer than the latest, as clocks go back once a year.
+        Where a clock begins at 0 in each episode, rows of two may be alike: what came before a row
+        that is as old as this one had another clock, and is no longer asked.
         """
-        recent, latest = self._recent, self.latest
+        recent, when = self._recent, told.time
         next_place = len(recent) if self._next is None else self._next + 1
         if next_place < len(recent) and recent[next_place][0] == told:
             return next_place
-        if told == latest:
+        if told == self.latest:
             return len(recent) - 1
-        if isinstance(told, End) and told.time is None:
+        if when is None:
             return None  # it says of no episode in particular that it ended
-        is_newer = isinstance(told, Row) and isinstance(latest, Row) and told.time > latest.time
-        for place in range(len(recent) - 2, -1, -1):
-            is_newer &= not isinstance(recent[place][0], End)  # before which are other times
-            if recent[place][0] == told:
-                before = recent[place - 1][0] if place else None
-                return None if is_newer or _begins_anew(told, before, latest) else place
+        for place in range(len(recent) - 1, -1, -1):
+            message = recent[place][0]
+            if message == told:
+                return None if isinstance(told, Row) and self._begins_anew(told, place) else place
+            if message.time is None or message.time > when:
+                continue
+            if message.time < when or isinstance(message, Row):
+                return None
         return None
+
+    def _begins_anew(self, told: Row, place: int) -> bool:
+        """Whether a row is no repetition, as an episode began with it, and another begins.
+
+        That is so after an end, and where time goes back to it as it did before: who plays a
+        recording once more begins with its first row.
+        """
+        before = [message for message, _ in islice(self._recent, place)]
+        times = [message.time for message in before if message.time is not None]
+        is_back = not times or told.time <= times[-1]
+        if isinstance(self.latest, Row):
+            return is_back and told.time < self.latest.time - _LATE
+        return is_back or isinstance(before[-1], End)
 
     def error(self, about: str, what: str, time: float | None = None) -> Answer:
         """What is answered where a message is refused."""
@@ -336,16 +352,6 @@ class Decider:
         for message, answer in memory["recent"]:
             self._recent.append((msgspec.convert(message, Message), dict(answer)))
         self.decided_on = self.latest if isinstance(self.latest, Row) else None
-
-
-def _begins_anew(told: Message, before: Message | None, latest: Message | None) -> bool:
-    """Whether what first came after ``before`` is no repetition where it comes after another."""
-    if not isinstance(latest, Row):
-        return before is None or isinstance(before, End)
-    if before is None:
-        return isinstance(told, End) or told.time < latest.time - _LATE
-    # Episodes that are as long as each other end alike.
-    return before.time == latest.time if isinstance(told, End) else before == latest
 
 
 def _refuse_stale(row: Row, latest: Row) -> None:
