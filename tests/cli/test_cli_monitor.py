@@ -95,10 +95,12 @@ def test_the_audit_log_is_good(tmp_path):
     found = audit(log)
     assert (found.is_good, found.replayed) == (True, 40)
     log.unlink()
-    for part in (ROWS[:25], ROWS[25:]):  # its rows are taken in again, and written again
+    rows = [*ROWS[:12], b'{"end": true, "failed": true}', *ROWS]
+    for part in (rows[:25], rows[25:30], [], rows[30:]):  # what it goes on after is in the log
         assert evofsm("--learn", "--audit", log, "--state", state, lines=part).exit_code == 0
     found = audit(log)
-    assert (found.is_good, found.replayed) == (True, 65)
+    assert (found.is_good, found.replayed) == (True, 52)
+    assert found.contents[:3] == (1, 2, 52)
 
 
 def numbers_of(text):

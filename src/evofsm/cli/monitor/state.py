@@ -18,7 +18,7 @@ from evofsm import store
 from evofsm.cli.journal import Journal, differences
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.messages import Taken
-from evofsm.guard import Guard
+from evofsm.guard import AuditLog, Guard, Head
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +40,7 @@ class State:
         self._provenance: dict[str, Any] = {}
         self._mark = 0
         self._memory: Mapping[str, Any] | None = None
+        self._logged: str | None = None  # head of the audit log, as the guard was saved
         self._count = 0  # messages in the journal
 
     def guard(
@@ -64,6 +65,7 @@ class State:
                 "another file"
             )
         self._mark, self._memory = int(entry["mark"]), entry["memory"]
+        self._logged = entry.get("audit")
         if journal.settings.get("mark") not in (self._mark, self._mark - 1):
             raise ValueError(
                 f"{journal.path} is missing or empty: rows that came after {self.path} was saved "
@@ -81,6 +83,8 @@ class State:
         if self._memory is None or self._journal.settings["mark"] != self._mark:
             self._save(decider)  # what is in a journal of the mark before, is in the guard
             return 0
+        if isinstance(log := decider.guard.audit, AuditLog) and self._logged:
+            log.told_again(Head.parse(self._logged))
         self._count = len(self._journal.records)
         for record in self._journal.records:
             try:
@@ -116,7 +120,8 @@ class State:
     def _save(self, decider: Decider) -> None:
         """Write the guard, and begin a journal; the one before counts until it is written."""
         mark = self._mark + 1
-        entry = {"mark": mark, "settings": self.settings, "memory": decider.memory()}
+        head = str(log.head) if isinstance(log := decider.guard.audit, AuditLog) else None
+        entry = {"mark": mark, "settings": self.settings, "memory": decider.memory(), "audit": head}
         decider.guard.save(self.path, {**self._provenance, _PROVENANCE: entry})
         self._journal.begin_anew({"mark": mark})
         self._mark, self._count = mark, 0
