@@ -56,14 +56,15 @@ class Journal:
         """Add records, which then survive the process, with ``sync`` a power cut too."""
         self._write(b"".join(map(_line, records)), sync=sync)
 
-    def begin_anew(self, settings: Record, *records: dict[str, Any]) -> None:
+    def begin_anew(self, settings: Record, *records: Record) -> None:
         """Replace all of it by a header and these records, at once or not at all."""
         fresh = self.path.with_name(f".{self.path.name}.new")
         fresh.unlink(missing_ok=True)
-        before, self._file = self._file, _opened(fresh, "try again")
-        self._write(b"".join(map(_line, ({"settings": settings}, *records))))
+        journal = Journal(fresh, settings, "try again")
+        journal.append(*records)
         os.replace(fresh, self.path)
-        before.close()
+        self.close()
+        self._file = journal._file
         self.settings, self.records = settings, [*records]
 
     def sync(self) -> None:

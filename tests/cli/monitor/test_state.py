@@ -211,18 +211,35 @@ def test_two_monitors_do_not_keep_themselves_in_one_place(tmp_path, opened):
             opened(path)
 
 
-def test_where_it_can_not_be_kept_it_goes_on_and_says_so(opened, monkeypatch):
+def test_where_it_can_not_be_kept_it_goes_on_says_so_and_keeps_it_later(opened, monkeypatch):
     decider, state = opened()
 
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
+    rows = [line(row) for row in traffic(9)]
     with monkeypatch.context() as patched:
+        for keeper, name in ((state._journal, "append"), (decider.guard, "save")):
+            patched.setattr(keeper, name, full)
+        for message in (rows[0], b'{"end": true}', rows[1]):
+            assert decider.answer(message)["kind"] != "error"
+        assert "No space left" in state.failure
+    decider.answer(rows[2])
+    with pytest.raises(ValueError, match="No space left on device; what came since then is lost"):
+        state.close()
+    decider, state = opened()
+    assert decider.n == 0
+    with monkeypatch.context() as patched:
+        patched.setattr("evofsm.cli.journal.os.replace", full)
         patched.setattr(state._journal, "append", full)
-        first, second = (line(row) for row in traffic(2))
-        assert decider.answer(first)["kind"] == "decision"
-    assert decider.answer(second)["kind"] == "decision"
-    assert "No space left" in state.failure
+        for message in (rows[0], b'{"end": true}', rows[1]):
+            decider.answer(message)
+    decider.answer(b'{"end": true, "failed": true}')
+    assert not state.failure
+    decider.answer(rows[2])
+    abandoned(state)
+    decider, state = opened()
+    assert (decider.n, decider.rows, decider.guard.n_failed) == (3, 1, 1)
 
 
 def test_scenes_and_ends_are_kept(opened):

@@ -33,7 +33,7 @@ class State:
     def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
         self.path = path.resolve()
         self.settings = dict(settings)
-        self.failure = ""  #: why nothing is saved any more; empty as long as it is
+        self.failure = ""  #: why nothing is saved; empty as long as it is
         self._journal = Journal(
             self.path.with_name(f"{self.path.name}.journal"), {"mark": _NEW}, "name another file"
         )
@@ -95,27 +95,33 @@ class State:
 
     def rest(self, decider: Decider) -> None:
         """Write the guard as it is, unless it is within an episode."""
-        if self._count and not (self.failure or decider.rows):
-            self._save(decider)
+        if (self._count or self.failure) and not decider.rows:
+            self._try(partial(self._save, decider))
 
     def close(self) -> None:
-        """Force the journal onto the disk, and let others have the files."""
+        """Force the journal onto the disk, and let others have the files; raise if all is not."""
         if not self.failure:
-            self._journal.sync()
+            self._try(self._journal.sync)
         self._journal.close()
+        if self.failure:
+            raise ValueError(f"{self.failure}; what came since then is lost")
 
     def _keep(self, told: Taken, decider: Decider) -> None:
         """Write down what was acted on, and the guard, if an episode has just ended."""
-        if self.failure:
-            return
-        try:
-            self._journal.append({"told": told}, sync=False)
+        if not self.failure:
+            self._try(partial(self._journal.append, {"told": told}, sync=False))
             self._count += 1
-            if decider.rows == 0 and self._count >= _EVERY:
-                self._save(decider)
-        except Exception as error:  # decisions matter most: it is said, and gone on without
-            self.failure = f"{self.path} is not saved any more: {error}"
-            _log.error(self.failure)
+        if decider.rows == 0 and (self.failure or self._count >= _EVERY):
+            self._try(partial(self._save, decider))
+
+    def _try(self, save: Callable[[], None]) -> None:
+        """Decisions matter most: what fails is said, and gone on without until an episode ends."""
+        try:
+            save()
+        except Exception as error:
+            if not self.failure:
+                self.failure = f"{self.path} is not saved: {error}"
+                _log.error(self.failure)
 
     def _save(self, decider: Decider) -> None:
         """Write the guard, and begin a journal; the one before counts until it is written."""
@@ -125,3 +131,6 @@ class State:
         decider.guard.save(self.path, {**self._provenance, _PROVENANCE: entry})
         self._journal.begin_anew({"mark": mark})
         self._mark, self._count = mark, 0
+        if self.failure:
+            _log.warning("%s is saved again", self.path)
+            self.failure = ""
