@@ -19,6 +19,7 @@ from evofsm.cli.journal import Journal, differences
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.messages import Taken
 from evofsm.guard import AuditLog, Guard, Head
+from evofsm.guard.audit_log import NOTHING, seal
 
 _log = logging.getLogger(__name__)
 
@@ -42,6 +43,7 @@ class State:
         self._memory: Mapping[str, Any] | None = None
         self._logged: str | None = None  # head of the audit log, as the guard was saved
         self._count = 0  # messages in the journal
+        self._head = NOTHING  # of the chain that they are
 
     def guard(
         self, fresh: Callable[[], Guard], failed: Callable[[Any], bool] | None = None
@@ -71,6 +73,15 @@ class State:
                 f"{journal.path} is missing or empty: rows that came after {self.path} was saved "
                 "are lost; put it back, or give the guard as --guard and name another --state"
             )
+        self._head = Head(journal.settings["mark"], NOTHING.digest)
+        for number, record in enumerate(journal.records, 2):
+            digest = self._sealed(record.get("told"))["hash"]
+            if record.get("hash", digest) != digest:  # those of before have none
+                raise ValueError(
+                    f"{journal.path}, line {number} was altered: its hash is not that of what it "
+                    "says; put back what was there, or delete it from that line on, and send again "
+                    "what came since"
+                )
         return load()
 
     def begin(self, decider: Decider) -> int:
@@ -109,10 +120,16 @@ class State:
     def _keep(self, told: Taken, decider: Decider) -> None:
         """Write down what was acted on, and the guard, if an episode has just ended."""
         if not self.failure:
-            self._try(partial(self._journal.append, {"told": told}, sync=False))
+            self._try(lambda: self._journal.append(self._sealed(told), sync=False))
             self._count += 1
         if decider.rows == 0 and (self.failure or self._count >= _EVERY):
             self._try(partial(self._save, decider))
+
+    def _sealed(self, told: Any) -> dict[str, Any]:
+        """The record of a message, with the hash of it and of all before it, as in an audit log."""
+        told = msgspec.to_builtins(told)
+        _, self._head = seal({"told": told}, self._head)
+        return {"told": told, "hash": self._head.digest}
 
     def _try(self, save: Callable[[], None]) -> None:
         """Decisions matter most: what fails is said, and gone on without until an episode ends."""
@@ -130,7 +147,7 @@ class State:
         entry = {"mark": mark, "settings": self.settings, "memory": decider.memory(), "audit": head}
         decider.guard.save(self.path, {**self._provenance, _PROVENANCE: entry})
         self._journal.begin_anew({"mark": mark})
-        self._mark, self._count = mark, 0
+        self._mark, self._count, self._head = mark, 0, Head(mark, NOTHING.digest)
         if self.failure:
             _log.warning("%s is saved again", self.path)
             self.failure = ""
