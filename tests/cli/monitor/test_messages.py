@@ -72,6 +72,12 @@ def test_junk_is_refused_as_a_line(junk):
     assert refused(FORM, junk)[0] == "line"
 
 
+def test_a_key_that_is_there_twice_is_named():
+    twice = line().replace(b'"gap"', b'"gap": 1, "gap"')
+    assert refused(FORM, twice) == ("gap", "is there 2 times; which of them counts?")
+    assert refused(FORM, scene(TRUCK).replace(b'"vx"', b'"id": 1, "vx"'))[0] == "id"
+
+
 def test_the_time_of_what_is_refused_is_told_where_it_can_be_read():
     for wrong, time in ((line(gap="near"), 1.0), (line(time="noon"), None), (scene(3), 2.0)):
         with pytest.raises(MessageError) as error:

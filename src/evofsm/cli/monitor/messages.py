@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 from operator import itemgetter
 from typing import Annotated, Any, Literal
@@ -303,6 +304,7 @@ def _parsed(line: bytes) -> dict[str, Any]:
         raise MessageError("line", f"is longer than {LONGEST} bytes")
     try:
         body = msgspec.json.decode(line)
+        json.loads(line, object_pairs_hook=_refuse_twice, parse_int=str)
     except RecursionError:
         raise MessageError("line", "is nested too deeply") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
@@ -320,6 +322,14 @@ def _parsed(line: bytes) -> dict[str, Any]:
     if not isinstance(body, dict):
         raise MessageError("line", f"is {_shown(body)}; it must be a JSON object")
     return body
+
+
+def _refuse_twice(pairs: list[tuple[str, Any]]) -> None:
+    """Raise where a key of an object is there twice: of its values one would be left out."""
+    names = Counter(name for name, _ in pairs)
+    if len(names) < len(pairs):
+        (name, count), *_ = names.most_common(1)
+        raise MessageError(name[:_LETTERS], f"is there {count} times; which of them counts?")
 
 
 def _time(told: dict[str, Any]) -> float | None:
