@@ -296,7 +296,9 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     assert (bad["about"], bad["error"][:27]) == ("heat", "line 13: 'Bad' is no number")
     assert "line 14: 2 fields, but the header names 4" in short["error"]
     assert "not seen: heat" in unseen["reason"]
-    first, _ = (a["error"] for a in answers("zeit;trip;heat;runs", *lines, *lines) if "error" in a)
+    # What is not read is never told as no alarm; nor without names above.
+    first, *others = (a["error"] for a in answers("zeit;trip;heat;runs", *lines))
+    assert [a["kind"] for a in answers(*lines)] == ["error"] * len(others) == ["error"] * len(lines)
     assert "is no column; there are zeit, trip, heat, runs (zeit? case counts)" in first
     faults = {
         "'1'; it is compared with the number 1.0 (--failed)": {"trip": "1"},

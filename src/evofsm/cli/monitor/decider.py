@@ -90,8 +90,7 @@ class Decider:
         """
         try:
             if (body := self._csv.read(line)) is None:
-                why = self._csv.unread or messages.NO_ROW
-                return self._of("waiting", alarm=self._alarm, reason=why)
+                return self._of("waiting", alarm=self._alarm, reason=messages.NO_ROW)
             message = self.form.read(body)
             beyond = self.guard.beyond(np.array(message.observation or (), np.float64))
             if beyond is not None:

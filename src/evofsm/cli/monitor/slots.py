@@ -15,8 +15,6 @@ from evofsm.io import LogColumns, tables
 from evofsm.io.logs import Condition, units_of
 from evofsm.io.tables import Dialect, decoded, explained, is_date, is_number, is_value
 
-# Lines that are no rows are told of as the first came, and then as so many had.
-_SAID_AT = [10**k for k in range(1, 10)]
 _BECOME: dict[str, Any] = {"mean": fmean, "last": itemgetter(-1), "max": max, "min": min}
 
 
@@ -124,11 +122,10 @@ class CsvRows:
         self._count, self._factors = 0, dict[str, float]()
         self._head: list[str] = []  # the line with the names, and those below to the first row
         self._dialect: Dialect | None = None  # once that row has come
-        self._acts, self._may_be_title = acts, not acts  # who drives along sends no log
+        self._may_be_title = not acts  # who drives along sends no log
         self._needs = *variables, *columns.time.split(",")
         self._above: Sequence[str] = ()  # fields of the line before
-        self.unread = ""  #: why lines are no rows, as names are missing
-        self._n_unread = 0
+        self._unread = ""  # why lines are no rows, as names are missing
         self.place, self.in_csv = "", False  #: of a line, as what is said of it begins
 
     def read(self, line: bytes) -> bytes | dict[str, Any] | None:
@@ -148,13 +145,13 @@ class CsvRows:
         columns = {*Dialect(text, ()).columns} if may_name else set()
         if may_name and {*self._needs} <= columns:
             self._head, self._dialect = [text], None
-            self._may_be_title, self.unread = False, ""
+            self._may_be_title, self._unread = False, ""
             return None
         if {*self._variables} & columns:  # the names of another log
             self._head = []
         if not self._head:
             self._refuse_unnamed(text)
-            return None if self._may_be_title or self.unread else line
+            return None if self._may_be_title else line
         try:
             if self._dialect is None and self._has_units(text):
                 return None
@@ -164,28 +161,26 @@ class CsvRows:
             raise MessageError("line", f"{error} (an unclosed quote?)") from None
 
     def _refuse_unnamed(self, text: str) -> None:
-        """Raise where a line tells that names are missing above the rows; then now and then."""
-        if self.unread:
-            self._n_unread += 1
-            if self._acts or self._n_unread in _SAID_AT:
-                fault = f"is one of {self._n_unread:,} that were not read: {self.unread}"
-                raise MessageError("line", fault)
-            return
+        """Raise where a line tells that names are missing above the rows; and then at each."""
+        if self._unread:
+            raise MessageError("line", f"was not read: {self._unread}")
         above, self._above = self._above, Dialect(text, ()).columns
         needs, lower_case = ([x.casefold() for x in xs] for xs in (self._needs, self._above))
-        if not (is_row := _begins_row(self._above)):  # it may name the columns itself
+        if not _begins_row(self._above):  # it may name the columns itself
             above = self._above if {*needs} & {*lower_case} else ()
+        elif all(self._above):  # a title has no field in most columns
+            above = above or self._above
         omissions = [name for name in self._needs if name not in above]
         if len(above) < 2 or len(above) != len(self._above) or not omissions:
             return
-        about, self.unread, self._n_unread = "line", NO_ROW, int(is_row)
+        about, self._unread = "line", NO_ROW
         if not _begins_row(above):
             about, *rest = omissions
             fault = ", nor is ".join([f"{about} is no column", *rest])
             near = ", ".join(x for x in above if x not in self._needs and x.casefold() in needs)
             near = f" ({near}? case counts)" if near else ""
-            self.unread = f"{fault}; there are {', '.join(above)}{near}"
-        raise MessageError(about, self.unread.removeprefix(f"{about} "))
+            self._unread = f"{fault}; there are {', '.join(above)}{near}"
+        raise MessageError(about, self._unread.removeprefix(f"{about} "))
 
     def _has_units(self, text: str) -> bool:
         """Whether a line below the names tells units, or the like; the first row tells the rest."""
