@@ -89,6 +89,25 @@ def test_a_state_goes_on_over_runs_and_may_be_the_guards_own_file(tmp_path):
     assert "learn was true and is now false" in refused.stderr
 
 
+def test_a_file_is_taken_in_once_and_as_it_grows_what_is_new_of_it(tmp_path):
+    log, other, state = (tmp_path / name for name in ("log.csv", "other.csv", "state.evofsm"))
+    names = "time,gap,v_follower,v_leader,a_follower"
+    rows = [",".join(map(str, row.values())) for row in closing_in(40)]
+
+    def answers(file, *lines):
+        file.write_text("\n".join([names, *lines]))
+        result = evofsm(file, "--learn", "--state", state)
+        assert result.exit_code == 0, result.stderr
+        return [one["n"] for one in told(result)], result.stderr
+
+    assert answers(log, *rows[:30])[0] == [0, *range(1, 31)]
+    again, said = answers(log, *rows[:30])
+    assert (again, f"{log} was read before, up to line 31" in said) == ([], True)
+    assert answers(log, *rows)[0] == [*range(31, 41)]
+    assert answers(other, *rows[1:])[0][0] == 40
+    assert answers(log, *rows)[0] == []
+
+
 def test_the_audit_log_is_good(tmp_path):
     log, state = tmp_path / "audit.jsonl", tmp_path / "state.evofsm"
     assert evofsm("--audit", log, lines=ROWS).exit_code == 0

@@ -304,8 +304,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         self._learnt: dict[str, float] | None = None  # as that episode ended
         self._settings: dict[str, Any] = {}
         self._before: list[list[Any]] = []
-        self._known: list[str] = []  # what it holds of what a guard is told once more
-        self._n_again = 0  # of these were
+        self._known: list[str] = []  # what it holds of what a guard is now told again
         try:
             store.only_writer(self._file, path, "name another file")
             self._find_end()
@@ -331,20 +330,19 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
 
     def told_again(self, after: Head) -> None:
         """Write nothing twice of what followed a record, as a guard is told that once more."""
-        self._known, has_head = [], after == NOTHING
-        for record in Chain(self.path).records():
-            kind, rows = record.content["kind"], record.content.get("before", [])
-            if kind == "decision":
-                rows = [*rows, [record.content["time"], record.content["observation"]]]
-            if has_head:
-                self._known += [canonical(row[:2]) for row in rows]
-                self._known += [kind] if kind in ("begin", "end") else []
-            has_head = has_head or after == (record.number, record.digest)
+        records = Chain(self.path).records()
+        if after == NOTHING or any(after == (one.number, one.digest) for one in records):
+            for _, _, _, content in records:
+                self._known += [canonical(row[:2]) for row in content.get("before", ())]
+                if content["kind"] == "decision":
+                    self._known.append(canonical([content["time"], content["observation"]]))
+                elif content["kind"] in ("begin", "end"):
+                    self._known.append(content["kind"])
 
     def _is_known(self, what: str) -> bool:
-        """Whether it is next of what is told once more; after what is not, all is new."""
-        is_known = self._known[self._n_again : self._n_again + 1] == [what]
-        self._n_again = self._n_again + 1 if is_known else len(self._known)
+        """Whether it is next of what is told again; after what is not, all is new."""
+        is_known = self._known[:1] == [what]
+        self._known = self._known[1:] if is_known else []
         return is_known
 
     # -- As a guard's decision logger -------------------------------------------------------------
@@ -354,14 +352,11 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         self._raise()
         self._flush()  # of an episode that was broken off
         parts = (guard.reviser, guard.machine, guard.judge, guard.failed)
-        is_other = list(map(id, parts)) != list(map(id, self._who))
-        is_new = not self._is_known("begin")
-        if is_new and (is_other or self._learnt != sums_of(guard)):
+        if list(map(id, parts)) != list(map(id, self._who)) or self._learnt != sums_of(guard):
             self._write("start", **_start(guard))
         self._guard, self._who, self._learnt = guard, parts, None
         self._settings = settings_now(guard)
-        if is_new:
-            self._write("begin", settings=self._settings)
+        self._write("begin", settings=self._settings)
         self._force()
         self._raise()
 
@@ -376,7 +371,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         if self._guard is None:
             return
         time, observation = self._before.pop()
-        if self._n_again < len(self._known) and self._is_known(canonical([time, observation])):
+        if self._known and self._is_known(canonical([time, observation])):
             return
         now = settings_now(self._guard)
         if now != self._settings:
@@ -401,8 +396,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         self._learnt = sums_of(self._guard)
         last = None if observation is None else observation.tolist()
         how = {"failed": bool(failed), "terminated": terminated, "score": score}
-        if not self._is_known("end"):
-            self._write("end", learnt=self._learnt, observation=last, **how)
+        self._write("end", learnt=self._learnt, observation=last, **how)
         self._force()
         self._guard = None
         self._raise()
@@ -450,6 +444,8 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
             self._write("quiet")
 
     def _write(self, kind: str, **content: Any) -> None:
+        if self._known and (kind == "start" or self._is_known(kind)):
+            return
         if "before" in FIELDS[kind]:
             content["before"], self._before = self._before, []
         if self._failure is not None:

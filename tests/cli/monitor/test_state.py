@@ -232,7 +232,7 @@ def test_where_it_can_not_be_kept_it_goes_on_says_so_and_keeps_it_later(opened, 
             assert decider.answer(message)["kind"] != "error"
         assert "No space left" in state.failure
     decider.answer(rows[2])
-    with pytest.raises(ValueError, match="No space left on device; what came since then is lost"):
+    with pytest.raises(OSError, match="No space left on device; what came since then is lost"):
         state.close()
     decider, state = opened()
     assert decider.n == 0

@@ -110,7 +110,7 @@ def monitor(
     from evofsm.cli.monitor.slots import Slots
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.summary import Text
-    from evofsm.cli.monitor.transports import Server, json_line, transport_of
+    from evofsm.cli.monitor.transports import Server, Stream, json_line, transport_of
     from evofsm.cli.show import show, warn
     from evofsm.driving.cars import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
@@ -217,6 +217,8 @@ def monitor(
         line = Text().line if text else json_line
         server = Server(decider, keeps=keeper is not None, line=line)
         transport, where = transport_of(file, socket, udp, zenoh, stack)
+        if keeper is not None and isinstance(transport, Stream) and file and file.is_file():
+            transport.source.seek(keeper.pass_over(file, decider))
         warn(notice)
         if slots is not None and (log_options := options.given_of(reader)):
             warn(f"rows are read as in a log: {options.typed(log_options)}")
@@ -227,8 +229,6 @@ def monitor(
             warn("nobody reads the decisions any more")
             return 1
         finally:
-            if keeper is not None:
-                keeper.rest(decider)
-            elif decider.rows:
+            if keeper is None and decider.rows:
                 decider.end()
     return None

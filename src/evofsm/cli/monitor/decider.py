@@ -69,7 +69,7 @@ class Decider:
         self._units = () if judge is None else judge.labels.units
         self._drives = isinstance(judge, LatentRisk | TrafficRisk)
         self._is_alone = isinstance(judge, Foresight)  # nobody acts
-        self._csv = CsvRows(self.slots, self.form.variables, acts=not self._is_alone)
+        self.csv = CsvRows(self.slots, self.form.variables, acts=not self._is_alone)
         if isinstance(judge, Foresight):
             judge.bridges = self.slots.hole or 0.0
 
@@ -89,7 +89,7 @@ class Decider:
         Messages that are sent again, as after a connection was lost, get the answers of before.
         """
         try:
-            if (body := self._csv.read(line)) is None:
+            if (body := self.csv.read(line)) is None:
                 return self._of("waiting", alarm=self._alarm, reason=messages.NO_ROW)
             message = self.form.read(body)
             beyond = self.guard.beyond(np.array(message.observation or (), np.float64))
@@ -110,7 +110,7 @@ class Decider:
                 if not message.time < message.time + self.guard.interval:
                     raise MessageError("time", "is too large to tell rows apart", message.time)
         except MessageError as error:
-            place = self._csv.place if self._csv.in_csv or error.about == "line" else ""
+            place = self.csv.place if self.csv.in_csv or error.about == "line" else ""
             return self.error(error.about, f"{place}{error}", error.time)
         try:
             answer = self.act(message)
@@ -137,9 +137,8 @@ class Decider:
             message = recent[place][0]
             if message == told:
                 return None if isinstance(told, Row) and self._begins_anew(told, place) else place
-            if message.time is None or message.time > when:
-                continue
-            if message.time < when or isinstance(message, Row):
+            is_older = message.time is not None and message.time < when
+            if is_older or (message.time == when and isinstance(message, Row)):
                 return None
         return None
 

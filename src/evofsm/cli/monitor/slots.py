@@ -5,12 +5,13 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterator, Sequence
+from hashlib import sha256
 from itertools import zip_longest
 from operator import itemgetter
 from statistics import fmean
 from typing import Any
 
-from evofsm.cli.monitor.messages import NO_ROW, Message, MessageError, Row
+from evofsm.cli.monitor.messages import LONGEST, NO_ROW, Message, MessageError, Row
 from evofsm.io import LogColumns, tables
 from evofsm.io.logs import Condition, units_of
 from evofsm.io.tables import Dialect, decoded, explained, is_date, is_number, is_value
@@ -127,10 +128,11 @@ class CsvRows:
         self._above: Sequence[str] = ()  # fields of the line before
         self._unread = ""  # why lines are no rows, as names are missing
         self.place, self.in_csv = "", False  #: of a line, as what is said of it begins
+        self.heard = ""  #: digest of all lines so far
 
     def read(self, line: bytes) -> bytes | dict[str, Any] | None:
         """The keys of a row, or JSON as it is; None of names of columns, a title or units."""
-        self._count += 1
+        self._count, self.heard = self._count + 1, heard_after(self.heard, line)
         self.place, self.in_csv = f"line {self._count}: ", False
         begin = line.lstrip(b"\xef\xbb\xbf \t")[:1]
         self._may_be_title &= begin != b"{" and self._count < Dialect.most_above
@@ -142,12 +144,12 @@ class CsvRows:
             return line
         self.in_csv = True
         may_name = any(name in text for name in self._variables)
-        columns = {*Dialect(text, ()).columns} if may_name else set()
-        if may_name and {*self._needs} <= columns:
+        columns = Dialect(text, ()).columns if may_name else []
+        if {*self._needs} <= {*columns}:
             self._head, self._dialect = [text], None
             self._may_be_title, self._unread = False, ""
             return None
-        if {*self._variables} & columns:  # the names of another log
+        if {*self._variables} & {*columns}:  # the names of another log
             self._head = []
         if not self._head:
             self._refuse_unnamed(text)
@@ -216,6 +218,11 @@ class CsvRows:
             raise MessageError(name, explained(text))
         number = float(plain) * self._factors[name]
         return int(number) if self._called[name] == "proposal" and number.is_integer() else number
+
+
+def heard_after(heard: str, line: bytes) -> str:
+    """The digest of a line and of those before it, however it ends."""
+    return sha256(heard.encode() + line.rstrip(b"\r\n")[:LONGEST]).hexdigest()
 
 
 def _begins_row(fields: Sequence[str]) -> bool:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,15 @@ import msgspec
 from evofsm import store
 from evofsm.cli.journal import Journal, differences
 from evofsm.cli.monitor.decider import Decider
-from evofsm.cli.monitor.messages import Taken
+from evofsm.cli.monitor.messages import MessageError, Taken
+from evofsm.cli.monitor.slots import heard_after
+from evofsm.cli.show import warn
 from evofsm.guard import AuditLog, Guard, Head
 from evofsm.guard.audit_log import NOTHING, seal
 
 _log = logging.getLogger(__name__)
 
+_FILES = 100  # so many of the latest that were read are known again
 _EVERY = 600  # messages in the journal, from which on the guard is written as an episode ends
 _PROVENANCE = "monitor"
 _NEW = -1  # the mark of a journal that was made just now
@@ -40,10 +45,12 @@ class State:
         )
         self._provenance: dict[str, Any] = {}
         self._mark = 0
-        self._memory: Mapping[str, Any] | None = None
-        self._logged: str | None = None  # head of the audit log, as the guard was saved
+        self._saved: Mapping[str, Any] = {}  # what stands beside the guard
+        self._decider: Decider  # once it has begun
         self._count = 0  # messages in the journal
         self._head = NOTHING  # of the chain that they are
+        self._files: list[str] = []  # digests of what was read of each, in the end
+        self._read: dict[str, str] = {}  # that of the file that is read, for records
 
     def guard(
         self, fresh: Callable[[], Guard], failed: Callable[[Any], bool] | None = None
@@ -66,36 +73,36 @@ class State:
                 f"{self.path} was saved with other settings: {changes}; go on with those, or name "
                 "another file"
             )
-        self._mark, self._memory = int(entry["mark"]), entry["memory"]
-        self._logged = entry.get("audit")
+        self._mark, self._saved = int(entry["mark"]), entry
         if journal.settings.get("mark") not in (self._mark, self._mark - 1):
             raise ValueError(
                 f"{journal.path} is missing or empty: rows that came after {self.path} was saved "
                 "are lost; put it back, or give the guard as --guard and name another --state"
             )
+        latest = [record["read"] for record in journal.records[-1:] if "read" in record]
+        self._files = [*entry.get("files", ()), *latest]
         self._head = Head(journal.settings["mark"], NOTHING.digest)
         for number, record in enumerate(journal.records, 2):
-            digest = self._sealed(record.get("told"))["hash"]
-            if record.get("hash", digest) != digest:  # those of before have none
+            if record.pop("hash", None) not in (self._sealed(record)["hash"], None):
                 raise ValueError(
                     f"{journal.path}, line {number} was altered: its hash is not that of what it "
-                    "says; put back what was there, or delete it from that line on, and send again "
-                    "what came since"
+                    "says; put back what was there, or delete it from that line on"
                 )
         return load()
 
     def begin(self, decider: Decider) -> int:
         """Go on where it was; returns the number of messages that were taken in again."""
-        decider.keep = lambda told: self._keep(told, decider)
-        if self._memory is None:
-            self._journal.begin_anew({"mark": self._mark})
+        self._decider, decider.keep = decider, self._keep
+        if self._saved:
+            decider.remember(self._saved["memory"])
         else:
-            decider.remember(self._memory)
-        if self._memory is None or self._journal.settings["mark"] != self._mark:
-            self._save(decider)  # what is in a journal of the mark before, is in the guard
+            self._journal.begin_anew({"mark": self._mark})
+        if not self._saved or self._journal.settings["mark"] != self._mark:
+            self._save()  # what is in a journal of the mark before, is in the guard
             return 0
-        if isinstance(log := decider.guard.audit, AuditLog) and self._logged:
-            log.told_again(Head.parse(self._logged))
+        head = self._saved.get("audit")
+        if head is not None and isinstance(log := decider.guard.audit, AuditLog):
+            log.told_again(Head.parse(head))
         self._count = len(self._journal.records)
         for record in self._journal.records:
             try:
@@ -104,50 +111,67 @@ class State:
                 _log.error("%s: a message is left out: %s", self._journal.path, error)
         return self._count
 
-    def rest(self, decider: Decider) -> None:
-        """Write the guard as it is, unless it is within an episode."""
-        if (self._count or self.failure) and not decider.rows:
-            self._try(partial(self._save, decider))
+    def pass_over(self, file: Path, decider: Decider) -> int:
+        """Pass over the lines of a file that were taken in before; returns their length [byte]."""
+        heard, known = "", 0
+        digests = {*self._files, *(record.get("read") for record in self._journal.records)}
+        with file.open("rb") as source:
+            for number, line in enumerate(source, 1):
+                heard = heard_after(heard, line)
+                known = number if heard in digests else known
+            source.seek(0)
+            for line in islice(source, known):
+                with suppress(MessageError):
+                    decider.csv.read(line.rstrip(b"\r\n"))  # names of columns, and units
+            size = source.tell()
+        if known:
+            warn(f"{file} was read before, up to line {known}: it goes on behind that")
+        self._read = {"read": decider.csv.heard}
+        return size
 
     def close(self) -> None:
-        """Force the journal onto the disk, and let others have the files; raise if all is not."""
+        """Write the guard, but within an episode; an OSError where not all could be saved."""
+        if (self._count or self.failure) and self._decider.rows == 0:
+            self._try(self._save)
         if not self.failure:
             self._try(self._journal.sync)
         self._journal.close()
         if self.failure:
-            raise ValueError(f"{self.failure}; what came since then is lost")
+            raise OSError(f"{self.failure}; what came since then is lost")
 
-    def _keep(self, told: Taken, decider: Decider) -> None:
+    def _keep(self, told: Taken) -> None:
         """Write down what was acted on, and the guard, if an episode has just ended."""
+        self._read = self._read and {"read": self._decider.csv.heard}
+        record = {"told": msgspec.to_builtins(told), **self._read}
         if not self.failure:
-            self._try(lambda: self._journal.append(self._sealed(told), sync=False))
+            self._try(lambda: self._journal.append(self._sealed(record), sync=False))
             self._count += 1
-        if decider.rows == 0 and (self.failure or self._count >= _EVERY):
-            self._try(partial(self._save, decider))
+        if self._decider.rows == 0 and (self.failure or self._count >= _EVERY):
+            self._try(self._save)
 
-    def _sealed(self, told: Any) -> dict[str, Any]:
-        """The record of a message, with the hash of it and of all before it, as in an audit log."""
-        told = msgspec.to_builtins(told)
-        _, self._head = seal({"told": told}, self._head)
-        return {"told": told, "hash": self._head.digest}
+    def _sealed(self, record: dict[str, Any]) -> dict[str, Any]:
+        """A record with the hash of it and of all before it, as in an audit log."""
+        _, self._head = seal(record, self._head)
+        return {**record, "hash": self._head.digest}
 
     def _try(self, save: Callable[[], None]) -> None:
         """Decisions matter most: what fails is said, and gone on without until an episode ends."""
+        failure = ""
         try:
             save()
         except Exception as error:
-            if not self.failure:
-                self.failure = f"{self.path} is not saved: {error}"
-                _log.error(self.failure)
+            failure = f"{self.path} is not saved: {error}"
+        if bool(failure) != bool(self.failure):
+            _log.error(failure or f"{self.path} is saved again")
+        self.failure = failure
 
-    def _save(self, decider: Decider) -> None:
+    def _save(self) -> None:
         """Write the guard, and begin a journal; the one before counts until it is written."""
-        mark = self._mark + 1
+        decider, mark = self._decider, self._mark + 1
         head = str(log.head) if isinstance(log := decider.guard.audit, AuditLog) else None
-        entry = {"mark": mark, "settings": self.settings, "memory": decider.memory(), "audit": head}
+        files = [*self._files, *self._read.values()][-_FILES:]
+        entry = {"mark": mark, "settings": self.settings, "memory": decider.memory()}
+        entry |= {"audit": head, "files": files}
         decider.guard.save(self.path, {**self._provenance, _PROVENANCE: entry})
         self._journal.begin_anew({"mark": mark})
         self._mark, self._count, self._head = mark, 0, Head(mark, NOTHING.digest)
-        if self.failure:
-            _log.warning("%s is saved again", self.path)
-            self.failure = ""

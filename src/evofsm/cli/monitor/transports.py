@@ -137,7 +137,7 @@ class Stream:
 
     def __init__(self, source: Any, sink: Any) -> None:
         # A buffer that a thread waits in would not let the process end.
-        self._source, self._sink = (getattr(file, "raw", file) for file in (source, sink))
+        self.source, self._sink = (getattr(file, "raw", file) for file in (source, sink))
         self._writing = threading.Lock()
 
     def serve(self, server: Server) -> None:
@@ -145,7 +145,7 @@ class Stream:
         server.converse(self._read, self.send)
 
     def _read(self, count: int) -> bytes:
-        while (data := self._source.read(count)) is None:  # made so by whoever shares it
+        while (data := self.source.read(count)) is None:  # made so by whoever shares it
             time.sleep(_POLL)
         return bytes(data)
 
