@@ -108,6 +108,13 @@ def test_a_file_is_taken_in_once_and_as_it_grows_what_is_new_of_it(tmp_path):
     assert answers(log, *rows)[0] == []
 
 
+def test_csv_with_a_column_twice_is_refused():
+    names, row = b"time,gap,gap,v_follower,v_leader,a_follower", b"0,1,100,20,20,0"
+    head, first = told(evofsm(lines=[names, row]))
+    assert (head["about"], first["about"], first["kind"]) == ("gap", "line", "error")
+    assert "gap is the name of several columns" in first["error"]
+
+
 def test_the_audit_log_is_good(tmp_path):
     log, state = tmp_path / "audit.jsonl", tmp_path / "state.evofsm"
     assert evofsm("--audit", log, lines=ROWS).exit_code == 0

@@ -148,6 +148,10 @@ class CsvRows:
         if {*self._needs} <= {*columns}:
             self._head, self._dialect = [text], None
             self._may_be_title, self._unread = False, ""
+            for name in self._called:
+                if columns.count(name) > 1:
+                    self._head, self._unread = [], f"{name} is the name of several columns"
+                    raise MessageError(name, "is the name of several columns")
             return None
         if {*self._variables} & {*columns}:  # the names of another log
             self._head = []
