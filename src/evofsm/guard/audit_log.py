@@ -331,7 +331,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
     def told_again(self, after: Head) -> None:
         """Write nothing twice of what followed a record, as a guard is told that once more."""
         records = Chain(self.path).records()
-        if after == NOTHING or any(after == (one.number, one.digest) for one in records):
+        if after == NOTHING or any(after.digest == record.digest for record in records):
             for _, _, _, content in records:
                 self._known += [canonical(row[:2]) for row in content.get("before", ())]
                 if content["kind"] == "decision":

@@ -132,7 +132,8 @@ class CsvRows:
 
     def read(self, line: bytes) -> bytes | dict[str, Any] | None:
         """The keys of a row, or JSON as it is; None of names of columns, a title or units."""
-        self._count, self.heard = self._count + 1, heard_after(self.heard, line)
+        self._count += 1
+        self.heard = sha256(self.heard.encode() + line[:LONGEST]).hexdigest()
         self.place, self.in_csv = f"line {self._count}: ", False
         begin = line.lstrip(b"\xef\xbb\xbf \t")[:1]
         self._may_be_title &= begin != b"{" and self._count < Dialect.most_above
@@ -190,7 +191,7 @@ class CsvRows:
 
     def _has_units(self, text: str) -> bool:
         """Whether a line below the names tells units, or the like; the first row tells the rest."""
-        self._head.append(text)
+        self._head = [*self._head, text]
         header, *below = self._head
         dialect = Dialect(header, below)
         fields = next(csv.reader([text], delimiter=dialect.separator, strict=True))
@@ -222,11 +223,6 @@ class CsvRows:
             raise MessageError(name, explained(text))
         number = float(plain) * self._factors[name]
         return int(number) if self._called[name] == "proposal" and number.is_integer() else number
-
-
-def heard_after(heard: str, line: bytes) -> str:
-    """The digest of a line and of those before it, however it ends."""
-    return sha256(heard.encode() + line.rstrip(b"\r\n")[:LONGEST]).hexdigest()
 
 
 def _begins_row(fields: Sequence[str]) -> bool:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from copy import copy
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from evofsm import store
 from evofsm.cli.journal import Journal, differences
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.messages import MessageError, Taken
-from evofsm.cli.monitor.slots import heard_after
 from evofsm.cli.show import warn
 from evofsm.guard import AuditLog, Guard, Head
 from evofsm.guard.audit_log import NOTHING, seal
@@ -113,21 +112,19 @@ class State:
 
     def pass_over(self, file: Path, decider: Decider) -> int:
         """Pass over the lines of a file that were taken in before; returns their length [byte]."""
-        heard, known = "", 0
         digests = {*self._files, *(record.get("read") for record in self._journal.records)}
+        csv, size, behind = copy(decider.csv), 0, 0
         with file.open("rb") as source:
-            for number, line in enumerate(source, 1):
-                heard = heard_after(heard, line)
-                known = number if heard in digests else known
-            source.seek(0)
-            for line in islice(source, known):
+            for line in source:
+                size += len(line)
                 with suppress(MessageError):
-                    decider.csv.read(line.rstrip(b"\r\n"))  # names of columns, and units
-            size = source.tell()
-        if known:
-            warn(f"{file} was read before, up to line {known}: it goes on behind that")
+                    csv.read(line.removesuffix(b"\n").removesuffix(b"\r"))
+                if csv.heard in digests:  # with what it knows of names and units
+                    decider.csv, behind = copy(csv), size
+        if behind:
+            warn(f"{file} was read before, up to {decider.csv.place}it goes on behind that")
         self._read = {"read": decider.csv.heard}
-        return size
+        return behind
 
     def close(self) -> None:
         """Write the guard, but within an episode; an OSError where not all could be saved."""
