@@ -324,14 +324,15 @@ class Decider:
             return call()
 
     def _is_alarm(self, revision: Revision) -> bool:
-        """Whether the proposal is not kept, or too risky.
+        """Whether the proposal is not kept, or too risky; as it was while that is not known.
 
         Cars brake in proportion: an alarm begins where a proposal is not kept, but for a little,
         and lasts until its risk is tolerable.
         """
         reviser: Any = self.guard.reviser
         if not self._drives:
-            return is_spoken(reviser, revision)
+            is_unknown = self.rows > 1 and math.isnan(revision.risk_proposed)
+            return is_spoken(reviser, revision) or (is_unknown and self._alarm)
         if self.rows > 1 and self._alarm:
             return bool(reviser.refuses or revision.risk_proposed > reviser.tolerance)
         wish = make_usable(Proposal(revision.proposed), reviser.actions, reviser.fallback).action
