@@ -124,10 +124,12 @@ _CARS = """<routes><vTypeDistribution id="mix"><vType id="calm" probability="{ca
 departLane="best" departSpeed="max"/></routes>"""
 
 
-def write_simulation(world: str, drivers: str, seed: int, folder: Path) -> list[str]:
-    """Write, or copy, its files; what SUMO is started with."""
+def write_simulation(
+    world: str, drivers: str, seed: int, folder: Path, step: float = 0.0
+) -> list[str]:
+    """Write, or copy, its files; what SUMO is started with. Without a step it is the usual one."""
     kind = {"default": "", "hasty": _HASTY, "late": _HASTY + _LATE}[drivers]
-    usual = ["--step-length", "0.1", "--collision.action", "warn"]
+    usual = ["--step-length", f"{step or 0.1}", "--collision.action", "warn"]
     if world in _ROADS:
         limits, lanes, metres, period, end = _ROADS[world]
         (folder / "road.net.xml").write_text(_net(limits, lanes, metres))
@@ -141,13 +143,13 @@ def write_simulation(world: str, drivers: str, seed: int, folder: Path) -> list[
         cars = cars.replace(' actionStepLength="1.0"', _LATE if drivers == "late" else "")
         cars = cars if kind else cars.replace('type="hasty"', 'type="normal"')
         (folder / "grid.rou.xml").write_text(cars)
-        return ["-c", str(file)]
+        return ["-c", str(file), *usual[: 2 * bool(step)]]
     game = demos()
     assert game is not None
     shutil.copytree(game / world, folder / world)
     for name in (f"{world}.sumocfg", "input_additional.add.xml"):
         shutil.copy(game / name, folder)  # what it writes is not written there
-    return ["-c", f"{folder}/{world}.sumocfg"]
+    return ["-c", f"{folder}/{world}.sumocfg", *usual[: 2 * bool(step)]]
 
 
 def simulate(
@@ -157,6 +159,7 @@ def simulate(
     seed: int,
     share: str = "all",
     seconds: float = 180.0,
+    step: float = 0.0,
     **settings: Any,
 ) -> dict[str, Any]:
     """The row of one simulation, of which a share of the cars is looked at, or guarded.
@@ -167,7 +170,7 @@ def simulate(
 
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "sumo.log"
-        started = write_simulation(world, drivers, seed, Path(folder))
+        started = write_simulation(world, drivers, seed, Path(folder), step)
         quiet = ["--no-step-log", "true", "--no-warnings", "false", "--verbose", "false"]
         quiet += ["--duration-log.statistics", "false", "--seed", str(seed)]
         with _stderr_to(log):
@@ -251,6 +254,7 @@ class Traffic(Study):
     worlds: Annotated[str, Option(help="Networks: drop, road, grid, and demos of SUMO.")] = (
         ",".join((*DEMOS, *OWN))
     )
+    step: Annotated[float, Option(min=0.0, help="Of SUMO [s]; 0: as each world has it.")] = 0.0
     seconds: tuple[float, float] = (180.0, 450.0)  # of calm and of risky traffic [s]
     regains: tuple[float, ...] = (1.0, 2.0, 3.0, 5.0)
     episodes: tuple[int, int] = (60, 200)  # of cut_in: to learn from, and held out
@@ -276,7 +280,8 @@ class Traffic(Study):
         kinds += [(world, each, risky) for world in there if world in OWN for each in DRIVERS[1:]]
         tasks, curve = [], []
         for k, (world, drivers, seconds) in product(range(self.seeds), kinds):
-            one = partial(simulate, world, drivers, seed=self.seed + k, seconds=seconds)
+            how = {"seed": self.seed + k, "seconds": seconds, "step": self.step}
+            one = partial(simulate, world, drivers, **how)
             # As many look at it alone as guarded: in `ramp`, who merges first hangs on that.
             for policy, share in product((ALONE, OURS), SHARES):
                 tasks.append(partial(one, policy, share=share))

@@ -133,10 +133,13 @@ def test_a_gap_that_is_not_safe_is_regained_in_proportion():
 
 
 def test_one_brakes_no_harder_than_who_is_behind_survives():
-    one = Object("ahead", 14.0, 0.0, 15.0, ax=-8.0)
-    alone, followed = (decide(scene(one, *others)) for others in ([], [behind(8.0, 15)]))
+    one = Object("ahead", 14.0, 0.0, 15.0, ax=-4.0)
+    alone, followed = (decide(scene(one, *others)) for others in ([], [behind(5.0, 15)]))
     assert alone.executed < followed.executed < 0.0
     assert "who is behind survives" in followed.reason
+    one = one._replace(ax=-8.0)  # whom one would hit, as it goes on like that
+    alone, followed = (decide(scene(one, *others)) for others in ([], [behind(5.0, 15)]))
+    assert followed.executed == alone.executed < -4.5
 
 
 def test_what_is_sure_ahead_weighs_more_than_who_is_behind():

@@ -160,8 +160,8 @@ class TrafficRisk(ActionJudge):
     -----
     Chosen is the action in proportion (`LatentRisk.choose`) that the car behind survives. Where
     none avoids a collision that is foreseen, it is the least risky ahead of those that the car
-    behind survives; where a leader who merely keeps its speed would be hit then, the softest that
-    avoids it, or the hardest.
+    behind survives; where a leader who goes on as it does, at its speed or braking, would be hit
+    then, the softest that avoids it, or the hardest.
 
     Examples
     --------
@@ -236,7 +236,8 @@ class TrafficRisk(ActionJudge):
         arguments = options, judged.risk, tolerances, self.ahead.comfort, avoids & bearable, regains
         if (choice := in_proportion(*arguments)) is not None:
             return choice
-        if bearable.any() and judged.critical[bearable].max() > 0.0:
+        braking = max((pair.braking for pair in pairs if pair.role is not Role.BEHIND), default=0.0)
+        if bearable.any() and judged.critical[bearable].max() > braking:
             # Of several that are survived as well the hardest braking.
             rank = np.lexsort((options, -judged.critical, ~bearable))
             return int(rank[0]), "nothing can, the least risky that who is behind survives"
