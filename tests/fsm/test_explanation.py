@@ -34,8 +34,8 @@ def by_hand(states, I, starts, failures, horizon, n):
         taken = {(I[row], states[row], row) for row in range(begin, end - 1) if I[row] >= 0}
         for action, state in {(a, s) for a, s, _ in taken}:
             counts["tried"][action, state] += 1
-            followed = [row + 1 for a, s, row in taken if (a, s) == (action, state)]
-            soon = [end - 1 - row <= horizon for row in followed]
+            rows = [row for a, s, row in taken if (a, s) == (action, state)]
+            soon = [end - 1 - row <= horizon for row in rows]
             counts["failed_after"][action, state] += failed and any(soon)
     return counts
 
@@ -194,3 +194,15 @@ def test_either_a_situation_or_an_observation_is_explained():
         model.explain(observation=[0.0, 1.0])
     with pytest.raises(ValueError, match="2 observations; one"):
         model.explain(observation=[[0.0], [1.0]])
+
+
+def test_what_came_after_an_action_is_part_of_what_came_here():
+    machine = EvolvingFSM(2, rule=Novelty(radius=1.0))
+    machine.observe([0.0, 0.0])
+    for _ in range(20):  # in which nobody saw whole where it is taken
+        machine.start_episode()
+        machine.observe([0.0, np.nan], partial=True)
+        machine.act(1)
+        machine.observe([10.0, 0.0], failed=True)
+    text = machine.model().explain(0, action=1).text
+    assert "0 of 1 (at most 74 %) failed later on; none of them is known to have tried a(2)" in text

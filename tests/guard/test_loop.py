@@ -96,3 +96,13 @@ def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
     assert LatentRisk.load(tmp_path / "risk.evofsm").brakes.decel == pytest.approx(6.0)
     reviser.mode = Mode.ACT
     assert braked(7.0) == pytest.approx(6.0)  # its own braking is told from what it commands
+
+
+@pytest.mark.parametrize("executed", [math.nan, 99.0, None, "x"])
+def test_what_is_no_action_is_not_executed_whoever_says_so(executed):
+    class Odd(Unrevised):
+        def revise(self, situation, proposal):
+            return super().revise(situation, proposal)._replace(executed=executed)
+
+    with pytest.raises(ValueError, match=r"Odd would execute .* none of IntervalActions"):
+        Guard.of(Odd(ACTIONS), interval=0.25).decide([9.0, 20.0, 20.0], 1.0)

@@ -81,8 +81,8 @@ def drive(
     With --out, the same command goes on where it was stopped, whatever stopped it, and comes to the
     same result; with more --episodes, it goes on to these.
 
-    A SUMO configuration (my.sumocfg) is run as it is, once, with guards in the cars that --vehicles
-    names; of all else only --mode (act or shadow), --tolerance and --json hold then.
+    A SUMO configuration (my.sumocfg) is run as it is, with guards in the cars that --vehicles names
+    and, to act, alone before; of all else only --mode (act or shadow), --tolerance and --json hold.
     """
     from evofsm.cli.show import facts, print_json, progress, say, show, warn
 

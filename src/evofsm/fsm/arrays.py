@@ -52,7 +52,7 @@ VARIABLE = np.dtype([(name, np.float64) for name in ("first", "latest", "mean")]
 #: Of an action: the place of its matrix, and how many transitions were learnt with it.
 ACTION = np.dtype([("place", np.int64), ("uses", np.float64)])
 #: Of an action in a state: episodes that tried it, those of them that failed soon after, and the
-#: clock one observation after the latest time.
+#: clock of the visit in which it was tried latest.
 TRY = np.dtype([(name, np.float64) for name in ("tried", "failed_after", "latest_try")])
 
 

@@ -151,16 +151,20 @@ def _tick(now: Any) -> None:
 
 @inner_kernel
 def _count_decision(learnt: Learnt, place: int, n: int, failed: bool) -> None:
-    """Count that the pending action was taken from the belief, and whether it led to failure."""
+    """Count that the pending action was taken from the belief, and whether it led to failure.
+
+    An episode tried it in a state that it visited: not where nothing was seen whole.
+    """
     now, belief = learnt.now[0], learnt.belief
     for i in range(lanes(n)):
         learnt.decisions[place, i] += belief[i]
     if failed:
         for i in range(n):
             learnt.failures[place, i] += belief[i]
-    tries = learnt.tries[place, now.state]
-    tries.tried += tries.latest_try < now.began
-    tries.latest_try = now.clock
+    tries, visit = learnt.tries[place, now.state], learnt.states[now.state].latest_visit
+    if visit >= now.began:
+        tries.tried += tries.latest_try < now.began
+        tries.latest_try = visit
 
 
 @rare_kernel

@@ -7,6 +7,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache, partial
 from io import BytesIO
 from typing import Any, NamedTuple, Protocol, Self, SupportsFloat
@@ -30,7 +31,10 @@ from evofsm.guard.actions import (
     Choices,
     checked_mask,
     fixed,
+    is_usable,
     no_action,
+    put_into,
+    same_action,
 )
 from evofsm.guard.api import (
     BELIEF_TOLERANCE,
@@ -634,6 +638,8 @@ class Guard:
             guard with an audit log, which could not be replayed then.
         """
         revision = self.reviser.revise(situation, proposal)
+        if not isinstance(self.reviser, ActionReviser):  # whose actions are of the set
+            self._refuse_unfit(revision.executed)
         if self.explaining or self.audit is not None:
             revision = self._explained(situation, revision)
         if self.audit is not None:
@@ -643,6 +649,15 @@ class Guard:
             choice, advice = int(revision.executed), int(revision.advised)
             revision = revision._replace(executed=choice, advised=advice)
         return revision
+
+    def _refuse_unfit(self, action: Any) -> None:
+        """Raise for what somebody's own reviser would execute, if that is no action of the set."""
+        with suppress(TypeError, ValueError):
+            is_fit = is_usable(self.actions, action)
+            if is_fit and same_action(put_into(self.actions, action), action):
+                return
+        name = type(self.reviser).__name__
+        raise ValueError(f"{name} would execute {action!r}, which is none of {self.actions}")
 
     def _take_in(self, situation: Situation, executed: Action) -> None:
         """Machine and judge learn what was executed."""
