@@ -1,5 +1,6 @@
 """State rules: what each makes of observations, and what holds for all of them."""
 
+from dataclasses import dataclass
 from fractions import Fraction
 from random import Random
 
@@ -90,6 +91,16 @@ def test_as_many_scales_as_variables(snapshot):
             learn([0.0, 1.0])
     assert snapshot(machine) == before
     assert machine.observe([0.0, 1.0, 2.0]).event == Event.CREATED
+
+
+def test_a_scale_of_a_rule_of_ones_own_is_positive():
+    @dataclass(frozen=True)
+    class Flat(Paper):
+        scales = (0.0, 1.0)
+
+    register_rule("flat", Flat)
+    with pytest.raises(ValueError, match="a scale is 0.0; it must be a positive"):
+        EvolvingFSM(1, rule=Flat()).observe([0.0, 1.0])
 
 
 @pytest.mark.parametrize(

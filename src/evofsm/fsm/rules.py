@@ -143,7 +143,7 @@ def rule_named(name: object) -> Any:
 
 def weights_of(rule: StateRule, m: int) -> Floats:
     """(m,) 1 / scale of each variable."""
-    scales = np.array(rule.scales or [1.0] * m)
+    scales = np.array([positive("a scale", scale) for scale in rule.scales or [1.0] * m])
     if len(scales) != m:
         raise ValueError(f"observation has {m} variables, but there are {len(scales)} in {rule}")
     return 1.0 / scales
