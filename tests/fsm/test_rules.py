@@ -99,7 +99,7 @@ def test_a_scale_of_a_rule_of_ones_own_is_positive():
         scales = (0.0, 1.0)
 
     register_rule("flat", Flat)
-    with pytest.raises(ValueError, match="a scale is 0.0; it must be a positive"):
+    with pytest.raises(ValueError, match=r"a scale is 0.0; it must be a positive"):
         EvolvingFSM(1, rule=Flat()).observe([0.0, 1.0])
 
 
