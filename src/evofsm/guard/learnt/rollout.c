@@ -8,9 +8,8 @@
   /* Observations of the last step, the oldest first, and what was done there. */
   double past[EVOFSM_STRIDE][EVOFSM_VARIABLES], acted[EVOFSM_STRIDE][EVOFSM_NUMBERS];
   int n_past, is_placed;         /* how many there are; and whether one knows where one is now */
-  int n_blind, lacks;            /* observations before that lack something, and whether this */
-  int ranks[EVOFSM_BACKUPS];     /* backups, those first that passed last */
-  int done;                      /* steps of rollouts in this search */
+  int n_blind, lacks;            /* observations on end that lack something; whether this one does */
+  int ranks[EVOFSM_BACKUPS], done; /* backups, those first that passed last; steps of a search */
   /* Room of a rollout. */
   double z[EVOFSM_VARIABLES][EVOFSM_LANES], change[EVOFSM_VARIABLES][EVOFSM_LANES];
   double move[EVOFSM_VARIABLES][EVOFSM_LANES];
@@ -469,10 +468,10 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   memcpy(s->best, s->proposal, sizeof s->best);
   situate(s);
   is_known = s->is_placed && !(s->lacks && s->n_blind + 1 >= BLIND);
+  out->evidence = is_known ? EVIDENCE : 0.0;
   if (!is_known) {
     out->reason = EVOFSM_NOTHING_SEEN;
     out->risk_proposed = out->risk_executed = out->risk_low = out->risk_high = out->seen = NAN;
-    out->evidence = 0.0;
   }
   if (!s->is_placed) {
     return;
@@ -494,15 +493,13 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   } else if (ALLOWED > 0) {
     out->unsurvived = unsurvived = foresee(s, proposal);
   }
-  if (!is_known) {
-    return;
-  }
   unsurvived = ACTS ? unsurvived : out->unsurvived;
-  out->evidence = EVIDENCE;
-  out->risk_proposed = risks[1 + out->unsurvived][0];
-  out->risk_executed = risks[1 + unsurvived][0];
-  out->risk_low = risks[1 + unsurvived][1];
-  out->risk_high = risks[1 + unsurvived][2];
+  if (is_known) {
+    out->risk_proposed = risks[1 + out->unsurvived][0];
+    out->risk_executed = risks[1 + unsurvived][0];
+    out->risk_low = risks[1 + unsurvived][1];
+    out->risk_high = risks[1 + unsurvived][2];
+  }
 }
 
 /* LearntRisk.follow: keep up with what is executed, and what is expected then, undisturbed. */
