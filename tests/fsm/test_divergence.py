@@ -41,14 +41,6 @@ def test_it_is_symmetric_between_0_and_1_and_0_of_itself(pair):
     assert jensen_shannon(p, p) == 0.0
 
 
-def test_one_distribution_is_broadcast_against_many():
-    many = np.array([[[1.0, 0.0], [0.5, 0.5]], [[0.0, 1.0], [0.9, 0.1]]])
-    divergence = jensen_shannon(many, [1.0, 0.0])
-    assert divergence.shape == (2, 2)
-    for i, j in np.ndindex(2, 2):
-        assert divergence[i, j] == jensen_shannon(many[i, j], [1.0, 0.0])
-
-
 @pytest.mark.parametrize(
     ("p", "q", "words"),
     [

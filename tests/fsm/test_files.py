@@ -93,7 +93,6 @@ MACHINES = [
     ("n_actions", 10**6, r"has shape \(3,\), not \(1000000,\)"),
     ("failures_told", 2, "failures_told of 2"),
     ("rule", {"name": "magic"}, "rule is .*magic.*; it must be one of paper, novelty"),
-    ("rule", None, "rule"),
     ("rule", {"name": "novelty", "gain": 1.0}, "gain"),
     ("rule", {"name": "novelty", "scales": [1.0]}, "scales"),
 ]
@@ -104,7 +103,6 @@ MODELS = [
     ("actions", {"low": -0.5, "high": 1.0, "width": 1e-12}, "1 to 100,000 intervals"),
     ("failures_told", {}, "failures_told is {}; it must be of type bool"),
     ("names", {}, r"names is {}; it must be of type list\[str\]"),
-    ("units", ["m", 1], r"units is \['m', 1\]"),
     ("names", ["gap"], r"names are \('gap',\), but there are 2 variables"),
 ]
 

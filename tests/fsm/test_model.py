@@ -68,7 +68,6 @@ def test_parts_that_do_not_fit_each_other_are_refused(change, words):
     ("z", "words"),
     [
         ([1.0], r"z has shape \(1,\); a row needs 2 variables"),
-        ([[1.0, 2.0, 3.0]], r"z has shape \(1, 3\)"),
         (np.zeros((1, 1, 2)), r"z has shape \(1, 1, 2\)"),
         ([np.nan, 0.0], "variable 0: nan cannot be used"),
         ([0.0, -np.inf], "variable 1: -inf"),
