@@ -374,9 +374,6 @@ def test_what_a_search_finds_outside_is_put_into_the_set():
     assert guard.decide([0.0, 0.0], [0.0, 2.0]).executed.tolist() == [-1.0, 9.0]
 
 
-# -- What a judge is told -----------------------------------------------------------------------
-
-
 # -- What is refused ----------------------------------------------------------------------------
 
 
@@ -398,6 +395,13 @@ def test_what_a_search_finds_outside_is_put_into_the_set():
         ({"low": -1.0, "high": 1.0, "mode": "on"}, "'on' is not a valid Mode"),
         ({"low": -1.0, "high": 1.0, "audit": "log.jsonl"}, "has no method decided"),
         ({"low": -1.0, "high": 1.0, "judge": None, "names": "ab"}, "names is 'ab'; it must be"),
+        ({"low": [0.0, 0.0], "high": [1.0], "judge": None}, "low has 2 components and high has 1"),
+        ({"n_actions": 0, "judge": None}, "n_actions"),
+        ({"n_actions": 10**9, "judge": None}, "takes at most 1,000 actions"),
+        (
+            {"n_actions": 2, "judge": None, "horizon": 1e9},
+            "10,000,000,000 decisions of 0.1 s; .* at most 10,000",
+        ),
     ],
 )
 def test_what_makes_no_guard_is_refused(settings, message):

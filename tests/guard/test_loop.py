@@ -15,7 +15,6 @@ from evofsm.driving.world import COMMANDED, SPEED
 from evofsm.fsm.actions import IntervalActions
 from evofsm.guard.api import Proposal
 from evofsm.guard.guard import Guard
-from evofsm.guard.loop import run_episode
 from evofsm.guard.reviser import ActionReviser, Mode
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
@@ -64,16 +63,10 @@ def test_a_controller_that_fails_once_is_driven_on_without(line, caplog):
 
 
 def test_an_observation_of_another_size_is_refused_with_both_numbers():
-    class Grows:
-        def reset(self, **_):
-            return np.zeros(3), {}
-
-        def step(self, action):
-            return np.zeros(4), 0.0, False, False, {}
-
-    episode = run_episode(Grows(), Guard(-1.0, 1.0, interval=0.1), lambda z: 0.5)
+    guard = Guard(-1.0, 1.0, interval=0.1)
+    guard.decide(np.zeros(3), 0.5)
     with pytest.raises(ValueError, match="observation has 4 variables; it must have 3"):
-        list(episode)
+        guard.decide(np.zeros(4), 0.5)
 
 
 def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
