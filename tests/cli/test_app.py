@@ -62,6 +62,12 @@ def test_help_loads_nothing_heavy(command):
         (["inspect", "x", "--colour", "red"], "No such option: --colour"),
         (["drive", "paper", "--episodes", "0"], "Invalid value for '--episodes'"),
         (["drive", "paper", "--world", "moon"], "'moon' is not one of 'sumo', 'kinematic'"),
+        (["drive", "nowhere"], "nowhere"),
+        (["drive", "paper", "--reviser", "magic"], "magic"),
+        (["drive", "emergency+rain"], "rain"),
+        (["drive", "paper", "--frozen", "nothing-here"], "nothing-here"),
+        (["drive", "paper", "--tolerance", "2"], "tolerance"),
+        (["drive", "paper", "--mcap", "a", "--workers", "2"], "workers send no decisions"),
     ],
 )
 def test_a_command_that_is_called_wrongly_says_so_in_one_line(refused, words, says):

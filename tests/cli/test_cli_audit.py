@@ -2,29 +2,20 @@ import json
 import re
 import tracemalloc
 
-import numpy as np
 import pytest
 
-from evofsm.driving.judge import LatentRisk
-from evofsm.fsm.actions import IntervalActions
-from evofsm.guard.api import Proposal
-from evofsm.guard.audit_log import AuditLog
-from evofsm.guard.guard import Guard
-from evofsm.guard.reviser import ActionReviser
-
-ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
+from evofsm.driving import guard_for_cars
+from evofsm.guard import AuditLog, Guard
 
 
 @pytest.fixture
 def log(tmp_path):
     """A log of ten records, seven of them decisions; and its head."""
-    risk = LatentRisk(ACTIONS.low)
     with AuditLog(tmp_path / "log.jsonl") as written:
-        guard = Guard.of(ActionReviser(risk, ACTIONS), judge=risk, interval=0.25, audit=written)
+        guard = guard_for_cars(-2.5, 2.5, audit=written)
         for step in range(7):
-            seen = np.array([20.0 - step, 15.0 - 0.6 * step, 11.0])
-            guard.revise(guard.recognise(seen, 0.25 * step), Proposal(1.0))
-        guard.end(failed=False, observation=np.array([13.0, 10.0, 11.0]))
+            guard.decide([20.0 - step, 15.0 - 0.6 * step, 11.0], 1.0)
+        guard.end(failed=False, observation=[13.0, 10.0, 11.0])
     return written.path, str(written.head)
 
 

@@ -93,21 +93,6 @@ def test_a_judge_that_is_given_nothing_but_failures_is_driven_saved_and_gone_on_
     assert "of the judge 'learnt', not of 'kinematic'" in wrong
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (("nowhere",), "nowhere"),
-        (("emergency", "--reviser", "magic"), "magic"),
-        (("emergency+rain",), "rain"),
-        (("emergency", "--frozen", "nothing-here"), "nothing-here"),
-        (("emergency", "--tolerance", "2"), "tolerance"),
-        (("emergency", "--mcap", "a", "--workers", "2"), "workers send no decisions"),
-    ],
-)
-def test_what_cannot_be_driven_is_refused_in_one_line(refused, words, says):
-    assert says in refused("drive", *words, "--episodes", 1)
-
-
 # -- Whatever stops it ----------------------------------------------------------------------------
 
 

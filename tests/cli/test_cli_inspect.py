@@ -4,20 +4,19 @@ import json
 
 import pytest
 
-from evofsm import EvolvingFSM, Guard
-from evofsm.driving import Unrevised, guard_for_family, learners_of, load_family, teach
+from evofsm import Guard
+from evofsm.driving import guard_for_family, load_family, teach
+from evofsm.guard import Mode
 
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
     """What unrevised driving into collisions has taught."""
     family, folder = load_family("emergency"), tmp_path_factory.mktemp("learnt")
-    machine, risk = learners_of(guard_for_family(family))
-    reviser = Unrevised(family.actions)
-    guard = Guard.of(reviser, interval=family.interval, machine=machine, judge=risk)
+    guard = guard_for_family(family, mode=Mode.OFF)
     teach(guard, [family.draw(0, index, split="train") for index in range(6)])
     guard.save(folder / "guard.evofsm", {"family": "emergency"})
-    return folder, machine
+    return folder, guard.machine
 
 
 def test_every_state_is_explained_with_the_words_of_its_family(evofsm, saved):
@@ -40,6 +39,8 @@ def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
     assert one["action"]["failed"] == machine.failed_after[11, one["state"]]
     assert "a(12)" in one["text"]
     assert "m/s²" in one["text"]
+    far = evofsm("explain", folder, "--observation", "900,14,14", "--json").stdout
+    assert json.loads(far)["situations"][0]["never_seen"]
 
 
 @pytest.mark.parametrize(
@@ -55,15 +56,6 @@ def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
 )
 def test_what_is_not_there_is_refused_in_one_line(refused, saved, arguments, says):
     assert says in refused("explain", saved[0], *arguments)
-
-
-def test_of_a_machine_it_is_said_that_failures_are_untold_and_what_was_never_seen(evofsm, tmp_path):
-    machine = EvolvingFSM(1)
-    machine.learn_many([[0.0], [5.0]] * 20, [0] * 40, range(0, 40, 2))
-    machine.save(tmp_path / "machine")
-    asked = "explain", tmp_path / "machine", "--observation", 500
-    assert "Never seen" in evofsm(*asked).stdout
-    assert json.loads(evofsm(*asked, "--json").stdout)["situations"][0]["never_seen"] is True
 
 
 def test_what_a_guard_has_learnt_is_said_and_drawn(evofsm, tmp_path):

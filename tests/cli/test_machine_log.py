@@ -100,8 +100,7 @@ def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, wri
         assert "refused" not in live
 
 
-def test_units_of_names_are_part_of_the_command_that_is_proposed(evofsm, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_units_of_names_are_part_of_the_command_that_is_proposed(evofsm):
     rows = (f"{100 * k},{63 + k * k % 19},{k % 70},{k % 3}" for k in range(300))
     Path("a.csv").write_text("\n".join(["t_ms,ego_kmh,way,acc", *rows, ""]))
     first = evofsm("learn", "a.csv").stdout
@@ -315,25 +314,6 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     text = evofsm("monitor", "rows.jsonl", *begun, "--text").stdout
     for one, fault in zip(found, [*faults, "rows are JSON, one per line"], strict=True):
         assert fault in one["error"] in text
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--resample", "often"], "--resample is 'often'; write how long, such as 30s"),
-        (["--resample", "30s,Drehzahl=most"], "NAME=HOW with one of mean, last, max, min"),
-        (["--hole", "5 weeks"], "--hole is '5 weeks'; write how long"),
-        (["--hole", "1min", "--dt", "1"], "--hole goes by a clock, and --dt stands in for one"),
-        (["--where", "Drehzahl>"], "--where is 'Drehzahl>'; write a column of truth values"),
-        (["--where", "Drehzahl>9999", "--resample", "30s"], "and --where Drehzahl>9999 must hold"),
-        (["--action", "", "--tolerance", "0.1"], "--false-a-day counts"),
-        (["--false-a-day", "1"], "--false-a-day is of alarms where nobody"),
-    ],
-)
-def test_what_cannot_be_done_with_rows_is_refused(refused, written, options, message):
-    path = written()
-    asked = "--observe", BEARING, "--action", "Drehzahl", "--time", "Zeit"
-    assert message in refused("learn", path, *asked, "--failed", "Status==Störung", *options)
 
 
 def sent(frame, path):
