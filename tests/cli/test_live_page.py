@@ -7,29 +7,26 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
 import pytest
 
 pytest.importorskip("websockets")
 pytest.importorskip("playwright.sync_api")
 
 from playwright import sync_api as playwright
+from typer.testing import CliRunner
 
-from evofsm.cli.foreseen import guard_where_nobody_acts
-from evofsm.cli.learning import episodes_read, learn_chunk
+from evofsm import Guard
+from evofsm.cli.app import application
 from evofsm.cli.options import reading_of
 from evofsm.cli.watch.session import (
     OnRoads,
     Session,
     learn_first,
     read_simulated,
-    system_machine,
     watched_guard,
     watched_log,
 )
 from evofsm.driving import KinematicWorld, load_family
-from evofsm.fsm import IntervalActions, Labels
-from evofsm.io.logs import Noted
 
 PAPER = load_family("paper")
 DISC = str(Path(__file__).parents[2] / "examples/watched_disc.py")
@@ -84,15 +81,13 @@ def logged():
         path = Path(folder) / "log.csv"
         lines = ["run,t,a variable of a long name,load", *(",".join(map(str, r)) for r in rows)]
         path.write_text("\n".join(lines))
-        failed = '"a variable of a long name">78'
-        reading = reading_of("a variable of a long name,load", "", "t", failed=failed)
-        episodes = [*episodes_read(str(path), reading, Noted(), dated=True)]
-        labels = Labels(names=reading.columns.observe.names)
-        machine = system_machine(1, np.concatenate([part.observations for part in episodes]))
-        for part in episodes:
-            learn_chunk(machine, part, IntervalActions(0.0, 1.0, 1.0))
-        guard = guard_where_nobody_acts(episodes, labels, None, 0.0, None, machine)
-        with watched_log(str(path), reading, guard=guard) as opened:
+        read = {"observe": "a variable of a long name,load", "action": "", "time": "t"}
+        read["failed"] = '"a variable of a long name">78'
+        words = [word for name, value in read.items() for word in (f"--{name}", value)]
+        learn = ["learn", str(path), *words, "--guard", f"{folder}/guard"]
+        assert CliRunner().invoke(application(), learn).exit_code == 0
+        guard = Guard.load(f"{folder}/guard")
+        with watched_log(str(path), reading_of(**read), guard=guard) as opened:
             yield opened
 
 
