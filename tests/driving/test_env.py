@@ -8,6 +8,7 @@ import pytest
 gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
+from tests.guard.test_gym import drive  # noqa: E402
 
 from evofsm.driving.env import ID, CarFollowing  # noqa: E402
 from evofsm.driving.family import load_family  # noqa: E402
@@ -15,16 +16,6 @@ from evofsm.driving.scenarios import Behind  # noqa: E402
 
 NAME = f"evofsm.driving.env:{ID}"
 INFO = {"time", "gap", "distance", "failed", "rear_ended", "split", "index"}
-
-
-def drive(env, policy, **reset):
-    """What reset and every step answered, in an episode."""
-    answers = [env.reset(**reset)]
-    over = False
-    while not over:
-        answers.append(env.step([policy(answers[-1][0], answers[-1][-1])]))
-        over = answers[-1][2] or answers[-1][3]
-    return answers
 
 
 # Accelerations are in m/s² here; gymnasium.wrappers.RescaleAction gives the range that is advised.
@@ -74,7 +65,7 @@ def test_a_step_is_an_interval_and_pays_the_distance():
 def test_a_collision_terminates_costs_and_is_a_failure():
     env = CarFollowing(collision_cost=100.0)
     *before, (observation, reward, terminated, truncated, info) = drive(
-        env, lambda *_: 2.5, options={"index": 0}
+        env, lambda *_: [2.5], options={"index": 0}
     )
     assert (terminated, truncated) == (True, False)
     assert (info["failed"], info["rear_ended"]) == (True, False)
@@ -84,7 +75,7 @@ def test_a_collision_terminates_costs_and_is_a_failure():
 
 
 def test_the_end_of_time_truncates():
-    answers = drive(CarFollowing(), lambda *_: 0.0, options={"index": 0})
+    answers = drive(CarFollowing(), lambda *_: [0.0], options={"index": 0})
     _, reward, terminated, truncated, info = answers[-1]
     assert (terminated, truncated, info["failed"], reward) == (False, True, False, 0.0)
     assert info["time"] == pytest.approx(35.0, abs=0.02)
@@ -100,7 +91,7 @@ def test_being_rear_ended_terminates_and_costs_but_is_no_failure():
     env = CarFollowing(replace(family, make=followed_closely))
 
     def stops_dead(observation, info):
-        return 2.5 if info["time"] < 3.0 else -2.5
+        return [2.5 if info["time"] < 3.0 else -2.5]
 
     ends = [drive(env, stops_dead, options={"index": index})[-1] for index in range(8)]
     rear_ended = [end for end in ends if end[-1]["rear_ended"]]
@@ -122,7 +113,7 @@ def test_there_is_no_step_without_an_episode():
     env = CarFollowing()
     with pytest.raises(RuntimeError, match="reset"):
         env.step([0.0])
-    drive(env, lambda *_: 2.5, options={"index": 0})
+    drive(env, lambda *_: [2.5], options={"index": 0})
     with pytest.raises(RuntimeError, match="reset"):
         env.step([0.0])
 
