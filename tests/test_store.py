@@ -204,10 +204,6 @@ HARMFUL = {
     "too large": (array_with("values", shape=[1 << 60, 2]), "values does not stand where"),
     "negative sizes": (array_with("values", shape=[-5, -2]), r"claims to be of shape \[-5, -2\]"),
     "turned": (array_with("values", shape=[2, 5]), "shape"),
-    "one more array": (
-        lambda told, entries, _: entries.update(extra=entries["note"] | {"shape": [0]}),
-        "extra does not stand where it should",
-    ),
     "a path": (lambda told, entries, _: entries.update({"../x": entries.pop("note")}), "'../x'"),
     "above the most": ({"ranks": 1 << 40}, r"ranks of 1\.09951e\+12 .* must lie between 0"),
     "a boolean of 2": (chosen_2, "neither true nor false"),

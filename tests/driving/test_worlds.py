@@ -91,7 +91,6 @@ def test_a_controller_that_proposes_no_number_is_named(wrong):
         ("body", {"lowest": 3.0, "highest": 2.0}, "body's bounds"),
         ("sensors", {"delay": -0.1}, "delay"),
         ("driver", {"accel": 0.0}, "accel"),
-        ("driver", {"decel": -2.0}, "decel"),
         ("driver", {"min_gap": -1.0}, "min_gap"),
         ("driver", {"desired_speed": math.nan}, "desired_speed"),
         ("driver", {"lowest": 3.0, "highest": 2.5}, "bounds"),
