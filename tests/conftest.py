@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import warnings
 from contextlib import contextmanager
 from html import unescape
@@ -66,6 +67,25 @@ def ends_in_time():
             faulthandler.cancel_dump_traceback_later()
 
     return within
+
+
+@pytest.fixture(scope="session")
+def full_at():
+    """No file may grow beyond so many bytes, which the system reports like a full disk."""
+    resource = pytest.importorskip("resource")
+
+    @contextmanager
+    def full(size):
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            signal.signal(signal.SIGXFSZ, handler)
+
+    return full
 
 
 @pytest.fixture(scope="session")

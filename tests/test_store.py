@@ -3,7 +3,6 @@ import io
 import json
 import os
 import shutil
-import signal
 import stat
 import tempfile
 import time
@@ -230,25 +229,13 @@ def test_a_forged_file_is_refused_before_anything_is_allocated(change, words, fo
 # -- On the disk -----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def full_disk():
-    """No file may grow beyond 100 bytes, which the system reports like a full disk."""
-    resource = pytest.importorskip("resource")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    signal.signal(signal.SIGXFSZ, handler)
-
-
-def test_a_full_disk_leaves_the_folder_as_it_was_and_names_the_file(full_disk, tmp_path):
+def test_a_full_disk_leaves_the_folder_as_it_was_and_names_the_file(full_at, tmp_path):
     path = tmp_path / "file"
     path.write_bytes(b"what was there before")
     try:
         raise KeyboardInterrupt
     except KeyboardInterrupt:  # who saves on Ctrl-C is told of the disk
-        with pytest.raises(OSError, match="File too large") as raised:
+        with full_at(100), pytest.raises(OSError, match="File too large") as raised:
             write(path)
     assert raised.value.filename == str(path)
     assert [one.read_bytes() for one in tmp_path.iterdir()] == [b"what was there before"]

@@ -1,6 +1,5 @@
 """The audit log: what is tampered with is found where it was, and what is replayed is the same."""
 
-import errno
 import json
 import logging
 import math
@@ -467,38 +466,21 @@ def test_a_log_that_was_tampered_with_is_not_gone_on_with(driven, tmp_path):
     assert path.read_bytes() == before
 
 
-class Full:
-    """A disk that has room for so many bytes, and then takes a part."""
-
-    def __init__(self, file, room):
-        self.file, self.room = file, room
-
-    def write(self, data):
-        if not self.room:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        data = data[: self.room]
-        self.room -= len(data)
-        return self.file.write(data)
-
-    def __getattr__(self, name):
-        return getattr(self.file, name)
-
-
-def test_where_the_disk_is_full_it_drives_on_and_says_so_at_the_end(tmp_path, caplog):
+def test_where_the_disk_is_full_it_drives_on_and_says_so_at_the_end(tmp_path, caplog, full_at):
     path, decided = tmp_path / "log", []
     log = AuditLog(path)
     guard = cars(log)
     drive(guard)
     kept, number = path.read_bytes(), log.head.number
-    log._file = Full(log._file, 1500)
-    with caplog.at_level(logging.ERROR), pytest.raises(OSError, match="ends with record"):
-        drive(guard, wanted=lambda k: decided.append(k) or 2.5)
-    assert decided[-1] == 23
-    assert len(caplog.records) == 1
-    with pytest.raises(OSError, match=f"ends with record {log.head.number}"):
-        drive(guard)
-    with pytest.raises(OSError, match="ends with record"):
-        log.close()
+    with full_at(len(kept) + 1500):  # which takes a part of a record
+        with caplog.at_level(logging.ERROR), pytest.raises(OSError, match="ends with record"):
+            drive(guard, wanted=lambda k: decided.append(k) or 2.5)
+        assert decided[-1] == 23
+        assert len(caplog.records) == 1
+        with pytest.raises(OSError, match=f"ends with record {log.head.number}"):
+            drive(guard)
+        with pytest.raises(OSError, match="ends with record"):
+            log.close()
     assert log.head.number > number
     assert path.read_bytes().startswith(kept)
     assert path.read_bytes().endswith(b"\n")  # the part of a record was taken back
