@@ -19,7 +19,6 @@ from evofsm.driving.judge import LatentRisk
 from evofsm.guard.actions import BoxActions, Choices, put_into, same_action
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Search
 from evofsm.guard.guard import KIND
-from evofsm.guard.loop import run_episode
 from evofsm.guard.reviser import Mode
 from evofsm.guard.scene import SceneRisk
 
@@ -465,31 +464,6 @@ def test_wherever_a_call_is_broken_off_nothing_is_done_and_it_works_again(kind, 
 
 
 # -- Who feeds it -------------------------------------------------------------------------------
-
-
-class Falling:
-    """An environment that falls sooner or later."""
-
-    def reset(self, *, seed=None, options=None):
-        self.k = 0
-        return [0.1, 0.0], {}
-
-    def step(self, action):
-        self.k += 1
-        return [0.1 + 0.1 * self.k, 0.1], 0.0, self.k > 7, False, {}
-
-
-def test_two_loops_that_feed_one_guard_by_turns_are_told():
-    guard = continuous()
-    one, other = (run_episode(Falling(), guard, lambda _: 0.0) for _ in range(2))
-    next(one)
-    next(other)
-    before = guard.situation
-    with pytest.raises(RuntimeError, match=r"RevisedVectorActions.*guard of its own"):
-        next(one)
-    assert guard.situation is before
-    assert len(list(other)) == 7
-    assert (guard.n_episodes, guard.n_failed) == (1, 1)
 
 
 def test_an_action_may_be_an_array_of_one_number_as_policies_predict_it():

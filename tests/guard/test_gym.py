@@ -1,5 +1,6 @@
 """Any environment of Gymnasium or PettingZoo runs under a guard, alone or many at once."""
 
+import copy
 import importlib
 import math
 import os
@@ -546,6 +547,19 @@ def test_what_a_loop_begins_amid_an_episode_is_not_mixed_with_it():
     env.reset()  # as it was advised
     env.step(np.array([0.0]))
     assert [len(rows) for rows, *_ in env.guard.judge.episodes] == [1]
+
+
+def test_two_loops_that_feed_one_guard_by_turns_are_told():
+    guard, script = guard_for(ONE), Script(*[FAR] * 8, HIT, failed=True)
+    one, other = (run_episode(copy.copy(script), guard, lambda _: [0.0]) for _ in range(2))
+    next(one)
+    next(other)
+    before = guard.situation
+    with pytest.raises(RuntimeError, match=r"RevisedVectorActions.*guard of its own"):
+        next(one)
+    assert guard.situation is before
+    assert len(list(other)) == 7
+    assert (guard.n_episodes, guard.n_failed) == (1, 1)
 
 
 def test_what_is_learnt_in_another_process_does_not_come_back():

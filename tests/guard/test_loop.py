@@ -2,15 +2,15 @@
 
 import logging
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from evofsm.driving.drivers import IDM
+from evofsm.driving import guard_for_family, load_family
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.revisers import Unrevised
-from evofsm.driving.scenarios import Leader, Scenario
-from evofsm.driving.trials import drive
+from evofsm.driving.trials import drive, unrevised_guard
 from evofsm.driving.world import COMMANDED, SPEED
 from evofsm.fsm.actions import IntervalActions
 from evofsm.guard.api import Proposal
@@ -18,19 +18,11 @@ from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser, Mode
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
-LEADER = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=6.0)
-HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
-
-
-def driven(reviser, judge, controller=HASTY, duration=10.0):
-    guard = Guard.of(reviser, interval=0.25, judge=judge)
-    scenario = Scenario(LEADER, initial_gap=8.0, duration=duration)
-    return drive(guard, scenario, controller=controller)
+EMERGENCY = load_family("emergency")
 
 
 def test_decisions_are_those_of_the_record():
-    risk = LatentRisk(lowest=-2.5)
-    told = driven(ActionReviser(risk, ACTIONS), risk)
+    told = drive(guard_for_family(EMERGENCY), EMERGENCY.draw(0, 0))
     record, time = told.record, told.time
     starts = [round(d.situation.time / 0.01) for d in told.decisions]
     assert starts == list(range(0, starts[-1] + 1, 25))
@@ -45,7 +37,7 @@ def test_decisions_are_those_of_the_record():
 
 @pytest.mark.parametrize("line", [RuntimeError("lost"), math.nan, math.inf, Proposal(None)])
 def test_a_controller_that_fails_once_is_driven_on_without(line, caplog):
-    risk, lines = LatentRisk(lowest=-2.5), iter([1.0, 1.0, line])
+    lines, scenario = iter([1.0, 1.0, line]), EMERGENCY.draw(0, 0).scenario
 
     def propose(observation):
         if isinstance(said := next(lines, 1.0), Exception):
@@ -53,7 +45,8 @@ def test_a_controller_that_fails_once_is_driven_on_without(line, caplog):
         return said
 
     with caplog.at_level(logging.WARNING, logger="evofsm"):
-        told = driven(Unrevised(ACTIONS), risk, propose, 3.0)
+        short = replace(scenario, duration=3.0)
+        told = drive(unrevised_guard(EMERGENCY), short, controller=propose)
     assert len(caplog.records) == 1
     assert "controller" in caplog.text
     assert "0.5 s" in caplog.text
