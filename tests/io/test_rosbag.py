@@ -234,14 +234,10 @@ def test_an_action_may_be_mapped_and_failures_be_told_of_by_a_comparison(tmp_pat
     (chunk,) = read(path, told, failed="gap<=44")
     assert (chunk.actions == 0.0).all()
     assert len(chunk.failures) == 1
-    with pytest.raises(ValueError, match="write --failed 'gap>0'"):
-        read(path, failed="gap")
 
 
-def test_a_bag_without_a_map_or_that_is_damaged_says_so(tmp_path):
+def test_a_bag_that_is_damaged_says_so(tmp_path):
     path = write(tmp_path / "bag", drive())
-    with pytest.raises(ValueError, match="--topics names a file"):
-        list(read_traces([path]))
     (file,) = (one for one in (tmp_path / "bag").iterdir() if one.suffix == ".db3")
     file.write_bytes(file.read_bytes()[:20_000])
     with pytest.raises(ValueError, match="cannot be read as a bag of ROS 2"):
