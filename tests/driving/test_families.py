@@ -183,7 +183,6 @@ def test_a_file_of_ones_own_is_a_family_with_switches_and_in_other_processes(min
     ("before", "after", "message"),
     [
         ("interval=0.5", "interval=0.0", r"mine\.py: family's interval is 0\.0; it must be posi"),
-        ("decel=3.0", "decel=-3.0", r"mine\.py: family's decel is -3\.0; it must be positive"),
         ("leader_decel=5.0", "leader_decel=4.0", r"a leader brakes by 5 m/s², but leader_decel is"),
         ("make, -3.0", "make, -4.0", "can brake by 4 m/s², but decel is 3; bound its body"),
         ("brake_time=10.0", "brake_time=-1.0", r"mine\.py: leader's brake_time is -1"),

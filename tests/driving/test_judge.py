@@ -142,24 +142,13 @@ def situation(gap, speed, leader_speed, belief=(1.0,)):
 
 @pytest.fixture
 def taught():
-    """Some learning, in mid-episode."""
-    rng = np.random.default_rng(3)
-    risk = LatentRisk(lowest=-4.0)
-    for _ in range(6):
-        speed = leader_speed = 20.0
-        gap, decel = 40.0, rng.uniform(3.0, 6.0)
-        for k in range(60):
-            command = 0.5 if k < 20 else -4.0
-            risk.learn([gap, speed, leader_speed], command, rng.dirichlet([1.0, 1.0, 1.0]))
-            braking = decel if k > 15 else 0.0
-            reached = max(0.0, leader_speed - DT * braking)
-            then = max(0.0, speed + DT * max(command, -3.0))
-            gap += 0.5 * DT * (leader_speed + reached - speed - then)
-            speed, leader_speed = then, reached
-        risk.start_episode()
-    assert len(risk.manoeuvres) == 6
-    assert risk.brakes.known
-    return risk
+    """It has learnt of some drives."""
+    family = driving.load_family("emergency")
+    guard = driving.guard_for_family(family)
+    driving.teach(guard, [family.draw(0, k) for k in range(3)])
+    assert len(guard.judge.manoeuvres) == 3
+    assert guard.judge.brakes.known
+    return guard.judge
 
 
 @given(GAPS, SPEEDS, SPEEDS)

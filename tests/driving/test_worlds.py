@@ -202,11 +202,6 @@ def test_who_is_asked_at_an_interval_keeps_its_command_between():
     assert (commands == commands[:, :1]).all()
 
 
-# -- Who drives: the Intelligent Driver Model ------------------------------------------------------
-
-HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
-
-
 @pytest.mark.parametrize("gap", [0.5, 0.0, -3.0])
-def test_bounds_hold_also_at_and_after_a_collision(gap):
-    assert HASTY.propose(np.array([gap, 20.0, 0.0])).action == -4.0
+def test_bounds_of_a_driver_hold_also_at_and_after_a_collision(gap):
+    assert replace(NORMAL, lowest=-4.0).propose(np.array([gap, 20.0, 0.0])).action == -4.0
