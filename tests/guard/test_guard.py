@@ -5,6 +5,7 @@ import math
 import sys
 import threading
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
@@ -501,30 +502,24 @@ def test_a_guard_in_print_says_what_it_learnt_from(reloaded, guard, row, says):
 
 
 def test_threads_share_a_guard_and_what_is_saved_meanwhile_loads(tmp_path):
-    guard, errors, over = Guard(low=-1.0, high=1.0, interval=0.1), [], threading.Event()
+    guard, over = Guard(low=-1.0, high=1.0, interval=0.1), threading.Event()
 
     def work(seed):
         draw = np.random.default_rng(seed)
-        try:
-            while not over.is_set():
-                guard.decide(draw.normal(size=2), draw.uniform(-1.0, 1.0))
-                if draw.random() < 0.05:
-                    guard.end(failed=draw.random() < 0.5)
-        except BaseException as error:
-            errors.append(error)
+        while not over.is_set():
+            guard.decide(draw.normal(size=2), draw.uniform(-1.0, 1.0))
+            if draw.random() < 0.05:
+                guard.end(failed=draw.random() < 0.5)
 
     usual = sys.getswitchinterval()
-    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(3)]
-    sys.setswitchinterval(1e-5)
-    try:
-        for thread in threads:
-            thread.start()
-        for _ in range(20):
-            guard.save(tmp_path / "guard.evofsm")
-            Guard.load(tmp_path / "guard.evofsm")
-    finally:
-        over.set()
-        sys.setswitchinterval(usual)
-        for thread in threads:
-            thread.join()
-    assert not errors
+    with ThreadPoolExecutor(3) as threads:
+        sys.setswitchinterval(1e-5)
+        try:
+            done = [threads.submit(work, seed) for seed in range(3)]
+            for _ in range(20):
+                guard.save(tmp_path / "guard.evofsm")
+                Guard.load(tmp_path / "guard.evofsm")
+        finally:
+            over.set()
+            sys.setswitchinterval(usual)
+    assert [one.result() for one in done] == [None] * 3
