@@ -868,13 +868,8 @@ def test_the_guard_learns_each_agents_episode_whole_and_info_says_what_was_done(
 def test_what_an_agent_is_not_told_is_optional(crowd, silent):
     class Silent(crowd):
         def step(self, actions):
-            said = dict(
-                zip(
-                    ("observations", "rewards", "terminated", "truncated", "infos"),
-                    super().step(actions),
-                    strict=True,
-                )
-            )
+            names = "observations", "rewards", "terminated", "truncated", "infos"
+            said = dict(zip(names, super().step(actions), strict=True))
             said["truncated"] = {}
             for name, each in said.items():
                 if silent in (name, "all"):

@@ -69,8 +69,7 @@ def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
     def braked(*decels):
         guard, speed, time = Guard.of(reviser, judge=risk, interval=0.1), 25.0, 0.0
         for decel in np.repeat((0.0, *decels, 0.0), 20):
-            situation = guard.recognise(np.array([60.0, speed, speed]), time)
-            guard.revise(situation, Proposal(-decel))
+            guard.decide([60.0, speed, speed], -decel, time)
             speed, time = max(speed - 0.1 * decel, 0.0), time + 0.1
         guard.end(failed=False)
         return risk.brakes.decel

@@ -245,7 +245,6 @@ FCD = "timestep_time,vehicle_id,vehicle_speed,vehicle_pos,vehicle_lane"
     ("text", "message"),
     [
         ("timestep_time;vehicle_id;vehicle_speed;vehicle_pos\n0;a;1;1\n", "no 'vehicle_lane'"),
-        (f"{FCD}\n0,a,1,,e_0\n", "line 2, pos: the field is empty"),
         (f"{FCD}\n1,a,1,1,e_0\n0,a,1,1,e_0\n", "line 3: time goes from 1 to 0"),
     ],
 )
