@@ -6,6 +6,7 @@ import random
 import re
 
 import pytest
+from tests.test_recipes import write
 
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.rules import Novelty, Paper
@@ -311,30 +312,18 @@ def test_another_rule_is_told_by_its_name(evofsm, crashes, tmp_path, options, ru
     assert FSMModel.load(tmp_path / "model").rule == rule
 
 
-RULE = """
-from dataclasses import dataclass
-from evofsm import Novelty, register_rule
-
-@dataclass(frozen=True)
-class Coarse(Novelty):
-    radius: float = 3.0
-
-register_rule("coarse", Coarse)
-"""
-
-
 def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
     evofsm, refused, crashes, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "coarse_rule.py").write_text(RULE)
+    write("Add a state rule", tmp_path)
     said = "'coarse'; it must be one of paper, novelty"
     assert said in refused("learn", crashes, "--rule", "coarse")
     monkeypatch.setattr("evofsm.fsm.rules._RULES", {"paper": Paper, "novelty": Novelty})
-    for name in ("coarse_rule:Coarse", "coarse"):  # which its module has registered
+    for name in ("my_rule:Coarse", "coarse"):  # which its module has registered
         text = " ".join(evofsm("learn", crashes, "--rule", name, "--out", "m").stdout.split())
-        assert "rule coarse (--rule), radius 3.0" in text
-        assert FSMModel.load("m").rule.radius == 3.0
+        assert "rule coarse (--rule), apart 2.0" in text
+        assert FSMModel.load("m").rule.apart == 2.0
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,6 @@ MODELS = [
     ("actions", {"low": -0.5, "high": 1.0, "width": 1e-12}, "1 to 100,000 intervals"),
     ("failures_told", {}, "failures_told is {}; it must be of type bool"),
     ("names", {}, r"names is {}; it must be of type list\[str\]"),
-    ("names", ["gap"], r"names are \('gap',\), but there are 2 variables"),
 ]
 
 
