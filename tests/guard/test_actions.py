@@ -1,4 +1,4 @@
-"""Boxes of actions: their cells, and what is refused."""
+"""Boxes of actions and their cells."""
 
 import math
 
@@ -28,22 +28,6 @@ def test_every_cell_is_encoded_by_its_middle_and_beyond_lies_the_edge():
     for action, why in (([0.0, math.nan], "NaN"), ([0.0], "it must have 2")):
         with pytest.raises(ValueError, match=why):
             BOX.encode(action)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"low": (0.0,), "high": (1.0, 2.0)}, "1 components and high has 2"),
-        ({"low": (0.0, 2.0), "high": (1.0, 2.0)}, "in component 1; low must be below high"),
-        ({"low": (-math.inf,), "high": (1.0,)}, "low is .* must be finite"),
-        ({"low": (), "high": ()}, "not empty"),
-        ({"low": 0.0, "high": 1.0}, "low has shape"),
-        ({"low": ("a",), "high": (1.0,)}, "low"),
-    ],
-)
-def test_what_is_no_box_is_refused(settings, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        BoxActions(**settings)
 
 
 def test_options_are_the_nearest_of_each_cell_and_the_corners():

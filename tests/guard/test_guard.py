@@ -396,6 +396,11 @@ def test_what_a_search_finds_outside_is_put_into_the_set():
         ({"low": -1.0, "high": 1.0, "audit": "log.jsonl"}, "has no method decided"),
         ({"low": -1.0, "high": 1.0, "judge": None, "names": "ab"}, "names is 'ab'; it must be"),
         ({"low": [0.0, 0.0], "high": [1.0], "judge": None}, "low has 2 components and high has 1"),
+        ({"low": [0.0, 2.0], "high": [1.0, 2.0]}, "in component 1; low must be below high"),
+        ({"low": [-math.inf], "high": [1.0]}, "low is .* must be finite"),
+        ({"low": [], "high": []}, "not empty"),
+        ({"low": [[0.0]], "high": [[1.0]]}, "low has shape"),
+        ({"low": ["a"], "high": [1.0]}, "low"),
         ({"n_actions": 0, "judge": None}, "n_actions"),
         ({"n_actions": 10**9, "judge": None}, "takes at most 1,000 actions"),
         (
@@ -424,6 +429,7 @@ def test_a_machine_of_other_actions_is_refused():
         ("end", "observation", [0.0]),
         *(("end", "failed", v) for v in (np.array([True]), [True], 1, 0.0, None, "no")),
         *(("end", "terminated", v) for v in (np.array([True]), 1)),
+        *(("end", "score", v) for v in (math.nan, "much")),
     ],
 )
 def test_what_is_refused_leaves_it_as_it_was(make, call, name, value, snapshot):
@@ -432,7 +438,7 @@ def test_what_is_refused_leaves_it_as_it_was(make, call, name, value, snapshot):
         balance(one, pushes(make, 10))
         one.decide([0.1, 0.0], SMALL[make])
     usual = {"observation": [0.2, 0.1]} | ({"proposal": SMALL[make]} if call == "decide" else {})
-    with pytest.raises((TypeError, ValueError)):
+    with pytest.raises((TypeError, ValueError), match=f"{name}|rate|action|much"):
         getattr(guard, call)(**usual | {name: value})
     said = [repr(getattr(one, call)(**usual)) for one in (guard, twin)]
     assert said[0] == said[1]

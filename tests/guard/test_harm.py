@@ -174,16 +174,6 @@ def test_a_judge_of_ones_own_sees_all_and_is_found_to_do_harm():
         guard.freeze()
 
 
-def test_a_score_that_is_no_number_is_refused_and_nothing_ends():
-    guard = make()
-    guard.decide([0.0], 0.0)
-    for score in (math.nan, "much"):
-        with pytest.raises((TypeError, ValueError), match="score"):
-            guard.end(score=score)
-    guard.end(score=1)
-    assert guard.n_episodes == 1
-
-
 # -- Which is better -----------------------------------------------------------------------------
 
 
