@@ -280,8 +280,8 @@ class Traffic(Study):
         kinds += [(world, each, risky) for world in there if world in OWN for each in DRIVERS[1:]]
         tasks, curve = [], []
         for k, (world, drivers, seconds) in product(range(self.seeds), kinds):
-            how = {"seed": self.seed + k, "seconds": seconds, "step": self.step}
-            one = partial(simulate, world, drivers, **how)
+            how: dict[str, Any] = {"seconds": seconds, "step": self.step}
+            one = partial(simulate, world, drivers, seed=self.seed + k, **how)
             # As many look at it alone as guarded: in `ramp`, who merges first hangs on that.
             for policy, share in product((ALONE, OURS), SHARES):
                 tasks.append(partial(one, policy, share=share))

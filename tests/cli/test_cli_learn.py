@@ -140,14 +140,18 @@ def own(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("end", "failures", "rows"),
-    [("0", 0, 9), ("0\n", 1, 10), ("-0.1", 1, 10), ("4", 0, 10), ("-", 0, 9), ("0\n4,5,6", 1, 10)],
+    ("fails", "end", "failures", "rows"),
+    [
+        *(("gap<=0", end, 1, 10) for end in ("0\n", "-0.1", "0\n4,5,6")),
+        *(("gap<=0", "0", 0, 9), ("gap<=0", "4", 0, 10), ("gap<=0", "-", 0, 9)),
+        *(("gap>10", "10.5", 0, 9), ("gap>10", "11", 1, 10)),  # of 10.5e-5
+    ],
 )
-def test_a_number_that_is_cut_off_is_no_failure(evofsm, tmp_path, end, failures, rows):
+def test_a_number_that_is_cut_off_is_no_failure(evofsm, tmp_path, fails, end, failures, rows):
     lines = [f"{k / 10},15,15,0.1,{9 - k}.432" for k in range(9)]
     text = "\n".join(["time,v_follower,v_leader,a_follower,gap", *lines, f"0.9,15,15,0.1,{end}"])
     (tmp_path / "log.csv").write_text(text)
-    told = evofsm("learn", tmp_path / "log.csv", "--failed", "gap<=0")
+    told = evofsm("learn", tmp_path / "log.csv", "--failed", fails)
     assert f"rows         {rows}," in told.stdout
     assert f"failures     {failures} episode" in told.stdout
     assert ("line 11, column 'gap': '0' has no line end" in told.stderr) == (end == "0")

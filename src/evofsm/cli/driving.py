@@ -16,7 +16,7 @@ from functools import partial
 from importlib import import_module
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from threading import Thread
+from threading import Thread, current_thread, main_thread
 from typing import Any
 
 from evofsm import driving, store
@@ -250,7 +250,8 @@ def _signals() -> Iterator[list[int]]:
         if len(signals) > 1:
             raise SystemExit(128 + number)
 
-    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    is_main = current_thread() is main_thread()  # others get none
+    numbers = [getattr(signal, name) for name in names if is_main and hasattr(signal, name)]
     before = {n: signal.signal(n, note) for n in numbers if signal.getsignal(n) != signal.SIG_IGN}
     try:
         yield signals

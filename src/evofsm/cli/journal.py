@@ -65,7 +65,7 @@ class Journal:
         os.replace(fresh, self.path)
         self.close()
         self._file = journal._file
-        self.settings, self.records = settings, [*records]
+        self.settings, self.records = settings, [dict(record) for record in records]
 
     def sync(self) -> None:
         """Force what was written onto the disk."""

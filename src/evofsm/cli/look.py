@@ -110,10 +110,10 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
         name: _range(name, z[order], (runs | (name == still))[order], last)
         for name, z in values.items()
     }
-    for name in (name for name in values if len(stand_ins[name])):
-        columns[name] += f"; {', '.join(f'{x:g}' for x in stand_ins[name])} for none"
     for name in (name for name in values if tables.UNITS.get(units[name], 1.0) != 1.0):
         columns[name] += f" {tables.SI[units[name]]}, from {units[name]}"
+    for name in (name for name in values if len(stand_ins[name])):
+        columns[name] += f"; {', '.join(f'{x:g}' for x in stand_ins[name])} for none"
     columns |= {name: _told(frame[name]) for name in texts}
     facts = [*columns.items()][:_COLUMNS_SHOWN]
     if more := len(columns) - len(facts):

@@ -386,7 +386,7 @@ class Guard:
     @learn.setter
     @transaction
     def learn(self, learn: bool) -> None:
-        learn = self._learn = truth("learn is", learn)
+        learn = self._learn = truth("learn", learn)
         if self.judge is not None and hasattr(self.judge, "learning"):
             self.judge.learning = learn
         self._under_way = False
@@ -743,7 +743,7 @@ class Guard:
         """
         if episode not in (None, self._begun):
             return
-        failed, terminated = truth("failed is", failed), truth("terminated is", terminated)
+        failed, terminated = truth("failed", failed), truth("terminated", terminated)
         if score is not None:
             refuse_unusable("score", real_array("score", [score], 1))
             score = float(score)
@@ -927,17 +927,24 @@ def _resized(ranges: tuple[tuple[float, float], ...], m: int) -> NDArray[np.floa
     return np.resize(ranges, (m, 2)).T
 
 
-def truth(what: str, value: Any, kinds: str = "b") -> bool:
-    """True or False, NumPy's as well, or of other ``kinds``."""
-    if np.ndim(value) or np.asarray(value).dtype.kind not in kinds:
-        raise TypeError(f"{what} {value!r}; it must be True or False, of one environment")
+def truth(name: str, value: Any) -> bool:
+    """True or False, NumPy's as well."""
+    if np.ndim(value) or np.asarray(value).dtype != np.bool_:
+        raise TypeError(f"{name} is {value!r}; it must be True or False, of one environment")
     return bool(value)
+
+
+def answered(reply: Any) -> bool:
+    """What a function ``failed`` returned: true or false, or a number that stands for it."""
+    if np.size(reply) != 1 or np.asarray(reply).dtype.kind not in "biu":
+        raise TypeError(f"failed returned {reply!r}; it must be True or False")
+    return bool(reply)
 
 
 def asked(failed: Callable[[NDArray[np.float64]], bool], z: NDArray[np.float64]) -> bool:
     """Whether a function says that an observation is a failure."""
     try:
-        return truth("failed returned", np.squeeze(failed(z)), "biu")
+        return answered(failed(z))
     except Exception as error:
         error.add_note(f"failed was asked of {z}; it is also asked around what was observed")
         raise

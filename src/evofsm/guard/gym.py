@@ -29,7 +29,7 @@ from evofsm.guard.actions import (
     same_action,
 )
 from evofsm.guard.api import Proposal, Revision
-from evofsm.guard.guard import Guard, truth
+from evofsm.guard.guard import Guard, answered
 from evofsm.guard.loop import action_masks
 from evofsm.guard.reviser import make_usable, unjudged_revision
 
@@ -483,7 +483,7 @@ class Terms:
         if self._failed is None or isinstance(self._failed, str):
             return step.terminated and (self._failed is not None or self.guard.failed is None)
         try:
-            return truth("failed returned", np.squeeze(self._failed(step)), "biu")
+            return answered(self._failed(step))
         except (AttributeError, KeyError, TypeError) as error:
             about = "a step: its observation, reward, terminated, truncated and info"
             error.add_note(f"failed was called with {about}, such as failed={_FAILED}")

@@ -256,8 +256,10 @@ class Term(NamedTuple):
         """Whether it holds in the last row, perhaps, only as a number was cut off there."""
         if self.column != piece.cut or not self.of_number:
             return False
-        longer = math.copysign(math.inf, piece.numbers[self.column][-1])
-        return not _SIGNS[self.sign](longer, self.value)
+        value, holds = piece.numbers[self.column][-1], _SIGNS[self.sign]
+        with_exponent = 0.0 if value % 1.0 else value
+        ends = math.copysign(math.inf, value), with_exponent
+        return self.sign == "!=" or not all(holds(end, self.value) for end in ends)
 
     def fault(self, value: Any) -> str:
         """Why it cannot be told of one value, if that is so."""

@@ -56,7 +56,7 @@ class Decider:
         self.episode = episode
         self.slots = slots or Slots()
         self.form = Form(guard, self.slots.keys, *self.slots.clock)
-        self.keep: Callable[[Taken], None] = lambda taken: None
+        self.keep: Callable[[Taken | None], None] = lambda taken: None
         self.n = 0  #: decisions so far
         self.rows = 0  #: decisions of the episode under way; 0 where none is
         self.decided_on: Row | None = None  #: latest
@@ -112,12 +112,13 @@ class Decider:
         except MessageError as error:
             place = self.csv.place if self.csv.in_csv or error.about == "line" else ""
             return self.error(error.about, f"{place}{error}", error.time)
+        self.keep(message)  # before it: an audit log knows nothing that is not kept
         try:
-            answer = self.act(message)
+            return self.act(message)
         except Exception as error:  # an end that the guard cannot take
             return self.error("end", f"was refused: {type(error).__name__}: {error}")
-        self.keep(message)
-        return answer
+        finally:
+            self.keep(None)
 
     def _sent_before(self, told: Message) -> int | None:
         """Where among the recent messages one is that is sent again; None if it is a new one.
@@ -180,8 +181,9 @@ class Decider:
         """Decide on what waits, as nothing came for long; None where nothing waits."""
         if not self.slots.waiting:
             return None
-        answer = self.act(Pause())
         self.keep(Pause())
+        answer = self.act(Pause())
+        self.keep(None)
         return answer
 
     def _waited(self, *, early: bool = False) -> Answer:

@@ -326,9 +326,9 @@ def _parsed(line: bytes) -> dict[str, Any]:
 
 def _refuse_twice(pairs: list[tuple[str, Any]]) -> None:
     """Raise where a key of an object is there twice: of its values one would be left out."""
-    for name, count in Counter(name for name, _ in pairs).items():
-        if count > 1:
-            raise MessageError(name[:_LETTERS], f"is there {count} times; which of them counts?")
+    if len(dict(pairs)) < len(pairs):
+        name, count = Counter(name for name, _ in pairs).most_common(1)[0]
+        raise MessageError(name[:_LETTERS], f"is there {count} times; which of them counts?")
 
 
 def _time(told: dict[str, Any]) -> float | None:

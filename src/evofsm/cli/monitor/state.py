@@ -49,7 +49,7 @@ class State:
         self._count = 0  # messages in the journal
         self._head = NOTHING  # of the chain that they are
         self._files: list[str] = []  # digests of what was read of each, in the end
-        self._read: dict[str, str] = {}  # that of the file that is read, for records
+        self._read: dict[str, str] = {}  # of the file that is read, and of the one before it
 
     def guard(
         self, fresh: Callable[[], Guard], failed: Callable[[Any], bool] | None = None
@@ -78,8 +78,9 @@ class State:
                 f"{journal.path} is missing or empty: rows that came after {self.path} was saved "
                 "are lost; put it back, or give the guard as --guard and name another --state"
             )
-        latest = [record["read"] for record in journal.records[-1:] if "read" in record]
-        self._files = [*entry.get("files", ()), *latest]
+        told = [record for record in journal.records if "read" in record]
+        self._files = [*entry.get("files", ()), *(r["before"] for r in told if "before" in r)]
+        self._files += [record["read"] for record in told[-1:]]
         self._head = Head(journal.settings["mark"], NOTHING.digest)
         for number, record in enumerate(journal.records, 2):
             if record.pop("hash", None) not in (self._sealed(record)["hash"], None):
@@ -112,18 +113,19 @@ class State:
 
     def pass_over(self, file: Path, decider: Decider) -> int:
         """Pass over the lines of a file that were taken in before; returns their length [byte]."""
-        digests = {*self._files, *(record.get("read") for record in self._journal.records)}
         csv, size, behind = copy(decider.csv), 0, 0
         with file.open("rb") as source:
-            for line in source:
+            for line in source if self._files else ():
                 size += len(line)
                 with suppress(MessageError):
                     csv.read(line.removesuffix(b"\n").removesuffix(b"\r"))
-                if csv.heard in digests:  # with what it knows of names and units
+                if csv.heard in self._files:  # with what it knows of names and units
                     decider.csv, behind = copy(csv), size
         if behind:
             warn(f"{file} was read before, up to {decider.csv.place}it goes on behind that")
         self._read = {"read": decider.csv.heard}
+        if self._files:
+            self._read["before"] = self._files[-1]
         return behind
 
     def close(self) -> None:
@@ -136,15 +138,19 @@ class State:
         if self.failure:
             raise OSError(f"{self.failure}; what came since then is lost")
 
-    def _keep(self, told: Taken) -> None:
-        """Write down what was acted on, and the guard, if an episode has just ended."""
-        self._read = self._read and {"read": self._decider.csv.heard}
+    def _keep(self, told: Taken | None) -> None:
+        """Write down what is to be acted on; and after that the guard, if an episode has ended."""
+        if told is None:
+            if self._decider.rows == 0 and (self.failure or self._count >= _EVERY):
+                self._try(self._save)
+            return
+        if self._read:
+            self._read["read"] = self._decider.csv.heard
         record = {"told": msgspec.to_builtins(told), **self._read}
+        self._read.pop("before", None)
         if not self.failure:
             self._try(lambda: self._journal.append(self._sealed(record), sync=False))
             self._count += 1
-        if self._decider.rows == 0 and (self.failure or self._count >= _EVERY):
-            self._try(self._save)
 
     def _sealed(self, record: dict[str, Any]) -> dict[str, Any]:
         """A record with the hash of it and of all before it, as in an audit log."""
