@@ -2,22 +2,16 @@ from contextlib import suppress
 
 import msgspec
 import pytest
+from tests.cli.monitor.test_decider import made
 
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.slots import Slots
 from evofsm.cli.monitor.state import State
 from evofsm.cli.monitor.transports import Server
-from evofsm.driving.cars import guard_of_monitor
 from evofsm.guard import Guard, Mode
 from evofsm.io import LogColumns
 from evofsm.io.logs import Resample
 from monitor_rows import JUNK, line, scenes, traffic
-
-
-def made(learn=True, mode=Mode.SHADOW):
-    guard = guard_of_monitor(0.1, 6.0)
-    guard.learn, guard.reviser.mode = learn, mode
-    return guard
 
 
 def abandoned(state):
@@ -72,7 +66,7 @@ def test_rows_that_wait_for_their_slot_go_on_waiting(opened):
         columns = LogColumns(resample=Resample(0.3), failed="gap<=0", where="gap<300")
         return {"episode": 30, "slots": Slots(columns)}
 
-    plain = Decider(made(), **settings())
+    plain = Decider(made(learn=True), **settings())
     decider, state = opened(**settings())
     kinds = set()
     for k, row in enumerate(traffic(1600)):
@@ -111,7 +105,7 @@ def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path,
             opened(path)
     journal.write_bytes(whole)
     guard = path.read_bytes()
-    for lose in (path.unlink, lambda: made().save(path)):  # it is missing, or another one
+    for lose in (path.unlink, lambda: made(learn=True).save(path)):  # it is missing, or another one
         lose()
         with pytest.raises(ValueError, match=r"a guard that is not in .*state\.evofsm; put"):
             opened(path)
@@ -126,7 +120,7 @@ def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path,
 @pytest.mark.parametrize("moment", ["before the guard is saved", "after it"])
 def test_killed_as_the_guard_is_saved_it_goes_on(opened, moment, monkeypatch):
     rows = [line(row) for row in traffic(702)]
-    plain = Decider(made(), episode=700)
+    plain = Decider(made(learn=True), episode=700)
     expected = [plain.answer(row) for row in rows]
     decider, state = opened()
 
@@ -145,7 +139,7 @@ def test_killed_as_the_guard_is_saved_it_goes_on(opened, moment, monkeypatch):
 def test_rows_in_flight_across_an_end_are_decided_once_though_it_is_killed(opened):
     rows = [line(row) for row in traffic(720)]
     messages = [*rows[:700], b'{"end": true, "failed": true}', *rows[700:]]
-    plain = Decider(made())
+    plain = Decider(made(learn=True))
     expected = [plain.answer(message) for message in messages]
     decider, state = opened()
     for lost in (5, 695, 699, 702):  # the guard is written with message 700
@@ -160,7 +154,7 @@ def test_rows_in_flight_across_an_end_are_decided_once_though_it_is_killed(opene
 
 def test_rows_that_a_sender_does_not_wait_with_are_decided_once_though_it_is_killed(opened):
     rows = [line(row) for row in traffic(620)]
-    plain, answers = Decider(made()), []
+    plain, answers = Decider(made(learn=True)), []
     expected = [msgspec.json.decode(msgspec.json.encode(plain.answer(row))) for row in rows]
     for count in (400, 619, 999):  # with so many it is killed, before the last is answered
         decider, state = opened()
@@ -250,7 +244,7 @@ def test_where_it_can_not_be_kept_it_goes_on_says_so_and_keeps_it_later(opened, 
 
 
 def test_scenes_and_ends_are_kept(opened):
-    plain = Decider(made())
+    plain = Decider(made(learn=True))
     messages = [*scenes(5), b'{"end": true}', *scenes(9)][:12]
     decider, state = opened()
     for message in messages:
