@@ -101,10 +101,6 @@ def results_of(folder):
     return (folder / "episodes.csv").read_bytes()
 
 
-class StoppedError(Exception):
-    pass
-
-
 @pytest.mark.parametrize("every", [0.0, 1e9])
 def test_learning_that_is_stopped_goes_on_bit_for_bit(tmp_path, snapshot, monkeypatch, every):
     monkeypatch.setattr("evofsm.cli.driving._EVERY", every)
@@ -114,11 +110,11 @@ def test_learning_that_is_stopped_goes_on_bit_for_bit(tmp_path, snapshot, monkey
     def show(done, **_):
         if done in stops:
             stops.remove(done)
-            raise StoppedError
+            raise EOFError
 
     stops = [1, 2, 4]
     while stops:
-        with begun(folder, setup) as results, pytest.raises(StoppedError):
+        with begun(folder, setup) as results, pytest.raises(EOFError):
             drive_in_turn(results, 5, show)
     again = in_turn(folder, 5)
     assert results_of(folder) == results_of(tmp_path / "plain")
