@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from evofsm import Guard
+from evofsm import EvolvingFSM, Guard
 from evofsm.driving import guard_for_family, load_family, teach
 from evofsm.guard import Mode
 
@@ -39,8 +39,6 @@ def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
     assert one["action"]["failed"] == machine.failed_after[11, one["state"]]
     assert "a(12)" in one["text"]
     assert "m/s²" in one["text"]
-    far = evofsm("explain", folder, "--observation", "900,14,14", "--json").stdout
-    assert json.loads(far)["situations"][0]["never_seen"]
 
 
 @pytest.mark.parametrize(
@@ -56,6 +54,17 @@ def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
 )
 def test_what_is_not_there_is_refused_in_one_line(refused, saved, arguments, says):
     assert says in refused("explain", saved[0], *arguments)
+
+
+def test_of_a_machine_it_is_said_that_failures_are_untold_and_what_was_never_seen(evofsm, tmp_path):
+    machine = EvolvingFSM(1)
+    machine.learn_many([[0.0], [5.0]] * 20, [0] * 40, range(0, 40, 2))
+    machine.save(tmp_path / "machine")
+    asked = "explain", tmp_path / "machine", "--observation", 500
+    told = evofsm(*asked).stdout
+    assert told.startswith("Which episodes failed is not known: nothing said so.")
+    assert "Never seen" in told
+    assert json.loads(evofsm(*asked, "--json").stdout)["situations"][0]["never_seen"] is True
 
 
 def test_what_a_guard_has_learnt_is_said_and_drawn(evofsm, tmp_path):

@@ -341,6 +341,7 @@ def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
         (["--dt", "0"], "--dt is 0.0; it must be a positive"),
         (["--out", "/no/such/folder/model"], "there is no folder"),
         (["--failed", "gap<"], "--failed is 'gap<'"),
+        (["--failed", "gap<0<1"], "--failed is 'gap<0<1'"),
         (["--failed", "crash"], "no column 'crash'; it has pair, time, gap, v_follower, v_leader"),
         (["--unit", "v=warp"], "--unit is 'v=warp'"),
         (["--unit", "speed=km/h"], "no column that is read is called so"),

@@ -61,6 +61,7 @@ def test_guards_act_where_they_are_told_to(evofsm, configuration):
     ("options", "said"),
     [
         (["--mode", "off"], "act or shadow"),
+        (["--vehicles", "lots%"], "vehicles is"),
         (["--out", "folder"], "--out is for families"),
         (["--vehicles", "type:hatsy"], "nothing was guarded; types are calm, hasty"),
     ],

@@ -228,6 +228,7 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, pieces):
         (f"{HEADER.replace('segment', 'gap')}\n1,2".encode(), "two columns are called 'gap'"),
         (f'{HEADER}\nr,"v1,0,1\n{"x" * 90}'.encode(), "unclosed quote"),
         (f'{HEADER}\nr,"a"b,0,0,1,1,1,1\n'.encode(), "line 2: ',' expected after '\"'"),
+        (f"{HEADER}\n{'x,' * 5_000_000}".encode(), "a line of more than 1,000,000 bytes"),
     ],
 )
 def test_what_is_no_table_is_refused(tmp_path, content, said):

@@ -71,6 +71,7 @@ def within(of, name, value):
     [
         ({"n_actions": 10**9}, "at most 1,000"),
         ({"given_horizon": 1e9}, "looks at most 10,000 ahead"),
+        ({"state": []}, r"state is \[\]"),
         (within("state", "luck", 1), "luck"),
         (within("settings", "margin", "3"), "margin is '3'"),
     ],
