@@ -89,10 +89,8 @@ def test_a_first_observation_must_be_whole():
 def test_the_less_is_seen_the_more_careful_it_gets():
     watch, risks = guard(), []
     for k in range(24):
-        gap_and_leader = (30.0, 10.0) if k < 4 else (NAN, NAN)
-        situation = watch.recognise(np.insert(gap_and_leader, 1, 10.0), 0.25 * k)
-        assert situation.intake is (Intake.WHOLE if k < 4 else Intake.PARTIAL)
-        revision = watch.revise(situation, Proposal(0.0))
+        revision = watch.decide([30.0, 10.0, 10.0] if k < 4 else [NAN, 10.0, NAN], 0.0)
+        assert watch.situation.intake is (Intake.WHOLE if k < 4 else Intake.PARTIAL)
         risks.append(revision.risk_proposed)
     assert risks[4] < 0.02
     assert risks[-1] > 0.5
