@@ -7,15 +7,9 @@ import pytest
 MODULE = """
 from evofsm.guard import Proposal
 
-class Hasty:
-    def __init__(self, action=1.0):
-        self.action = action
-
+class Confused:
     def propose(self, observation, time=0.0):
-        return Proposal(self.action)
-
-def confused():
-    return Hasty(float("nan"))
+        return Proposal(float("nan"))
 """
 
 
@@ -29,11 +23,11 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_it_ends_with_1_and_says_what_is_wrong(evofsm, folder):
-    result = evofsm("check", "own_driver:confused", "--json")
+    result = evofsm("check", "own_driver:Confused", "--json")
     assert result.exit_code == 1
     assert '"passed": false' in result.output
     assert "it proposes nan at gap" in result.output
-    result = evofsm("check", "own_driver:confused")
+    result = evofsm("check", "own_driver:Confused")
     assert max(map(len, result.output.splitlines())) <= 80
 
 
@@ -44,7 +38,6 @@ def test_it_ends_with_1_and_says_what_is_wrong(evofsm, folder):
         (["own_driver:Calm"], "has no attribute 'Calm'"),
         (["not_there:Calm"], "is it in this folder, or installed?"),
         (["own_driver:Proposal"], "has the methods of no kind"),
-        (["own_driver:Hasty", "--kind", "judge"], "No such option: --kind"),
     ],
 )
 def test_what_cannot_be_checked_is_refused_in_one_line(refused, folder, arguments, message):

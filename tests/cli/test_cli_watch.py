@@ -44,7 +44,6 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c(tmp_path, arg
         (["paper", "--unit", "v=km/h"], "options of columns are for a log, and paper is none"),
         (["CartPole-v9"], "CartPole-v9: Environment version `v9` for environment `CartPole`"),
         (["missing.mcap"], "missing.mcap: no such file or directory"),
-        (["missing.py"], "missing.py: no such file or directory"),
         (["CartPole"], "named with its version: CartPole-v1"),
         (["folder"], "folder is a folder; name the files in it"),
         (["learnt"], "learnt holds what was learnt, and is no log: evofsm inspect prints it"),
