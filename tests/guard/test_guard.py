@@ -17,7 +17,7 @@ import one_guard
 from evofsm import EvolvingFSM, Guard, Labels, store
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.judge import LatentRisk
-from evofsm.guard.actions import BoxActions, Choices, put_into, same_action
+from evofsm.guard.actions import Choices, put_into, same_action
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Search
 from evofsm.guard.guard import KIND
 from evofsm.guard.reviser import Mode
@@ -46,12 +46,12 @@ class Balance(ActionJudge):
     def fallback(self):
         return Fallback(2.0 if self.index else 0.0, "doing nothing")
 
-    def _push(self, actions):
+    def push(self, actions):
         return np.take(PUSHES, np.asarray(actions, int)) if self.index else np.asarray(actions)
 
     def judge(self, situation, actions):
         angle, rate = np.nan_to_num(situation.observation)
-        after = rate + (5.0 * np.sin(angle) + self._push(actions)) * self.dt
+        after = rate + (5.0 * np.sin(angle) + self.push(actions)) * self.dt
         where = np.abs(angle + after * self.dt + 0.4 * after) + self.gust
         risk = 1.0 / (1.0 + np.exp(-20.0 * (where - 0.5)))
         return Judgement(risk, risk, risk, where, evidence=1.0, seen=math.nan)
@@ -94,7 +94,7 @@ class Balance(ActionJudge):
 class Shares(Balance):
     """Whose actions are vectors, of which the first component is a fourth of the push."""
 
-    def _push(self, actions):
+    def push(self, actions):
         return 4.0 * np.asarray(actions)[..., 0]
 
 
@@ -143,13 +143,7 @@ def balance(guard, proposals, gusts=(), missing=()):
         seen[[k in missing, False]] = math.nan
         revision = guard.decide(seen, proposal)
         said.append(revision)
-        match guard.actions:
-            case Choices():
-                push = PUSHES[revision.executed]
-            case BoxActions():
-                push = 4.0 * revision.executed[0]
-            case _:
-                push = revision.executed
+        push = float(guard.judge.push(revision.executed))
         rate += (5.0 * math.sin(angle) + push) * DT + (gusts[k] if k < len(gusts) else 0.0)
         angle += rate * DT
         if abs(angle) > 0.8:

@@ -18,6 +18,10 @@ def judge(points):
     return store.read(BytesIO(file.getvalue()), KIND)
 
 
+FEWER = dict.fromkeys(("squares", "recent_squares"), lambda one: one[1:, 1:])
+FEWER |= dict.fromkeys(("products", "recent_products"), lambda one: one[1:])
+
+
 def with_first(value):
     def change(array):
         array = array.copy()
@@ -37,16 +41,7 @@ def with_first(value):
         ({}, {"situations": lambda one: one[:, 1:]}, "situations has shape"),
         ({}, {"windows": lambda one: one[:, :, 1:]}, "windows has shape"),
         ({}, {"policies": lambda one: one[:, :, 1:]}, "policies has shape"),
-        (
-            {},
-            {
-                "squares": lambda one: one[1:, 1:],
-                "recent_squares": lambda one: one[1:, 1:],
-                "products": lambda one: one[1:],
-                "recent_products": lambda one: one[1:],
-            },
-            "squares has",
-        ),
+        ({}, FEWER, "squares has"),
         ({}, {"forms": with_first(7.0)}, "forms are of variables that there are not"),
         ({}, {"forms": lambda one: one + 2.0 * np.eye(14)[2]}, "forms are of variables"),
         ({}, {"forms": lambda one: one * (np.arange(14) != 5)}, "units that are not positive"),
