@@ -124,9 +124,7 @@ _CARS = """<routes><vTypeDistribution id="mix"><vType id="calm" probability="{ca
 departLane="best" departSpeed="max"/></routes>"""
 
 
-def write_simulation(
-    world: str, drivers: str, seed: int, folder: Path, step: float = 0.0
-) -> list[str]:
+def write_simulation(world: str, drivers: str, seed: int, folder: Path, step: float) -> list[str]:
     """Write, or copy, its files; what SUMO is started with. Without a step it is the usual one."""
     kind = {"default": "", "hasty": _HASTY, "late": _HASTY + _LATE}[drivers]
     usual = ["--step-length", f"{step or 0.1}", "--collision.action", "warn"]
@@ -179,10 +177,9 @@ def simulate(
             mode = "watch" if policy == ALONE else "act"
             given = {**settings, "guard": _formula(policy, libsumo.simulation.getDeltaT())}
             chosen = attach(libsumo, share, mode=mode, **given)
-            until = libsumo.simulation.getTime() + seconds
-            while (
-                libsumo.simulation.getTime() < until and libsumo.simulation.getMinExpectedNumber()
-            ):
+            clock = libsumo.simulation
+            until = clock.getTime() + seconds
+            while clock.getTime() < until and clock.getMinExpectedNumber():
                 libsumo.simulationStep()
             libsumo.close()
         emergencies = log.read_text().count("performs emergency braking")
