@@ -78,9 +78,9 @@ class State:
                 f"{journal.path} is missing or empty: rows that came after {self.path} was saved "
                 "are lost; put it back, or give the guard as --guard and name another --state"
             )
-        told = [record for record in journal.records if "read" in record]
-        self._files = [*entry.get("files", ()), *(r["before"] for r in told if "before" in r)]
-        self._files += [record["read"] for record in told[-1:]]
+        rows = [record for record in journal.records if "read" in record]
+        self._files = [*entry.get("files", ()), *(row["before"] for row in rows if "before" in row)]
+        self._files += [row["read"] for row in rows[-1:]]
         self._head = Head(journal.settings["mark"], NOTHING.digest)
         for number, record in enumerate(journal.records, 2):
             if record.pop("hash", None) not in (self._sealed(record)["hash"], None):
