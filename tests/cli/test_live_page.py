@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
+pytest.importorskip("typer")
 pytest.importorskip("websockets")
 pytest.importorskip("playwright.sync_api")
 

@@ -8,8 +8,6 @@ import pytest
 pytest.importorskip("typer")
 pytest.importorskip("libsumo")
 
-from tests.cli.test_watching import drive
-
 from evofsm.cli.driving import trace_configuration
 from evofsm.cli.options import reading_of
 from evofsm.cli.watch import _is_log
@@ -86,10 +84,12 @@ def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tm
     assert whole == [80.0, False]
     recorded = watched_log(str(log), reading_of(), collisions=collisions)
     assert recorded.start.cases[0] == "ego behind lead, from 0.0 s (collision)"
-    *_, last = drive(recorded)
+    frames = [recorded.step()]
+    while not frames[-1].over:
+        frames.append(recorded.step())
     met = collisions["ego behind lead"][0]  # whom SUMO takes away is not seen then
-    assert last.time == pytest.approx(met - 0.1 * (afterwards == "teleport"), abs=0.01)
-    told = tell(last, recorded.start)
+    assert frames[-1].time == pytest.approx(met - 0.1 * (afterwards == "teleport"), abs=0.01)
+    told = tell(frames[-1], recorded.start)
     assert told.headline == "Collision (by SUMO)"
     assert "only watched, in shadow mode" in told.done
     assert "The reviser" not in told.done
