@@ -244,6 +244,8 @@ FCD = "timestep_time,vehicle_id,vehicle_speed,vehicle_pos,vehicle_lane"
 def test_what_is_wrong_in_a_table_is_named(tmp_path):
     lacks = "timestep_time;vehicle_id;vehicle_speed;vehicle_pos\n0;a;1;1\n"
     assert "no 'vehicle_lane'" in refusal(write(tmp_path / "a.csv", lacks))
+    empty = f"{FCD}\n0,a,1,,e_0\n"
+    assert "line 2, pos: the field is empty" in refusal(write(tmp_path / "a.csv", empty))
     backward = f"{FCD}\n1,a,1,1,e_0\n0,a,1,1,e_0\n"
     assert "line 3: time goes from 1 to 0" in refusal(write(tmp_path / "a.csv", backward))
 

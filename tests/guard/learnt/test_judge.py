@@ -14,6 +14,7 @@ from evofsm.guard.actions import same_action
 from evofsm.guard.api import Proposal, Situation
 from evofsm.guard.audit_log import AuditLog, audit
 from evofsm.guard.learnt import judge as judging
+from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.rollout import action_of, search
 
 
@@ -335,6 +336,12 @@ def test_after_a_gap_in_time_nothing_follows_from_what_was(points):
     learning.decide([0.9, 0.01], 0.1, time=60.0)
     assert learning.judge.state.n_episodes == 4
     assert learning.judge.state.most[0] < 0.3  # the leap was not learnt
+
+
+@pytest.mark.parametrize("wrong", [{"dt": 0.0}, {"horizon": 0.0}, {"n_actions": 0}])
+def test_a_setting_that_cannot_be_is_named(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        LearntRisk(**({"dt": 0.1, "n_actions": 2} | wrong))
 
 
 def test_a_question_changes_nothing_of_what_is_learnt(point, snapshot):
