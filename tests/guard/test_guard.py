@@ -432,7 +432,7 @@ def test_what_is_refused_leaves_it_as_it_was(make, call, name, value, snapshot):
         balance(one, pushes(make, 10))
         one.decide([0.1, 0.0], SMALL[make])
     usual = {"observation": [0.2, 0.1]} | ({"proposal": SMALL[make]} if call == "decide" else {})
-    with pytest.raises((TypeError, ValueError), match=f"{name}|rate|action|much"):
+    with pytest.raises((TypeError, ValueError), match=f"{name}|rate|action"):
         getattr(guard, call)(**usual | {name: value})
     said = [repr(getattr(one, call)(**usual)) for one in (guard, twin)]
     assert said[0] == said[1]

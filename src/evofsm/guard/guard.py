@@ -23,7 +23,7 @@ from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.sharing import Rollback, alone, share, transaction
-from evofsm.fsm.validation import function, positive, real_array, refuse_unusable
+from evofsm.fsm.validation import function, number, positive, real_array, refuse_unusable
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -522,7 +522,7 @@ class Guard:
             if np.size(action) != 1:
                 raise ValueError(f"proposal has {np.size(action)} numbers; it must be a single one")
             action = np.ravel(action)[0]
-        return float(action)  # type: ignore[arg-type]
+        return action if type(action) is float else number("proposal", action)
 
     @transaction
     def recognise(self, observation: ArrayLike, time: float) -> Situation:
