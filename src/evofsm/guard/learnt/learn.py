@@ -11,15 +11,7 @@ from numpy.random import Generator
 from evofsm.guard.learnt import danger, failure, model, motion
 from evofsm.guard.learnt.backups import evolved, first_backups, fitted
 from evofsm.guard.learnt.rollout import FAILS, FATAL, Flags, Floats, Ints, Model, value_of
-from evofsm.guard.learnt.state import (
-    Episode,
-    Given,
-    LearntSettings,
-    State,
-    model_of,
-    residuals_of,
-    sizes,
-)
+from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State, model_of, residuals_of
 
 # Actions of an episode that says how a system moves, and situations of which is learnt, at least;
 # situations that are drawn to look for disturbances, and those that mutants are tried on.
@@ -118,8 +110,7 @@ def doubted(state: State, episode: Episode, settings: LearntSettings, *, tried: 
         count = state.n_doubted - (tried and not episode.failed)
     elif count < settings.patience * settings.again**state.wrong:
         return state._replace(n_doubted=count)
-    rivals = failure.rivals(state.forms, state.failures, sizes(state))
-    if {*map(tuple, rivals)} == {*map(tuple, state.forms)}:
+    if {*map(tuple, state.rivals)} == {*map(tuple, state.forms)}:
         return state._replace(n_doubted=max(0, count))
     return state._replace(n_doubted=min(-1, count))
 

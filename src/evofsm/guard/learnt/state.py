@@ -213,6 +213,11 @@ class State(NamedTuple):
         """Whether its forms are doubted: while it learns rivals are tried."""
         return self.n_doubted < 0
 
+    @property
+    def rivals(self) -> Floats:
+        """Its forms, as small as they may be (`failure.rivals`)."""
+        return failure.rivals(self.forms, self.failures, sizes(self))
+
     def is_settled(self, settings: LearntSettings) -> bool:
         """Whether rivals were tried for so long without a failure that they count, also frozen."""
         return self.n_doubted < -settings.settled

@@ -32,7 +32,7 @@ from evofsm.guard.harm import Harm
 from evofsm.guard.learnt import failure
 from evofsm.guard.learnt.failure import HELD, SAYS, I
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, FATAL, Floats, Model
-from evofsm.guard.learnt.state import State, sizes
+from evofsm.guard.learnt.state import State
 
 #: Said as long as there is nothing to judge by.
 NOTHING_LEARNT = "nothing was learnt yet"
@@ -162,8 +162,7 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
         more += f"; failed= says otherwise in {state.differs:.1%} of the states around, where this "
         more += "decides"
     if state.is_doubted:
-        rivals = failure.rivals(state.forms, state.failures, sizes(state))
-        fails, ends, _ = _where(rivals, names)
+        fails, ends, _ = _where(state.rivals, names)
         more += "; much was refused without a failure: while it learns it tries whether it "
         more += f"ends by itself {' or '.join(ends)}, and " if ends else ""
         more += f"only fails {' or '.join(fails)}"
