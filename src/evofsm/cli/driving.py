@@ -16,11 +16,11 @@ from functools import partial
 from importlib import import_module
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from threading import Thread, current_thread, main_thread
+from threading import Thread
 from typing import Any
 
 from evofsm import driving, store
-from evofsm.cli.journal import Journal
+from evofsm.cli.journal import Journal, asked_to_stop
 from evofsm.cli.options import split_names
 from evofsm.cli.show import Advance, print_json, progress, show, table
 from evofsm.driving.cars import TOLD, name_judge
@@ -224,8 +224,14 @@ def drive_in_turn(
     setup, guard, n_episodes = results.setup, results.guard, len(results.rows)
     if setup.learn and n_episodes > episodes:
         raise ValueError(f"{results.folder} has driven {n_episodes} episodes, more than {episodes}")
-    guard.audit, world = audit, open_world(setup.world)
-    with _signals() as signals:
+    guard.audit, world, signals = audit, open_world(setup.world), list[int]()
+
+    def note(number: int, _: object) -> None:
+        signals.append(number)
+        if len(signals) > 1:  # a second one stops it at once
+            raise SystemExit(128 + number)
+
+    with asked_to_stop(note):
         for number in range(episodes):
             if number in results.rows:
                 continue
@@ -238,26 +244,6 @@ def drive_in_turn(
             if is_over:
                 raise KeyboardInterrupt
         return results.summed_up(episodes)
-
-
-@contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Those that ask to stop, but for what nohup lets it ignore; a second one stops it at once."""
-    names, signals = ("SIGINT", "SIGTERM", "SIGHUP"), list[int]()
-
-    def note(number: int, _: object) -> None:
-        signals.append(number)
-        if len(signals) > 1:
-            raise SystemExit(128 + number)
-
-    is_main = current_thread() is main_thread()  # others get none
-    numbers = [getattr(signal, name) for name in names if is_main and hasattr(signal, name)]
-    before = {n: signal.signal(n, note) for n in numbers if signal.getsignal(n) != signal.SIG_IGN}
-    try:
-        yield signals
-    finally:
-        for number, how in before.items():
-            signal.signal(number, how)
 
 
 def drive_at_once(

@@ -10,8 +10,11 @@ from __future__ import annotations
 import io
 import json
 import os
-from collections.abc import Mapping
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from threading import current_thread, main_thread
 from typing import Any
 
 import msgspec
@@ -22,6 +25,23 @@ from evofsm.guard.audit_log import lines
 _LONGEST_RECORD = 1 << 20  # a record has at most so many bytes
 
 Record = Mapping[str, Any]
+
+
+@contextmanager
+def asked_to_stop(handle: Callable[[int, Any], object]) -> Iterator[None]:
+    """Have signals that ask to stop call ``handle``; what nohup lets it ignore, it ignores.
+
+    Python calls such in the main thread alone: in another one nothing changes.
+    """
+    names = ("SIGTERM", "SIGINT", "SIGHUP") if current_thread() is main_thread() else ()
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    numbers = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class Journal:

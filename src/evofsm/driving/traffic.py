@@ -226,17 +226,17 @@ class TrafficRisk(ActionJudge):
         """Index of the acceleration that is in proportion ahead and survived behind, and why."""
         avoids, regains = np.ones((2, len(options)), np.bool_)
         pairs = pairs_of(situation.observation)
-        for pair in pairs:
-            if pair.role is not Role.BEHIND:
-                pair_arguments = pair[2:5], pair.braking, options, tolerances[-1]
-                two = self.ahead._foreseen(*pair_arguments, hardest=-float(options.min()))
-                avoids, regains = avoids & two[0], regains & two[1]
+        ahead = [pair for pair in pairs if pair.role is not Role.BEHIND]
+        for pair in ahead:
+            pair_arguments = pair[2:5], pair.braking, options, tolerances[-1]
+            two = self.ahead._foreseen(*pair_arguments, hardest=-float(options.min()))
+            avoids, regains = avoids & two[0], regains & two[1]
         avoids &= options <= options[0]
         bearable = options >= -self._survived(pairs)[0]
         arguments = options, judged.risk, tolerances, self.ahead.comfort, avoids & bearable, regains
         if (choice := in_proportion(*arguments)) is not None:
             return choice
-        braking = max((pair.braking for pair in pairs if pair.role is not Role.BEHIND), default=0.0)
+        braking = max((pair.braking for pair in ahead), default=0.0)
         if bearable.any() and judged.critical[bearable].max() > braking:
             # Of several that are survived as well the hardest braking.
             rank = np.lexsort((options, -judged.critical, ~bearable))

@@ -63,6 +63,11 @@ class Situation(NamedTuple):
     seen: float = math.nan  #: time spent in this state so far [s]; NaN where that is not known
 
 
+def is_missing(z: Floats) -> bool:
+    """Whether a variable of an observation is NaN; the quickest way to ask for it."""
+    return math.isnan(z.dot(z))
+
+
 class Revision(NamedTuple):
     """What a reviser made of a proposal, and why.
 

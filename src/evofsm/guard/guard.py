@@ -31,10 +31,7 @@ from evofsm.guard.actions import (
     Choices,
     checked_mask,
     fixed,
-    is_usable,
     no_action,
-    put_into,
-    same_action,
 )
 from evofsm.guard.api import (
     BELIEF_TOLERANCE,
@@ -49,10 +46,11 @@ from evofsm.guard.api import (
     Reviser,
     Revision,
     Situation,
+    is_missing,
 )
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.parts import outline, rebuild
-from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
+from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken, make_usable
 from evofsm.guard.warming import warm_machine
 from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
 
@@ -84,7 +82,7 @@ class InputMonitor(NamedTuple):
         if time <= self.time:
             return Intake.REPEATED if time == self.time else Intake.LATE, self
         intake, latest_row = Intake.WHOLE, observation
-        if _is_missing(observation):
+        if is_missing(observation):
             intake = Intake.PARTIAL
             if len(self.held) == len(observation):  # what was seen of them before is still held
                 latest_row = np.where(np.isnan(observation), self.held, observation)
@@ -250,9 +248,8 @@ class Guard:
         shadow: bool = True,
     ) -> None:
         actions = _actions(low, high, n_actions)
-        for name, part, method in ("judge", judge, "judge"), ("audit", audit, "decided"):
-            if not (part is None or hasattr(part, method)):
-                raise TypeError(f"{name} is {part!r}, which has no method {method}")
+        if not (judge is None or hasattr(judge, "judge")):
+            raise TypeError(f"judge is {judge!r}, which has no method judge")
         interval = positive("interval", interval)
         soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
         arguments: dict[str, Any] = {"model": model, "backup": backup, "names": names}
@@ -327,6 +324,8 @@ class Guard:
         n_failed: int = 0,
     ) -> None:
         function("failed", failed, "lambda z: z[0] <= 0")
+        if not (audit is None or hasattr(audit, "decided")):
+            raise TypeError(f"audit is {audit!r}, which has no method decided")
         share(self)
         self.process = os.getpid()  #: in which it was made; a copy elsewhere learns for itself
         self.actions = reviser.actions
@@ -594,7 +593,7 @@ class Guard:
 
     def _count_missing(self, z: NDArray[np.float64]) -> None:
         """Warn where no observation is whole for long: nothing is learnt from such."""
-        self._lacking = self._lacking + 1 if _is_missing(z) else 0
+        self._lacking = self._lacking + 1 if is_missing(z) else 0
         if self._lacking == _MANY:
             names = ", ".join(map(self._labels.variable, np.flatnonzero(np.isnan(z)).tolist()))
             warnings.warn(
@@ -610,7 +609,7 @@ class Guard:
         state: int | None = None
         is_incomplete = bool(intake) and bool(intake & Intake.PARTIAL)
         if model is not None:
-            if model.n_states and not _is_missing(latest_row):
+            if model.n_states and not is_missing(latest_row):
                 belief = model.recognise(latest_row)
                 state = int(belief.argmax())
         elif machine is not None and not (is_incomplete and machine.n_states == 0):
@@ -653,8 +652,7 @@ class Guard:
     def _refuse_unfit(self, action: Any) -> None:
         """Raise for what somebody's own reviser would execute, if that is no action of the set."""
         with suppress(TypeError, ValueError):
-            is_fit = is_usable(self.actions, action)
-            if is_fit and same_action(put_into(self.actions, action), action):
+            if not make_usable(Proposal(action), self.actions).remark:
                 return
         name = type(self.reviser).__name__
         raise ValueError(f"{name} would execute {action!r}, which is none of {self.actions}")
@@ -756,7 +754,7 @@ class Guard:
         terminated = terminated and not failed
         machine = self.machine if self._learn else None
         if machine is not None:
-            has_gaps = z is not None and _is_missing(z)
+            has_gaps = z is not None and is_missing(z)
             if z is not None and (machine.n_states or not has_gaps):
                 machine.observe(z, failed=failed, partial=has_gaps)
             elif failed and machine.state is not None:
@@ -910,11 +908,6 @@ class Guard:
             parts = rebuild(settings, files, judge)
             plain = {name: settings[name] for name in _PLAIN_SETTINGS}
             return cls.of(failed=failed, **parts, **plain)
-
-
-def _is_missing(z: NDArray[np.float64]) -> bool:
-    """Whether a variable is NaN; the quickest way to ask for it."""
-    return math.isnan(z.dot(z))
 
 
 def ends_of(judge: ActionJudge | None, m: int) -> NDArray[np.float64]:

@@ -12,14 +12,15 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, suppress
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from evofsm.cli.journal import asked_to_stop
 from evofsm.cli.monitor.decider import Answer, Decider
 from evofsm.cli.monitor.messages import LONGEST
 from evofsm.extras import needs
@@ -90,7 +91,7 @@ class Server:
         """Serve until the input ends, SIGTERM, SIGHUP or Ctrl-C; no decision is cut short."""
         threading.Thread(target=self._serve, args=(transport,), daemon=True).start()
         try:
-            with _stoppable():
+            with asked_to_stop(signal.default_int_handler), suppress(KeyboardInterrupt):
                 while not self._over.wait(_LONGEST_WAIT):
                     if time.monotonic() - self._heard > (self.decider.slots.step or math.inf):
                         transport.send(self._lapse())
@@ -115,21 +116,6 @@ class Server:
         with self._turn:
             answer = self.decider.lapse()
         return b"" if answer is None else self._line(answer)
-
-
-@contextmanager
-def _stoppable() -> Iterator[None]:
-    """Let signals end it; what whoever started it let it ignore, as nohup does, it ignores."""
-    names = ("SIGTERM", "SIGINT", "SIGHUP")
-    signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    signals = [number for number in signals if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, signal.default_int_handler) for number in signals}
-    try:
-        with suppress(KeyboardInterrupt):
-            yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class Stream:

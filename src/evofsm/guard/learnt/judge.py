@@ -25,7 +25,15 @@ from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import action_name, function, positive, whole
 from evofsm.guard.actions import ActionSet, BoxActions, Choices, Mask, limits
-from evofsm.guard.api import Fallback, Judgement, ObservingJudge, Search, SearchingJudge, Situation
+from evofsm.guard.api import (
+    Fallback,
+    Judgement,
+    ObservingJudge,
+    Search,
+    SearchingJudge,
+    Situation,
+    is_missing,
+)
 from evofsm.guard.harm import SETTINGS, Harm
 from evofsm.guard.learnt import rollout, words
 from evofsm.guard.learnt.backups import basis
@@ -380,8 +388,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         """Of some actions; of the first it is kept why it is dangerous (`why`)."""
         counts = [outcome.unsurvived for outcome in outcomes]
         self._unsurvived = -1 if math.isinf(counts[0]) else int(counts[0])
-        memory, z = self.remembered, situation.observation
-        if math.isnan(z.dot(z)) and self._n_blind + 1 >= self.BLIND:
+        memory = self.remembered
+        if self._n_blind + 1 >= self.BLIND and is_missing(situation.observation):
             return _unjudged(len(counts))
         soon = self._soon(memory.seconds)
         risk, low, high = np.array([self._risk(n, soon) for n in counts]).T
@@ -414,7 +422,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def _here(self, z: Floats) -> Floats | None:
         """The situation, if that is seen; what was not is taken to be as was expected."""
         row, stride, n = z, self.state.stride, len(self._done)
-        if math.isnan(z.dot(z)):
+        if is_missing(z):
             if self._before is None:
                 return None
             situation, action = self._before
@@ -526,7 +534,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         """Keep up with what happens, without learning from it."""
         z = np.array(observation, np.float64)
         here, stride = self._here(z), self.state.stride
-        self._n_blind = self._n_blind + 1 if math.isnan(z.dot(z)) else 0
+        self._n_blind = self._n_blind + 1 if is_missing(z) else 0
         if here is not None:
             inner = self.encode(action)
             self._past = [*self._past, here[: len(z)]][-stride:]
@@ -637,7 +645,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
         Empty, and None, where it is in and near none, nor near a form of failures.
         """
-        if math.isnan(observation.dot(observation)) or self.parts is None:
+        if is_missing(observation) or self.parts is None:
             return "", None
         near = self.settings.margin_max
         return words.here(self.state, self.parts.model, self.called, observation, near)
