@@ -6,9 +6,9 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from operator import itemgetter
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import msgspec
 import numpy as np
@@ -37,6 +37,7 @@ _Speed = Annotated[float, Meta(ge=SPEEDS[0], le=SPEEDS[1])]
 _Rate = Annotated[float, Meta(ge=RATES[0], le=RATES[1])]
 _Size = Annotated[float, Meta(ge=SIZES[0], le=SIZES[1])]
 _Seen = _Number | None
+_Keys: Any = TypedDict  # of any letters, as columns have them
 _Name = Annotated[str, Meta(max_length=_LETTERS)] | Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 
 
@@ -110,62 +111,53 @@ class Form:
         self.count = len(self.variables) or n_variables
         length = Meta(min_length=self.count or 1, max_length=self.count or None)
         several: Any = Annotated[list[_Seen], length]
-        # By keys of our own: a column may be called "Tank 1 [mm]", which no attribute can be.
-        self._keys = {f"v{k}": name for k, name in enumerate(self.variables or ["observation"])}
-        self._others = {f"w{k}": name for k, name in enumerate(others)}
+        variables = dict.fromkeys(self.variables, _Seen) or {"observation": several}
+        self._observed, self._others = list(variables), others
         clocks = dict.fromkeys([clock, *clock.split(",")])  # of date and time of day
-        names = {"time", *self._keys.values(), *others}
-        self._clocks = {f"x{k}": name for k, name in enumerate(clocks) if name not in names}
+        self._clocks = [name for name in clocks if name not in ("time", *variables, *others)]
         self._form, self._unit = unit if "%" in unit else "", TIMES.get(unit, 1.0)
-        variables = [(key, _Seen if self.variables else several) for key in self._keys]
-        action: Any = ("proposal", _action(guard))
+        action = _action(guard)
         if isinstance(guard.actions, Choices) and guard.actions.n_actions == 1:  # nobody acts
-            action = (*action, 0)
-        version = ("schema", Literal[1], SCHEMA)
-        also = [(key, float | bool | str | None, None) for key in self._others]
-        when = [(key, _Number | str | UnsetType, UNSET) for key in ("time", *self._clocks)]
-        self._row = self._struct("Row", *when, action, *variables, *also, version)
-        vehicles = ("ego", _Vehicle), ("objects", list[_Vehicle])
-        self._scene = self._struct("Scene", ("time", _Number), action, *vehicles, version)
-        last = [(key, kind | UnsetType, UNSET) for key, kind in variables]
-        end = ("end", bool), ("failed", bool, False), ("time", _Seen | str | UnsetType, UNSET)
-        self._end = self._struct("End", *end, *when[1:], *last, *also, version)
-
-    def _struct(self, name: str, *fields: Any) -> Any:
-        strict: Any = {
-            "forbid_unknown_fields": True,
-            "kw_only": True,
-            "rename": self._keys | self._others | self._clocks,
-        }
-        return msgspec.defstruct(name, fields, **strict)
+            action = NotRequired[action]
+        also = dict.fromkeys(others, NotRequired[float | bool | str | None])
+        also["schema"] = NotRequired[Literal[1]]
+        when = dict.fromkeys(["time", *self._clocks], NotRequired[_Number | str])
+        self._row = _Keys("Row", {**when, "proposal": action, **variables, **also})
+        scene = {"time": _Number, "proposal": action, "ego": _Vehicle, "objects": list[_Vehicle]}
+        self._scene = _Keys("Scene", {**scene, "schema": also["schema"]})
+        last = {name: NotRequired[kind] for name, kind in variables.items()}
+        end = {"end": bool, "failed": NotRequired[bool], **when, "time": NotRequired[_Seen | str]}
+        self._end = _Keys("End", {**end, **last, **also})
 
     def read(self, line: bytes | dict[str, Any]) -> Message:
         """The message on a line, or with these keys."""
         body = line if isinstance(line, dict) else _parsed(line)
         kind = self._scene if self.scenes or body.keys() & {"ego", "objects"} else self._row
         kind = self._end if "end" in body else kind
+        names = kind.__required_keys__ | kind.__optional_keys__
         try:
-            fields = msgspec.convert(body, kind)
+            if unknown := [name for name in body if name not in names]:
+                raise _unknown(unknown[0], names)
+            try:
+                fields = msgspec.convert(body, kind)
+            except msgspec.ValidationError as error:
+                raise _refused(body, str(error)) from None
             if kind is self._end:
                 return self._of_end(fields)
             if kind is self._scene:
                 return self._of_scene(fields)
-            also = tuple(getattr(fields, key) for key in self._others)
             if (time := self._when(fields)) is None:
-                names = "".join(f", or {name!r}" for name in self._clocks.values())
-                raise MessageError("time", f"is missing{names}; every message of its kind has it")
-            return Row(time, self._observed(fields), _frozen(fields.proposal), told=also)
+                clocks = "".join(f", or {name!r}" for name in self._clocks)
+                raise MessageError("time", f"is missing{clocks}; every message of its kind has it")
+            also = tuple(map(fields.get, self._others))
+            return Row(time, self._seen(fields), _frozen(fields.get("proposal", 0)), told=also)
         except MessageError as error:
             error.time = _time(body)
             raise
-        except msgspec.ValidationError as error:
-            raise self._refused(body, kind, str(error)) from None
 
-    def _when(self, told: Any) -> float | None:
+    def _when(self, told: dict[str, Any]) -> float | None:
         """The time of a message [s], as it or a log has it."""
-        keys = {"time": "time", **self._clocks}
-        fields = {name: getattr(told, key) for key, name in keys.items()}
-        times = {name: value for name, value in fields.items() if value not in (UNSET, None)}
+        times = {n: told[n] for n in ("time", *self._clocks) if told.get(n) is not None}
         name, time = next(iter(times.items()), ("time", None))
         if isinstance(time, str):
             try:
@@ -178,28 +170,26 @@ class Form:
             raise MessageError(name, f"is {time:.15g}: milliseconds? It must be in seconds", time)
         return seconds
 
-    def _observed(self, told: Any) -> tuple[float | None, ...]:
-        values = [getattr(told, key) for key in self._keys]
-        return tuple(values if self.variables else values[0])
+    def _seen(self, told: dict[str, Any]) -> tuple[float | None, ...]:
+        return tuple(told[name] for name in self.variables) or tuple(told["observation"])
 
-    def _of_end(self, told: Any) -> End:
-        if not told.end:
+    def _of_end(self, told: dict[str, Any]) -> End:
+        if not told["end"]:
             raise MessageError("end", "is false; it must be true")
-        omissions = [name for key, name in self._keys.items() if getattr(told, key) is UNSET]
-        if len(omissions) == len(self._keys):
-            return End(told.failed, time=self._when(told))
-        if omissions:
+        omissions = [name for name in self._observed if name not in told]
+        if 0 < len(omissions) < len(self._observed):
             raise MessageError(omissions[0], "is missing; a variable that was not seen is null")
-        return End(told.failed, self._observed(told), self._when(told))
+        observation = None if omissions else self._seen(told)
+        return End(told.get("failed", False), observation, self._when(told))
 
-    def _of_scene(self, told: Any) -> Row:
+    def _of_scene(self, told: dict[str, Any]) -> Row:
         if not (self.scenes or self.variables == VARIABLES):
             raise MessageError(
                 "objects", "are for guards of car following; send a row of this guard's variables"
             )
-        ego = told.ego
+        ego, time, cars = told["ego"], told["time"], told["objects"]
         _refuse_nowhere(ego, "ego")
-        for k, car in enumerate(told.objects):
+        for k, car in enumerate(cars):
             where = f"objects[{k}]"
             _refuse_nowhere(car, where)
             if car.id is UNSET:
@@ -208,41 +198,17 @@ class Form:
             if not in_lanes and (car.y is UNSET or ego.y is UNSET):
                 fault = "is given for it or for ego, but not for both; nor is y"
                 raise MessageError(f"{where}.lane", fault)
-        proposal = _frozen(told.proposal)
+        proposal = _frozen(told.get("proposal", 0))
         if self.scenes:
-            objects = [_object(car, f"objects[{k}]") for k, car in enumerate(told.objects)]
+            objects = [_object(car, f"objects[{k}]") for k, car in enumerate(cars)]
             scene = Scene(_object(ego, "ego"), objects)
             names = tuple(obj.id for obj in scene.objects[1 : _MOST_OBJECTS + 1])
             rows = (None if math.isnan(z) else z for z in scene.rows(_MOST_OBJECTS).tolist())
-            return Row(told.time, tuple(rows), proposal, objects=names)
-        if (ahead := _nearest_ahead(ego, told.objects)) is None:
-            return Row(told.time, None, proposal)
+            return Row(time, tuple(rows), proposal, objects=names)
+        if (ahead := _nearest_ahead(ego, cars)) is None:
+            return Row(time, None, proposal)
         gap, car = ahead
-        return Row(told.time, (gap, ego.vx, car.vx), proposal, None if car.id is UNSET else car.id)
-
-    def _refused(self, body: dict[str, Any], kind: Any, error: str) -> MessageError:
-        """What msgspec refused, with the key and the value, in a sentence."""
-        text, _, place = error.partition(" - at `$")
-        place, time = place.removesuffix("`").removeprefix("."), _time(body)
-        if text == "Number out of range":
-            return MessageError(place, "is too large", time)
-        if match := re.fullmatch(r"Object (missing|contains).* field `(.*)`", text):
-            about = f"{place}.{match[2]}".removeprefix(".")
-            if match[1] == "missing":
-                return MessageError(about, f"is missing{_missing(about)}", time)
-            fields = msgspec.structs.fields(_Vehicle if place else kind)
-            names = ", ".join(sorted(field.encode_name for field in fields))
-            return MessageError(about[:_LETTERS], f"is not known; known are {names}", time)
-        value = _shown(_at(body, place))
-        if place == "schema":
-            fault = f"is {value}; this monitor knows version {SCHEMA} alone"
-        else:
-            demand = re.sub("^Expected |, got .*|`", "", text).replace(" | ", " or ")
-            fault = f"is {value}; it must be {demand}"
-            if isinstance(word := _at(body, place), str) and is_number(word.replace(",", ".")):
-                cause = "a decimal comma" if "," in word else "a number in quotes"
-                fault += f" ({cause}? send {word.replace(',', '.')})"
-        return MessageError(place or "line", fault, time)
+        return Row(time, (gap, ego.vx, car.vx), proposal, None if car.id is UNSET else car.id)
 
 
 def _action(guard: Guard) -> Any:
@@ -322,6 +288,33 @@ def _parsed(line: bytes) -> dict[str, Any]:
     if not isinstance(body, dict):
         raise MessageError("line", f"is {_shown(body)}; it must be a JSON object")
     return body
+
+
+def _refused(body: dict[str, Any], error: str) -> MessageError:
+    """What msgspec refused, with the key and the value, in a sentence."""
+    text, _, place = error.partition(" - at `$")
+    place = place.removesuffix("`").removeprefix(".")
+    if text == "Number out of range":
+        return MessageError(place, "is too large")
+    if match := re.fullmatch(r"Object (missing|contains).* field `(.*)`", text):
+        about = f"{place}.{match[2]}".removeprefix(".")
+        if match[1] == "missing":
+            return MessageError(about, f"is missing{_missing(about)}")
+        return _unknown(about, _Vehicle.__struct_fields__)
+    value = _shown(_at(body, place))
+    if place == "schema":
+        fault = f"is {value}; this monitor knows version {SCHEMA} alone"
+    else:
+        demand = re.sub("^Expected |, got .*|`", "", text).replace(" | ", " or ")
+        fault = f"is {value}; it must be {demand}"
+        if isinstance(word := _at(body, place), str) and is_number(word.replace(",", ".")):
+            cause = "a decimal comma" if "," in word else "a number in quotes"
+            fault += f" ({cause}? send {word.replace(',', '.')})"
+    return MessageError(place or "line", fault)
+
+
+def _unknown(about: str, names: Iterable[str]) -> MessageError:
+    return MessageError(about[:_LETTERS], f"is not known; known are {', '.join(sorted(names))}")
 
 
 def _refuse_twice(pairs: list[tuple[str, Any]]) -> None:
