@@ -18,7 +18,7 @@ from evofsm.cli.monitor.summary import decided_on_log
 from evofsm.cli.options import reading_of
 from evofsm.cli.watch.session import watched_log
 from evofsm.cli.watch.words import introduce, tell
-from evofsm.io import LogColumns, episodes_of
+from evofsm.io import LogColumns, episodes_of, read_traces
 
 polars = pytest.importorskip("polars")
 
@@ -346,7 +346,7 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
     found = [one for one in found if one["kind"] == "decision"]
     # As the log is read: by the options that are in the guard's file.
     told = json.loads(evofsm("inspect", "guard.evofsm", "--json").stdout)["provenance"]["read with"]
-    chunks = reading_of(**told).traces([path])
+    chunks = read_traces([path], reading_of(**told))
     decider = Decider(Guard.load("guard.evofsm"), slots=Slots(LogColumns(hole=300.0)))
     expected = [a for a, row in decided_on_log(decider, episodes_of(chunks)) if row is not None]
     began = seconds(log["Zeit"][0])

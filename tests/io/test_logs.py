@@ -392,7 +392,7 @@ def test_any_name_of_a_column_can_be_said(tmp_path, name):
     frame = {"time": [0.0, 0.1, 0.2], name: [3.0, 1.0, 0.0], "light": ["a", "b", "a"]}
     polars.DataFrame(frame | {"u, own": [0.0] * 3}).write_parquet(path)
     asked = f'{quoted}, "light"=a/b', '"u, own"', "time", quoted, None, f"{quoted}<=0"
-    columns, *_ = reading_of(*asked, [f"{quoted}=cm"], None, None, None, 0, None)
+    columns = reading_of(*asked, [f"{quoted}=cm"], None, None, None, 0, None)
     (chunk,) = read_traces([str(path)], replace(columns, episode=None))
     assert chunk.observations[:, 0].tolist() == [0.03, 0.01, 0.0]
     assert chunk.failures.tolist() == [2]

@@ -80,7 +80,7 @@ def drive(seconds=2.0):
 
 
 def read(path, told=TOLD, **columns):
-    return list(read_traces([path], LogColumns(**columns), topics=Topics.of(told)))
+    return list(read_traces([path], LogColumns(topics=Topics.of(told), **columns)))
 
 
 @pytest.mark.parametrize(
@@ -172,13 +172,13 @@ def test_two_clocks_of_different_rates_are_told(tmp_path, plugin, rate, warns):
         for topic, x, v in ((OTHER, 50.0, 18.0), (EGO, 0.0, 20.0))
     ]
     path, noted = write(tmp_path / "bag", messages, plugin), Noted()
-    list(read_traces([path], topics=Topics.of(TOLD), noted=noted))
+    list(read_traces([path], LogColumns(topics=Topics.of(TOLD)), noted))
     told = " ".join(warnings_of(noted))
     assert (f"span 5.9 s by their headers, and {5.9 / rate:.3g} s as recorded" in told) == warns
     if warns:
         way = re.search('stamp = "(header)" in the file of --topics', told)[1]
         noted = Noted()
-        (chunk,) = read_traces([path], topics=Topics.of(TOLD | {"stamp": way}), noted=noted)
+        (chunk,) = read_traces([path], LogColumns(topics=Topics.of(TOLD | {"stamp": way})), noted)
         assert np.diff(chunk.observations[:, 0]) == pytest.approx(-0.2)
         assert (chunk.dt, warnings_of(noted)) == (0.1, [])
 
@@ -222,7 +222,7 @@ def test_of_mcap_that_ends_early_the_beginning_is_read(tmp_path):
     (whole,) = read(write(tmp_path / "bag", drive(60.0), MCAP))
     (path,), noted = (tmp_path / "bag").glob("*.mcap"), Noted()
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 9 // 10])
-    (chunk,) = read_traces([str(path)], topics=Topics.of(TOLD), noted=noted)
+    (chunk,) = read_traces([str(path)], LogColumns(topics=Topics.of(TOLD)), noted)
     assert 5 < len(chunk.times) < len(whole.times)
     assert (chunk.observations == whole.observations[: len(chunk.times)]).all()
     assert "it ends within a record" in " ".join(warnings_of(noted))

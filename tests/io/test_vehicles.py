@@ -28,9 +28,9 @@ def write(path, text):
     return str(path)
 
 
-def episodes(path, lengths=None, **columns):
+def episodes(path, **columns):
     """Every episode as (observations, actions, times)."""
-    chunks = read_traces([str(path)], LogColumns(**columns), lengths)
+    chunks = read_traces([str(path)], LogColumns(**columns))
     return [(one.observations, one.actions, one.times) for one in episodes_of(chunks)]
 
 
@@ -69,11 +69,11 @@ def test_an_episode_ends_when_somebody_cuts_in_or_a_pair_is_away(tmp_path):
 def test_lengths_are_those_of_the_leader_s_type(tmp_path):
     road = {0.0: [("a", "e_0", 50.0, 1.0, "truck@a"), ("b", "e_0", 20.0, 1.0, "car")]}
     path = write(tmp_path / "a.xml", xml(road))
-    assert episodes(path, lengths_given(["4", "truck=12"]))[0][0][0, 0] == 18.0
-    assert episodes(path, lengths_given(["4"]))[0][0][0, 0] == 26.0
+    assert episodes(path, lengths=lengths_given(["4", "truck=12"]))[0][0][0, 0] == 18.0
+    assert episodes(path, lengths=lengths_given(["4"]))[0][0][0, 0] == 26.0
     assert str(lengths_given(["4", "truck=12"])) == "truck 12 m, others 4 m"
     with pytest.raises(ValueError, match=r"has the type 'lorry' .* the types are car, truck"):
-        episodes(path, lengths_given(["lorry=12"]))
+        episodes(path, lengths=lengths_given(["lorry=12"]))
     for text in ("truck=", "-1", "nan"):
         with pytest.raises(ValueError, match="--vehicle-length is"):
             lengths_given([text])
@@ -195,10 +195,10 @@ def test_who_is_beside_is_nobody_s_leader_in_fcd(tmp_path, told, ending):
         text = "\n".join(",".join(map(str, row)) for row in rows)
     path, noted = write(tmp_path / f"a.{ending}", text), Noted()
     lengths = lengths_given(["bike=1.6x0.65", "truck=12x2.5"])
-    (chunk,) = read_traces([path], LogColumns(), lengths, noted=noted)
+    (chunk,) = read_traces([path], LogColumns(lengths=lengths), noted)
     assert set(chunk.names) == BEHIND
     assert warnings_of(noted) == []
-    (chunk,) = read_traces([path], LogColumns(), lengths_given(["12x2.5"]), noted=noted)
+    (chunk,) = read_traces([path], LogColumns(lengths=lengths_given(["12x2.5"])), noted)
     assert "is it narrower than 2.5 m? --vehicle-length bike=12x0.8" in " ".join(warnings_of(noted))
 
 
@@ -296,7 +296,7 @@ def sumo(tmp_path_factory, sumo_road):
 def test_pairs_are_those_that_sumo_drove(sumo, ending):
     path = sumo(f"truth.{ending}", "--precision", "6")
     truth = np.array(json.loads(Path(path).with_name("truth.json").read_text()))
-    found = episodes(path, lengths_given(["truck=12"]))
+    found = episodes(path, lengths=lengths_given(["truck=12"]))
     (mine,) = [rows for rows, _, _ in found if abs(rows[0, 0] - truth[0, 0]) < 1e-5]
     assert len(mine) == len(truth) > 30
     assert mine == pytest.approx(truth, abs=2e-6)

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli import options
 from evofsm.cli.options import Reading, argument, option
+
+if TYPE_CHECKING:
+    from evofsm.io import LogColumns
 
 
 @options.reads_logs
@@ -16,7 +19,7 @@ def learn(
     files: Annotated[
         list[str], argument("Logs, recordings of traffic (FCD, ASAM OSI, objects), bags of ROS 2.")
     ],
-    reading: partial[Reading],
+    reading: Reading,
     action_range: Annotated[
         str, option("Intervals of --action, LOW:HIGH:WIDTH; the end ones take what lies beyond.")
     ] = "-2.5:2.5:0.3",
@@ -57,31 +60,33 @@ def learn(
     from evofsm.cli.models import tables_of
     from evofsm.cli.show import facts, print_json, progress, say, show, warn
     from evofsm.guard import Foresight, Guard
-    from evofsm.io import Chunk, episodes_of
+    from evofsm.io import Chunk, episodes_of, read_traces
     from evofsm.io.logs import Noted
 
     learning.check_out(out)
     learning.check_out(guard, "--guard")
-    columns, lengths, _, acts = read = reading()
-    if _is_looked_at(files, read):
+    columns = reading()
+    if _is_looked_at(files, columns):
         if out or guard or options.given_of(reading):
             raise ValueError(f"say what is observed in {files[0]}: --observe; a way stands above")
         return
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
     own_tolerance = None if tolerance == options.TOLERANCE else tolerance
-    options.refuse_other_limit(acts, false_a_day, own_tolerance)
-    actions = learning.actions_of(action_range if acts else "0:1:1")
+    options.refuse_other_limit(columns.acts, false_a_day, own_tolerance)
+    actions = learning.actions_of(action_range if columns.acts else "0:1:1")
     encoder = columns.observe
     machine = learning.machine_of(actions.n_actions, rule, scale, max_states, encoder)
-    kind = None if guard is None else learning.judge_of(judge if acts else "learnt", columns)
+    kind = None if guard is None else learning.judge_of(judge, columns)
     notes, places = Noted(), [Path(file).resolve() for file in files]
     if twice := [f for f, place in zip(files, places, strict=True) if places.count(place) > 1]:
         raise ValueError(f"{twice[0]} is named twice; what failed there would be learnt twice, too")
     sizes = [learning.size_of(file) for file in files]
     with progress("Learning", sum(sizes)) as move:
-        chunks: Iterable[Chunk] = read.traces(files, notes, lambda count: move(advance=count))
-        chunks = list(chunks) if guard is not None and not acts else chunks
+        chunks: Iterable[Chunk] = read_traces(
+            files, columns, notes, lambda count: move(advance=count)
+        )
+        chunks = list(chunks) if guard is not None and not columns.acts else chunks
         units_of = partial(notes.si_units, encoder.names)
         lesson = learning.learn_traces(chunks, machine, actions, encoder.names, units_of)
     model = lesson.model
@@ -100,10 +105,10 @@ def learn(
         model.save(out, provenance)
     new_guard: Guard | None = None
     if guard is not None and kind is not None:
-        if acts:
+        if columns.acts:
             new_guard = learning.guard_of_log(kind, model, machine, brakes, tolerance)
             with progress("Teaching the guard", lesson.rows) as move:
-                share = learning.teach(new_guard, read.traces(files), lambda count: move(count))
+                share = learning.teach(new_guard, read_traces(files, columns), move)
             if refusal := learning.refusing(share):
                 warn(f"warning: in the later half of the log the guard {refusal}")
         else:
@@ -118,10 +123,10 @@ def learn(
         document |= learning.document_of(lesson, provenance)
         print_json({**document, "noted": notes, "warnings": warnings})
         return
-    pairs = [*learning.read_of(lesson, columns.action * acts)]
+    pairs = [*learning.read_of(lesson, columns.action * columns.acts)]
     pairs += learning.read_otherwise(notes, columns, lesson)
-    if lengths.seen:
-        pairs.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
+    if columns.lengths.seen:
+        pairs.append(("vehicle lengths", f"assumed, for FCD has none: {columns.lengths}"))
     learner = new_guard and new_guard.judge
     tables = foreseen.alarms_of(learner) if isinstance(learner, Foresight) else tables_of(model)
     show(facts("What was read", pairs), *tables)
@@ -136,16 +141,15 @@ def learn(
             say(line)
 
 
-def _is_looked_at(files: list[str], reading: Reading) -> bool:
+def _is_looked_at(files: list[str], columns: LogColumns) -> bool:
     """Whether nobody said what is observed in a log of no cars; then what it holds was printed."""
     from evofsm.driving.naming import VARIABLES
     from evofsm.io.logs import open_table
     from evofsm.io.tables import CsvTable, ParquetTable, Skips
 
-    columns = reading.columns
     if columns.observe.names != VARIABLES:
         return False
-    table = open_table(files[0], columns, reading.lengths, reading.topics, Skips())
+    table = open_table(files[0], columns, Skips())
     if not isinstance(table, CsvTable | ParquetTable) or {*VARIABLES} & {*table.columns}:
         return False
     from evofsm.cli.look import show_look

@@ -14,7 +14,7 @@ import numpy as np
 
 from evofsm import store
 from evofsm.cli.models import model_document
-from evofsm.cli.options import Judge, Reading, imported
+from evofsm.cli.options import Judge, imported
 from evofsm.cli.show import warn
 from evofsm.driving import SAFETY_RULE
 from evofsm.driving.cars import guard_of_monitor
@@ -24,7 +24,7 @@ from evofsm.fsm.rules import describe_rule, rule_named
 from evofsm.fsm.validation import positive
 from evofsm.guard import ActionReviser, Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.foresight import span
-from evofsm.io import Chunk, LogColumns, episodes_of
+from evofsm.io import Chunk, LogColumns, episodes_of, read_traces
 from evofsm.io.logs import Noted
 from evofsm.io.tables import SI, TIMES, UNITS, quoted_name
 
@@ -209,18 +209,13 @@ def _contradictions(noted: Noted, columns: LogColumns) -> Iterator[str]:
 
 
 def episodes_read(
-    path: str,
-    reading: Reading,
-    notes: Noted,
-    *,
-    dated: bool,
-    fewest: int = 2,
+    path: str, columns: LogColumns, notes: Noted, *, dated: bool, fewest: int = 2
 ) -> Iterator[Chunk]:
     """The episodes of a log of so many rows, dated if they shall be; then what was noticed."""
-    for episode in episodes_of(reading.traces([path], notes)):
+    for episode in episodes_of(read_traces([path], columns, notes)):
         if len(episode.times) >= fewest:
             yield episode._replace(times=episode.times + notes.began) if dated else episode
-    for warning in warnings_of(notes, reading.columns):
+    for warning in warnings_of(notes, columns):
         warn(f"warning: {warning}")
 
 
@@ -350,6 +345,7 @@ def judge_of(judge: Judge | None, columns: LogColumns) -> Judge:
     if any(not isinstance(variable, str) for variable in columns.observe.variables):
         raise ValueError("--guard takes numbers alone, and --observe names a discrete column")
     judge = judge or ("kinematic" if names == VARIABLES else "learnt")
+    judge = judge if columns.acts else "learnt"
     if judge == "kinematic" and len(names) != len(VARIABLES):
         raise ValueError(
             f"--judge kinematic knows cars by their {', '.join(VARIABLES)}; --observe has to name "

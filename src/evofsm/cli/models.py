@@ -19,6 +19,7 @@ from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, Labels
 from evofsm.fsm.explanation import Explanation
 from evofsm.guard import Foresight, Guard, LearntRisk
 from evofsm.guard.learnt.failure import telling
+from evofsm.io import read_traces
 
 # What folders of results hold, in the order in which it is looked for.
 _MODELS = ("guard.evofsm", "model.evofsm")
@@ -61,7 +62,7 @@ def logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> di
         return {}
     rows, failed = list[Any](), list[Any]()
     options = {**read_with} if read_with else {"observe": quoted(model.names)}
-    for chunk in reading_of(**options).traces([log]):
+    for chunk in read_traces([log], reading_of(**options)):
         rows.append(chunk.observations)
         failed.append(chunk.fails)
     every, failures = np.concatenate(rows), np.concatenate(failed)

@@ -12,7 +12,7 @@ from inspect import Parameter, Signature, signature
 from pathlib import Path
 from pkgutil import resolve_name
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from evofsm.fsm.observations import ObservationEncoder
-    from evofsm.io import Chunk, LogColumns, Topics, VehicleLengths
-    from evofsm.io.logs import Noted, Resample
+    from evofsm.io import LogColumns, VehicleLengths
+    from evofsm.io.logs import Resample
 
 Judge = Literal["kinematic", "learnt"]  #: what a judge was given
 ModeName = Literal["off", "shadow", "act"]  #: how far a guard goes, as `evofsm.guard.Mode`
@@ -131,26 +131,8 @@ def _named(text: str) -> list[tuple[str, str]]:
     return [quoted_name(part.strip()) for part in parts if part.strip()]
 
 
-class Reading(NamedTuple):
-    """How a log is read."""
-
-    columns: LogColumns
-    lengths: VehicleLengths
-    topics: Topics | None
-    acts: bool = True  #: whether somebody acts; else the action is any column, and means nothing
-
-    def traces(
-        self,
-        files: Iterable[str],
-        noted: Noted | None = None,
-        on_read: Callable[[int], object] = lambda count: None,
-    ) -> Iterator[Chunk]:
-        """What is in files."""
-        from evofsm.io import read_traces
-
-        read = read_traces(files, self.columns, self.lengths, on_read, noted, self.topics)
-        # Before a hole the action is unknown still, where somebody acts.
-        return read if self.acts else (part._replace(actions=0.0 * part.actions) for part in read)
+#: How a log is read, by options that may be added to.
+Reading = partial["LogColumns"]
 
 
 def reading_of(
@@ -206,7 +188,7 @@ def reading_of(
         str | None,
         option("Up to so long a hole in time costs one transition, and no episode: 10min."),
     ] = None,
-) -> Reading:
+) -> LogColumns:
     """How a log is read, from the options of those names."""
     from evofsm.driving.naming import VARIABLES
     from evofsm.fsm.observations import Category, ObservationEncoder
@@ -230,7 +212,7 @@ def reading_of(
         encoder = ObservationEncoder(*variables)
     except ValueError as error:
         raise ValueError(f"--observe {observe}: {error}") from None
-    columns = LogColumns(
+    return LogColumns(
         observe=encoder,
         action="".join(quoted_name(action)) or encoder.names[0],
         time=",".join(split_names(time)),
@@ -244,13 +226,13 @@ def reading_of(
         where=where,
         resample=None if resample is None else _resampled(resample, encoder, action),
         hole=None if hole is None else seconds("--hole", hole),
+        lengths=lengths_given(vehicle_length or ()),
+        topics=None if topics is None else Topics.load(topics),
+        acts=action != "",
     )
-    lengths = lengths_given(vehicle_length or ())
-    topic_map = None if topics is None else Topics.load(topics)
-    return Reading(columns, lengths, topic_map, acts=action != "")
 
 
-def given_of(reading: partial[Reading]) -> dict[str, Any]:
+def given_of(reading: Reading) -> dict[str, Any]:
     """The options of `reading_of` that were typed, by the names of its parameters."""
     usual = signature(reading_of).parameters
     return {k: v for k, v in reading.keywords.items() if v not in (usual[k].default, [])}
@@ -265,7 +247,7 @@ def read_with(learnt: Path | None) -> dict[str, Any]:
     return dict(read_header(learnt).provenance.get("read with", {}))
 
 
-def with_defaults(reading: partial[Reading], defaults: Mapping[str, Any]) -> partial[Reading]:
+def with_defaults(reading: Reading, defaults: Mapping[str, Any]) -> Reading:
     """`reading_of` with what was typed, else with these."""
     return partial(reading_of, **{**reading.keywords, **defaults, **given_of(reading)})
 
@@ -331,7 +313,8 @@ def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
 def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
     """A command that has the options of `reading_of`, but for its own, in place of ``reading``."""
     parameters = signature(command, eval_str=True).parameters
-    options = signature(reading_of, eval_str=True).parameters
+    later = {"LogColumns": Any}  # which takes long to load
+    options = signature(reading_of, eval_str=True, locals=later).parameters
     log_options = {name: parameter for name, parameter in options.items() if name not in parameters}
 
     @wraps(command)

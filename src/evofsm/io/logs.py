@@ -362,6 +362,12 @@ class LogColumns:
     hole : float, optional
         A hole in time of up to this [s] costs one transition, a longer one begins an episode.
         Without it each does; with ``resample`` it is ten of its steps.
+    lengths : VehicleLengths
+        Lengths assumed for vehicles in FCD.
+    topics : Topics, optional
+        What the topics of bags mean.
+    acts : bool
+        Whether somebody acts; else the action is any column, and means nothing.
     """
 
     observe: ObservationEncoder = field(default_factory=lambda: ObservationEncoder(*VARIABLES))
@@ -377,6 +383,9 @@ class LogColumns:
     where: str | None = None
     resample: Resample | None = None
     hole: float | None = None
+    lengths: VehicleLengths = field(default_factory=VehicleLengths)
+    topics: Topics | None = None
+    acts: bool = True
 
     @property
     def longest_hole(self) -> float | None:
@@ -390,10 +399,8 @@ class LogColumns:
 def read_traces(
     paths: Iterable[str],
     columns: LogColumns | None = None,
-    lengths: VehicleLengths | None = None,
-    on_read: tables.OnRead = lambda count: None,
     noted: Noted | None = None,
-    topics: Topics | None = None,
+    on_read: tables.OnRead = lambda count: None,
 ) -> Iterator[Chunk]:
     r"""Read logs (CSV, Parquet), and recordings in which many vehicles follow each other.
 
@@ -408,14 +415,10 @@ def read_traces(
     columns : LogColumns, optional
         What the columns of a log mean. Recordings of many vehicles give gap, v_follower, v_leader
         and a_follower.
-    lengths : VehicleLengths, optional
-        Lengths assumed for vehicles in FCD.
-    on_read : callable, optional
-        Called with the number of bytes whenever some were read.
     noted : Noted, optional
         Collects what is noticed in reading.
-    topics : Topics, optional
-        What the topics of bags mean.
+    on_read : callable, optional
+        Called with the number of bytes whenever some were read.
 
     Yields
     ------
@@ -440,14 +443,12 @@ def read_traces(
     array([[ 9., 20., 19.]])
     """
     columns = columns or LogColumns()
-    lengths = lengths or VehicleLengths()
-    notes = noted or Noted()
-    clock = _Clock(columns)
+    notes, clock, lengths = noted or Noted(), _Clock(columns), columns.lengths
     for path in paths:
         clock.open(path)
         rows, left_out = 0, notes.leaderless + notes.elsewhere
         skips = Skips(columns.skip_bad, notes.skipped, notes.told, on_read)
-        table = open_table(path, columns, lengths, topics, skips)
+        table = open_table(path, columns, skips)
         file_columns = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
         chunks = _Reader(table, file_columns, clock, notes).chunks()
         if file_columns.longest_hole:
@@ -455,7 +456,8 @@ def read_traces(
         for chunk in chunks:
             rows += len(chunk.times)
             notes.see(chunk, columns.observe.names, first=rows == len(chunk.times))
-            yield chunk
+            # Before a hole the action is unknown still, where somebody acts.
+            yield chunk if columns.acts else chunk._replace(actions=0.0 * chunk.actions)
         if rows == 0 and notes.leaderless + notes.elsewhere > left_out:
             meets = f", and --where {columns.where} must hold" if columns.where else ""
             names = ", ".join(columns.observe.names)
@@ -650,24 +652,18 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
             yield step_rows.rows(0, keeps)
 
 
-def open_table(
-    path: str,
-    columns: LogColumns,
-    lengths: VehicleLengths,
-    topics: Topics | None,
-    skips: Skips,
-) -> Table:
+def open_table(path: str, columns: LogColumns, skips: Skips) -> Table:
     """The rows of a file, whatever it holds."""
     kind = tables.file_kind(path)
-    if kind == "bag" or (kind == "mcap" and topics is not None):  # whatever its profile says
-        if topics is None:
+    if kind == "bag" or (kind == "mcap" and columns.topics):  # whatever its profile says
+        if columns.topics is None:
             raise ValueError(
                 f"{path} is a bag of ROS 2; --topics names a file that says which field of which "
                 "topic is which variable (docs/how-to/logs-of-others.md has one)"
             )
         from evofsm.io.rosbag import BagTable
 
-        return BagTable(path, topics, skips)
+        return BagTable(path, columns.topics, skips)
     steps, scenes = None, None
     if kind in ("osi", "mcap"):
         read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap
@@ -688,7 +684,7 @@ def open_table(
             return table
         scenes = vehicles.scenes_of_table(table)
     if steps is not None:
-        moments = vehicles.pairs_of_fcd(path, steps, lengths, skips)
+        moments = vehicles.pairs_of_fcd(path, steps, columns.lengths, skips)
     else:
         moments = vehicles.pairs_of_scenes(path, scenes or (), skips)
     return PairTable(path, moments, skips)

@@ -65,7 +65,7 @@ def monitor(
     ] = False,
     observe: Annotated[str | None, option("Variables of rows. [default: the guard's]")] = None,
     *,
-    reading: partial[Reading],
+    reading: Reading,
     horizon: options.Horizon = None,
     persist: options.Persist = 0.0,
     false_a_day: options.FalseADay = None,
@@ -171,7 +171,7 @@ def monitor(
                 warn(f"warning: {warning} {sentry.interval:g} s: --resample {sentry.interval:g}s")
             if alone:
                 options.refuse_other_limit(False, false_a_day, tolerance)
-                every, names = list(chunks), log_format.columns.observe.names
+                every, names = list(chunks), log_format.observe.names
                 about = names, notes.si_units(names), alarms, split, plot
                 show_foreseen(file, every, sentry, *about, as_json=as_json)
                 return None
@@ -193,7 +193,7 @@ def monitor(
         prepare(sentry, mode, (tolerance, false_a_day), audit, stack, learn=learn)
         if not (is_log or traffic):
             observe = options.quoted(sentry.variables or VARIABLES)
-            slots = Slots(reader(observe=observe, dt=None).columns)
+            slots = Slots(reader(observe=observe, dt=None))
         decider = Decider(sentry, episode=rows, slots=slots)
         notice = assumptions(brakes, accepted_risk)
         if guard is not None:

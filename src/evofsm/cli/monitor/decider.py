@@ -7,7 +7,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -389,7 +388,7 @@ def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None
 
 def begun(
     told: dict[str, Any],
-    reading: partial[Reading],
+    reading: Reading,
     interval: float | None,
     tolerance: float | None,
     alarms: tuple[float | None, float, float | None],
@@ -397,13 +396,13 @@ def begun(
     """A guard that knows nothing yet, from what was told of a system."""
     if "observe" not in told:
         raise ValueError("say what is observed, the keys of rows: --observe temperature,load")
-    columns, *_, acts = reading(observe=told.pop("observe"), dt=None)
+    columns = reading(observe=told.pop("observe"), dt=None)
     names, scheme = columns.observe.names, columns.resample
     if (step := scheme.step if scheme else interval) is None:
         raise ValueError("say how often rows come [s]: --interval 1; or --resample 10s of jittered")
-    if not acts and told:
+    if not columns.acts and told:
         raise ValueError("--action '' says that nobody acts, and goes with no range of actions")
-    if not acts:
+    if not columns.acts:
         horizon, hold, false_a_day = alarms
         judge = Foresight.from_zero(dt=step, names=names, horizon=horizon, hold=hold)
         return guard_of_alarms(judge, false_a_day, EvolvingFSM(1, max_states=200), learn=True)

@@ -6,7 +6,6 @@ import asyncio
 import re
 import webbrowser
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from shlex import quote
 from typing import Annotated
@@ -34,7 +33,7 @@ def watch(
     learn_first: Annotated[int, option("Episodes to learn from before, at most.", min=0)] = 60,
     brakes: options.Brakes = options.BRAKES,
     *,
-    reading: partial[Reading],
+    reading: Reading,
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
 ) -> None:
     """Watch a run in the browser while it is driven, and act on it; or a log.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from evofsm import driving
 from evofsm.cli.driving import trace_configuration
 from evofsm.cli.learning import episodes_read, learn_chunk
-from evofsm.cli.options import BRAKES, Reading, refuse_other_limit, require_world
+from evofsm.cli.options import BRAKES, refuse_other_limit, require_world
 from evofsm.cli.show import progress, warn
 from evofsm.cli.watch import shown
 from evofsm.driving.cars import assumptions, guard_of_monitor, name_judge
@@ -32,7 +32,7 @@ from evofsm.guard import Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.actions import Action, Choices, change, is_usable, limits, put_into
 from evofsm.guard.api import BELIEF_TOLERANCE, TOLERANCE, Judgement, Proposal, Revision, Situation
 from evofsm.guard.foresight import DATES
-from evofsm.io.logs import LONGEST_STEP, Chunk, Noted
+from evofsm.io.logs import LONGEST_STEP, Chunk, LogColumns, Noted
 from evofsm.io.tables import date
 
 #: The state rule for looking on: coarse enough that each state can be told from the others.
@@ -390,7 +390,7 @@ class Logged:
 
 def watched_log(
     path: str,
-    reading: Reading,
+    columns: LogColumns,
     tolerance: float | None = None,
     case: int | None = None,
     guard: Guard | None = None,
@@ -403,18 +403,18 @@ def watched_log(
     Of cars one is over with a contact, or one of ``collisions`` [s] that a simulation counted, by
     the name of who follows whom. ``case`` is the number of the one to begin with, from 1.
     """
-    names = reading.columns.observe.names
-    of_cars = reading.acts and len(names) == len(VARIABLES) and (not guard or names == VARIABLES)
+    names = columns.observe.names
+    of_cars = columns.acts and len(names) == len(VARIABLES) and (not guard or names == VARIABLES)
     if guard is None and not of_cars:
         raise ValueError(f"{path} is of no cars: --guard names a guard (evofsm learn --guard)")
-    episodes = episodes_read(path, reading, Noted(), dated=not of_cars)
+    episodes = episodes_read(path, columns, Noted(), dated=not of_cars)
     stretches = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
     if not stretches:
         why = f"nobody follows anybody for {_SHOWS}" if of_cars else "no episode has two"
         raise ValueError(f"{path}: {why} rows")
     labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
     rows = [stretch.rows for stretch in stretches]
-    refuse_other_limit(reading.acts, None, tolerance)
+    refuse_other_limit(columns.acts, None, tolerance)
     if guard is None:
         risk = TOLERANCE if tolerance is None else tolerance
         guard = guard_of_monitor(rows[0].dt, brakes, risk)
@@ -432,18 +432,18 @@ def watched_log(
     guard.learn = False
     if isinstance(guard.judge, Foresight):
         stretches = list(_alarmed(guard.judge, guard.judge.alarm, stretches))
-    system = Logged(path, stretches, labels, acts=reading.acts, of_cars=of_cars)
+    system = Logged(path, stretches, labels, acts=columns.acts, of_cars=of_cars)
     return Session(system, guard, case=system.first if case is None else case - 1, on=False)
 
 
-def watched_simulation(path: str, reading: Reading, *choices: Any, brakes: float) -> Session:
+def watched_simulation(path: str, columns: LogColumns, *choices: Any, brakes: float) -> Session:
     """What a configuration of SUMO drives, as a log."""
     with TemporaryDirectory() as folder:
         log = Path(folder) / Path(path).name
         duration, is_cut, crashes = trace_configuration(Path(path), log, _SECONDS, _ENOUGH)
         if is_cut:
             warn(f"watched are the first {duration:,.0f} s of the simulation")
-        return watched_log(str(log), reading, *choices, brakes=brakes, collisions=crashes)
+        return watched_log(str(log), columns, *choices, brakes=brakes, collisions=crashes)
 
 
 def _alarmed(judge: Foresight, rate: int | None, found: Sequence[Played]) -> Iterator[Played]:
