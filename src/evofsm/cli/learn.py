@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli import options
-from evofsm.cli.options import Reading, argument, option
+from evofsm.cli.options import argument, option
 
 if TYPE_CHECKING:
     from evofsm.io import LogColumns
@@ -19,7 +19,7 @@ def learn(
     files: Annotated[
         list[str], argument("Logs, recordings of traffic (FCD, ASAM OSI, objects), bags of ROS 2.")
     ],
-    reading: Reading,
+    reading: dict[str, Any],
     action_range: Annotated[
         str, option("Intervals of --action, LOW:HIGH:WIDTH; the end ones take what lies beyond.")
     ] = "-2.5:2.5:0.3",
@@ -65,9 +65,9 @@ def learn(
 
     learning.check_out(out)
     learning.check_out(guard, "--guard")
-    columns = reading()
+    columns = options.reading_of(**reading)
     if _is_looked_at(files, columns):
-        if out or guard or options.given_of(reading):
+        if out or guard or reading:
             raise ValueError(f"say what is observed in {files[0]}: --observe; a way stands above")
         return
     if guard is not None and out is not None and guard.resolve() == out.resolve():
@@ -96,7 +96,7 @@ def learn(
         "episodes": lesson.episodes,
         "transitions": lesson.transitions,
         "failures": lesson.failures,
-        "read with": {k: v for k, v in options.given_of(reading).items() if k != "topics"},
+        "read with": {k: v for k, v in reading.items() if k != "topics"},
     }
     warnings = learning.warnings_of(notes, columns)
     for warning in warnings:

@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from functools import partial, wraps
+from functools import wraps
 from importlib.util import find_spec
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -131,10 +131,6 @@ def _named(text: str) -> list[tuple[str, str]]:
     return [quoted_name(part.strip()) for part in parts if part.strip()]
 
 
-#: How a log is read, by options that may be added to.
-Reading = partial["LogColumns"]
-
-
 def reading_of(
     observe: Annotated[
         str, option("Columns to observe; a discrete one with its values: light=red/green.")
@@ -232,12 +228,6 @@ def reading_of(
     )
 
 
-def given_of(reading: Reading) -> dict[str, Any]:
-    """The options of `reading_of` that were typed, by the names of its parameters."""
-    usual = signature(reading_of).parameters
-    return {k: v for k, v in reading.keywords.items() if v not in (usual[k].default, [])}
-
-
 def read_with(learnt: Path | None) -> dict[str, Any]:
     """The options with which the log was read that a file is learnt from; none where it is not."""
     from evofsm.store import read_header
@@ -245,11 +235,6 @@ def read_with(learnt: Path | None) -> dict[str, Any]:
     if learnt is None or not learnt.is_file():
         return {}
     return dict(read_header(learnt).provenance.get("read with", {}))
-
-
-def with_defaults(reading: Reading, defaults: Mapping[str, Any]) -> Reading:
-    """`reading_of` with what was typed, else with these."""
-    return partial(reading_of, **{**reading.keywords, **defaults, **given_of(reading)})
 
 
 def typed(given: Mapping[str, Any]) -> str:
@@ -311,7 +296,10 @@ def _resampled(text: str, encoder: ObservationEncoder, action: str) -> Resample:
 
 
 def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
-    """A command that has the options of `reading_of`, but for its own, in place of ``reading``."""
+    """A command that has the options of `reading_of`, but for its own, in place of ``reading``.
+
+    It is given those that were typed, by the names of these parameters.
+    """
     parameters = signature(command, eval_str=True).parameters
     later = {"LogColumns": Any}  # which takes long to load
     options = signature(reading_of, eval_str=True, locals=later).parameters
@@ -319,8 +307,9 @@ def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(command)
     def run(**given: Any) -> Any:
-        arguments = {name: given.pop(name) for name in log_options}
-        return command(**given, reading=partial(reading_of, **arguments))
+        pairs = ((name, given.pop(name)) for name in log_options)
+        choices = {name: v for name, v in pairs if v not in (log_options[name].default, [])}
+        return command(**given, reading=choices)
 
     all_parameters = list[Parameter]()
     for parameter in parameters.values():

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, nullcontext
-from functools import partial
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from evofsm.cli import options
-from evofsm.cli.options import Reading, argument, option
+from evofsm.cli.options import argument, option
 
 _SAME_STEP = 0.05  # share by which the step of a log may differ from that of the guard
 _INTERVAL = 0.1  # of rows of cars, where nobody said another one [s]
@@ -65,7 +64,7 @@ def monitor(
     ] = False,
     observe: Annotated[str | None, option("Variables of rows. [default: the guard's]")] = None,
     *,
-    reading: Reading,
+    reading: dict[str, Any],
     horizon: options.Horizon = None,
     persist: options.Persist = 0.0,
     false_a_day: options.FalseADay = None,
@@ -132,7 +131,7 @@ def monitor(
     is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
     parts = {"low": low, "high": high, "n_actions": n_actions, "observe": observe}
     system, new_guard = {name: part for name, part in parts.items() if part is not None}, None
-    if guard is None and not is_log and (system or "action" in options.given_of(reading)):
+    if guard is None and not is_log and (system or "action" in reading):
         if traffic:
             raise ValueError("--traffic is of cars, and goes with no --observe or --action")
         new_guard, learn = begun({**system}, reading, interval, tolerance, alarms), True
@@ -141,7 +140,7 @@ def monitor(
     log_episode = defaults.pop("episode", None)
     if is_log and episode is None:
         episode = log_episode
-    reader = options.with_defaults(reading, defaults)
+    reader = {**defaults, **reading}
     if episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
         raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns of a log")
     rows = EPISODE if episode is None or is_log else int(episode)
@@ -153,13 +152,14 @@ def monitor(
             from evofsm.io.logs import Noted
 
             sentry = fresh() if guard else None
-            alone = not reader.keywords["action"] or isinstance(sentry and sentry.judge, Foresight)
+            alone = reader.get("action") == ""
+            alone |= isinstance(sentry and sentry.judge, Foresight)
             names = sentry.variables if sentry else VARIABLES
             if observe is None or {*options.split_names(observe)} == {*names}:  # in its own order
                 observe = options.quoted(names)
             if alone:
-                reader = partial(reader, action="")
-            log_format = reader(observe=observe, episode=episode)
+                reader["action"] = ""
+            log_format = options.reading_of(**reader, observe=observe, episode=episode)
             fewest = 1 if alone else 2  # a failure that comes at once counts as well
             notes = Noted()
             episodes = episodes_read(str(file), log_format, notes, dated=alone, fewest=fewest)
@@ -183,7 +183,7 @@ def monitor(
             basics = {"interval": interval, "brakes": brakes} if guard is None else {}
             how = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
             how["false_a_day"] = false_a_day
-            columns = {k: v for k, v in options.given_of(reader).items() if k != "topics"}
+            columns = {k: v for k, v in reader.items() if k != "topics"}
             keeper = State(state, {"guard": digest, **basics, **how, **system, **columns})
             stack.callback(keeper.close)
         elif learn and not summary:
@@ -193,7 +193,7 @@ def monitor(
         prepare(sentry, mode, (tolerance, false_a_day), audit, stack, learn=learn)
         if not (is_log or traffic):
             observe = options.quoted(sentry.variables or VARIABLES)
-            slots = Slots(reader(observe=observe, dt=None))
+            slots = Slots(options.reading_of(**{**reader, "observe": observe, "dt": None}))
         decider = Decider(sentry, episode=rows, slots=slots)
         notice = assumptions(brakes, accepted_risk)
         if guard is not None:
@@ -220,8 +220,8 @@ def monitor(
         if keeper is not None and isinstance(transport, Stream) and file and file.is_file():
             transport.source.seek(keeper.pass_over(file, decider))
         warn(notice)
-        if slots is not None and (log_options := options.given_of(reader)):
-            warn(f"rows are read as in a log: {options.typed(log_options)}")
+        if slots is not None and reader:
+            warn(f"rows are read as in a log: {options.typed(reader)}")
         warn(f"ready: {where}")
         try:
             server.run(transport)

@@ -19,7 +19,7 @@ from evofsm.cli.foreseen import guard_of_alarms
 from evofsm.cli.monitor import messages
 from evofsm.cli.monitor.messages import End, Form, Message, MessageError, Pause, Row, Taken
 from evofsm.cli.monitor.slots import CsvRows, Slots
-from evofsm.cli.options import TOLERANCE, ModeName, Reading, refuse_other_limit
+from evofsm.cli.options import TOLERANCE, ModeName, reading_of, refuse_other_limit
 from evofsm.cli.show import plain
 from evofsm.driving import Object, Scene
 from evofsm.driving.judge import SLIGHT, LatentRisk
@@ -388,7 +388,7 @@ def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None
 
 def begun(
     told: dict[str, Any],
-    reading: Reading,
+    reading: Mapping[str, Any],
     interval: float | None,
     tolerance: float | None,
     alarms: tuple[float | None, float, float | None],
@@ -396,7 +396,7 @@ def begun(
     """A guard that knows nothing yet, from what was told of a system."""
     if "observe" not in told:
         raise ValueError("say what is observed, the keys of rows: --observe temperature,load")
-    columns = reading(observe=told.pop("observe"), dt=None)
+    columns = reading_of(**{**reading, "observe": told.pop("observe"), "dt": None})
     names, scheme = columns.observe.names, columns.resample
     if (step := scheme.step if scheme else interval) is None:
         raise ValueError("say how often rows come [s]: --interval 1; or --resample 10s of jittered")

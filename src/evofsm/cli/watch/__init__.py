@@ -8,10 +8,10 @@ import webbrowser
 from contextlib import suppress
 from pathlib import Path
 from shlex import quote
-from typing import Annotated
+from typing import Annotated, Any
 
 from evofsm.cli import options
-from evofsm.cli.options import Reading, argument, option
+from evofsm.cli.options import argument, option
 
 
 @options.reads_logs
@@ -33,7 +33,7 @@ def watch(
     learn_first: Annotated[int, option("Episodes to learn from before, at most.", min=0)] = 60,
     brakes: options.Brakes = options.BRAKES,
     *,
-    reading: Reading,
+    reading: dict[str, Any],
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
 ) -> None:
     """Watch a run in the browser while it is driven, and act on it; or a log.
@@ -62,20 +62,20 @@ def watch(
             await page.player.play()
             await asyncio.Event().wait()  # it broke off; the page says why
 
-    is_log, log_options = _is_log(what), options.given_of(reading)
-    if not is_log and (log_options or guard):
+    is_log = _is_log(what)
+    if not is_log and (reading or guard):
         raise ValueError(f"--guard and options of columns are for a log, and {what} is none")
     with suppress(KeyboardInterrupt):
         if is_log:
             risk = None if tolerance == options.TOLERANCE else tolerance
             log_guard = None if guard is None else Guard.load(guard)
             try:
-                log_format = options.with_defaults(reading, options.read_with(guard))()
+                log_format = options.reading_of(**{**options.read_with(guard), **reading})
                 is_simulation = what.endswith(".sumocfg")
                 show = session.watched_simulation if is_simulation else session.watched_log
                 run = show(what, log_format, risk, case, log_guard, brakes=brakes)
             except ValueError as error:
-                if log_options or "has no column" not in str(error):
+                if reading or "has no column" not in str(error):
                     raise
                 look = f"evofsm learn {quote(what)} says what it holds, and what to name"
                 raise ValueError(f"{error}. Is it no log of cars? {look}") from error
