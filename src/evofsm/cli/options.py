@@ -348,10 +348,7 @@ def lengths_given(texts: Iterable[str]) -> VehicleLengths:
                 f"--vehicle-length is {text!r}; write a positive length such as 5.0, or "
                 "truck=12 for one type, or 5.0x1.8 with a width"
             ) from None
-        if kind:
-            lengths.by_type[kind] = length
-        else:
-            lengths.default = length
+        lengths.lengths[kind] = length
         if width:
             lengths.widths[kind] = width[0]
     return lengths

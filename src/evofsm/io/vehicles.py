@@ -125,9 +125,10 @@ FCD_COLUMNS = ("timestep_time", "time", "id", "lane", "pos", "speed", "vehicle_i
 _BYTES_AT_ONCE = 1 << 16
 # SUMO writes neither longer tags or comments [byte] nor more tags within tags.
 _LONGEST_TAG, _DEEPEST = 1_000_000, 16
-# A vehicle as wide as SUMO's passenger car [m], where nobody said; who is less aside is in line;
-# and who is that near may be beside by its place in the plane.
-_USUAL_WIDTH, _IN_LINE, _BESIDE_WITHIN = 1.8, 0.4, 20.0
+# A vehicle as long and as wide as SUMO's passenger car [m], where nobody said.
+_USUAL_LENGTH, _USUAL_WIDTH = 5.0, 1.8
+# Who is less aside is in line; and who is that near may be beside by its place in the plane [m].
+_IN_LINE, _BESIDE_WITHIN = 0.4, 20.0
 # What the parser says where a file ends early.
 _CUT = {expat.errors.XML_ERROR_NO_ELEMENTS, expat.errors.XML_ERROR_UNCLOSED_TOKEN}
 _CUT |= {expat.errors.XML_ERROR_PARTIAL_CHAR}
@@ -139,16 +140,11 @@ class VehicleLengths:
 
     Parameters
     ----------
-    default : float
-        Length of a type not named [m]; 5 m is SUMO's passenger car.
-    by_type : dict
-        Lengths of single types [m].
-    widths : dict
-        Widths of single types [m]; of others, under an empty name, 1.8 m as SUMO's passenger car.
+    lengths, widths : dict
+        Of single types [m]; of others, under an empty name, those of SUMO's passenger car.
     """
 
-    default: float = 5.0
-    by_type: dict[str, float] = field(default_factory=dict)
+    lengths: dict[str, float] = field(default_factory=lambda: {"": _USUAL_LENGTH})
     widths: dict[str, float] = field(default_factory=lambda: {"": _USUAL_WIDTH})
     seen: set[str] = field(default_factory=set, init=False)  #: types met so far
     #: Times that one of a type was not beside, but not in line either, where it overlaps.
@@ -158,20 +154,21 @@ class VehicleLengths:
         """Length and width of a vehicle of the given type [m]."""
         kind = kind.partition("@")[0]  # a vehicle changed on its own has the type `car@id`
         self.seen.add(kind)
-        return self.by_type.get(kind, self.default), self.widths.get(kind, self.widths[""])
+        length = self.lengths.get(kind, self.lengths[""])
+        return length, self.widths.get(kind, self.widths[""])
 
     def refuse_unknown(self) -> None:
         """Raise if a length was given for a type that no vehicle had: most likely a slip."""
-        for kind in self.by_type:
-            if kind not in self.seen:
+        for kind in self.lengths:
+            if kind and kind not in self.seen:
                 raise ValueError(
                     f"no vehicle has the type {kind!r} of --vehicle-length; the types "
                     f"are {', '.join(sorted(self.seen)) or 'not in the file'}"
                 )
 
     def __str__(self) -> str:
-        texts = [f"{kind} {length:g} m" for kind, length in self.by_type.items()]
-        return ", ".join([*texts, f"{'others ' if texts else ''}{self.default:g} m"])
+        texts = [f"{kind} {length:g} m" for kind, length in self.lengths.items() if kind]
+        return ", ".join([*texts, f"{'others ' if texts else ''}{self.lengths['']:g} m"])
 
 
 class _Car(NamedTuple):
