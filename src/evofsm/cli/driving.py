@@ -22,7 +22,7 @@ from typing import Any
 from evofsm import driving, store
 from evofsm.cli.journal import Journal, asked_to_stop
 from evofsm.cli.options import split_names
-from evofsm.cli.show import Advance, print_json, progress, show, table
+from evofsm.cli.show import Advance, plain, print_json, progress, show, table
 from evofsm.driving.cars import TOLD, name_judge
 from evofsm.driving.naming import DECISION_COLUMNS
 from evofsm.driving.sumo import open_world
@@ -236,7 +236,7 @@ def drive_in_turn(
             if number in results.rows:
                 continue
             episode, row = setup.drive(guard, world, number)
-            results.add({**row, "decided": _decided(episode)})
+            results.add({**row, "decided": plain(_decided(episode))})
             is_over = bool(signals)
             if setup.learn:
                 results.save_guard(now=is_over or audit is not None)

@@ -1,6 +1,6 @@
 """A journal: what is in it survives whatever happens to the process that writes it.
 
-It is a file of JSON objects, one on each line; the first is the header, with the settings that all
+It is a chain of records, as an audit log is; the first is the header, with the settings that all
 others belong to. A line that was half written when the process was killed, or the disk full, is cut
 off when the journal is opened again.
 """
@@ -17,12 +17,8 @@ from pathlib import Path
 from threading import current_thread, main_thread
 from typing import Any
 
-import msgspec
-
 from evofsm import store
-from evofsm.guard.audit_log import lines
-
-_LONGEST_RECORD = 1 << 20  # a record has at most so many bytes
+from evofsm.guard.audit_log import NOTHING, Chain, canonical, seal
 
 Record = Mapping[str, Any]
 
@@ -54,12 +50,12 @@ class Journal:
         #: Those that it was begun with: of another journal where it has records.
         self.settings: Record = settings
         self.records: list[dict[str, Any]] = []
+        self._head = NOTHING  # of the chain
         self._file = _opened(path, otherwise)
         try:
-            good = self._read()
-            self._file.truncate(good)
-            if good == 0:
-                self._write(_line({"settings": settings}))
+            self._read()
+            if self._head == NOTHING:
+                self.append({"settings": settings})
         except BaseException:
             self.close()
             raise
@@ -74,7 +70,18 @@ class Journal:
 
     def append(self, *records: Record, sync: bool = True) -> None:
         """Add records, which then survive the process, with ``sync`` a power cut too."""
-        self._write(b"".join(map(_line, records)), sync=sync)
+        data = b""
+        for record in records:
+            line, self._head = seal(record, self._head)
+            data += line
+        try:
+            while data:  # a disk that gets full takes a part of it first
+                data = data[self._file.write(data) :]
+            if sync:
+                self.sync()
+        except OSError as error:
+            hint = "what came before is kept: make room, and run the same command again"
+            raise OSError(error.errno, f"{error.strerror}; {hint}", str(self.path)) from error
 
     def begin_anew(self, settings: Record, *records: Record) -> None:
         """Replace all of it by a header and these records, at once or not at all."""
@@ -84,7 +91,7 @@ class Journal:
         journal.append(*records)
         os.replace(fresh, self.path)
         self.close()
-        self._file = journal._file
+        self._file, self._head = journal._file, journal._head
         self.settings, self.records = settings, [dict(record) for record in records]
 
     def sync(self) -> None:
@@ -95,37 +102,23 @@ class Journal:
         """Let others have the file."""
         self._file.close()
 
-    def _write(self, data: bytes, *, sync: bool = True) -> None:
-        try:
-            while data:  # a disk that gets full takes a part of it first
-                data = data[self._file.write(data) :]
-            if sync:
-                self.sync()
-        except OSError as error:
-            hint = "what came before is kept: make room, and run the same command again"
-            raise OSError(error.errno, f"{error.strerror}; {hint}", str(self.path)) from error
-
-    def _read(self) -> int:
-        """Read what is there, and say up to where it is good; without a record, nothing is."""
-        good, bad_line = 0, 0
-        for number, line in enumerate(lines(self.path, _LONGEST_RECORD), 1):
-            record = _record(line)
-            if record is None or (number == 1 and "settings" not in record):
-                if number == 1 and not _line({"settings": self.settings}).startswith(line):
-                    raise ValueError(f"{self.path} is no journal")
-                bad_line = bad_line or number
-                continue
-            if bad_line:
-                raise ValueError(
-                    f"{self.path}, line {bad_line} is damaged (was it edited?); delete that line, "
-                    "and what it said is done again"
-                )
-            if number == 1:
-                self.settings = record["settings"]
-            else:
-                self.records.append(record)
-            good += len(line)
-        return good
+    def _read(self) -> None:
+        """Read what is there, and cut off what is not whole."""
+        chain = Chain(self.path)
+        contents = [record.content for record in chain.records()]
+        if chain.finding is not None:
+            number, why, _ = chain.finding
+            raise ValueError(
+                f"{self.path}: {why} (was it edited?); put back what was there, or delete it from "
+                f"line {number} on, and what that said is done again"
+            )
+        begins, _ = seal({"settings": self.settings}, NOTHING)
+        if contents and "settings" in contents[0]:
+            self.settings, self.records = contents[0]["settings"], contents[1:]
+        elif contents or not begins.startswith(self.path.read_bytes()):
+            raise ValueError(f"{self.path} is no journal")
+        self._head = chain.head
+        self._file.truncate(chain.size)
 
 
 def _opened(path: Path, otherwise: str) -> io.FileIO:
@@ -141,22 +134,9 @@ def _opened(path: Path, otherwise: str) -> io.FileIO:
     return file
 
 
-def _line(record: Record) -> bytes:
-    return msgspec.json.encode(record) + b"\n"
-
-
-def _record(line: bytes) -> dict[str, Any] | None:
-    """What a line holds; None where it is not whole."""
-    try:
-        record = json.loads(line) if line.endswith(b"\n") else None
-    except ValueError:
-        return None
-    return record if isinstance(record, dict) else None
-
-
 def differences(before: Record, now: Record) -> str:
     """In which settings two pieces of work differ, in words; empty where in none."""
-    now = json.loads(msgspec.json.encode(now))  # as the other was read
+    now = json.loads(canonical(now))  # as the other was read
     return ", ".join(
         f"{name} was {_shown(before.get(name))} and is now {_shown(now.get(name))}"
         for name in {**before, **now}

@@ -22,7 +22,6 @@ from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.messages import MessageError, Taken
 from evofsm.cli.show import warn
 from evofsm.guard import AuditLog, Guard, Head
-from evofsm.guard.audit_log import NOTHING, seal
 
 _log = logging.getLogger(__name__)
 
@@ -47,7 +46,6 @@ class State:
         self._saved: Mapping[str, Any] = {}  # what stands beside the guard
         self._decider: Decider  # once it has begun
         self._count = 0  # messages in the journal
-        self._head = NOTHING  # of the chain that they are
         self._files: list[str] = []  # digests of what was read of each, in the end
         self._read: dict[str, str] = {}  # of the file that is read, and of the one before it
 
@@ -81,13 +79,6 @@ class State:
         rows = [record for record in journal.records if "read" in record]
         self._files = [*entry.get("files", ()), *(row["before"] for row in rows if "before" in row)]
         self._files += [row["read"] for row in rows[-1:]]
-        self._head = Head(journal.settings["mark"], NOTHING.digest)
-        for number, record in enumerate(journal.records, 2):
-            if record.pop("hash", None) not in (self._sealed(record)["hash"], None):
-                raise ValueError(
-                    f"{journal.path}, line {number} was altered: its hash is not that of what it "
-                    "says; put back what was there, or delete it from that line on"
-                )
         return load()
 
     def begin(self, decider: Decider) -> int:
@@ -149,13 +140,8 @@ class State:
         record = {"told": msgspec.to_builtins(told), **self._read}
         self._read.pop("before", None)
         if not self.failure:
-            self._try(lambda: self._journal.append(self._sealed(record), sync=False))
+            self._try(lambda: self._journal.append(record, sync=False))
             self._count += 1
-
-    def _sealed(self, record: dict[str, Any]) -> dict[str, Any]:
-        """A record with the hash of it and of all before it, as in an audit log."""
-        _, self._head = seal(record, self._head)
-        return {**record, "hash": self._head.digest}
 
     def _try(self, save: Callable[[], None]) -> None:
         """Decisions matter most: what fails is said, and gone on without until an episode ends."""
@@ -177,4 +163,4 @@ class State:
         entry |= {"audit": head, "files": files}
         decider.guard.save(self.path, {**self._provenance, _PROVENANCE: entry})
         self._journal.begin_anew({"mark": mark})
-        self._mark, self._count, self._head = mark, 0, Head(mark, NOTHING.digest)
+        self._mark, self._count = mark, 0
