@@ -119,8 +119,8 @@ def print_json(document: object) -> None:
     print(visible(text))
 
 
-def plain(value: Any) -> Any:
-    """A value as JSON knows it.
+def plain(value: Any, digits: int = 400) -> Any:
+    """A value as JSON knows it, with so many digits behind the point, by default all.
 
     >>> plain({"lead": (1.5, math.inf)})
     {'lead': [1.5, None]}
@@ -136,10 +136,12 @@ def plain(value: Any) -> Any:
     elif hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: plain(item, digits) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return [plain(item, digits) for item in value]
+    if isinstance(value, float):
+        return round(value, digits) if math.isfinite(value) else None
+    return value
 
 
 Advance = Callable[..., None]

@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from operator import itemgetter
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,37 +99,25 @@ def _schema(column: Column | None) -> dict[str, Any]:
     return _of({float: "number", int: "integer", str: "string"}[column.kind], column.about)
 
 
-class _File:
+class _File(io.BufferedWriter):
     """A file that remembers why it could not be written: Foxglove's library goes on then."""
 
-    def __init__(self, file: BinaryIO, context: foxglove.Context) -> None:
-        self._file = file
-        self.error: OSError | None = None
-        options = MCAPWriteOptions(compression_threads=0)
-        with self._explained():
-            self._mcap = foxglove.open_mcap(self, context=context, writer_options=options)
+    error: OSError | None = None
 
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Raise the error of writing in place of what the library makes of it."""
+    def write(self, data: Any) -> int:
         try:
-            yield
-        except RuntimeError as error:
-            raise self.error or error from None
-
-    def write(self, data: bytes | bytearray) -> int:
-        try:
-            return self._file.write(data)
+            return super().write(data)
         except OSError as error:
             self.error = error
             raise
 
-    def __getattr__(self, name: str) -> Any:  # seek, flush
-        return getattr(self._file, name)
-
-    def close(self) -> None:
-        with self._explained():
-            self._mcap.close()
+    @contextmanager
+    def explaining(self) -> Iterator[None]:
+        """Raise that error in place of what the library makes of it."""
+        try:
+            yield
+        except RuntimeError as error:
+            raise self.error or error from None
 
 
 class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
@@ -198,11 +186,13 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
         self._open, self._file = ExitStack(), None
         if file is not None:
             try:
-                writer = self._open.enter_context(io.BufferedWriter(io.FileIO(file, "x")))
+                self._file = self._open.enter_context(_File(io.FileIO(file, "x")))
             except FileExistsError:
                 raise FileExistsError(f"{fspath(file)} exists; it was left alone") from None
-            self._file = _File(writer, context)
-            self._open.callback(self._file.close)
+            self._open.enter_context(self._file.explaining())
+            options = MCAPWriteOptions(compression_threads=0)
+            mcap = foxglove.open_mcap(self._file, context=context, writer_options=options)
+            self._open.callback(mcap.close)
         self.address: str | None = None  #: where it is served; None without a port
         self._episode = self._start = 0  # its number, and when it began [ns]
         if port is not None:

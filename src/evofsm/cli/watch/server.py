@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, Self
 
 import msgspec
 
+from evofsm.cli.show import plain
 from evofsm.cli.watch.session import Session
 from evofsm.cli.watch.shown import Frame, Start
 from evofsm.cli.watch.words import introduce, tell
@@ -189,16 +190,7 @@ def message(kind: str, what: Any, start: Start | None = None) -> str:
             body["danger"] = {"since": danger.began.time, "last": danger.last, "dead_end": dead_end}
         body["story"] = {**story._asdict(), "danger": None, "dead_end": dead_end}
         body["told"] = tell(what, start)
-    return msgspec.json.encode(_rounded({"kind": kind, **body})).decode()
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, float):
-        return round(value, 5)
-    value = value._asdict() if hasattr(value, "_asdict") else value
-    if isinstance(value, dict):
-        return {name: _rounded(part) for name, part in value.items()}
-    return [_rounded(part) for part in value] if isinstance(value, list | tuple) else value
+    return msgspec.json.encode(plain({"kind": kind, **body}, digits=5)).decode()
 
 
 class LivePage:
