@@ -79,7 +79,7 @@ class Decider:
             ego, car = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
             observation = Scene(ego, [car, car._replace(x=-20.0)]).rows(2)
         for k in range(4):
-            twin.decide(observation + 0.1 * k, None)
+            twin.decide(observation + 0.1 * k * (not self.form.scenes), None)
         twin.end(observation=observation)
 
     def answer(self, line: bytes) -> Answer:
