@@ -206,7 +206,7 @@ class Chain:
         """What is wrong with the line after the head, which holds ``here``."""
         at = self.head.number + 1
         if at == 1 and here is None and after is None and not any(map(unseal, rest)):
-            raise ValueError(f"{self.path} is no log of evofsm: no line of it is a record")
+            raise ValueError(f"{self.path} is no audit log or journal: no line of it is a record")
         if here is None:
             why = "its hash is not that of what it says"
         elif here.previous == self.head.digest:
