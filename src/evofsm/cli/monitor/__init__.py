@@ -101,8 +101,9 @@ def monitor(
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
     if plot is not None:
         options.require(matplotlib="plot")
-    if traffic and (guard or state or learn):
-        raise ValueError("--traffic learns nothing: it goes with no --guard, --state or --learn")
+    is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
+    if traffic and (guard or state or learn or is_log):
+        raise ValueError("--traffic judges scenes alone: no log, --guard, --state or --learn")
     if summary and (file is None or state or audit):
         raise ValueError("--summary needs FILE, and goes with no --state or --audit")
     from evofsm.cli.monitor.decider import EPISODE, Decider, begun, prepare
@@ -128,7 +129,6 @@ def monitor(
         maker = guard_of_traffic if traffic else guard_of_monitor
         return maker(interval or _INTERVAL, brakes, accepted_risk)
 
-    is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
     parts = {"low": low, "high": high, "n_actions": n_actions, "observe": observe}
     system, new_guard = {name: part for name, part in parts.items() if part is not None}, None
     if guard is None and not is_log and (system or "action" in reading):
