@@ -14,6 +14,7 @@ from array import array
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from itertools import chain
 from os import PathLike
 from pathlib import Path
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 
 from evofsm.extras import needs
 from evofsm.io import tables
-from evofsm.io.tables import UNITS, Piece, RefusedError, Skips, Table, Wanted, readable
+from evofsm.io.tables import UNITS, Piece, RefusedError, Skips, Table, Wanted, in_row, readable
 from evofsm.io.vehicles import ACTION
 
 with needs("msgspec", "ros", "a bag of ROS 2"):
@@ -218,7 +219,8 @@ class BagTable(Table):
                 f"{self.path}: at no time are all variables known, none older than "
                 f"{self._topics.oldest:g} s (oldest in the file of --topics)"
             )
-        yield Piece.of_numbers(self.path, 0, numbers, [0], (), self.skips)
+        find = partial(in_row, self.path, numbers, 0)
+        yield Piece(len(numbers["time"]), numbers, find, self.skips, starts=[0])
 
     def _held(self, found: Mapping[str, _Values]) -> dict[str, NDArray[np.float64]]:
         """Of each tick in which all are known, the latest values before it."""

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -346,25 +346,6 @@ class Piece:
     def __post_init__(self) -> None:
         self.bad = np.zeros(self.rows, np.bool_)
 
-    @classmethod
-    def of_numbers(
-        cls,
-        path: str,
-        before: int,
-        numbers: Numbers,
-        starts: Sequence[int],
-        names: Sequence[str],
-        skips: Skips,
-    ) -> Self:
-        """Rows of numbers alone, after so many others."""
-
-        def find(row: int, name: str | None) -> tuple[str, str]:
-            text = "" if name is None else str(numbers[name][row])
-            return f"{path}, row {before + row + 1}", text
-
-        rows = len(next(iter(numbers.values())))
-        return cls(rows, numbers, find, skips, starts=starts, names=names)
-
     def at(self, row: int) -> str:
         """Where a row stands, for a message."""
         return self.find(row, None)[0]
@@ -407,6 +388,12 @@ class Piece:
         )
         piece.bad[:] = self.bad[rows]
         return piece
+
+
+def in_row(path: str, columns: Any, before: int, row: int, name: str | None) -> tuple[str, str]:
+    """Where a row stands that is one of some columns, behind so many others; and what it has."""
+    value = None if name is None else columns[name][row]
+    return f"{path}, row {before + row + 1}", "" if value is None else str(value)
 
 
 class Wanted(NamedTuple):
@@ -756,14 +743,8 @@ class ParquetTable(Table):
             with readable(self.path, _AS_PARQUET):
                 frame = part.slice(first, _PARQUET_ROWS).collect()
             series = {name: frame[name] for name in wanted.all}
-            yield wanted.piece(series, partial(self._find, frame, first), self.skips)
+            yield wanted.piece(series, partial(in_row, self.path, frame, first), self.skips)
             self.skips.on_read(os.path.getsize(self.path) * len(frame) // self._rows)
-
-    def _find(
-        self, frame: polars.DataFrame, first: int, row: int, name: str | None
-    ) -> tuple[str, str]:
-        value = None if name is None else frame[name][row]
-        return f"{self.path}, row {first + row + 1}", "" if value is None else str(value)
 
 
 # -- Fields ---------------------------------------------------------------------------------------

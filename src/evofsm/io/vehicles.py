@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving.naming import VARIABLES
 from evofsm.extras import needs
-from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained, mcap_messages
+from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained, in_row, mcap_messages
 from evofsm.store import LARGEST_OBSERVATION
 
 ACTION = "a_follower"  #: of a pair of vehicles: what the follower did until the next time
@@ -74,8 +74,8 @@ class PairTable(Table):
                 starts.append(starts[-1] + len(blocks[-1]))
             if blocks and (rows is None or starts[-1] >= _ROWS_AT_ONCE):
                 numbers = dict(zip(COLUMNS, np.concatenate(blocks).T, strict=True))
-                episodes = starts[:-1], names
-                yield Piece.of_numbers(self.path, before, numbers, *episodes, self.skips)
+                find, begins = partial(in_row, self.path, numbers, before), starts[:-1]
+                yield Piece(starts[-1], numbers, find, self.skips, starts=begins, names=names)
                 before, starts, blocks, names = before + starts[-1], [0], [], []
         if before == 0:
             self.skips.refuse_nothing(
