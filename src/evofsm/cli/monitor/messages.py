@@ -134,7 +134,7 @@ class Form:
         body = line if isinstance(line, dict) else _parsed(line)
         kind = self._scene if self.scenes or body.keys() & {"ego", "objects"} else self._row
         kind = self._end if "end" in body else kind
-        names = kind.__required_keys__ | kind.__optional_keys__
+        names = kind.__annotations__
         try:
             if unknown := [name for name in body if name not in names]:
                 raise _unknown(unknown[0], names)
