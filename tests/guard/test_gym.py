@@ -89,11 +89,9 @@ class Spy(ActionJudge):
     def why(self, judged):
         return "dangerous"
 
-    def learn(self, observation, action, belief):
+    def learn(self, observation, action, *, watched):
         action = np.atleast_1d(np.float32(action))  # as an environment takes it
         self.rows.append((tuple(observation), tuple(action)))
-
-    watch = learn
 
     def follow(self, observation, action):
         pass
@@ -101,12 +99,12 @@ class Spy(ActionJudge):
     def start_episode(self, *, learn=True):
         self.rows = []
 
-    def end(self, observation, *, failed):
+    def end(self, observation, *, failed, terminated):
         last = None if observation is None else tuple(observation)
         self.episodes.append((self.rows, last, failed))
         self.rows = []
 
-    def sums(self, n_states):
+    def sums(self):
         return {}
 
     def save(self, path, provenance=None):
@@ -250,7 +248,7 @@ def test_a_change_is_executed_and_can_cost_reward(space, proposed, executed, siz
         return (np.asarray(action) > 0.5).any() if isinstance(space, Box) else action == 2
 
     class Half(Spy):  # finds what is nearest itself
-        def search(self, situation, wanted, *, tolerance, revising):
+        def search(self, situation, wanted, *, tolerance, mask):
             options = np.array([wanted, 1.0 if np.ndim(wanted) == 0 else np.minimum(wanted, 0.5)])
             best = int(bool(dangerous(wanted)))
             return Search(options, self.judge(situation, options), best, "nearest")
@@ -623,8 +621,8 @@ class Barred(gymnasium.Env):
 
 
 class Searching(Spy):
-    def search(self, situation, wanted, *, tolerance, revising, mask=(1, 1, 1)):
-        options = np.append(wanted, np.flatnonzero(mask))
+    def search(self, situation, wanted, *, tolerance, mask):
+        options = np.append(wanted, np.flatnonzero(np.ones(3) if mask is None else mask))
         judged = self.judge(situation, options)
         return Search(options, judged, int(judged.risk.argmin()), "searched")
 

@@ -147,9 +147,7 @@ class Cautious(ObservingJudge):
     def refuse_unfit(self, actions):
         assert (actions.low, actions.high) == (-1.0, 1.0)
 
-    def learn(self, observation, action, belief): ...
-
-    watch = learn
+    def learn(self, observation, action, *, watched): ...
 
     def observe(self, observation):
         self.seen.append(float(observation[0]))

@@ -187,7 +187,7 @@ def test_in_a_file_it_is_kept_as_it_is_also_between_two_fits(more, reloaded):
     world.steps = 4
     failures(world, guard, range(100, 100 + more))
     again = reloaded(guard)
-    assert again.judge.sums(0) == guard.judge.sums(0)
+    assert again.judge.sums() == guard.judge.sums()
     world.steps = 40
     for seed in (901, 902):  # and it goes on learning
         one, two = (world.play(each, seed)[0] for each in (guard, again))

@@ -176,25 +176,16 @@ class LatentRisk(Retraced, LearningJudge):
         risk.brakes.trust(positive("decel", decel))
         return risk
 
-    def learn(
-        self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
-    ) -> None:
+    def learn(self, observation: ArrayLike, acceleration: float, *, watched: bool = False) -> None:
         """Take in an observation and the acceleration commanded after it [m/s²].
 
         Where one of gap [m] and both speeds [m/s] is NaN nothing is learnt, and what is under way
-        is not gone on with; a TypeError or ValueError leaves what was learnt as it was. It learns
-        alike in all states, whatever the ``belief``.
-        """
-        self._take_in(observation, acceleration, learn=True)
+        is not gone on with; a TypeError or ValueError leaves what was learnt as it was.
 
-    def watch(
-        self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
-    ) -> None:
-        """Learn as `learn` does, where someone else drives, as in shadow mode.
-
-        Hard braking shows what the brakes can do; ordinary braking not what they cannot.
+        Where someone else drives (``watched``), as in shadow mode, hard braking shows what the
+        brakes can do; ordinary braking not what they cannot.
         """
-        self._take_in(observation, acceleration, learn=True, watched=True)
+        self._take_in(observation, acceleration, learn=True, watched=watched)
 
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
         """Keep up with what happens, as `learn`, without learning from it."""
@@ -242,7 +233,7 @@ class LatentRisk(Retraced, LearningJudge):
     def _become(self, again: Self) -> None:
         vars(self).update(vars(again))
 
-    def end(self, observation: ArrayLike | None, *, failed: bool) -> None:
+    def end(self, observation: ArrayLike | None, *, failed: bool, terminated: bool = False) -> None:
         """What comes is not a consequence of what was; how it ended teaches nothing."""
         self.start_episode(learn=True)
 
@@ -353,7 +344,7 @@ class LatentRisk(Retraced, LearningJudge):
                 f"actions ends at {actions.low:g}"
             )
 
-    def sums(self, n_states: int) -> dict[str, float]:
+    def sums(self) -> dict[str, float]:
         """A few sums that whatever is learnt changes."""
         return {
             "brakes": self.brakes.decel,

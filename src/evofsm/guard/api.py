@@ -212,7 +212,7 @@ class SearchingJudge(ActionJudge, Protocol):
     """A judge that looks for the best action itself, instead of judging those that it is given."""
 
     def search(
-        self, situation: Situation, wanted: Action, /, *, tolerance: float, revising: bool
+        self, situation: Situation, wanted: Action, /, *, tolerance: float, mask: Mask | None
     ) -> Search:
         """The action closest to ``wanted`` that is within the tolerance.
 
@@ -223,10 +223,8 @@ class SearchingJudge(ActionJudge, Protocol):
             The proposal, one of the set.
         tolerance : float
             Highest risk that is accepted.
-        revising : bool
-            Whether the proposal before, in this episode, was not kept.
-        mask : (n,) ndarray of bool
-            Which of `Choices` are allowed, ``wanted`` among them; only given where not all are.
+        mask : (n,) ndarray of bool, optional
+            Which of `Choices` are allowed, ``wanted`` among them; None where all are.
         """
 
 
@@ -242,7 +240,7 @@ class LearningJudge(ActionJudge, Protocol):
 
     dt: float  #: time between decisions [s]
 
-    def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike, /) -> None:
+    def learn(self, observation: ArrayLike, action: Action, /, *, watched: bool = False) -> None:
         """Take in an observation, and the action executed after it.
 
         Parameters
@@ -251,17 +249,8 @@ class LearningJudge(ActionJudge, Protocol):
             In the judge's units; NaN where not seen.
         action : action
             One of the set.
-        belief : (n,) array_like
-            Distribution over states, as the machine recognised it.
-        """
-
-    def watch(self, observation: ArrayLike, action: Action, belief: ArrayLike, /) -> None:
-        """Learn where someone else acts.
-
-        Parameters
-        ----------
-        observation, action, belief
-            As in `learn`.
+        watched : bool
+            Whether someone else acts, as where proposals pass.
         """
 
     def follow(self, observation: ArrayLike, action: Action, /) -> None:
@@ -270,10 +259,18 @@ class LearningJudge(ActionJudge, Protocol):
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was."""
 
-    def end(self, observation: Floats | None, *, failed: bool) -> None:
-        """Learn how an episode ended, with the last observation if there is one."""
+    def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
+        """Learn how an episode ended.
 
-    def sums(self, n_states: int, /) -> dict[str, float]:
+        Parameters
+        ----------
+        observation : (m,) ndarray or None
+            The last one, if there is one.
+        failed, terminated : bool
+            As in `Guard.end`.
+        """
+
+    def sums(self) -> dict[str, float]:
         """A few sums, by name, that whatever is learnt changes."""
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
@@ -288,8 +285,8 @@ class LearningJudge(ActionJudge, Protocol):
 class ObservingJudge(LearningJudge, Protocol):
     """A learning judge that is shown each observation, asked or not, and may be found to do harm.
 
-    While it learns, the controller drives some episodes alone (`evofsm.guard.harm`). Its `end` also
-    takes ``terminated``, as `Guard.end`; its `save` keeps `harm`.
+    While it learns, the controller drives some episodes alone (`evofsm.guard.harm`). Its `save`
+    keeps `harm`.
     """
 
     harm: Harm  #: how episodes ended, guarded and alone: `Harm()` at first, then the guard's

@@ -536,7 +536,7 @@ def sums_of(guard: Guard) -> dict[str, float]:
         sums["potential"] = math.fsum(model.potentials.tolist())
         sums["transitions"] = math.fsum(model.decisions.ravel().tolist())
     if guard.judge is not None:
-        sums |= guard.judge.sums(0 if machine is None else machine.n_states)
+        sums |= guard.judge.sums()
     return sums
 
 

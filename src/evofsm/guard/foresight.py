@@ -599,15 +599,13 @@ class Foresight(LearningJudge):
         """Keep up with what happens; it learns from whole logs alone."""
         self._now = self._next(np.asarray(observation, np.float64))[-1]
 
-    def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike = (), /) -> None:
+    def learn(self, observation: ArrayLike, action: Action, /, *, watched: bool = False) -> None:
         """Keep up with what happens, and what it learns from."""
         self.follow(observation, action)
         if self.log is not None:
             self._seen.append(np.asarray(observation, np.float64))
 
-    watch = learn
-
-    def end(self, observation: Floats | None, *, failed: bool) -> None:
+    def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
         """The episode is over; it learns anew where it learns as it goes, and there is enough."""
         last = [] if observation is None else [observation]
         self._learn_from([*self._seen, *last], failed=failed)
@@ -631,7 +629,7 @@ class Foresight(LearningJudge):
             self.log = log
         self._seen = []
 
-    def sums(self, n_states: int, /) -> dict[str, float]:
+    def sums(self) -> dict[str, float]:
         """What it has learnt, in a few sums."""
         return {"limits": float(self.limits.sum()), "forms": float(self.forms.sum())}
 

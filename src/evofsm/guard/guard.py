@@ -126,7 +126,7 @@ class DecisionLogger(Protocol):
 # Settings that stand in a file as they are.
 _PLAIN_SETTINGS = ("explaining", "interval", "learn", "n_episodes", "n_failed", "shadow")
 # What a judge has that learns.
-_LEARNS = ("dt", "learn", "watch", "follow", "start_episode", "end", "sums", "save", "load")
+_LEARNS = ("dt", "learn", "follow", "start_episode", "end", "sums", "save", "load")
 # The files of the machine and of the judge, as bytes.
 KIND = Kind(
     "guard",
@@ -668,14 +668,14 @@ class Guard:
             return
         if not self._learn:
             self.judge.follow(situation.observation, executed)
-        elif not getattr(self.reviser, "acts", True):
-            self.judge.watch(situation.observation, executed, situation.belief)
+            return
+        is_watched = not getattr(self.reviser, "acts", True)
+        self.judge.learn(situation.observation, executed, watched=is_watched)
+        if is_watched:
             self._watched += 1
-        else:
-            self.judge.learn(situation.observation, executed, situation.belief)
-            if (refuses := getattr(self.reviser, "refuses", None)) is not None:
-                self._acted += 1
-                self._kept += not refuses
+        elif (refuses := getattr(self.reviser, "refuses", None)) is not None:
+            self._acted += 1
+            self._kept += not refuses
 
     def _explained(self, situation: Situation, revision: Revision) -> Revision:
         """With what the machine has seen come of what is executed, where that is asked for."""
@@ -766,8 +766,7 @@ class Guard:
             machine.start_episode()
         if self.judge is not None:
             if self._learn:
-                how = {"terminated": terminated} if self._observing is not None else {}
-                self.judge.end(z, failed=failed, **how)
+                self.judge.end(z, failed=failed, terminated=terminated)
             else:
                 self.judge.start_episode(learn=False)
         self._under_way = False

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from enum import Enum
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -220,9 +220,8 @@ class ActionReviser:
     ) -> Search:
         """Which option should be executed: the judge's own, or the best of those it is given."""
         if self._searches:
-            how: dict[str, Any] = {} if mask is None else {"mask": mask}
             options, judgement, best, reason = self.risk.search(  # type: ignore[attr-defined]
-                situation, wanted, tolerance=self.tolerance, revising=self.refuses, **how
+                situation, wanted, tolerance=self.tolerance, mask=mask
             )
             self.refuses = best != 0
             within = np.minimum(np.maximum(options, self._low), self._high)

@@ -168,7 +168,6 @@ class SceneRisk(LearningJudge, SearchingJudge):
         wanted: Action,
         *,
         tolerance: float,
-        revising: bool,
         mask: Mask | None = None,
     ) -> Search:
         """The tolerable action of those in ``mask`` that is closest in effect to ``wanted``.
@@ -242,15 +241,13 @@ class SceneRisk(LearningJudge, SearchingJudge):
             return Seen(ego, away, rest + ego[_P:])
         return Seen(ego, away - ego[:_P], rest)
 
-    def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike) -> None:
-        """Take in an observation and the action after it."""
+    def learn(self, observation: ArrayLike, action: Action, *, watched: bool = False) -> None:
+        """Take in an observation and the action after it, whoever acts."""
         scene = self._read(np.asarray(observation, np.float64))
         if not np.isfinite(scene.own).all():  # what follows begins anew
             self._remember(failed=False)
             return
         self._seen = [*self._seen, scene._replace(action=int(action))]
-
-    watch = learn
 
     def follow(self, observation: ArrayLike, action: Action) -> None:
         """Nothing: its decisions depend on the present observation alone."""
@@ -261,7 +258,7 @@ class SceneRisk(LearningJudge, SearchingJudge):
             self._remember(failed=False)
         self._seen = []
 
-    def end(self, observation: Floats | None, *, failed: bool) -> None:
+    def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
         """Learn from an episode, and from its last observation if there is one."""
         if observation is not None:
             last = self._read(observation)
@@ -279,7 +276,7 @@ class SceneRisk(LearningJudge, SearchingJudge):
             self.memory.add(Past.of(self._seen, self.columns - 1 - _P, failed))
         self._seen = []
 
-    def sums(self, n_states: int) -> dict[str, float]:
+    def sums(self) -> dict[str, float]:
         """A few sums that change with whatever is learnt."""
         history = self.memory.past
         return {

@@ -220,9 +220,9 @@ class LearntRisk(ObservingJudge, SearchingJudge):
             for z in random.normal(size=(12, 2)).cumsum(axis=0):
                 judge.observe(z)
                 here = Situation(z, np.ones(1), None, 0.0, 0.0)
-                judge.search(here, 0.5, tolerance=0.02, revising=False)
+                judge.search(here, 0.5, tolerance=0.02)
                 judge.act(0.5)
-                judge.learn(z, 0.5, here.belief)
+                judge.learn(z, 0.5)
             judge.end(None, failed=True)
 
     @property
@@ -288,14 +288,13 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         wanted: Any,
         *,
         tolerance: float,
-        revising: bool,
         mask: Mask | None = None,
     ) -> Search:
         """The closest action to ``wanted`` that passes, or else that of the longest-lasting backup.
 
         Of `Choices` it is one of ``mask``, and backups do what is in it: more may be allowed later,
         or less, which nobody knows.
-        ``revising`` changes nothing: a band in which a proposal is refused longer gained nothing.
+        There is no band in which a proposal is refused for longer: that gained nothing.
         """
         if not self.n_variables:
             rollout.refuse_too_many(len(situation.observation), self.size, box=not self.choices)
@@ -506,22 +505,17 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self._u.append(inner)
         self._used = self._used + used_at(inner[None], self.choices)[0]
 
-    def learn(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
-        """Take in what was executed, and whether the certificate of before still held."""
-        if "margin" not in self.without and self.parts is not None:
+    def learn(self, observation: ArrayLike, action: Any, *, watched: bool = False) -> None:
+        """Take in what was executed, and whether the certificate of before still held.
+
+        Where someone else acts (``watched``) nothing was certified.
+        """
+        if not watched and "margin" not in self.without and self.parts is not None:
             is_violated = self._certified and not self._holds
             s = self.settings
             margin = self.state.margin + s.margin_step * (is_violated - s.violation_rate)
             self.state = self.state._replace(margin=min(s.margin_max, max(s.margin_step, margin)))
-        self._certified = self._holds
-        self._take_in(observation, action)
-
-    def watch(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
-        """Take in what someone else does: then nothing was certified."""
-        self._certified = False
-        self._take_in(observation, action)
-
-    def _take_in(self, observation: ArrayLike, action: Any) -> None:
+        self._certified = self._holds and not watched
         self.follow(observation, action)
         self._notes.append((self._refused, self._lost, self._certified))
         if len(self._z) > _MOST_ROWS * (stride := self.state.stride):
@@ -549,15 +543,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
             self._forget()
 
     def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
-        """Learn from an episode.
-
-        Parameters
-        ----------
-        observation : (m,) ndarray or None
-            The last one; it was taken in already (`observe`).
-        failed, terminated : bool
-            How it ended, as in `Guard.end`.
-        """
+        """Learn from an episode, whose last observation was taken in already (`observe`)."""
         self.state = self.state._replace(n_failed=self.state.n_failed + int(failed))
         self._study(failed=failed, terminated=terminated and not failed)
         self._forget()
@@ -655,7 +641,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         """Names of variables, as people read them."""
         return self.labels.names or [f"variable {j + 1}" for j in range(self.n_variables)]
 
-    def sums(self, n_states: int) -> dict[str, float]:
+    def sums(self) -> dict[str, float]:
         """A few sums that whatever is learnt changes."""
         return {
             "margin": self.margin,
