@@ -207,7 +207,7 @@ def learn_risk(training: Sequence[Case], held_out: Sequence[Case]) -> Learnt:
         realised = np.append(np.diff(case.observations[:, 1]) / INTERVAL, 0.0)
         for row, acceleration in zip(case.observations, realised.tolist(), strict=True):
             risk.learn(row, acceleration)
-        risk.start_episode()
+        risk.end(None, failed=False)
     return {"evofsm": [_whatever_is_asked(risk.score(case.observations)) for case in held_out]}
 
 

@@ -190,7 +190,7 @@ def test_bad_input_is_named_and_changes_nothing(taught, snapshot, observation, a
     for risk in (taught, after):  # nor is it confused about what is under way
         for k in range(12):
             risk.learn([30.0, 20.0, 20.0 - k], -4.0)
-        risk.start_episode()
+        risk.end(None, failed=False)
     assert snapshot(taught) == snapshot(after)
 
 
@@ -274,7 +274,7 @@ def test_a_risk_that_saw_jumps_and_odd_numbers_is_kept_and_read_again(tmp_path):
         for turn in range(300):
             risk.learn(random.choice(odd, 3), random.choice([-2.5, 1.0, -1e100, 1e100]))
             if turn % 100 == 0:
-                risk.start_episode()
+                risk.end(None, failed=False)
         risk.save(tmp_path / "risk")
         LatentRisk.load(tmp_path / "risk").save(tmp_path / "again")
         assert (tmp_path / "again").read_bytes() == (tmp_path / "risk").read_bytes()

@@ -364,7 +364,7 @@ REPLAYED = {
     "observation": ("decision", 3, other("observation", [90.0, 15.0, 15.0])),
     "reason": ("decision", 2, other("reason", "the driver wished it")),
     "explanation": ("decision", 4, other("explanation", "all was well here")),
-    "learnt": ("end", 0, lambda content: content["learnt"].update(manoeuvres=99)),
+    "learnt": ("end", 0, lambda content: content["learnt"].update(judge="0" * 64)),
     "a flag that is none": ("end", 0, other("failed", 0)),
     "no number": ("decision", 1, other("observation", ["x", 1.0, 2.0])),
     "no guard": ("start", 0, other("guard", "AAAA")),

@@ -71,14 +71,11 @@ class Balance(ActionJudge):
             self.gust = max(self.gust, min(abs(observation[1] - self._before), 0.2))
         self._before = None if np.isnan(observation).any() else float(observation[1])
 
-    def start_episode(self, *, learn=True):
+    def start_episode(self):
         self._before = None
 
     def end(self, observation, *, failed, terminated):
         self.start_episode()
-
-    def sums(self):
-        return {"gust": self.gust}
 
     def save(self, path, provenance=None):
         path.write(f"{self.dt} {self.index:d} {self.gust!r}".encode())

@@ -96,16 +96,13 @@ class Spy(ActionJudge):
     def follow(self, observation, action):
         pass
 
-    def start_episode(self, *, learn=True):
+    def start_episode(self):
         self.rows = []
 
     def end(self, observation, *, failed, terminated):
         last = None if observation is None else tuple(observation)
         self.episodes.append((self.rows, last, failed))
         self.rows = []
-
-    def sums(self):
-        return {}
 
     def save(self, path, provenance=None):
         pass

@@ -218,12 +218,8 @@ class LatentRisk(Retraced, LearningJudge):
         self._watched = learn and watched
 
     @step
-    def start_episode(self, *, learn: bool = True) -> None:
-        """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
-        decel, own_decel = self._watch.end(), self._own_watch.end()
-        if learn:
-            self.manoeuvres.remember(decel)
-            self.brakes.show(own_decel)
+    def start_episode(self) -> None:
+        """What comes is not a consequence of what was."""
         self._watch.clear()
         self._own_watch.clear()
         self.brakes.clear()
@@ -233,9 +229,12 @@ class LatentRisk(Retraced, LearningJudge):
     def _become(self, again: Self) -> None:
         vars(self).update(vars(again))
 
+    @step
     def end(self, observation: ArrayLike | None, *, failed: bool, terminated: bool = False) -> None:
-        """What comes is not a consequence of what was; how it ended teaches nothing."""
-        self.start_episode(learn=True)
+        """A manoeuvre under way counts as it is; how it ended teaches nothing."""
+        self.manoeuvres.remember(self._watch.end())
+        self.brakes.show(self._own_watch.end())
+        self.start_episode()
 
     def _of_change(self, variable: int) -> float:
         """Standard deviation of the noise on a difference of two of its values."""
@@ -343,13 +342,6 @@ class LatentRisk(Retraced, LearningJudge):
                 f"the risk counts on braking down to {self.lowest:g}, but the set of "
                 f"actions ends at {actions.low:g}"
             )
-
-    def sums(self) -> dict[str, float]:
-        """A few sums that whatever is learnt changes."""
-        return {
-            "brakes": self.brakes.decel,
-            "manoeuvres": len(self.manoeuvres) + self.manoeuvres.gentle,
-        }
 
     def _cautious(self, observation: ArrayLike) -> Three:
         """The situation as it most likely is, but closer by what is not sure about it."""

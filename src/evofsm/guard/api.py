@@ -256,11 +256,11 @@ class LearningJudge(ActionJudge, Protocol):
     def follow(self, observation: ArrayLike, action: Action, /) -> None:
         """Keep up with what happens, without learning from it."""
 
-    def start_episode(self, *, learn: bool = True) -> None:
-        """What comes is not a consequence of what was."""
+    def start_episode(self) -> None:
+        """What comes is not a consequence of what was, which is not learnt from any more."""
 
     def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
-        """Learn how an episode ended.
+        """Learn how an episode ended, or a part of one before a gap in time.
 
         Parameters
         ----------
@@ -269,9 +269,6 @@ class LearningJudge(ActionJudge, Protocol):
         failed, terminated : bool
             As in `Guard.end`.
         """
-
-    def sums(self) -> dict[str, float]:
-        """A few sums, by name, that whatever is learnt changes."""
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file."""

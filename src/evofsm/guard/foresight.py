@@ -544,7 +544,7 @@ class Foresight(LearningJudge):
         record = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
         return f"{plain}{self.words(rate)} ({record}, {_COUNTED})"
 
-    def start_episode(self, *, learn: bool = True) -> None:
+    def start_episode(self) -> None:
         """Nothing was seen yet; what was before, of an episode that nobody ended, went well."""
         self._learn_from(self._seen, failed=False)
         kinds = self.held_out[self.limits[:, _RATE].astype(int), 3]
@@ -628,10 +628,6 @@ class Foresight(LearningJudge):
                 self.held_out, self._learnt = new.held_out, count
             self.log = log
         self._seen = []
-
-    def sums(self) -> dict[str, float]:
-        """What it has learnt, in a few sums."""
-        return {"limits": float(self.limits.sum()), "forms": float(self.forms.sum())}
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""

@@ -126,7 +126,7 @@ class DecisionLogger(Protocol):
 # Settings that stand in a file as they are.
 _PLAIN_SETTINGS = ("explaining", "interval", "learn", "n_episodes", "n_failed", "shadow")
 # What a judge has that learns.
-_LEARNS = ("dt", "learn", "follow", "start_episode", "end", "sums", "save", "load")
+_LEARNS = ("dt", "learn", "follow", "start_episode", "end", "save", "load")
 # The files of the machine and of the judge, as bytes.
 KIND = Kind(
     "guard",
@@ -454,7 +454,7 @@ class Guard:
         if hasattr(self.reviser, "passing"):
             self.reviser.passing = self._passing
         if self.judge is not None:
-            self.judge.start_episode(learn=False)
+            self.judge.start_episode()
         if self.machine is not None and self._learn:
             self.machine.start_episode()
         if self.audit is not None:
@@ -549,7 +549,9 @@ class Guard:
                 if self.machine is not None and self._learn:
                     self.machine.start_episode()
                 if self.judge is not None and not step <= getattr(self.judge, "bridges", 0.0):
-                    self.judge.start_episode(learn=self._learn)
+                    if self._learn:
+                        self.judge.end(None, failed=False)
+                    self.judge.start_episode()
             situation = self._latest = self._recognised(z, time, intake)
         if self.audit is not None:
             self.audit.seen(z, time)
@@ -767,8 +769,7 @@ class Guard:
         if self.judge is not None:
             if self._learn:
                 self.judge.end(z, failed=failed, terminated=terminated)
-            else:
-                self.judge.start_episode(learn=False)
+            self.judge.start_episode()
         self._under_way = False
         if self._learn:
             if (judge := self._observing) is not None:

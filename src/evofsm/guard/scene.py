@@ -252,10 +252,8 @@ class SceneRisk(LearningJudge, SearchingJudge):
     def follow(self, observation: ArrayLike, action: Action) -> None:
         """Nothing: its decisions depend on the present observation alone."""
 
-    def start_episode(self, *, learn: bool = True) -> None:
-        """What comes does not follow from what was; with ``learn`` that is still learnt from."""
-        if learn:
-            self._remember(failed=False)
+    def start_episode(self) -> None:
+        """What comes does not follow from what was."""
         self._seen = []
 
     def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
@@ -275,16 +273,6 @@ class SceneRisk(LearningJudge, SearchingJudge):
         if len(self._seen) > 1:
             self.memory.add(Past.of(self._seen, self.columns - 1 - _P, failed))
         self._seen = []
-
-    def sums(self) -> dict[str, float]:
-        """A few sums that change with whatever is learnt."""
-        history = self.memory.past
-        return {
-            "episodes": float(len(history.ends) - 1),
-            "failures": float(self.memory.failures),
-            "moments": float(len(history.own)),
-            "places": float(history.away.sum()),
-        }
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what is remembered to a file; all else follows from it."""

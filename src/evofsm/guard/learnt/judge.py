@@ -206,7 +206,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         margin = 0.0 if "margin" in self.without else self.state.margin
         self.state = self.state._replace(stride=stride, margin=margin)
         self.parts: Parts | None = None
-        self._forget()
+        self.start_episode()
 
     @staticmethod
     @cache
@@ -535,18 +535,11 @@ class LearntRisk(ObservingJudge, SearchingJudge):
             self._done = [*self._done, inner][-stride:]
             self._before = here, inner
 
-    def start_episode(self, *, learn: bool = True) -> None:
-        """What comes is not a consequence of what was; the episode before is learnt from."""
-        if learn:
-            self.end(None, failed=False)
-        else:
-            self._forget()
-
     def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
         """Learn from an episode, whose last observation was taken in already (`observe`)."""
         self.state = self.state._replace(n_failed=self.state.n_failed + int(failed))
         self._study(failed=failed, terminated=terminated and not failed)
-        self._forget()
+        self.start_episode()
 
     @property
     def _given(self) -> Given:
@@ -599,10 +592,10 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def remake(self) -> None:
         """Decide by `state`, between two episodes."""
         self.parts = Parts.of(self.state, self.settings, self.dt)
-        self._forget()
+        self.start_episode()
 
-    def _forget(self) -> None:
-        """Begin an episode."""
+    def start_episode(self) -> None:
+        """What comes is not a consequence of what was."""
         self._past, self._done, self._before = [], [], None
         self._z, self._u, self._notes = [], [], []
         self._certified = self._holds = self._refused = self._lost = False
@@ -640,15 +633,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def called(self) -> Sequence[str]:
         """Names of variables, as people read them."""
         return self.labels.names or [f"variable {j + 1}" for j in range(self.n_variables)]
-
-    def sums(self) -> dict[str, float]:
-        """A few sums that whatever is learnt changes."""
-        return {
-            "margin": self.margin,
-            "backups": float(self.state.policies.sum()),
-            "disturbances": float(self.state.windows.sum()),
-            "harm": self.harm.kept + self.harm.n_episodes,
-        }
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
