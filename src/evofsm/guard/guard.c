@@ -181,7 +181,7 @@ static void recognise(evofsm_state *s) {
 #endif
 }
 
-/* -- Input: InputMonitor of guard.py, make_usable of reviser.py ------------------------------- */
+/* -- Input: Guard._take of guard.py, make_usable of reviser.py ------------------------------- */
 
 /* What is wrong with an observation. */
 static int take(evofsm_state *s, const double observation[EVOFSM_VARIABLES], double time) {

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from io import BytesIO
-from typing import Any, NamedTuple, Protocol, Self, SupportsFloat
+from typing import Any, Protocol, Self, SupportsFloat
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,31 +64,6 @@ _MANY = 100
 _GAP = 1.5
 # Fourth powers of larger observations, summed over a long run, would lose all others.
 _LARGEST_VALUE = 1e30
-
-
-class InputMonitor(NamedTuple):
-    """Tells what is wrong with observations: late, twice, after a gap in time, or incomplete.
-
-    They are due every ``interval`` [s].
-    """
-
-    interval: float
-    #: The latest value of each variable; NaN of one that was never seen.
-    held: NDArray[np.float64] = np.empty(0)
-    time: float = math.nan  #: of the latest observation [s]
-
-    def take(self, observation: NDArray[np.float64], time: float) -> tuple[Intake, InputMonitor]:
-        """What is wrong with an observation at ``time`` [s], and itself, unless it was too late."""
-        if time <= self.time:
-            return Intake.REPEATED if time == self.time else Intake.LATE, self
-        intake, latest_row = Intake.WHOLE, observation
-        if is_missing(observation):
-            intake = Intake.PARTIAL
-            if len(self.held) == len(observation):  # what was seen of them before is still held
-                latest_row = np.where(np.isnan(observation), self.held, observation)
-        if time - self.time > _GAP * self.interval:
-            intake |= Intake.GAP
-        return intake, InputMonitor(self.interval, latest_row.copy(), time)
 
 
 class DecisionLogger(Protocol):
@@ -368,8 +343,7 @@ class Guard:
         #: Episodes that it learnt from, and those of them that failed.
         self.n_episodes, self.n_failed = n_episodes, n_failed
         self._frozen: FSMModel | None = None
-        self._monitor = InputMonitor(interval)
-        self._latest: Situation | None = None
+        self._forget()
         self._under_way, self._passing, self._learn = False, "", True
         self._begun = self._decisions = self._acted = self._watched = self._kept = 0
         self._lacking = 0  # observations since one was whole
@@ -446,8 +420,7 @@ class Guard:
 
     def _begin(self, twin: Self | None = None) -> None:
         """Begin the episode of that number."""
-        self._monitor = InputMonitor(self.interval)
-        self._latest = None
+        self._forget()
         self._decisions = self._acted = self._watched = self._kept = 0
         self.reviser.start_episode()
         self._passing = self._why_passing() if twin is None else twin._passing
@@ -460,6 +433,13 @@ class Guard:
         if self.audit is not None:
             self.audit.begin(self)
         self._under_way = True
+
+    def _forget(self) -> None:
+        """Nothing was observed yet."""
+        self._latest: Situation | None = None
+        self._time = math.nan  # of the latest observation [s]
+        # The latest value of each variable; NaN of one that was never seen.
+        self._held: NDArray[np.float64] = np.empty(0)
 
     @transaction
     def decide(
@@ -538,8 +518,7 @@ class Guard:
         z, time = self._checked(observation), self._seconds(time)
         if not self._under_way:
             self._begin()
-        step = time - self._monitor.time
-        intake, self._monitor = self._monitor.take(z, time)
+        step, intake = time - self._time, self._take(z, time)
         if intake and intake & STALE and self._latest is not None:
             situation = self._latest._replace(intake=intake)
         else:
@@ -557,6 +536,20 @@ class Guard:
             self.audit.seen(z, time)
         return situation
 
+    def _take(self, z: NDArray[np.float64], time: float) -> Intake:
+        """What is wrong with an observation, which is held unless it comes too late."""
+        if time <= self._time:
+            return Intake.REPEATED if time == self._time else Intake.LATE
+        intake, latest_row = Intake.WHOLE, z
+        if is_missing(z):
+            intake = Intake.PARTIAL
+            if len(self._held) == len(z):  # what was seen of them before is still held
+                latest_row = np.where(np.isnan(z), self._held, z)
+        if time - self._time > _GAP * self.interval:
+            intake |= Intake.GAP
+        self._held, self._time = latest_row.copy(), time
+        return intake
+
     def _seconds(self, time: float) -> float:
         """A time after which another is later by an interval."""
         is_number = type(time) is float or isinstance(time, SupportsFloat)  # asked quickly first
@@ -572,7 +565,7 @@ class Guard:
         """An observation that judge and machine can take in; NaN stays."""
         z = real_array("observation", observation, 1)
         count = len(self.variables) or (0 if self.machine is None else self.machine.n_variables)
-        count = count or len(self._monitor.held)
+        count = count or len(self._held)
         if count and len(z) != count:
             names = f" ({', '.join(self.variables)})" if self.variables else ""
             raise ValueError(f"observation has {len(z)} variables; it must have {count}{names}")
@@ -606,7 +599,7 @@ class Guard:
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:
         """Where it is; machine and judge learn the transition to it."""
-        machine, model, latest_row = self.machine, self._frozen, self._monitor.held
+        machine, model, latest_row = self.machine, self._frozen, self._held
         belief, surprise, state_time = np.ones(1), math.nan, math.nan
         state: int | None = None
         is_incomplete = bool(intake) and bool(intake & Intake.PARTIAL)
@@ -689,7 +682,7 @@ class Guard:
         if self._frozen is None:
             text = self.machine.explain(action, self._labels).text
         else:
-            nearest = self._frozen.nearest(self._monitor.held)
+            nearest = self._frozen.nearest(self._held)
             text = explain(self._frozen, situation.belief, action, self._labels, nearest).text
         if words := self.told_here(situation.observation):
             text = f"{text} {words}"
