@@ -187,31 +187,6 @@ _SETTINGS: dict[str, Any] = {
     **_optional({**_LIMITS, "belief_tolerance": Numbers(least=0.0, most=_BELOW_1)}),
     "rule": _RULE,
 }
-OF_MODEL: dict[str, Numbers] = {
-    "centers": _OBSERVED.of("n", "m"),
-    "potentials": SHARE.of("n"),
-    "uses": COUNT.of("q"),
-    "transition_matrices": SHARE.of("q", "n", "n"),
-    "origin_frequency": _FREQUENCY.of("q", "n"),
-    **dict.fromkeys((*SUMS, "created"), COUNT.of("n")),
-    "joined": FLAG.of("n"),
-    "changes": COUNT.of("n", "n"),
-    **dict.fromkeys(("decisions", "failures"), _SUM.of("q", "n")),
-    **dict.fromkeys(("tried", "failed_after"), COUNT.of("q", "n")),
-}
-MODEL = Kind(
-    "model",
-    OF_MODEL,
-    {
-        "width": Numbers(least=0.0),
-        "failures_told": bool,
-        **dict.fromkeys(("names", "units"), list[str]),
-        **_optional({"dt": SIZE}),
-        "rule": _RULE,
-        "settings": _optional(_SETTINGS),
-        "actions": _optional({"low": _OBSERVED, "high": _OBSERVED, "width": SIZE}),
-    },
-)
 _INDEX, _PRODUCT = COUNT._replace(least=-1.0, dtype=np.int64), Numbers(least=0.0, most=1e300)
 _COUNTERS = ("n_states", "n_created", "n_places", "state", "clock", "began", "n_observations")
 MACHINE = Kind(
@@ -237,4 +212,26 @@ MACHINE = Kind(
         **dict.fromkeys(("tried", "failed_after", "latest_try"), COUNT.of("s", "n")),
     },
     _SETTINGS,
+)
+#: Of a model: those of its machine, with all actions.
+OF_MODEL: dict[str, Numbers] = {
+    "centers": _OBSERVED.of("n", "m"),
+    "uses": COUNT.of("q"),
+    "transition_matrices": SHARE.of("q", "n", "n"),
+    "changes": COUNT.of("n", "n"),
+    **{name: MACHINE.arrays[name] for name in (*SUMS, "potentials", "created", "joined")},
+    **{name: MACHINE.arrays[name].of("q", "n") for name in ("origin_frequency", *OF_ACTIONS)},
+}
+MODEL = Kind(
+    "model",
+    OF_MODEL,
+    {
+        "width": Numbers(least=0.0),
+        "failures_told": bool,
+        **dict.fromkeys(("names", "units"), list[str]),
+        **_optional({"dt": SIZE}),
+        "rule": _RULE,
+        "settings": _optional(_SETTINGS),
+        "actions": _optional({"low": _OBSERVED, "high": _OBSERVED, "width": SIZE}),
+    },
 )
