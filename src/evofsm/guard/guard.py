@@ -49,7 +49,7 @@ from evofsm.guard.api import (
     is_missing,
 )
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.parts import outline, rebuild
+from evofsm.guard.parts import outline, rebuild, settings_of
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken, make_usable
 from evofsm.guard.warming import warm_machine
 from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
@@ -781,9 +781,8 @@ class Guard:
             span = f"{actions.n_actions} actions"
         else:
             span = f"actions from {actions.low} to {actions.high}"
-        how = type(self.reviser).__name__
-        if settings := getattr(self.reviser, "settings_text", ""):
-            how += f", {settings}"
+        settings = (f"{name} {value}" for name, value in settings_of(self.reviser).items())
+        how = ", ".join([type(self.reviser).__name__, *settings])
         is_tested = hasattr(self.reviser, "passing") and self._observing is not None
         if is_tested and (self._learn or not self.shadow):
             how += ", in shadow where in doubt" if self.shadow else ", harm is not noticed"

@@ -106,7 +106,7 @@ def settings_of(reviser: Reviser) -> dict[str, Any]:
     """What may be changed about a reviser while driving."""
     if not isinstance(reviser, ActionReviser):
         return {}
-    return {"mode": reviser.mode.value, "tolerance": reviser.tolerance}
+    return {"tolerance": reviser.tolerance, "mode": reviser.mode.value}
 
 
 def set_again(reviser: Reviser, settings: Mapping[str, Any]) -> None:

@@ -179,11 +179,6 @@ class ActionReviser:
         return self.risk.fallback
 
     @property
-    def settings_text(self) -> str:
-        """How it was set, in words."""
-        return f"tolerance {self.tolerance:g}, mode {self.mode.value}"
-
-    @property
     def acts(self) -> bool:
         """Whether what it decides is executed."""
         return self.mode is Mode.ACT and not self.passing
