@@ -171,8 +171,11 @@ _FREQUENCY = Numbers(least=0.0, most=LARGEST_OBSERVATION)
 _SUM = COUNT._replace(whole=False)
 
 
-def _optional(settings: Mapping[str, Numbers]) -> dict[str, Numbers]:
-    return {name: numbers._replace(optional=True) for name, numbers in settings.items()}
+def _optional(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: form._replace(optional=True) if isinstance(form, Numbers) else form
+        for name, form in settings.items()
+    }
 
 
 _SIZES = dict.fromkeys(("radius", "spread"), SIZE)
