@@ -90,11 +90,11 @@ def crash():
 
 
 def test_what_is_new_is_said_to_be(crash):
-    machine, machine.labels = crash
+    machine, labels = crash
     machine.start_episode()
     assert machine.explain().text == "Nothing was observed yet in this episode."
     machine.observe([200.0, 5.0, 5.0])
-    found = machine.explain()
+    found = machine.explain(labels=labels)
     assert "Never seen but in one observation." in found.text
     assert found.here == Tally(0, 0)
     machine.observe([200.0, 5.0, 5.0])

@@ -15,7 +15,7 @@ from evofsm import store
 from evofsm.cli.options import picture, quoted, reading_of, typed
 from evofsm.cli.show import table
 from evofsm.driving import FAMILIES, load_family
-from evofsm.fsm import EvolvingFSM, FSMModel
+from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions
 from evofsm.fsm.explanation import Explanation
 from evofsm.guard import Foresight, Guard, LearntRisk
 from evofsm.guard.learnt.failure import telling
@@ -46,9 +46,12 @@ def load_model(place: Path) -> tuple[FSMModel, store.Header, Guard | None]:
     family = str(header.provenance.get("family"))
     if not machine.n_states:
         raise ValueError(f"{place} has seen nothing yet: an episode has to be over")
+    labels = getattr(guard and guard.judge, "labels", machine.labels)
+    if isinstance(actions := getattr(guard and guard.reviser, "actions", None), IntervalActions):
+        labels = labels._replace(actions=actions)
     if family in FAMILIES:
-        machine.labels = load_family(family).labels
-    return machine.model(), header, guard
+        labels = load_family(family).labels
+    return machine.model(**labels._asdict()), header, guard
 
 
 def logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import bounds_text, wilson_bounds
 from evofsm.fsm.validation import Floats, counted, state_name
 
@@ -82,14 +83,14 @@ class Explanation(NamedTuple):
 
 
 def explain(
-    known: Any, belief: Floats, action: int | None, nearest: Nearest | None = None
+    known: Any, belief: Floats, action: int | None, labels: Labels, nearest: Nearest | None = None
 ) -> Explanation:
     """What a model ``known`` says of a ``belief`` (n,) and, if known, of its observation."""
     if not len(belief):
         return Explanation("Nothing was learnt yet.")
     if nearest is not None and nearest.distance > nearest.reach:
-        return _never_seen(known, belief, nearest)
-    state, labels = int(belief.argmax()), known.labels
+        return _never_seen(known, belief, nearest, labels)
+    state = int(belief.argmax())
     is_exact, is_told = not known.joined[state], known.failures_told
     here = Tally(int(known.failed_soon[state]), int(known.episodes[state]), is_exact, is_told)
     visits = int(known.visits[state])
@@ -104,7 +105,7 @@ def explain(
     horizon = known.settings.get("failure_horizon")
     soon = "later on" if horizon is None else f"within {labels.duration(horizon)}"
     sentences = [
-        _of_place(known, belief, state),
+        _of_place(known, belief, state, labels),
         _of_episodes(here, visits, soon, tally, "" if action is None else labels.action(action)),
     ]
     if better is not None:
@@ -118,9 +119,9 @@ def explain(
     return Explanation(". ".join(sentences) + ".", state, float(belief[state]), *contents)
 
 
-def _never_seen(known: Any, belief: Floats, nearest: Nearest) -> Explanation:
+def _never_seen(known: Any, belief: Floats, nearest: Nearest, labels: Labels) -> Explanation:
     state, no_tally = nearest.state, Tally(0, 0, is_told=known.failures_told)
-    place = known.labels.place(known.centers[state])
+    place = labels.place(known.centers[state])
     place = place if place.startswith("(") else f"({place})"
     text = f"Never seen, as far as the states tell: {nearest.distance:.3g} from the nearest, "
     text += f"{state_name(state)} {place}, where a state reaches {nearest.reach:.3g}."
@@ -137,8 +138,8 @@ def _best(after: Sequence[Tally], than: Tally) -> int | None:
     return min(better)[1] if better else None
 
 
-def _of_place(known: Any, belief: Floats, state: int) -> str:
-    place = f"{state_name(state)}: {known.labels.place(known.centers[state])}"
+def _of_place(known: Any, belief: Floats, state: int, labels: Labels) -> str:
+    place = f"{state_name(state)}: {labels.place(known.centers[state])}"
     if belief[state] > _SURE or len(belief) == 1:
         return place
     second = int(np.argsort(-belief, kind="stable")[1])

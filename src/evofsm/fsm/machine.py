@@ -287,15 +287,23 @@ class EvolvingFSM(Retraced):
         return np.asarray(self.belief @ self._learnt.matrices[place, :n, :n])
 
     @alone
-    def explain(self, action: SupportsIndex | None = None) -> Explanation:
-        """What experience says of the present situation, as `FSMModel.explain` tells it."""
+    def explain(
+        self, action: SupportsIndex | None = None, labels: Labels | None = None
+    ) -> Explanation:
+        """What experience says of the present situation, as `FSMModel.explain` tells it.
+
+        Parameters
+        ----------
+        action, labels : int, Labels, optional
+            What came of taking it there; what the numbers mean.
+        """
         index = None if action is None else valid.check_action(action, self.n_actions)
         if self.state is None:
             return Explanation("Nothing was observed yet in this episode.")
         model, learnt = self.model(), self._learnt
         is_whole = learnt.states["latest_visit"][self.state] == learnt.now["clock"][0]
         nearest = model.nearest(learnt.variables["latest"]) if is_whole else None
-        return explain(model, self.belief, index, nearest)
+        return explain(model, self.belief, index, labels or self.labels, nearest)
 
     @alone
     def model(self, **labels: Any) -> FSMModel:

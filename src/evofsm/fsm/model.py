@@ -83,7 +83,7 @@ class FSMModel:
             getattr(self, name).setflags(write=False)
         m, q = self.n_variables, self.n_actions
         for name in ("names", "units"):
-            if m and len(getattr(self, name)) not in (0, m):
+            if len(getattr(self, name)) not in (0, m):
                 raise ValueError(f"{name} are {getattr(self, name)}, but there are {m} variables")
         if self.actions is not None and self.actions.n_actions != q:
             raise ValueError(f"actions has {self.actions.n_actions} intervals for {q} matrices")
@@ -204,7 +204,7 @@ class FSMModel:
             belief = np.eye(self.n_states)[state]
         else:
             belief = self._belief(situation)
-        return explain(self, belief, index, nearest)
+        return explain(self, belief, index, self.labels, nearest)
 
     def __repr__(self) -> str:
         variables = ", ".join(self.names) or f"{self.n_variables} variables"

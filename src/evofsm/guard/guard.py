@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm import store
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.arrays import VISITS
+from evofsm.fsm.explanation import explain
 from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
@@ -339,9 +340,6 @@ class Guard:
         self.fallback: Fallback = getattr(reviser, "fallback", NOTHING)
         intervals = self.actions if isinstance(self.actions, IntervalActions) else None
         self._labels = labels._replace(actions=intervals, dt=interval)
-        if machine is not None:  # what the judge does not say is as it was
-            new = {name: value for name, value in self._labels._asdict().items() if value}
-            machine.labels = machine.labels._replace(**new)
         #: Episodes that it learnt from, and those of them that failed.
         self.n_episodes, self.n_failed = n_episodes, n_failed
         self._frozen: FSMModel | None = None
@@ -681,9 +679,11 @@ class Guard:
         if not (self.explaining or is_spoken(self.reviser, revision)):
             return revision
         action = self.actions.encode(revision.executed)
-        source: Any = self._frozen or self.machine
-        here = {} if self._frozen is None else {"observation": self._held}
-        text = source.explain(action=action, **here).text
+        if self._frozen is None:
+            text = self.machine.explain(action, self._labels).text
+        else:
+            nearest = self._frozen.nearest(self._held)
+            text = explain(self._frozen, situation.belief, action, self._labels, nearest).text
         if words := self.told_here(situation.observation):
             text = f"{text} {words}"
         return revision._replace(explanation=text)
