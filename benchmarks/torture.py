@@ -43,6 +43,7 @@ from evofsm.driving.family import load_family
 from evofsm.driving.judge import LatentRisk
 from evofsm.fsm.arrays import MACHINE
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
 from evofsm.guard import Guard, warm
 
 #: What must not happen, in the order in which it is printed.
@@ -411,6 +412,7 @@ class Sample:
 
 _LOADS: dict[str, tuple[Callable[[Path], Any], Callable[[Any], object]]] = {
     "machine": (EvolvingFSM.load, lambda machine: machine.learn_one([0.0, 1.0], 0)),
+    "model": (FSMModel.load, lambda model: model.explain(0)),
     "risk": (LatentRisk.load, lambda risk: risk.score([[30.0, 20.0, 18.0]])),
     "guard": (Guard.load, lambda guard: guard.decide([30.0, 20.0, 18.0], 0.5)),
 }
@@ -425,6 +427,7 @@ def samples(folder: Path) -> list[Sample]:
     for decel in (3.0, 4.0, 6.0):
         risk.manoeuvres.remember(decel)
     machine.save(folder / "new.machine", {"files": ["a.csv"]})
+    machine.model(names=("x", "y")).save(folder / "new.model")
     risk.save(folder / "new.risk")
     guard = guard_for_cars(low=-2.5, high=2.5)
     for k in range(20):

@@ -40,7 +40,7 @@ def learnt() -> FSMModel:
 
 def main() -> None:
     """Ask Storm each property, from the state that was created first."""
-    model = EvolvingFSM.load(sys.argv[1]).model() if len(sys.argv) > 1 else learnt()
+    model = FSMModel.load(sys.argv[1]) if len(sys.argv) > 1 else learnt()
     with TemporaryDirectory() as folder:
         file = Path(folder) / "model.prism"
         file.write_text(to_prism(model), encoding="utf-8")

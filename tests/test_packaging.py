@@ -204,17 +204,17 @@ def test_the_wheel_learns_saves_and_forecasts_with_its_core_dependencies_alone(f
     program = """
 import sys
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.naming import Labels
+from evofsm.fsm.model import FSMModel
 from evofsm.fsm.actions import IntervalActions
 
 actions = IntervalActions(-1.0, 1.0, 0.5)
 machine = EvolvingFSM(actions.n_actions, radius=0.5)
 for z, a in ((0.0, -1.0), (0.1, 0.0), (2.0, 0.2), (1.0, 0.9), (1.1, 1.0)):
     machine.learn_one([z], actions.encode(a))
-machine.labels = Labels(actions)
 machine.save("machine")
 assert EvolvingFSM.load("machine").predict(0).tolist() == machine.predict(0).tolist()
-forecast = EvolvingFSM.load("machine").model().propagate(machine.belief, 0)
+machine.model(actions=actions).save("model")
+forecast = FSMModel.load("model").propagate(machine.belief, 0)
 assert forecast.tolist() == machine.predict(0).tolist()
 print(machine.n_states, sys.modules["evofsm"].__file__)
 """

@@ -7,7 +7,6 @@ import pytest
 pytest.importorskip("scipy")
 
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.naming import Labels
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +97,8 @@ def test_no_text_from_a_file_tells_the_terminal_what_to_do(evofsm, tmp_path):
     machine = EvolvingFSM(n_actions=1, radius=0.5)
     machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], failures=[3])
     evil = "\x1b[2Jgap\x9b31m\r\u202e"
-    machine.labels = Labels(names=(evil,), units=(evil,), dt=0.1)
-    machine.save(tmp_path / "model", {evil: evil, "files": [{"name": evil, "bytes": 1}]})
+    model = machine.model(names=[evil], units=[evil], dt=0.1)
+    model.save(tmp_path / "model", {evil: evil, "files": [{"name": evil, "bytes": 1}]})
     (tmp_path / "text").write_text("x")
     printed = [
         *(("inspect", tmp_path / "model"), ("inspect", tmp_path / "model", "--json")),

@@ -8,7 +8,7 @@ import re
 import pytest
 from tests.test_recipes import write
 
-from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
 from evofsm.fsm.rules import Novelty, Paper
 from evofsm.io import tables
 
@@ -87,7 +87,7 @@ def test_options_reach_the_machine_and_the_log(evofsm, tmp_path):
         *("--episode", "", "--out", model),
     )
     assert result.exit_code == 0
-    learnt = EvolvingFSM.load(model).model()
+    learnt = FSMModel.load(model)
     assert learnt.names == ("x", "light=red", "light=green")
     assert learnt.n_actions == 3
     assert learnt.dt == 0.5
@@ -313,7 +313,7 @@ def test_a_failure_that_no_row_meets_is_said_with_the_range_of_its_column(evofsm
 )
 def test_another_rule_is_told_by_its_name(evofsm, crashes, tmp_path, options, rule):
     assert evofsm("learn", crashes, *options, "--out", tmp_path / "model").exit_code == 0
-    assert EvolvingFSM.load(tmp_path / "model").rule == rule
+    assert FSMModel.load(tmp_path / "model").rule == rule
 
 
 def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
@@ -327,7 +327,7 @@ def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
     for name in ("my_rule:Coarse", "coarse"):  # which its module has registered
         text = " ".join(evofsm("learn", crashes, "--rule", name, "--out", "m").stdout.split())
         assert "rule coarse (--rule), apart 2.0" in text
-        assert EvolvingFSM.load("m").rule.apart == 2.0
+        assert FSMModel.load("m").rule.apart == 2.0
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ SCRIPT = """
 import sys
 import numpy as np
 from pathlib import Path
-from evofsm import EvolvingFSM, Novelty
+from evofsm import EvolvingFSM, FSMModel, Novelty
 
 folder = Path(sys.argv[1])
 
@@ -29,7 +29,9 @@ one.learn_many([[0.0], [3.0], [3.1], [3.0], [0.0], [0.1]], [0] * 6, episode_star
 assert one.begun.tolist() == [1.0, 1.0], one.begun  # it counts
 assert one.model().begun.tolist() == [1.0, 1.0]
 one.save(folder / "machine")
+one.model().save(folder / "model")
 assert EvolvingFSM.load(folder / "machine").begun.tolist() == [1.0, 1.0]
+assert FSMModel.load(folder / "model").begun.tolist() == [1.0, 1.0]
 
 full = machine(max_states=2)
 full.learn_many([[0.0], [1.5], [9.0]], [0] * 3, episode_starts=[0, 1])

@@ -11,6 +11,7 @@ from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.explanation import Tally
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.rules import Novelty
 
@@ -155,7 +156,9 @@ def test_failures_that_were_told_and_never_happened_are_counted_as_none(tell, tm
     tell(machine)
     assert "0 of 3 (at most 48 %) failed later on" in machine.model().explain(0).text
     machine.save(tmp_path / "machine")
+    machine.model().save(tmp_path / "model")
     assert EvolvingFSM.load(tmp_path / "machine").failures_told
+    assert FSMModel.load(tmp_path / "model").failures_told
     assert machine.copy().failures_told
 
 

@@ -7,14 +7,16 @@ import pytest
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.naming import Labels
 from evofsm.fsm.rules import Novelty, Paper
 
 
-def with_labels(grown):
-    actions = IntervalActions(-0.5, 1.0, 0.5, outside="clip")
-    grown.labels = Labels(actions, ("gap", "speed"), ("m", "m/s"), 0.01)
-    return grown
+def full_model(grown):
+    return grown.model(
+        actions=IntervalActions(-0.5, 1.0, 0.5, outside="clip"),
+        names=("gap", "speed"),
+        units=("m", "m/s"),
+        dt=0.01,
+    )
 
 
 SITUATIONS = {
@@ -40,19 +42,19 @@ def test_a_loaded_machine_goes_on_bit_for_bit(situation, grown, spiral, snapshot
     assert snapshot(loaded) == snapshot(machine) == snapshot(twin)
 
 
-def novel(grown):
+def novel_model(grown):
     machine = EvolvingFSM(3, rule=Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7))
     machine.learn_many(grown.centers, [0] * grown.n_states, failures=[3])
-    return machine
+    return machine.model()
 
 
 @pytest.mark.parametrize(
-    "make", [with_labels, novel, EvolvingFSM.copy, lambda grown: EvolvingFSM(2)]
+    "make", [full_model, novel_model, EvolvingFSM.model, lambda _: EvolvingFSM(2).model()]
 )
-def test_the_model_of_a_loaded_machine_has_every_field_of_the_saved_one(make, grown, tmp_path):
-    machine = make(grown)
-    machine.save(tmp_path / "machine")
-    model, loaded = machine.model(), EvolvingFSM.load(tmp_path / "machine").model()
+def test_a_loaded_model_has_every_field_of_the_saved_one(make, grown, tmp_path):
+    model = make(grown)
+    model.save(tmp_path / "model")
+    loaded = FSMModel.load(tmp_path / "model")
     for field in fields(FSMModel):
         value, expected = getattr(loaded, field.name), getattr(model, field.name)
         if isinstance(expected, np.ndarray):
@@ -81,11 +83,8 @@ def test_numbers_of_every_size_are_kept_and_read_again(snapshot, tmp_path):
             machine.learn_many(Z, random.integers(-1, 2, 60), [7, 31], failures=[6, 59])
             machine.save(tmp_path / "machine")
             assert snapshot(EvolvingFSM.load(tmp_path / "machine")) == snapshot(machine)
-
-
-def of_actions(low, high, width):
-    actions = {"low": low, "high": high, "width": width}
-    return {"names": [], "units": [], "dt": None, "actions": actions}
+            machine.model().save(tmp_path / "model")
+            FSMModel.load(tmp_path / "model")
 
 
 MACHINES = [
@@ -96,17 +95,26 @@ MACHINES = [
     ("rule", {"name": "magic"}, "rule is .*magic.*; it must be one of paper, novelty"),
     ("rule", {"name": "novelty", "gain": 1.0}, "gain"),
     ("rule", {"name": "novelty", "scales": [1.0]}, "scales"),
+]
+
+MODELS = [
     ("visits", -1.0, "visits of -1"),
-    ("labels", of_actions(-1e308, 0.0, 1e308), "labels.actions.low of -1e"),
-    ("labels", of_actions(-0.5, 1.0, 1e-12), "1 to 100,000 intervals"),
-    ("labels", {"names": {}}, r"labels.names is {}; it must be of type list\[str\]"),
+    ("actions", {"low": -1e308, "high": 0.0, "width": 1e308}, "actions.low of -1e"),
+    ("actions", {"low": -0.5, "high": 1.0, "width": 1e-12}, "1 to 100,000 intervals"),
+    ("failures_told", {}, "failures_told is {}; it must be of type bool"),
+    ("names", {}, r"names is {}; it must be of type list\[str\]"),
 ]
 
 
-@pytest.mark.parametrize(("name", "value", "words"), MACHINES)
-def test_what_no_learning_could_have_left_is_refused(grown, forge, tmp_path, name, value, words):
+@pytest.mark.parametrize(
+    ("kind", "name", "value", "words"),
+    [*((EvolvingFSM, *one) for one in MACHINES), *((FSMModel, *one) for one in MODELS)],
+)
+def test_what_no_learning_could_have_left_is_refused(
+    grown, forge, tmp_path, kind, name, value, words
+):
     path = tmp_path / "file"
-    with_labels(grown).save(path)
+    (grown if kind is EvolvingFSM else full_model(grown)).save(path)
     forge(path, {name: value})
     with pytest.raises(ValueError, match=f"{re.escape(str(path))}.*{words}"):
-        EvolvingFSM.load(path)
+        kind.load(path)

@@ -7,7 +7,6 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.arrays import OF_ACTIONS, SUMS
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.naming import Labels
 from evofsm.fsm.rules import Novelty
 
 ACTIONS = IntervalActions(low=-1.0, high=1.0, width=1.0)
@@ -54,18 +53,12 @@ def test_nothing_in_a_snapshot_can_be_changed(grown):
         ({"names": ("x",)}, "names are .*2 variables"),
         ({"units": ("m", "m", "s")}, "units are .*2 variables"),
         ({"actions": ACTIONS}, "2 intervals for 1 matrices"),
+        ({"dt": 0.0}, "dt of 0 cannot be right"),
     ],
 )
 def test_parts_that_do_not_fit_each_other_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
         dataclasses.replace(chain(STAY), **change)
-
-
-@pytest.mark.parametrize("labels", [{"dt": 0.0}, {"names": [1]}, {"colour": "red"}])
-def test_labels_that_cannot_be_right_are_refused(grown, labels):
-    with pytest.raises(ValueError, match=next(iter(labels))):
-        grown.model(**labels)
-    assert grown.labels == Labels()
 
 
 # -- Recognition -------------------------------------------------------------------------------

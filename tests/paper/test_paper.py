@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evofsm.driving import KinematicWorld
-from evofsm.fsm import EvolvingFSM
+from evofsm.fsm import FSMModel
 from evofsm.paper.claims import check_claims
 from evofsm.paper.reproduction import divergences, page_of, write
 from evofsm.paper.runs import Settings, run_paper
@@ -106,5 +106,5 @@ def test_all_of_it_is_written_and_can_be_read_back(tmp_path, read_page):
     assert len(list((folder / "figures").iterdir())) == 12
     claims = json.loads((folder / "claims.json").read_text())
     assert [claim["id"] for claim in claims] == [claim.id for claim in check_claims(study)]
-    model = EvolvingFSM.load(folder / "model.evofsm").model()
+    model = FSMModel.load(folder / "model.evofsm")
     assert np.array_equal(model.centers, study.model.centers)

@@ -102,7 +102,7 @@ def learn(
     for warning in warnings:
         warn(f"warning: {warning}")
     if out is not None:
-        lesson.machine.save(out, provenance)
+        model.save(out, provenance)
     new_guard: Guard | None = None
     if guard is not None and kind is not None:
         if columns.acts:

@@ -19,7 +19,7 @@ from evofsm.cli.show import warn
 from evofsm.driving import SAFETY_RULE
 from evofsm.driving.cars import guard_of_monitor
 from evofsm.driving.naming import VARIABLES
-from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, Labels, Novelty, ObservationEncoder
+from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, Novelty, ObservationEncoder
 from evofsm.fsm.rules import describe_rule, rule_named
 from evofsm.fsm.validation import positive
 from evofsm.guard import ActionReviser, Foresight, Guard, LearntRisk, Mode
@@ -102,8 +102,7 @@ def learn_traces(
     for chunk in chunks:
         lesson.take(chunk)
     dt = None if np.isnan(lesson.dt) else lesson.dt
-    lesson.machine.labels = Labels(actions, tuple(names), tuple(units()), dt)
-    lesson.model = lesson.machine.model()
+    lesson.model = lesson.machine.model(actions=actions, names=names, units=units(), dt=dt)
     if lesson.transitions == 0:
         raise ValueError(
             "no transition could be learnt: no row with an action is followed by another row of "

@@ -15,7 +15,7 @@ from evofsm import store
 from evofsm.cli.options import picture, quoted, reading_of, typed
 from evofsm.cli.show import table
 from evofsm.driving import FAMILIES, load_family
-from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions
+from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, Labels
 from evofsm.fsm.explanation import Explanation
 from evofsm.guard import Foresight, Guard, LearntRisk
 from evofsm.guard.learnt.failure import telling
@@ -41,12 +41,14 @@ def load_model(place: Path) -> tuple[FSMModel, store.Header, Guard | None]:
         machine = guard.machine
         if machine is None:
             raise ValueError(f"{place}: this guard has no machine")
-    else:
+    elif header.kind == "machine":
         machine = EvolvingFSM.load(place)
+    else:
+        return FSMModel.load(place), header, None
     family = str(header.provenance.get("family"))
     if not machine.n_states:
         raise ValueError(f"{place} has seen nothing yet: an episode has to be over")
-    labels = getattr(guard and guard.judge, "labels", machine.labels)
+    labels = getattr(guard and guard.judge, "labels", Labels())
     if isinstance(actions := getattr(guard and guard.reviser, "actions", None), IntervalActions):
         labels = labels._replace(actions=actions)
     if family in FAMILIES:

@@ -44,11 +44,6 @@ SUMS: tuple[str, ...] = ("visits", "endings", "episodes", "failed_soon")
 VISITS, ENDINGS, EPISODES, FAILED_SOON = range(len(SUMS))
 #: Counts of each state by action.
 OF_ACTIONS = ("decisions", "failures", "tried", "failed_after")
-#: What a model has of its machine, by state or by action.
-OF_MODEL: tuple[str, ...] = (
-    *(*SUMS, *OF_ACTIONS, "centers", "potentials", "created", "joined", "changes", "uses"),
-    *("transition_matrices", "origin_frequency"),
-)
 #: Of a state: the number of its creation (from 0) and of the observation that created it (from 1),
 #: whether two were joined in it, and the clock at the latest visit.
 STATE = np.dtype([(name, np.float64) for name in ("id", "created", "joined", "latest_visit")])
@@ -183,7 +178,7 @@ _SIZES = dict.fromkeys(("radius", "spread"), SIZE)
 _RULE = _optional({**_SIZES, "scales": Numbers(("scales",), 1e-20, 1e20)})
 _BELOW_1, _WEIGHT = math.nextafter(1.0, 0.0), SIZE._replace(most=1e50)
 _LIMITS = dict.fromkeys(("max_states", "failure_horizon"), FROM_1)
-#: Of a machine, with those of its rule, and what its numbers mean.
+#: Of a machine, with those of its rule.
 _SETTINGS: dict[str, Any] = {
     "n_actions": FROM_1,
     **_SIZES,
@@ -191,11 +186,6 @@ _SETTINGS: dict[str, Any] = {
     "learning_rate": _WEIGHT._replace(most=_BELOW_1),
     **_optional({**_LIMITS, "belief_tolerance": Numbers(least=0.0, most=_BELOW_1)}),
     "rule": _RULE,
-    "labels": {
-        **dict.fromkeys(("names", "units"), list[str]),
-        "dt": SIZE._replace(optional=True),
-        "actions": _optional({"low": _OBSERVED, "high": _OBSERVED, "width": SIZE}),
-    },
 }
 _INDEX, _PRODUCT = COUNT._replace(least=-1.0, dtype=np.int64), Numbers(least=0.0, most=1e300)
 _COUNTERS = ("n_states", "n_created", "n_places", "state", "clock", "began", "n_observations")
@@ -222,4 +212,26 @@ MACHINE = Kind(
         **dict.fromkeys(("tried", "failed_after", "latest_try"), COUNT.of("s", "n")),
     },
     _SETTINGS,
+)
+#: Of a model: those of its machine, with all actions.
+OF_MODEL: dict[str, Numbers] = {
+    "centers": _OBSERVED.of("n", "m"),
+    "uses": COUNT.of("q"),
+    "transition_matrices": SHARE.of("q", "n", "n"),
+    "changes": COUNT.of("n", "n"),
+    **{name: MACHINE.arrays[name] for name in (*SUMS, "potentials", "created", "joined")},
+    **{name: MACHINE.arrays[name].of("q", "n") for name in ("origin_frequency", *OF_ACTIONS)},
+}
+MODEL = Kind(
+    "model",
+    OF_MODEL,
+    {
+        "width": Numbers(least=0.0),
+        "failures_told": bool,
+        **dict.fromkeys(("names", "units"), list[str]),
+        **_optional({"dt": SIZE}),
+        "rule": _RULE,
+        "settings": _optional(_SETTINGS),
+        "actions": _optional({"low": _OBSERVED, "high": _OBSERVED, "width": SIZE}),
+    },
 )

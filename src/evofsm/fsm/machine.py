@@ -22,6 +22,7 @@ from evofsm import store
 from evofsm.fsm import arrays, rules
 from evofsm.fsm import step as stepping
 from evofsm.fsm import validation as valid
+from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.arrays import MACHINE, NO_ACTION, NOT_OPEN, OF_ACTIONS, OF_MODEL, Learnt, Settings
 from evofsm.fsm.clusters import width_of
 from evofsm.fsm.divergence import jensen_shannon
@@ -109,8 +110,6 @@ class EvolvingFSM(Retraced):
         belief_tolerance: float = 0.0,
         failure_horizon: int | None = None,
     ) -> None:
-        #: What its numbers mean, for words and pictures; its file keeps that.
-        self.labels = Labels()
         self._rule = rules.Paper() if rule is None else rule
         rules.describe_rule(self._rule)
         table = {name: float(value) for name, value in self._rule.table.items()}
@@ -303,20 +302,24 @@ class EvolvingFSM(Retraced):
         model, learnt = self.model(), self._learnt
         is_whole = learnt.states["latest_visit"][self.state] == learnt.now["clock"][0]
         nearest = model.nearest(learnt.variables["latest"]) if is_whole else None
-        return explain(model, self.belief, index, labels or self.labels, nearest)
+        return explain(model, self.belief, index, labels or Labels(), nearest)
 
     @alone
-    def model(self, **labels: Any) -> FSMModel:
+    def model(
+        self,
+        *,
+        actions: IntervalActions | None = None,
+        names: Sequence[str] = (),
+        units: Sequence[str] = (),
+        dt: float | None = None,
+    ) -> FSMModel:
         """Snapshot for analysis, which later learning does not change.
 
         Parameters
         ----------
-        **labels
-            What its numbers mean, as `Labels` takes them, in place of its own.
+        actions, names, units, dt
+            What its numbers mean, as `Labels` takes them.
         """
-        lists = {name: tuple(labels[name]) for name in labels.keys() & {"names", "units"}}
-        own_labels = self.labels._replace(**labels | lists)
-        MACHINE.refuse_others(self._content | {"labels": own_labels.described()})
         contents, now = arrays.by_name(self._learnt), self._learnt.now[0]
         q, n = self.n_actions, self.n_states
         if now["chained"]:  # what belongs to an episode that is going on is not shown yet
@@ -335,7 +338,8 @@ class EvolvingFSM(Retraced):
         parts["centers"] = contents["centers"].T
         for name in ("width", "rule", "failures_told", "settings"):
             parts[name] = getattr(self, name)
-        return FSMModel(**parts, **own_labels._asdict())
+        labels = Labels(actions, tuple(names), tuple(units), dt)
+        return FSMModel(**parts, **labels._asdict())
 
     def __getattr__(self, name: str) -> Any:
         """A setting, or an array of the snapshot of now."""
@@ -456,9 +460,7 @@ class EvolvingFSM(Retraced):
         """
         content, learnt = store.read(path, MACHINE)
         with store.explained(path):
-            labels = Labels.restored(content.pop("labels"))
             machine = cls(**{**content, "rule": rules.restore_rule(content["rule"])})
-            machine.labels = labels
             if m := len(learnt["first"]):
                 machine._fit(m)
             machine._learnt = arrays.from_names(learnt, m, machine.n_actions)
@@ -466,16 +468,13 @@ class EvolvingFSM(Retraced):
 
     @property
     def _content(self) -> dict[str, Any]:
-        rule, labels = rules.describe_rule(self._rule), self.labels.described()
-        return self.settings | {"rule": rule, "labels": labels}
+        return self.settings | {"rule": rules.describe_rule(self._rule)}
 
     # A copy, or what another process gets, has a lock and arrays of its own.
     @alone
     def __getstate__(self) -> dict[str, Any]:
         learnt = [array.copy() for array in self._learnt]
-        return {name: vars(self)[name] for name in ("labels", "_rule", "_settings")} | {
-            "_learnt": learnt
-        }
+        return {"_rule": self._rule, "_settings": self._settings, "_learnt": learnt}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)

@@ -3,31 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, Self, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evofsm import store
 from evofsm.fsm import validation as valid
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.arrays import OF_MODEL
+from evofsm.fsm.arrays import MODEL, OF_MODEL
 from evofsm.fsm.clusters import recognise_rows
 from evofsm.fsm.explanation import Explanation, Nearest, explain
 from evofsm.fsm.kernels import lanes
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.rules import Paper, StateRule, reach, weights_of
+from evofsm.fsm.rules import Paper, StateRule, describe_rule, reach, restore_rule, weights_of
 from evofsm.fsm.validation import Floats
+from evofsm.store import Place
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class FSMModel:
     """States and transitions as they stood when the snapshot was taken.
 
-    `EvolvingFSM.model` takes it; the machine's file keeps all of it. n is the number of states, m
-    of variables, q of actions. Distances and potentials are those of observations divided by the
-    rule's scales. Rows of a matrix are "from", columns "to". Arrays are read-only.
+    `EvolvingFSM.model` takes it. n is the number of states, m of variables, q of actions. Distances
+    and potentials are those of observations divided by the rule's scales. Rows of a matrix are
+    "from", columns "to". Arrays are read-only.
 
     Counts never forget. An episode is counted once for each state it came to, and each action it
     took there, for its observations are no independent evidence; the one that is going on is not
@@ -81,6 +83,7 @@ class FSMModel:
     def __post_init__(self) -> None:
         for name in OF_MODEL:
             getattr(self, name).setflags(write=False)
+        MODEL.refuse_others(self._content)
         m, q = self.n_variables, self.n_actions
         for name in ("names", "units"):
             if len(getattr(self, name)) not in (0, m):
@@ -216,6 +219,37 @@ class FSMModel:
     def __deepcopy__(self, memo: Any) -> Self:
         """Itself: nothing in it ever changes."""
         return self
+
+    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write it to a file.
+
+        Parameters
+        ----------
+        path, provenance
+            As `EvolvingFSM.save` takes them.
+        """
+        arrays = {name: getattr(self, name) for name in OF_MODEL}
+        store.write(path, MODEL, self._content, arrays, provenance)
+
+    @classmethod
+    def load(cls, path: Place) -> Self:
+        """Read it from a file, as `EvolvingFSM.load` does."""
+        content, arrays = store.read(path, MODEL)
+        with store.explained(path):
+            if (actions := content.get("actions")) is not None:
+                content["actions"] = IntervalActions(**actions)
+            content |= {name: tuple(content[name]) for name in ("names", "units")}
+            content["rule"] = restore_rule(content["rule"])
+            return cls(**content | arrays)
+
+    @property
+    def _content(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("width", "dt", "failures_told")} | {
+            **{name: list(getattr(self, name)) for name in ("names", "units")},
+            "actions": None if self.actions is None else asdict(self.actions),
+            "rule": describe_rule(self.rule),
+            "settings": dict(self.settings),
+        }
 
     @cached_property
     def _places(self) -> tuple[Floats, Floats]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,19 +58,6 @@ class Labels(NamedTuple):
     names: tuple[str, ...] = ()  #: of the variables
     units: tuple[str, ...] = ()  #: of the variables
     dt: float | None = None  #: time between two observations [s]
-
-    def described(self) -> dict[str, Any]:
-        """All of it, for JSON."""
-        actions = None if self.actions is None else asdict(self.actions)
-        names, units = list(self.names), list(self.units)
-        return {"actions": actions, "names": names, "units": units, "dt": self.dt}
-
-    @classmethod
-    def restored(cls, described: Mapping[str, Any]) -> Self:
-        """Those that were `described`."""
-        actions, names, units, dt = (described[name] for name in cls._fields)
-        intervals = None if actions is None else IntervalActions(**actions)
-        return cls(intervals, tuple(names), tuple(units), dt)
 
     def place(self, center: ArrayLike) -> str:
         """Where a centre (m,) lies: in words where a package declares some, else by its numbers."""

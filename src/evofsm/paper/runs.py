@@ -15,7 +15,9 @@ from evofsm.driving import IDM, ChangingIDM, Episode, Leader, Scenario
 from evofsm.driving.measures import is_dead_end
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.driving.world import World
-from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, Labels
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
 
 CASES = (1, 2, 3, 4)
 
@@ -98,8 +100,7 @@ class PaperStudy:
     runs: tuple[Run, ...]
     extra_runs: tuple[Run, ...]
     is_safe_at_the_end: bool  #: whether the longer runs of cases 2 and 3 stay safe
-    machine: EvolvingFSM
-    model: FSMModel  #: of the machine
+    model: FSMModel
     dead_end: int  #: index of the state that stands at most collisions; -1 without collisions
 
     @property
@@ -178,8 +179,8 @@ def run_paper(
     longer = replace(settings.scenario, duration=settings.safe_until)
     is_safe = not any(world.run(longer, settings.drivers[case]).collided for case in (2, 3))
     progress(total, total)
-    machine.labels = Labels(settings.actions, VARIABLES, UNITS, settings.scenario.dt)
+    dt = settings.scenario.dt
+    model = machine.model(actions=settings.actions, names=VARIABLES, units=UNITS, dt=dt)
     at_collisions = [run.state[-1] for run in runs if run.episode.collided]
     dead_end = int(np.bincount(at_collisions).argmax()) if at_collisions else -1
-    every = tuple(runs), tuple(extra_runs)
-    return PaperStudy(name, settings, *every, is_safe, machine, machine.model(), dead_end)
+    return PaperStudy(name, settings, tuple(runs), tuple(extra_runs), is_safe, model, dead_end)
