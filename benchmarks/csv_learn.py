@@ -93,7 +93,7 @@ def learn(path: str) -> None:
     from evofsm.io.logs import read_traces
 
     actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
-    learn_traces(read_traces([path]), EvolvingFSM(n_actions=17), actions)
+    learn_traces(read_traces([path]), EvolvingFSM.paper(), actions)
 
 
 def parse(path: str) -> None:

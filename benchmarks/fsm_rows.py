@@ -115,7 +115,7 @@ def pair(n_states: int, rows: int) -> tuple[EvolvingFSM, NumpyFSM, Stream]:
     """
     if n_states == 7:
         stream, taught = paper_stream(PAPER_ROUND + rows), PAPER_ROUND
-        machine, reference = EvolvingFSM(n_actions=17), NumpyFSM(17)
+        machine, reference = EvolvingFSM.paper(), NumpyFSM(17)
     else:
         taught = 20 * n_states
         stream = lattice_stream(n_states, taught + rows)

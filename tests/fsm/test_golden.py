@@ -48,4 +48,4 @@ def test_what_is_learnt_in_the_end_is_the_golden_one(name, golden, outcome):
 
 def test_the_paper_preset_has_the_settings_of_the_papers_golden_run():
     with np.load(Path(__file__).parents[1] / "golden" / "paper_four_runs.npz") as archive:
-        assert repr(EvolvingFSM(n_actions=17)) == repr(machine_for(archive))
+        assert repr(EvolvingFSM.paper()) == repr(machine_for(archive))

@@ -55,8 +55,7 @@ class EvolvingFSM(Retraced):
     Parameters
     ----------
     n_actions : int
-        Number q of discrete actions; each has a transition matrix of its own. In the paper 17,
-        those of ``IntervalActions(-2.5, 2.5, 0.3)`` [m/s²].
+        Number q of discrete actions; each has a transition matrix of its own.
     radius : float, optional
         The paper's epsilon: how close the nearest state must be to be moved. 0.3 for `Paper`;
         other rules have their own.
@@ -132,6 +131,14 @@ class EvolvingFSM(Retraced):
         self._learnt = arrays.blank(0, whole("n_actions", n_actions), 0, 0)
         self._share()
         MACHINE.refuse_others(self._content)
+
+    @classmethod
+    def paper(cls) -> Self:
+        """The machine of the paper's Section 3: ``[gap [m], v_follower [m/s], v_leader [m/s]]``.
+
+        Its 17 actions are those of ``IntervalActions(-2.5, 2.5, 0.3)`` [m/s²].
+        """
+        return cls(n_actions=17)
 
     # -- Learning -------------------------------------------------------------------------------
 
