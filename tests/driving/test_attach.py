@@ -73,19 +73,6 @@ def drive(sumo, seconds, brakes_at=15.0):
     return speeds
 
 
-def test_what_a_guard_made_a_car_do_is_not_learnt_as_what_leaders_do(road):
-    behind = '<vehicle id="last" type="calm" route="along" depart="0" departPos="20"/>'
-    sumo = road(*NO_GAP, others=behind)
-    told = []
-    guards = attach(sumo, "all", report=told.append)
-    drive(sumo, 25.0)
-    assert min(one.deed for one in told if one.car == "ego") < -4.5  # which "last" follows
-    by_lead, *by_drivers = sorted(guards.guarding.leaders.decels, reverse=True)
-    assert by_lead == pytest.approx(8.0, abs=0.1)
-    assert max(by_drivers, default=0.0) < 4.5  # no car of these brakes harder by itself
-    guards.detach()
-
-
 def test_the_summary_says_what_guards_cost(road):
     alone, guarded = {}, {}
     for mode, found in (("watch", alone), ("act", guarded)):
@@ -121,7 +108,10 @@ def test_shadow_changes_nothing(road):
 )
 def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step):
     usual = (
-        '<vType id="usual" decel="4.5" speedDev="0.1"/><flow id="car" type="usual" route="along" '
+        '<vTypeDistribution id="mix"><vType id="usual" speedDev="0.1" probability="0.7"/>'
+        '<vType id="truck" vClass="truck" probability="0.15"/>'
+        '<vType id="bike" vClass="motorcycle" probability="0.15"/></vTypeDistribution>'
+        '<flow id="car" type="mix" route="along" '
         'begin="1" end="40" period="2" departSpeed="max" departPos="0"/>'
     )
     found = []
@@ -130,7 +120,7 @@ def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step):
         sumo.load([*road.options[:-1], str(step), "--seed", "1"])
         sumo.simulationStep()
         sumo.vehicle.setType("ego", "usual")  # nobody is hasty
-        cars = attach(sumo, "type:usual", mode=mode)
+        cars = attach(sumo, "all", mode=mode)
         drive(sumo, 40.0, brakes_at=np.inf)
         sumo.vehicle.setMaxSpeed("lead", 3.0)
         drive(sumo, 40.0, brakes_at=np.inf)
@@ -140,6 +130,7 @@ def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step):
     assert guarded["collisions"] == alone["collisions"] == 0
     assert guarded["hard_brakes"] <= alone["hard_brakes"] + 1
     assert guarded["speed"] >= 0.995 * alone["speed"]
+    assert guarded["revised"] < 0.25 * guarded["decisions"]  # by some 0.1 m/s², most of them
 
 
 @pytest.mark.parametrize("ballistic", ["true", "false"])
@@ -154,7 +145,6 @@ def test_a_guarded_car_does_not_collide(road, options, ballistic):
     assert 0 < guards.guarding.limited < guards.guarding.decisions
     held = [one for one in told if one.revision.executed < 3.5]
     assert {(one.other, one.role) for one in held} == {("lead", Role.AHEAD)}
-    assert list(guards.guarding.leaders.decels) == [pytest.approx(8.0, abs=0.1)]
     for one in held:
         stands = speeds[round(one.time / 0.1)] == 0.0
         assert stands or one.deed <= one.revision.executed + 1e-6

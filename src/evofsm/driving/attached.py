@@ -18,29 +18,25 @@ import weakref
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
-from itertools import chain, count
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from evofsm.driving.judge import REGAIN, SLIGHT, LatentRisk
-from evofsm.driving.leaders import BrakeWatch, Manoeuvres
+from evofsm.driving.leaders import Manoeuvres
 from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 from evofsm.driving.naming import VARIABLES
 from evofsm.driving.scenarios import steps_between
-from evofsm.driving.traffic import COLUMNS, Role, TrafficRisk, guard_for_traffic
+from evofsm.driving.traffic import COLUMNS, Role, TrafficRisk, guard_for_traffic, width_for
 from evofsm.fsm.validation import Floats
 from evofsm.guard import TOLERANCE, ActionJudge, ActionReviser, Guard, Mode, Revision
 
 # What is done with the chosen cars.
 _MODES = ("act", "shadow", "watch")
 _TYPE = "type:"
-# Leaders are taken to brake so hard, until enough was seen [m/s²]: SUMO's usual ``decel``. In an
-# emergency they brake harder, and so does whoever follows.
-_LEADER_DECEL = 4.5
-# What is seen is so exact [m/s²].
-_SEEN_TO = 0.05
 # Braking harder than this is hard [m/s²].
 _HARD = 5.0
 # Clocks of SUMO count thousandths; two times that differ by less are one [s].
@@ -68,8 +64,8 @@ _LOOKS_AHEAD, _GENTLE = 30.0, 3.0
 _CAR_WIDTH = 1.8
 # Nobody is nearer in what is judged [m]. SUMO keeps minGap itself: what is kept beside it [m].
 _NEAREST, _MARGIN = 0.05, 0.1
-# Limits are as coarse as that [m/s²], and so far a driver may want more.
-_COARSE = 0.3
+# SUMO is told no lower limit of acceleration [m/s²].
+_LEAST = 0.01
 # Slower than this a car stands, and a speed that differs by no more is the same [m/s].
 _STANDS, _SAME_SPEED = 0.1, 1e-6
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
@@ -115,8 +111,8 @@ class Seeing:
         ballistic = str(simulation.getOption("step-method.ballistic")).lower() in ("true", "1")
         # In SUMO's Euler step a car drives all of it at the speed of its end. Against what is
         # rehearsed, a faster follower gets less far by half a step's worth of the difference, and a
-        # slower one further; whoever brakes to a standstill within a step, too, by up to an eighth
-        # of its braking over the square of the step.
+        # slower one further; so does whoever comes to a standstill within a step, by what speed it
+        # has after this one (`_further`).
         self._euler = 0.0 if ballistic else self.dt
         self._known: set[str] = set()
         self._bodies.clear()
@@ -155,15 +151,18 @@ class Seeing:
         neighbour, gap = find(car, reach) or ("", 0.0)
         if not neighbour:
             return None
-        v, follower = self._vehicle.getSpeed(neighbour), self.body(car if is_ahead else neighbour)
-        closing_speed = speed - v if is_ahead else v - speed
-        euler = self._euler
-        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * closing_speed
+        v, euler = self._vehicle.getSpeed(neighbour), self._euler
+        own, other = (speed, self.body(car)), (v, self.body(neighbour))
+        (first, follower), (second, leader) = (own, other) if is_ahead else (other, own)
         # Who is nearer than SUMO lets anybody be stands in a queue, or beside, where lanes merge.
         # Across a junction SUMO says 0 of all that is nearer than minGap.
         spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
-        room = max(gap + spare_gap - late, _NEAREST)
-        return Neighbour(neighbour, gap + follower.min_gap, room, v)
+        near = Neighbour(neighbour, gap + follower.min_gap, gap + spare_gap, v)
+        gained = 0.5 * euler * (first - second) + _further(second, leader.decel, euler)
+        if is_ahead and 0.125 * follower.decel * euler * euler > _MARGIN:  # an eighth is the most
+            first = self.wish(car, speed, near)
+        room = near.room + gained - _further(first, follower.decel, euler)
+        return near._replace(room=max(room, _NEAREST))
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
         """The speed that a car's own model wants after the next step [m/s], but for red lights."""
@@ -209,9 +208,11 @@ class _Car:
     id: str
     guard: Guard
     high: float  # the hardest acceleration
-    mode: int | None = None  # SUMO's speed mode before it was taken over
+    mode: int | None = None  # SUMO's speed mode before its speed was set
+    kind: str = ""  # its type, and what that accelerates by [m/s²], before less was set
+    accel: float = 0.0
     speed: float = 0.0
-    limit: float = 0.0  # the speed that was set
+    limit: float = math.inf  # the speed that was set, or that it can gain
     wish: float = 0.0  # the speed that its model wants instead
     time: float = 0.0
     seen: Floats | None = None  # what is decided on
@@ -220,8 +221,16 @@ class _Car:
     about: tuple[str, Role | None] = ("", None)
 
 
+def _further(speed: float, decel: float, euler: float) -> float:
+    """So much further a car gets until it stands [m], as that is amid an Euler step [s]."""
+    if not euler:
+        return 0.0
+    part = speed / (decel * euler) % 1.0
+    return 0.5 * decel * euler * euler * part * (1.0 - part)
+
+
 class Guarding:
-    """Guards each car, by a guard of its own; what leaders do they share, unless given a guard."""
+    """Guards each car, by a guard of its own."""
 
     def __init__(
         self,
@@ -237,20 +246,16 @@ class Guarding:
         self._acts, self._report = acts, report
         self._template, self._tolerance, self._regain = guard, tolerance, regain
         self.cars: dict[str, _Car] = {}  #: by id
-        self._watches: dict[str, BrakeWatch] = {}
         judge = None if guard is None else _judge(guard)
         if not (judge is None or isinstance(judge, TrafficRisk) or judge.labels.names == VARIABLES):
             raise ValueError(
                 f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must "
                 f"be a TrafficRisk, or observe {', '.join(VARIABLES)}"
             )
-        # How hard SUMO's cars brake is exactly known, and has an end.
-        #: How hard they were seen to brake.
-        self.leaders = Manoeuvres(_LEADER_DECEL, width=_SEEN_TO)
         self.begin_anew()
         self.decisions = 0
-        #: Steps in which a car braked harder, or accelerated less, than its driver wanted by more
-        #: than 0.1 m/s²; in shadow, would have. Who stands, and goes on standing, is not counted.
+        #: Steps in which a car was made to brake harder, or accelerate less, than its driver wanted
+        #: by more than 0.1 m/s²; in shadow, would have been. Who goes on standing does not count.
         self.revised = 0
         self.limited = 0  #: steps in which a guard set a limit to the speed of a car
         self.overruled = 0  #: steps in which a car drove faster than its guard had set
@@ -261,7 +266,6 @@ class Guarding:
         self.interval = self._seeing.dt if interval is None else interval
         self._every = steps_between(self.interval, self._seeing.dt)
         self._steps = 0
-        self._watches.clear()
 
     def add(self, car: str) -> None:
         """Guard it from now on."""
@@ -278,27 +282,23 @@ class Guarding:
         """Say what came of the step that is over, and decide on the next."""
         decides = self._steps % self._every == 0
         self._steps += 1
-        seen_leaders: dict[str, float] = {}
         for car in self.cars.values():
             speed = self._vehicle.getSpeed(car.id)
             if car.seen is not None:
                 self._look_back(car, speed)
+            self._hand_back(car)  # so that its model says what it wants by itself
             if decides:
                 self._look(car, speed)
-                if car.around[0] is not None:
-                    seen_leaders[car.around[0].id] = car.around[0].speed
                 if car.seen is not None and self._acts:
                     self._decide(car, car.high)
             car.speed, car.time = speed, time
             if self._acts:
                 self._act(car, speed)
-        if decides:
-            self._watch(seen_leaders)
 
     def _look(self, car: _Car, speed: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
         ahead, before = self._seeing.neighbour(car.id, speed), car.around[0]
-        scene = isinstance(_judge(car.guard), TrafficRisk)
+        scene = isinstance(judge := _judge(car.guard), TrafficRisk)
         # Who is behind matters only where one brakes: if acting, because somebody is ahead.
         alone = ahead is None and self._acts
         behind = None
@@ -307,6 +307,8 @@ class Guarding:
         car.around = ahead, behind
         if (ahead and ahead.id) != (before and before.id):
             car.guard.begin()  # what is known of the one before does not hold of this one
+            if ahead and self._template is None and isinstance(judge, TrafficRisk):
+                judge.ahead.manoeuvres = _brakes(self._seeing.body(ahead.id).decel)
         car.revision = car.seen = None
         if scene and (ahead or behind):
             car.seen = self._seeing.rows(car.id, speed, ahead, behind)
@@ -323,74 +325,66 @@ class Guarding:
         return revision
 
     def _act(self, car: _Car, speed: float) -> None:
-        """Set the speed, where the guard allows less than the car might want."""
-        revision = car.revision
+        """Hold it back, where the guard allows less than the car might want."""
+        revision, vehicle, dt = car.revision, self._vehicle, self._seeing.dt
         if revision is None or revision.executed >= car.high:
-            self._hand_back(car)
             return
-        next_speed = max(0.0, speed + float(revision.executed) * self._seeing.dt)
+        car.wish, late = (
+            self._seeing.wish(car.id, speed, car.around[0]),
+            self._seeing.body(car.id).late,
+        )
+        next_speed = max(0.0, speed + float(revision.executed) * dt)
         # Nor faster than it would drive on a free road.
-        car.limit = min(next_speed, self._vehicle.getAllowedSpeed(car.id))
-        car.wish = self._seeing.wish(car.id, speed, car.around[0])
-        if not self._seeing.body(car.id).late and car.wish <= car.limit + _COARSE * self._seeing.dt:
-            self._hand_back(car)  # it drives as it would by itself, with its imperfections
-            return
-        if car.mode is None:
-            car.mode = self._vehicle.getSpeedMode(car.id)
-            self._vehicle.setSpeedMode(car.id, car.mode & ~_OFF | _ON)
+        limit = min(next_speed, vehicle.getAllowedSpeed(car.id))
+        if not late and car.wish <= limit + width_for(dt) * dt:
+            return  # it drives as it would by itself, with its imperfections
         self.limited += 1
-        self._vehicle.setSpeed(car.id, car.limit)
+        if revision.executed >= 0.0 and not late:
+            # Its model drives on, lets others in and changes lanes: to set its speed ends that.
+            car.kind, car.limit = vehicle.getTypeID(car.id), next_speed
+            car.accel = vehicle.getAccel(car.id)
+            vehicle.setAccel(car.id, max(float(revision.executed), _LEAST))
+            return
+        car.mode, car.limit = vehicle.getSpeedMode(car.id), limit
+        vehicle.setSpeedMode(car.id, car.mode & ~_OFF | _ON)
+        vehicle.setSpeed(car.id, limit)
 
     def _hand_back(self, car: _Car) -> None:
+        if car.kind.endswith(f"@{car.id}"):  # a type of its own already, by somebody's script
+            self._vehicle.setAccel(car.id, car.accel)
+        elif car.kind:
+            self._vehicle.setType(car.id, car.kind)
         if car.mode is not None:
             self._vehicle.setSpeed(car.id, -1.0)
             self._vehicle.setSpeedMode(car.id, car.mode)
-            car.mode = None
+        car.kind, car.mode, car.limit = "", None, math.inf
 
     def _look_back(self, car: _Car, speed: float) -> None:
         """What the driver wanted, now that it shows; in shadow it is what is judged."""
         desired_speed = speed
-        if car.mode is not None and speed > car.limit + _FASTER:
+        if speed > car.limit + _FASTER:
             self.overruled += 1
             if self.overruled == _OFTEN:
                 warnings.warn(_OVERRULED.format(car.id, _OFTEN), RuntimeWarning, stacklevel=4)
-        # Slower than the limit is what SUMO itself wanted, such as to stop at a red light.
-        if car.mode is not None and speed >= car.limit - _SAME_SPEED:
+        # Slower than the limit is what SUMO itself wanted, such as to stop at a red light; to gain
+        # less speed may be its imperfection.
+        if car.limit < math.inf and speed >= min(car.limit, car.speed) - _SAME_SPEED:
             desired_speed = max(car.wish, speed)
-        wish, acceleration = ((v - car.speed) / self._seeing.dt for v in (desired_speed, speed))
+        speeds = desired_speed, speed, car.limit
+        wish, acceleration, most = ((v - car.speed) / self._seeing.dt for v in speeds)
         revision = car.revision or self._decide(car, wish)  # where it acts, that was decided before
         stands = max(car.speed, speed, desired_speed) < _STANDS
-        outcome = acceleration if self._acts else float(revision.advised)
-        self.revised += not stands and outcome < wish - SLIGHT
+        allowed = most if self._acts else float(revision.advised)
+        self.revised += not stands and allowed < wish - SLIGHT
         if self._report is not None:
             self._report(GuardedStep(car.time, car.id, wish, acceleration, revision, *car.about))
-
-    def _watch(self, speeds: dict[str, float]) -> None:
-        """Learn how hard leaders brake, each by itself, whoever follows it.
-
-        What a guard makes a car do, whoever attached it, is not what leaders do: it is not learnt.
-        """
-        decels = []
-        groups = [a.guarding for a in _ATTACHED if a._sumo is self._sumo and a.guarding]
-        for car in chain.from_iterable(group.cars.values() for group in groups):
-            if car.mode is not None:
-                speeds.pop(car.id, None)
-                self._watches.pop(car.id, None)
-        for leader, speed in speeds.items():
-            if leader not in self._watches:
-                self._watches[leader] = BrakeWatch(self.interval)
-            decels.append(self._watches[leader].see(0.0, speed, speed))
-        for leader in sorted(self._watches.keys() - speeds.keys()):
-            decels.append(self._watches.pop(leader).end())
-        self.leaders.remember(*decels)
 
     def _guard_for(self, car: str, high: float) -> Guard:
         mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
             decel, dt = self._vehicle.getDecel(car), self.interval
             how = {"margin": _MARGIN, "regain": self._regain}
-            risk = LatentRisk.given(-decel, decel, _LEADER_DECEL, dt, **how)
-            risk.manoeuvres = self.leaders
+            risk = LatentRisk.given(-decel, decel, decel, dt, **how)
             low, judge = -max(self._vehicle.getEmergencyDecel(car), decel), TrafficRisk(risk)
             limits = low, high, decel, dt
             return guard_for_traffic(*limits, judge=judge, tolerance=self._tolerance, mode=mode)
@@ -399,6 +393,15 @@ class Guarding:
         if isinstance(guard.reviser, ActionReviser):
             guard.reviser.mode = mode
         return guard
+
+
+@cache
+def _brakes(decel: float) -> Manoeuvres:
+    """Of a leader that SUMO says brakes so hard [m/s²].
+
+    In an emergency it brakes harder, and so does whoever follows.
+    """
+    return Manoeuvres(decel)
 
 
 def _judge(guard: Guard) -> ActionJudge | None:
@@ -646,7 +649,7 @@ def attach(
 
     From then on each ``simulationStep`` does the rest. SUMO drives a guarded car as before, but no
     faster than its guard allows, who minds who is ahead and behind in its lane; right of way, red
-    lights and lane changes stay SUMO's. Guards that are made here learn how hard leaders brake.
+    lights and lane changes stay SUMO's.
 
     Parameters
     ----------
@@ -657,7 +660,7 @@ def attach(
     guard : Guard, optional
         Each car gets a copy, frozen. It observes scenes (`guard_for_traffic`) or gap and speeds
         (`guard_for_cars`, or `Guard.of` an `EnvelopeReviser`). Without one, each counts on SUMO's
-        ``decel`` of its car and brakes up to ``emergencyDecel`` where it has to.
+        ``decel`` of its car and of leaders, and brakes up to ``emergencyDecel`` where it has to.
     mode : {"act", "shadow", "watch"}
         Whether guards act, only say what they would do, or there are none: then only time to
         collision and needed deceleration are measured.
@@ -677,9 +680,10 @@ def attach(
 
     Notes
     -----
-    Where a guard acts, the speed mode has "safe speed" and the limit of acceleration on and that of
-    braking off. It is put back as it was, with ``setSpeed(-1)``, as soon as the guard allows all
-    that the car can do. Where you set a car's speed yourself, ask a `Guard` before you do instead.
+    A guard that allows less acceleration than a driver wants says so by ``setAccel``; one that has
+    to brake by ``setSpeed``, with "safe speed" and the limit of acceleration on in the speed mode
+    and that of braking off. Both are put back before the next step. Where you set a car's speed
+    yourself, ask a `Guard` before you do instead.
     After ``load``, or ``close`` and ``start``, an attachment goes on with the new cars, and what it
     counts goes on; whoever attaches anew ends those of earlier simulations.
 

@@ -74,14 +74,10 @@ REAL_DRIVES = LeaderBrakes(
 
 
 class Manoeuvres:
-    """The decelerations of the latest manoeuvres, and how likely harder ones are.
+    """The decelerations of the latest manoeuvres, and how likely harder ones are."""
 
-    ``width`` is that of the kernel [m/s²]; without it Silverman's.
-    """
-
-    def __init__(self, assumed: float, width: float | None = None) -> None:
+    def __init__(self, assumed: float) -> None:
         self.assumed = positive("assumed", assumed)
-        self.width = width
         self.gentle = 0
         self.decels: deque[float] = deque(maxlen=_MOST_REMEMBERED)
         self._tabulate()
@@ -114,7 +110,7 @@ class Manoeuvres:
         if self.decels:
             samples = np.array(self.decels)
             # Silverman's rule; where few were seen their spread says little.
-            width = self.width or max(_NARROWEST, 2.34 * samples.std() * len(samples) ** -0.2)
+            width = max(_NARROWEST, 2.34 * samples.std() * len(samples) ** -0.2)
             offset = np.clip((samples - grid[:, None]) / width, -1.0, 1.0)
             harder += (0.5 + offset * (0.75 - 0.25 * offset * offset)).sum(axis=1)
         harder[grid >= HARDEST] = 0.0

@@ -33,8 +33,9 @@ PLACES, SIZES, RATES = (-1e9, 1e9), (0.0, 1e3), (-1e3, 1e3)
 
 # Who will be in one's path within this time at the present lateral speed cuts in, or crosses [s].
 _AHEAD = 2.0
-# Width of an interval of accelerations, of which one is looked at [m/s²].
-_INTERVAL_WIDTH = 0.3
+# Width of an interval of accelerations, of which one is looked at [m/s²]; it changes the speed at
+# the next decision by so much at most [m/s].
+_WIDEST, _COARSEST = 0.3, 0.05
 # So hard leaders brake at most, unless told or seen otherwise: SUMO's emergencyDecel [m/s²].
 LEADER_DECEL = 9.0
 # So hard those behind brake [m/s²], once they have kept their speed for so long [s].
@@ -265,6 +266,11 @@ class TrafficRisk(ActionJudge):
         self.ahead.refuse_unfit(actions)
 
 
+def width_for(interval: float) -> float:
+    """Of intervals of accelerations [m/s²], where decisions are so far apart [s]."""
+    return min(_WIDEST, _COARSEST / interval)
+
+
 def _worse(a: Judgement, b: Judgement) -> Judgement:
     """The higher risk of each action."""
     risk, low, high = map(np.maximum, a[:3], b[:3])
@@ -299,6 +305,6 @@ def guard_for_traffic(
     mode : Mode
     """
     judge = judge or TrafficRisk(LatentRisk.given(-decel, decel, LEADER_DECEL, interval))
-    actions = IntervalActions(low, high, _INTERVAL_WIDTH, outside="clip")
+    actions = IntervalActions(low, high, width_for(interval), outside="clip")
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, learn=False)
