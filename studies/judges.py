@@ -74,14 +74,14 @@ PARTS: dict[str, str] = {
     "landings": "a variable that jumps does not land where it did",
 }
 
-
-def _both(known: Vector, new: Vector) -> Vector:
-    """(2, m) the least of all, twice."""
-    return np.tile(np.minimum(known[0], new), (2, 1))
-
-
 # What stands in its settings, or in its modules, where a part has no other switch.
 _GONE: dict[str, dict[str, Any]] = {
+    "stretches": {"learn.disturbances": lambda state, *_: state},
+    "margin": {"margin": 0.0, "margin_step": 0.0},
+    "backups": {"learn.evolved": lambda state, *_: state},
+    "regions": {"failure._candidates": lambda *_: ()},
+    "dead-ends": {"danger.dead_ends": lambda state, *_: state},
+    "rivals": {"learn.doubted": lambda state, *_, tried: state},
     "lags": {"lags": 1e12},
     "products": {"shy": 1e12},
     "shy": {"shy": LearntSettings().prior},
@@ -97,7 +97,9 @@ _GONE: dict[str, dict[str, Any]] = {
     "glitches": {"model.without_glitches": lambda z, unit: z},
     "gaps": {"model.filled": lambda z, failed: z},
     "held": {"motion._held": lambda state, to, after: np.zeros((2, *after.shape), bool)},
-    "witness": {"motion._extremes": lambda known, new, _: (_both(known, new), new < known[0])},
+    "witness": {
+        "motion._extremes": lambda old, new, _: (np.minimum(old[[0, 0]], new), new < old[0])
+    },
     "blur": {"failure._BLURRED": 0.0},
     "dropped": {"danger._dropped": lambda state, was, *rest: was[:0]},
     "endings": {"danger._ENDED": math.inf},
@@ -187,9 +189,7 @@ _TOLD = {
 def learnt_guard(
     *,
     interval: float,
-    seed: int,
     without: Sequence[str],
-    horizon: float | None = None,
     failed: Callable[[Vector], bool] | None = None,
     **told: Any,
 ) -> Guard:
@@ -197,10 +197,8 @@ def learnt_guard(
 
     Without ``harm`` no episode is driven in shadow.
     """
-    parts = [part for part in without if part in LearntRisk.PARTS]
     settings = LearntSettings(**_changes(without, in_modules=False))
-    told |= {"horizon": horizon, "seed": seed}
-    judge = LearntRisk(interval, **told, without=parts, settings=settings)
+    judge = LearntRisk(interval, **told, settings=settings)
     guard = Guard(**told, interval=interval, judge=judge, failed=failed)
     guard.shadow = "harm" not in without
     if "states" in without:

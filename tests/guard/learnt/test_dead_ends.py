@@ -25,7 +25,7 @@ def play(guard, road, episode, see=lambda z: z):
 
 def taught(see=lambda z: z, times=2):
     """A guard that knows the wall, and met the trap some times."""
-    judge = LearntRisk(0.1, -1.0, 1.0, without=["regions"])
+    judge = LearntRisk(0.1, -1.0, 1.0)
     guard = Guard(low=-1.0, high=1.0, interval=0.1, judge=judge, explaining=True)
     for episode in range(4):
         play(guard, episode % 2, episode, see)

@@ -34,7 +34,6 @@ def with_first(value):
 @pytest.mark.parametrize(
     ("settings", "arrays", "why"),
     [
-        ({"without": ["luck"]}, {}, "without names"),
         ({"low": [3.0]}, {}, "below high"),
         ({"n_actions": 4}, {}, "of actions of 1 numbers, but they have 4"),
         ({"low": [-1.0, -1.0], "high": [1.0, 1.0]}, {}, "of actions of 1 numbers, but they have 2"),

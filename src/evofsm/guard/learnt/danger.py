@@ -33,7 +33,7 @@ _RADII = tuple(0.1 * 1.3**k for k in range(20))
 
 def fails(state: State, z: Floats, episode: Episode, given: Given) -> State:
     """Learn where it fails, and where it ends, of observations ``z`` (T + 1, m) of an episode."""
-    settings, function, bends = given.settings, given.failed, "regions" not in given.without
+    settings, function = given.settings, given.failed
     failed = episode.failed and bool(np.isfinite(z[-1]).all())
     rows = z[:-1] if episode.failed else z
     rows = rows[np.isfinite(rows).all(1)]
@@ -62,11 +62,11 @@ def fails(state: State, z: Floats, episode: Episode, given: Given) -> State:
         brinks = np.vstack([state.brinks, rows[-1:]])[-most:]
         state = state._replace(failures=np.vstack([state.failures, z[-1]])[-most:], brinks=brinks)
     if function is not None:
-        return _asked(state, function, bends=bends)
-    return _explained(state, settings, failed=failed, bends=bends)
+        return _asked(state, function)
+    return _explained(state, settings, failed=failed)
 
 
-def _explained(state: State, settings: LearntSettings, *, failed: bool, bends: bool) -> State:
+def _explained(state: State, settings: LearntSettings, *, failed: bool) -> State:
     """Explain all that failed or ended by forms, anew if it ``failed`` now."""
     survival, table = sizes(state), state.forms
     if len(state.ended) >= _ENDED:
@@ -82,7 +82,7 @@ def _explained(state: State, settings: LearntSettings, *, failed: bool, bends: b
         sides = sides[failure.among(sides, was[are_sides])]
     rows = np.concatenate([sides, bent])
     is_told = not len(failures) or failure.inside(rows, failures).any(0).all()
-    if bends and (failed or not is_told):
+    if failed or not is_told:
         rows = failure.explain(FAILS, failures, survival, noise)
     rows = failure.counted(rows, failures)
     ends, fatal = failure.saying(table, ENDS, CRASHES), failure.saying(table, FATAL)
@@ -139,7 +139,7 @@ def _endings(state: State, table: Floats, known: Survived) -> Floats:
     return np.concatenate([rows, crashes, failure.saying(table, FAILS, FATAL)])
 
 
-def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> State:
+def _asked(state: State, given: Callable[[Floats], bool]) -> State:
     """Explain what a function says around what was survived, unless that is explained.
 
     Looked for in drawn directions, farther along variables that change slowly.
@@ -178,7 +178,7 @@ def _asked(state: State, given: Callable[[Floats], bool], *, bends: bool) -> Sta
 
     table = state.forms
     if differs(table) > 0.0:
-        table = failure.explain(FAILS, failures, failure.boxed(survival, rows), bends=bends)
+        table = failure.explain(FAILS, failures, failure.boxed(survival, rows))
     return state._replace(forms=table, differs=differs(table))
 
 

@@ -86,8 +86,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         decisions, as with a longer horizon that is given.
     seed : int
         Of the draws with which backups evolve and situations are chosen.
-    without : sequence of str
-        Parts of `PARTS` that are left out.
     names, units : sequence of str
         Of the variables, for what people read; nothing is decided by them.
     settings : LearntSettings, optional
@@ -98,8 +96,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     Raises
     ------
     ValueError
-        If ``dt`` is not positive and finite, ``without`` names no part, or not one of a range and
-        ``n_actions`` is given.
+        If ``dt`` is not positive and finite, or not one of a range and ``n_actions`` is given.
 
     Notes
     -----
@@ -120,8 +117,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     LearntRisk(dt=0.02, seed=0)
     """
 
-    #: Parts that can be left out, to see what each is worth.
-    PARTS = ("margin", "backups", "dead-ends", "stretches", "regions", "rivals")
     #: From so many observations on end that lack something on, the risk is not known.
     BLIND = 5
 
@@ -152,7 +147,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         n_actions: int | None = None,
         horizon: float | None = None,
         seed: int = 0,
-        without: Sequence[str] = (),
         names: Sequence[str] = (),
         units: Sequence[str] = (),
         settings: LearntSettings | None = None,
@@ -168,9 +162,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
                 f"looks at most {_MAX_STEPS:,} ahead (is it in seconds?)"
             )
         self.seed = operator.index(seed)
-        if unknown := set(without) - set(self.PARTS):
-            raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(self.PARTS)}")
-        self.without = frozenset(without)
         self.settings = LearntSettings() if settings is None else settings
         self.model = function("model", model, "lambda z, u: z + 0.1 * u")
         self.backup = function("backup", backup, "lambda z: -1.0")
@@ -203,8 +194,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         while steps is not None and steps > self.settings.horizon_max:
             steps, stride = -(-steps // 2), 2 * stride
         self.state = State.none(0, self.size, self.choices, self.settings, steps)
-        margin = 0.0 if "margin" in self.without else self.state.margin
-        self.state = self.state._replace(stride=stride, margin=margin)
+        self.state = self.state._replace(stride=stride)
         self.parts: Parts | None = None
         self.start_episode()
 
@@ -505,12 +495,9 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self._u.append(inner)
         self._used = self._used + used_at(inner[None], self.choices)[0]
 
-    def learn(self, observation: ArrayLike, action: Any, *, watched: bool = False) -> None:
-        """Take in what was executed, and whether the certificate of before still held.
-
-        Where someone else acts (``watched``) nothing was certified.
-        """
-        if not watched and "margin" not in self.without and self.parts is not None:
+    def learn(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
+        """Take in what was executed, and whether the certificate of before still held."""
+        if self.parts is not None:
             is_violated = self._certified and not self._holds
             s = self.settings
             margin = self.state.margin + s.margin_step * (is_violated - s.violation_rate)
@@ -563,7 +550,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
                 raise ValueError(f"backup gave {action} at {z}; it has to give an action")
             return self.encode(action[0] if self.choices else np.clip(action, self.low, self.high))
 
-        numbers = self.settings, self.seed, self.without, self.given_horizon
+        numbers = self.settings, self.seed, self.given_horizon
         return Given(*numbers, self.failed, model if move else None, backup if act else None)
 
     def _study(self, *, failed: bool, terminated: bool) -> None:
@@ -642,7 +629,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
             **{name: getattr(self, name).tolist() for name in ("low", "high")},
             **{name: list(getattr(self.labels, name)) for name in ("names", "units")},
             "n_actions": self.choices or None,
-            "without": sorted(self.without),
             "harm": {name: getattr(self.harm, name) for name in SETTINGS},
             "settings": asdict(self.settings),
             "state": numbers,
@@ -655,7 +641,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         """Read what was learnt, between two episodes; a ValueError if the file is damaged."""
         settings, arrays = store.read(path, KIND)
         with store.explained(path):
-            names = ("n_actions", "seed", "without", "names", "units")
+            names = ("n_actions", "seed", "names", "units")
             keywords = {name: settings[name] for name in names}
             if keywords["n_actions"] is None:
                 keywords |= {"low": settings["low"], "high": settings["high"]}

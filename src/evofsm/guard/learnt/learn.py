@@ -28,7 +28,7 @@ _ONSET = 0.5
 
 def learn(state: State, episode: Episode, given: Given) -> State:
     """Learn from an episode, or from a part of a long one, and from what the user said."""
-    decisions, before, settings, without = episode, state, given.settings, given.without
+    decisions, before, settings = episode, state, given.settings
     rows = model.filled(episode.observations, failed=episode.failed)
     decisions = decisions._replace(observations=rows)
     # What a rival certified says nothing of the model.
@@ -43,11 +43,10 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     z = model.without_glitches(episode.observations, unit)
     safe = z[:-1] if episode.failed else z
     u = episode.actions[: max(0, len(safe) - 1)]
-    margin = max(settings.margin_step, settings.margin_fade * state.margin)
     is_lost = episode.failed and 2.0 * episode.lost.sum() > len(episode.lost)
     state = state._replace(
         n_seen=state.n_seen + int(is_seen.sum()),
-        margin=0.0 if "margin" in without else margin,
+        margin=max(settings.margin_step, settings.margin_fade * state.margin),
         misled=(settings.drift_fade if is_lost else 1.0) * state.misled,  # so that lags come back
         used=state.used + motion.used_at(u, state.choices).sum(0),
     )
@@ -61,7 +60,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
             state = motion.told(state, model_of(state, settings), safe, given.model, random)
     # Failure
     state = danger.fails(state, z, episode, given)
-    if "dead-ends" not in without and len(state.forms):
+    if len(state.forms):
         motion_model = model_of(state, settings)
         state = danger.dead_ends(state, motion_model, safe, episode, before.survived)
     if not moves:
@@ -69,7 +68,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     if not len(state.policies):
         state = first_backups(state, u, settings.n_linear)
     state = noted(state, safe, episode, settings, random)
-    if "rivals" not in without and given.failed is None:
+    if given.failed is None:
         was_tried = failure.inside(failure.saying(before.forms, FAILS), safe, 0.0).any()
         state = doubted(state, episode, settings, tried=bool(was_tried))
     refutations = 1 + np.flatnonzero(episode.lost[1 : max(1, len(safe) - state.horizon)])
@@ -78,8 +77,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     # Disturbances
     motion_model, looks, fails = model_of(state, settings), looks_for_harm(state), len(state.forms)
     state = state._replace(n_scanned=state.n_scanned + looks)
-    if "stretches" not in without:
-        state = disturbances(state, motion_model, safe, u, settings, random)
+    state = disturbances(state, motion_model, safe, u, settings, random)
     rest = residuals_of(state, motion_model, state.horizon)
     if looks and given.horizon is None:
         # A certified episode failed later than it looks ahead, and it looks as far as it may.
@@ -91,7 +89,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     # Backups
     if given.backup is not None:
         state = fitted(state, motion_model, given.backup)
-    if fails and len(state.situations) >= _ENOUGH and "backups" not in without:
+    if fails and len(state.situations) >= _ENOUGH:
         numbers = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
         rest, scale = np.ascontiguousarray(rest[:, :, numbers]), state.disturbance_scale(settings)
         state = evolved(state, motion_model, rest, scale, settings, random)

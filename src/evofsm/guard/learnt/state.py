@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
@@ -88,7 +88,6 @@ class Given(NamedTuple):
 
     settings: LearntSettings
     seed: int  #: of what is drawn, together with the number of the episode
-    without: Set[str]  #: parts that are left out (`LearntRisk.PARTS`)
     horizon: float | None  #: how far to look ahead [s]
     failed: Callable[[Floats], bool] | None  #: of an observation
     model: Move | None
@@ -364,7 +363,7 @@ KIND = Kind(
         "n_actions": FROM_1._replace(optional=True),
         **dict.fromkeys(("low", "high"), Numbers(("ends",), -1e100, 1e100)),
         "seed": COUNT,
-        **dict.fromkeys(("names", "units", "without"), list[str]),
+        **dict.fromkeys(("names", "units"), list[str]),
         "harm": SETTINGS,
         "settings": {name: _SETTING[kind] for name, kind in get_type_hints(LearntSettings).items()},
         "state": _NUMBERS,
