@@ -103,7 +103,7 @@ _GONE: dict[str, dict[str, Any]] = {
     "blur": {"failure._BLURRED": 0.0},
     "dropped": {"danger._dropped": lambda state, was, *rest: was[:0]},
     "endings": {"danger._ENDED": math.inf},
-    "fatal": {"learn._fatal": lambda state, known, found, settings: (state, found)},
+    "fatal": {"learn._fatal": lambda state, known, found: (state, found)},
     "landings": {"model.trimmed": lambda found: found[:, : found.shape[1] // 2].copy()},
 }
 _SETTINGS = asdict(LearntSettings())

@@ -20,7 +20,7 @@ from numpy.random import Generator
 
 from evofsm.guard.learnt.model import ridge
 from evofsm.guard.learnt.rollout import ROUNDING, SMALL, Floats, Ints, Model, features, rollout
-from evofsm.guard.learnt.state import LearntSettings, State
+from evofsm.guard.learnt.state import State
 
 # Of mutants the share that are of the best, the share of numbers that differ, by a size of 10 to a
 # power between these.
@@ -36,13 +36,13 @@ _FITTED = 200
 _MAX_CORNERS = 3
 
 
-def first_backups(state: State, u: Floats, n_linear: int) -> State:
+def first_backups(state: State, u: Floats) -> State:
     """Begin with constants, and linear ones of which nothing was learnt yet.
 
     By actions (T, a) of the first episode: it makes no difference in which order or direction they
     come.
     """
-    a, choices = u.shape[1], state.choices
+    a, choices, n_linear = u.shape[1], state.choices, state.settings.n_linear
     order, turns = basis(u, choices)
     if choices:
         ends = np.eye(a)
@@ -122,16 +122,10 @@ def regulator(A: Floats, B: Floats, cost: Floats, effort: float, steps: int) -> 
     return -K
 
 
-def evolved(
-    state: State,
-    model: Model,
-    residuals: Floats,
-    scale: float,
-    settings: LearntSettings,
-    random: Generator,
-) -> State:
+def evolved(state: State, model: Model, residuals: Floats, random: Generator) -> State:
     """Take backups that are worth more, in the order in which they are asked."""
-    policies, situations = state.policies.copy(), state.situations
+    policies, situations, settings = state.policies.copy(), state.situations, state.settings
+    scale = state.disturbance_scale
 
     def worth(policy: Floats) -> Floats:
         """(S,) how well it ends in each situation, in the mean of all disturbances."""

@@ -14,7 +14,7 @@ import numpy as np
 from evofsm.guard.learnt import failure, model
 from evofsm.guard.learnt.failure import HELD, B, I, Survived
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, FATAL, Floats, Model
-from evofsm.guard.learnt.state import Episode, Given, LearntSettings, State, sizes
+from evofsm.guard.learnt.state import Episode, Given, State, sizes
 
 # Episodes of which the end tells where there are any; observations so near the last one [typical
 # steps] cannot be told from it.
@@ -33,7 +33,7 @@ _RADII = tuple(0.1 * 1.3**k for k in range(20))
 
 def fails(state: State, z: Floats, episode: Episode, given: Given) -> State:
     """Learn where it fails, and where it ends, of observations ``z`` (T + 1, m) of an episode."""
-    settings, function = given.settings, given.failed
+    settings, function = state.settings, given.failed
     failed = episode.failed and bool(np.isfinite(z[-1]).all())
     rows = z[:-1] if episode.failed else z
     rows = rows[np.isfinite(rows).all(1)]
@@ -63,10 +63,10 @@ def fails(state: State, z: Floats, episode: Episode, given: Given) -> State:
         state = state._replace(failures=np.vstack([state.failures, z[-1]])[-most:], brinks=brinks)
     if function is not None:
         return _asked(state, function)
-    return _explained(state, settings, failed=failed)
+    return _explained(state, failed=failed)
 
 
-def _explained(state: State, settings: LearntSettings, *, failed: bool) -> State:
+def _explained(state: State, *, failed: bool) -> State:
     """Explain all that failed or ended by forms, anew if it ``failed`` now."""
     survival, table = sizes(state), state.forms
     if len(state.ended) >= _ENDED:
@@ -87,22 +87,20 @@ def _explained(state: State, settings: LearntSettings, *, failed: bool) -> State
     rows = failure.counted(rows, failures)
     ends, fatal = failure.saying(table, ENDS, CRASHES), failure.saying(table, FATAL)
     forms = np.concatenate([ends, rows, fatal])
-    state = state._replace(dropped=_dropped(state, was, forms, survival, settings))
+    state = state._replace(dropped=_dropped(state, was, forms, survival))
     if state.is_doubted and failed and not _foreseen(state, table, survival):
         return state._replace(forms=forms, n_doubted=0, wrong=state.wrong + 1)
     has_changed = not state.is_doubted and (failed or _shape(was) != _shape(rows))
     return state._replace(forms=forms, n_doubted=0 if has_changed else state.n_doubted)
 
 
-def _dropped(
-    state: State, was: Floats, now: Floats, known: Survived, settings: LearntSettings
-) -> Floats:
+def _dropped(state: State, was: Floats, now: Floats, known: Survived) -> Floats:
     """(k, SIZE) thresholds that fewer forms took the place of, as long as nothing refutes them.
 
     One beyond which it ends is refuted: some episodes ended there without failing.
     """
     sides, older = was[failure.are_sides(was)].copy(), state.dropped.copy()
-    sides[:, HELD] = settings.settled
+    sides[:, HELD] = state.settings.settled
     older[:, HELD] -= 1.0
     table = failure.without(np.concatenate([older[older[:, HELD] > 0.0], sides]), known.rows)
     holds = failure.inside(table, state.failures).any(1)

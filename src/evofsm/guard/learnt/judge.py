@@ -162,7 +162,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
                 f"looks at most {_MAX_STEPS:,} ahead (is it in seconds?)"
             )
         self.seed = operator.index(seed)
-        self.settings = LearntSettings() if settings is None else settings
         self.model = function("model", model, "lambda z, u: z + 0.1 * u")
         self.backup = function("backup", backup, "lambda z: -1.0")
         if isinstance(names, str) or not all(isinstance(name, str) for name in names):
@@ -191,10 +190,10 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self.harm = Harm()  #: how episodes ended, guarded and alone
         #: All that it has learnt, and what decides, made of it.
         stride = 1
-        while steps is not None and steps > self.settings.horizon_max:
+        numbers = LearntSettings() if settings is None else settings
+        while steps is not None and steps > numbers.horizon_max:
             steps, stride = -(-steps // 2), 2 * stride
-        self.state = State.none(0, self.size, self.choices, self.settings, steps)
-        self.state = self.state._replace(stride=stride)
+        self.state = State.none(numbers, 0, self.size, self.choices, steps)._replace(stride=stride)
         self.parts: Parts | None = None
         self.start_episode()
 
@@ -219,6 +218,11 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def n_variables(self) -> int:
         """Number of variables of an observation; 0 before the first."""
         return len(self.state.origin)
+
+    @property
+    def settings(self) -> LearntSettings:
+        """Its numbers."""
+        return self.state.settings
 
     @property
     def margin(self) -> float:
@@ -550,8 +554,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
                 raise ValueError(f"backup gave {action} at {z}; it has to give an action")
             return self.encode(action[0] if self.choices else np.clip(action, self.low, self.high))
 
-        numbers = self.settings, self.seed, self.given_horizon
-        return Given(*numbers, self.failed, model if move else None, backup if act else None)
+        parts = self.failed, model if move else None, backup if act else None
+        return Given(self.seed, self.given_horizon, *parts)
 
     def _study(self, *, failed: bool, terminated: bool) -> None:
         """Learn from the rows of an episode, and forget them."""
@@ -567,19 +571,19 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         episode = Episode(z, u, *ends, refusals, losses, certificates, self._fails_after)
         if not self.n_variables:
             now = self.state
-            blank = State.none(z.shape[1], self.size, self.choices, self.settings, now.horizon)
+            blank = State.none(self.settings, z.shape[1], self.size, self.choices, now.horizon)
             self.state = blank._replace(stride=now.stride, margin=now.margin, n_failed=now.n_failed)
         n_drifts = len(self.state.drifts)
         self.state = learn(self.state, episode, self._given)
         if len(self.state.drifts) > n_drifts:  # another system: how one fares alone is not known
             self.harm = self.harm._replace(moved=self.harm.n_episodes)
-        self.parts = Parts.of(self.state, self.settings, self.dt)
+        self.parts = Parts.of(self.state, self.dt)
         self._used, self._ranks = np.zeros((self.size, 2)), np.arange(len(self.state.policies))
 
     def remake(self) -> None:
         """Decide by `state`, between two episodes."""
-        self.parts = Parts.of(self.state, self.settings, self.dt)
-        self.start_episode()
+        self.parts = Parts.of(self.state, self.dt)
+        self._forget()
 
     def start_episode(self) -> None:
         """What comes is not a consequence of what was."""
@@ -647,7 +651,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
                 keywords |= {"low": settings["low"], "high": settings["high"]}
             keywords |= {"horizon": settings["given_horizon"]}
             judge = cls(settings["dt"], settings=LearntSettings(**settings["settings"]), **keywords)
-            judge.state = unpacked(settings["state"], arrays, judge.state, judge.settings)
+            judge.state = unpacked(settings["state"], arrays, judge.state)
             judge.harm = Harm.restored(settings["harm"], arrays["harm"])
             judge.remake()
         return judge

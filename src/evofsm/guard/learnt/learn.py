@@ -28,11 +28,11 @@ _ONSET = 0.5
 
 def learn(state: State, episode: Episode, given: Given) -> State:
     """Learn from an episode, or from a part of a long one, and from what the user said."""
-    decisions, before, settings = episode, state, given.settings
+    decisions, before, settings = episode, state, state.settings
     rows = model.filled(episode.observations, failed=episode.failed)
     decisions = decisions._replace(observations=rows)
     # What a rival certified says nothing of the model.
-    if state.is_doubted and not state.is_settled(settings):
+    if state.is_doubted and not state.is_settled:
         decisions = decisions._replace(certified=np.zeros(len(decisions.certified)))
     episode = decisions.every(state.stride)
     random = np.random.default_rng([given.seed, state.n_episodes])
@@ -55,53 +55,53 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     whole: Flags = np.asarray(np.isfinite(safe).all(1))
     moves = len(u) >= _ENOUGH and bool((whole[:-2] & whole[1:-1] & whole[2:]).any())
     if moves:
-        state = motion.dynamics(state, model_of(state, settings), safe, u, settings)
+        state = motion.dynamics(state, model_of(state), safe, u)
         if given.model is not None:
-            state = motion.told(state, model_of(state, settings), safe, given.model, random)
+            state = motion.told(state, model_of(state), safe, given.model, random)
     # Failure
     state = danger.fails(state, z, episode, given)
     if len(state.forms):
-        motion_model = model_of(state, settings)
-        state = danger.dead_ends(state, motion_model, safe, episode, before.survived)
+        state = danger.dead_ends(state, model_of(state), safe, episode, before.survived)
     if not moves:
         return state._replace(n_episodes=state.n_episodes + 1)
     if not len(state.policies):
-        state = first_backups(state, u, settings.n_linear)
-    state = noted(state, safe, episode, settings, random)
+        state = first_backups(state, u)
+    state = noted(state, safe, episode, random)
     if given.failed is None:
         was_tried = failure.inside(failure.saying(before.forms, FAILS), safe, 0.0).any()
-        state = doubted(state, episode, settings, tried=bool(was_tried))
+        state = doubted(state, episode, tried=bool(was_tried))
     refutations = 1 + np.flatnonzero(episode.lost[1 : max(1, len(safe) - state.horizon)])
     if len(refutations):
-        state = motion.misled(state, safe, u, refutations, settings, failed=episode.failed)
+        state = motion.misled(state, safe, u, refutations, failed=episode.failed)
     # Disturbances
-    motion_model, looks, fails = model_of(state, settings), looks_for_harm(state), len(state.forms)
+    motion_model, looks, fails = model_of(state), looks_for_harm(state), len(state.forms)
     state = state._replace(n_scanned=state.n_scanned + looks)
-    state = disturbances(state, motion_model, safe, u, settings, random)
+    state = disturbances(state, motion_model, safe, u, random)
     rest = residuals_of(state, motion_model, state.horizon)
     if looks and given.horizon is None:
         # A certified episode failed later than it looks ahead, and it looks as far as it may.
         if late(episode) > state.horizon >= int(farthest(motion_model, settings)):
             # All of above is learnt anew of what was before, in steps twice as long.
             decisions = decisions._replace(fails_after=0.5 * decisions.fails_after)
-            return learn(coarser(before, settings), decisions, given)
-        state = look_ahead(state, motion_model, rest, episode, settings)
+            return learn(coarser(before), decisions, given)
+        state = look_ahead(state, motion_model, rest, episode)
     # Backups
     if given.backup is not None:
         state = fitted(state, motion_model, given.backup)
     if fails and len(state.situations) >= _ENOUGH:
         numbers = np.append(0, 1 + random.permutation(rest.shape[2] - 1)[:_TRIED_ON])
-        rest, scale = np.ascontiguousarray(rest[:, :, numbers]), state.disturbance_scale(settings)
-        state = evolved(state, motion_model, rest, scale, settings, random)
+        sample = np.ascontiguousarray(rest[:, :, numbers])
+        state = evolved(state, motion_model, sample, random)
     return state._replace(n_episodes=state.n_episodes + 1)
 
 
-def doubted(state: State, episode: Episode, settings: LearntSettings, *, tried: bool) -> State:
+def doubted(state: State, episode: Episode, *, tried: bool) -> State:
     """Doubt forms that refused for long without a failure: rivals are tried (`failure.rivals`).
 
     If there are any. An episode speaks for them only if it was where they allow what forms refuse
     (``tried``).
     """
+    settings = state.settings
     much = episode.refused.sum() > settings.refused * len(episode.actions)
     count = state.n_doubted + bool(much and not episode.failed)
     if state.is_doubted:
@@ -116,9 +116,7 @@ def doubted(state: State, episode: Episode, settings: LearntSettings, *, tried: 
 # -- Disturbances ---------------------------------------------------------------------------------
 
 
-def noted(
-    state: State, z: Floats, episode: Episode, settings: LearntSettings, random: Generator
-) -> State:
+def noted(state: State, z: Floats, episode: Episode, random: Generator) -> State:
     """Note situations, on which disturbances and backups are tried: of all in their turn.
 
     One anywhere in an episode, one where a proposal was refused, and some before failure.
@@ -134,7 +132,7 @@ def noted(
         row = np.concatenate([z[t], z[t] - z[t - 1], episode.actions[t - 1]])
         if not np.isfinite(row).all():
             continue
-        if len(rows) < settings.n_situations:
+        if len(rows) < state.settings.n_situations:
             rows.append(row)
         else:
             rows[int(random.integers(len(rows)))] = row
@@ -146,16 +144,14 @@ def looks_for_harm(state: State) -> bool:
     return len(state.forms) > 0 and len(state.situations) > _ENOUGH
 
 
-def disturbances(
-    state: State, known: Model, z: Floats, u: Floats, settings: LearntSettings, random: Generator
-) -> State:
+def disturbances(state: State, known: Model, z: Floats, u: Floats, random: Generator) -> State:
     """Remember windows of an episode in which what was not expected harms most.
 
     Where it looks for harm, for the best backup in some situation; else, as long as no failure is
     known, the largest ones.
     """
     H, S, (T, a), m = state.horizon, state.situations, u.shape, z.shape[1]
-    looks, longest = looks_for_harm(state), settings.horizon_max + 2
+    looks, longest, settings = looks_for_harm(state), state.windows.shape[1], state.settings
     starts = np.arange(0, max(1, T - 4), max(1, (T - 1) // settings.n_starts))
     rest = model.undisturbed(len(u) + H, m, 1)[..., 0]
     rest[: T - 1] = model.disturbed(known, z, u, state.unit)
@@ -181,21 +177,18 @@ def disturbances(
     state = state._replace(windows=table, lengths=np.array(lengths), seen_in=seen_in)
     residuals = residuals_of(state, known, H)
     if looks and len(windows):
-        state, residuals = _fatal(state, known, residuals, settings)
+        state, residuals = _fatal(state, known, residuals)
     if len(state.windows) <= settings.n_disturbances:
         return state
     if looks:
-        scale = state.disturbance_scale(settings)
-        ends = _worst(known, S, state.policies[:2], residuals, scale)
+        ends = _worst(known, S, state.policies[:2], residuals, state.disturbance_scale)
         keep = _chosen(ends, settings.n_disturbances)
     else:
         keep = _sizes(residuals[:, :, 1:], state)[: settings.n_disturbances]
     return _kept(state, keep)
 
 
-def _fatal(
-    state: State, known: Model, found: Floats, settings: LearntSettings
-) -> tuple[State, Floats]:
+def _fatal(state: State, known: Model, found: Floats) -> tuple[State, Floats]:
     """Take what nothing survives, in whatever situation, for a dead end where it began.
 
     Such as the contact with the end of a rail: it is no disturbance that may begin anywhere. Where
@@ -208,7 +201,7 @@ def _fatal(
     size = np.abs(found[:, :m, 1 + fatal] / (state.unit[:, None] + 1e-300)).sum(1)
     rows = state.windows[fatal, (size >= _ONSET * size.max(0)).argmax(0), :m]
     is_new = ~(rows[:, None] == state.fatal).all(2).any(1)
-    fatal_rows = np.concatenate([state.fatal, rows[is_new]])[-settings.max_failures :]
+    fatal_rows = np.concatenate([state.fatal, rows[is_new]])[-state.settings.max_failures :]
     state = danger.fatal_sides(state._replace(fatal=fatal_rows))
     within = failure.inside(failure.saying(state.forms, FATAL), rows).any(0)
     keep = np.setdiff1d(np.arange(len(state.windows)), fatal[within])
@@ -252,9 +245,7 @@ def _chosen(ends: Floats, most: int) -> Ints:
     return keep
 
 
-def look_ahead(
-    state: State, known: Model, rest: Floats, episode: Episode, settings: LearntSettings
-) -> State:
+def look_ahead(state: State, known: Model, rest: Floats, episode: Episode) -> State:
     """Look as far ahead as it takes to fail where nothing helps, and half as far again.
 
     Farther after an episode that failed as late after its last certificate as where nothing helps:
@@ -262,7 +253,7 @@ def look_ahead(
     whole horizon from where nothing seemed to help, but not as far as was too short lately. What
     the model says of failure farther away than that is believed again little by little.
     """
-    H, s, most = state.horizon, settings, farthest(known, settings)
+    H, s, most = state.horizon, state.settings, farthest(known, state.settings)
     ends = value_of(known, state.situations, state.policies[: s.n_asked], rest)
     after = float(ends[ends < 0.0].max(initial=-1.0 - H) + 1 + H)
     is_refuted = len(episode.lost) > H and episode.lost[:-H].any()
@@ -295,10 +286,10 @@ def farthest(known: Model, settings: LearntSettings) -> float:
     return min(settings.horizon_max, settings.work / cost / settings.n_asked)
 
 
-def coarser(state: State, settings: LearntSettings) -> State:
+def coarser(state: State) -> State:
     """Make each step last twice as many decisions: how it moves is to be learnt anew."""
-    m = len(state.origin)
-    blank = State.none(m, len(state.used), state.choices, settings, max(1, state.horizon // 2))
+    shape = len(state.origin), len(state.used), state.choices
+    blank = State.none(state.settings, *shape, max(1, state.horizon // 2))
     learnt_anew = (
         *("squares", "products", "least", "most", "scale", "noise", "power"),
         *("recent_squares", "recent_products", "doubt", "since", "drifts", "misled"),

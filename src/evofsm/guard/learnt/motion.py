@@ -12,7 +12,7 @@ from numpy.random import Generator
 
 from evofsm.guard.learnt import model
 from evofsm.guard.learnt.rollout import ROUNDING, SMALL, Flags, Floats, Ints, Model, features, lags
-from evofsm.guard.learnt.state import LearntSettings, Move, State, model_of
+from evofsm.guard.learnt.state import Move, State, model_of
 
 # Changes of which the typical step is learnt; a larger one counts as so many times that.
 _MOST_CHANGES, _LARGEST_STEP = 5000.0, 6.0
@@ -76,14 +76,14 @@ def _extremes(known: Floats, new: Floats, close: Floats) -> tuple[Floats, Flags]
     return np.array([np.where(is_new, new, known[0]), second]), is_new
 
 
-def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntSettings) -> State:
+def dynamics(state: State, known: Model, z: Floats, u: Floats) -> State:
     """Learn the model of observations (T + 1, m) and actions (T, a); NaN was not seen.
 
     Outliers of the model ``known`` weigh less, but for those that follow an action that was hardly
     used; jumps, and what is held at an end of a variable, are left out.
     """
     phi, change, is_seen = model.rows_of(known, z, u)
-    m = len(state.unit)
+    settings, m = state.settings, len(state.unit)
     rest = model.disturbed(known, z, u, state.unit)[:, :m]
     after, rests = z[2:], z[2:] == z[1:-1]
     to, is_known = z[1:-1] + phi @ known.weights, bool(state.scale.any())
@@ -100,7 +100,7 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
         free = ((after > known.lowest) & (after < known.highest)).all(1)
         ordinary = ((change >= state.least) & (change <= state.most)).all(1)
         rows = is_seen & free & ordinary
-        state = _drifted(state, known, phi[rows], change[rows], np.diff(z, axis=0), settings)
+        state = _drifted(state, known, phi[rows], change[rows], np.diff(z, axis=0))
     x, row_weights = phi[is_seen], weight[is_seen, None]
     state = state._replace(
         squares=state.squares + x.T @ (row_weights * x),
@@ -109,7 +109,7 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
     is_moving = is_seen[:, None] & ~rests
     if (here := is_moving.any(1)).sum() < _FEWEST_CHANGES:
         return state
-    now = model_of(state, settings)
+    now = model_of(state)
     rest = np.abs(model.disturbed(now, z, u, state.unit)[:, :m])
     size = [
         1.4826 * np.median(r[h]) if h.sum() >= _FEWEST_CHANGES else 0.0
@@ -125,9 +125,7 @@ def dynamics(state: State, known: Model, z: Floats, u: Floats, settings: LearntS
     return state._replace(scale=scale, noise=noise, reached=visits)
 
 
-def misled(
-    state: State, z: Floats, u: Floats, starts: Ints, settings: LearntSettings, *, failed: bool
-) -> State:
+def misled(state: State, z: Floats, u: Floats, starts: Ints, *, failed: bool) -> State:
     """Ask whether more had been foreseen without lags, where failure did not come as foreseen.
 
     A feature may help one step ahead, and mislead over many. From each step of ``starts`` an
@@ -139,8 +137,8 @@ def misled(
     if not np.isfinite(z[ahead]).all():
         return state
     errors = []
-    for doubt in (0.0, settings.misled):
-        motion_model = model_of(state._replace(misled=doubt), settings)
+    for doubt in (0.0, state.settings.misled):
+        motion_model = model_of(state._replace(misled=doubt))
         at, before, total = z[ahead[:, 1]], z[ahead[:, 0]], 0.0
         for now in ahead[:, 1:-1].T:
             phi = features(motion_model, at, at - before, u[now - 1], u[now])
@@ -190,14 +188,12 @@ def _held(state: State, to: Floats, after: Floats) -> Flags:
     return np.array([(after <= low) & (to <= after), (after >= high) & (to >= after)])
 
 
-def _drifted(
-    state: State, known: Model, phi: Floats, change: Floats, moves: Floats, settings: LearntSettings
-) -> State:
+def _drifted(state: State, known: Model, phi: Floats, change: Floats, moves: Floats) -> State:
     """Correct the model, where it is otherwise now, by features and changes of an episode.
 
     ``moves`` (T, m) are all changes of the episode.
     """
-    n = state.n_episodes
+    n, settings = state.n_episodes, state.settings
     size = np.maximum(np.maximum(state.scale, 0.5 * state.unit), 1e-100)
     errors = change - phi @ known.weights
     new_errors = errors - phi @ _correction(state, known)
@@ -228,11 +224,12 @@ def _drifted(
         doubt=np.where(drifts, 0.0, doubt),
         since=np.where(drifts, float(n), state.since),
     )
-    return _anew(state, settings) if is_new.any() else state
+    return _anew(state) if is_new.any() else state
 
 
-def _anew(state: State, settings: LearntSettings) -> State:
+def _anew(state: State) -> State:
     """Trust model and disturbances as little as at first: it may take longer to fail, too."""
+    settings = state.settings
     longer = settings.ahead * max(state.time_to_failure, settings.horizon / settings.ahead)
     return state._replace(
         time_to_failure=min(longer, settings.horizon_max / settings.ahead),

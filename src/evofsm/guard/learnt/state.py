@@ -86,7 +86,6 @@ class LearntSettings:
 class Given(NamedTuple):
     """What a user says, None where that is learnt; actions are encoded, (a,)."""
 
-    settings: LearntSettings
     seed: int  #: of what is drawn, together with the number of the episode
     horizon: float | None  #: how far to look ahead [s]
     failed: Callable[[Floats], bool] | None  #: of an observation
@@ -121,6 +120,7 @@ class Episode(NamedTuple):
 class State(NamedTuple):
     """What was learnt, of m variables and actions of a numbers; p features."""
 
+    settings: LearntSettings
     choices: Annotated[int, COUNT]  #: number of actions; 0 where the action is a box
     n_episodes: Annotated[int, COUNT]
     n_failed: Annotated[int, COUNT]
@@ -184,7 +184,7 @@ class State(NamedTuple):
 
     @classmethod
     def none(
-        cls, m: int, a: int, choices: int, settings: LearntSettings, horizon: int | None
+        cls, settings: LearntSettings, m: int, a: int, choices: int, horizon: int | None
     ) -> State:
         """Before anything was learnt: zeros, and no rows, but for what is named here."""
         p, steps = rollout.n_features(m, a, box=not choices), settings.horizon_max + 2
@@ -196,7 +196,7 @@ class State(NamedTuple):
             else kind()
             for name, (kind, numbers) in _FIELDS.items()
         }
-        return cls(**fields)._replace(
+        return cls(settings, **fields)._replace(
             choices=choices,
             lowest=np.full((2, m), np.inf),
             highest=np.full((2, m), -np.inf),
@@ -217,12 +217,15 @@ class State(NamedTuple):
         """Its forms, as small as they may be (`failure.rivals`)."""
         return failure.rivals(self.forms, self.failures, sizes(self))
 
-    def is_settled(self, settings: LearntSettings) -> bool:
+    @property
+    def is_settled(self) -> bool:
         """Whether rivals were tried for so long without a failure that they count, also frozen."""
-        return self.n_doubted < -settings.settled
+        return self.n_doubted < -self.settings.settled
 
-    def disturbance_scale(self, settings: LearntSettings) -> float:
+    @property
+    def disturbance_scale(self) -> float:
         """How much harder than they were disturbances are taken to be, while little was seen."""
+        settings = self.settings
         most = settings.caution_again if len(self.drifts) else settings.caution_max
         return 1.0 + min(most, settings.caution / max(1, self.n_scanned))
 
@@ -247,7 +250,7 @@ def _spread(state: State) -> Floats:
     )
 
 
-def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) -> Floats:
+def forms_of(state: State, *, daring: bool = False) -> Floats:
     """(r, 13) forms as rollouts take them (`failure.prepared`).
 
     Where they are ``daring``, as while it learns, rivals of what is doubted are tried, and it comes
@@ -258,16 +261,16 @@ def forms_of(state: State, settings: LearntSettings, *, daring: bool = False) ->
         crash = table[:, SAYS] == CRASHES
         table = table.copy()
         table[crash] = failure.nearer(table[crash], state.failures, 0.5)
-    if state.is_doubted and (daring or state.is_settled(settings)):
+    if state.is_doubted and (daring or state.is_settled):
         table = failure.rivals(table, state.failures, sizes(state))
     if not daring:
         table = np.concatenate([table, state.dropped])
     return failure.prepared(table)
 
 
-def model_of(state: State, settings: LearntSettings) -> Model:
+def model_of(state: State) -> Model:
     """Make what rollouts take; weights are solved of the sums each time."""
-    spread = _spread(state)
+    settings, spread = state.settings, _spread(state)
     inverse = np.divide(1.0, spread, out=np.zeros_like(spread), where=spread > 0.0)
     lowest = np.where(state.reached[:, 0] >= 2, state.lowest[0], -np.inf)
     highest = np.where(state.reached[:, 1] >= 2, state.highest[0], np.inf)
@@ -288,7 +291,7 @@ def model_of(state: State, settings: LearntSettings) -> Model:
         highest=highest,
         least=state.least,
         most=state.most,
-        forms=forms_of(state, settings),
+        forms=forms_of(state),
         dead_ends=np.column_stack(
             [state.centres, state.radii, np.full(len(state.radii), 1.0 / (typical + 1e-300))]
         ),
@@ -328,12 +331,12 @@ class Parts(NamedTuple):
     most: float  #: steps of rollouts after which a search is cut short
 
     @classmethod
-    def of(cls, state: State, settings: LearntSettings, dt: float) -> Parts | None:
+    def of(cls, state: State, dt: float) -> Parts | None:
         """Make them; None as long as there are no backups."""
         if not len(state.policies):
             return None
-        motion = model_of(state, settings)
-        daring_model = motion._replace(forms=forms_of(state, settings, daring=True))
+        settings, motion = state.settings, model_of(state)
+        daring_model = motion._replace(forms=forms_of(state, daring=True))
         residuals = residuals_of(state, motion, state.horizon)
         few = settings.n_asked if len(rollout.pairs(len(state.origin))[0]) else 2
         cost = (motion.weights.size + motion.dead_ends.size) * residuals.shape[2]
@@ -341,7 +344,7 @@ class Parts(NamedTuple):
         n_judged = 1 if most < 2 * few * state.horizon else few
         n_policies = len(state.policies)
         n_tried = few if not state.is_doubted or most < n_policies * state.horizon else n_policies
-        scale = state.disturbance_scale(settings)
+        scale = state.disturbance_scale
         return cls(motion, daring_model, residuals, scale, few, n_tried, n_judged, most)
 
 
@@ -349,7 +352,9 @@ class Parts(NamedTuple):
 
 # What a field holds: its type, and which numbers.
 _FIELDS = {
-    name: get_args(hint) for name, hint in get_type_hints(State, include_extras=True).items()
+    name: get_args(hint)
+    for name, hint in get_type_hints(State, include_extras=True).items()
+    if name != "settings"  # they stand beside it
 }
 _ARRAYS = {name: numbers for name, (kind, numbers) in _FIELDS.items() if kind == Floats}
 _NUMBERS = {name: numbers for name, (_, numbers) in _FIELDS.items() if name not in _ARRAYS}
@@ -371,21 +376,20 @@ KIND = Kind(
 )
 
 
-def unpacked(
-    numbers: Mapping[str, Any], arrays: Mapping[str, Any], blank: State, settings: LearntSettings
-) -> State:
+def unpacked(numbers: Mapping[str, Any], arrays: Mapping[str, Any], blank: State) -> State:
     """Make a state of what `State.packed` gave, of actions as of a ``blank`` one.
 
     A ValueError if sizes or indices contradict each other, or the actions: kernels trust them.
     """
-    state = State(**numbers, **{name: arrays[name] for name in _ARRAYS})
+    state = State(blank.settings, **numbers, **{name: arrays[name] for name in _ARRAYS})
     m, a, choices = len(state.origin), len(state.used), state.choices
     if (choices, a) != (blank.choices, len(blank.used)):
         raise ValueError(f"it is of actions of {a} numbers, but they have {len(blank.used)}")
     rollout.refuse_too_many(m, a, box=not choices)
-    for name, array in State.none(m, a, choices, settings, None)._asdict().items():
+    right = State.none(state.settings, m, a, choices, None)
+    for name in _ARRAYS:
         shape, rows = np.shape(getattr(state, name)), int(name != "squares")
-        if shape[rows:] != np.shape(array)[rows:]:
+        if shape[rows:] != np.shape(getattr(right, name))[rows:]:
             raise ValueError(
                 f"{name} has shape {shape}, not one of {m} variables and actions of {a} numbers"
             )
