@@ -121,9 +121,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     BLIND = 5
 
     # Of the present episode.
-    _past: list[Floats]  # observations of the last step, unseen ones as they were taken to be
-    _done: list[Floats]  # and actions
-    _before: tuple[Floats, Floats] | None  # situation and action of the decision before
+    _step: list[tuple[Floats, Floats]]  # situations and actions of the last step
     _z: list[Floats]  # observations that are to be learnt from
     _u: list[Floats]  # and actions after them
     # Of each decision: a proposal was refused, nothing helped even undisturbed, some backup held.
@@ -414,18 +412,20 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
     def _here(self, z: Floats) -> Floats | None:
         """The situation, if that is seen; what was not is taken to be as was expected."""
-        row, stride, n = z, self.state.stride, len(self._done)
+        row, m, stride = z, len(z), self.state.stride
         if is_missing(z):
-            if self._before is None:
+            if not self._step:
                 return None
-            situation, action = self._before
-            row = situation[: len(z)]
+            situation, action = self._step[-1]
+            row = situation[:m]
             if self.parts is not None:
                 row = row + (rollout.expected(self.parts.model, situation, action) - row) / stride
             row = np.where(np.isnan(z), row, z)
-        if not n:
-            return np.append(row, np.zeros(len(z) + self.size))
-        return np.concatenate([row, (row - self._past[0]) * (stride / n), sum(self._done) / n])
+        if not self._step:
+            return np.append(row, np.zeros(m + self.size))
+        situations, actions = zip(*self._step, strict=True)
+        change = (row - situations[0][:m]) * (stride / len(actions))
+        return np.concatenate([row, change, sum(actions) / len(actions)])
 
     def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
@@ -518,13 +518,10 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
         z = np.array(observation, np.float64)
-        here, stride = self._here(z), self.state.stride
+        here = self._here(z)
         self._n_blind = self._n_blind + 1 if is_missing(z) else 0
         if here is not None:
-            inner = self.encode(action)
-            self._past = [*self._past, here[: len(z)]][-stride:]
-            self._done = [*self._done, inner][-stride:]
-            self._before = here, inner
+            self._step = [*self._step, (here, self.encode(action))][-self.state.stride :]
 
     def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
         """Learn from an episode, whose last observation was taken in already (`observe`)."""
@@ -585,10 +582,9 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self.parts = Parts.of(self.state, self.dt)
         self._forget()
 
-    def start_episode(self) -> None:
-        """What comes is not a consequence of what was."""
-        self._past, self._done, self._before = [], [], None
-        self._z, self._u, self._notes = [], [], []
+    def _forget(self) -> None:
+        """Begin an episode."""
+        self._step, self._z, self._u, self._notes = [], [], [], []
         self._certified = self._holds = self._refused = self._lost = False
         self._unsurvived, self._n_blind, self._fails_after = 0, 0, 0.0
         self._used, self._ranks = np.zeros((self.size, 2)), np.arange(len(self.state.policies))
