@@ -251,7 +251,7 @@ def test_who_keeps_to_a_gap_that_is_safe_survives_whatever_the_leader_does(speed
     ("name", "value", "words"),
     [
         ("gentle", -5.0, "gentle of -5"),
-        ("brakes", 1e7, r"brakes of 1e\+07"),
+        ("full", 1e8, r"full of 1e\+08"),
         ("lowest", -1e308, r"lowest of -1e\+308"),
     ],
 )

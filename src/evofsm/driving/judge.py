@@ -39,7 +39,7 @@ from evofsm.fsm.validation import Floats, positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import ActionSet, BoxActions, nearest_bounds
 from evofsm.guard.api import LearningJudge, Trial
-from evofsm.store import COUNT, FLAG, SIZE, SMALLEST, Kind, Numbers, Place
+from evofsm.store import COUNT, SIZE, SMALLEST, Kind, Numbers, Place
 
 if TYPE_CHECKING:
     from evofsm.guard import ActionReviser
@@ -61,22 +61,20 @@ _CAUTION = 2.5
 _ASKED, _SHORTEST_DT, _LONGEST_DT = 100.0, 1e-6, 1e6
 _MOST_BROUGHT = hardest_seen(_SHORTEST_DT)
 _ACCELERATION = Numbers(least=SMALLEST, most=_ASKED)
-_BROUGHT = Numbers(least=-_MOST_BROUGHT, most=_MOST_BROUGHT)
-_SHORTFALL = Numbers(least=-2.0 * _MOST_BROUGHT - _ASKED, most=2.0 * _MOST_BROUGHT + _ASKED)
+_BRAKING = Numbers(least=-2.0 * _MOST_BROUGHT - _ASKED, most=2.0 * _MOST_BROUGHT + _ASKED)
+# What `OwnBrakes` remembers: of each sample its value, and whether a run begins.
+_SAMPLES = ("full", "brought", "shortfalls")
 _PRODUCT, _NOISE = Numbers(least=-1e300, most=1e300), Numbers(least=0.0, most=1e300)
 _RISK = Kind(
     "risk",
     {
-        "brakes": _BROUGHT.of("samples"),
-        "stretches": FLAG.of("samples"),
+        **{name: _BRAKING.of(name, 2) for name in _SAMPLES},
         "decels": Numbers(("decels",), SMALLEST, HARDEST),
         "gentle": COUNT.of(1),
         "lagged": _PRODUCT.of(2),
         "noise_gap": _NOISE.of("gaps"),
         "noise_speed": _NOISE.of("speeds"),
         "noise_leader": _NOISE.of("leaders"),
-        "doubts_brought": _BROUGHT.of("brought"),
-        "doubts_shortfalls": _SHORTFALL.of("shortfalls"),
     },
     {
         "lowest": Numbers(least=-_ASKED, most=-SMALLEST),
@@ -412,15 +410,12 @@ class LatentRisk(Retraced, LearningJudge):
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt, and what it learnt from for people, to a file (`evofsm.store`)."""
         settings = {**self._settings, "own_brakes": self.brakes.assumed}
-        full = np.array(self.brakes.full, np.float64).reshape(-1, 2)
         learnt = {
+            **{name: np.reshape(getattr(self.brakes, name), (-1, 2)) for name in _SAMPLES},
             "decels": np.array(self.manoeuvres.decels),
             "gentle": np.array([self.manoeuvres.gentle], np.float64),
-            **{"brakes": full[:, 0], "stretches": full[:, 1]},
             **self.perception.learnt(),
             "lagged": np.array(self.brakes.lagged),
-            "doubts_brought": np.ravel(np.array(self.brakes.brought, np.float64)),
-            "doubts_shortfalls": np.ravel(np.array(self.brakes.shortfalls, np.float64)),
         }
         store.write(path, _RISK, settings, learnt, provenance)
 
@@ -432,13 +427,11 @@ class LatentRisk(Retraced, LearningJudge):
             risk = cls(**settings)
             risk.manoeuvres.remember(*arrays["decels"].tolist())
             risk.manoeuvres.gentle = int(arrays["gentle"][0])
-            full = arrays["brakes"].tolist(), arrays["stretches"].tolist()
-            risk.brakes.remember(zip(*full, strict=True))
+            for name in _SAMPLES:
+                getattr(risk.brakes, name).extend(map(tuple, arrays[name].tolist()))
+            risk.brakes.remember(())  # it judges by them
             risk.perception.restore(arrays)
             risk.brakes.set_lagged(*arrays["lagged"].tolist())
-            for name in ("brought", "shortfalls"):
-                latest = arrays[f"doubts_{name}"].reshape(-1, 2).tolist()
-                getattr(risk.brakes, name).extend(map(tuple, latest))
         return risk
 
     @property
