@@ -64,6 +64,8 @@ _ACCELERATION = Numbers(least=SMALLEST, most=_ASKED)
 _BRAKING = Numbers(least=-2.0 * _MOST_BROUGHT - _ASKED, most=2.0 * _MOST_BROUGHT + _ASKED)
 # What `OwnBrakes` remembers: of each sample its value, and whether a run begins.
 _SAMPLES = ("full", "brought", "shortfalls")
+# Residuals that `Perception` remembers.
+_NOISES = ("noise_gap", "noise_speed", "noise_leader")
 _PRODUCT, _NOISE = Numbers(least=-1e300, most=1e300), Numbers(least=0.0, most=1e300)
 _RISK = Kind(
     "risk",
@@ -72,9 +74,7 @@ _RISK = Kind(
         "decels": Numbers(("decels",), SMALLEST, HARDEST),
         "gentle": COUNT.of(1),
         "lagged": _PRODUCT.of(2),
-        "noise_gap": _NOISE.of("gaps"),
-        "noise_speed": _NOISE.of("speeds"),
-        "noise_leader": _NOISE.of("leaders"),
+        **{name: _NOISE.of(name) for name in _NOISES},
     },
     {
         "lowest": Numbers(least=-_ASKED, most=-SMALLEST),
@@ -410,11 +410,12 @@ class LatentRisk(Retraced, LearningJudge):
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt, and what it learnt from for people, to a file (`evofsm.store`)."""
         settings = {**self._settings, "own_brakes": self.brakes.assumed}
+        noises = self.perception.sizes
         learnt = {
             **{name: np.reshape(getattr(self.brakes, name), (-1, 2)) for name in _SAMPLES},
             "decels": np.array(self.manoeuvres.decels),
             "gentle": np.array([self.manoeuvres.gentle], np.float64),
-            **self.perception.learnt(),
+            **{name: np.array(sizes.latest) for name, sizes in zip(_NOISES, noises, strict=True)},
             "lagged": np.array(self.brakes.lagged),
         }
         store.write(path, _RISK, settings, learnt, provenance)
@@ -430,7 +431,7 @@ class LatentRisk(Retraced, LearningJudge):
             for name in _SAMPLES:
                 getattr(risk.brakes, name).extend(map(tuple, arrays[name].tolist()))
             risk.brakes.remember(())  # it judges by them
-            risk.perception.restore(arrays)
+            risk.perception = Perception(risk.dt, [arrays[name].tolist() for name in _NOISES])
             risk.brakes.set_lagged(*arrays["lagged"].tolist())
         return risk
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, insort
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from math import isnan, nan, sqrt
 from typing import NamedTuple, TypeAlias
 
@@ -19,7 +19,6 @@ import numpy as np
 
 from evofsm.driving.rehearsal import Three
 from evofsm.fsm.kernels import compiled
-from evofsm.fsm.validation import Floats
 
 # Gap [m], speed of the follower and of the leader [m/s], or what is said of each of them.
 Matrix: TypeAlias = tuple[Three, Three, Three]
@@ -42,7 +41,6 @@ _MEDIAN = 0.6745
 _SIX = sqrt(6.0)
 _NO_NOISE = (0.0, 0.0, 0.0)
 _NO_COVARIANCE = (_NO_NOISE, _NO_NOISE, _NO_NOISE)
-_NOISES = ("noise_gap", "noise_speed", "noise_leader")
 
 
 class Estimate(NamedTuple):
@@ -63,14 +61,17 @@ class Estimate(NamedTuple):
 
 
 class Perception:
-    """Estimates gap and speeds every ``dt`` [s], and learns how noisy they are observed."""
+    """Estimates gap and speeds every ``dt`` [s], and learns how noisy they are observed.
 
-    def __init__(self, dt: float) -> None:
+    What of ``residuals``, of gap, own and leader's speed, was learnt before it goes on with.
+    """
+
+    def __init__(self, dt: float, residuals: Iterable[Iterable[float]] = ((), (), ())) -> None:
         self.dt = dt
+        #: Of what gap and both speeds did that kinematics do not explain.
+        self.sizes = tuple(map(Sizes, residuals))
         #: Standard deviations of observed gap [m], own and leader's speed [m/s].
-        self.noise = _NO_NOISE
-        # Of what gap and both speeds did that kinematics do not explain.
-        self._sizes = _Sizes(), _Sizes(), _Sizes()
+        self.noise = _noise(self.sizes, dt)
         self.clear()
 
     def clear(self) -> None:
@@ -113,25 +114,12 @@ class Perception:
         dt, (was, last) = self.dt, self._changes
         closing_sum = now[1] + before[1] - now[2] - before[2]
         self._changes = speed, leader = now[1] - before[1] - realised * dt, now[2] - before[2]
-        self._sizes[0].add(now[0] - before[0] + 0.5 * dt * closing_sum)
+        self.sizes[0].add(now[0] - before[0] + 0.5 * dt * closing_sum)
         if min(now[1], before[1]) > _STANDING:
-            self._sizes[1].add(speed - was)
+            self.sizes[1].add(speed - was)
         if min(now[2], before[2]) > _STANDING:
-            self._sizes[2].add(leader - last)
-        self.noise = _noise(self._sizes, dt)
-
-    def learnt(self) -> dict[str, Floats]:
-        """The residuals by name, the oldest first, for a file."""
-        return {
-            name: np.array(sizes.latest, dtype=np.float64)
-            for name, sizes in zip(_NOISES, self._sizes, strict=True)
-        }
-
-    def restore(self, latest: Mapping[str, Iterable[float]]) -> None:
-        """Take over what `learnt` returned."""
-        gap, speed, leader = (_Sizes(np.asarray(latest[name]).tolist()) for name in _NOISES)
-        self._sizes = gap, speed, leader
-        self.noise = _noise(self._sizes, self.dt)
+            self.sizes[2].add(leader - last)
+        self.noise = _noise(self.sizes, dt)
 
 
 def is_whole(observation: Three) -> bool:
@@ -197,7 +185,7 @@ def _filtered(
     )
 
 
-class _Sizes:
+class Sizes:
     """Absolute values of the latest residuals, and their deviation: robust, from the median."""
 
     def __init__(self, sizes: Iterable[float] = ()) -> None:
@@ -219,7 +207,7 @@ class _Sizes:
         return self._sorted[n // 2] / _MEDIAN if n >= _FEWEST_RESIDUALS else 0.0
 
 
-def _noise(sizes: Iterable[_Sizes], dt: float) -> Three:
+def _noise(sizes: Iterable[Sizes], dt: float) -> Three:
     """Standard deviation of the noise on gap and both speeds, from that of their residuals."""
     # The second difference of a noisy speed has 6 times its variance; that of a gap against
     # the trapezoid of four noisy speeds twice its own, and some of theirs.
