@@ -22,6 +22,7 @@ from evofsm.guard.learnt.failure import (
     explain,
     inside,
     rivals,
+    sides_of,
 )
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS
 
@@ -38,9 +39,8 @@ UNIT = np.full(3, 0.1)
 
 def survived_as(rows, unit, ended=()):
     """What was survived, as it is asked of."""
-    lowest, highest = np.array([rows.min(0)] * 2), np.array([rows.max(0)] * 2)
-    ended = np.reshape(ended, (-1, rows.shape[1]))
-    return Survived(rows, lowest, highest, unit, rows.std(0), ended)
+    ends, m = [np.array([end] * 2) for end in (rows.min(0), rows.max(0))], len(unit)
+    return Survived(rows, *ends, unit, rows.std(0), np.reshape(ended, (-1, m)), np.zeros((m, 2)))
 
 
 def test_a_single_failure_amid_what_was_survived_says_nothing_of_where_it_fails():
@@ -87,7 +87,7 @@ ABOVE_ALONE = np.array([[0.0, 0.2], [0.2, 0.2]])  # who stands, does not fail fo
 
 def sides(failures, rows, unit, blur):
     """Variables, directions and places of sides."""
-    found = explain(FAILS, failures, survived_as(rows, unit), blur, bends=False)
+    found = sides_of(FAILS, failures, survived_as(rows, unit)._replace(noise=blur))
     assert (found[:, C] == 0.0).all()
     return {(int(i), sign, at) for i, sign, at in found[:, [I, B, AT]].tolist()}
 
@@ -179,7 +179,7 @@ def test_a_rival_of_a_threshold_fails_only_as_failures_did(ended):
     rows = np.column_stack([rng.uniform(0.0, 5.0, 500), rng.normal(0.0, [0.6, 0.3], (500, 2))])
     failures = np.array([[-0.1, -1.4, 0.6], [-0.1, -1.2, -0.7], [-0.1, -1.1, 0.5]])
     known = survived_as(rows, np.full(3, 0.02), ended)
-    tried = rivals(explain(FAILS, failures, known, bends=False), failures, known)
+    tried = rivals(sides_of(FAILS, failures, known), failures, known)
     says, touches = tried[:, SAYS], np.array([[-0.1, -0.1, 0.0], *failures])
     assert inside(tried[says == ENDS], touches).any(0).all()
     assert inside(tried[says == CRASHES], touches).any(0).tolist() == [False, True, True, True]

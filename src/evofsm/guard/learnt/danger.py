@@ -72,18 +72,17 @@ def _explained(state: State, *, failed: bool) -> State:
     if len(state.ended) >= _ENDED:
         table = _endings(state, table, survival)
     failures = state.failures[~failure.crashed(table, state.failures)]
-    noise = np.where(state.reached < 2, state.scale[:, None], 0.0)
     survival = survival._replace(rows=np.concatenate([survival.rows, state.ended]))
     was = failure.saying(table, FAILS)
     are_sides = failure.are_sides(was)
     bent = failure.without(was[~are_sides], survival.rows)
-    sides = failure.explain(FAILS, failures, survival, noise, bends=False)
+    sides = failure.sides_of(FAILS, failures, survival)
     if len(bent):  # others come with other bent forms
         sides = sides[failure.among(sides, was[are_sides])]
     rows = np.concatenate([sides, bent])
     is_told = not len(failures) or failure.inside(rows, failures).any(0).all()
     if failed or not is_told:
-        rows = failure.explain(FAILS, failures, survival, noise)
+        rows = failure.explain(FAILS, failures, survival)
     rows = failure.counted(rows, failures)
     ends, fatal = failure.saying(table, ENDS, CRASHES), failure.saying(table, FATAL)
     forms = np.concatenate([ends, rows, fatal])
@@ -216,7 +215,7 @@ def fatal_sides(state: State) -> State:
     went_on = state.survived[state.proven > 0.0]
     if not len(state.fatal) or not len(went_on):
         return state
-    ends = failure.explain(FATAL, state.fatal, failure.boxed(sizes(state), went_on), bends=False)
+    ends = failure.sides_of(FATAL, state.fatal, failure.boxed(sizes(state), went_on))
     rest = failure.saying(state.forms, FAILS, ENDS, CRASHES)
     return state._replace(forms=np.concatenate([rest, failure.nearer(ends, state.fatal, 1.0)]))
 

@@ -74,6 +74,8 @@ class Survived(NamedTuple):
     unit: Floats  #: (m,) what a distance of 1 is for each variable
     spread: Floats  #: (m,) their standard deviation
     ended: Floats  #: (e, m) where episodes ended without failing
+    #: (m, 2) scales of what may have blurred the lowest and the highest; none where not said
+    noise: Floats = np.zeros(2)
 
 
 # -- What forms say -------------------------------------------------------------------------------
@@ -259,7 +261,7 @@ def _of_one(
 def boxed(known: Survived, rows: Floats) -> Survived:
     """Others (n, m) that forms are to leave outside, in the same units."""
     low, high = (np.array([end] * 2) for end in (rows.min(0), rows.max(0)))
-    return known._replace(rows=rows, lowest=low, highest=high)
+    return known._replace(rows=rows, lowest=low, highest=high, noise=0.0 * known.noise)
 
 
 def crashing(failed: Floats, ended: Floats, survived: Survived, *at: int) -> Floats:
@@ -267,37 +269,25 @@ def crashing(failed: Floats, ended: Floats, survived: Survived, *at: int) -> Flo
     alike = failed.copy()
     alike[:, at] = ended[:, at].mean(0)
     end_box = boxed(survived, ended)
-    table = explain(CRASHES, alike, end_box, least=1.0)
+    table = explain(CRASHES, alike, end_box)
     if inside(table, alike, 0.0).any(0).all():
         return table
-    return explain(CRASHES, failed, end_box, least=1.0)
+    return explain(CRASHES, failed, end_box)
 
 
 # -- Which forms there are ------------------------------------------------------------------------
 
 
-def explain(
-    says: int,
-    failures: Floats,
-    survived: Survived,
-    noise: Floats | None = None,
-    least: float = 0.0,
-    *,
-    bends: bool = True,
-) -> Floats:
+def explain(says: int, failures: Floats, survived: Survived) -> Floats:
     """Fit the fewest forms (r, SIZE) that hold what failed, or ended (k, m), as it ``says``.
 
-    What was survived is outside. Of sides, ``noise`` may have blurred the lowest and the highest of
-    it by scales (m, 2); bent forms are blurred by `BLUR`. Sides that some failures are beyond by
-    ``least`` [typical steps] come first. Where forms may be bent (``bends``), sides that explain
-    few may go if bent forms explain the same failures; and all of them, if bent forms alone explain
-    all and are fewer.
+    What was survived is outside. Sides (`sides_of`) that explain few may go if bent forms, blurred
+    by `BLUR`, explain the same failures; and all, if bent forms alone explain all and are fewer.
     """
-    noise = np.zeros((len(survived.unit), 2)) if noise is None else noise
-    stay = _sides(says, failures, survived, noise, least)
+    stay = sides_of(says, failures, survived)
     by, k = inside(stay, failures), len(failures)
-    if not bends or by.any(0).all() or not len(survived.rows) or not k:
-        return counted(stay, failures)
+    if by.any(0).all() or not len(survived.rows) or not k:
+        return stay
     share = _SHARE if len(stay) <= _FEW_SIDES else 0.5 / len(stay)
     strong = by.sum(1) >= max(_FEW_FAILURES, share * k)
     bent, _ = _bent(says, failures[by[strong].sum(0) == 0], survived, k)
@@ -310,17 +300,17 @@ def explain(
     return counted(np.concatenate([stay[keep], bent]), failures)
 
 
-def _sides(says: int, failures: Floats, survived: Survived, noise: Floats, least: float) -> Floats:
+def sides_of(says: int, failures: Floats, survived: Survived) -> Floats:
     """The fewest ends of the box of what was survived that explain failures.
 
-    Of two that explain the first ones alike both hold until another failure tells them apart. A
-    failure within five scales of a blurred end may have been beyond it: then the side is where the
-    innermost of such failures was seen.
+    Where it crashes those come first that some failures are beyond by a typical step. Of two that
+    explain the first ones alike both hold until another failure tells them apart. A failure within
+    five scales of a blurred end may have been beyond it: then the side is where the innermost of
+    such failures was seen.
     """
-    m, unit = len(survived.unit), survived.unit
-    table = np.empty((0, SIZE))
+    m, unit, noise = len(survived.unit), survived.unit, survived.noise
     if not len(failures) or not np.isfinite(survived.lowest[0]).all():
-        return table
+        return np.empty((0, SIZE))
     ends = np.concatenate([survived.lowest[0], survived.highest[0]])
     far, again = (
         np.hstack([low - failures, failures - high])
@@ -332,7 +322,7 @@ def _sides(says: int, failures: Floats, survived: Survived, noise: Floats, least
     perhaps = (far > -wide.T.ravel()) | ((again > 0.0) & np.isfinite(again))
     is_open = np.ones(len(failures), bool)
     thresholds: dict[int, float] = {}
-    for clear in (max(least, ROUNDING), ROUNDING):
+    for clear in (1.0 if says == CRASHES else ROUNDING, ROUNDING):
         while (is_explained := (beyond > clear) & is_open[:, None]).any():
             ties, best = _most_telling(is_explained, perhaps, beyond)
             is_open &= ~(beyond[:, best] > ROUNDING)
@@ -348,7 +338,7 @@ def _sides(says: int, failures: Floats, survived: Survived, noise: Floats, least
         _of_one(says, k % m, at, unit[k % m], b=-1.0 if k < m else 1.0)
         for k, at in thresholds.items()
     ]
-    return np.array(rows).reshape(-1, SIZE)
+    return counted(np.array(rows).reshape(-1, SIZE), failures)
 
 
 def _most_telling(explained: Flags, perhaps: Flags, beyond: Floats) -> tuple[list[int], int]:

@@ -239,7 +239,8 @@ def sizes(state: State) -> Survived:
     """What was survived, as forms are fitted to it."""
     rows = np.concatenate([state.survived, state.brinks])
     unit = 1.25 * np.maximum(state.unit, model.FLOOR * _spread(state) + 1e-300)
-    return Survived(rows, state.lowest, state.highest, unit, _spread(state), state.ended)
+    noise = np.where(state.reached < 2, state.scale[:, None], 0.0)
+    return Survived(rows, state.lowest, state.highest, unit, _spread(state), state.ended, noise)
 
 
 def _spread(state: State) -> Floats:
