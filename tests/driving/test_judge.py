@@ -39,8 +39,8 @@ LAGS = st.one_of(st.just(0.0), st.floats(0.0, 1.0))
 def critical(gap, speed, leader_speed, action, *, before=0.0, decel=4.0, lag=0.0):
     answer = np.empty(1)
     observation = np.array([gap, speed, leader_speed])
-    body = Follower(decel, lag, MARGIN)
-    critical_decelerations(observation, np.array([action]), before, body, DT, answer)
+    body = Follower(decel, lag, MARGIN, before, DT)
+    critical_decelerations(observation, np.array([action]), body, answer)
     return float(answer[0])
 
 

@@ -265,7 +265,7 @@ class LatentRisk(Retraced, LearningJudge):
             sure = np.ones(len(actions))
             return Judgement(sure, 0.0 * sure, sure, 0.0 * sure, evidence, situation.seen)
         rows = np.empty((4, len(actions)))
-        _judge(here, actions, self._commands[1], self.body, self.dt, table, evidence, rows)
+        _judge(here, actions, self.body, table, evidence, rows)
         risk, low, high, critical = rows
         return Judgement(risk, low, high, critical, evidence, situation.seen)
 
@@ -318,8 +318,8 @@ class LatentRisk(Retraced, LearningJudge):
         """(2, k) whether options avoid what is seen, and regain a safe gap, as `foresee` has it."""
         worst = self.manoeuvres.exceeded_by(tolerance)
         outcomes = np.empty((2, len(options)), np.bool_)
-        arguments = min(braking, worst), options, self._commands[1], self.body
-        foresee(observation, *arguments, self.dt, worst, self.regain, hardest, outcomes)
+        inputs = observation, min(braking, worst), options, self.body
+        foresee(*inputs, worst, self.regain, hardest, outcomes)
         return outcomes
 
     def _leader_braking(self, situation: Situation) -> float:
@@ -361,13 +361,14 @@ class LatentRisk(Retraced, LearningJudge):
         """
         triple, actions = _three_finite(observation), _finite("accelerations", accelerations)
         critical = np.empty(len(actions))
-        critical_decelerations(triple, actions, self._commands[1], self.body, self.dt, critical)
+        critical_decelerations(triple, actions, self.body, critical)
         return critical
 
     @property
     def body(self) -> Body:
-        """What the follower is able to do, as far as was learnt."""
-        return Body(self.brakes.decel, self.brakes.lag, self.margin)
+        """What the follower is able to do, as far as was learnt, and what it was told."""
+        brakes = self.brakes
+        return Body(brakes.decel, brakes.lag, self.margin, self._commands[1], self.dt)
 
     def score(self, observations: Floats, dt: float = 0.25) -> Floats:
         """How surely each row is a dead end if the leader brakes now, as a `RiskMeasure` [m/s²].
@@ -377,9 +378,9 @@ class LatentRisk(Retraced, LearningJudge):
         however small the gap that is left.
         """
         rows, critical = np.asarray(observations, np.float64), np.empty((len(observations), 1))
-        settings = np.array([self.lowest]), self._commands[1], self.body._replace(margin=0.0)
+        settings = np.array([self.lowest]), self.body._replace(margin=0.0)
         for row, outcome in zip(rows, critical, strict=True):
-            critical_decelerations(_three_finite(row), *settings, self.dt, outcome)
+            critical_decelerations(_three_finite(row), *settings, outcome)
         return self.manoeuvres.exceeded_by(TOLERANCE) - critical[:, 0]
 
     def in_c99(self, reviser: ActionReviser) -> Part:
@@ -510,14 +511,12 @@ def _finite(name: str, values: ArrayLike) -> Floats:
 def _judge(
     observation: Three,
     accelerations: Floats,
-    before: float,
     body: Body,
-    dt: float,
     table: Floats,
     evidence: float,
     judged: Floats,
 ) -> None:
-    critical_decelerations(observation, accelerations, before, body, dt, judged[3])
+    critical_decelerations(observation, accelerations, body, judged[3])
     for k in range(len(accelerations)):
         judged[0, k] = _interpolated(judged[3, k], table)
         judged[1, k], judged[2, k] = wilson_bounds(judged[0, k], evidence + 1.0)

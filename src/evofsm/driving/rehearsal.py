@@ -29,37 +29,34 @@ Three: TypeAlias = tuple[float, float, float]
 
 
 class Body(NamedTuple):
-    """What the follower is able to do, as far as is known."""
+    """What the follower is able to do, as far as is known, and what it was told."""
 
     decel: float  #: full braking that it realises [m/s²], positive
     lag: float  #: share of a decision interval in which the command before it still rules
     margin: float  #: smallest gap that counts as no collision [m]
+    before: float  #: acceleration commanded last [m/s²]
+    dt: float  #: time between two decisions [s]
 
 
 @compiled
 def critical_decelerations(
     observation: Three | Floats,
     accelerations: Floats,
-    before: float,
     body: Body,
-    dt: float,
     critical: Floats,
 ) -> None:
-    """Write the critical deceleration under each acceleration that could be commanded now.
-
-    ``before`` is the acceleration commanded last.
-    """
+    """Write the critical deceleration under each acceleration that could be commanded now."""
     for k in range(len(accelerations)):
         low, high = 0.0, HARDEST
-        if survives(observation, accelerations[k], before, body, high, dt):
+        if survives(observation, accelerations[k], body, high):
             critical[k] = HARDEST
             continue
-        if not survives(observation, accelerations[k], before, body, low, dt):
+        if not survives(observation, accelerations[k], body, low):
             critical[k] = 0.0
             continue
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
-            if survives(observation, accelerations[k], before, body, middle, dt):
+            if survives(observation, accelerations[k], body, middle):
                 low = middle
             else:
                 high = middle
@@ -71,9 +68,7 @@ def foresee(
     observation: Three | Floats,
     braking: float,
     accelerations: Floats,
-    before: float,
     body: Body,
-    dt: float,
     worst: float,
     regain: float,
     hardest: float,
@@ -93,21 +88,17 @@ def foresee(
     leader_distance, leader_end_speed = _drive_on(leader_speed, -braking, regain)
     for k in range(len(accelerations)):
         full = max(body.decel, min(-accelerations[k], hardest))
-        careful = Body(full, body.lag, margin)
-        found[0, k] = survives(near, accelerations[k], before, careful, braking, dt)
+        careful = Body(full, body.lag, margin, body.before, body.dt)
+        found[0, k] = survives(near, accelerations[k], careful, braking)
         distance, end_speed = _drive_on(speed, accelerations[k], regain)
         then = (gap + leader_distance - distance, end_speed, leader_end_speed)
-        found[1, k] = survives(then, 0.0, accelerations[k], body, worst, dt)
+        later = Body(body.decel, body.lag, body.margin, accelerations[k], body.dt)
+        found[1, k] = survives(then, 0.0, later, worst)
 
 
 @kernel
 def survives(
-    observation: Three | Floats,
-    acceleration: float,
-    before: float,
-    body: Body,
-    leader_decel: float,
-    dt: float,
+    observation: Three | Floats, acceleration: float, body: Body, leader_decel: float
 ) -> bool:
     """Whether no collision comes of ``acceleration`` now and full braking after it."""
     gap = observation[0] - body.margin
@@ -115,14 +106,15 @@ def survives(
     speed, leader_speed = max(observation[1], 0.0), max(observation[2], 0.0)
     caution = -body.decel
     demand = max(acceleration, caution)
-    last = max(before, caution)
+    last = max(body.before, caution)
     if speed <= 0.0 and max(demand, last) <= 0.0:
         return bool(observation[0] > 0.0)  # who stands, and stays, may be closer than the margin
     for _ in range(2):  # until full braking rules alone
         if gap <= 0.0 or (demand == caution and last == caution):
             break
-        distance, speed = _drive_on(speed, body.lag * last + (1.0 - body.lag) * demand, dt)
-        leader_distance, leader_speed = _drive_on(leader_speed, -leader_decel, dt)
+        mean = body.lag * last + (1.0 - body.lag) * demand
+        distance, speed = _drive_on(speed, mean, body.dt)
+        leader_distance, leader_speed = _drive_on(leader_speed, -leader_decel, body.dt)
         gap += leader_distance - distance
         last, demand = demand, caution
     # Both brake until they stand: the gap is smallest at the end, if it shrinks until then, ...
