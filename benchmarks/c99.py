@@ -436,11 +436,12 @@ def _learnt(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str
         return words.NOTHING_SEEN
     remembered, backup = judge.remembered, judge.backup_text(code["backup"])
     allowed = judge._allowed(reviser.tolerance, remembered)
+    remembered = remembered._replace(spared=allowed)
     if kind == 0:
-        return words.kept(backup, remembered, number["left"], allowed)
-    why = words.refused(code["unsurvived"], remembered, judge.margin, judge.parts.scale, allowed)
+        return words.kept(backup, remembered, number["left"])
+    why = words.refused(code["unsurvived"], remembered, judge.margin, judge.parts.scale)
     if kind == 1:
-        return f"{why}; {words.changed(backup, remembered, judge.margin, allowed)}"
+        return f"{why}; {words.changed(backup, remembered, judge.margin)}"
     if kind == 3 and code["passes"]:
         return f"{why}; {words.NO_LONGER}"
     return f"{why}; {words.lasting(backup, cut=kind == 2)}"

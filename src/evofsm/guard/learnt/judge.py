@@ -300,8 +300,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         n_asked = parts.n_tried if self.learning else parts.n_asked
         proposal, scale, margin = self.encode(wanted), parts.scale, self.state.margin
         memory, ranks, most = self.remembered, self._ranks[:n_asked], parts.most
-        allowance = self._allowed(tolerance, memory)
-        policies = self.state.policies
+        memory = memory._replace(spared=self._allowed(tolerance, memory))
+        policies, allowance = self.state.policies, memory.spared
         if mask is not None:
             policies = policies.copy()
             policies[:, ~mask, 0] = _NEVER
@@ -331,11 +331,11 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         judgement = self._judged(situation, outcomes)
         backup = self.backup_text(best, policies)
         if not self._refused:
-            return Search(options, judgement, 0, words.kept(backup, memory, slack, allowance))
-        why = words.refused(self._unsurvived, memory, margin, scale, allowance)
+            return Search(options, judgement, 0, words.kept(backup, memory, slack))
+        why = words.refused(self._unsurvived, memory, margin, scale)
         why += "" if mask is None else words.IF_NO_MORE
         if passes:
-            instead = words.changed(backup, memory, margin, allowance)
+            instead = words.changed(backup, memory, margin)
         elif trial is not None:
             instead = words.TRIED
         else:

@@ -61,6 +61,7 @@ class Remembered(NamedTuple):
 
     number: int
     seconds: float  #: of observation that they come from
+    spared: int = 0  #: so many of them need not be survived
 
     def __str__(self) -> str:
         time = f"{self.seconds:,.0f} s" if self.seconds >= 10.0 else f"{self.seconds:.1f} s"
@@ -68,28 +69,27 @@ class Remembered(NamedTuple):
             return f"what {time} brought"
         return f"{counted(self.number, 'disturbance')} remembered from {time}"
 
-    def but(self, spared: int) -> str:
+    @property
+    def most(self) -> str:
         """All of them, but those that need not be survived."""
         if self.number == 0:
             return str(self)
-        if spared:
-            return f"all but at most {spared} of the {self}"
+        if self.spared:
+            return f"all but at most {self.spared} of the {self}"
         return f"{'all' if self.number > 1 else 'the'} {self}"
 
 
-def kept(backup: str, remembered: Remembered, left: float, spared: int = 0) -> str:
+def kept(backup: str, remembered: Remembered, left: float) -> str:
     """Why a proposal is kept."""
-    return f"then {backup} survives {remembered.but(spared)}, by {changes(left)}"
+    return f"then {backup} survives {remembered.most}, by {changes(left)}"
 
 
-def refused(
-    unsurvived: int, remembered: Remembered, margin: float, scale: float, spared: int = 0
-) -> str:
+def refused(unsurvived: int, remembered: Remembered, margin: float, scale: float) -> str:
     """Why an action is dangerous; ``unsurvived`` is -1 without a disturbance, 0 by the margin."""
     if unsurvived < 0:
         return "no backup prevents failure, even if nothing disturbs it"
     if unsurvived == 0:
-        text = f"no backup survives {remembered.but(spared)} by the margin of {changes(margin)}"
+        text = f"no backup survives {remembered.most} by the margin of {changes(margin)}"
         return text if scale < _HARDER else f"{text}, were they {scale:.2g} times as hard"
     if unsurvived < remembered.number:
         return f"no backup survives {unsurvived} of the {remembered}"
@@ -118,11 +118,11 @@ def failed(counts: Sequence[int]) -> str:
     return f"{several} episode{'s' * (texts != ['1'])} that had been certified failed"
 
 
-def changed(backup: str, remembered: Remembered, margin: float, spared: int = 0) -> str:
+def changed(backup: str, remembered: Remembered, margin: float) -> str:
     """What is done instead, where another action passes."""
     cases = "all of them" if remembered.number > 1 else "it"
-    if spared and remembered.number > 1:
-        cases = f"all but at most {spared} of them"
+    if remembered.spared and remembered.number > 1:
+        cases = f"all but at most {remembered.spared} of them"
     return f"the closest action after which {backup} survives {cases}, by {changes(margin)} or more"
 
 
