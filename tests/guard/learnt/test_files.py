@@ -105,9 +105,9 @@ def test_a_judge_of_other_actions_or_variables_is_refused(points, snapshot):
     (told, own), (_, others) = (store.read(file, GUARD) for file in files)
     mixed = BytesIO()
     store.write(mixed, GUARD, told, own | {"judge": others["judge"]})
-    with pytest.raises(ValueError, match="the judge was made for actions from"):
+    with pytest.raises(ValueError, match=r"made for BoxActions\(.*, but the guard has Interval"):
         Guard.load(BytesIO(mixed.getvalue()))
-    with pytest.raises(ValueError, match="the judge was made for a range of actions"):
+    with pytest.raises(ValueError, match=r"made for BoxActions\(.*, but the guard has Choices"):
         Guard(n_actions=2, interval=0.1, judge=LearntRisk(0.1, 0.0, 1.0))
     guard = Guard(low=-1.0, high=1.0, interval=0.1, judge=box.judge)
     with pytest.raises(ValueError, match="observation has 3 variables, but the judge learnt of 2"):

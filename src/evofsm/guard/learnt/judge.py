@@ -242,17 +242,13 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
     def refuse_unfit(self, actions: ActionSet) -> None:
         """Raise for another range of actions than it learns of."""
-        if bool(self.choices) != isinstance(actions, Choices):
+        box: Any = self.low, self.high
+        right = Choices(self.choices) if self.choices else BoxActions(*box)
+        ends = np.ravel(limits(right)), np.ravel(limits(actions))
+        if isinstance(actions, Choices) != bool(self.choices) or not np.array_equal(*ends):
             raise ValueError(
-                "the judge was made for a range of actions, but the guard has n_actions, or the "
-                "other way round"
-            )
-        low, high = limits(actions)
-        ends = (0, self.choices - 1) if self.choices else (self.low, self.high)
-        if not all(map(np.array_equal, map(np.atleast_1d, ends), map(np.atleast_1d, (low, high)))):
-            raise ValueError(
-                f"the judge was made for actions from {ends[0]} to {ends[1]}, not from {low} to "
-                f"{high}: give it low and high, or n_actions, of the guard"
+                f"the judge was made for {right}, but the guard has {actions}: give it low and "
+                "high, or n_actions, of the guard"
             )
 
     def encode(self, action: Any) -> Floats:
