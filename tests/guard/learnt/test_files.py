@@ -45,7 +45,7 @@ def with_first(value):
         ({}, {"forms": lambda one: one + 2.0 * np.eye(14)[2]}, "forms are of variables"),
         ({}, {"forms": lambda one: one * (np.arange(14) != 5)}, "units that are not positive"),
         ({}, {"drifts": lambda one: np.full((1, 3), 9.0)}, "drifts are of variables"),
-        ({}, {"lengths": with_first(999.0)}, "windows have other than 3 to 146 steps"),
+        ({}, {"spans": with_first(999.0)}, "windows have other than 3 to 146 steps"),
     ],
 )
 def test_a_file_that_contradicts_itself_is_refused(judge, settings, arrays, why):

@@ -163,7 +163,7 @@ def disturbances(state: State, known: Model, z: Floats, u: Floats, random: Gener
         sample = S[random.permutation(len(S))[:_TRIED_IN]]
         ends = _worst(known, sample, state.policies[:1], with_none, 1.0)
     harmful = np.unique(ends.argmin(1)) if len(ends) else _sizes(new, state)[:_MOST_WINDOWS]
-    windows, lengths = list(state.windows), state.lengths.tolist()
+    windows, spans = [*state.windows], state.spans.tolist()
     for t in starts[harmful]:
         is_seen: Flags = np.asarray(np.isfinite(z[t : t + longest]).all(1))
         n = len(is_seen) if is_seen.all() else int(is_seen.argmin())
@@ -171,10 +171,9 @@ def disturbances(state: State, known: Model, z: Floats, u: Floats, random: Gener
             row = np.zeros((longest, m + a))
             row[:n, :m], row[: n - 1, m:] = z[t : t + n], u[t : t + n - 1]
             windows.append(row)
-            lengths.append(float(n))
-    since = np.full(len(windows) - len(state.windows), float(state.n_episodes))
-    seen_in, table = np.append(state.seen_in, since), np.reshape(windows, (-1, longest, m + a))
-    state = state._replace(windows=table, lengths=np.array(lengths), seen_in=seen_in)
+            spans.append((float(n), float(state.n_episodes)))
+    table = np.reshape(windows, (-1, longest, m + a))
+    state = state._replace(windows=table, spans=np.reshape(spans, (-1, 2)))
     residuals = residuals_of(state, known, H)
     if looks and len(windows):
         state, residuals = _fatal(state, known, residuals)
@@ -210,8 +209,7 @@ def _fatal(state: State, known: Model, found: Floats) -> tuple[State, Floats]:
 
 def _kept(state: State, keep: Ints) -> State:
     """Forget all disturbances but these, by their numbers from 0."""
-    of = {name: getattr(state, name)[keep] for name in ("windows", "lengths", "seen_in")}
-    return state._replace(**of)
+    return state._replace(windows=state.windows[keep], spans=state.spans[keep])
 
 
 def _sizes(rest: Floats, state: State) -> Ints:
@@ -294,8 +292,8 @@ def coarser(state: State) -> State:
         *("squares", "products", "least", "most", "scale", "noise", "power"),
         *("recent_squares", "recent_products", "doubt", "since", "drifts", "misled"),
         *("n_scanned", "n_moves", "centres", "radii", "counts", "fatal"),
-        *("windows", "lengths", "seen_in"),
-        *("situations", "margin", "time_to_failure", "believed", "too_short", "horizon"),
+        *("windows", "spans", "situations", "margin"),
+        *("time_to_failure", "believed", "too_short", "horizon"),
     )
     return state._replace(
         **{name: getattr(blank, name) for name in learnt_anew},

@@ -166,8 +166,7 @@ class State(NamedTuple):
     fatal: Annotated[Floats, _SEEN.of("fatal", "m")]  #: where what nothing survives began
     # disturbances
     windows: Annotated[Floats, _SEEN.of("windows", "steps", "seen")]  #: observations and actions
-    lengths: Annotated[Floats, COUNT.of("windows")]
-    seen_in: Annotated[Floats, COUNT.of("windows")]  #: episode
+    spans: Annotated[Floats, COUNT.of("windows", 2)]  #: steps of each, and its episode
     #: observation, its change, action before
     situations: Annotated[Floats, _SEEN.of("situations", "situation")]
     # backups
@@ -310,8 +309,8 @@ def residuals_of(state: State, known: Model, steps: int) -> Floats:
     """
     m = len(state.origin)
     residuals = model.undisturbed(steps, m, 1 + len(state.windows))
-    rows = zip(state.windows, state.lengths.astype(int), state.seen_in, strict=True)
-    for k, (window, n, episode) in enumerate(rows, 1):
+    rows = zip(state.windows, state.spans.astype(int).tolist(), strict=True)
+    for k, (window, (n, episode)) in enumerate(rows, 1):
         inputs = window[:n, :m], window[: n - 1, m:], state.unit
         rest = model.disturbed(known, *inputs)[:steps]
         rest[:, state.drifts[state.drifts[:, 1] > episode, 0].astype(int)] = 0.0
@@ -402,6 +401,6 @@ def unpacked(numbers: Mapping[str, Any], arrays: Mapping[str, Any], blank: State
         raise ValueError("forms have units that are not positive")
     if (state.drifts[:, 0] >= m).any():
         raise ValueError("drifts are of variables that there are not")
-    if ((state.lengths < 3.0) | (state.lengths > steps)).any():
+    if ((state.spans[:, 0] < 3.0) | (state.spans[:, 0] > steps)).any():
         raise ValueError(f"windows have other than 3 to {steps} steps")
     return state
