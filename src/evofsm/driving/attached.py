@@ -152,16 +152,18 @@ class Seeing:
         if not neighbour:
             return None
         v, euler = self._vehicle.getSpeed(neighbour), self._euler
-        own, other = (speed, self.body(car)), (v, self.body(neighbour))
-        (first, follower), (second, leader) = (own, other) if is_ahead else (other, own)
+        cars, speeds = (car, neighbour), (speed, v)
+        follower, leader = map(self.body, cars if is_ahead else cars[::-1])
+        v_follower, v_leader = speeds if is_ahead else speeds[::-1]
         # Who is nearer than SUMO lets anybody be stands in a queue, or beside, where lanes merge.
         # Across a junction SUMO says 0 of all that is nearer than minGap.
         spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
         near = Neighbour(neighbour, gap + follower.min_gap, gap + spare_gap, v)
-        gained = 0.5 * euler * (first - second) + _further(second, leader.decel, euler)
+        room = near.room + 0.5 * euler * (v_follower - v_leader)
         if is_ahead and 0.125 * follower.decel * euler * euler > _MARGIN:  # an eighth is the most
-            first = self.wish(car, speed, near)
-        room = near.room + gained - _further(first, follower.decel, euler)
+            v_follower = self.wish(car, speed, near)
+        room += _further(v_leader, leader.decel, euler)
+        room -= _further(v_follower, follower.decel, euler)
         return near._replace(room=max(room, _NEAREST))
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
@@ -374,8 +376,8 @@ class Guarding:
         wish, acceleration, most = ((v - car.speed) / self._seeing.dt for v in speeds)
         revision = car.revision or self._decide(car, wish)  # where it acts, that was decided before
         stands = max(car.speed, speed, desired_speed) < _STANDS
-        allowed = most if self._acts else float(revision.advised)
-        self.revised += not stands and allowed < wish - SLIGHT
+        outcome = most if self._acts else float(revision.advised)
+        self.revised += not stands and outcome < wish - SLIGHT
         if self._report is not None:
             self._report(GuardedStep(car.time, car.id, wish, acceleration, revision, *car.about))
 

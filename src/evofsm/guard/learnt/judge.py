@@ -495,9 +495,12 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self._u.append(inner)
         self._used = self._used + used_at(inner[None], self.choices)[0]
 
-    def learn(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
-        """Take in what was executed, and whether the certificate of before still held."""
-        if self.parts is not None:
+    def learn(self, observation: ArrayLike, action: Any, *, watched: bool = False) -> None:
+        """Take in what was executed, and whether the certificate of before still held.
+
+        Where someone else acts (``watched``) nothing was certified.
+        """
+        if not watched and self.parts is not None:
             is_violated = self._certified and not self._holds
             s = self.settings
             margin = self.state.margin + s.margin_step * (is_violated - s.violation_rate)
@@ -576,10 +579,10 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def remake(self) -> None:
         """Decide by `state`, between two episodes."""
         self.parts = Parts.of(self.state, self.dt)
-        self._forget()
+        self.start_episode()
 
-    def _forget(self) -> None:
-        """Begin an episode."""
+    def start_episode(self) -> None:
+        """What comes is not a consequence of what was."""
         self._step, self._z, self._u, self._notes = [], [], [], []
         self._certified = self._holds = self._refused = self._lost = False
         self._unsurvived, self._n_blind, self._fails_after = 0, 0, 0.0
