@@ -64,8 +64,6 @@ _LOOKS_AHEAD, _GENTLE = 30.0, 3.0
 _CAR_WIDTH = 1.8
 # Nobody is nearer in what is judged [m]. SUMO keeps minGap itself: what is kept beside it [m].
 _NEAREST, _MARGIN = 0.05, 0.1
-# SUMO is told no lower limit of acceleration [m/s²].
-_LEAST = 0.01
 # Slower than this a car stands, and a speed that differs by no more is the same [m/s].
 _STANDS, _SAME_SPEED = 0.1, 1e-6
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
@@ -210,11 +208,9 @@ class _Car:
     id: str
     guard: Guard
     high: float  # the hardest acceleration
-    mode: int | None = None  # SUMO's speed mode before its speed was set
-    kind: str = ""  # its type, and what that accelerates by [m/s²], before less was set
-    accel: float = 0.0
+    mode: int | None = None  # SUMO's speed mode before it was taken over
     speed: float = 0.0
-    limit: float = math.inf  # the speed that was set, or that it can gain
+    limit: float = 0.0  # the speed that was set
     wish: float = 0.0  # the speed that its model wants instead
     time: float = 0.0
     seen: Floats | None = None  # what is decided on
@@ -256,8 +252,8 @@ class Guarding:
             )
         self.begin_anew()
         self.decisions = 0
-        #: Steps in which a car was made to brake harder, or accelerate less, than its driver wanted
-        #: by more than 0.1 m/s²; in shadow, would have been. Who goes on standing does not count.
+        #: Steps in which a car braked harder, or accelerated less, than its driver wanted by more
+        #: than 0.1 m/s²; in shadow, would have. Who stands, and goes on standing, is not counted.
         self.revised = 0
         self.limited = 0  #: steps in which a guard set a limit to the speed of a car
         self.overruled = 0  #: steps in which a car drove faster than its guard had set
@@ -288,7 +284,6 @@ class Guarding:
             speed = self._vehicle.getSpeed(car.id)
             if car.seen is not None:
                 self._look_back(car, speed)
-            self._hand_back(car)  # so that its model says what it wants by itself
             if decides:
                 self._look(car, speed)
                 if car.seen is not None and self._acts:
@@ -327,56 +322,45 @@ class Guarding:
         return revision
 
     def _act(self, car: _Car, speed: float) -> None:
-        """Hold it back, where the guard allows less than the car might want."""
-        revision, vehicle, dt = car.revision, self._vehicle, self._seeing.dt
+        """Set the speed, where the guard allows less than the car might want."""
+        revision = car.revision
         if revision is None or revision.executed >= car.high:
+            self._hand_back(car)
             return
-        car.wish, late = (
-            self._seeing.wish(car.id, speed, car.around[0]),
-            self._seeing.body(car.id).late,
-        )
-        next_speed = max(0.0, speed + float(revision.executed) * dt)
+        next_speed = max(0.0, speed + float(revision.executed) * self._seeing.dt)
         # Nor faster than it would drive on a free road.
-        limit = min(next_speed, vehicle.getAllowedSpeed(car.id))
-        if not late and car.wish <= limit + width_for(dt) * dt:
-            return  # it drives as it would by itself, with its imperfections
-        self.limited += 1
-        if revision.executed >= 0.0 and not late:
-            # Its model drives on, lets others in and changes lanes: to set its speed ends that.
-            car.kind, car.limit = vehicle.getTypeID(car.id), next_speed
-            car.accel = vehicle.getAccel(car.id)
-            vehicle.setAccel(car.id, max(float(revision.executed), _LEAST))
+        car.limit = min(next_speed, self._vehicle.getAllowedSpeed(car.id))
+        car.wish = self._seeing.wish(car.id, speed, car.around[0])
+        coarse = max(SLIGHT, width_for(self._seeing.dt)) * self._seeing.dt
+        if not self._seeing.body(car.id).late and car.wish <= car.limit + coarse:
+            self._hand_back(car)  # it drives as it would by itself, with its imperfections
             return
-        car.mode, car.limit = vehicle.getSpeedMode(car.id), limit
-        vehicle.setSpeedMode(car.id, car.mode & ~_OFF | _ON)
-        vehicle.setSpeed(car.id, limit)
+        if car.mode is None:
+            car.mode = self._vehicle.getSpeedMode(car.id)
+            self._vehicle.setSpeedMode(car.id, car.mode & ~_OFF | _ON)
+        self.limited += 1
+        self._vehicle.setSpeed(car.id, car.limit)
 
     def _hand_back(self, car: _Car) -> None:
-        if car.kind.endswith(f"@{car.id}"):  # a type of its own already, by somebody's script
-            self._vehicle.setAccel(car.id, car.accel)
-        elif car.kind:
-            self._vehicle.setType(car.id, car.kind)
         if car.mode is not None:
             self._vehicle.setSpeed(car.id, -1.0)
             self._vehicle.setSpeedMode(car.id, car.mode)
-        car.kind, car.mode, car.limit = "", None, math.inf
+            car.mode = None
 
     def _look_back(self, car: _Car, speed: float) -> None:
         """What the driver wanted, now that it shows; in shadow it is what is judged."""
         desired_speed = speed
-        if speed > car.limit + _FASTER:
+        if car.mode is not None and speed > car.limit + _FASTER:
             self.overruled += 1
             if self.overruled == _OFTEN:
                 warnings.warn(_OVERRULED.format(car.id, _OFTEN), RuntimeWarning, stacklevel=4)
-        # Slower than the limit is what SUMO itself wanted, such as to stop at a red light; to gain
-        # less speed may be its imperfection.
-        if car.limit < math.inf and speed >= min(car.limit, car.speed) - _SAME_SPEED:
+        # Slower than the limit is what SUMO itself wanted, such as to stop at a red light.
+        if car.mode is not None and speed >= car.limit - _SAME_SPEED:
             desired_speed = max(car.wish, speed)
-        speeds = desired_speed, speed, car.limit
-        wish, acceleration, most = ((v - car.speed) / self._seeing.dt for v in speeds)
+        wish, acceleration = ((v - car.speed) / self._seeing.dt for v in (desired_speed, speed))
         revision = car.revision or self._decide(car, wish)  # where it acts, that was decided before
         stands = max(car.speed, speed, desired_speed) < _STANDS
-        outcome = most if self._acts else float(revision.advised)
+        outcome = acceleration if self._acts else float(revision.advised)
         self.revised += not stands and outcome < wish - SLIGHT
         if self._report is not None:
             self._report(GuardedStep(car.time, car.id, wish, acceleration, revision, *car.about))
@@ -682,10 +666,9 @@ def attach(
 
     Notes
     -----
-    A guard that allows less acceleration than a driver wants says so by ``setAccel``; one that has
-    to brake by ``setSpeed``, with "safe speed" and the limit of acceleration on in the speed mode
-    and that of braking off. Both are put back before the next step. Where you set a car's speed
-    yourself, ask a `Guard` before you do instead.
+    Where a guard acts, the speed mode has "safe speed" and the limit of acceleration on and that of
+    braking off. It is put back as it was, with ``setSpeed(-1)``, as soon as the guard allows all
+    that the car can do. Where you set a car's speed yourself, ask a `Guard` before you do instead.
     After ``load``, or ``close`` and ``start``, an attachment goes on with the new cars, and what it
     counts goes on; whoever attaches anew ends those of earlier simulations.
 
