@@ -468,6 +468,9 @@ _CHOSEN = {
     3: "nothing can, the least risky",
     7: "it regains a safe gap in time",
     8: "the least braking that regains a safe gap in time",
+    9: "it avoids a collision if the leader goes on so",
+    10: "the least braking that avoids a collision if the leader goes on so",
+    11: "comfortable braking, which avoids a collision if the leader goes on so",
 }
 
 

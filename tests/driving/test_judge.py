@@ -220,6 +220,20 @@ def test_in_a_smaller_gap_one_never_brakes_less(proposal, ahead):
     assert -3.3 < found[4] < 0.0  # nothing is foreseen: as hard as is comfortable, to an option
 
 
+@given(st.floats(0.5, 40.0), st.floats(5.0, 40.0), SPEEDS, st.floats(-4.0, 2.5))
+@example(9.0, 20.0, 15.0, 0.5)
+def test_a_reason_says_what_was_looked_at(gap, speed, ahead, proposal):
+    guard = cars(9.0)
+    chosen = guard.decide([gap, speed, ahead], proposal)
+    options = np.array([chosen.executed, chosen.executed + 0.3])
+    avoids, regains = guard.judge._foreseen((gap, speed, ahead), 0.0, options, 0.02)
+    said = chosen.reason.rpartition("; ")[2]
+    if "avoids" in said or "regains" in said:
+        assert (regains if "regains" in said else avoids)[0]
+    if "least" in said and "avoids" in said and options[1] <= proposal:
+        assert not avoids[1]
+
+
 def collides(gap, speed, ahead, brakes_at, worst, waves=()):
     """Behind a leader that goes on as it is, or in waves, and then brakes as hard as is assumed."""
     leader = Leader(STEADY, worst, brake_time=brakes_at, initial_speed=ahead, waves=waves)

@@ -177,6 +177,15 @@ def test_brakes_that_are_not_known_are_tried_in_c_too(tmp_path):
     assert found.changed > 50
 
 
+def test_cars_that_brake_hard_give_the_same_reasons_in_c(tmp_path):
+    guard = guard_for_cars(-6.0, 2.5, judge=LatentRisk.given(-6.0, 6.0, 9.0))
+    guard.freeze()
+    asked = c99.ask(c99.Learnt(c99.CutIn(), guard), 3000, 3)
+    assert c99.compare(guard, c99.build(guard, tmp_path), asked).agrees
+    said = {reason.rpartition("; ")[2] for reason, _ in asked.said}
+    assert {c99._CHOSEN[code] for code in (1, 3, *range(7, 12))} <= said
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["disc", "cars"])
 def test_it_asks_for_no_memory_and_little_of_the_stack(name, tmp_path):

@@ -232,7 +232,7 @@ static int closest(const evofsm_state *s, double action, double tolerated) {
    braking beyond that avoids what is seen; -1: none. */
 static int in_proportion(const evofsm_state *s, const double here[3], double limit, int *reason) {
   const double braking = lesser(leader_braking(s), WORST), wanted = s->options[0];
-  int i, k, passes[3], best[3] = {-1, -1, -1};
+  int i, k, passes[3], best[3] = {-1, -1, -1}, softest = -1;
   for (i = 0; i < EVOFSM_OPTIONS; i++) {
     const double option = s->options[i], off = fabs(option - wanted);
     const int is_gentle = option >= lesser(-COMFORT, wanted);
@@ -241,13 +241,19 @@ static int in_proportion(const evofsm_state *s, const double here[3], double lim
     passes[0] = is_soon || (is_gentle && s->risk[i] <= limit);
     passes[1] = is_soon || (is_gentle && s->risk[i] <= TOLERANCE);
     passes[2] = is_lower && option <= -COMFORT;
+    softest = is_lower && (softest < 0 || option > s->options[softest]) ? i : softest;
     for (k = 0; k < 3; k++) {
       best[k] = passes[k] && (best[k] < 0 || off < fabs(s->options[best[k]] - wanted)) ? i : best[k];
     }
   }
   i = best[0] >= 0 ? best[0] : best[1] >= 0 ? best[1] : best[2];
   if (i >= 0 && !(s->risk[i] <= TOLERANCE)) {
-    *reason = i ? EVOFSM_REGAINED : EVOFSM_REGAINS;
+    if (regains(here, s->options[i], braking)) {
+      *reason = i ? EVOFSM_REGAINED : EVOFSM_REGAINS;
+    } else {
+      *reason = i == 0 ? EVOFSM_AVOIDS
+                       : s->options[softest] > s->options[i] ? EVOFSM_COMFORTABLE : EVOFSM_AVOIDED;
+    }
   }
   return i;
 }

@@ -30,7 +30,10 @@ enum {
   EVOFSM_TRIED = 5,          /* cars: own brakes are not known yet, so it brakes in full */
   EVOFSM_TRYING = 6,         /* and goes on with it for a while */
   EVOFSM_REGAINS = 7,        /* cars: the proposal regains a safe gap in time */
-  EVOFSM_REGAINED = 8        /* cars: the least braking that regains one */
+  EVOFSM_REGAINED = 8,       /* cars: the least braking that regains one */
+  EVOFSM_AVOIDS = 9,         /* cars: it avoids a collision if the leader goes on so */
+  EVOFSM_AVOIDED = 10,       /* cars: the least braking that avoids one */
+  EVOFSM_COMFORTABLE = 11    /* cars: comfortable braking, which avoids one */
 };
 
 /* What had to be done to a proposal. */
