@@ -234,6 +234,18 @@ def test_a_reason_says_what_was_looked_at(gap, speed, ahead, proposal):
         assert not avoids[1]
 
 
+@pytest.mark.parametrize("noise", [(0.0, 0.0, 0.0), (0.5, 0.3, 0.3)])
+def test_who_comes_towards_one_is_no_car_that_stands(noise):
+    guard = cars(9.0)
+    guard.freeze()  # which learns no other noise
+    guard.judge.perception.noise = noise
+    gaps = np.arange(240.0, 180.0, -10.0)
+    first, *_, last = (guard.decide([gap, 20.0, -20.0], 1.0) for gap in gaps)
+    assert (first.risk_proposed, first.executed) == (0.0, 1.0)
+    assert (last.risk_proposed, last.executed) == (1.0, -4.0)
+    assert "avoids" not in last.reason
+
+
 def collides(gap, speed, ahead, brakes_at, worst, waves=()):
     """Behind a leader that goes on as it is, or in waves, and then brakes as hard as is assumed."""
     leader = Leader(STEADY, worst, brake_time=brakes_at, initial_speed=ahead, waves=waves)

@@ -25,6 +25,7 @@ ACTIONS = np.array([2.5, 0.0, -4.5, -9.0])
         (Object("d", 115.0, 3.5, 20.0, vy=-1.0), (Role.CUTTING_IN, 1, 10.0, 20.0, 20.0)),
         (Object("e", 115.0, -3.5, 20.0, vy=1.0), (Role.CUTTING_IN, 1, 10.0, 20.0, 20.0)),
         (Object("f", 115.0, 3.5, 20.0, vy=1.0), None),  # moves away
+        (Object("i", 130.0, 0.0, -25.0), (Role.ONCOMING, 1, 25.0, 20.0, -25.0)),
         # Who crosses is as long along the road as it is wide.
         (
             Object("g", 120.0, -6.0, 0.0, vy=4.0, length=2.0, width=0.6),
@@ -103,6 +104,14 @@ def test_whoever_crosses_is_braked_for():
     assert revision.executed <= -4.0
     assert "crossing" in revision.reason
     assert decide(scene(walker._replace(y=3.0))).executed == 1.0
+
+
+def test_who_comes_towards_one_is_braked_for_in_full():
+    assert decide(scene(ahead(400.0, -25.0))).executed == 1.0
+    revision = decide(scene(ahead(80.0, -25.0)))
+    assert (revision.risk_proposed, revision.executed) == (1.0, LOW)
+    assert "object 1, oncoming" in revision.reason
+    assert "nothing can" in revision.reason
 
 
 def test_a_proposal_is_kept_or_changed_as_little_as_it_can_be():

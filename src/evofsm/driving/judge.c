@@ -74,7 +74,7 @@ static void filter(evofsm_state *s, const double now[3]) {
     }
   }
   at[1] = greater(at[1], 0.0);
-  at[2] = greater(at[2], 0.0);
+  at[2] = at[2] < ONCOMING ? at[2] : greater(at[2], 0.0);
 }
 
 static void locate(evofsm_state *s, const double now[3]) {
@@ -109,14 +109,22 @@ static double drive_on(double *speed, double acceleration, double dt) {
   return reached >= 0.0 ? 0.5 * (was + reached) * dt : -0.5 * was * was / acceleration;
 }
 
+/* _speeds: as they are rehearsed; one that comes towards oneself stands, approached faster. */
+static void speeds(const double here[3], double *speed, double *leader) {
+  const int is_oncoming = here[2] < ONCOMING;
+  *speed = is_oncoming ? greater(here[1], 0.0) - here[2] : greater(here[1], 0.0);
+  *leader = is_oncoming ? 0.0 : greater(here[2], 0.0);
+}
+
 /* Whether no collision comes of an acceleration and full braking after it, for a smallest gap. */
 static int survives(const double here[3], double acceleration, double before, double leader_decel,
                     double clearance) {
   const double caution = -DECEL;
-  double gap = here[0] - clearance, speed = greater(here[1], 0.0), leader = greater(here[2], 0.0);
+  double gap = here[0] - clearance, speed, leader;
   double asked = greater(acceleration, caution), last = greater(before, caution);
   double left, closing;
   int t;
+  speeds(here, &speed, &leader);
   if (speed <= 0.0 && greater(asked, last) <= 0.0) {
     return here[0] > 0.0;
   }
@@ -278,7 +286,7 @@ static int decide_by_risk(evofsm_state *s, const double here[3], int *reason) {
     return closest(s, LOWEST, INFINITY);
   }
   *reason = EVOFSM_CHANGED;
-  best = is_whole(here) ? in_proportion(s, here, limit, reason) : -1;
+  best = is_whole(here) && here[2] >= ONCOMING ? in_proportion(s, here, limit, reason) : -1;
   if (best >= 0) {
     s->revising = best != 0;
     return best;

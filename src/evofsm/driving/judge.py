@@ -28,7 +28,7 @@ from evofsm.driving.brakes import OwnBrakes, hardest_seen
 from evofsm.driving.leaders import BrakeWatch, LeaderBrakes, Manoeuvres, is_another
 from evofsm.driving.naming import LABELS, RANGES
 from evofsm.driving.perception import Estimate, Perception, is_whole
-from evofsm.driving.rehearsal import HARDEST, Body, Three, critical_decelerations, foresee
+from evofsm.driving.rehearsal import HARDEST, ONCOMING, Body, Three, critical_decelerations, foresee
 from evofsm.driving.revisers import GENTLE_BRAKE
 from evofsm.fsm.kernels import compiled, inner_kernel
 from evofsm.fsm.machine import EvolvingFSM
@@ -303,7 +303,7 @@ class LatentRisk(Retraced, LearningJudge):
         to avoid the collision that is foreseen.
         """
         here = self._cautious(situation.observation)
-        if not is_whole(here):
+        if not is_whole(here) or here[2] < ONCOMING:  # who goes on so is hit, however one brakes
             return None
         foreseen = self._foreseen(here, self._leader_braking(situation), options, tolerances[-1])
         return in_proportion(options, judged.risk, tolerances, self.comfort, *foreseen)
@@ -393,6 +393,7 @@ class LatentRisk(Retraced, LearningJudge):
             **{"DECEL": self.brakes.decel, "LAG": self.brakes.lag, "LIKELY": self.brakes._likely},
             **{"KNOWN": self.brakes.known, "LOWEST": self.lowest, "CLEARANCE": self.margin},
             **{"HARDEST": HARDEST, "HALVINGS": rehearsal._HALVINGS, "STANDS": _STANDS},
+            "ONCOMING": ONCOMING,
             **{"COMFORT": self.comfort, "REGAIN": self.regain, "TOUCHING": rehearsal._TOUCHING},
             "WORST": self.manoeuvres.exceeded_by(reviser.tolerance),
             **{"ANOTHER_GAP": leaders._ANOTHER_GAP, "ANOTHER_SPEED": leaders._ANOTHER_SPEED},

@@ -17,7 +17,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from evofsm.driving.rehearsal import Three
+from evofsm.driving.rehearsal import ONCOMING, Three
 from evofsm.fsm.kernels import compiled
 
 # Gap [m], speed of the follower and of the leader [m/s], or what is said of each of them.
@@ -178,7 +178,8 @@ def _filtered(
             gain = row[j] / total
             for k in range(3):
                 spread[j, k] -= gain * row[k]
-    return (mean[0], max(mean[1], 0.0), max(mean[2], 0.0)), (
+    mean[2] = mean[2] if mean[2] < ONCOMING else max(mean[2], 0.0)
+    return (mean[0], max(mean[1], 0.0), mean[2]), (
         (spread[0, 0], spread[0, 1], spread[0, 2]),
         (spread[1, 0], spread[1, 1], spread[1, 2]),
         (spread[2, 0], spread[2, 1], spread[2, 2]),

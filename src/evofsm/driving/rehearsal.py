@@ -4,6 +4,9 @@ The follower does what is asked of it for one decision interval and then brakes 
 brakes from now on until it stands. The *critical deceleration* is the hardest braking of the leader
 that ends without a collision. `foresee` asks what comes of an action if the leader goes on as it is
 seen, and whether the gap is safe again some seconds later.
+
+One that comes towards oneself is rehearsed as one that stands, approached at the closing speed:
+whoever brakes in full then stands in time for it to stop as well, braking as hard.
 """
 
 from __future__ import annotations
@@ -24,6 +27,8 @@ _TOUCHING = 0.1
 # Halvings of [0, HARDEST] in search of the critical deceleration: to 0.015 m/s².
 _HALVINGS = 10
 
+#: Below it a leader comes towards oneself; above, a sensor may show one that stands so [m/s].
+ONCOMING = -1.0
 #: Gap [m], speed of the follower and of the leader [m/s].
 Three: TypeAlias = tuple[float, float, float]
 
@@ -82,7 +87,7 @@ def foresee(
     asked, if that is harder. Then whether each, held for ``regain`` [s], has regained a gap in
     which who keeps the speed survives a leader that brakes by ``worst`` [m/s²].
     """
-    gap, speed, leader_speed = observation[0], max(observation[1], 0.0), max(observation[2], 0.0)
+    gap, (speed, leader_speed) = observation[0], _speeds(observation)
     room = max(gap, _TOUCHING)
     near, margin = (room, speed, leader_speed), min(body.margin, 0.5 * room)
     leader_distance, leader_end_speed = _drive_on(leader_speed, -braking, regain)
@@ -102,8 +107,7 @@ def survives(
 ) -> bool:
     """Whether no collision comes of ``acceleration`` now and full braking after it."""
     gap = observation[0] - body.margin
-    # Sensors may show a car that stands as one that rolls back.
-    speed, leader_speed = max(observation[1], 0.0), max(observation[2], 0.0)
+    speed, leader_speed = _speeds(observation)
     caution = -body.decel
     demand = max(acceleration, caution)
     last = max(body.before, caution)
@@ -124,6 +128,15 @@ def survives(
         return bool(gap + min(gap_change, 0.0) > 0.0)
     closing_speed = max(speed - leader_speed, 0.0)  # ... or where they are as fast as each other
     return bool(gap - 0.5 * closing_speed * closing_speed / (body.decel - leader_decel) > 0.0)
+
+
+@kernel
+def _speeds(observation: Three | Floats) -> tuple[float, float]:
+    """Own speed and the leader's as they are rehearsed: nobody drives backwards."""
+    speed, leader_speed = max(observation[1], 0.0), observation[2]
+    if leader_speed < ONCOMING:
+        return speed - leader_speed, 0.0
+    return speed, max(leader_speed, 0.0)
 
 
 @kernel

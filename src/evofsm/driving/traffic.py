@@ -1,8 +1,8 @@
 """Many cars instead of one leader: a scene of objects, its pairs, and a judge of the worst of them.
 
-Whoever is ahead, cuts in or crosses is a leader, and each is rehearsed as the one leader of
-`LatentRisk`. For whoever is behind, oneself is the leader: by the same rehearsal, in which it keeps
-its speed until it has reacted, own braking that is harder than it survives ends in a collision.
+Whoever is ahead, oncoming, cuts in or crosses is a leader, and each is rehearsed as the one leader
+of `LatentRisk`. For whoever is behind, oneself is the leader: by the same rehearsal, in which it
+keeps its speed until it has reacted, own braking harder than it survives ends in a collision.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from evofsm.driving.judge import LatentRisk, effective, in_proportion
 from evofsm.driving.naming import SPEEDS
+from evofsm.driving.rehearsal import ONCOMING
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.validation import Floats, real_array
@@ -62,6 +63,7 @@ class Role(Enum):
     """Where the other one of a pair is."""
 
     AHEAD = "ahead"
+    ONCOMING = "oncoming"
     CUTTING_IN = "cutting in"
     CROSSING = "crossing"
     BEHIND = "behind"  #: it follows, and oneself is its leader
@@ -141,9 +143,10 @@ def _pair(ego: list[float], obj: list[float], index: int) -> Pair | None:
     if apart < 0.0:
         # Who moves across behind is none of one's business.
         return None if crosses else Pair(Role.BEHIND, index, gap, vx, ego[3])
-    role = Role.AHEAD if free < 0.0 else Role.CUTTING_IN
+    in_path = Role.ONCOMING if vx < ONCOMING else Role.AHEAD
+    role = in_path if free < 0.0 else Role.CUTTING_IN
     braking = max(-ax, 0.0) if vx > 0.0 else 0.0
-    return Pair(Role.CROSSING if crosses else role, index, gap, ego[3], max(vx, 0.0), braking)
+    return Pair(Role.CROSSING if crosses else role, index, gap, ego[3], vx, braking)
 
 
 class TrafficRisk(ActionJudge):
@@ -231,6 +234,8 @@ class TrafficRisk(ActionJudge):
         for pair in ahead:
             pair_arguments = pair[2:5], pair.braking, options, tolerances[-1]
             two = self.ahead._foreseen(*pair_arguments, hardest=-float(options.min()))
+            if pair.v_leader < ONCOMING and not two[0].all():
+                return None  # who goes on so is hit, however one brakes
             avoids, regains = avoids & two[0], regains & two[1]
         avoids &= options <= options[0]
         bearable = options >= -self._survived(pairs)[0]
