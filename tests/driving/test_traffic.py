@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evofsm.driving import LatentRisk, Object, Scene, TrafficRisk, guard_for_traffic
+from evofsm.driving import LatentRisk, Object, Scene, TrafficRisk, guard_for_cars, guard_for_traffic
 from evofsm.driving.traffic import Role, pairs_of
 from evofsm.guard import Mode, Situation
 
@@ -172,3 +172,7 @@ def test_what_it_cannot_work_with_is_refused():
         guard_for_traffic(-4.0, HIGH, DECEL, INTERVAL, judge=judge())
     with pytest.raises(ValueError, match="no rows of 8"):
         decide([1.0, 2.0])
+    with pytest.raises(ValueError, match="own vx is -20; x counts along"):
+        decide(Scene(ME._replace(vx=-20.0)).rows(1))
+    with pytest.raises(ValueError, match=r"v_follower is -20; .*direction"):
+        guard_for_cars(LOW, HIGH).decide([8.0, -20.0, -5.0], 1.0)

@@ -74,7 +74,7 @@ def drive(seconds=2.0):
     """The leader at 10 Hz, the follower at 20 Hz and a little later."""
     found = [(0.1 * k, OTHER, odometry(50.0 + 1.8 * k, 18.0)) for k in range(round(10 * seconds))]
     return found + [
-        (0.05 * k + 0.01, EGO, odometry(1.0 * k, 20.0 - 0.05 * k))
+        (0.05 * k + 0.01, EGO, odometry(1.0 * k, max(20.0 - 0.05 * k, 0.0)))
         for k in range(round(20 * seconds))
     ]
 

@@ -18,7 +18,9 @@ from evofsm.guard.record import RECORD, Column
 VARIABLES, UNITS = ("gap", "v_follower", "v_leader"), ("m", "m/s", "m/s")
 #: What a speed of a car [m/s] can be, and what these three.
 SPEEDS = -150.0, 150.0
-RANGES = (-1e3, 1e6), SPEEDS, SPEEDS
+#: Nobody reverses faster: who seems to counts against the direction of travel [m/s].
+REVERSE = -5.0
+RANGES = (-1e3, 1e6), (REVERSE, SPEEDS[1]), SPEEDS
 
 # Up to these a gap [m] and a speed [m/s] are called so.
 Bands = Sequence[tuple[float, str]]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm.driving.judge import LatentRisk, effective, in_proportion
-from evofsm.driving.naming import SPEEDS
+from evofsm.driving.naming import REVERSE, SPEEDS
 from evofsm.driving.rehearsal import ONCOMING
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
@@ -125,6 +125,8 @@ def pairs_of(rows: ArrayLike) -> list[Pair]:
     if len(flat) % len(COLUMNS):
         raise ValueError(f"{len(flat)} numbers are no rows of {len(COLUMNS)}: {', '.join(COLUMNS)}")
     ego, *objects = flat.reshape(-1, len(COLUMNS)).tolist()
+    if ego[_SPEED] < REVERSE:
+        raise ValueError(f"own vx is {ego[_SPEED]:g}; x counts along one's direction of travel")
     whole = ((k, obj) for k, obj in enumerate(objects, 1) if not math.isnan(sum(obj)))
     pairs = [_pair(ego, obj, index) for index, obj in whole if obj[0] > 0.5]
     return sorted(filter(None, pairs), key=lambda pair: pair.gap)

@@ -582,8 +582,8 @@ class Guard:
         k = wrong.index(True)
         name = self.variables[k] if self.variables else f"observation[{k}]"
         return name, (
-            f"is {z[k]:g}; it must lie between {least[k]:g} and {most[k]:g} (in another unit, or "
-            "does it stand for what was not seen? That is NaN, in JSON null)"
+            f"is {z[k]:g}; it must lie between {least[k]:g} and {most[k]:g} (another unit, or "
+            "direction, or does it stand for what was not seen? That is NaN, in JSON null)"
         )
 
     def _count_missing(self, z: NDArray[np.float64]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from evofsm.driving import Object, Scene, TrafficRisk
-from evofsm.driving.naming import SPEEDS, VARIABLES
+from evofsm.driving.naming import REVERSE, SPEEDS, VARIABLES
 from evofsm.driving.traffic import PLACES, RATES, SIZES
 from evofsm.fsm.naming import visible
 from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
@@ -189,6 +189,8 @@ class Form:
             )
         ego, time, cars = told["ego"], told["time"], told["objects"]
         _refuse_nowhere(ego, "ego")
+        if ego.vx < REVERSE:
+            raise MessageError("ego.vx", f"is {ego.vx:g}; x counts along its direction of travel")
         for k, car in enumerate(cars):
             where = f"objects[{k}]"
             _refuse_nowhere(car, where)
