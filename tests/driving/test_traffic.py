@@ -45,6 +45,8 @@ def test_rows_hold_the_closest_and_zeros_where_there_is_none():
     rows = Scene(ME, [far, near]).rows(most=1).reshape(2, 8)
     assert rows[1].tolist() == [1.0, 120.0, 0.0, 20.0, 0.0, 5.0, 1.8, 0.0]
     assert not Scene(ME).rows(most=3)[8:].any()
+    aside = [Object("aside", 100.0 + k, 6.0, 0.0) for k in range(9)]
+    assert [pair.gap for pair in pairs_of(Scene(ME, [*aside, far, near]).rows(most=2))] == [15, 75]
 
 
 # -- The judge ---------------------------------------------------------------------------------

@@ -104,11 +104,17 @@ class Scene:
     """
 
     def __init__(self, own: Object, others: Sequence[Object] = ()) -> None:
-        #: Oneself, then the others, the closest along the road first.
-        self.objects = (own, *sorted(others, key=lambda obj: abs(obj.x - own.x)))
+        ego = [1.0, *own[1:]]
+
+        def rank(other: Object) -> tuple[bool, float]:
+            is_out = _pair(ego, [1.0, *other[1:]], 0) is None
+            return is_out, float(np.nan_to_num(abs(other.x - own.x)))
+
+        #: Oneself, then whom one may meet, then the others, the closest along the road first.
+        self.objects = (own, *sorted(others, key=rank))
 
     def rows(self, most: int) -> Floats:
-        """((most + 1) * 8,) ndarray: `COLUMNS` of oneself and the closest others; zeros else."""
+        """((most + 1) * 8,) ndarray: `COLUMNS` of oneself and the first others; zeros else."""
         rows = np.zeros((most + 1, len(COLUMNS)))
         for row, obj in zip(rows, self.objects, strict=False):
             row[:] = 1.0, *obj[1:]

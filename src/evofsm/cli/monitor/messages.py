@@ -24,7 +24,7 @@ from evofsm.store import LARGEST_OBSERVATION
 
 SCHEMA = 1  #: the version of the messages
 LONGEST = 1 << 16  #: a longer line is refused unread [byte]
-_MOST_OBJECTS = 64  # of a whole scene; of more the closest along the road count
+_MOST_OBJECTS = 64  # of a whole scene; of more the first of `Scene.objects` count
 _LETTERS = 40  # so much of what is refused is shown, and so long may a name be [letters]
 _LATEST = 1e11  # what is later than this is in another unit [s]
 #: What is said of lines of another kind.
