@@ -299,7 +299,7 @@ def ask(learnt: Learnt, decisions: int, seed: int = 1) -> Asked:
 
 def _asked(learnt: Learnt, decisions: int, chance: np.random.Generator) -> Iterator[Any]:
     system, guard = learnt
-    names = guard.reviser.risk.labels.names  # type: ignore[attr-defined]
+    labels = guard.reviser.risk.labels  # type: ignore[attr-defined]
     nothing = np.atleast_1d(no_action(guard.actions))
     low, high = (np.atleast_1d(end) for end in limits(guard.actions))
     episode, over, time, spread, blind = 0, True, 0.0, np.zeros(1), 0
@@ -338,7 +338,7 @@ def _asked(learnt: Learnt, decisions: int, chance: np.random.Generator) -> Itera
         state = -1 if situation.state is None else situation.state
         risks = revision.risk_proposed, revision.risk_executed, *revision.interval
         done = [np.atleast_1d(each) for each in (revision.executed, revision.advised)]
-        unseen = unseen_text(situation, names) if situation.intake else ""
+        unseen = unseen_text(situation, labels) if situation.intake else ""
         yield (
             row,
             (0.0, float(situation.intake), float(state)),

@@ -84,11 +84,18 @@ def test_one_leader_is_judged_as_by_the_kinematic_judge():
     np.testing.assert_array_equal(found.critical, expected.critical)
 
 
-def test_an_empty_road_has_no_risk_nor_has_what_is_not_seen_whole():
-    half_seen = scene(ahead(3.0, 0.0))
-    half_seen[9] = np.nan
-    for rows in (scene(), half_seen):
-        assert not judge().judge(at(rows), ACTIONS).risk.any()
+def test_an_empty_road_has_no_risk_but_of_what_is_not_seen_it_is_not_known():
+    assert not judge().judge(at(scene()), ACTIONS).risk.any()
+    near, far = ahead(3.0, 0.0), ahead(300.0, 15.0)
+    for column, risks in (("vx", (np.nan, 1.0)), ("ax", (1.0, 1.0)), ("width", (1.0, 1.0))):
+        unseen = near._replace(**{column: np.nan})
+        for others, risk in zip(((unseen, far), (unseen, near)), risks, strict=True):
+            revision = decide(scene(*others))
+            np.testing.assert_equal(revision.risk_proposed, risk)
+            assert f"not seen: object 1 {column}; " in revision.reason
+    assert decide(scene(near._replace(x=np.nan))).reason.endswith("its risk is not known yet")
+    unseen = decide(Scene(SLOWER._replace(vx=np.nan), [behind(60.0, 15.0)]).rows(2))
+    assert unseen.reason == "not seen: own vx; its risk is not known yet"
 
 
 def test_the_risk_is_that_of_the_worst_and_names_it():

@@ -393,14 +393,13 @@ class LatentRisk(Retraced, LearningJudge):
             **{"DECEL": self.brakes.decel, "LAG": self.brakes.lag, "LIKELY": self.brakes._likely},
             **{"KNOWN": self.brakes.known, "LOWEST": self.lowest, "CLEARANCE": self.margin},
             **{"HARDEST": HARDEST, "HALVINGS": rehearsal._HALVINGS, "STANDS": _STANDS},
-            "ONCOMING": ONCOMING,
             **{"COMFORT": self.comfort, "REGAIN": self.regain, "TOUCHING": rehearsal._TOUCHING},
             "WORST": self.manoeuvres.exceeded_by(reviser.tolerance),
             **{"ANOTHER_GAP": leaders._ANOTHER_GAP, "ANOTHER_SPEED": leaders._ANOTHER_SPEED},
             **{"LEADER": perception._LEADER, "UNEVEN": perception._UNEVEN, "CAUTION": _CAUTION},
             "DOUBT": perception._OWN if self.brakes.known else perception._OWN_UNKNOWN,
             **{"ANOTHER": perception._ANOTHER_LEADER, "EXACT": not any(self.perception.noise)},
-            "EVIDENCE": float(len(self.manoeuvres)),
+            **{"EVIDENCE": float(len(self.manoeuvres)), "ONCOMING": ONCOMING},
             **{"TABLE": self.manoeuvres.table.shape[1], "harder": self.manoeuvres.table},
             **{"noise": self.perception.noise, "option_low": lowest, "option_high": highest},
         }
@@ -468,7 +467,6 @@ def in_proportion(
             if risk[best] <= tolerances[-1]:
                 return best, "the closest that can"
             does = "regains a safe gap in time" if regains[best] else _AVOIDS
-            # Where less would avoid it, too, it brakes as hard as is comfortable.
             is_least = regains[best] or not (lower & (options > options[best])).any()
             more = "the least braking that" if is_least else "comfortable braking, which"
             return best, f"{more if best else 'it'} {does}"

@@ -4,9 +4,6 @@ The follower does what is asked of it for one decision interval and then brakes 
 brakes from now on until it stands. The *critical deceleration* is the hardest braking of the leader
 that ends without a collision. `foresee` asks what comes of an action if the leader goes on as it is
 seen, and whether the gap is safe again some seconds later.
-
-One that comes towards oneself is rehearsed as one that stands, approached at the closing speed:
-whoever brakes in full then stands in time for it to stop as well, braking as hard.
 """
 
 from __future__ import annotations
@@ -132,11 +129,9 @@ def survives(
 
 @kernel
 def _speeds(observation: Three | Floats) -> tuple[float, float]:
-    """Own speed and the leader's as they are rehearsed: nobody drives backwards."""
-    speed, leader_speed = max(observation[1], 0.0), observation[2]
-    if leader_speed < ONCOMING:
-        return speed - leader_speed, 0.0
-    return speed, max(leader_speed, 0.0)
+    """Own speed and the leader's; who comes towards oneself stands, approached so much faster."""
+    speed, leader_speed = max(observation[1], 0.0), max(observation[2], 0.0)
+    return speed - observation[2] * (observation[2] < ONCOMING), leader_speed
 
 
 @kernel

@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 
 from evofsm.driving import measures
-from evofsm.driving.naming import VARIABLES
+from evofsm.driving.naming import LABELS
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import Floats, positive
@@ -63,7 +63,7 @@ class EnvelopeReviser:
             return unjudged_revision(action, proposal, remark or "measure calls for nothing")
         reason = remark or f"measure calls for it: {danger:.3g}"
         if math.isnan(danger):
-            reason = unseen_text(situation, VARIABLES) or "danger unknown"
+            reason = unseen_text(situation, LABELS) or "danger unknown"
         return unjudged_revision(self.actions.low, proposal, reason)
 
     def described(self) -> dict[str, Any] | None:

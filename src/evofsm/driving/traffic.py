@@ -59,6 +59,17 @@ class Object(NamedTuple):
     ax: float = 0.0  #: [m/s²]
 
 
+# What is not seen of an object is as of most; where it is, and how fast, nobody can guess.
+_USUAL = [math.nan] * 5 + [Object._field_defaults[name] for name in COLUMNS[5:]]
+
+
+class _SceneLabels(Labels):
+    def variable(self, index: int) -> str:
+        """Whose number it is, and which."""
+        number, column = divmod(index, len(COLUMNS))
+        return f"{f'object {number}' if number else 'own'} {COLUMNS[column]}"
+
+
 class Role(Enum):
     """Where the other one of a pair is."""
 
@@ -104,14 +115,10 @@ class Scene:
     """
 
     def __init__(self, own: Object, others: Sequence[Object] = ()) -> None:
-        ego = [1.0, *own[1:]]
-
-        def rank(other: Object) -> tuple[bool, float]:
-            is_out = _pair(ego, [1.0, *other[1:]], 0) is None
-            return is_out, float(np.nan_to_num(abs(other.x - own.x)))
-
+        near = sorted(others, key=lambda obj: np.nan_to_num(abs(obj.x - own.x)))
+        near.sort(key=lambda obj: _pair([1.0, *own[1:]], [1.0, *obj[1:]], 0) is None)
         #: Oneself, then whom one may meet, then the others, the closest along the road first.
-        self.objects = (own, *sorted(others, key=rank))
+        self.objects = (own, *near)
 
     def rows(self, most: int) -> Floats:
         """((most + 1) * 8,) ndarray: `COLUMNS` of oneself and the first others; zeros else."""
@@ -125,12 +132,14 @@ def pairs_of(rows: ArrayLike) -> list[Pair]:
     """With whom one may meet, the closest first, from a scene's `Scene.rows`.
 
     An object is in one's lane where their sides overlap; it cuts in, or crosses if it moves across
-    more than along the road, where they will within 2 s. Rows that hold NaN are left out.
+    more than along the road, where they will within 2 s. Rows without a place or speed (NaN) are
+    left out; sizes that are not seen are usual ones, an acceleration 0.
     """
     flat = real_array("rows", rows, 1)
     if len(flat) % len(COLUMNS):
         raise ValueError(f"{len(flat)} numbers are no rows of {len(COLUMNS)}: {', '.join(COLUMNS)}")
-    ego, *objects = flat.reshape(-1, len(COLUMNS)).tolist()
+    table = flat.reshape(-1, len(COLUMNS))
+    ego, *objects = np.where(np.isnan(table), _USUAL, table).tolist()
     if ego[_SPEED] < REVERSE:
         raise ValueError(f"own vx is {ego[_SPEED]:g}; x counts along one's direction of travel")
     whole = ((k, obj) for k, obj in enumerate(objects, 1) if not math.isnan(sum(obj)))
@@ -151,8 +160,7 @@ def _pair(ego: list[float], obj: list[float], index: int) -> Pair | None:
     if apart < 0.0:
         # Who moves across behind is none of one's business.
         return None if crosses else Pair(Role.BEHIND, index, gap, vx, ego[3])
-    in_path = Role.ONCOMING if vx < ONCOMING else Role.AHEAD
-    role = in_path if free < 0.0 else Role.CUTTING_IN
+    role = (Role.ONCOMING if vx < ONCOMING else Role.AHEAD) if free < 0.0 else Role.CUTTING_IN
     braking = max(-ax, 0.0) if vx > 0.0 else 0.0
     return Pair(Role.CROSSING if crosses else role, index, gap, ego[3], vx, braking)
 
@@ -195,12 +203,12 @@ class TrafficRisk(ActionJudge):
         self.ahead = ahead
         # Judges the one that follows, of which oneself is the leader.
         self._behind = LatentRisk.given(-_BEHIND, _BEHIND, _BEHIND, _REACTION)
-        self.labels = Labels(dt=ahead.dt)
+        self.labels = _SceneLabels(dt=ahead.dt)
         #: The worst pair of the first action that was judged last; None where there is none.
         self.worst: Pair | None = None
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
-        """Risk of each acceleration [m/s²]: the highest of all pairs."""
+        """Risk of each acceleration [m/s²], the highest of all pairs; 0 is NaN if one is unseen."""
         actions = np.ascontiguousarray(actions, np.float64)
         zeros = np.zeros(len(actions))
         worst = Judgement(zeros, zeros, zeros, zeros + math.inf, 0.0)
@@ -215,16 +223,20 @@ class TrafficRisk(ActionJudge):
             worst = _worse(worst, judgement)
         # Who does not brake is hit by nobody that it has to mind.
         limit, follower = self._survived(pairs) if hardest > 0.0 else (math.inf, None)
-        if hardest <= limit:
-            return worst
-        hit = np.where(actions < -limit, 1.0, 0.0)
-        if self.worst is None or hit[0] > worst.risk[0]:
-            self.worst = follower
-        return _worse(worst, Judgement(hit, hit, hit, zeros + math.inf, 0.0))
+        if hardest > limit:
+            hit = np.where(actions < -limit, 1.0, 0.0)
+            if self.worst is None or hit[0] > worst.risk[0]:
+                self.worst = follower
+            worst = _worse(worst, Judgement(hit, hit, hit, zeros + math.inf, 0.0))
+        rows = situation.observation.reshape(-1, len(COLUMNS))
+        if worst.risk[0] == 0.0 and np.isnan(rows[rows[:, 0] != 0.0, :5]).any():
+            unknown = zeros + math.nan
+            return worst._replace(risk=unknown, low=unknown, high=unknown)
+        return worst
 
     def _survived(self, pairs: Sequence[Pair]) -> tuple[float, Pair | None]:
         """The hardest braking of oneself that all behind survive [m/s²], and who survives least."""
-        behind = [pair for pair in pairs if pair.role is Role.BEHIND]
+        behind = [p for p in pairs if p.role is Role.BEHIND and not math.isnan(p.v_leader)]
         limits = [float(self._behind.critical(pair.observation, _COASTING)[0]) for pair in behind]
         return min(zip(limits, behind, strict=True), key=itemgetter(0), default=(math.inf, None))
 

@@ -7,7 +7,6 @@ arXiv:2006.08092).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from enum import Enum
 from functools import partial
 from typing import NamedTuple
@@ -195,7 +194,7 @@ class ActionReviser:
         index, advice = best if acts else 0, fixed(options[best])
         if not acts and best != 0:
             reason = f"{self.passing or self.mode.value}: {reason}"
-        unseen = unseen_text(situation, self.risk.labels.names) if situation.intake else ""
+        unseen = unseen_text(situation, self.risk.labels) if situation.intake else ""
         # Of a situation that is new: whether it is dangerous is another question.
         new = "never seen before" if judgement.seen < _NEW else ""
         return Revision(
@@ -275,10 +274,10 @@ class ActionReviser:
         return int(distances(self.actions, options, action).argmin())
 
 
-def unseen_text(situation: Situation, variables: Sequence[str]) -> str:
+def unseen_text(situation: Situation, labels: Labels) -> str:
     """What is said of a situation that was not seen whole, or not in time."""
     if gaps := np.flatnonzero(np.isnan(situation.observation)).tolist():
-        return f"not seen: {', '.join(map(Labels(names=tuple(variables)).variable, gaps))}"
+        return f"not seen: {', '.join(map(labels._replace(units=()).variable, gaps))}"
     return "nothing new was seen" if situation.intake & STALE else ""
 
 
