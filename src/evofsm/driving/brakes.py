@@ -62,7 +62,7 @@ class OwnBrakes:
         self.lag = min(max(products / squares, 0.0), 1.0) if squares > 0.0 else 0.0
 
     def trust(self, decel: float) -> None:
-        """Take full braking as known [m/s²], positive."""
+        """Take full braking as known [m/s²], positive; slow to come it is better given as less."""
         self.remember([(decel, True)] * _FEWEST)
 
     def remember(self, samples: Iterable[tuple[float, float]]) -> None:

@@ -152,8 +152,8 @@ def assumptions(brakes: float, tolerance: float) -> str:
     """What such a guard reckons with, in a line."""
     share = (1 + LEADERS.counts[-1]) / (1 + sum(LEADERS.counts))
     return (
-        f"assumed: the own car brakes with {brakes:g} m/s² (--brakes), {share:.0%} of leaders' "
-        f"hard brakes are in full ({_FULL:g} m/s²), the others as in public drives; "
+        f"assumed: the own car brakes with {brakes:g} m/s², at once (--brakes), {share:.0%} of "
+        f"leaders' hard brakes are in full ({_FULL:g} m/s²), the others as in public drives; "
         f"a risk of {tolerance:.3g} is accepted (--tolerance)"
     )
 

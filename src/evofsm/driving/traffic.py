@@ -47,7 +47,7 @@ _SPEED = COLUMNS.index("vx")
 
 
 class Object(NamedTuple):
-    """Something on the road, along which x is counted."""
+    """Something on the road; x is counted along it, in one's own direction of travel."""
 
     id: str
     x: float  #: of its centre, along the road [m]
