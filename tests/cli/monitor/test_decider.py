@@ -162,8 +162,8 @@ def test_a_scene_names_who_is_ahead_and_a_change_begins_anew():
     ego = {"x": 0.0, "lane": 0, "vx": 20.0, "length": 5.0}
     car = {"id": "a", "x": 40.0, "lane": 0, "vx": 20.0, "length": 5.0}
 
-    def seen(time, *objects):
-        told = {"time": time, "ego": ego, "objects": objects, "proposal": 0.5}
+    def seen(time, *objects, proposal=0.5):
+        told = {"time": time, "ego": ego, "objects": objects, "proposal": proposal}
         return decider.answer(json.dumps(told).encode())
 
     assert seen(0.0, car)["ahead"] == "a"
@@ -174,6 +174,9 @@ def test_a_scene_names_who_is_ahead_and_a_change_begins_anew():
     assert (gone["ahead"], gone["alarm"], gone["executed"]) == (None, False, 0.5)
     assert (gone["risk_proposed"], gone["reason"]) == (None, "nothing is ahead in the lane")
     assert seen(0.4, car)["n"] == 5
+    beyond, nothing = seen(0.5, proposal=99), seen(0.6, proposal=None)
+    assert (beyond["executed"], nothing["executed"]) == (2.5, -1.0)
+    assert beyond["reason"] == f"proposal 99 is outside [-6, 2.5]; {gone['reason']}"
 
 
 def test_a_judge_that_raises_is_answered_and_gone_on_after(monkeypatch):

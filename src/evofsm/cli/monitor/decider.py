@@ -26,7 +26,7 @@ from evofsm.driving.judge import SLIGHT, LatentRisk
 from evofsm.driving.traffic import COLUMNS, TrafficRisk
 from evofsm.fsm import EvolvingFSM
 from evofsm.fsm.validation import probability
-from evofsm.guard import ActionReviser, BoxActions, Foresight, Guard, LearntRisk, Mode
+from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.audit_log import AuditLog
 from evofsm.guard.reviser import is_spoken, make_usable
@@ -210,10 +210,10 @@ class Decider:
                 self.end(is_new, _numbers(row.observation) if is_new and counts else None)
             columns = slots.columns
             why = f"--failed {columns.failed}" if fails else f"not --where {columns.where}"
-            action = {} if self._is_alone else {"executed": plain(row.proposal)}
+            action = {"reason": why} if self._is_alone else self._unjudged(row, why)
             verdict = {"failed": is_new} if is_end else {"alarm": False}
             kind = "end" if is_end else "waiting"
-            return self._of(kind, time=row.time, **verdict, **action, reason=why, **last)
+            return self._of(kind, time=row.time, **verdict, **action, **last)
         if not slots.step:
             return self._decided(row)
         if (whole := slots.add(row)) is not None:
@@ -246,8 +246,8 @@ class Decider:
         self.n += 1
         leader = {} if row.ahead is None else {"ahead": row.ahead}
         if row.observation is None:  # nothing is ahead: whatever is wanted is done
-            body = dict.fromkeys(("proposed", "executed", "advised"), plain(row.proposal))
-            body |= dict.fromkeys(_RISKS) | {"reason": "nothing is ahead in the lane"}
+            body = self._unjudged(row, "nothing is ahead in the lane") | dict.fromkeys(_RISKS)
+            body |= {"proposed": plain(row.proposal), "advised": body["executed"]}
             body |= {"alarm": False, "mode": self._mode.value}
             return self._of("decision", time=row.time, ahead=None, **body, **note)
         try:
@@ -264,6 +264,13 @@ class Decider:
         self._alarm = self._is_alarm(revision)
         body |= {"reason": revision.reason, "alarm": self._alarm, "mode": self._mode.value}
         return self._of("decision", time=row.time, **leader, **self._worst(row), **body, **note)
+
+    def _unjudged(self, row: Row, why: str) -> Answer:
+        """What is executed where nothing is judged, made usable as before a decision, and why."""
+        proposal: Any = math.nan if row.proposal is None else row.proposal
+        action, remark = make_usable(Proposal(proposal), self.guard.actions, self.guard.fallback)
+        executed = int(action) if isinstance(self.guard.actions, Choices) else plain(action)
+        return {"executed": executed, "reason": "; ".join(filter(None, (remark, why)))}
 
     def _worst(self, row: Row) -> Answer:
         """Who of a scene the proposal is most dangerous with."""
