@@ -1,11 +1,14 @@
+import itertools
 import json
 
 import pytest
 
 from evofsm.cli.monitor.decider import Decider
+from evofsm.cli.monitor.slots import Slots
 from evofsm.driving import EnvelopeReviser, guard_for_cars, measures
 from evofsm.driving.cars import guard_of_monitor, guard_of_traffic
 from evofsm.guard import AuditLog, Guard, Mode, audit
+from evofsm.io import LogColumns
 from monitor_rows import closing_in as rows
 from monitor_rows import line
 
@@ -177,6 +180,32 @@ def test_a_scene_names_who_is_ahead_and_a_change_begins_anew():
     beyond, nothing = seen(0.5, proposal=99), seen(0.6, proposal=None)
     assert (beyond["executed"], nothing["executed"]) == (2.5, -1.0)
     assert beyond["reason"] == f"proposal 99 is outside [-6, 2.5]; {gone['reason']}"
+
+
+@pytest.mark.parametrize("rule", [None, "end", "leader==0"])
+def test_where_nobody_is_ahead_nothing_is_judged_and_lost_sight_is_no_free_road(rule):
+    decider = Decider(made(mode=Mode.ACT), slots=Slots(LogColumns(no_leader=rule)))
+    nobody = {"gap": None, "v_leader": None}
+
+    def seen(**changed):
+        row = next(rows(1)) | {"time": 0.1 * next(clock)} | changed
+        answer = decider.answer(line(row))
+        return answer["kind"], answer.get("executed")
+
+    clock = itertools.count()
+    free = ("waiting", 2.5)
+    assert [seen(**nobody, proposal=9), seen(**nobody, proposal=9)] == [free, free]
+    assert seen()[0] == "decision"
+    if rule == "leader==0":
+        assert seen(leader=0) == ("end", 0.5)
+        assert seen(leader=1)[0] == "decision"
+    if rule == "end":
+        assert seen(**nobody) == ("end", 0.5)
+    else:
+        assert seen(**nobody)[0] == seen(**nobody)[0] == "decision"
+        decider.answer(b'{"end": true}')
+    assert seen(**nobody, proposal=9) == free
+    assert seen(gap=None)[0] == "decision"  # but for v_leader
 
 
 def test_a_judge_that_raises_is_answered_and_gone_on_after(monkeypatch):

@@ -23,6 +23,7 @@ from evofsm.cli.options import TOLERANCE, ModeName, reading_of, refuse_other_lim
 from evofsm.cli.show import plain
 from evofsm.driving import Object, Scene
 from evofsm.driving.judge import SLIGHT, LatentRisk
+from evofsm.driving.naming import VARIABLES
 from evofsm.driving.traffic import COLUMNS, TrafficRisk
 from evofsm.fsm import EvolvingFSM
 from evofsm.fsm.validation import probability
@@ -41,6 +42,7 @@ _FAST = 60.0  # nothing on a road is faster [m/s]
 _LATE = 1.0  # what is older by less is late, by more from a sender that began anew [s]
 HOLE, _OFTEN = 1.5, 0.5  #: a gap in time, and rows that come too often, in intervals
 _VX, _AX = COLUMNS.index("vx"), COLUMNS.index("ax")
+_NOBODY = "as if nobody were ahead"
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
 
 Answer = dict[str, Any]
@@ -199,7 +201,8 @@ class Decider:
     def _taken(self, row: Row) -> Answer:
         """What a row brings, as it would in a log."""
         slots, before = self.slots, self.latest
-        counts, fails = slots.counts(row), slots.fails(row)
+        free, fails = self._free(row), slots.fails(row)
+        counts = not free and slots.counts(row)
         if fails or not counts:
             is_new = fails and not slots.fails(before)
             if is_new:
@@ -209,7 +212,7 @@ class Decider:
             if is_end:
                 self.end(is_new, _numbers(row.observation) if is_new and counts else None)
             columns = slots.columns
-            why = f"--failed {columns.failed}" if fails else f"not --where {columns.where}"
+            why = f"--failed {columns.failed}" if fails else free or f"not --where {columns.where}"
             action = {"reason": why} if self._is_alone else self._unjudged(row, why)
             verdict = {"failed": is_new} if is_end else {"alarm": False}
             kind = "end" if is_end else "waiting"
@@ -264,6 +267,17 @@ class Decider:
         self._alarm = self._is_alarm(revision)
         body |= {"reason": revision.reason, "alarm": self._alarm, "mode": self._mode.value}
         return self._of("decision", time=row.time, **leader, **self._worst(row), **body, **note)
+
+    def _free(self, row: Row) -> str:
+        """Why nobody counts as ahead: --no-leader, or none was seen in this drive; or nothing."""
+        rule, latest = self.slots.columns.no_leader, self.latest
+        unseen = [place for place, value in enumerate(row.observation or ()) if value is None]
+        is_blind = self.form.variables == VARIABLES and unseen == [0, 2]
+        if (is_blind and rule == "end") or self.slots.holds("--no-leader", row):
+            return f"{_NOBODY}: --no-leader {rule}"
+        is_first = not isinstance(latest, Row) or row.time < latest.time
+        is_first = is_first or _NOBODY in self._recent[-1][1].get("reason", "")
+        return f"{_NOBODY}: gap and v_leader are null" * (is_blind and is_first)
 
     def _unjudged(self, row: Row, why: str) -> Answer:
         """What is executed where nothing is judged, made usable as before a decision, and why."""

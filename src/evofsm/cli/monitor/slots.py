@@ -29,7 +29,8 @@ class Slots:
         self.hole = columns.longest_hole  #: up to which a hole costs no episode [s]
         self.names = columns.observe.names
         self._how = {} if scheme is None else scheme.how
-        texts = {"--where": columns.where, "--failed": columns.failed}
+        nobody = None if columns.no_leader == "end" else columns.no_leader
+        texts = {"--failed": columns.failed, "--where": columns.where, "--no-leader": nobody}
         self._conditions = {o: Condition.parse(t, o) for o, t in texts.items() if t is not None}
         every = [term for c in self._conditions.values() for term in c.terms]
         self.compared = [term.column for term in every if term.of_number]  #: with a number
@@ -52,17 +53,20 @@ class Slots:
         """What a row does not tell of what conditions name, in words."""
         pairs = zip(self.keys, row.told, strict=False) if isinstance(row, Row) else ()
         names = ", ".join(name for name, value in pairs if value is None)
-        return f"no {names} in the row, which --failed or --where names" if names else ""
+        return f"no {names} in the row, which {' or '.join(self._conditions)} names" * bool(names)
 
     def fails(self, row: Message | None) -> bool:
         """Whether a row meets what tells of failures."""
-        return isinstance(row, Row) and self._holds("--failed", row)
+        if not isinstance(row, Row) or self.holds("--no-leader", row):
+            return False
+        return self.holds("--failed", row)
 
     def counts(self, row: Row) -> bool:
         """Whether it does, or is left out; what a row does not tell is no reason."""
-        return "--where" not in self._conditions or self._holds("--where", row, unknown=True)
+        return "--where" not in self._conditions or self.holds("--where", row, unknown=True)
 
-    def _holds(self, option: str, row: Row, *, unknown: bool = False) -> bool:
+    def holds(self, option: str, row: Row, *, unknown: bool = False) -> bool:
+        """Whether a row meets the condition of an option; not where there is none."""
         if (condition := self._conditions.get(option)) is None:
             return False
         values: dict[str, Any] = {self.columns.action: row.proposal}
