@@ -273,3 +273,5 @@ def test_in_traffic_the_worst_object_is_named_and_who_is_behind_counts():
     refused = seen(0.3, flat | {"lane": 1}, ahead)
     assert (refused["kind"], refused["about"]) == ("error", "objects[0].lane")
     assert (decider.warm(), seen(0.4)["alarm"]) == (None, False)  # by a copy
+    roles = [seen(0.5 + 0.1 * k, beside | {"y": y})["role"] for k, y in enumerate((3.5, 3.4, 6.9))]
+    assert roles == [None, "cutting in", None]  # without vy; the last one leaps

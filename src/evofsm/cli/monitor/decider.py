@@ -24,7 +24,7 @@ from evofsm.cli.show import plain
 from evofsm.driving import Object, Scene
 from evofsm.driving.judge import SLIGHT, LatentRisk
 from evofsm.driving.naming import VARIABLES
-from evofsm.driving.traffic import COLUMNS, TrafficRisk
+from evofsm.driving.traffic import COLUMNS, RATES, TrafficRisk
 from evofsm.fsm import EvolvingFSM
 from evofsm.fsm.validation import probability
 from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, LearntRisk, Mode
@@ -41,8 +41,9 @@ _RECENT = 256  # so many of the latest messages are known again when they are se
 _FAST = 60.0  # nothing on a road is faster [m/s]
 _LATE = 1.0  # what is older by less is late, by more from a sender that began anew [s]
 HOLE, _OFTEN = 1.5, 0.5  #: a gap in time, and rows that come too often, in intervals
-_VX, _AX = COLUMNS.index("vx"), COLUMNS.index("ax")
-_NOBODY = "as if nobody were ahead"
+_AX, _VX, _VY, _Y = map(COLUMNS.index, ("ax", "vx", "vy", "y"))
+_CHANGES = (_AX, _VX, 0.0, RATES[1]), (_VY, _Y, 0.5, 20.0)  # else it jitters, or leaps
+_NOBODY = "gap and v_leader are null: nobody is taken to be ahead"
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
 
 Answer = dict[str, Any]
@@ -274,10 +275,10 @@ class Decider:
         unseen = [place for place, value in enumerate(row.observation or ()) if value is None]
         is_blind = self.form.variables == VARIABLES and unseen == [0, 2]
         if (is_blind and rule == "end") or self.slots.holds("--no-leader", row):
-            return f"{_NOBODY}: --no-leader {rule}"
+            return f"--no-leader {rule}"
         is_first = not isinstance(latest, Row) or row.time < latest.time
         is_first = is_first or _NOBODY in self._recent[-1][1].get("reason", "")
-        return f"{_NOBODY}: gap and v_leader are null" * (is_blind and is_first)
+        return _NOBODY * (is_blind and is_first)
 
     def _unjudged(self, row: Row, why: str) -> Answer:
         """What is executed where nothing is judged, made usable as before a decision, and why."""
@@ -331,7 +332,7 @@ class Decider:
             proposal = np.array(proposal)
         observation: Any = _numbers(row.observation)
         if self.form.scenes:
-            observation = _accelerating(row, before if isinstance(self.latest, Row) else None)
+            observation = _moving(row, before if isinstance(self.latest, Row) else None)
         return self._without_lost_audit(lambda: self.guard.decide(observation, proposal, row.time))
 
     def _without_lost_audit(self, call: Callable[[], _T]) -> _T:
@@ -383,17 +384,19 @@ def _refuse_stale(row: Row, latest: Row) -> None:
         raise MessageError("time", f"{date(row.time, ' s')} {text}", row.time)
 
 
-def _accelerating(row: Row, before: Row | None) -> NDArray[np.float64]:
-    """A scene with the accelerations that were not sent: since the scene before, else 0."""
+def _moving(row: Row, before: Row | None) -> NDArray[np.float64]:
+    """A scene with the rates that were not sent: since the scene before, else 0."""
     rows = np.array(_numbers(row.observation)).reshape(-1, len(COLUMNS))
     latest, step = {}, math.nan
     if before is not None and before.time < row.time:
         step = row.time - before.time
         last_rows = np.array(_numbers(before.observation)).reshape(-1, len(COLUMNS))
-        latest = dict(zip(("", *before.objects), last_rows[:, _VX].tolist(), strict=False))
+        latest = dict(zip(("", *before.objects), last_rows, strict=False))
     for name, values in zip(("", *row.objects), rows, strict=False):
-        if math.isnan(values[_AX]):
-            values[_AX] = (values[_VX] - latest[name]) / step if name in latest else 0.0
+        for rate, number, least, most in _CHANGES:
+            if math.isnan(values[rate]):
+                change = (values - latest[name])[number] / step if name in latest else 0.0
+                values[rate] = change if least <= abs(change) <= most else 0.0
     return rows.ravel()
 
 

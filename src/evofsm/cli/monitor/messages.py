@@ -87,7 +87,7 @@ class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     id: _Name | UnsetType = UNSET
     y: _Place | UnsetType = UNSET
     lane: _Number | _Name | UnsetType = UNSET
-    vy: _Speed = 0.0
+    vy: _Speed | UnsetType = UNSET
     width: _Size = _USUAL_WIDTH
     ax: _Rate | UnsetType = UNSET
 
@@ -241,8 +241,8 @@ def _object(car: _Vehicle, where: str) -> Object:
     if car.y is UNSET:
         raise MessageError(f"{where}.y", "is missing; it says who is in whose way")
     name = where if car.id is UNSET else str(car.id)
-    ax = math.nan if car.ax is UNSET else car.ax
-    return Object(name, car.x, car.y, car.vx, car.vy, car.length, car.width, ax)
+    vy, ax = (math.nan if rate is UNSET else rate for rate in (car.vy, car.ax))
+    return Object(name, car.x, car.y, car.vx, vy, car.length, car.width, ax)
 
 
 def _nearest_ahead(ego: _Vehicle, objects: list[_Vehicle]) -> tuple[float, _Vehicle] | None:
