@@ -128,6 +128,8 @@ def test_a_scene_is_the_nearest_object_ahead_in_the_lane():
     further = TRUCK | {"id": 4, "x": 190.0}
     row = FORM.read(scene(beside, behind, further, TRUCK))
     assert row == Row(2.0, (40.0, 20.0, 15.0), 0.0, "truck")
+    for lane in (str(EGO["lane"]), float(EGO["lane"])):
+        assert FORM.read(scene(beside, TRUCK, lane=lane)) == row
     assert FORM.read(scene()) == Row(2.0, None, 0.0)
     ego = {"x": 0.0, "y": 0.0, "vx": 20.0, "length": 5.0}
     one = {"id": 1, "x": 30.0, "y": 1.0, "vx": 15.0, "length": 5.0, "width": 2.0}

@@ -258,7 +258,7 @@ def _nearest_ahead(ego: _Vehicle, objects: list[_Vehicle]) -> tuple[float, _Vehi
 def _in_lane(ego: Any, car: Any) -> bool:
     """Whether it is in the own lane; by their widths where a lane is not given."""
     if ego.lane is not UNSET and car.lane is not UNSET:
-        return bool(ego.lane == car.lane)
+        return len({str(x.lane).removesuffix(".0") for x in (ego, car)}) == 1  # 1, 1.0 and "1"
     return bool(abs(car.y - ego.y) < 0.5 * (ego.width + car.width))
 
 
