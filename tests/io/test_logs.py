@@ -678,6 +678,9 @@ def test_times_may_be_dates(tmp_path, texts, point):
         (chunk,) = read(one)
         assert chunk.times == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-12)
         assert (chunk.dt, chunk.starts.tolist()) == (0.1, [0])
+    if texts is not ZONED:
+        (chunk,) = read(path, units={"time": f"%Y-%m-%d %H:%M:%S{point}%f"})
+        assert chunk.times[-1] == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize(

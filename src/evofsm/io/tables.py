@@ -855,6 +855,7 @@ def _microseconds(
         if not form and (match := _DAY_FIRST.match(str(texts.first()))):
             form = f"%d.%m.%{'Y' if match[1] else 'y'} %H:%M{':%S' if match[2] else ''}"
             parts = "%.f" if match[2] else ""
+        form = form.replace(",%f", ".%f").replace(".%f", "%.f").replace("%f", "%6f")  # as polars
         if "," not in form and texts.str.contains(",", literal=True).any():
             texts = texts.str.replace(r",\s+", " ").str.replace(",", ".", literal=True)
         try:
