@@ -135,7 +135,7 @@ NUMBERS = st.floats(-1e90, 1e90) | st.integers(-(10**20), 10**20) | st.floats(-9
 @settings(max_examples=150, deadline=None)
 @given(
     rows=st.lists(st.tuples(NUMBERS, FIELDS, NUMBERS), min_size=1, max_size=12),
-    separator=st.sampled_from(",;\t"),
+    separator=st.sampled_from(",;\t|"),
     end=st.sampled_from(["\n", "\r\n", "\n\n"]),
     quoting=st.sampled_from([csv.QUOTE_MINIMAL, csv.QUOTE_ALL, csv.QUOTE_NONNUMERIC]),
     size=st.sampled_from([1, 40, 1 << 20]),

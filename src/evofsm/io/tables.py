@@ -490,7 +490,7 @@ class Dialect:
             self.units, rows = dict(zip(self.columns, units, strict=False)), rows[self.n_told :]
         self.first_row = rows[0] if rows else []
         commas = map(_DECIMAL_COMMA.fullmatch, [t for row in rows for t in row])
-        self.has_commas = self.separator == ";" or (self.separator == "\t" and any(commas))
+        self.has_commas = self.separator == ";" or (self.separator in "\t|" and any(commas))
 
     def miscounted(self, count: int, named: int) -> str:
         """What is wrong with a line of so many fields."""
@@ -499,7 +499,7 @@ class Dialect:
 
 
 class CsvTable(Table):
-    """A CSV file, gzipped or not, with a header; fields end at a comma, semicolon, tab or space.
+    """A CSV file, gzipped or not, with a header; fields end at a comma, semicolon, tab, | or space.
 
     The header is the line that has most of the names that are looked for; one further down names
     the columns anew. polars reads blocks of plain lines; Python's own reader, which is slower,
@@ -770,7 +770,7 @@ def _count(block: bytes | bytearray, byte: bytes) -> int:
 
 
 def _separator(line: str) -> str:
-    return max(",;\t", key=line.count) if re.search("[,;\t]", line) else " "
+    return max(",;\t|", key=line.count) if re.search("[,;\t|]", line) else " "
 
 
 def _fields(line: str, separator: str) -> list[str]:
