@@ -47,6 +47,8 @@ def test_a_guard_is_written_in_c_and_for_cpp_to_a_folder(evofsm, refused, driven
     assert "gap" in header
     assert "#define EVOFSM_VARIABLES 3\n" in header
     assert "name a file, of c99 a folder, by --out" in refused("export", out, "--to", "c99")
+    unfit = "export", out, "--to", "fmu", "--prefix", "cars", "--out", tmp_path / "cars.fmu"
+    assert "--prefix is of other formats than --to fmu" in refused(*unfit)
     named = evofsm("export", out, "--to", "c99", "--prefix", "cars", "--out", tmp_path / "c")
     assert "int cars_decide(" in (tmp_path / "c" / "cars.h").read_text(), named.stderr
     assert "\n#define ACTS 0\n" in (tmp_path / "c" / "cars.c").read_text()

@@ -377,7 +377,7 @@ def test_a_guard_from_zero_where_nobody_acts_learns_as_it_goes(evofsm, pump):
         rows = sent(part, "rows.jsonl")
         done = evofsm("monitor", rows, *asked, "--state", "pump.evofsm")
         assert done.exit_code == 0, done.stderr
-        for said in (f"a guard of {VIBRATION}, {BEARING} begins", "ready: reads rows.jsonl"):
+        for said in (f"a guard of {VIBRATION}, {BEARING} learns", "ready: reads rows.jsonl"):
             assert said in done.stderr
         answers = [json.loads(line) for line in done.stdout.splitlines()]
         for before, end in pairwise(answers):

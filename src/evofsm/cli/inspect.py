@@ -116,7 +116,7 @@ def export(
         option("Graph for Graphviz, process for PRISM and Storm; the guard in C, or as an FMU."),
     ],
     out: Annotated[Path | None, option("File to write, else printed; of c99 a folder.")] = None,
-    prefix: Annotated[str, option("Of c99: how all names in it begin.")] = "evofsm",
+    prefix: Annotated[str | None, option("Of c99: how names begin. [default: evofsm]")] = None,
     mode: Annotated[ModeName | None, option("Of c99, fmu: act filters. [default: saved]")] = None,
     least: Annotated[
         float | None,
@@ -128,7 +128,12 @@ def export(
 ) -> None:
     """Write what was learnt, or driven, in the formats of other tools."""
     _refuse_learnt(out)
-    if to in ("c99", "fmu"):
+    is_code = to in ("c99", "fmu")
+    unfit: Any = {"--least": least, "--evidence": evidence} if is_code else {"--mode": mode}
+    unfit |= {} if to == "c99" else {"--prefix": prefix}
+    if names := [name for name, value in unfit.items() if value is not None]:
+        raise ValueError(f"{names[0]} is of other formats than --to {to}")
+    if is_code:
         from evofsm.guard import Foresight, Guard, Mode
         from evofsm.guard.export import write_c99, write_fmu
 
@@ -141,7 +146,7 @@ def export(
             raise ValueError(f"{file}: {why}; run `evofsm monitor` beside the machine")
         if mode and hasattr(guard.reviser, "mode"):
             guard.reviser.mode = Mode(mode)
-        return write_c99(guard, out, prefix) if to == "c99" else write_fmu(guard, out)
+        return write_c99(guard, out, prefix or "evofsm") if to == "c99" else write_fmu(guard, out)
     from evofsm import store
     from evofsm.cli import models
     from evofsm.driving import LatentRisk, dead_ends_of

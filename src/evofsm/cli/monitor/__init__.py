@@ -199,7 +199,7 @@ def monitor(
         if guard is not None:
             notice = f"assumed: what {guard} was given and has learnt"
         if new_guard:
-            notice = f"a guard of {', '.join(sentry.variables)} begins, and learns from what comes"
+            notice = f"a guard of {', '.join(sentry.variables)} learns from what comes"
         if summary and file is not None:
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
 
@@ -221,7 +221,8 @@ def monitor(
             transport.source.seek(keeper.pass_over(file, decider))
         warn(notice)
         if slots is not None and reader:
-            warn(f"rows are read as in a log: {options.typed(reader)}")
+            si = "; in JSON all but its column of the time is in the SI" * ("unit" in reader)
+            warn(f"rows are read as in a log: {options.typed(reader)}{si}")
         warn(f"ready: {where}")
         try:
             server.run(transport)
