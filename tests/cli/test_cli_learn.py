@@ -8,8 +8,11 @@ import re
 import pytest
 from tests.test_recipes import write
 
+from evofsm.cli.options import read_with, reading_of
+from evofsm.cli.watch.session import watched_log
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.rules import Novelty, Paper
+from evofsm.guard import Guard
 from evofsm.io import tables
 
 
@@ -179,8 +182,11 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
     wrong, answer, fast = map(json.loads, answers)
     assert fast["note"] == f"{keys[1]} is above 60 m/s: is that km/h?"
     assert (wrong["about"], wrong["error"]) == (keys[0], 'is "near"; it must be float or null')
-    asked = ("monitor", own, *OWN[2:], *options[:2], "--guard", path, "--summary")
-    summed = evofsm(*asked, *(OWN[:2] if judge == "kinematic" else ()))
+    summed = evofsm("monitor", own, *OWN[2:], *options[:2], "--guard", path, "--summary")
+    live = evofsm("monitor", own, "--guard", path).stdout  # as CSV
+    assert ("decision" in live, "error" in live) == (True, False)
+    watched = watched_log(str(own), reading_of(**read_with(path)), guard=Guard.load(path))
+    assert watched.system.of_cars == (judge == "kinematic")
     assert "failures  3; 3 in alarm by then, for " in summed.stdout
     assert answer["alarm"]
     assert answer["mode"] == "shadow"

@@ -136,7 +136,8 @@ def monitor(
             raise ValueError("--traffic is of cars, and goes with no --observe or --action")
         new_guard, learn = begun({**system}, reading, interval, tolerance, alarms), True
     defaults = options.read_with(guard or state)
-    defaults.pop("observe", None)
+    learnt_of = defaults.pop("observe", None)
+    observe = observe or learnt_of
     log_episode = defaults.pop("episode", None)
     if is_log and episode is None:
         episode = log_episode
@@ -192,7 +193,8 @@ def monitor(
         sentry = fresh() if keeper is None else keeper.guard(fresh, failed)
         prepare(sentry, mode, (tolerance, false_a_day), audit, stack, learn=learn)
         if not (is_log or traffic):
-            observe = options.quoted(sentry.variables or VARIABLES)
+            if observe is None or sentry.variables != VARIABLES:  # cars' may have other names
+                observe = options.quoted(sentry.variables or VARIABLES)
             slots = Slots(options.reading_of(**{**reader, "observe": observe, "dt": None}))
         decider = Decider(sentry, episode=rows, slots=slots)
         notice = assumptions(brakes, accepted_risk)

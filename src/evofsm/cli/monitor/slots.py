@@ -116,19 +116,20 @@ class CsvRows:
 
     def __init__(self, slots: Slots, variables: Sequence[str], *, acts: bool) -> None:
         self._columns = columns = slots.columns
-        self._variables, action = variables, [columns.action] if acts else []
-        self._numbers = {*variables, *action, *slots.compared}
+        self._variables, action = slots.names[: len(variables)], [columns.action] if acts else []
+        self._numbers = {*self._variables, *action, *slots.compared}
         if "%" not in columns.units.get(columns.time, ""):
             self._numbers.add(columns.time)
-        names = *variables, *slots.keys, *columns.time.split(","), "proposal"
+        names = *self._variables, *slots.keys, *columns.time.split(","), "proposal"
         #: What messages call the columns that are read.
-        self._called = dict(zip(names, names, strict=True)) | dict.fromkeys(action, "proposal")
+        self._called = dict(zip(names, (*variables, *names[len(variables) :]), strict=True))
+        self._called |= dict.fromkeys(action, "proposal")
         self._called[columns.time] = "time"
         self._count, self._factors = 0, dict[str, float]()
         self._head: list[str] = []  # the line with the names, and those below to the first row
         self._dialect: Dialect | None = None  # once that row has come
         self._may_be_title = not acts  # who drives along sends no log
-        self._needs = *variables, *columns.time.split(",")
+        self._needs = *self._variables, *columns.time.split(",")
         self._above: Sequence[str] = ()  # fields of the line before
         self._unread = ""  # why lines are no rows, as names are missing
         self.place, self.in_csv = "", False  #: of a line, as what is said of it begins

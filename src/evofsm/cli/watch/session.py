@@ -403,8 +403,9 @@ def watched_log(
     Of cars one is over with a contact, or one of ``collisions`` [s] that a simulation counted, by
     the name of who follows whom. ``case`` is the number of the one to begin with, from 1.
     """
-    names = columns.observe.names
-    of_cars = columns.acts and len(names) == len(VARIABLES) and (not guard or names == VARIABLES)
+    names, variables = columns.observe.names, guard.variables if guard else VARIABLES
+    if of_cars := columns.acts and variables == VARIABLES and len(names) == len(VARIABLES):
+        names = VARIABLES  # which may be called otherwise in the log
     if guard is None and not of_cars:
         raise ValueError(f"{path} is of no cars: --guard names a guard (evofsm learn --guard)")
     episodes = episodes_read(path, columns, Noted(), dated=not of_cars)
