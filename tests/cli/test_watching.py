@@ -283,3 +283,4 @@ def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
     for frame, told in frames:  # what it changes where it sees no danger, it changes for the margin
         story = frame.story
         assert ("by a margin" in told.done) == (story.danger is None and story.advised > 0)
+        assert ("came close" in told.when) == ("by a margin" in told.done)

@@ -71,6 +71,7 @@ def tell(frame: Frame, start: Start) -> Told:
     headline = headlines[status]
     if danger is None:
         when = "No danger was seen." if frame.over else "No danger so far."
+        when = "Some proposals came close." if story.advised else when
         why, response = _no_danger(frame, start), _quiet(frame, start)
     else:
         when, why = _when(start, story, danger, knows_leaders), _why(danger.began, start)
