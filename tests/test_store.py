@@ -120,7 +120,7 @@ def test_a_file_cut_off_anywhere_is_refused(whole, tmp_path):
     path = tmp_path / "cut"
     for length in range(len(whole)):
         path.write_bytes(whole[:length])
-        with pytest.raises(ValueError, match=f"{path} cannot be read as an evofsm file"):
+        with pytest.raises(ValueError, match=f"{path} cannot be loaded"):
             store.read(path, DRAWS)
 
 

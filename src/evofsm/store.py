@@ -484,7 +484,7 @@ def explained(place: Place) -> Iterator[None]:
         yield
     except _DAMAGE as error:
         why = str(error)[:300]  # it may quote a damaged file
-        raise ValueError(f"{_named(place)} cannot be read as an evofsm file: {why}") from error
+        raise ValueError(f"{_named(place)} cannot be loaded: {why}") from error
 
 
 def _opened(place: Place) -> AbstractContextManager[BinaryIO]:

@@ -311,7 +311,7 @@ def test_a_damaged_file_is_refused(tmp_path):
         (content, {**arrays, "judge": arrays["machine"]}),
     ):
         store.write(path, KIND, spoilt, files)
-        with pytest.raises(ValueError, match="cannot be read as an evofsm file"):
+        with pytest.raises(ValueError, match="cannot be loaded"):
             Guard.load(path)
 
 
