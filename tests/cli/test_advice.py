@@ -78,7 +78,7 @@ OPTIONS = {
         *(r"\((--unit ego_kmh=m/s): it is right", ""),
     ),
     "no scale": (
-        *(table("time,level,u"), LEVEL + " --rule novelty", r": (--scale level=2) \(", ""),
+        *(table("time,level,u"), LEVEL + " --rule novelty", r": (--scale) level=NUMBER", "level=2"),
     ),
     "no failures": (table("time,d,v,w,u"), OWN, r"cars in pairs (--judge kinematic) needs", ""),
     "no failures of a judge": (

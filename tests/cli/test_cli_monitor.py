@@ -135,6 +135,13 @@ def numbers_of(text):
     return [one for one in cells if one and one[0].replace(".", "").isdecimal()]
 
 
+def test_a_summary_says_that_rows_come_too_seldom(tmp_path):
+    file = tmp_path / "rows.jsonl"
+    file.write_bytes(b"".join(line(row) + b"\n" for row in closing_in(9, dt=1.0)))
+    said = " ".join(evofsm(file, "--summary").stdout.split())
+    assert "; they come every 1 s, and count as 0.1 s each (--interval)" in said
+
+
 @pytest.mark.slow
 def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(tmp_path):
     decider = Decider(guard_of_monitor(0.1, 5.0, 0.05))

@@ -328,7 +328,7 @@ def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]
     if omissions := [column for column in single if column not in scales]:
         raise ValueError(
             f"--rule novelty has to know the difference that counts as 1 in {omissions[0]!r}: "
-            f"--scale {quote(omissions[0])}=2 (a fifth of what it spans, or so)"
+            f"--scale {quote(omissions[0])}=NUMBER, a fifth of what it spans or so"
         )
     return [scales.get(name, 1.0) for name in encoder.names]
 
