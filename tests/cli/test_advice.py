@@ -66,6 +66,10 @@ OPTIONS = {
         *(table(gap=lambda k: -1 if k % 20 < 4 else 9 + k), ""),
         *(r"\? (--no-leader gap==-1.0) leaves", ""),
     ),
+    "65535 is nobody": (
+        *(table(gap=lambda k: 65535 if k % 20 < 4 else 9 + k), ""),
+        *(r"\? (--no-leader gap==65535.0) leaves", ""),
+    ),
     "km/h": (table(v_leader=lambda k: 70 + k / 9), "", r"\? (--unit v_leader=km/h) converts", ""),
     "ms": (table(time=lambda k: 100 * k), "", r"\? (--unit time=ms) converts", ""),
     "ns": (table(time=lambda k: EPOCH + 10**8 * k), "", r"\? (--unit time=ns) converts", ""),

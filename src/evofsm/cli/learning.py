@@ -174,7 +174,7 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
     if alone := [(name, *pair) for name, pair in noted.below.items() if pair[0] and pair[1] > 2]:
         name, value, rows = min(alone, key=lambda entry: entry[1] not in _NOBODY)
         warnings.append(
-            f"{name} is {value!r} in {rows:,} rows, and else never below 0: is that a missing "
+            f"{name} is {value!r} in {rows:,} rows, apart from all others: is that a missing "
             f"value{nobody}? --no-leader {quote(f'{name}=={value!r}')} leaves such rows out"
         )
     warnings += _contradictions(noted, columns)

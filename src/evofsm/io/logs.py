@@ -137,7 +137,7 @@ class Noted:
     compared: dict[str, list[Any]] = field(default_factory=dict)
     fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
     longest_step: float = 0.0  #: the usual one, beyond belief [s]
-    #: By variable, the number that it is below 0 (0 where there are several), and in how many rows.
+    #: By variable, the number below 0 or far out (0 where there are several), and in how many rows.
     below: dict[str, tuple[float, int]] = field(default_factory=dict)
     failed: int = 0  #: episodes
     failed_at_once: int = 0  #: of them, those with one row
@@ -156,7 +156,7 @@ class Noted:
         for name, values in zip(names, chunk.observations.T, strict=True):
             if _SPEED.match(name) and (fastest := float(np.abs(values).max())) > _FASTEST:
                 self.fastest[name] = max(fastest, self.fastest.get(name, 0.0))
-            if len(below := values[values < 0.0]):
+            if len(below := values[(values < 0.0) | are_stand_ins(values)]):
                 value, rows = self.below.get(name, (float(below[0]), 0))
                 self.below[name] = value if (below == value).all() else 0.0, rows + len(below)
         if chunk.dt > _LONGEST_USUAL:
