@@ -345,6 +345,7 @@ def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
         (["--action-range", "0:1:1e-9"], "more than 1000 intervals"),
         (["--horizon", "0"], "greater than or equal to 0.001"),
         (["--dt", "0"], "--dt is 0.0; it must be a positive"),
+        (["--dt", "20", "--guard", "new.evofsm"], "20 s from a decision to the next: too long for"),
         (["--out", "/no/such/folder/model"], "there is no folder"),
         (["--failed", "gap<"], "--failed is 'gap<'"),
         (["--failed", "gap<0<1"], "--failed is 'gap<0<1'"),

@@ -86,6 +86,8 @@ def guard_for_cars(
     'nothing was learnt yet'
     """
     actions = IntervalActions(low, high, width, outside="clip")
+    if machine is None and interval >= 2.0 * _SOON:
+        raise ValueError(f"{interval:g} s from a decision to the next: too long for cars (in ms?)")
     if judge == "kinematic":
         judge = LatentRisk(actions.low, interval)
     elif judge == "learnt":
