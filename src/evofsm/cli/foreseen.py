@@ -177,16 +177,15 @@ def _tables(
         row = [f"{alarm['stated']:g}"]
         for tally in (alarm["learnt"], alarm["plain"]):
             share, ahead = f"{tally['foreseen']} of {tally['failures']}", span(tally["lead"])
-            row += [share, ahead, f"{tally['false_a_day']:.2g}"]
-        if poisson_bounds(alarm["plain"]["false"])[0] > days * alarm["stated"]:
-            worse.append(k)  # they are no choice at this rate
-            row[4:6] = "-", "-"
+            star = "*" * bool(poisson_bounds(tally["false"])[0] > days * alarm["stated"])
+            row += [share, ahead, f"{tally['false_a_day']:.2g}{star}"]
+        worse += [k] * len(star)  # plain thresholds are no choice at this rate
         rows.append(row)
         if alarm["is_own"]:
             mean = f"(mean, {horizon} at most; not foreseen: 0)"
             text = f"{row[1]} failures foreseen, {row[2]} ahead {mean}"
-            text += f", {(false := alarm['learnt']['false']):,} false"
-            if poisson_bounds(false)[0] > days * alarm["stated"]:
+            text += f", {alarm['learnt']['false']:,} false"
+            if "*" in row[3]:
                 text += f": more than the {row[0]} a day that were stated, beyond what is by chance"
             bold = [k]
     episodes = counted(found["episodes"], "episode")
@@ -198,6 +197,7 @@ def _tables(
     pairs += [("failures", failures), ("alarms", text)]
     yield facts(title, pairs)
     title = "\nAlarms by the false ones a day that were stated, and plain thresholds"
+    title += " (*: more are false, beyond chance)" * any("*" in "".join(row) for row in rows)
     yield table(title, _HEADER, rows, bold=bold)
     yield from alarms_of(judge, worse)
     if rows := [[x["where"], f"{x['came']:,}", f"{x['failed']:,}"] for x in found["fails"]]:
