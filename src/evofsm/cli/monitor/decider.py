@@ -42,7 +42,7 @@ _FAST = 60.0  # nothing on a road is faster [m/s]
 _LATE = 1.0  # what is older by less is late, by more from a sender that began anew [s]
 HOLE, _OFTEN = 1.5, 0.5  #: a gap in time, and rows that come too often, in intervals
 _AX, _VX, _VY, _Y = map(COLUMNS.index, ("ax", "vx", "vy", "y"))
-_CHANGES = (_AX, _VX, 0.0, RATES[1]), (_VY, _Y, 0.5, 20.0)  # else it jitters, or leaps
+_CHANGES = (_AX, _VX, 0.0, RATES[1]), (_VY, _Y, 0.5, 20.0)  # less is noise, more a leap
 _NOBODY = "gap and v_leader are null: nobody is taken to be ahead"
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
 
