@@ -329,6 +329,22 @@ def test_what_is_terminated_has_failed_unless_somebody_says_otherwise(
     assert guard.machine.endings.sum() == failed
 
 
+def test_a_failure_that_lasts_is_one_and_what_comes_after_it_another_episode():
+    env = RevisedActions(
+        Script(*[[9.0] * 3, [1.0] * 3, [-1.0] * 3, [-2.0] * 3, [1.0] * 3, [1.0] * 3, [-1.0] * 3]),
+        guard_for(ONE, Spy(above_half)),
+        failed=lambda step: step.observation[0] < 0.0,
+    )
+    steps = drive(env, lambda *_: np.array([1.0]))
+    passes = [step[-1]["reviser/reason"].startswith("it failed") for step in steps]
+    assert passes == [False, False, True, True, False, False]
+    assert [step[-1]["reviser/executed_action"][0] > 0.5 for step in steps] == passes
+    ends = [
+        ([row[0] for row, _ in rows], last[0], bad) for rows, last, bad in env.guard.judge.episodes
+    ]
+    assert ends == [([9.0, 1.0], -1.0, True), ([1.0, 1.0], -1.0, True)]
+
+
 def test_who_does_not_say_which_episodes_failed_is_told_both_ways_to():
     def warned(guard, **settings):
         with warnings.catch_warnings(record=True) as caught:

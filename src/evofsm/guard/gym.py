@@ -120,8 +120,9 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
 
     Notes
     -----
-    A proposal that is kept is passed on untouched. A failure ends the guard's episode, also where
-    the environment goes on. A failure right after nothing was judged is not counted.
+    A proposal that is kept is passed on untouched. A failure ends the guard's episode. Where the
+    environment goes on, proposals pass until ``failed`` says no again, and the guard's next episode
+    begins there. A failure right after nothing was judged is not counted.
 
     Examples
     --------
@@ -321,6 +322,7 @@ class Lane:
         self.terms = terms
         self.revision: Revision | None = None  #: the latest decision
         self.is_open = False  #: whether the environment is within an episode
+        self._has_failed = False  # in that, and not come out of it
         self._shared, self._allowed = shared, action_masks(env)
         self._guard: Guard | None = None  # that decides, within an episode of the guard
         self._episode = 0  # the number of that
@@ -332,7 +334,7 @@ class Lane:
     def begin(self, observation: Any, info: Mapping[str, Any]) -> None:
         """An episode of the environment begins."""
         _LANES.setdefault(self.terms.guard, WeakSet()).add(self)
-        self.is_open, self._score = True, 0.0
+        self.is_open, self._has_failed, self._score = True, False, 0.0
         self._look(observation, info)
 
     def _look(self, observation: Any, info: Mapping[str, Any]) -> None:
@@ -347,9 +349,11 @@ class Lane:
             terms.say_if_silent("no episode was under way: call reset()")
             decision = terms.decided(action, terms.unjudged(proposal, "no episode is under way"))
             return decision._replace(executed=action, cost=0.0)
-        if self._seen is None:
-            terms.say_if_silent("observe returned None: there was nothing to judge", ever=False)
-            self.revision = terms.unjudged(proposal)
+        if self._seen is None or self._has_failed:
+            why = "it failed, and failed= still says so" if self._has_failed else "nothing to judge"
+            words = why if self._has_failed else "observe returned None: there was nothing to judge"
+            terms.say_if_silent(words, ever=self._has_failed)
+            self.revision = terms.unjudged(proposal, why)
             return terms.decided(action, self.revision)
         terms.say_if_silent()
         if self._guard is None:
@@ -397,7 +401,7 @@ class Lane:
         if failed or is_over or self._seen is None:
             score = float(self._score) if is_over and np.isfinite(self._score) else None
             self.end(failed=failed, terminated=step.terminated, score=score)
-        self.is_open = not is_over
+        self.is_open, self._has_failed = not is_over, failed and not is_over
         if resets:
             self.begin(now.observation, now.info)
 
@@ -456,8 +460,8 @@ class Terms:
         if self._silent == _SILENT:
             warnings.warn(f"nothing was decided in {_SILENT} steps on end: {why}", stacklevel=4)
 
-    def unjudged(self, proposal: Proposal, why: str = "nothing to judge") -> Revision:
-        """The proposal, made usable, where there is nothing to judge."""
+    def unjudged(self, proposal: Proposal, why: str) -> Revision:
+        """The proposal, made usable, where nothing is judged."""
         action, remark = make_usable(proposal, self.guard.actions, self.guard.fallback)
         return unjudged_revision(action, proposal, f"{why}; {remark or 'not revised'}")
 
