@@ -79,7 +79,7 @@ class RiskByState:
     Where states disagree, their standard deviation is added to their mean risk.
     """
 
-    labels, fallback = LatentRisk.labels, LatentRisk.fallback
+    labels, fallback, lowest_first = LatentRisk.labels, LatentRisk.fallback, True
 
     def __init__(self, risk: LatentRisk, machine: EvolvingFSM) -> None:
         self.risk, self.machine = risk, machine

@@ -8,9 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evofsm.driving.judge import LatentRisk
+from evofsm.fsm import Labels
 from evofsm.fsm.actions import IntervalActions
+from evofsm.guard import Guard
 from evofsm.guard.actions import nearest_bounds
-from evofsm.guard.api import Judgement, Proposal, Situation
+from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Situation
 from evofsm.guard.reviser import ActionReviser, Mode
 
 LOW, HIGH, TOLERANCE = -2.5, 2.5, 0.02
@@ -35,6 +37,22 @@ class Told(LatentRisk):
 
     def choose(self, *_):
         """Leave it to the reviser."""
+
+
+@pytest.mark.parametrize(("span", "wanted"), [((0.0, 1.0), 0.9), (([0.0], [1.0]), [0.9])])
+def test_where_all_is_as_risky_the_proposal_stays_and_a_car_brakes(span, wanted):
+    class Lost(ActionJudge):
+        labels, fallback = Labels(), Fallback(0.0, "nothing")
+
+        def judge(self, situation, actions):
+            return Judgement(*[np.ones(len(actions))] * 4, evidence=1.0)
+
+        def why(self, judged):
+            return "all is lost"
+
+    assert Guard(*span, interval=1.0, judge=Lost()).decide([13.0], wanted).executed == wanted
+    assert Guard(n_actions=4, interval=1.0, judge=Lost()).decide([13.0], 3).executed == 3
+    assert ActionReviser(Told(lambda a: 1.0), ACTIONS).revise(HERE, Proposal(1.0)).executed == LOW
 
 
 @st.composite

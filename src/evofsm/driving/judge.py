@@ -122,7 +122,7 @@ class LatentRisk(Retraced, LearningJudge):
     (array([1., 1.]), 0.0)
     """
 
-    labels, ranges = LABELS, RANGES
+    labels, ranges, lowest_first = LABELS, RANGES, True
     fallback = GENTLE_BRAKE
 
     def __init__(

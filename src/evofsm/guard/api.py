@@ -146,7 +146,8 @@ class ActionJudge(Protocol):
 
     Actions come as a (k,) array, of `BoxActions` as a (k, d) one. One that knows what the variables
     of an observation can be may say so as ``ranges``, (least, most) of each, of more in turn: a
-    guard refuses all else.
+    guard refuses all else. With ``lowest_first`` true the lowest of several actions that are least
+    risky is taken, as cars brake; else the one closest to the proposal.
     """
 
     #: What it calls the variables of an observation.

@@ -20,7 +20,6 @@ from evofsm.fsm.validation import probability
 from evofsm.guard.actions import (
     Action,
     ActionSet,
-    BoxActions,
     Choices,
     Mask,
     action_text,
@@ -111,9 +110,9 @@ class ActionReviser:
     """Keeps a proposal whose latent risk is tolerable, and replaces any other.
 
     By the least change: the action closest to the proposal whose risk is within the tolerance;
-    where there is none, the least risky one. Where the judge has to try an action first
-    (`api.Trial`), that is held for a while instead. Once it has begun to revise, it keeps on until
-    the proposal is safe by a margin, so that it does not chatter.
+    where there is none, the least risky one, of several the closest. Where the judge has to try an
+    action first (`api.Trial`), that is held for a while instead. Once it has begun to revise, it
+    keeps on until the proposal is safe by a margin, so that it does not chatter.
 
     A judge that looks for an action itself (`api.SearchingJudge`) is asked for it. Where nothing of
     what it decides is executed (any mode but `Mode.ACT`), nothing is tried.
@@ -260,8 +259,8 @@ class ActionReviser:
             self.refuses = choice[0] != 0
             return choice[0], f"{why}; {choice[1]}"
         change = distances(self.actions, options, options[0])
-        # Of several that are least risky the lowest, in a box that of the least change.
-        rank = change if isinstance(self.actions, BoxActions) else options
+        # Of several that are least risky the closest to the proposal, unless to brake is better.
+        rank = options if getattr(self.risk, "lowest_first", False) else change
         least = int(np.lexsort((rank, judged.risk))[0])
         if isinstance(self.actions, Choices) and judged.risk[least] <= self.tolerance:
             return least, f"{why}; the least risky that can"
