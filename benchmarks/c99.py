@@ -326,10 +326,11 @@ def _asked(learnt: Learnt, decisions: int, chance: np.random.Generator) -> Itera
         elif kind == 4:
             wanted = chance.uniform(low - (high - low), high + (high - low))
         time += guard.interval * (chance.choice([-1.0, 0.0, 3.0]) if kind == 5 else 1.0)
+        when = (math.inf, -math.inf, math.nan, 1e300)[episode % 4] if kind == 7 else time
         proposal: Any = wanted if isinstance(guard.actions, BoxActions) else float(wanted[0])
-        row = np.concatenate([[begins, time], z, wanted])
+        row = np.concatenate([[begins, when], z, wanted])
         try:
-            situation = guard.recognise(z, time)
+            situation = guard.recognise(z, when)
         except ValueError:
             none = np.full(len(NUMBERS) - 1, math.nan), np.concatenate([nothing, nothing])
             yield row, (1.0, 0.0, 0.0), *none, ("", "")

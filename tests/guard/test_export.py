@@ -241,11 +241,17 @@ def test_tools_load_an_fmu_and_step_it(wall, monkeypatch, tmp_path, caplog, caps
         unit.doStep(0.0, wall.guard.interval / 3)
         assert unit.getBoolean([6]) == [True]
         unit.setReal([2], [0.0])
-    for value, step, why in ((0.0, 0.07, "a step has to be"), (math.inf, 0.1, "is infinite")):
+    for value, step, why in ((0.0, 0.07, "a step has to"), (math.inf, 0.1, "is infinite")):
         unit.setReal([0], [value])
         with pytest.raises(FMICallException):
             unit.doStep(0.0, step)
         assert why in capsys.readouterr().out
+    unit.setReal([0], [0.9])
+    unit.doStep(0.0, wall.guard.interval / 3)
+    with pytest.raises(FMICallException):  # beyond the next decision
+        unit.doStep(0.0, wall.guard.interval)
+    assert "with it at the latest" in capsys.readouterr().out
+    unit.doStep(0.0, wall.guard.interval / 3)
     unit.freeInstance()
     monkeypatch.setenv("CC", "no-such-compiler")
     write_fmu(wall.guard, file)

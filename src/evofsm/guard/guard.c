@@ -16,7 +16,7 @@ extern "C" {
 /* What evofsm_decide returns. But for EVOFSM_OK nothing has changed, and nothing was written. */
 enum {
   EVOFSM_OK = 0,
-  EVOFSM_UNUSABLE = 1, /* an entry of the observation is infinite, or cannot be so */
+  EVOFSM_UNUSABLE = 1, /* an entry of the observation, or the time, is infinite, or cannot be so */
   EVOFSM_MISCOMPILED = 2 /* it does not compute as IEEE 754 says, so that nothing is decided */
 };
 
@@ -188,12 +188,9 @@ static void recognise(evofsm_state *s) {
 
 /* What is wrong with an observation. */
 static int take(evofsm_state *s, const double observation[EVOFSM_VARIABLES], double time) {
-  int j, found = 0;
+  int j, found = time - s->time > LONGEST_GAP ? EVOFSM_GAP : 0;
   if (time <= s->time) {
     return time < s->time ? EVOFSM_LATE : EVOFSM_REPEATED;
-  }
-  if (time - s->time > LONGEST_GAP) {
-    found = EVOFSM_GAP;
   }
   for (j = 0; j < EVOFSM_VARIABLES; j++) {
     s->observation[j] = observation[j];
@@ -260,7 +257,8 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
     return EVOFSM_MISCOMPILED;
   }
   for (i = 0; i < EVOFSM_VARIABLES; i++) {
-    if (observation[i] < seen_from[i] || observation[i] > seen_to[i]) {
+    if (observation[i] < seen_from[i] || observation[i] > seen_to[i] ||
+        !(time < time + EVOFSM_INTERVAL)) { /* nor is it of NaN, or infinite */
       return EVOFSM_UNUSABLE;
     }
   }
@@ -352,7 +350,7 @@ enum {
 typedef struct {
   evofsm_state state;
   double values[VALUES];
-  double wait; /* steps until the next decision */
+  double wait; /* until the next decision [s] */
   fmi2CallbackFunctions callbacks;
   char name[128];
 } unit;
@@ -413,24 +411,26 @@ NOTHING(Terminate, void *c)
    it: then it decides at the first of them. */
 EXPORT fmi2Status fmi2DoStep(void *c, double time, double step, int no_return) {
   unit *of = c;
-  const double *proposal = of->values + PROPOSAL, steps = floor(EVOFSM_INTERVAL / step + 0.5);
+  const double *proposal = of->values + PROPOSAL, left = of->wait / step;
+  const double steps = floor(EVOFSM_INTERVAL / step + 0.5);
   static const char *const why[] = {
       "", "an observation is infinite, or cannot be so; NaN says not seen",
       "this unit was compiled to compute otherwise than IEEE 754 says"};
   evofsm_decision decision;
   int i, rc;
-  if (!(steps >= 1.0) || !(fabs(steps * step / EVOFSM_INTERVAL - 1.0) <= 1e-6)) {
-    return fail(of, "a step has to be as long as stepSize in modelDescription.xml, or a whole part");
+  if (!(steps >= 1.0) || !(fabs(steps * step / EVOFSM_INTERVAL - 1.0) <= 1e-6) ||
+      fabs(left - 0.5) < 0.499) {
+    return fail(of, "a step has to divide the interval (stepSize), and to end with it at the latest");
   }
-  if (of->wait >= 1.0) {
-    of->wait -= 1.0;
+  if (left > 0.5) {
+    of->wait -= step;
     return fmi2OK;
   }
   rc = evofsm_decide(&of->state, of->values, proposal, &decision);
   if (rc != EVOFSM_OK) {
     return fail(of, why[rc]);
   }
-  of->wait = steps - 1.0;
+  of->wait = EVOFSM_INTERVAL - step;
   of->values[RISK] = decision.risk_executed;
   of->values[REASON] = decision.reason;
   of->values[REVISED] = 0.0;
