@@ -1,5 +1,6 @@
 """The audit log: what is tampered with is found where it was, and what is replayed is the same."""
 
+import copy
 import json
 import logging
 import math
@@ -306,9 +307,15 @@ def test_what_is_not_known_is_verified_and_said_not_to_be_replayed(tmp_path):
     with AuditLog(tmp_path / "log") as log:
         drive(cars(log, Own(ACTIONS)))
         drive(cars(log, judge=LatentRisk(-2.5, 0.25)))  # another one than its reviser asks
+        guard = Guard(-2.5, 2.5, interval=0.25, model=lambda z, u: z, backup=lambda z: -2.5)
+        guard.audit = log
+        drive(guard)
+        guard.freeze()  # from here on nothing of the functions is asked
+        frozen = drive(guard)
+        assert copy.deepcopy(guard).audit is None
     result = audit(tmp_path / "log")
-    assert (result.is_good, result.replayed) == (True, 0)
-    assert [why.split()[0] for why in result.not_replayed] == ["Own", "ActionReviser"]
+    assert (result.is_good, result.replayed) == (True, len(frozen))
+    assert [why.split()[0] for why in result.not_replayed] == ["Own", *["ActionReviser"] * 2]
 
 
 # -- Forging --------------------------------------------------------------------------------------

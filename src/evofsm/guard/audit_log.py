@@ -351,7 +351,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         """An episode begins."""
         self._raise()
         self._flush()  # of an episode that was broken off
-        parts = (guard.reviser, guard.machine, guard.judge, guard.failed)
+        parts = (guard.reviser, guard.machine, guard.judge, guard.failed, _asks_code(guard))
         if list(map(id, parts)) != list(map(id, self._who)) or self._learnt != digests_of(guard):
             self._write("start", **_start(guard))
         self._guard, self._who, self._learnt = guard, parts, None
@@ -503,9 +503,15 @@ def made_by() -> dict[str, str]:
     }
 
 
+def _asks_code(guard: Guard) -> bool:
+    """Whether what it learns hangs on a model or a backup that it was given: no log holds code."""
+    functions = (getattr(guard.judge, "__dict__", {}).get(name) for name in ("model", "backup"))
+    return guard.learn and any(map(callable, functions))
+
+
 def _start(guard: Guard) -> dict[str, Any]:
     file = BytesIO()
-    if is_replayable := can_be_made_again(guard):
+    if is_replayable := can_be_made_again(guard) and not _asks_code(guard):
         guard.save(file)
         if not (is_replayable := file.tell() < _LONGEST_LINE // 2):
             _log.warning("the guard is too large for an audit log: it will not be replayed")
@@ -729,7 +735,8 @@ class _Player:
         if content["guard"] is None:
             self.not_replayed.append(
                 f"{content['reviser']} is no reviser that is known here, or asks a judge that is "
-                "not, or that was not told what happened, or the guard was too large"
+                "not, or that was not told what happened, or the guard was too large, or learnt "
+                "with model= or backup=, which are code"
             )
         elif needs_code and self._failed is None:
             self.not_replayed.append(_NO_FUNCTION)

@@ -803,7 +803,8 @@ class Guard:
     # What another process gets has a lock of its own.
     @alone
     def __getstate__(self) -> dict[str, Any]:
-        return {name: vars(self)[name] for name in vars(self) if name not in ("_lock", "_call")}
+        state = {name: vars(self)[name] for name in vars(self) if name not in ("_lock", "_call")}
+        return state | {"audit": None}  # which is the file of this one
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
