@@ -48,8 +48,6 @@ from evofsm.store import Place
 _MOST_ROWS = 1024
 # No horizon that is given has more steps: memory and the time of a decision grow with it.
 _MAX_STEPS = 10_000
-# Actions among which one is chosen, at most.
-_MAX_CHOICES = 1_000
 # What a backup says to an action that is not allowed.
 _NEVER = -1e300
 
@@ -167,10 +165,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.dt)
         #: Number of actions; 0 where the action is a box.
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
-        if self.choices > _MAX_CHOICES:
-            raise ValueError(
-                f"n_actions is {n_actions}; a learnt judge takes at most {_MAX_CHOICES:,} actions"
-            )
         if {low is None, high is None} != {n_actions is not None}:
             raise ValueError("give either low and high, or n_actions")
         self.low: Floats = np.zeros(0)
@@ -181,6 +175,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         #: How many numbers an action has.
         self.size = self.choices or len(self.low)
+        rollout.refuse_too_many(1, self.size, box=not self.choices)
         #: Whether it may try actions to learn what they do.
         self.learning = True
         #: From an observation to whether it is a failure, if that was given.

@@ -94,13 +94,16 @@ def n_features(m: int, a: int, *, box: bool) -> int:
 
 
 def refuse_too_many(m: int, a: int, *, box: bool) -> None:
-    """Raise a ValueError for more variables than can be learnt of."""
+    """Raise a ValueError for more variables, or numbers of an action, than can be learnt of."""
     most = min(_MAX_VARIABLES, (_MAX_FEATURES - n_features(0, a, box=box)) // 2)
+    if most < 1:
+        kind, numbers = ("components", 2 + len(KNOTS)) if box else ("actions", 2)
+        most = (_MAX_FEATURES - n_features(1, 0, box=box)) // numbers
+        raise ValueError(f"a learnt judge takes at most {most} {kind}, not {a}: group them")
     if m > most:
         raise ValueError(
             f"observation has {m} variables; with actions of {a} numbers a judge learns of at most "
-            f"{max(most, 0)}: choose those on which failure depends, as with observe= of "
-            "RevisedActions"
+            f"{most}: choose those on which failure depends, as with observe= of RevisedActions"
         )
 
 
