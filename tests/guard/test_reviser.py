@@ -8,11 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evofsm.driving.judge import LatentRisk
-from evofsm.fsm import Labels
 from evofsm.fsm.actions import IntervalActions
-from evofsm.guard import Guard
 from evofsm.guard.actions import nearest_bounds
-from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Situation
+from evofsm.guard.api import Judgement, Proposal, Situation
 from evofsm.guard.reviser import ActionReviser, Mode
 
 LOW, HIGH, TOLERANCE = -2.5, 2.5, 0.02
@@ -39,20 +37,19 @@ class Told(LatentRisk):
         """Leave it to the reviser."""
 
 
-@pytest.mark.parametrize(("span", "wanted"), [((0.0, 1.0), 0.9), (([0.0], [1.0]), [0.9])])
-def test_where_all_is_as_risky_the_proposal_stays_and_a_car_brakes(span, wanted):
-    class Lost(ActionJudge):
-        labels, fallback = Labels(), Fallback(0.0, "nothing")
+@pytest.mark.parametrize(("lowest_first", "executed"), [(True, LOW), (False, 1.0)])
+def test_where_all_is_as_risky_a_car_brakes_and_else_the_proposal_stays(lowest_first, executed):
+    judge = Told(lambda a: 1.0)
+    judge.lowest_first = lowest_first
+    assert ActionReviser(judge, ACTIONS).revise(HERE, Proposal(1.0)).executed == executed
 
-        def judge(self, situation, actions):
-            return Judgement(*[np.ones(len(actions))] * 4, evidence=1.0)
 
-        def why(self, judged):
-            return "all is lost"
-
-    assert Guard(*span, interval=1.0, judge=Lost()).decide([13.0], wanted).executed == wanted
-    assert Guard(n_actions=4, interval=1.0, judge=Lost()).decide([13.0], 3).executed == 3
-    assert ActionReviser(Told(lambda a: 1.0), ACTIONS).revise(HERE, Proposal(1.0)).executed == LOW
+@pytest.mark.parametrize("answer", [None, Judgement([0.1] * 2, *[[0.0]] * 3, 1.0), [1.1]])
+def test_who_gives_no_judgement_is_named(answer):
+    judge = Told(lambda a: 1.1)
+    judge.judge = judge.judge if answer == [1.1] else lambda *_: answer
+    with pytest.raises(ValueError, match=r"^Told.judge gave .* of 1 actions; .* in \[0, 1\]"):
+        ActionReviser(judge, ACTIONS).revise(HERE, Proposal(1.0))
 
 
 @st.composite

@@ -144,7 +144,7 @@ class Guard:
         From an observation and an action to the next observation: how it moves, as far as that is
         known. A learnt judge asks it, after each episode, as often as that had decisions, around
         where it was; what is seen corrects it. Like `backup` it is code, and in no file: what it
-        said stays learnt.
+        said stays learnt, and `load` takes it again.
     backup : callable, optional
         From an observation to an action that is thought to save. A learnt judge fits linear
         feedback to it, and tries that as one backup of several.
@@ -867,6 +867,8 @@ class Guard:
         *,
         judge: ActionJudge | type[LearningJudge] | None = None,
         failed: Callable[[NDArray[np.float64]], bool] | None = None,
+        model: Callable[[NDArray[np.float64], Any], ArrayLike] | None = None,
+        backup: Callable[[NDArray[np.float64]], ArrayLike] | None = None,
     ) -> Self:
         """Read a guard, as it was between two episodes.
 
@@ -876,8 +878,8 @@ class Guard:
         judge : type or ActionJudge, optional
             The class of the judge, or a judge as it is, where no installed package declares it as
             an entry point of ``evofsm.participants``.
-        failed : callable, optional
-            As in `Guard`; needed where the guard had one.
+        failed, model, backup : callable, optional
+            As in `Guard`; ``failed`` is needed where the guard had one.
 
         Raises
         ------
@@ -900,7 +902,12 @@ class Guard:
                 raise ValueError("this guard knew failures by a function; give it again: failed=")
             parts = rebuild(settings, files, judge)
             plain = {name: settings[name] for name in _PLAIN_SETTINGS}
-            return cls.of(failed=failed, **parts, **plain)
+            guard = cls.of(failed=failed, **parts, **plain)
+            if isinstance(guard.judge, LearntRisk):
+                guard.judge.model, guard.judge.backup = model, backup
+            elif model or backup:
+                raise ValueError(f"{type(guard.judge).__name__} asks no model and no backup")
+            return guard
 
 
 def ends_of(judge: ActionJudge | None, m: int) -> NDArray[np.float64]:

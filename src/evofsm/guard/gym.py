@@ -350,9 +350,9 @@ class Lane:
             decision = terms.decided(action, terms.unjudged(proposal, "no episode is under way"))
             return decision._replace(executed=action, cost=0.0)
         if self._seen is None or self._has_failed:
-            why = "it failed, and failed= still says so" if self._has_failed else "nothing to judge"
-            words = why if self._has_failed else "observe returned None: there was nothing to judge"
-            terms.say_if_silent(words, ever=self._has_failed)
+            why = "nothing to judge: observe returned None"
+            why = "it failed, and failed= still says so" if self._has_failed else why
+            terms.say_if_silent(why, ever=self._has_failed)
             self.revision = terms.unjudged(proposal, why)
             return terms.decided(action, self.revision)
         terms.say_if_silent()

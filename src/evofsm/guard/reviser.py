@@ -225,12 +225,22 @@ class ActionReviser:
         if not acts:
             options = self.risk.effective(situation, options)
         if self.risk.trial() is None:  # most proposals are kept: this one is looked at first
-            judgement = self.risk.judge(situation, options[:1])
+            judgement = self._judged(situation, options[:1])
             if judgement.risk[0] <= self.tolerance * (_RELEASE if self.refuses else 1.0):
                 self.refuses = False
                 return Search(options[:1], judgement, 0, _KEPT)
-        judgement = self.risk.judge(situation, options)
+        judgement = self._judged(situation, options)
         return Search(options, judgement, *self._decide(situation, options, judgement, acts))
+
+    def _judged(self, situation: Situation, options: NDArray[np.float64]) -> Judgement:
+        """What the judge says, if it is a judgement of these options."""
+        judgement = self.risk.judge(situation, options)
+        risk = np.asarray(getattr(judgement, "risk", None), np.float64)
+        if risk.shape != (len(options),) or any(p < 0.0 or p > 1.0 for p in risk.tolist()):
+            name, count = f"{type(self.risk).__name__}.judge", len(options)
+            text = f"{name} gave {judgement!s:.200} of {count} actions; it has to give a Judgement"
+            raise ValueError(f"{text} with a risk in [0, 1], or NaN, of each")
+        return judgement._replace(risk=risk)
 
     def _decide(
         self, situation: Situation, options: NDArray[np.float64], judged: Judgement, acts: bool

@@ -43,7 +43,7 @@ def test_a_given_model_knows_of_brakes_that_were_never_tried():
     assert told <= 2 < 5 <= without  # it is fitted, not copied
 
 
-def test_what_is_wrong_with_a_given_function_is_said_and_nothing_is_learnt():
+def test_what_is_wrong_with_a_given_function_is_said_and_nothing_is_learnt(tmp_path):
     guard = Guard(-1.0, 1.0, interval=0.1, model=lambda z, u: [0.0])
     for k in range(5):
         guard.decide([1.0 + 0.1 * k, 2.0], 0.5)
@@ -55,6 +55,13 @@ def test_what_is_wrong_with_a_given_function_is_said_and_nothing_is_learnt():
         Guard(-1.0, 1.0, interval=0.1, backup=3)
     with pytest.raises(ValueError, match="LearntRisk asks no model, no backup"):
         Guard(-1.0, 1.0, interval=0.1, judge=guard.judge, model=move)
+    guard.save(tmp_path / "guard")
+    again = Guard.load(tmp_path / "guard", model=lambda z, u: 1 / 0)  # as given anew
+    for k in range(5):
+        again.decide([1.0 + 0.1 * k, 2.0], 0.5)
+    with pytest.raises(ZeroDivisionError) as raised:
+        again.end(False)
+    assert "model was asked of [1.1 2. ], " in raised.value.__notes__[0]
 
 
 @pytest.mark.parametrize("n_actions", [2, None])

@@ -531,7 +531,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         def model(z: Floats, inner: Floats) -> Floats:
             assert move is not None
             action = self.decode(inner)
-            after = np.array(move(z, action if len(action) > 1 else action[0]), np.float64)
+            after = _answer("model", move, z, action if len(action) > 1 else action[0])
             if after.shape != (m,) or not np.isfinite(after).all():
                 raise ValueError(
                     f"model gave {after} after {z} and {action}; it has to give {m} finite numbers"
@@ -540,7 +540,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
         def backup(z: Floats) -> Floats:
             assert act is not None
-            action = np.atleast_1d(np.array(act(z), np.float64))
+            action = np.atleast_1d(_answer("backup", act, z))
             if action.shape != ((1,) if self.choices else (self.size,)) or np.isnan(action).any():
                 raise ValueError(f"backup gave {action} at {z}; it has to give an action")
             return self.encode(action[0] if self.choices else np.clip(action, self.low, self.high))
@@ -648,6 +648,15 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
+
+
+def _answer(name: str, function: Callable[..., ArrayLike], *at: Any) -> Floats:
+    """What a given function says, as numbers."""
+    try:
+        return np.array(function(*at), np.float64)
+    except Exception as error:
+        error.add_note(f"{name} was asked of {', '.join(map(str, at))}, near what was observed")
+        raise
 
 
 def _unjudged(count: int) -> Judgement:
