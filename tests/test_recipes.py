@@ -60,6 +60,7 @@ def test_a_state_rule(tmp_path):
 
 def test_a_judge(tmp_path):
     python(tmp_path, "-c", write("Add a judge", tmp_path))
+    assert "0 failed" in python(tmp_path, "-m", "evofsm", "check", "my_judge:Kettle")
 
 
 def test_a_column():

@@ -20,7 +20,7 @@ import numpy as np
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.validation import Floats
 from evofsm.guard.api import Judgement, Proposal, Revision, Situation
-from evofsm.guard.guard import Guard
+from evofsm.guard.guard import Guard, ends_of
 
 Make = Callable[[], Any]
 Rows = Sequence[Floats]
@@ -101,13 +101,15 @@ def _same(one: object, other: object) -> bool:
     return a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
-def _drive(rows: int = 40, seed: int = 0) -> Floats:
-    """(rows, 3) gap, speed, leader's speed: behind a leader that brakes now and then."""
+def _drive(rows: int = 40, seed: int = 0, judge: Any = None) -> Floats:
+    """(rows, m) gap, speed, leader's speed as it brakes, by turns for what a judge names."""
     draw = np.random.default_rng(seed)
     leader = np.clip(15.0 + np.cumsum(draw.normal(0.0, 0.8, rows)), 5.0, 30.0)
     follower = np.clip(leader + draw.normal(0.0, 2.0, rows), 1.0, 35.0)
     gap = np.clip(25.0 + np.cumsum((leader - follower) * _DT), 3.0, 80.0)
-    return np.column_stack([gap, follower, leader])
+    names = getattr(getattr(judge, "labels", None), "names", ())
+    columns = np.resize([gap, follower, leader], (len(names) or 3, rows))
+    return np.asarray(np.clip(columns.T, *ends_of(judge, len(columns))))
 
 
 def _common(answers: Callable[[Any, Rows], Answers]) -> Clause:
@@ -115,14 +117,15 @@ def _common(answers: Callable[[Any, Rows], Answers]) -> Clause:
 
     def answers_hang_on_inputs_alone(make: Make) -> None:
         """It changes no input, keeps no array of its caller, and draws no random numbers."""
-        part, twin, buffer, outputs = make(), make(), np.empty(3), []
-        for row in _drive():
+        part, twin, outputs = make(), make(), []
+        buffer = np.empty_like((drive := _drive(judge=part))[0])
+        for row in drive:
             buffer[:] = row
             outputs += answers(part, [buffer])
             message = "it changed an observation that it was given (work in place? copy it first)"
             _insist(_same(buffer, row), message)
             buffer[:] = 1e6
-        reference = [answer for row in _drive() for answer in answers(twin, [row])]
+        reference = [answer for row in drive for answer in answers(twin, [row])]
         _insist(
             _same(outputs, reference),
             "two that saw the same answer otherwise (an array that is kept instead of copied, a "
@@ -210,16 +213,16 @@ def _taught(make: Make, *, ask: bool = False) -> tuple[Guard, Any]:
 
 def _go_on(guard: Guard, judge: Any, episodes: range, *, ask: bool = False) -> None:
     for episode in episodes:
-        rows, failed = _drive(seed=episode), episode % 2 == 0
+        rows, failed = _drive(seed=episode, judge=judge), episode % 2 == 0
         for k, row in enumerate(rows):
             if ask:
                 judge.why(judge.judge(_situation(row, 0), _ACTIONS))
             guard.decide(row, float(_ACTIONS[k % len(_ACTIONS)]), k * _DT)
-        guard.end(failed, np.array([-0.1, *rows[-1, 1:]]) if failed else rows[-1])
+        guard.end(failed, rows[-1])
 
 
 def _asked(judge: Any) -> list[Judgement]:
-    return [judge.judge(_situation(row, 0), _ACTIONS.copy()) for row in _drive(8, seed=99)]
+    return [judge.judge(_situation(row, 0), _ACTIONS.copy()) for row in _drive(8, 99, judge)]
 
 
 def judges_each_action(make: Make) -> None:
