@@ -307,8 +307,7 @@ def test_what_is_not_known_is_verified_and_said_not_to_be_replayed(tmp_path):
     with AuditLog(tmp_path / "log") as log:
         drive(cars(log, Own(ACTIONS)))
         drive(cars(log, judge=LatentRisk(-2.5, 0.25)))  # another one than its reviser asks
-        guard = Guard(-2.5, 2.5, interval=0.25, model=lambda z, u: z, backup=lambda z: -2.5)
-        guard.audit = log
+        guard = Guard(-2.5, 2.5, interval=0.25, audit=log, model=lambda z, u: z)
         drive(guard)
         guard.freeze()  # from here on nothing of the functions is asked
         frozen = drive(guard)

@@ -250,7 +250,6 @@ def test_tools_load_an_fmu_and_step_it(wall, monkeypatch, tmp_path, caplog, caps
     unit.doStep(0.0, wall.guard.interval / 3)
     with pytest.raises(FMICallException):  # beyond the next decision
         unit.doStep(0.0, wall.guard.interval)
-    assert "with it at the latest" in capsys.readouterr().out
     unit.doStep(0.0, wall.guard.interval / 3)
     unit.freeInstance()
     monkeypatch.setenv("CC", "no-such-compiler")

@@ -236,6 +236,7 @@ def test_actions_that_are_not_the_guards_are_refused(space, guarded):
         (Box(-2.0, 2.0, (2, 1), np.float32), [[1.0], [2.0]], [[0.5], [0.5]], 10.0**0.5 / 4.0),
         (Box(-2.0, 2.0, (1,), np.float32), [9.0], [0.5], 0.75),
         (Box(-2.0, 2.0, (1,), np.float32), [math.nan], [0.0], 1.0),
+        (Box(-4.0, 4.0, (1,), np.float32), [9.0], [0.5], 1.75),  # beyond the guard's 2, too
         (Box(-2.0, 2.0, (), np.float32), 1.0, 0.5, 0.25),
     ],
 )
@@ -251,7 +252,8 @@ def test_a_change_is_executed_and_can_cost_reward(space, proposed, executed, siz
             return Search(options, self.judge(situation, options), best, "nearest")
 
     script = Script(FAR, FAR, FAR, action_space=space)
-    env = RevisedActions(script, guard_for(space, Half(dangerous)), penalty=penalty)
+    within = Box(-2.0, 2.0, space.shape) if isinstance(space, Box) else space
+    env = RevisedActions(script, guard_for(within, Half(dangerous)), penalty=penalty)
     env.reset()
     seen, reward, terminated, truncated, info = env.step(np.array(proposed, space.dtype)[()])
     assert (seen, terminated, truncated) == (FAR, False, False)
@@ -264,6 +266,19 @@ def test_a_change_is_executed_and_can_cost_reward(space, proposed, executed, siz
     assert np.array_equal(script.executed, [executed])
     assert info["reviser/penalty"] == pytest.approx(size)
     assert reward == pytest.approx(1.5 - penalty * size)
+
+
+def test_what_does_not_fit_is_named():
+    env = RevisedActions(Script(FAR), guard_for(ONE))
+    with pytest.raises(ValueError, match=r"the action is array\(\[0.5, 0.2\]\), but .* Box"):
+        env.step(np.array([0.5, 0.2]))
+    with pytest.raises(AttributeError, match="guard"):  # no second one is taken without a word
+        env.guard = guard_for(ONE)
+    with pytest.raises(TypeError, match=r"guard is 'a\.evofsm'; it must be a Guard"):
+        RevisedActions(Script(FAR), "a.evofsm")
+    env.env.observation_space = Dict({"speed": ONE, "gap": ONE})
+    with pytest.raises(ValueError, match=r"names are .* taken in order: \('gap', 'speed'\)"):
+        RevisedActions(env.env, Guard(-2.5, 2.5, interval=0.1, names=("speed", "gap")))
 
 
 def test_a_penalty_is_no_reward():
@@ -330,19 +345,15 @@ def test_what_is_terminated_has_failed_unless_somebody_says_otherwise(
 
 
 def test_a_failure_that_lasts_is_one_and_what_comes_after_it_another_episode():
-    env = RevisedActions(
-        Script(*[[9.0] * 3, [1.0] * 3, [-1.0] * 3, [-2.0] * 3, [1.0] * 3, [1.0] * 3, [-1.0] * 3]),
-        guard_for(ONE, Spy(above_half)),
-        failed=lambda step: step.observation[0] < 0.0,
-    )
-    steps = drive(env, lambda *_: np.array([1.0]))
-    passes = [step[-1]["reviser/reason"].startswith("it failed") for step in steps]
+    script = Script(*[[height] * 3 for height in (9.0, 1.0, -1.0, -2.0, 1.0, 1.0, -1.0)])
+    judge = Spy(above_half)
+    env = RevisedActions(script, guard_for(ONE, judge), failed=lambda step: step.observation[0] < 0)
+    infos = [step[-1] for step in drive(env, lambda *_: np.array([1.0]))]
+    passes = [info["reviser/executed_action"][0] > 0.5 for info in infos]
+    assert passes == [info["reviser/reason"].startswith("it failed") for info in infos]
     assert passes == [False, False, True, True, False, False]
-    assert [step[-1]["reviser/executed_action"][0] > 0.5 for step in steps] == passes
-    ends = [
-        ([row[0] for row, _ in rows], last[0], bad) for rows, last, bad in env.guard.judge.episodes
-    ]
-    assert ends == [([9.0, 1.0], -1.0, True), ([1.0, 1.0], -1.0, True)]
+    rows = [[row[0] for row, _ in rows] for rows, _, bad in judge.episodes if bad]
+    assert rows == [[9.0, 1.0], [1.0, 1.0]]
 
 
 def test_who_does_not_say_which_episodes_failed_is_told_both_ways_to():

@@ -37,17 +37,16 @@ class Told(LatentRisk):
         """Leave it to the reviser."""
 
 
-@pytest.mark.parametrize(("lowest_first", "executed"), [(True, LOW), (False, 1.0)])
-def test_where_all_is_as_risky_a_car_brakes_and_else_the_proposal_stays(lowest_first, executed):
+def test_where_all_is_as_risky_a_car_brakes_and_else_the_proposal_stays():
     judge = Told(lambda a: 1.0)
-    judge.lowest_first = lowest_first
-    assert ActionReviser(judge, ACTIONS).revise(HERE, Proposal(1.0)).executed == executed
+    for judge.lowest_first, executed in ((True, LOW), (False, 1.0)):
+        assert ActionReviser(judge, ACTIONS).revise(HERE, Proposal(1.0)).executed == executed
 
 
-@pytest.mark.parametrize("answer", [None, Judgement([0.1] * 2, *[[0.0]] * 3, 1.0), [1.1]])
-def test_who_gives_no_judgement_is_named(answer):
-    judge = Told(lambda a: 1.1)
-    judge.judge = judge.judge if answer == [1.1] else lambda *_: answer
+@pytest.mark.parametrize("risk", [None, [0.1, 0.2], [1.1]])
+def test_who_gives_no_judgement_is_named(risk):
+    judge = Told(None)
+    judge.judge = lambda *_: risk and Judgement(risk, *[[0.0]] * 3, 1.0)
     with pytest.raises(ValueError, match=r"^Told.judge gave .* of 1 actions; .* in \[0, 1\]"):
         ActionReviser(judge, ACTIONS).revise(HERE, Proposal(1.0))
 

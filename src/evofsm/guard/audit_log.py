@@ -612,8 +612,7 @@ def audit(path: Path, kept: Head | None = None, *, failed: _Failed | None = None
     kept : Head, optional
         A head that was kept elsewhere.
     failed : callable, optional
-        As the guard had it. No log holds code: without it episodes of a guard that was told by a
-        function where it fails are not replayed, which is said.
+        As the guard had it: no log holds code. Without it such episodes are not replayed.
 
     Raises
     ------
@@ -734,9 +733,8 @@ class _Player:
         self._guard, needs_code = None, content["told_failures"]
         if content["guard"] is None:
             self.not_replayed.append(
-                f"{content['reviser']} is no reviser that is known here, or asks a judge that is "
-                "not, or that was not told what happened, or the guard was too large, or learnt "
-                "with model= or backup=, which are code"
+                f"{content['reviser']} or its judge is not known here, or was not told what "
+                "happened, or the guard is too large, or learnt with model= or backup= (code)"
             )
         elif needs_code and self._failed is None:
             self.not_replayed.append(_NO_FUNCTION)

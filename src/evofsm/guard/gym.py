@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any, Literal, NamedTuple, SupportsFloat
 from weakref import WeakKeyDictionary, WeakSet
 
@@ -71,7 +72,13 @@ class StepResult:
 Failed = Callable[[StepResult], bool] | Literal["terminated"]
 
 
-class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+# To replace either is an error, not ignored: for another guard wrap the environment anew.
+class _Settled:
+    guard = property(attrgetter("_guard"), doc="Who decides.")
+    failed = property(attrgetter("_failed"), doc="Who says which episodes failed.")
+
+
+class RevisedActions(_Settled, gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Executes a guard's revision of each action, and forwards all else as it is.
 
     The guard learns while the environment runs. ``info`` holds ``reviser/proposed_action`` and
@@ -96,18 +103,16 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         Without it a box is flattened, each value of ``Discrete`` is a variable that is 1 or 0, and
         parts of ``Dict`` and ``Tuple`` follow each other, but for an ``action_mask``.
     failed : callable or "terminated"
-        From a step to whether it ended in failure: of ``step.observation``, ``step.reward``,
-        ``step.terminated``, ``step.truncated`` and ``step.info``. ``"terminated"`` says that every
-        episode that is terminated failed, as in CartPole. Where an environment also terminates on
-        success that is wrong: ``lambda step: step.terminated and step.reward <= 0`` for FrozenLake,
+        From a `StepResult` to whether it ended in failure. ``"terminated"`` says that every episode
+        that is terminated failed, as in CartPole. Where an environment also terminates on success
+        that is wrong: ``lambda step: step.terminated and step.reward <= 0`` for FrozenLake,
         ``step.reward <= -100`` for LunarLander and BipedalWalker, ``lambda step: False`` for never,
         as in MountainCar and Acrobot. Not needed where the guard has a function of its own; where
         nobody says it, it is ``"terminated"``, with a warning.
     penalty : float
         Subtracted from the reward per unit of ``reviser/penalty``: half ranges of the action, in a
-        box the root of the sum of squares over its components; 1 for another index. In training
-        1 is best of what ``studies peers`` tried: without it a policy leans on the guard, and
-        fails by itself. By default returns stay what they are.
+        box the root of the sum of squares over its components; 1 for another index. Of what
+        ``studies peers`` tried 1 is best: at 0 a policy leans on the guard, and fails by itself.
 
     Raises
     ------
@@ -120,9 +125,9 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
 
     Notes
     -----
-    A proposal that is kept is passed on untouched. A failure ends the guard's episode. Where the
-    environment goes on, proposals pass until ``failed`` says no again, and the guard's next episode
-    begins there. A failure right after nothing was judged is not counted.
+    A proposal that is kept is passed on untouched. A failure ends the guard's episode; where the
+    environment goes on, proposals pass until ``failed`` says no again, where the next one begins. A
+    failure right after nothing was judged is not counted.
 
     Examples
     --------
@@ -152,7 +157,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         arguments = {"guard": guard, "observe": observe, "failed": failed, "penalty": penalty}
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **arguments)  # for `spec`
         gymnasium.Wrapper.__init__(self, env)
-        self.guard, self.failed = guard, failed
+        self._guard, self._failed = guard, failed
         terms = Terms(guard, *_spaces(env), observe, failed, penalty)
         self._lane = Lane(terms, shared=False, env=env)
         self._resets_itself = any(type(layer).__name__ == "Autoreset" for layer in _layers(env))
@@ -183,7 +188,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         return observation, decision.paid(reward), terminated, truncated, {**info, **decision.info}
 
 
-class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
+class RevisedVectorActions(_Settled, VectorWrapper[Any, Any, Any, Any, Any]):
     """Many environments at once under one guard, as `RevisedActions` does it for one.
 
     The guard learns every environment's episode **as a whole when it ends**. Within an episode a
@@ -240,7 +245,7 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     ) -> None:
         refuse_unless(isinstance(env, VectorEnv), env)
         super().__init__(env)
-        self.guard = guard
+        self._guard, self._failed = guard, failed
         terms = Terms(guard, *_spaces(env), observe, failed, penalty)
         mode = env.metadata.get("autoreset_mode")  # which not everybody names
         self._same_step = getattr(mode, "value", mode) == "SameStep"
@@ -443,10 +448,15 @@ class Terms:
         function("observe", observe, "lambda observation: observation['state']")
         if failed != "terminated":
             function("failed", failed, _FAILED)
+        if not isinstance(guard, Guard):
+            raise TypeError(f"guard is {guard!r}; it must be a Guard, as Guard.load(path) reads it")
         self.guard = guard
         self.penalty = penalty
         self._silent, self._has_decided = 0, False
         self._observe, self._failed = observe or _flat(observations), failed
+        keys = tuple(observations.keys()) if isinstance(observations, Dict) else ()
+        if not observe and guard.variables != keys and {*guard.variables} == {*keys}:
+            raise ValueError(f"names are {guard.variables}, but the Dict is taken in order: {keys}")
         self.to_guard, self._to_env = _conversions(actions, guard.actions)
 
     def say_if_silent(self, why: str = "", *, ever: bool = True) -> None:
@@ -469,9 +479,12 @@ class Terms:
         """What is executed, as the environment takes it: the very action where it is kept."""
         is_kept = same_action(revision.executed, revision.proposed)
         executed = action if is_kept else self._to_env(revision.executed)
-        actions, size = self.guard.actions, 1.0
-        if is_usable(actions, revision.proposed):
-            size = change(actions, put_into(actions, revision.proposed), revision.executed)
+        actions, size = self.guard.actions, 0.0 if is_kept else 1.0
+        if not is_kept and is_usable(actions, revision.proposed):
+            request = self.to_guard(self._to_env(revision.proposed))  # as the environment takes it
+            if not change(actions, request, put_into(actions, request)) > 1e-6:  # but for rounding
+                request = put_into(actions, revision.proposed)
+            size = change(actions, request, revision.executed)
         info = {
             "reviser/proposed_action": deepcopy(action),
             "reviser/executed_action": deepcopy(executed),
@@ -489,8 +502,7 @@ class Terms:
         try:
             return answered(self._failed(step))
         except (AttributeError, KeyError, TypeError) as error:
-            about = "a step: its observation, reward, terminated, truncated and info"
-            error.add_note(f"failed was called with {about}, such as failed={_FAILED}")
+            error.add_note(f"failed was called with a StepResult, such as failed={_FAILED}")
             raise
 
     def look(self, observation: Any) -> Floats | None:
@@ -510,8 +522,7 @@ def _flat(space: Space[Any]) -> Observe:
         if space.n > _MOST_VALUES:
             raise ValueError(
                 f"the environment's observations are {space}: each of {space.n} values would be a "
-                f"variable, and at most {_MOST_VALUES} are taken; give observe, which makes a few "
-                "numbers of them (row and column of a place)"
+                f"variable, of at most {_MOST_VALUES}; give observe, which makes few (row, column)"
             )
         first, unit = int(space.start), np.eye(int(space.n))
         return lambda observation: unit[int(observation) - first]
@@ -559,13 +570,14 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
     if (low < space.low - slack).any() or (high > space.high + slack).any():
         raise ValueError(
             f"the guard's actions go from {actions.low} to {actions.high}, beyond those of the "
-            f"environment, {space}: what it learns would not be what is executed; make a guard of "
-            "the environment's low and high"
+            f"environment, {space}; make a guard of the environment's low and high"
         )
 
     def to_guard(action: Any) -> Action:
-        array = np.array(action, dtype=np.float64).reshape(shape)
-        return array if shape else float(array)
+        array = np.array(action, dtype=np.float64)
+        if array.size != math.prod(shape):
+            raise ValueError(f"the action is {action!r}, but the environment's are {space}")
+        return array.reshape(shape) if shape else array.item()
 
     def to_env(action: Action) -> NDArray[Any]:
         array = np.asarray(action).reshape(space.shape).astype(space.dtype)

@@ -7,9 +7,10 @@ from functools import partial
 from typing import Any
 
 from evofsm.extras import needs
+from evofsm.guard import gym
 from evofsm.guard.api import Revision
 from evofsm.guard.guard import Guard
-from evofsm.guard.gym import Failed, Lane, Observe, StepResult, Terms, refuse_unless, warn_of
+from evofsm.guard.gym import Failed, Lane, Observe, StepResult, Terms
 
 with needs("pettingzoo", "pettingzoo", "a wrapper for PettingZoo"):
     from pettingzoo import AECEnv, ParallelEnv
@@ -18,7 +19,7 @@ with needs("pettingzoo", "pettingzoo", "a wrapper for PettingZoo"):
 _Each = dict[Any, Any]
 
 
-class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
+class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
     """Executes a guard's revision of each agent's action, and forwards all else as it is.
 
     All profit from what any agent meets: the guard learns each agent's episode **as a whole when
@@ -53,14 +54,14 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
         *,
         penalty: float = 0.0,
     ) -> None:
-        refuse_unless(not isinstance(env, AECEnv), env)
+        gym.refuse_unless(not isinstance(env, AECEnv), env)
         super().__init__(env)
-        self.guard = guard
+        self._guard, self._failed = guard, failed
         self._terms = partial(Terms, guard, observe=observe, failed=failed, penalty=penalty)
         self._lanes: dict[Any, Lane] = {}
         for agent in getattr(env, "possible_agents", ()):  # which an environment need not know
             self._enter(agent)
-        warn_of(env, guard, failed)
+        gym.warn_of(env, guard, failed)
 
     @property
     def revisions(self) -> dict[Any, Revision]:
