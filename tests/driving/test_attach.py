@@ -122,6 +122,7 @@ def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step):
         sumo.vehicle.setType("ego", "usual")  # nobody is hasty
         cars = attach(sumo, "all", mode=mode)
         drive(sumo, 40.0, brakes_at=np.inf)
+        assert cars.summary().get("limited", 0) == 0  # nobody had to brake hard until now
         sumo.vehicle.setMaxSpeed("lead", 3.0)
         drive(sumo, 40.0, brakes_at=np.inf)
         found.append(cars.summary())
@@ -130,7 +131,6 @@ def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step):
     assert guarded["collisions"] == alone["collisions"] == 0
     assert guarded["hard_brakes"] <= alone["hard_brakes"] + 1
     assert guarded["speed"] >= 0.995 * alone["speed"]
-    assert guarded["revised"] < 0.25 * guarded["decisions"]  # by some 0.1 m/s², most of them
 
 
 @pytest.mark.parametrize("ballistic", ["true", "false"])

@@ -18,25 +18,26 @@ import weakref
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import cache
 from importlib import import_module
-from itertools import count
+from itertools import chain, count
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from evofsm.driving.judge import REGAIN, SLIGHT, LatentRisk
-from evofsm.driving.leaders import Manoeuvres
+from evofsm.driving.leaders import BrakeWatch, Manoeuvres
 from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 from evofsm.driving.naming import VARIABLES
 from evofsm.driving.scenarios import steps_between
-from evofsm.driving.traffic import COLUMNS, Role, TrafficRisk, guard_for_traffic, width_for
+from evofsm.driving.traffic import COLUMNS, Role, TrafficRisk, guard_for_traffic
 from evofsm.fsm.validation import Floats
 from evofsm.guard import TOLERANCE, ActionJudge, ActionReviser, Guard, Mode, Revision
 
 # What is done with the chosen cars.
 _MODES = ("act", "shadow", "watch")
 _TYPE = "type:"
+# What is seen is so exact [m/s²].
+_SEEN_TO = 0.05
 # Braking harder than this is hard [m/s²].
 _HARD = 5.0
 # Clocks of SUMO count thousandths; two times that differ by less are one [s].
@@ -64,6 +65,8 @@ _LOOKS_AHEAD, _GENTLE = 30.0, 3.0
 _CAR_WIDTH = 1.8
 # Nobody is nearer in what is judged [m]. SUMO keeps minGap itself: what is kept beside it [m].
 _NEAREST, _MARGIN = 0.05, 0.1
+# Limits are as coarse as that [m/s²], and so far a driver may want more.
+_COARSE = 0.3
 # Slower than this a car stands, and a speed that differs by no more is the same [m/s].
 _STANDS, _SAME_SPEED = 0.1, 1e-6
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
@@ -78,12 +81,14 @@ class Neighbour(NamedTuple):
     gap: float  #: from bumper to bumper [m]
     room: float  #: what is left of it until SUMO counts a collision, in its step [m]
     speed: float  #: [m/s]
+    spared: float = 0.0  #: more is left if the follower does what its model wants [m]
 
 
 class _Facts(NamedTuple):
     length: float  #: [m]
     min_gap: float  #: [m]
     decel: float  #: [m/s²]
+    tau: float  #: [s]
     late: bool  #: whether it decides less often than in each step, and goes on in between
 
 
@@ -109,8 +114,8 @@ class Seeing:
         ballistic = str(simulation.getOption("step-method.ballistic")).lower() in ("true", "1")
         # In SUMO's Euler step a car drives all of it at the speed of its end. Against what is
         # rehearsed, a faster follower gets less far by half a step's worth of the difference, and a
-        # slower one further; so does whoever comes to a standstill within a step, by what speed it
-        # has after this one (`_further`).
+        # slower one further; whoever comes to a standstill amid a step gets further, too, by up to
+        # an eighth of its braking over the square of the step (`_further`).
         self._euler = 0.0 if ballistic else self.dt
         self._known: set[str] = set()
         self._bodies.clear()
@@ -132,8 +137,8 @@ class Seeing:
         if car not in self._bodies:
             vehicle = self._vehicle
             late = vehicle.getActionStepLength(car) > self.dt + _TICK
-            facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car), late
-            self._bodies[car] = _Facts(*facts)
+            facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car)
+            self._bodies[car] = _Facts(*facts, vehicle.getTau(car), late)
         return self._bodies[car]
 
     def pair(self, car: str) -> tuple[float, float, float] | None:
@@ -156,13 +161,13 @@ class Seeing:
         # Who is nearer than SUMO lets anybody be stands in a queue, or beside, where lanes merge.
         # Across a junction SUMO says 0 of all that is nearer than minGap.
         spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
-        near = Neighbour(neighbour, gap + follower.min_gap, gap + spare_gap, v)
-        room = near.room + 0.5 * euler * (v_follower - v_leader)
-        if is_ahead and 0.125 * follower.decel * euler * euler > _MARGIN:  # an eighth is the most
-            v_follower = self.wish(car, speed, near)
-        room += _further(v_leader, leader.decel, euler)
-        room -= _further(v_follower, follower.decel, euler)
-        return near._replace(room=max(room, _NEAREST))
+        room = gap + spare_gap + 0.5 * euler * (v_follower - v_leader)
+        late = 0.125 * follower.decel * euler * euler  # at most, whatever the follower does
+        near = Neighbour(neighbour, gap + follower.min_gap, max(room - late, _NEAREST), v)
+        if not is_ahead or late < _MARGIN:
+            return near
+        late -= _further(self.wish(car, speed, near), follower.decel, euler)
+        return near._replace(spared=late + _further(v_leader, leader.decel, euler))
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
         """The speed that a car's own model wants after the next step [m/s], but for red lights."""
@@ -228,7 +233,11 @@ def _further(speed: float, decel: float, euler: float) -> float:
 
 
 class Guarding:
-    """Guards each car, by a guard of its own."""
+    """Guards each car, by a guard of its own; what leaders do they share, unless given a guard.
+
+    A leader is taken to brake by the ``decel`` that SUMO says of it, until enough with the same one
+    were seen to brake harder.
+    """
 
     def __init__(
         self,
@@ -244,12 +253,15 @@ class Guarding:
         self._acts, self._report = acts, report
         self._template, self._tolerance, self._regain = guard, tolerance, regain
         self.cars: dict[str, _Car] = {}  #: by id
+        self._watches: dict[str, tuple[BrakeWatch, Manoeuvres]] = {}
         judge = None if guard is None else _judge(guard)
         if not (judge is None or isinstance(judge, TrafficRisk) or judge.labels.names == VARIABLES):
             raise ValueError(
                 f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must "
                 f"be a TrafficRisk, or observe {', '.join(VARIABLES)}"
             )
+        #: How hard leaders were seen to brake, by their ``decel`` [m/s²].
+        self.leaders: dict[float, Manoeuvres] = {}
         self.begin_anew()
         self.decisions = 0
         #: Steps in which a car braked harder, or accelerated less, than its driver wanted by more
@@ -264,6 +276,7 @@ class Guarding:
         self.interval = self._seeing.dt if interval is None else interval
         self._every = steps_between(self.interval, self._seeing.dt)
         self._steps = 0
+        self._watches.clear()
 
     def add(self, car: str) -> None:
         """Guard it from now on."""
@@ -280,17 +293,22 @@ class Guarding:
         """Say what came of the step that is over, and decide on the next."""
         decides = self._steps % self._every == 0
         self._steps += 1
+        speeds: dict[str, float] = {}  # of leaders
         for car in self.cars.values():
             speed = self._vehicle.getSpeed(car.id)
             if car.seen is not None:
                 self._look_back(car, speed)
             if decides:
                 self._look(car, speed)
+                if car.around[0] is not None:
+                    speeds[car.around[0].id] = car.around[0].speed
                 if car.seen is not None and self._acts:
                     self._decide(car, car.high)
             car.speed, car.time = speed, time
             if self._acts:
                 self._act(car, speed)
+        if decides:
+            self._watch(speeds)
 
     def _look(self, car: _Car, speed: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
@@ -305,7 +323,7 @@ class Guarding:
         if (ahead and ahead.id) != (before and before.id):
             car.guard.begin()  # what is known of the one before does not hold of this one
             if ahead and self._template is None and isinstance(judge, TrafficRisk):
-                judge.ahead.manoeuvres = _brakes(self._seeing.body(ahead.id).decel)
+                judge.ahead.manoeuvres = self._leaders_like(ahead.id)
         car.revision = car.seen = None
         if scene and (ahead or behind):
             car.seen = self._seeing.rows(car.id, speed, ahead, behind)
@@ -331,8 +349,9 @@ class Guarding:
         # Nor faster than it would drive on a free road.
         car.limit = min(next_speed, self._vehicle.getAllowedSpeed(car.id))
         car.wish = self._seeing.wish(car.id, speed, car.around[0])
-        coarse = max(SLIGHT, width_for(self._seeing.dt)) * self._seeing.dt
-        if not self._seeing.body(car.id).late and car.wish <= car.limit + coarse:
+        most = car.limit + _COARSE * self._seeing.dt
+        is_safe = car.wish <= most or self._is_exactly_safe(car, speed)
+        if is_safe and not self._seeing.body(car.id).late:
             self._hand_back(car)  # it drives as it would by itself, with its imperfections
             return
         if car.mode is None:
@@ -340,6 +359,20 @@ class Guarding:
             self._vehicle.setSpeedMode(car.id, car.mode & ~_OFF | _ON)
         self.limited += 1
         self._vehicle.setSpeed(car.id, car.limit)
+
+    def _is_exactly_safe(self, car: _Car, speed: float) -> bool:
+        """Whether what its model wants is survived, if that is what it does in SUMO's step.
+
+        Who keeps less time than a step (``tau``) drives into others, as SUMO warns, if they dawdle.
+        """
+        judge, ahead, dt = _judge(car.guard), car.around[0], self._seeing.dt
+        is_careful = self._seeing.body(car.id).tau >= dt
+        if not (isinstance(judge, TrafficRisk) and ahead and ahead.spared and is_careful):
+            return False
+        # It may use up the margin, as SUMO's models do.
+        here = ahead.room + ahead.spared + judge.ahead.margin, speed, ahead.speed
+        critical = judge.ahead.critical(here, [(car.wish - speed) / dt])
+        return bool(critical[0] >= judge.ahead.manoeuvres.exceeded_by(self._tolerance) - _SEEN_TO)
 
     def _hand_back(self, car: _Car) -> None:
         if car.mode is not None:
@@ -365,6 +398,31 @@ class Guarding:
         if self._report is not None:
             self._report(GuardedStep(car.time, car.id, wish, acceleration, revision, *car.about))
 
+    def _watch(self, speeds: dict[str, float]) -> None:
+        """Learn how hard leaders brake, each by itself, whoever follows it.
+
+        What a guard makes a car do, whoever attached it, is not what leaders do: it is not learnt.
+        """
+        groups = [a.guarding for a in _ATTACHED if a._sumo is self._sumo and a.guarding]
+        for car in chain.from_iterable(group.cars.values() for group in groups):
+            if car.mode is not None:
+                speeds.pop(car.id, None)
+                self._watches.pop(car.id, None)
+        for leader, speed in speeds.items():
+            if leader not in self._watches:
+                self._watches[leader] = BrakeWatch(self.interval), self._leaders_like(leader)
+            watch, seen = self._watches[leader]
+            seen.remember(watch.see(0.0, speed, speed))
+        for leader in sorted(self._watches.keys() - speeds.keys()):
+            watch, seen = self._watches.pop(leader)
+            seen.remember(watch.end())
+
+    def _leaders_like(self, car: str) -> Manoeuvres:
+        """What is known of leaders that brake as hard as it, by what SUMO says of them."""
+        decel = self._seeing.body(car).decel
+        # How hard SUMO's cars brake is exactly known, and has an end.
+        return self.leaders.setdefault(decel, Manoeuvres(decel, width=_SEEN_TO))
+
     def _guard_for(self, car: str, high: float) -> Guard:
         mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
@@ -379,15 +437,6 @@ class Guarding:
         if isinstance(guard.reviser, ActionReviser):
             guard.reviser.mode = mode
         return guard
-
-
-@cache
-def _brakes(decel: float) -> Manoeuvres:
-    """Of a leader that SUMO says brakes so hard [m/s²].
-
-    In an emergency it brakes harder, and so does whoever follows.
-    """
-    return Manoeuvres(decel)
 
 
 def _judge(guard: Guard) -> ActionJudge | None:

@@ -74,10 +74,14 @@ REAL_DRIVES = LeaderBrakes(
 
 
 class Manoeuvres:
-    """The decelerations of the latest manoeuvres, and how likely harder ones are."""
+    """The decelerations of the latest manoeuvres, and how likely harder ones are.
 
-    def __init__(self, assumed: float) -> None:
+    ``width`` is that of the kernel [m/s²], which then ends at what was seen; else Silverman's.
+    """
+
+    def __init__(self, assumed: float, width: float | None = None) -> None:
         self.assumed = positive("assumed", assumed)
+        self.width = width
         self.gentle = 0
         self.decels: deque[float] = deque(maxlen=_MOST_REMEMBERED)
         self._tabulate()
@@ -108,9 +112,9 @@ class Manoeuvres:
         grid = np.arange(0.0, HARDEST + _GRID, _GRID)
         harder = (self.assumed > grid).astype(np.float64)
         if self.decels:
-            samples = np.array(self.decels)
+            samples = np.array(self.decels) - (self.width or 0.0)
             # Silverman's rule; where few were seen their spread says little.
-            width = max(_NARROWEST, 2.34 * samples.std() * len(samples) ** -0.2)
+            width = self.width or max(_NARROWEST, 2.34 * samples.std() * len(samples) ** -0.2)
             offset = np.clip((samples - grid[:, None]) / width, -1.0, 1.0)
             harder += (0.5 + offset * (0.75 - 0.25 * offset * offset)).sum(axis=1)
         harder[grid >= HARDEST] = 0.0

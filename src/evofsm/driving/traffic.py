@@ -34,9 +34,8 @@ PLACES, SIZES, RATES = (-1e9, 1e9), (0.0, 1e3), (-1e3, 1e3)
 
 # Who will be in one's path within this time at the present lateral speed cuts in, or crosses [s].
 _AHEAD = 2.0
-# Width of an interval of accelerations, of which one is looked at [m/s²]; it changes the speed at
-# the next decision by so much at most [m/s].
-_WIDEST, _COARSEST = 0.3, 0.05
+# Width of an interval of accelerations, of which one is looked at [m/s²].
+_INTERVAL_WIDTH = 0.3
 # So hard leaders brake at most, unless told or seen otherwise: SUMO's emergencyDecel [m/s²].
 LEADER_DECEL = 9.0
 # So hard those behind brake [m/s²], once they have kept their speed for so long [s].
@@ -196,7 +195,7 @@ class TrafficRisk(ActionJudge):
     'the least braking that regains a safe gap in time'
     """
 
-    fallback = Fallback(0.0, "keeping the speed")
+    fallback, lowest_first = Fallback(0.0, "keeping the speed"), True
     ranges = (0.0, 1.0), PLACES, PLACES, SPEEDS, SPEEDS, SIZES, SIZES, RATES
 
     def __init__(self, ahead: LatentRisk) -> None:
@@ -291,11 +290,6 @@ class TrafficRisk(ActionJudge):
         self.ahead.refuse_unfit(actions)
 
 
-def width_for(interval: float) -> float:
-    """Of intervals of accelerations [m/s²], where decisions are so far apart [s]."""
-    return min(_WIDEST, _COARSEST / interval)
-
-
 def _worse(a: Judgement, b: Judgement) -> Judgement:
     """The higher risk of each action."""
     risk, low, high = map(np.maximum, a[:3], b[:3])
@@ -330,6 +324,6 @@ def guard_for_traffic(
     mode : Mode
     """
     judge = judge or TrafficRisk(LatentRisk.given(-decel, decel, LEADER_DECEL, interval))
-    actions = IntervalActions(low, high, width_for(interval), outside="clip")
+    actions = IntervalActions(low, high, _INTERVAL_WIDTH, outside="clip")
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, learn=False)
