@@ -138,8 +138,8 @@ class Guard:
         move.
     failed : callable, optional
         From an observation to whether it is a failure; asked as an episode ends. A learnt judge
-        also asks it around what was survived: so it knows of failures before the first. It decides
-        by how it explains them, and `told_by_experience` says where the function says otherwise.
+        also asks it around what was survived: so from the second episode on it knows of failures
+        before one. It decides by how it explains them; `told_by_experience` says where that errs.
     model : callable, optional
         From an observation and an action to the next observation: how it moves, as far as that is
         known. A learnt judge asks it, after each episode, as often as that had decisions, around
