@@ -103,12 +103,12 @@ class RevisedActions(_Settled, gymnasium.Wrapper[Any, Any, Any, Any], RecordCons
         Without it a box is flattened, each value of ``Discrete`` is a variable that is 1 or 0, and
         parts of ``Dict`` and ``Tuple`` follow each other, but for an ``action_mask``.
     failed : callable or "terminated"
-        From a `StepResult` to whether it ended in failure. ``"terminated"`` says that every episode
-        that is terminated failed, as in CartPole. Where an environment also terminates on success
-        that is wrong: ``lambda step: step.terminated and step.reward <= 0`` for FrozenLake,
-        ``step.reward <= -100`` for LunarLander and BipedalWalker, ``lambda step: False`` for never,
-        as in MountainCar and Acrobot. Not needed where the guard has a function of its own; where
-        nobody says it, it is ``"terminated"``, with a warning.
+        From a step (``observation``, ``reward``, ``terminated``, ``truncated``, ``info``) to
+        whether it ended in failure. ``"terminated"`` says that all that are terminated failed, as
+        in CartPole. Where an environment also terminates on success that is wrong: ``lambda step:
+        step.terminated and step.reward <= 0`` for FrozenLake, ``step.reward <= -100`` for
+        LunarLander and BipedalWalker, ``lambda step: False`` for never, as in MountainCar and
+        Acrobot. By default what the guard says itself, or else ``"terminated"``, with a warning.
     penalty : float
         Subtracted from the reward per unit of ``reviser/penalty``: half ranges of the action, in a
         box the root of the sum of squares over its components; 1 for another index. Of what
@@ -502,7 +502,7 @@ class Terms:
         try:
             return answered(self._failed(step))
         except (AttributeError, KeyError, TypeError) as error:
-            error.add_note(f"failed was called with a StepResult, such as failed={_FAILED}")
+            error.add_note(f"failed gets a step {StepResult.__slots__}, such as failed={_FAILED}")
             raise
 
     def look(self, observation: Any) -> Floats | None:
