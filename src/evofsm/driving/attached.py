@@ -411,11 +411,11 @@ class Guarding:
         for leader, speed in speeds.items():
             if leader not in self._watches:
                 self._watches[leader] = BrakeWatch(self.interval), self._leaders_like(leader)
-            watch, seen = self._watches[leader]
-            seen.remember(watch.see(0.0, speed, speed))
+            watch, brakes = self._watches[leader]
+            brakes.remember(watch.see(0.0, speed, speed))
         for leader in sorted(self._watches.keys() - speeds.keys()):
-            watch, seen = self._watches.pop(leader)
-            seen.remember(watch.end())
+            watch, brakes = self._watches.pop(leader)
+            brakes.remember(watch.end())
 
     def _leaders_like(self, car: str) -> Manoeuvres:
         """What is known of leaders that brake as hard as it, by what SUMO says of them."""
