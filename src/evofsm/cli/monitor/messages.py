@@ -134,12 +134,13 @@ class Form:
         body = line if isinstance(line, dict) else _parsed(line)
         kind = self._scene if self.scenes or body.keys() & {"ego", "objects"} else self._row
         kind = self._end if "end" in body else kind
-        names = kind.__annotations__
+        # By the very keys of the type: others of letters beyond ASCII msgspec 0.22 does not find.
+        known = {name: name for name in kind.__annotations__}
         try:
-            if unknown := [name for name in body if name not in names]:
-                raise _unknown(unknown[0], names)
+            if unknown := [name for name in body if name not in known]:
+                raise _unknown(unknown[0], known)
             try:
-                fields = msgspec.convert(body, kind)
+                fields = msgspec.convert({known[name]: body[name] for name in body}, kind)
             except msgspec.ValidationError as error:
                 raise _refused(body, str(error)) from None
             if kind is self._end:
