@@ -81,7 +81,7 @@ class Neighbour(NamedTuple):
     gap: float  #: from bumper to bumper [m]
     room: float  #: what is left of it until SUMO counts a collision, in its step [m]
     speed: float  #: [m/s]
-    spared: float = 0.0  #: more is left if the follower does what its model wants [m]
+    exact: float = 0.0  #: the same, if the follower does what its model wants [m]; 0: not asked
 
 
 class _Facts(NamedTuple):
@@ -166,8 +166,9 @@ class Seeing:
         near = Neighbour(neighbour, gap + follower.min_gap, max(room - late, _NEAREST), v)
         if not is_ahead or late < _MARGIN:
             return near
-        late -= _further(self.wish(car, speed, near), follower.decel, euler)
-        return near._replace(spared=late + _further(v_leader, leader.decel, euler))
+        exact = room - _further(self.wish(car, speed, near), follower.decel, euler)
+        exact += _further(v_leader, leader.decel, euler)
+        return near._replace(exact=max(exact, _NEAREST))
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
         """The speed that a car's own model wants after the next step [m/s], but for red lights."""
@@ -367,12 +368,13 @@ class Guarding:
         """
         judge, ahead, dt = _judge(car.guard), car.around[0], self._seeing.dt
         is_careful = self._seeing.body(car.id).tau >= dt
-        if not (isinstance(judge, TrafficRisk) and ahead and ahead.spared and is_careful):
+        if not (isinstance(judge, TrafficRisk) and ahead and ahead.exact and is_careful):
             return False
         # It may use up the margin, as SUMO's models do.
-        here = ahead.room + ahead.spared + judge.ahead.margin, speed, ahead.speed
+        here = ahead.exact + judge.ahead.margin, speed, ahead.speed
         critical = judge.ahead.critical(here, [(car.wish - speed) / dt])
-        return bool(critical[0] >= judge.ahead.manoeuvres.exceeded_by(self._tolerance) - _SEEN_TO)
+        tolerance = getattr(car.guard.reviser, "tolerance", self._tolerance)
+        return bool(critical[0] >= judge.ahead.manoeuvres.exceeded_by(tolerance) - _SEEN_TO)
 
     def _hand_back(self, car: _Car) -> None:
         if car.mode is not None:
