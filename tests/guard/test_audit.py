@@ -353,20 +353,12 @@ def forge(path, target, kind, which, change):
     return numbers[which]
 
 
-def with_ulp(name):
-    return lambda content: content.update({name: math.nextafter(content[name], math.inf)})
-
-
 def other(name, value):
     return lambda content: content.update({name: value})
 
 
-def of_reviser(content):
-    content["settings"]["reviser"]["mode"] = "shadow"
-
-
 REPLAYED = {
-    "executed": ("decision", 3, with_ulp("executed")),
+    "executed": ("decision", 3, lambda it: it.update(executed=math.nextafter(it["executed"], 9))),
     "observation": ("decision", 3, other("observation", [90.0, 15.0, 15.0])),
     "reason": ("decision", 2, other("reason", "the driver wished it")),
     "explanation": ("decision", 4, other("explanation", "all was well here")),
@@ -375,7 +367,8 @@ REPLAYED = {
     "no number": ("decision", 1, other("observation", ["x", 1.0, 2.0])),
     "no guard": ("start", 0, other("guard", "AAAA")),
     "failed": ("end", 0, other("failed", True)),  # the machine learns it, and says so at the end
-    "mode": ("begin", 0, of_reviser),  # shows where it first matters
+    # It shows where it first matters.
+    "mode": ("begin", 0, lambda one: one["settings"]["reviser"].update(mode="shadow")),
 }
 MISFITS = {
     **{f"version {one!r}": ("start", other("version", one)) for one in (0, 99, 1.0, True, "1")},

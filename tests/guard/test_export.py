@@ -145,18 +145,12 @@ def test_decisions_are_the_same_and_sanitizers_silent(name, tmp_path):
     assert found.changed > 20
 
 
-SETTINGS = {
-    "mode": lambda guard: setattr(guard.reviser, "mode", Mode.SHADOW),
-    "tolerance": lambda guard: setattr(guard.reviser, "tolerance", 0.6),
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("change", SETTINGS)
+@pytest.mark.parametrize(("setting", "value"), [("mode", Mode.SHADOW), ("tolerance", 0.6)])
 @pytest.mark.parametrize("name", ["wall", "cars"])
-def test_settings_of_a_guard_are_those_in_c(name, change, tmp_path):
+def test_settings_of_a_guard_are_those_in_c(name, setting, value, tmp_path):
     learnt = c99.learnt(name)
-    SETTINGS[change](learnt.guard)
+    setattr(learnt.guard.reviser, setting, value)
     agrees(learnt, tmp_path, ["-O1"])
 
 

@@ -111,7 +111,9 @@ def test_one_failure_is_learnt_from_and_of_alarms_the_closest_that_there_is_coun
         assert judge.alarm == alarm
 
 
-def test_where_nothing_foresees_a_failure_there_is_no_alarm():
+def test_where_nothing_foresees_a_failure_there_is_no_alarm_and_without_failures_no_judge():
+    with pytest.raises(ValueError, match="no episode failed"):
+        Foresight.learn_log([[1.0, 2.0]], [False], dt=DT, horizon=HORIZON)
     judge = learnt(random, 40)
     assert judge.alarm is None
     for_all = (
@@ -173,11 +175,6 @@ def test_what_counts_as_foreseen_and_as_false(heat, failed, hold, told):
     found, _ = judge.tally(Runs.of([heat], [failed]), 0, plain=True)
     foreseen, minutes, false = told
     assert (found.foreseen, found.lead, found.false) == (foreseen, minutes * DT, false)
-
-
-def test_a_log_without_failures_is_refused():
-    with pytest.raises(ValueError, match="no episode failed"):
-        Foresight.learn_log([[1.0, 2.0]], [False], dt=DT, horizon=HORIZON)
 
 
 def test_an_episode_of_which_nothing_was_seen_ends_and_teaches_nothing():

@@ -55,13 +55,6 @@ def test_a_controller_that_fails_once_is_driven_on_without(line, caplog):
     assert "no usable proposal" in told.decisions[2].revision.reason
 
 
-def test_an_observation_of_another_size_is_refused_with_both_numbers():
-    guard = Guard(-1.0, 1.0, interval=0.1)
-    guard.decide(np.zeros(3), 0.5)
-    with pytest.raises(ValueError, match="observation has 4 variables; it must have 3"):
-        guard.decide(np.zeros(4), 0.5)
-
-
 def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
     risk = LatentRisk(-8.0, dt=0.1)
     reviser = ActionReviser(risk, IntervalActions(-8.0, 2.0, 0.5), mode=Mode.SHADOW)
