@@ -154,9 +154,15 @@ def forge():
         told = json.loads(entries.pop("__metadata__")["evofsm"])
         if callable(changes):
             changes(told, entries, numbers)
-        else:
-            for name, value in changes.items():
-                _change(told, entries, numbers, name, value)
+            changes = {}
+        for name, value in changes.items():
+            if name not in entries:
+                told["settings"][name] = value
+                continue
+            kinds = {"F64": "<f8", "I64": "<i8", "U8": "|u1", "BOOL": "|b1"}
+            begin, _ = entries[name]["data_offsets"]
+            one = np.array(value, kinds[entries[name]["dtype"]]).tobytes()
+            numbers[begin : begin + len(one)] = one
         metadata = {"sha256": "0" * 64, "evofsm": json.dumps(told)}
         header = json.dumps({"__metadata__": metadata, **entries}).encode()
         digest = hashlib.sha256(header + numbers).hexdigest().encode()
@@ -164,15 +170,6 @@ def forge():
         path.write_bytes(len(header).to_bytes(8, "little") + signed + numbers)
 
     return change
-
-
-def _change(told, entries, numbers, name, value):
-    if name not in entries:
-        told["settings"][name] = value
-        return
-    kind = {"F64": "<f8", "I64": "<i8", "U8": "|u1", "BOOL": "|b1"}[entries[name]["dtype"]]
-    begin, one = entries[name]["data_offsets"][0], np.array(value, kind).tobytes()
-    numbers[begin : begin + len(one)] = one
 
 
 @pytest.fixture

@@ -146,10 +146,7 @@ LOOKED_AT = {
     "Date": (lambda k: f"{at(k * 60):%m/%d/%Y %H:%M}", "--unit 'Date=%m/%d/%Y %H:%M'"),
     "Date,Time": (lambda k: f"{at(k):%d/%m/%Y,%H:%M}", "--time Date,Time"),
     "time": (lambda k: 600 - k, "time runs backwards"),
-    "t": (
-        lambda k: k + 7200 * (k > 500) + 60 * (k > 550),
-        "rows looked at 600, one every 1 s",
-    ),
+    "t": (lambda k: k + 7200 * (k > 500) + 60 * (k > 550), "rows looked at 600, one every 1 s"),
 }
 
 

@@ -60,9 +60,8 @@ def test_it_learns_saves_and_drives_frozen(evofsm, tmp_path):
     first = evofsm("drive", "emergency", "--episodes", 12, "--out", learnt)
     assert first.exit_code == 0, first.stderr
     assert "0 of 12: 0.0% (95 %, two-sided: 0.0% to 26.5%)" in first.stdout
-    assert {path.name for path in learnt.iterdir()} == {
-        *("guard.evofsm", "episodes.jsonl", "episodes.csv", "decisions.parquet"),
-    }
+    written = {path.name for path in learnt.iterdir()}
+    assert written == {"guard.evofsm", "episodes.jsonl", "episodes.csv", "decisions.parquet"}
     table = polars.read_parquet(learnt / "decisions.parquet")
     assert table.columns == ["episode", *DECISION_TABLE]
     changed = table.filter(polars.col("proposed") != polars.col("executed"))
@@ -164,15 +163,14 @@ def test_a_folder_of_other_settings_is_refused(tmp_path, changes, says):
     assert "or name another folder" in str(caught.value)
 
 
-def test_what_was_learnt_is_one_of_the_settings(evofsm, refused, tmp_path):
+def test_what_was_learnt_is_one_of_the_settings_and_two_at_once_are_refused(
+    evofsm, refused, tmp_path
+):
     for name in ("a", "b"):
         in_turn(tmp_path / name, 1, seed=ord(name))
     out = ("--episodes", 1, "--out", tmp_path / "out")
     assert evofsm("drive", "emergency", "--frozen", tmp_path / "a", *out).exit_code == 0
     assert "digest was" in refused("drive", "emergency", "--frozen", tmp_path / "b", *out)
-
-
-def test_two_at_once_are_refused(tmp_path):
     with begun(tmp_path, Setup(EMERGENCY)), pytest.raises(ValueError, match="another process"):
         in_turn(tmp_path, 1)
 
@@ -188,14 +186,6 @@ def test_a_full_disk_is_named_and_what_was_driven_is_kept(tmp_path, monkeypatch)
 
 
 # -- At once --------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    """The folder of many episodes that nothing happened to."""
-    out = tmp_path_factory.mktemp("undisturbed")
-    in_turn(out, EPISODES, reviser="none", learn=False)
-    return out
 
 
 def unrevised(out, *words):
@@ -241,7 +231,7 @@ def test_it_is_what_driving_in_turn_makes_of_the_same_episodes(tmp_path, world):
 
 
 @pytest.mark.slow
-def test_killed_workers_and_a_killed_parent_change_nothing(evofsm, tmp_path, undisturbed):
+def test_killed_workers_and_a_killed_parent_change_nothing(evofsm, tmp_path):
     journal, words = tmp_path / "episodes.jsonl", unrevised(tmp_path, "--workers", 2)
     with started(*words, stdout=subprocess.DEVNULL) as process:
         wait_for(journal, 2, process)
@@ -264,7 +254,8 @@ def test_killed_workers_and_a_killed_parent_change_nothing(evofsm, tmp_path, und
         file.write(b'{"episode":5,"varia')
     again = evofsm("drive", *unrevised(tmp_path, "--workers", 1), "--json")
     assert again.exit_code == 0, again.stderr
-    assert results_of(tmp_path) == results_of(undisturbed)
+    in_turn(tmp_path / "undisturbed", EPISODES, reviser="none", learn=False)
+    assert results_of(tmp_path) == results_of(tmp_path / "undisturbed")
     assert json.loads(again.stdout)["episodes"] == EPISODES
 
 

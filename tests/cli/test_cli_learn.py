@@ -256,9 +256,6 @@ def test_files_that_are_none_end_with_one_line(evofsm, refused, log, tmp_path):
     assert "is a folder" in refused("learn", tmp_path)
     assert "another program" in refused("inspect", log)
     assert "is named twice" in refused("learn", log, log.parent / ".." / log.parent.name / log.name)
-
-
-def test_out_never_overwrites_a_file_of_another_kind(evofsm, refused, log):
     before = log.read_bytes()
     assert "is no file of evofsm; it was left alone" in refused("learn", log, "--out", log)
     assert log.read_bytes() == before

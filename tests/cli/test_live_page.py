@@ -52,7 +52,7 @@ window.touching = () => [...words].flatMap(([id, all]) => all.flatMap((a, k) => 
 """
 SCALES = "[...document.querySelectorAll('canvas')].map((one) => one.height - one.clientHeight)"
 
-pytestmark = pytest.mark.usefixtures("compiled")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("compiled")]
 
 
 @contextmanager
@@ -134,7 +134,6 @@ def time_shown(page):
     return float(text(page, "time").split()[0])
 
 
-@pytest.mark.slow
 def test_the_cars_move_smoothly_and_can_be_stopped(seen):
     page = seen(speed=2.0)
     shows(page, "mode", "live")
@@ -160,7 +159,6 @@ def test_the_cars_move_smoothly_and_can_be_stopped(seen):
     playwright.expect(page.locator("#speed")).to_have_value("4")
 
 
-@pytest.mark.slow
 def test_switched_on_the_reviser_prevents_the_collision_that_happens_with_it_off(seen):
     page = seen(speed=math.inf)
     shows(page, "headline", "No collision")
@@ -182,7 +180,6 @@ def test_switched_on_the_reviser_prevents_the_collision_that_happens_with_it_off
     shows(page, "headline", "No collision")
 
 
-@pytest.mark.slow
 def test_the_past_can_be_looked_at_and_left(seen):
     page = seen(speed=math.inf)
     shows(page, "headline", "No collision")
@@ -205,7 +202,6 @@ def test_the_past_can_be_looked_at_and_left(seen):
     assert text(page, "mode").strip() == "ended"
 
 
-@pytest.mark.slow
 def test_states_and_help_are_shown_and_the_theme_changes(seen):
     page = seen(speed=math.inf)
     shows(page, "headline", "No collision")
@@ -221,7 +217,6 @@ def test_states_and_help_are_shown_and_the_theme_changes(seen):
     shows(page, "about", "case 4")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("session", [cars, environment("CartPole-v1"), environment(DISC), logged])
 def test_words_never_touch_and_nothing_is_larger_than_the_screen(seen, session):
     page = seen(session=session, speed=math.inf)

@@ -29,11 +29,8 @@ def test_it_decides_as_the_guard_does(mode):
         )
         executed = 0.5 if mode is Mode.SHADOW else revision.advised
         assert answer["executed"] == revision.executed == executed
-        assert (answer["risk_proposed"], answer["advised"], answer["reason"]) == (
-            revision.risk_proposed,
-            revision.advised,
-            revision.reason,
-        )
+        for name in ("risk_proposed", "advised", "reason"):
+            assert answer[name] == getattr(revision, name)
         risky = revision.risk_proposed > 0.02
         assert answer["alarm"] == risky == (revision.advised < 0.4)
     assert (answer["n"], answer["alarm"], answer["mode"]) == (80, True, mode.value)

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import queue
 import signal
 import socket
 import sys
@@ -223,8 +224,6 @@ def alone(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_zenoh_carries_the_same_and_refuses_a_key_that_is_none(alone, plain):
-    import queue
-
     import zenoh
 
     with pytest.raises(ValueError, match="--zenoh"):
