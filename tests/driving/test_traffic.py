@@ -160,11 +160,8 @@ def test_one_brakes_no_harder_than_who_is_behind_survives():
     assert followed.executed == alone.executed < -4.5
 
 
-def test_what_is_sure_ahead_weighs_more_than_who_is_behind():
+def test_who_is_behind_and_cannot_be_spared_is_braked_for_softly_unless_it_is_sure_ahead():
     assert decide(scene(ahead(10.0, 0.0), behind(3.0, 15))).executed == LOW
-
-
-def test_where_who_is_behind_cannot_be_spared_one_brakes_as_softly_as_one_can():
     revision = decide(scene(ahead(27.0, 0.0), behind(0.5, 15)))
     assert -DECEL <= revision.executed < 0.0
     assert "the softest for ahead" in revision.reason

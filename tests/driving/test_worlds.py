@@ -11,7 +11,7 @@ from evofsm.driving.sumo import SumoWorld
 from evofsm.driving.world import REALISED, KinematicWorld
 from evofsm.paper.runs import CASES, Settings
 
-pytest.importorskip("libsumo")
+libsumo = pytest.importorskip("libsumo")
 
 SETTINGS = Settings.load()
 NORMAL = IDM(1.25, 25.0, 2.0, 1.5, 2.0)
@@ -46,8 +46,6 @@ def test_the_closed_form_drives_the_golden_runs(in_both):
 
 
 def test_sumo_itself_reports_the_collision_at_the_last_step(in_both):
-    import libsumo
-
     episode, reports = in_both[1][0], []
     with SumoWorld() as world, world.open(SETTINGS.scenario) as road:
         while not road.over:
@@ -115,8 +113,6 @@ def test_a_road_that_may_be_too_short_is_refused():
 
 
 def test_after_a_run_that_was_closed_from_outside_another_one_starts():
-    import libsumo
-
     world, short = SumoWorld(), replace(SETTINGS.scenario, duration=0.5)
     before = world.run(short, SETTINGS.drivers[1])
     with world.open(short):

@@ -375,10 +375,10 @@ def assert_pair(path):
     assert chunk.times == pytest.approx(5.0 + 0.1 * np.arange(5))
 
 
-def test_ground_truth_and_sensor_views_are_read_gzipped_or_not(tmp_path, osi):
-    truth, view = osi.osi_traces()
+def test_ground_truth_and_sensor_views_are_read_gzipped_or_with_logical_lanes_alone(tmp_path, osi):
+    (truth, view), lanes = osi.osi_traces(), next(osi.osi_traces(logical=True))
     named = {"trace.osi": truth, "view.osi": view, "trace.osi.gz": gzip.compress(truth)}
-    for name, content in named.items():
+    for name, content in (named | {"lanes.osi": lanes}).items():
         (tmp_path / name).write_bytes(content)
         assert_pair(tmp_path / name)
 
@@ -392,11 +392,6 @@ def test_mcap_is_read_by_its_schema_and_named_where_it_holds_something_else(tmp_
             assert "its schemas are Log, SensorData" in refusal(path)
         else:
             assert_pair(path)
-
-
-def test_logical_lanes_are_lanes_where_there_are_no_others(tmp_path, osi):
-    (tmp_path / "trace.osi").write_bytes(next(osi.osi_traces(logical=True)))
-    assert_pair(tmp_path / "trace.osi")
 
 
 LEFT_OPEN = {
