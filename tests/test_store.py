@@ -148,9 +148,7 @@ def test_a_file_that_is_larger_than_any_is_refused_at_once(whole, tmp_path):
     (tmp_path / "bomb").write_bytes(whole)
     os.truncate(tmp_path / "bomb", 1 << 30)
     began = time.process_time()
-    with pytest.raises(
-        ValueError, match="1,073,741,824 bytes; no file holds more than 536,870,912"
-    ):
+    with pytest.raises(ValueError, match=r"1,073,741,824 bytes; no file .* than 536,870,912"):
         store.read(tmp_path / "bomb", DRAWS)
     assert time.process_time() - began < 0.1
 

@@ -25,12 +25,7 @@ def test_intervals_meet_and_an_inner_edge_belongs_to_the_one_that_it_begins():
 
 @pytest.mark.parametrize(
     ("low", "high", "width", "count"),
-    [
-        (0.0, 0.3, 0.1, 3),
-        (0.0, 2.1, 0.3, 7),
-        (-1.0, 1.0, 3.0, 1),
-        (0.0, 1.0, 0.4, 3),
-    ],
+    [(0.0, 0.3, 0.1, 3), (0.0, 2.1, 0.3, 7), (-1.0, 1.0, 3.0, 1), (0.0, 1.0, 0.4, 3)],
 )
 def test_the_range_is_covered_by_as_many_intervals_as_arithmetic_on_paper_says(
     low, high, width, count
@@ -42,9 +37,8 @@ def test_the_range_is_covered_by_as_many_intervals_as_arithmetic_on_paper_says(
 
 def test_values_beyond_the_range_fall_into_the_end_intervals_when_clipped():
     actions = IntervalActions(**PAPER, outside="clip")
-    assert actions.encode([-math.inf, -9.0, -2.6, 2.6, 9.0, math.inf]).tolist() == [
-        *(0, 0, 0, 16, 16, 16)
-    ]
+    beyond = [-math.inf, -9.0, -2.6, 2.6, 9.0, math.inf]
+    assert actions.encode(beyond).tolist() == [0, 0, 0, 16, 16, 16]
 
 
 @pytest.mark.parametrize(

@@ -99,9 +99,8 @@ def test_what_is_new_is_said_to_be(crash):
     assert "Never seen but in one observation." in found.text
     assert found.here == Tally(0, 0)
     machine.observe([200.0, 5.0, 5.0])
-    assert (
-        "No earlier episode that was counted came here (2 observations)." in machine.explain().text
-    )
+    text = machine.explain().text
+    assert "No earlier episode that was counted came here (2 observations)." in text
     assert EvolvingFSM(1).model().explain([]).text == "Nothing was learnt yet."
 
 

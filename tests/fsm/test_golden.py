@@ -30,12 +30,9 @@ def test_every_row_is_the_golden_one(name, golden, outcome):
     np.testing.assert_array_equal(getattr(outcome[1], name), golden[name])
 
 
-def test_surprise_is_the_golden_one_and_missing_in_the_same_rows(golden, outcome):
+def test_beliefs_and_surprise_are_the_golden_ones_and_missing_in_the_same_rows(golden, outcome):
     np.testing.assert_allclose(outcome[1].surprise, golden["jsd"], rtol=0, atol=1e-9)
     assert np.flatnonzero(np.isnan(outcome[1].surprise)).tolist() == list(golden["episode_starts"])
-
-
-def test_beliefs_are_the_golden_ones(golden, outcome):
     np.testing.assert_allclose(outcome[1].belief[::25], golden["belief"], rtol=0, atol=1e-9)
 
 

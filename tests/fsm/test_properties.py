@@ -17,10 +17,8 @@ def machines(draw, m, n_actions):
         "learning_rate": draw(st.sampled_from([0.01, 0.3, 0.9])),
         "prior_frequency": draw(st.sampled_from([1e-6, 1e-3, 1.0])),
     }
-    radius, spread = (
-        draw(st.sampled_from([0.05, 0.3, 2.0])),
-        draw(st.sampled_from([0.05, 1.0, 3.0])),
-    )
+    radius = draw(st.sampled_from([0.05, 0.3, 2.0]))
+    spread = draw(st.sampled_from([0.05, 1.0, 3.0]))
     if draw(st.booleans()):
         scales = draw(st.sampled_from([(), (0.5, 3.0, 1.0)[:m]]))
         return EvolvingFSM(n_actions, rule=Novelty(radius, scales, spread), **told)

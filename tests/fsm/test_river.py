@@ -101,9 +101,8 @@ def test_rivers_metrics_of_clusterers_score_it():
     rows = [(x, None) for x in as_features(walk())]
     score = evaluate.progressive_val_score(rows, clusterer, metrics.Silhouette())
     assert 0.0 < score.get() < 1.0
-    assert [
-        list(one.values()) for one in clusterer.centers.values()
-    ] == clusterer.machine.centers.tolist()
+    centers = [list(one.values()) for one in clusterer.centers.values()]
+    assert centers == clusterer.machine.centers.tolist()
     assert RiverClusterer().centers == {}
 
 

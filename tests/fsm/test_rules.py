@@ -13,10 +13,7 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.rules import Novelty, Paper, describe_rule, register_rule
 from evofsm.fsm.step import Event
 
-RULES = {
-    "paper": Paper(),
-    "novelty": Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7),
-}
+RULES = {"paper": Paper(), "novelty": Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7)}
 
 
 @pytest.fixture(params=RULES.values(), ids=RULES.keys())
@@ -59,9 +56,8 @@ def test_no_observation_is_farther_than_the_radius_from_every_centre(seed, radiu
         event = machine.observe(z).event
         distances = np.linalg.norm((machine.centers - z) / scales, axis=1)
         assert distances.min() <= radius
-        assert (event == Event.CREATED) == (
-            distances[-1] == 0.0 and (distances[:-1] > radius).all()
-        )
+        is_new = distances[-1] == 0.0 and (distances[:-1] > radius).all()
+        assert (event == Event.CREATED) == is_new
 
 
 def test_belief_falls_with_scaled_distance_however_much_was_seen():

@@ -80,7 +80,7 @@ def test_whoever_forecasts_better_is_where_it_loses(study):
     assert ("persistence", "case 1") in lost.frame.select("forecast", "where").rows()
 
 
-def test_one_round_is_a_study_too_and_says_how_far_it_is():
+def test_one_round_is_a_study_too_and_says_how_far_it_is_and_other_settings_are_refused():
     done = []
     study = drive(progress=lambda *at: done.append(at))
     assert done == sorted(done)
@@ -88,9 +88,6 @@ def test_one_round_is_a_study_too_and_says_how_far_it_is():
     assert np.isfinite(divergences(study).drop("forecast").to_numpy()).all()
     with pytest.raises(ValueError, match="at least once"):
         drive(rounds=0)
-
-
-def test_a_setting_that_there_is_not_is_refused_by_name():
     with pytest.raises(ValueError, match=r"\[machine\]: there is no 'radios'; known are radius"):
         Settings.load({"machine": {"radios": 1.0}})
 

@@ -4,8 +4,10 @@ import pytest
 from studies import closed_loop
 from studies.closed_loop import MACHINE, OURS, ClosedLoop
 
+from evofsm.paper import write_page
+
 # After ten drives a guard was seldom shown to help.
-pytestmark = pytest.mark.filterwarnings("ignore:this guard was not shown to help")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:this guard was not shown")]
 TINY = ClosedLoop(
     train=10,
     test=10,
@@ -30,7 +32,6 @@ def rows_of(found, policy):
     return found["rows"].filter(policy=policy).to_dicts()
 
 
-@pytest.mark.slow
 def test_the_unrevised_driver_collides_and_ours_does_not(found):
     (unrevised,) = rows_of(found, "unrevised")
     assert unrevised["collision_rate"] > 0.8
@@ -43,7 +44,6 @@ def test_the_unrevised_driver_collides_and_ours_does_not(found):
     assert all(row["mobility"] > 0.6 for row in ours)
 
 
-@pytest.mark.slow
 def test_the_machine_is_told_nothing_but_failures_and_learns_from_the_same_draws(found):
     machine = rows_of(found, MACHINE)
     assert {row["told"] for row in machine} == {"nothing but failures"}
@@ -56,10 +56,7 @@ def test_the_machine_is_told_nothing_but_failures_and_learns_from_the_same_draws
     assert curve.filter(episodes=0)["collisions"].min() >= 3
 
 
-@pytest.mark.slow
 def test_the_page_names_every_policy_and_where_ours_loses(found, tmp_path, read_page):
-    from evofsm.paper import write_page
-
     page = TINY.page(found)
     read = read_page(write_page(tmp_path / "index.html", [page]))
     read.is_sound()
@@ -69,7 +66,6 @@ def test_the_page_names_every_policy_and_where_ours_loses(found, tmp_path, read_
     assert not {"oracle", "evofsm-told"} & set(lost["policy"])  # which are our own reviser
 
 
-@pytest.mark.slow
 def test_the_papers_cases_are_driven_without_a_collision_and_left_alone_where_safe():
     found = closed_loop._revise_cases(ClosedLoop(family="paper"))["cases"]
     case = {row["run"]: row for row in found}

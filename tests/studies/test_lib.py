@@ -54,9 +54,8 @@ def invoke(*arguments, kind=Made):
 
 
 def test_options_of_a_command_are_the_annotated_fields():
-    assert json.loads(invoke("--json", "--throws", 3).stdout) == {
-        "rows": [{"throws": 3, "odds": None}]
-    }
+    told = json.loads(invoke("--json", "--throws", 3).stdout)
+    assert told == {"rows": [{"throws": 3, "odds": None}]}
     assert json.loads(invoke("--json", "--short").stdout)["rows"][0]["throws"] == 10
     assert invoke("--depth", 3).exit_code == 2
     assert invoke("--seed", -1).exit_code == 2

@@ -43,7 +43,9 @@ def test_what_is_finished_is_not_trained_again(tmp_path, finished):
     assert [job[:3] for job in finished] == [("hopper", "filter-1", 1)]
 
 
-def test_what_is_finished_is_shown_without_training(tmp_path, finished):
+def test_what_is_finished_is_shown_without_training_of_tasks_that_there_are(tmp_path, finished):
+    with pytest.raises(ValueError, match="there is no task 'kettle'; there are cartpole"):
+        _ = Peers(tasks="cartpole,kettle").jobs
     shown = Peers(tasks="pendulum", seeds=1, runs=tmp_path, show=True)
     with pytest.raises(ValueError, match="nothing is finished"):
         shown.run()
@@ -52,11 +54,6 @@ def test_what_is_finished_is_shown_without_training(tmp_path, finished):
     )
     assert shown.run()["rows"]["way"].to_list() == ["told-1"]
     assert not finished
-
-
-def test_a_task_that_there_is_not_is_refused():
-    with pytest.raises(ValueError, match="there is no task 'kettle'; there are cartpole"):
-        _ = Peers(tasks="cartpole,kettle").jobs
 
 
 def test_the_page_says_where_the_filter_loses(tmp_path):
