@@ -7,6 +7,7 @@ import os
 import re
 import warnings
 from contextlib import nullcontext
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -283,6 +284,9 @@ def test_what_does_not_fit_is_named():
     for penalty in (-1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="penalty"):
             RevisedActions(Script(FAR), guard_for(ONE), penalty=penalty)
+    for name, given in product(("failed", "observe"), ("failed", {"failed": True})):
+        with pytest.raises(TypeError, match=f"{name} is .* it must be a function, such as"):
+            RevisedActions(Script(FAR), guard_for(ONE), **{name: given})
 
 
 @pytest.mark.parametrize(
@@ -369,13 +373,6 @@ def test_who_does_not_say_which_episodes_failed_is_told_both_ways_to():
     frozen = guard_for(ONE)
     frozen.freeze()
     assert not warned(frozen)
-
-
-@pytest.mark.parametrize("failed", ["failed", {"failed": True}])
-def test_what_is_no_function_is_refused(failed):
-    for name in ("failed", "observe"):
-        with pytest.raises(TypeError, match=f"{name} is .* it must be a function, such as"):
-            RevisedActions(Script(FAR), guard_for(ONE), **{name: failed})
 
 
 @pytest.mark.parametrize(
