@@ -135,12 +135,12 @@ class Form:
         kind = self._scene if self.scenes or body.keys() & {"ego", "objects"} else self._row
         kind = self._end if "end" in body else kind
         # By the very keys of the type: others of letters beyond ASCII msgspec 0.22 does not find.
-        known = {name: name for name in kind.__annotations__}
+        keys = {name: name for name in kind.__annotations__}
         try:
-            if unknown := [name for name in body if name not in known]:
-                raise _unknown(unknown[0], known)
+            if unknown := [name for name in body if name not in keys]:
+                raise _unknown(unknown[0], keys)
             try:
-                fields = msgspec.convert({known[name]: body[name] for name in body}, kind)
+                fields = msgspec.convert({keys[name]: body[name] for name in body}, kind)
             except msgspec.ValidationError as error:
                 raise _refused(body, str(error)) from None
             if kind is self._end:
