@@ -470,8 +470,7 @@ _CHOSEN = {
     7: "it regains a safe gap in time",
     8: "the least braking that regains a safe gap in time",
     9: "it avoids a collision if the leader goes on so",
-    10: "the least braking that avoids a collision if the leader goes on so",
-    11: "comfortable braking, which avoids a collision if the leader goes on so",
+    10: "braking that avoids a collision if the leader goes on so",
 }
 
 

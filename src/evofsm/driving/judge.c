@@ -109,22 +109,16 @@ static double drive_on(double *speed, double acceleration, double dt) {
   return reached >= 0.0 ? 0.5 * (was + reached) * dt : -0.5 * was * was / acceleration;
 }
 
-/* _speeds: as they are rehearsed; one that comes towards oneself stands, approached faster. */
-static void speeds(const double here[3], double *speed, double *leader) {
-  const int is_oncoming = here[2] < ONCOMING;
-  *speed = is_oncoming ? greater(here[1], 0.0) - here[2] : greater(here[1], 0.0);
-  *leader = is_oncoming ? 0.0 : greater(here[2], 0.0);
-}
-
-/* Whether no collision comes of an acceleration and full braking after it, for a smallest gap. */
+/* Whether no collision comes of an acceleration and full braking after it, for a smallest gap; who
+   comes towards oneself stands, approached faster. */
 static int survives(const double here[3], double acceleration, double before, double leader_decel,
                     double clearance) {
   const double caution = -DECEL;
-  double gap = here[0] - clearance, speed, leader;
+  double speed = greater(here[1], 0.0) - (here[2] < ONCOMING ? here[2] : 0.0);
+  double gap = here[0] - clearance, leader = greater(here[2], 0.0);
   double asked = greater(acceleration, caution), last = greater(before, caution);
   double left, closing;
   int t;
-  speeds(here, &speed, &leader);
   if (speed <= 0.0 && greater(asked, last) <= 0.0) {
     return here[0] > 0.0;
   }
@@ -148,9 +142,6 @@ static double critical_of(const double here[3], double acceleration, double befo
   int i;
   if (survives(here, acceleration, before, high, CLEARANCE)) {
     return HARDEST;
-  }
-  if (!survives(here, acceleration, before, low, CLEARANCE)) {
-    return 0.0;
   }
   for (i = 0; i < HALVINGS; i++) {
     const double between = 0.5 * (low + high);
@@ -180,12 +171,8 @@ static int regains(const double here[3], double acceleration, double braking) {
 /* LatentRisk._leader_braking: since the observation before, if it is the same leader. */
 static double leader_braking(const evofsm_state *s) {
   const double *was = s->mean, *now = s->here, dt = EVOFSM_INTERVAL;
-  double expected_gap;
-  if (!s->is_located) {
-    return 0.0;
-  }
-  expected_gap = was[0] + 0.5 * dt * (was[2] + now[2] - was[1] - now[1]);
-  if (fabs(now[2] - was[2]) > HARDEST * dt + ANOTHER_SPEED ||
+  const double expected_gap = was[0] + 0.5 * dt * (was[2] + now[2] - was[1] - now[1]);
+  if (!s->is_located || fabs(now[2] - was[2]) > HARDEST * dt + ANOTHER_SPEED ||
       fabs(now[0] - expected_gap) > ANOTHER_GAP) {
     return 0.0;
   }
@@ -240,7 +227,7 @@ static int closest(const evofsm_state *s, double action, double tolerated) {
    braking beyond that avoids what is seen; -1: none. */
 static int in_proportion(const evofsm_state *s, const double here[3], double limit, int *reason) {
   const double braking = lesser(leader_braking(s), WORST), wanted = s->options[0];
-  int i, k, passes[3], best[3] = {-1, -1, -1}, softest = -1;
+  int i, k, passes[3], best[3] = {-1, -1, -1};
   for (i = 0; i < EVOFSM_OPTIONS; i++) {
     const double option = s->options[i], off = fabs(option - wanted);
     const int is_gentle = option >= lesser(-COMFORT, wanted);
@@ -249,19 +236,13 @@ static int in_proportion(const evofsm_state *s, const double here[3], double lim
     passes[0] = is_soon || (is_gentle && s->risk[i] <= limit);
     passes[1] = is_soon || (is_gentle && s->risk[i] <= TOLERANCE);
     passes[2] = is_lower && option <= -COMFORT;
-    softest = is_lower && (softest < 0 || option > s->options[softest]) ? i : softest;
     for (k = 0; k < 3; k++) {
       best[k] = passes[k] && (best[k] < 0 || off < fabs(s->options[best[k]] - wanted)) ? i : best[k];
     }
   }
   i = best[0] >= 0 ? best[0] : best[1] >= 0 ? best[1] : best[2];
   if (i >= 0 && !(s->risk[i] <= TOLERANCE)) {
-    if (regains(here, s->options[i], braking)) {
-      *reason = i ? EVOFSM_REGAINED : EVOFSM_REGAINS;
-    } else {
-      *reason = i == 0 ? EVOFSM_AVOIDS
-                       : s->options[softest] > s->options[i] ? EVOFSM_COMFORTABLE : EVOFSM_AVOIDED;
-    }
+    *reason = (regains(here, s->options[i], braking) ? EVOFSM_REGAINS : EVOFSM_AVOIDS) + (i != 0);
   }
   return i;
 }

@@ -52,7 +52,6 @@ COMFORT, REGAIN = 3.0, 1.0
 SLIGHT = 0.1
 # Slower than this a car stands, though a sensor may show that it moves [m/s].
 _STANDS = 0.1
-_AVOIDS = "avoids a collision if the leader goes on so"
 # Where a situation is not sure, it may be worse by so many standard deviations.
 _CAUTION = 2.5
 
@@ -466,10 +465,11 @@ def in_proportion(
             best = int(np.where(candidates, np.abs(options - options[0]), np.inf).argmin())
             if risk[best] <= tolerances[-1]:
                 return best, "the closest that can"
-            does = "regains a safe gap in time" if regains[best] else _AVOIDS
-            is_least = regains[best] or not (lower & (options > options[best])).any()
-            more = "the least braking that" if is_least else "comfortable braking, which"
-            return best, f"{more if best else 'it'} {does}"
+            subject = "braking that" if best else "it"
+            if not regains[best]:
+                return best, f"{subject} avoids a collision if the leader goes on so"
+            least = "the least " if best else ""
+            return best, f"{least}{subject} regains a safe gap in time"
     return None
 
 

@@ -32,8 +32,7 @@ enum {
   EVOFSM_REGAINS = 7,        /* cars: the proposal regains a safe gap in time */
   EVOFSM_REGAINED = 8,       /* cars: the least braking that regains one */
   EVOFSM_AVOIDS = 9,         /* cars: it avoids a collision if the leader goes on so */
-  EVOFSM_AVOIDED = 10,       /* cars: the least braking that avoids one */
-  EVOFSM_COMFORTABLE = 11    /* cars: comfortable braking, which avoids one */
+  EVOFSM_AVOIDED = 10        /* cars: braking that avoids one */
 };
 
 /* What had to be done to a proposal. */
