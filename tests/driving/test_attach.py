@@ -12,6 +12,7 @@ from evofsm.driving import (
     EnvelopeReviser,
     LatentRisk,
     attach,
+    attached,
     guard_for_cars,
     guard_for_traffic,
     measures,
@@ -55,6 +56,8 @@ def road(tmp_path, sumo_road):
         return libsumo
 
     yield start
+    for each in [*attached._ATTACHED]:  # else it guards what the next test simulates
+        each._listen_no_more()
     if libsumo.simulation.isLoaded():
         libsumo.close()
 
