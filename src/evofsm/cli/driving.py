@@ -334,6 +334,7 @@ def run_configuration(
                     collisions = f"{len(cars.collisions)} collisions"
                     move(description=f"Driving, {how} ({seconds:,.0f} s, {collisions})")
             seconds, kinds = float(sumo.simulation.getTime()), sumo.vehicletype.getIDList()
+            cars.detach()  # else they guard what is simulated next
         if not cars.ever:
             types = ", ".join(kind for kind in kinds if not kind.startswith("DEFAULT_"))
             raise ValueError(
