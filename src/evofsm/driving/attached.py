@@ -81,7 +81,7 @@ class Neighbour(NamedTuple):
     gap: float  #: from bumper to bumper [m]
     room: float  #: what is left of it until SUMO counts a collision, in its step [m]
     speed: float  #: [m/s]
-    exact: float = 0.0  #: the same, if the follower does what its model wants [m]; 0: not asked
+    most: float = 0.0  #: the same, if the follower stands after whole steps [m]; 0: not asked
 
 
 class _Facts(NamedTuple):
@@ -163,12 +163,8 @@ class Seeing:
         spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
         room = gap + spare_gap + 0.5 * euler * (v_follower - v_leader)
         late = 0.125 * follower.decel * euler * euler  # at most, whatever the follower does
-        near = Neighbour(neighbour, gap + follower.min_gap, max(room - late, _NEAREST), v)
-        if not is_ahead or late < _MARGIN:
-            return near
-        exact = room - _further(self.wish(car, speed, near), follower.decel, euler)
-        exact += _further(v_leader, leader.decel, euler)
-        return near._replace(exact=max(exact, _NEAREST))
+        most = 0.0 if late < _MARGIN else room + _further(v_leader, leader.decel, euler)
+        return Neighbour(neighbour, gap + follower.min_gap, max(room - late, _NEAREST), v, most)
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
         """The speed that a car's own model wants after the next step [m/s], but for red lights."""
@@ -367,11 +363,12 @@ class Guarding:
         Who keeps less time than a step (``tau``) drives into others, as SUMO warns, if they dawdle.
         """
         judge, ahead, dt = _judge(car.guard), car.around[0], self._seeing.dt
-        is_careful = self._seeing.body(car.id).tau >= dt
-        if not (isinstance(judge, TrafficRisk) and ahead and ahead.exact and is_careful):
+        body = self._seeing.body(car.id)
+        if not (isinstance(judge, TrafficRisk) and ahead and ahead.most and body.tau >= dt):
             return False
+        room = max(ahead.most - _further(car.wish, body.decel, dt), _NEAREST)
         # It may use up the margin, as SUMO's models do.
-        here = ahead.exact + judge.ahead.margin, speed, ahead.speed
+        here = room + judge.ahead.margin, speed, ahead.speed
         critical = judge.ahead.critical(here, [(car.wish - speed) / dt])
         tolerance = getattr(car.guard.reviser, "tolerance", self._tolerance)
         return bool(critical[0] >= judge.ahead.manoeuvres.exceeded_by(tolerance) - _SEEN_TO)
@@ -422,8 +419,9 @@ class Guarding:
     def _leaders_like(self, car: str) -> Manoeuvres:
         """What is known of leaders that brake as hard as it, by what SUMO says of them."""
         decel = self._seeing.body(car).decel
-        # How hard SUMO's cars brake is exactly known, and has an end.
-        return self.leaders.setdefault(decel, Manoeuvres(decel, width=_SEEN_TO))
+        if decel not in self.leaders:  # how hard SUMO's cars brake is exactly known, and has an end
+            self.leaders[decel] = Manoeuvres(decel, width=_SEEN_TO)
+        return self.leaders[decel]
 
     def _guard_for(self, car: str, high: float) -> Guard:
         mode = Mode.ACT if self._acts else Mode.SHADOW

@@ -255,9 +255,11 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
   if (!is_exact()) {
     return EVOFSM_MISCOMPILED;
   }
+  if (!(time < time + EVOFSM_INTERVAL)) { /* nor is it of NaN, or infinite */
+    return EVOFSM_UNUSABLE;
+  }
   for (i = 0; i < EVOFSM_VARIABLES; i++) {
-    if (observation[i] < seen_from[i] || observation[i] > seen_to[i] ||
-        !(time < time + EVOFSM_INTERVAL)) { /* nor is it of NaN, or infinite */
+    if (observation[i] < seen_from[i] || observation[i] > seen_to[i]) {
       return EVOFSM_UNUSABLE;
     }
   }

@@ -128,14 +128,16 @@ class Form:
         last = {name: NotRequired[kind] for name, kind in variables.items()}
         end = {"end": bool, "failed": NotRequired[bool], **when, "time": NotRequired[_Seen | str]}
         self._end = _Keys("End", {**end, **last, **also})
+        # The very keys of each: others of letters beyond ASCII msgspec 0.22 does not find.
+        kinds = self._row, self._scene, self._end
+        self._keys = {kind: {name: name for name in kind.__annotations__} for kind in kinds}
 
     def read(self, line: bytes | dict[str, Any]) -> Message:
         """The message on a line, or with these keys."""
         body = line if isinstance(line, dict) else _parsed(line)
         kind = self._scene if self.scenes or body.keys() & {"ego", "objects"} else self._row
         kind = self._end if "end" in body else kind
-        # By the very keys of the type: others of letters beyond ASCII msgspec 0.22 does not find.
-        keys = {name: name for name in kind.__annotations__}
+        keys = self._keys[kind]
         try:
             if unknown := [name for name in body if name not in keys]:
                 raise _unknown(unknown[0], keys)
