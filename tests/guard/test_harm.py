@@ -98,7 +98,7 @@ def test_a_guard_that_saves_drives_nearly_always(wrong):
     assert sum(row == (60, "") for row in rows[1:]) >= 37
     assert "in shadow where in doubt" in str(guard)
     assert " (0 of the latest 20 guarded), states" in str(guard)
-    assert "it refuses nearly everything: 0% of proposals pass; that is no filter" in str(guard)
+    assert "it refuses nearly everything: 0% of proposals pass, others are executed" in str(guard)
     with pytest.warns(UserWarning, match="refuses nearly everything: 0% of proposals pass"):
         guard.freeze()
 
@@ -213,6 +213,14 @@ def test_frozen_it_acts_where_it_prevents_most_failures(failed, kept, helps):
     guarded = [(150, "f", None)] * failed + [(300, "", None)] * (20 - failed)
     harm = arms(guarded, [(110, "f", None)] * 6)._replace(decided=500.0, kept=kept)
     assert harm.helps(learning=False) == helps
+
+
+def test_frozen_scores_count_only_where_the_controller_alone_never_failed():
+    """Who survives alone had an easier start: so a slow guard that arrives helps."""
+    arrived, sooner, failed = (60, "e", -102.0), (50, "e", -90.0), (30, "f", -130.0)
+    assert arms([arrived] * 7, [*[sooner] * 18, *[failed] * 2]).helps(learning=False)
+    assert not arms([(60, "", -102.0)] * 7, [*[sooner] * 18, *[failed] * 2]).helps(learning=False)
+    assert not arms([arrived] * 7, [sooner] * 20).helps(learning=False)
 
 
 def test_a_controller_of_which_much_more_is_kept_is_another_one_until_it_fails():

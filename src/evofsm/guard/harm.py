@@ -91,7 +91,7 @@ class Harm(NamedTuple):
     refuses: bool = False  #: whether anything was refused yet: before, it is no guard
     ends: bool = False  #: whether an episode ever ended by itself, without failing
     decided: float = 0.0  #: decisions of late in which it could refuse
-    kept: float = 0.0  #: and of these proposals that were kept
+    kept: float = 0.0  #: and of these those in which it did not
     changed: int = 0  #: the latest episode in which another controller seems to have come, or 0
     moved: int = 0  #: and after which the system moves otherwise
 
@@ -121,14 +121,15 @@ class Harm(NamedTuple):
         if self.decided < _FEWEST_DECISIONS or self.kept >= 0.05 * self.decided:
             return ""
         share = f"{self.kept / self.decided:.0%}"
-        return f"refuses nearly everything: {share} of proposals pass; that is no filter"
+        rest = "others are executed only where nothing lasts longer"
+        return f"refuses nearly everything: {share} of proposals pass, {rest}; that is no filter"
 
     def helps(self, *, learning: bool) -> bool:
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
 
         Of three episodes at least, a guard that failed in all prevents nothing, however late; nor
         does one that fails more than half as often per step as the controller alone; down to a
-        tenth, the more it replaces: one that replaces all would fly any controller's craft so.
+        tenth, the more it refuses: one that refuses all would fly any controller's craft so.
         """
         guarded, alone = self.guarded, self._alone(learning=learning)
         if _all_failed(guarded, max(_CAREFUL, len(guarded))):
@@ -140,6 +141,8 @@ class Harm(NamedTuple):
         most = _LEFT + (_LEFT_BY_ITSELF - _LEFT) * change
         if len(guarded) >= _CAREFUL and rate > most * rate_alone:
             return False
+        if rate_alone and not learning:  # who survived alone had it easier: scores tell nothing
+            guarded, alone = ([o._replace(score=math.nan) for o in arm] for arm in (guarded, alone))
         return bool(g @ better(guarded, alone) @ a >= 0.0)
 
     def drives(self, draws: int) -> float:

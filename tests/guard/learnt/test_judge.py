@@ -37,6 +37,26 @@ def test_after_a_failure_or_two_it_keeps_a_bad_controller_from_failing(point, se
     assert all(point.play(alone, 90_000 + k)[1] for k in range(10))
 
 
+@pytest.mark.parametrize(("tries", "least", "most"), [(8, 1, 6), (0, 14, 14)])
+def test_what_a_constant_proposal_never_showed_is_tried(tries, least, most):
+    """A pot that is always half on: what less of it does is known only once it was tried."""
+    guard = Guard(low=0.0, high=1.0, interval=1.0)
+    numbers = replace(guard.judge.settings, tries=tries)
+    guard.judge.state = guard.judge.state._replace(settings=numbers)
+    failures = 0
+    for episode in range(14):
+        random = np.random.default_rng(episode)
+        heat = random.uniform(20.0, 40.0)
+        for _ in range(40):
+            on = guard.decide([heat], 0.5).executed
+            heat += 12.0 * on - 0.02 * (heat - 20.0) + random.normal(0.0, 0.1)
+            if heat > 100.0:
+                break
+        guard.end(failed=heat > 100.0, observation=[heat])
+        failures += heat > 100.0
+    assert least <= failures <= most
+
+
 def test_it_looks_far_ahead_in_steps_of_several_decisions(point):
     guard = point.guard(horizon=30.0, shadow=False)
     assert sum(point.play(guard, k)[1] for k in range(12)) <= 4

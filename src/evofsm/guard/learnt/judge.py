@@ -430,7 +430,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         order, turns = basis(self.state.situations[:, 2 * self.n_variables :])
         turned_uses = np.where(turns[:, None] > 0.0, uses, uses[:, ::-1])[order]
         k, end = divmod(int(turned_uses.argmin()), 2)
-        if turned_uses[k, end] < tries and turned_uses[k, end] < turned_uses[k, 1 - end]:
+        if turned_uses[k, end] < min(tries, max(1.0, turned_uses[k, 1 - end])):
             best = best.copy()
             best[order[k]] = (-1.0, 1.0)[end] * turns[order[k]]
             return best
