@@ -16,9 +16,10 @@ from evofsm.guard.learnt.failure import HELD, B, I, Survived
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, FATAL, Floats, Model
 from evofsm.guard.learnt.state import Episode, Given, State, sizes
 
-# Episodes of which the end tells where there are any; observations so near the last one [typical
-# steps] cannot be told from it.
-_ENDED, _SAME_PLACE = 2, 0.5
+# Episodes of which the end tells where there are any, of which so small a share may be in no form
+# before these are fitted anew; observations so near the last one [typical steps] cannot be told
+# from it.
+_ENDED, _STRAY, _SAME_PLACE = 2, 0.2, 0.5
 # Dead ends: how near an old one counts once more, how far new ones are apart and their first
 # radius [spreads]; share of the way to what was survived; how many at most.
 _LARGEST_RADIUS, _APART, _WAY, _MAX_ENDS = 0.6, 0.15, 0.9, 40
@@ -123,7 +124,7 @@ def _shape(table: Floats) -> tuple[list[list[float]], int]:
 def _endings(state: State, table: Floats, known: Survived) -> Floats:
     """Where it ends by itself: nowhere where it went on, nor where it failed like that."""
     rows, endings = failure.without(failure.saying(table, ENDS), known.rows), state.ended
-    if len(known.rows) and not failure.inside(rows, endings).any(0).all():
+    if len(known.rows) and (~failure.inside(rows, endings).any(0)).mean() > _STRAY:
         rows = failure.explain(ENDS, endings, failure.boxed(known, known.rows))
     rows = rows[failure.inside(rows, endings).sum(1) >= _ENDED]
     # What fails as others do elsewhere does not fail for how it ends.
