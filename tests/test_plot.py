@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch
+from matplotlib.patches import Ellipse, FancyArrowPatch
 from studies.judges import run
 from studies.systems import Start, make_system
 
@@ -57,7 +57,8 @@ def test_states_stand_where_their_centres_are_and_what_is_on_the_axes_stays_in_v
 
 
 def test_states_over_rows_have_their_reach_and_their_ways_on_in_frame():
-    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=[2.0, 1.0]))
+    rule = Novelty(radius=1.0, scales=[2.0, 1.0], spread=0.25)
+    machine = EvolvingFSM(n_actions=1, rule=rule)
     rows = np.array([[0.0, 0.0], [9.0, 0.0], [0.0, 0.0], [5.0, 7.0], [30.0, -9.0]])
     machine.learn_many(rows[:4], [0] * 4)
     failed = np.arange(5) == 4
@@ -69,7 +70,8 @@ def test_states_over_rows_have_their_reach_and_their_ways_on_in_frame():
     arrows = [patch for patch in ax.patches if isinstance(patch, FancyArrowPatch)]
     assert len(arrows) == 3  # 1 to 2 and back, and on to 3
     only = plot.states(machine.model(), new(), ways=True)
-    assert only.axis()[0] < -1.0  # so far the first one reaches
+    ellipse = next(patch for patch in only.patches if isinstance(patch, Ellipse))
+    assert (ellipse.width, ellipse.height) == (4.0, 2.0)  # the radius, whatever the spread
 
 
 def test_a_few_spikes_do_not_set_the_axes_and_where_it_alarms_is_tinted():

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.extras import needs
+from evofsm.fsm.clusters import NOVELTY
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import usual_range
-from evofsm.fsm.rules import Novelty
 from evofsm.fsm.validation import check_index
 from evofsm.guard import Guard, LearntRisk
 from evofsm.guard.foresight import DATES
@@ -121,8 +121,9 @@ def states(
     if np.any(fails):
         look = {"markersize": 5.0, "color": COLORS["dead end"], "zorder": 4.0}
         ax.plot(*dots[fails].T, "x", label="failed", **look)
-    if ways and isinstance(model.rule, Novelty):
-        reach = np.sqrt(model.width) * np.resize(model.rule.scales, model.n_variables)[pair]
+    if ways and model.rule.table["rule"] == NOVELTY:
+        scales = np.resize(list(model.rule.scales) or 1.0, model.n_variables)[pair]
+        reach = model.nearest(model.centers[0]).reach * scales
         look = {"color": COLORS["leader"], "alpha": 0.1, "linewidth": 0.0, "zorder": 0.4}
         for k, center in enumerate(centers[in_view]):
             label = "" if k else "where a state reaches"

@@ -1,6 +1,8 @@
 """What is counted of episodes, and what is said of it."""
 
+from dataclasses import dataclass
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from evofsm.fsm.explanation import Tally
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.rules import Novelty
+from evofsm.fsm.rules import Novelty, register_rule
 
 COUNTS = ("episodes", "failed_soon", "tried", "failed_after")
 
@@ -164,10 +166,20 @@ def test_failures_that_were_told_and_never_happened_are_counted_as_none(tell, tm
 # -- What was never seen ---------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Own:
+    scales: ClassVar = ()
+    table: ClassVar = Novelty(radius=1.0, spread=9.0).table
+
+
+register_rule("own", Own)
+
+
 @pytest.mark.parametrize(
     ("rule", "seen", "never"),
     [
         (Novelty(radius=1.0, spread=9.0), 5.9, 6.1),  # its radius
+        (Own(), 5.9, 6.1),
         (None, 8.6, 8.7),  # twice the root of the width, which is 3 times the variance
     ],
 )

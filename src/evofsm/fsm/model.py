@@ -134,7 +134,7 @@ class FSMModel:
         offsets = (self.centers - rows[0]) * weights_of(self.rule, self.n_variables)
         distances = np.sqrt(np.square(offsets).sum(axis=1))
         state = int(distances.argmin())
-        return Nearest(state, float(distances[state]), reach(self.rule, self.width))
+        return Nearest(state, float(distances[state]), reach(self.rule, self.settings, self.width))
 
     def propagate(
         self, belief: ArrayLike, action: SupportsIndex | None = None, horizon: int = 1

@@ -149,9 +149,10 @@ def weights_of(rule: StateRule, m: int) -> Floats:
     return 1.0 / scales
 
 
-def reach(rule: StateRule, width: float) -> float:
+def reach(rule: StateRule, settings: Mapping[str, Any], width: float) -> float:
     """Distance from a centre, in scales, beyond which an observation is like no state."""
-    return rule.radius if isinstance(rule, Novelty) else _WIDTHS * math.sqrt(width)
+    table = {"radius": 0.0, **settings, **rule.table}
+    return float(table["radius"] if table["rule"] == NOVELTY else _WIDTHS * math.sqrt(width))
 
 
 def describe_rule(rule: StateRule) -> dict[str, Any]:
