@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.rules import Novelty, Paper, describe_rule, register_rule
 from evofsm.fsm.step import Event
+from evofsm.guard.check import check_results
 
 RULES = {"paper": Paper(), "novelty": Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7)}
 
@@ -36,12 +37,24 @@ def test_what_is_no_rule_is_refused(rule):
         EvolvingFSM(1, rule=rule)
 
 
+@pytest.mark.parametrize("table", [{"rule": 7}, {"radius": 1.0}, {"rule": 1, "radiu": 1.0}])
+def test_a_table_that_no_kernel_knows_is_refused(monkeypatch, table):
+    monkeypatch.setattr(Paper, "table", table)
+    with pytest.raises(
+        ValueError, match=r"table of Paper\(\) is {.*its rule must be one of \(0, 1"
+    ):
+        EvolvingFSM(1, rule=Paper())
+    assert not check_results(Paper())[-1].passed
+
+
 def test_a_rule_is_registered_once_under_its_name():
     register_rule("novelty", Novelty)
     with pytest.raises(ValueError, match="a state rule 'novelty' already: Novelty"):
         register_rule("novelty", Paper)
     with pytest.raises(TypeError, match="is no state rule"):
         register_rule("something", int)
+    with pytest.raises(TypeError, match="and `scales`"):
+        register_rule("something", dataclass(frozen=True)(type("Bare", (), {"table": {}})))
 
 
 # -- Novelty ---------------------------------------------------------------------------------------
@@ -92,7 +105,7 @@ def test_as_many_scales_as_variables(snapshot):
 def test_a_scale_of_a_rule_of_ones_own_is_positive():
     @dataclass(frozen=True)
     class Flat(Paper):
-        scales = (0.0, 1.0)
+        scales = np.array([0.0, 1.0])
 
     register_rule("flat", Flat)
     with pytest.raises(ValueError, match=r"a scale is 0.0; it must be a positive"):

@@ -25,9 +25,10 @@ UNCHANGED: int = 0
 MOVED: int = 1
 CREATED: int = 2
 MERGED: int = 4
-#: Which rule judges an observation.
+#: Which rule judges an observation; all that `_judge` knows.
 PAPER: int = 0
 NOVELTY: int = 1
+JUDGED = PAPER, NOVELTY
 
 # A share that no rounding comes to, and that no two observations tell apart either.
 _ROUNDING = 1e-12

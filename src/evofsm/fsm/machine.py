@@ -111,7 +111,7 @@ class EvolvingFSM(Retraced):
     ) -> None:
         self._rule = rules.Paper() if rule is None else rule
         rules.describe_rule(self._rule)
-        table = {name: float(value) for name, value in self._rule.table.items()}
+        table = rules.table_of(self._rule)
         for name, value in (("radius", radius), ("spread", spread)):
             if value is not None and table.setdefault(name, positive(name, value)) != value:
                 raise ValueError(f"{name} is {value}, but the rule has its own: {self._rule}")

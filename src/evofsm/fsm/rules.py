@@ -10,7 +10,8 @@ from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
 
-from evofsm.fsm.clusters import NOVELTY, PAPER
+from evofsm.fsm.arrays import Settings
+from evofsm.fsm.clusters import JUDGED, NOVELTY, PAPER
 from evofsm.fsm.validation import Floats, positive
 
 # So many roots of the width a state reaches where no radius says so: the similarity is 1/e⁴ there.
@@ -121,8 +122,9 @@ def register_rule(name: str, rule: type) -> None:
     0.1
     """
     is_frozen = is_dataclass(rule) and cast(Any, rule).__dataclass_params__.frozen
-    if not (is_frozen and hasattr(rule, "table")):
-        raise TypeError(f"{rule!r} is no state rule: a frozen dataclass with a `table`")
+    if not (is_frozen and {"table", "scales"} <= {*dir(rule), *vars(rule)["__dataclass_fields__"]}):
+        needs = "a frozen dataclass with a `table` and `scales`, () where each is 1"
+        raise TypeError(f"{rule!r} is no state rule: {needs}")
     owner = _RULES.get(name, rule)
     if (owner.__module__, owner.__qualname__) != (rule.__module__, rule.__qualname__):
         raise ValueError(f"there is a state rule {name!r} already: {owner.__name__}")
@@ -143,10 +145,21 @@ def rule_named(name: object) -> Any:
 
 def weights_of(rule: StateRule, m: int) -> Floats:
     """(m,) 1 / scale of each variable."""
-    scales = np.array([positive("a scale", scale) for scale in rule.scales or [1.0] * m])
+    scales = np.array(
+        [positive("a scale", scale) for scale in np.asarray(rule.scales).tolist() or [1.0] * m]
+    )
     if len(scales) != m:
         raise ValueError(f"observation has {m} variables, but there are {len(scales)} in {rule}")
     return 1.0 / scales
+
+
+def table_of(rule: StateRule) -> dict[str, float]:
+    """What the kernel judges by; refused where no kernel knows it."""
+    table, names = dict(rule.table), Settings._fields[:-1]
+    if "rule" not in table or table["rule"] not in JUDGED or not table.keys() <= {*names}:
+        knows = f"its rule must be one of {JUDGED}, as in the table of Novelty"
+        raise ValueError(f"table of {rule} is {table}; {knows}, and others of {', '.join(names)}")
+    return {name: float(value) for name, value in table.items()}
 
 
 def reach(rule: StateRule, settings: Mapping[str, Any], width: float) -> float:
