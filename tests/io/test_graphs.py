@@ -76,6 +76,7 @@ def test_what_cannot_be_drawn_or_is_no_process_is_refused(model):
     with pytest.raises(ValueError, match="counted no decisions"):
         to_prism(empty.model())
     empty.learn_many([[0.0], [1.0]], [0, 0])
+    assert "is an estimate, no bound" in to_prism(model)
     assert "NO DECISION FAILED" in to_prism(empty.model())
 
 

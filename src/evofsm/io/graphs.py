@@ -192,6 +192,8 @@ def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> Ite
     yield f"// Left out: {(~is_tried).sum():,} pairs of state and action that were never tried, and"
     yield f"// {few.sum():,} that rest on fewer than {evidence:g} decisions ({share:.2%} of all);"
     yield f"// transitions below {least:g}. States without any action, labelled unknown: {unknown}."
+    yield "// Where beliefs are wide (evofsm inspect) it moves on, and fails, at other times than"
+    yield "// what was seen, mostly sooner: a probability that it gives is an estimate, no bound."
     if not model.failures.any():
         yield "// NO DECISION FAILED, or which did is not known: a probability of failure that is"
         yield "// computed from this process is 0 for want of knowledge."
