@@ -71,8 +71,10 @@ def test_where_states_were_joined_there_is_no_interval():
     model = machine.model()
     (joined,) = np.flatnonzero(model.joined)
     text = model.explain(int(joined)).text
-    assert "States were joined here, so an episode may count twice." in text
+    assert "States were joined: an episode may count twice, and have been elsewhere." in text
     assert "%" not in text
+    text = model.explain(observation=[4.0]).text  # seen six times
+    assert text.startswith("Perhaps seen before states were joined: 2 from the nearest")
 
 
 # -- What is said ----------------------------------------------------------------------------------

@@ -111,7 +111,7 @@ def explain(
     if better is not None:
         sentences.append(f"Better after {labels.action(better)}: {after_better}")
     if not is_exact:
-        sentences.append("States were joined here, so an episode may count twice")
+        sentences.append("States were joined: an episode may count twice, and have been elsewhere")
     if origin is not None:
         share = f"{arrivals[origin]:,.0f} of {arrivals.sum():,.0f} times"
         sentences.append(f"Most often reached from {state_name(origin)}: {share}")
@@ -123,7 +123,8 @@ def _never_seen(known: Any, belief: Floats, nearest: Nearest, labels: Labels) ->
     state, no_tally = nearest.state, Tally(0, 0, is_told=known.failures_told)
     place = labels.place(known.centers[state])
     place = place if place.startswith("(") else f"({place})"
-    text = f"Never seen, as far as the states tell: {nearest.distance:.3g} from the nearest, "
+    ways = "Never seen, as far as the states tell", "Perhaps seen before states were joined"
+    text = f"{ways[int(known.joined.any())]}: {nearest.distance:.3g} from the nearest, "
     text += f"{state_name(state)} {place}, where a state reaches {nearest.reach:.3g}."
     return Explanation(text, state, float(belief[state]), 0, no_tally, never_seen=True)
 

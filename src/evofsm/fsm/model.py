@@ -33,8 +33,8 @@ class FSMModel:
 
     Counts never forget. An episode is counted once for each state it came to, and each action it
     took there, for its observations are no independent evidence; the one that is going on is not
-    shown yet. It failed *soon* after it was in a state if no more than ``failure_horizon``
-    observations lay between; without that, if it failed at all.
+    shown yet. It failed *soon* after it was in a state if that was at most ``failure_horizon``
+    observations later; without that, if it failed at all.
 
     Examples
     --------
