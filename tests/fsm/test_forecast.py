@@ -64,6 +64,20 @@ def test_states_created_later_are_taken_in(walk):
     np.testing.assert_allclose(matrix(forecasts, 0, 1).sum(axis=1), 1.0, atol=1e-9)
 
 
+def test_what_was_counted_of_a_merged_state_is_not_said_of_the_one_in_its_place():
+    machine, forecasts = (
+        EvolvingFSM(1, rule=Novelty(1.0, spread=0.3), max_states=9),
+        Forecasts(1, [1]),
+    )
+    for lap in range(40):
+        Z = 2.0 * lap + np.resize([0.0, 3.0, 6.0, 9.0], (80, 1))
+        machine.learn_many(Z, [0] * 80, [0])
+        forecasts.learn(machine.model(), Z, [0] * 80)
+    now, then = (belief := machine.model().recognise(Z))[:-1], belief[1:]
+    ours = jensen_shannon(forecasts.predict(now, 0, 1), then).mean()
+    assert ours < 0.9 * jensen_shannon(now, then).mean()
+
+
 def test_steps_that_cannot_be_are_refused():
     for steps, why in (([], "one or more"), ([2, 2], "each once"), ([0], "a positive integer")):
         with pytest.raises(ValueError, match=why):

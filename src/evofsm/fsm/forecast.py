@@ -42,7 +42,7 @@ class Forecasts:
     """Forecasts of the state a number of steps ahead, learnt alongside a machine.
 
     They look at observations through a snapshot of the machine: hand over each episode when it is
-    over, and the machine has learnt it. Counts never forget.
+    over, and the machine has learnt it. Counts forget nothing but states that were merged.
 
     Parameters
     ----------
@@ -70,6 +70,7 @@ class Forecasts:
             raise ValueError(f"steps are {tuple(steps)}; there must be one or more, each once")
         #: Number of states of the latest snapshot that was learnt through.
         self.n_states = 0
+        self._created: Floats = np.zeros(0)  # when the states of that snapshot were created
         # (n, n) where a state's transitions are presumed to lead that leave it: to those near it.
         self._elsewhere: Floats = np.zeros((0, 0))
         # For each horizon, evidence that beliefs stay, and that they move; and (n, n) counts, by
@@ -90,6 +91,9 @@ class Forecasts:
         beliefs = model.recognise(valid.real_array("observations", Z, ndim=2, copy=False))
         actions = valid.check_actions(I, len(beliefs), self.n_actions)
         self.n_states = self._check_states(model.n_states)
+        births = np.pad(self._created, (0, self.n_states - len(self._created)))
+        remains = births == model.created  # not where a new state took the place of a merged one
+        remain, self._created = np.outer(remains, remains), model.created
         near = model.recognise(model.centers)
         self._elsewhere = (1.0 - _ANYWHERE) * near + _ANYWHERE / self.n_states
         states = [np.flatnonzero(belief > _LEAST_BELIEF) for belief in beliefs]
@@ -97,7 +101,7 @@ class Forecasts:
             counts = self._counts[horizon]
             for action in {NO_ACTION, *actions.tolist()} | set(counts):
                 old = counts.get(action, np.zeros((0, 0)))
-                counts[action] = np.pad(old, (0, self.n_states - len(old)))
+                counts[action] = np.pad(old, (0, self.n_states - len(old))) * remain
             for before, row in enumerate(range(steps, len(beliefs))):
                 arguments = beliefs[before], states[before], beliefs[row], states[row]
                 self._learn(horizon, int(actions[before]), *arguments)
