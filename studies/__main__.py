@@ -75,8 +75,8 @@ def evidence(
             asked = kind(seed=seed, **given).shortened()
             pages.append(asked.page(asked.run(workers)))
             print(f"{kind.name}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
-        title = "Does it see danger earlier, and does that help?"
-        page = write_page(out / "index.html", pages, title, _ABOUT)
+            title = "Does it see danger earlier, and does that help?"
+            page = write_page(out / "index.html", pages, title, _ABOUT)  # lest a crash loses all
         print_page(*pages)
         print(f"\nPage with all tables and figures: {page}")
 

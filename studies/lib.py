@@ -11,6 +11,7 @@ from __future__ import annotations
 import inspect
 import math
 import os
+import pickle
 import shlex
 import sys
 from abc import ABC, abstractmethod
@@ -219,7 +220,7 @@ def parallel(
     )
     workers = min(workers or os.cpu_count() or 1, max(len(tasks), 1))
     if workers == 1:
-        return [task() for task in show(tasks)]
+        return [task() for task in show(pickle.loads(pickle.dumps(tasks)))]  # as in another
     # Forking a process that has started threads may hang; a fresh one costs a second.
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         running = {pool.submit(task): place for place, task in enumerate(tasks)}

@@ -128,7 +128,7 @@ class Scale(NamedTuple):
 
 LINEAR, LOG = Scale(float, float), Scale(math.log, math.exp)
 #: Small values are closer together, and 0 is one of them.
-SQUARE = Scale(math.sqrt, lambda height: height * height)
+SQUARE = Scale(math.sqrt, np.square)
 
 #: What the paper says about a parameter.
 OPEN, STATED, ADDED = "leaves it open", "states it", "does not mention it"

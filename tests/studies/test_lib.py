@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import subprocess
 import sys
 import textwrap
@@ -123,6 +124,8 @@ def test_results_keep_the_order_of_the_tasks_whatever_the_number_of_workers():
     assert lib.parallel(tasks, 1) == lib.parallel(tasks, 2) == [divmod(n, 3) for n in range(6)]
     slow_first = [partial(time.sleep, 0.3), partial(int, 7)]
     assert lib.parallel(slow_first, 2) == [None, 7]
+    with pytest.raises((AttributeError, pickle.PicklingError), match="lambda"):
+        lib.parallel([partial(lambda: 1)], 1)  # so that a test with one finds it
     with pytest.raises(ZeroDivisionError):
         lib.parallel([*tasks, partial(divmod, 1, 0)], 2)
 

@@ -18,17 +18,20 @@ def row(task="cartpole", way="alone", seed=0, **what):
     return found | {"under_return": 95.0 if told else None, "passes": False, **what}
 
 
+DONE = []
+
+
+def finish(job, runs):
+    DONE.append(job)
+    job.file(runs).write_text(json.dumps(row(*job[:3])))
+
+
 @pytest.fixture
 def finished(monkeypatch):
     """Jobs that are trained, which takes no time here."""
-    done = []
-
-    def finish(job, runs):
-        done.append(job)
-        job.file(runs).write_text(json.dumps(row(*job[:3])))
-
     monkeypatch.setattr(peers, "finish", finish)
-    return done
+    DONE.clear()
+    return DONE
 
 
 def test_what_is_finished_is_not_trained_again(tmp_path, finished):
