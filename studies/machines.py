@@ -189,7 +189,8 @@ class Machines(lib.Study):
         """Rows pooled over the seeds."""
         pooled = pooled_over_seeds(found["rows"])
         both = lib.compared(pooled, pl.col("alarm") == OURS, ["machine", "stated"])
-        fewer = pl.col("at_same_ours") < pl.col("lead") - 0.5
+        fewer = pl.col("ours_at_same") < pl.col("lead") - 0.5
+        exceeding = pooled.filter(pl.col("rate") > pl.col("stated"), alarm=OURS)
         rivals = both.filter(pl.col("alarm") == THRESHOLDS)
         shown = {
             **{"machine": "{machine}", "stated": "{stated:g}", "foreseen": "{foreseen:%}"},
@@ -199,9 +200,9 @@ class Machines(lib.Study):
             **{"machine": "{machine}", "stated": "{stated:g}", "false a day": "{rate:.2f}"},
             **{"thresholds foresee": "{foreseen:%}", "ahead [min]": "{lead:.1f}"},
             **{"learnt foresee": "{foreseen_ours:%}", "learnt ahead": "{lead_ours:.1f}"},
-            **{"learnt false": "{rate_ours:.2f}", "at as many": "{at_same_ours:.1f}"},
+            **{"learnt false": "{rate_ours:.2f}", "at as many": "{ours_at_same:.1f}"},
         }
-        worst = (pl.col("at_same_ours") - pl.col("lead")).min()
+        worst = (pl.col("ours_at_same") - pl.col("lead")).min()
         return self.shown(
             _ABOUT,
             [
@@ -213,7 +214,15 @@ class Machines(lib.Study):
                 for name in MACHINES
                 for minutes in rivals.filter(machine=name).select(worst).to_series()
             ],
-            lost=[Table("Rows in which thresholds warn longer", rivals.filter(fewer), compared)],
+            lost=[
+                Table("Rows in which thresholds warn longer", rivals.filter(fewer), compared),
+                Table(
+                    "Rows in which the states alone warn longer, with as many false alarms",
+                    both.filter(pl.col("alarm") == STATES).filter(fewer),
+                    shown | {"learnt, at as many": "{ours_at_same:.1f}"},
+                ),
+                Table("Rows in which the learnt alarm exceeds what was stated", exceeding, shown),
+            ],
         )
 
 
@@ -228,7 +237,7 @@ thresholds really had, between the rates that were stated."""
 
 
 def pooled_over_seeds(rows: pl.DataFrame) -> pl.DataFrame:
-    """Sums over seeds, and how far ahead each is with the false alarms that thresholds had."""
+    """Sums over seeds, and how far ahead ours is with the false alarms of each row."""
     sums = rows.group_by("machine", "alarm", "stated", maintain_order=True).agg(
         pl.col("failures", "seen", "false", "days").sum(), warned=pl.col("warned").sum()
     )
@@ -240,11 +249,10 @@ def pooled_over_seeds(rows: pl.DataFrame) -> pl.DataFrame:
     )
     found = []
     for row in pooled.to_dicts():
-        mine = pooled.filter(machine=row["machine"], alarm=row["alarm"]).sort("rate")
-        theirs = pooled.filter(machine=row["machine"], alarm=THRESHOLDS, stated=row["stated"])
+        mine = pooled.filter(machine=row["machine"], alarm=OURS).sort("rate")
         at = [0.0, *mine["rate"]], [0.0, *mine["lead"].cum_max()]
-        found.append(float(np.interp(theirs["rate"].item(), *at)))
-    return pooled.with_columns(at_same=pl.Series(found))
+        found.append(float(np.interp(row["rate"], *at)))
+    return pooled.with_columns(ours_at_same=pl.Series(found))
 
 
 def judged(name: str, days: float, seed: int) -> list[dict[str, Any]]:

@@ -78,7 +78,7 @@ def test_many_pages_on_one_are_summed_up_and_numbered_through(written):
     assert "2 of 2 targets are met" in read.text
     assert "1 of 2 targets are met" in read.text
     assert read.html.count('class="verdict') == 2  # nothing was asked of the third
-    assert "In no row of these tables." in read.text
+    assert "Looked for, and not found: nothing." in read.text
 
 
 def test_what_is_told_is_text_and_never_markup(written):

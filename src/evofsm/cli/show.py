@@ -96,7 +96,8 @@ def print_page(*pages: paper.Page) -> None:
     say(f"{page.title}\n{page.answer}".strip())
     for item in page.tables:
         _show_table(item)
-    say("\nWhere it loses" if page.losses else "\nIt loses in no row of these tables.")
+    titles = "; ".join(item.title for item in page.lost) or "nothing"
+    say(f"\nWhere it loses{'' if page.losses else f': looked for, and not found: {titles}.'}")
     for item in page.losses:
         _show_table(item)
 
