@@ -1,23 +1,10 @@
-import pickle
 from dataclasses import replace
 
 import pytest
-from studies.sensitivity import (
-    PARAMETERS,
-    Remembering,
-    Sensitivity,
-    Trial,
-    evaluate,
-    recovered,
-    shares_of,
-)
+from studies.sensitivity import Remembering, Sensitivity, Trial, evaluate, recovered, shares_of
 
 from evofsm.driving import KinematicWorld
 from evofsm.paper import check_claims, run_paper
-
-
-def test_parameters_go_to_other_processes():
-    assert pickle.loads(pickle.dumps(PARAMETERS)) == PARAMETERS
 
 
 @pytest.mark.slow

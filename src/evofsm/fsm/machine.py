@@ -157,7 +157,7 @@ class EvolvingFSM(Retraced):
             an episode. Without it nothing is said of failures: see `failures_told`.
         partial : bool
             Whether entries may be NaN or masked: that they were not observed. It is then recognised
-            by the others, no state moves, and no transition is learnt.
+            by the others, no state moves, and no transition to it is learnt.
 
         Raises
         ------
@@ -544,7 +544,8 @@ class EvolvingFSM(Retraced):
         else:
             centers, weights = self._learnt.centers[:, :n], self._settings.weights * ~absent
             belief = believed(centers, weights, vector[None], self.width)[0]
-        surprise = jensen_shannon(forecast, belief) if len(forecast) else np.nan
+        is_judged = len(forecast) and not absent.all()
+        surprise = jensen_shannon(forecast, belief) if is_judged else np.nan
         # In a copy, which takes the place of what there was as a whole.
         learnt = arrays.resized(self._learnt, *room_for(self._learnt, self._settings))
         stepping.believe(learnt, belief)

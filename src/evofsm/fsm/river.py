@@ -21,7 +21,7 @@ class RiverClusterer(base.Clusterer):
     """The states of an `EvolvingFSM` as the clusters of a River clusterer.
 
     A feature that is absent, None or NaN was *not observed*: such an observation is recognised by
-    the features that are there, creates and moves no state, and teaches no transition.
+    the features that are there, creates and moves no state, and teaches no transition to it.
 
     Parameters
     ----------

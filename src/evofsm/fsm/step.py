@@ -215,7 +215,7 @@ class Step(NamedTuple):
     belief: Floats  #: (n,) distribution over states
     event: Event  #: what happened to the states
     predicted: Floats  #: (n,) forecast made one step before; empty where none was
-    surprise: float  #: divergence of `predicted` and `belief` [bit]; NaN where none was
+    surprise: float  #: divergence of `predicted` and `belief` [bit]; NaN without one of them
 
     def __repr__(self) -> str:
         return (

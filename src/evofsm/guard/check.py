@@ -277,9 +277,6 @@ def is_frozen(make: Make) -> None:
 def a_machine_takes_it(make: Make) -> None:
     """A machine creates states by it, alike in a batch and one by one, and a file keeps it."""
     rule = make()
-    for name in ("radius", "spread"):
-        value = dict(rule.table).get(name, 1.0)
-        _insist(0.0 < value < np.inf, f"its {name} is {value}; it must be positive")
     Z = np.cumsum(np.random.default_rng(0).normal(size=(60, len(rule.scales) or 3)), axis=0)
     try:
         machine, batch = EvolvingFSM(2, rule=rule), EvolvingFSM(2, rule=make())
