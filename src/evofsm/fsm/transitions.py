@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import Any
 
 from evofsm.fsm.arrays import EPISODES, NO_ACTION, NOT_OPEN, VISITS, Learnt, Settings
-from evofsm.fsm.clusters import measure_distances
+from evofsm.fsm.clusters import measure_distances, nearest_center
 from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced_kernel
 from evofsm.fsm.validation import Floats
 
@@ -105,19 +105,21 @@ def merge_closest(learnt: Learnt, settings: Settings, nearest: int) -> Any:
     That index goes to the new state, so that no other changes. The newcomer is the latest
     observation, closest to the centre ``nearest``. Where it is one of the two, n is returned.
     """
-    n, weights = learnt.now[0].n_states, settings.weights
-    closest = learnt.squared_distances[nearest]
-    survivor, donor = nearest, n
-    for i in range(n):
-        for j in range(i):
-            squared_distance = 0.0
-            for k in range(len(weights)):
-                offset = (learnt.centers[k, i] - learnt.centers[k, j]) * weights[k]
-                squared_distance += offset * offset
-            if squared_distance < closest:
-                closest, survivor, donor = squared_distance, j, i
+    n, weights, squared_distances = (
+        learnt.now[0].n_states,
+        settings.weights,
+        learnt.squared_distances,
+    )
+    closest, survivor, donor = squared_distances[nearest], nearest, n
+    for i in range(1, n):
+        measure_distances(learnt.centers, weights, i, learnt.centers[:, i], squared_distances)
+        j = nearest_center(squared_distances, i)
+        if squared_distances[j] < closest:
+            closest, survivor, donor = squared_distances[j], j, i
     if donor < n:
         _merge(learnt, weights, survivor, donor, n)
+    # The latest observation again, from centres of which one may have moved.
+    measure_distances(learnt.centers, weights, n, learnt.variables["latest"], squared_distances)
     return donor
 
 
@@ -148,9 +150,6 @@ def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> No
     for place in range(now.n_places):
         _merge_actions(learnt, place, kept, given, n)
     now.state = kept if now.state == given else now.state
-    # The latest observation, from centres of which one has moved.
-    latest = learnt.variables["latest"]
-    measure_distances(learnt.centers, weights, n, latest, learnt.squared_distances)
 
 
 @spliced_kernel
