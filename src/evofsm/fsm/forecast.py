@@ -91,8 +91,8 @@ class Forecasts:
         beliefs = model.recognise(valid.real_array("observations", Z, ndim=2, copy=False))
         actions = valid.check_actions(I, len(beliefs), self.n_actions)
         self.n_states = self._check_states(model.n_states)
-        births = np.pad(self._created, (0, self.n_states - len(self._created)))
-        remains = births == model.created  # not where a new state took the place of a merged one
+        # Not where a new state took the place of one that was merged.
+        remains = np.resize(self._created, self.n_states) == model.created
         remain, self._created = np.outer(remains, remains), model.created
         near = model.recognise(model.centers)
         self._elsewhere = (1.0 - _ANYWHERE) * near + _ANYWHERE / self.n_states

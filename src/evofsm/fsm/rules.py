@@ -123,8 +123,7 @@ def register_rule(name: str, rule: type) -> None:
     """
     is_frozen = is_dataclass(rule) and cast(Any, rule).__dataclass_params__.frozen
     if not (is_frozen and {"table", "scales"} <= {*dir(rule), *vars(rule)["__dataclass_fields__"]}):
-        needs = "a frozen dataclass with a `table` and `scales`, () where each is 1"
-        raise TypeError(f"{rule!r} is no state rule: {needs}")
+        raise TypeError(f"{rule!r} is no state rule: a frozen dataclass with `table` and `scales`")
     owner = _RULES.get(name, rule)
     if (owner.__module__, owner.__qualname__) != (rule.__module__, rule.__qualname__):
         raise ValueError(f"there is a state rule {name!r} already: {owner.__name__}")
@@ -145,9 +144,8 @@ def rule_named(name: object) -> Any:
 
 def weights_of(rule: StateRule, m: int) -> Floats:
     """(m,) 1 / scale of each variable."""
-    scales = np.array(
-        [positive("a scale", scale) for scale in np.asarray(rule.scales).tolist() or [1.0] * m]
-    )
+    sizes = np.asarray(rule.scales).tolist() or [1.0] * m
+    scales = np.array([positive("a scale", scale) for scale in sizes])
     if len(scales) != m:
         raise ValueError(f"observation has {m} variables, but there are {len(scales)} in {rule}")
     return 1.0 / scales

@@ -105,21 +105,17 @@ def merge_closest(learnt: Learnt, settings: Settings, nearest: int) -> Any:
     That index goes to the new state, so that no other changes. The newcomer is the latest
     observation, closest to the centre ``nearest``. Where it is one of the two, n is returned.
     """
-    n, weights, squared_distances = (
-        learnt.now[0].n_states,
-        settings.weights,
-        learnt.squared_distances,
-    )
-    closest, survivor, donor = squared_distances[nearest], nearest, n
+    n, weights, far = learnt.now[0].n_states, settings.weights, learnt.squared_distances
+    closest, survivor, donor = far[nearest], nearest, n
     for i in range(1, n):
-        measure_distances(learnt.centers, weights, i, learnt.centers[:, i], squared_distances)
-        j = nearest_center(squared_distances, i)
-        if squared_distances[j] < closest:
-            closest, survivor, donor = squared_distances[j], j, i
+        measure_distances(learnt.centers, weights, i, learnt.centers[:, i], far)
+        j = nearest_center(far, i)
+        if far[j] < closest:
+            closest, survivor, donor = far[j], j, i
     if donor < n:
         _merge(learnt, weights, survivor, donor, n)
     # The latest observation again, from centres of which one may have moved.
-    measure_distances(learnt.centers, weights, n, learnt.variables["latest"], squared_distances)
+    measure_distances(learnt.centers, weights, n, learnt.variables["latest"], far)
     return donor
 
 
