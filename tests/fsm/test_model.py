@@ -1,4 +1,5 @@
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -38,11 +39,13 @@ STAY = [[1.0, 0.0], [0.0, 1.0]]
 
 def test_nothing_in_a_snapshot_can_be_changed(grown):
     model = grown.model()
+    again = pickle.loads(pickle.dumps(model))
     for field in dataclasses.fields(model):
         with pytest.raises(dataclasses.FrozenInstanceError):
             setattr(model, field.name, None)
         value = getattr(model, field.name)
         if isinstance(value, np.ndarray):
+            assert not getattr(again, field.name).flags.writeable
             with pytest.raises(ValueError, match="read-only"):
                 value[...] = 0.0
 

@@ -42,7 +42,7 @@ _LIMITS = {"max_states": None, "failure_horizon": None}
 _OPTIONS = {**_LIMITS, "belief_tolerance": 0.0}
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
 # What of a snapshot a machine answers with, beside what is its own.
-_ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"}
+_ASKED = {*arrays.OF_MODEL, "averaged_matrix", "joint_frequency", "marginal_matrix"}
 # Compiled code of a step.
 _LEARN_ROWS = Entry(stepping.learn_rows)
 
@@ -359,6 +359,9 @@ class EvolvingFSM(Retraced):
             return getattr(self.model(), name).copy()
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *_ASKED, *_LIMITS, *Settings._fields]
+
     @property
     def settings(self) -> dict[str, Any]:
         """Its settings by name, but for the rule; those that were left as they are, left out."""
@@ -544,8 +547,7 @@ class EvolvingFSM(Retraced):
         else:
             centers, weights = self._learnt.centers[:, :n], self._settings.weights * ~absent
             belief = believed(centers, weights, vector[None], self.width)[0]
-        is_judged = len(forecast) and not absent.all()
-        surprise = jensen_shannon(forecast, belief) if is_judged else np.nan
+        surprise = np.nan if absent.all() or not len(forecast) else jensen_shannon(forecast, belief)
         # In a copy, which takes the place of what there was as a whole.
         learnt = arrays.resized(self._learnt, *room_for(self._learnt, self._settings))
         stepping.believe(learnt, belief)

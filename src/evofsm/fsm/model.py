@@ -220,6 +220,10 @@ class FSMModel:
         """Itself: nothing in it ever changes."""
         return self
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.__post_init__()  # arrays that were pickled can be written to
+
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write it to a file.
 
