@@ -109,6 +109,12 @@ def test_what_a_model_does_not_have_is_named(model):
             draw(model, new(), dead_ends=[3])
         with pytest.raises(ValueError, match="no states: its machine had observed nothing"):
             draw(EvolvingFSM(n_actions=1).model(), new())
+        with pytest.raises(TypeError, match=r"a snapshot, such as machine.model\(\)"):
+            draw(EvolvingFSM(n_actions=1), new())
+    machine = EvolvingFSM(n_actions=1)
+    machine.observe([0.0])
+    with pytest.raises(ValueError, match="takes two variables; there is one"):
+        plot.states(machine.model(), new())
     with pytest.raises(ValueError, match="variable is 2; there are variables 0 to 1"):
         plot.states(model, new(), variables=(0, 2))
 

@@ -105,7 +105,9 @@ def states(
     >>> plot.states(model, Figure().subplots(), dead_ends=[1]).get_xlabel()
     'gap [m]'
     """
-    _refuse_unknown(model.n_states, dead_ends)
+    _refuse_unknown(model, dead_ends)
+    if model.n_variables < 2:
+        raise ValueError("a plane takes two variables; there is one")
     pair = [check_index("variable", k, model.n_variables) for k in variables]
     ax = _given_or_new(ax)
     box = [ax.dataLim.frozen()] if ax.has_data() else []
@@ -168,7 +170,7 @@ def graph(model: FSMModel, ax: Axes | None = None, *, dead_ends: States = ()) ->
     >>> "stays 77 %" in [text.get_text() for text in ax.texts]
     True
     """
-    _refuse_unknown(model.n_states, dead_ends)
+    _refuse_unknown(model, dead_ends)
     ax = _given_or_new(ax)
     matrix, n = model.averaged_matrix, model.n_states
     angle = 0.5 * np.pi - 2.0 * np.pi * np.arange(n) / n
@@ -384,11 +386,13 @@ def _given_or_new(ax: Axes | None) -> Axes:
     return pyplot.subplots(layout="constrained")[1]
 
 
-def _refuse_unknown(n: int, dead_ends: States) -> None:
-    if n == 0:
+def _refuse_unknown(model: FSMModel, dead_ends: States) -> None:
+    if not isinstance(model, FSMModel):
+        raise TypeError(f"model is {model!r}; it must be a snapshot, such as machine.model()")
+    if model.n_states == 0:
         raise ValueError("this model has no states: its machine had observed nothing")
     for state in dead_ends:
-        check_index("state", state, n)
+        check_index("state", state, model.n_states)
 
 
 # -- Parts, in the paper's figures as well --------------------------------------------------------
