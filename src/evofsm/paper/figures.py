@@ -43,17 +43,17 @@ def figures(study: PaperStudy) -> Iterator[Figure]:
     yield Figure(
         "divergence",
         "Divergence of forecast and recognised state",
-        "Jensen–Shannon divergence of the one-step forecast and the distribution over states "
-        "recognised then, in the last round: 0 bit where they are equal, 1 bit where they have "
-        "nothing in common. It may jump where the action changes, for each action has a matrix of "
-        "its own.",
+        "Jensen–Shannon divergence of the one-step forecast and the belief recognised then, in "
+        "the last round: 0 bit where they are equal, 1 bit where they have nothing in common. It "
+        "may jump where the action changes: each has a matrix of its own.",
         partial(draw_divergence, study),
     )
     yield Figure(
         "graph",
         "State graph",
-        "What the machine has learnt: the probability that one state follows another in the next "
-        "step, over all actions as often as each was used; staying is written beside the state.",
+        "The learnt probability that one state follows another in the next step, over all actions "
+        "by use, and beside a state that it stays. Wide beliefs make this far less than was "
+        f"counted: {np.trace(study.model.changes) / study.model.changes.sum():.1%} of steps stay.",
         partial(draw_graph, study),
     )
 
