@@ -91,8 +91,7 @@ class Forecasts:
         beliefs = model.recognise(valid.real_array("observations", Z, ndim=2, copy=False))
         actions = valid.check_actions(I, len(beliefs), self.n_actions)
         self.n_states = self._check_states(model.n_states)
-        # Not where a new state took the place of one that was merged.
-        remains = np.resize(self._created, self.n_states) == model.created
+        remains = np.resize(self._created, self.n_states) == model.created  # else merged, or new
         remain, self._created = np.outer(remains, remains), model.created
         near = model.recognise(model.centers)
         self._elsewhere = (1.0 - _ANYWHERE) * near + _ANYWHERE / self.n_states

@@ -167,6 +167,7 @@ def _revisions(reviser: Any, rows: Rows) -> Answers:
 def revises_what_is_proposed(make: Make) -> None:
     """It executes a finite number within its actions, even where no number was proposed."""
     reviser = make()
+    _insist(reviser.actions is not None, "its actions are None; it needs a set of them")
     proposals = (*_ACTIONS.tolist(), 5.0, -9.0, math.nan, math.inf, -math.inf, 1e9)
     for k, row in enumerate(_drive(40)):
         proposed = proposals[k % len(proposals)]
