@@ -426,7 +426,7 @@ def _said(
     is_other = done[0] != done[1] if is_kinematic else code["reason"] in (1, 2, 3)
     if is_other and not reviser.acts:
         reason = f"{reviser.passing or reviser.mode.value}: {reason}"
-    new = "never seen before" if code["is_new"] else ""
+    new = "never seen before, as far as the states tell" if code["is_new"] else ""
     return "; ".join(filter(None, (remark if is_told else "?", unseen, new, reason)))
 
 

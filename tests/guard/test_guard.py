@@ -225,6 +225,19 @@ def test_time_is_counted_where_it_is_not_told():
 # -- What it learns -----------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("frozen", [False, True])
+def test_what_lies_beyond_all_states_was_never_seen_however_often_the_nearest_was(frozen):
+    guard = guard_for_cars(-2.5, 2.5)
+    for k in range(60):
+        guard.decide([60.0 + 5.0 * math.sin(k), 20.0, 20.0], 0.0)
+    guard.end()
+    guard.learn = not frozen
+    asked = ([61.0, 20, 20], 1), ([200, 20, 20], 0), ([math.nan, 20, 20], 0), ([61, 20, 20], 1)
+    for z, is_seen in asked:  # of the third 200 is held
+        decided = guard.decide(z, 0.0)
+        assert (decided.seen > 0.5, "never seen before" in decided.reason) == (is_seen, not is_seen)
+
+
 def test_a_failure_is_told_or_found_by_the_function():
     guard = continuous(failed=lambda z: abs(z[0]) > 0.8)
     for last, end, failures in (

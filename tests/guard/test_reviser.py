@@ -162,7 +162,8 @@ def test_what_was_never_seen_is_said_to_be_so_and_what_is_known_is_not():
     assert unseen.interval[1] - unseen.interval[0] > 0.5
     reviser.start_episode()
     far = Situation(np.array([200.0, 10.0, 10.0]), np.array([0.0, 1.0]), 1, math.nan, 0.0)
-    for seen, remark in ((0.25, "never seen before; "), (0.5, ""), (math.nan, "")):
+    new = "never seen before, as far as the states tell; "
+    for seen, remark in ((0.25, new), (0.5, ""), (math.nan, "")):
         revision = reviser.revise(far._replace(seen=seen), Proposal(0.0))
         assert revision.reason == f"{remark}risk is within the tolerance"
         np.testing.assert_equal(revision.seen, seen)

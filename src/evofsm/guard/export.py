@@ -26,7 +26,7 @@ import numpy as np
 
 from evofsm import __version__, store
 from evofsm.fsm.naming import in_a_line, visible
-from evofsm.fsm.rules import weights_of
+from evofsm.fsm.rules import reach, weights_of
 from evofsm.guard import guard as looping
 from evofsm.guard import reviser as revising
 from evofsm.guard.actions import Choices, limits, put_into
@@ -220,6 +220,7 @@ def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any
         constants |= {
             "centers": model.centers,
             "centre_weights": weights_of(model.rule, m),
+            "STATE_REACH": reach(model.rule, model.width),
             "time_seen": model.visits * guard.interval,
         }
     return sizes, constants

@@ -180,6 +180,9 @@ static void recognise(evofsm_state *s) {
       s->seen = time_seen[i];
     }
   }
+  if (s->state >= 0 && smallest > STATE_REACH * STATE_REACH) {
+    s->seen = 0.0; /* as far as the states tell */
+  }
 #endif
 }
 

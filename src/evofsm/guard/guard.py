@@ -22,6 +22,7 @@ from evofsm.fsm.explanation import explain
 from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
+from evofsm.fsm.rules import reach
 from evofsm.fsm.sharing import Rollback, alone, share, transaction
 from evofsm.fsm.validation import function, number, positive, real_array, refuse_unusable
 from evofsm.guard.actions import (
@@ -613,8 +614,11 @@ class Guard:
         if self._observing is not None and self._learn:
             self._observing.observe(z)
         if machine is not None and state is not None:
-            visits = opened(machine)[0].sums[VISITS] if model is None else model.visits
-            state_time = float(visits[state]) * self.interval
+            learnt, settings = opened(machine)  # frozen, it stays as it is
+            offset = (latest_row - learnt.centers[:, state]) * settings.weights
+            is_beyond = offset.dot(offset) > reach(machine.rule, machine.width) ** 2
+            visits = 0.0 if is_beyond else float(learnt.sums[VISITS, state])
+            state_time = visits * self.interval
         return Situation(z, belief, state, surprise, time, intake, state_time)
 
     @transaction

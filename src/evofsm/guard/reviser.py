@@ -195,7 +195,7 @@ class ActionReviser:
             reason = f"{self.passing or self.mode.value}: {reason}"
         unseen = unseen_text(situation, self.risk.labels) if situation.intake else ""
         # Of a situation that is new: whether it is dangerous is another question.
-        new = "never seen before" if judgement.seen < _NEW else ""
+        new = "never seen before, as far as the states tell" if judgement.seen < _NEW else ""
         return Revision(
             executed=advice if acts else fixed(options[0]),
             proposed=fixed(proposal.action),
