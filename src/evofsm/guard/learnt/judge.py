@@ -603,7 +603,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def told_here(self, observation: Floats) -> tuple[str, Floats | None]:
         """What was learnt of an observation, in words, and the centre of the dead end it is near.
 
-        Empty, and None, where it is in and near none, nor near a form of failures.
+        Empty, and None, where it is in and near none, nor near where it fails.
         """
         if is_missing(observation) or self.parts is None:
             return "", None

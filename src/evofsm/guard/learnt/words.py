@@ -195,13 +195,13 @@ def here(
 
     Empty, and None, where failures and dead ends are farther than ``near``.
     """
-    text, forms = "", state.forms[~failure.are_sides(state.forms) & (state.forms[:, SAYS] == FAILS)]
+    text, forms = "", failure.saying(state.forms, FAILS)
     away = failure.distances(forms, z[None])[:, 0]
     if away.min(initial=math.inf) <= near:
         row, distance = forms[int(away.argmin())], float(away.min())
         where = "" if distance < 0.0 else f"{changes(distance)} from "
         place = region(names, row[I:HELD].tolist(), int(row[HELD]))
-        text = f"This is {where}where it fails: {place}."
+        text = f"This is {where}where it fails: {place.removeprefix('where ')}."
     off = np.sqrt((((state.centres - z) * model.inverse) ** 2).sum(1)) - state.radii
     off = off * model.dead_ends[:, -1]
     if off.min(initial=math.inf) > near:
