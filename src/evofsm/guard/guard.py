@@ -374,13 +374,16 @@ class Guard:
 
         An episode that is under way is broken off: nothing more is learnt from it. Where it steps
         back, or guarded episodes seem to fail sooner than those of the controller alone, proposals
-        pass. It warns of that, and of a guard that refuses nearly everything.
+        pass. It warns of that, of a guard that refuses nearly everything, and of a function
+        ``failed`` that does not cover what was told to be a failure.
         """
         self.learn = False
         if why := self._why_passing():
             warnings.warn(f"this guard {why}: frozen so, proposals pass", stacklevel=3)
         elif self._observing is not None and (why := self._observing.harm.replacing):
             warnings.warn(f"this guard {why}; learn on, or look at print(guard)", stacklevel=3)
+        elif why := getattr(self.judge, "uncovered", ""):
+            warnings.warn(f"{why}; it has to cover each kind (another unit?)", stacklevel=3)
 
     def _why_passing(self) -> str:
         """Why proposals pass in the episode to come; empty where they need not."""

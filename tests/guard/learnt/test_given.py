@@ -88,6 +88,18 @@ def test_a_given_backup_is_fitted_for_choices_and_for_many_numbers(n_actions):
         )
 
 
+def test_a_function_that_covers_not_all_failures_is_said_to():
+    guard = Guard(low=-1.0, high=1.0, interval=0.1, failed=lambda z: z[0] > 318.0)  # [K], for [°C]
+    for last in (47.0, 319.0, 46.0):
+        for temperature in (42.0, 43.0, 44.0):
+            guard.decide([temperature], 0.5)
+        guard.end(failed=True, observation=[last])
+    says = "failed= was False at the last row of 2 of 3 failures"
+    assert f"; {says}" in str(guard)
+    with pytest.warns(UserWarning, match=says):
+        guard.freeze()
+
+
 def test_a_guard_says_variables_by_their_names():
     guard = Guard(low=-1.0, high=1.0, interval=0.1, names=["angle", "speed"])
     for k in range(4):

@@ -598,7 +598,15 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def told_by_experience(self) -> str:
         """What was learnt so far, in words."""
         text = words.experience(self.state, self.remembered, self.called, self._no_threshold)
+        text += f"; {self.uncovered}" if self.uncovered else ""
         return text + words.harm(self.harm, learning=self.learning)
+
+    @property
+    def uncovered(self) -> str:
+        """At how many failures that were told a given function was false; empty where at none."""
+        rows, failed = self.state.failures, self.failed
+        n = 0 if failed is None else sum(not failed(z) for z in rows)
+        return f"failed= was False at the last row of {n} of {len(rows)} failures" if n else ""
 
     def told_here(self, observation: Floats) -> tuple[str, Floats | None]:
         """What was learnt of an observation, in words, and the centre of the dead end it is near.
