@@ -6,6 +6,7 @@ import sys
 import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -223,6 +224,17 @@ def test_time_is_counted_where_it_is_not_told():
 
 
 # -- What it learns -----------------------------------------------------------------------------
+
+
+def test_proposals_that_are_all_outside_the_range_are_told_of_once():
+    guard = Guard(low=0.0, high=1.0, interval=1.0)
+    for k in range(300):  # in percent
+        with (
+            pytest.warns(UserWarning, match=r"is outside \[0, 1\] by far")
+            if k == 99
+            else nullcontext()
+        ):
+            guard.decide([0.1 * k], 50.0 + k % 50)
 
 
 @pytest.mark.parametrize("frozen", [False, True])

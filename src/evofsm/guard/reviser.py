@@ -7,6 +7,7 @@ arXiv:2006.08092).
 from __future__ import annotations
 
 import math
+import warnings
 from enum import Enum
 from functools import partial
 from typing import NamedTuple
@@ -49,6 +50,8 @@ from evofsm.guard.api import (
 _TRIAL = 4
 # Share of the tolerance below which a proposal is kept again, once revising.
 _RELEASE = 0.9
+# So many proposals on end that are outside the range by more than so many widths are told of.
+_CLIPPED, _CLEARLY = 100, 10.0
 # States that were seen for a shorter time are new [s].
 _NEW = 0.5
 _KEPT = "risk is within the tolerance"
@@ -156,6 +159,7 @@ class ActionReviser:
         self.mode = Mode(mode)
         #: Why proposals pass in this episode although it might act; empty where they need not.
         self.passing = ""
+        self._clipped = 0  # proposals since one was not far outside
         self._searches = isinstance(risk, SearchingJudge)
         self._lowest, self._highest = nearest_bounds(actions)
         self._low, self._high = limits(actions)
@@ -168,7 +172,7 @@ class ActionReviser:
 
     def savepoint(self) -> Rollback:
         """What takes back all that is decided from now on."""
-        now = {"refuses": self.refuses, "_trial": self._trial, "passing": self.passing}
+        now = {name: getattr(self, name) for name in ("refuses", "passing", "_trial", "_clipped")}
         return partial(vars(self).update, now)
 
     @property
@@ -185,6 +189,13 @@ class ActionReviser:
         """What to execute instead of the proposal, which is first made usable (`make_usable`)."""
         acts = self.acts
         action, remark = make_usable(proposal, self.actions, self.risk.fallback)
+        is_far = remark.startswith("proposal ") and np.any(
+            abs(proposal.action - action) > _CLEARLY * (self._high - self._low)
+        )
+        self._clipped = self._clipped + 1 if is_far else 0
+        if self._clipped == _CLIPPED:
+            text = f"{remark} by far, as {_CLIPPED} on end were; another unit?"
+            warnings.warn(text, stacklevel=6)
         if not acts:
             self._trial = 0
         if self.mode is Mode.OFF:
