@@ -199,7 +199,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
     ("arguments", "said"),
     [
         (("--summary",), "--summary needs FILE"),
-        (("--episode", "trip"), "is a number of rows, or columns of a log"),
+        (("--episode", "0"), "--episode is 0; it must be a positive"),
         (("--mode", "drive"), "'drive' is not one of 'off', 'shadow', 'act'"),
         (("--udp", 0, "--socket", "x"), "give one of FILE, --socket, --udp and --zenoh"),
         (("--guard", "nowhere"), "nowhere: no such file or directory"),

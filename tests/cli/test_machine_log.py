@@ -316,6 +316,21 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
         assert fault in one["error"] in text
 
 
+def test_live_rows_of_several_machines_become_no_means_of_them(evofsm):
+    log = [f"{k},A,{max(6, k % 40)},{int(k > 42 and k % 40 < 3)}" for k in range(243)]
+    Path("log.csv").write_text("\n".join(["t,asset,heat,trip", *log]))
+    asked = "--observe", "heat", "--action", "", "--time", "t", "--failed", "trip"
+    asked = *asked, "--resample", "2s", "--episode", "asset", "--rule", "novelty"
+    assert not evofsm("learn", "log.csv", *asked, "--scale", "heat=9", "--guard", "g").exit_code
+    rows = [row for k, one in enumerate(log) for row in (one, f"{k},B,5,0", f"{k},C,5,0")]
+    Path("live.csv").write_text("\n".join(["t,asset,heat,trip", *rows]))
+    live = evofsm("monitor", "--guard", "g", "live.csv")
+    found = [json.loads(line) for line in live.stdout.splitlines()]
+    ends = [one["time"] for one in found if one["kind"] == "end" and one["failed"]]
+    assert ends == [*range(80, 241, 40)]  # each counts once
+    assert found[2]["note"] == "asset B after A: a new episode"
+
+
 def sent(frame, path):
     """Rows of a log as a machine sends them, in the order in which they came."""
     with Path(path).open("w") as file:

@@ -48,7 +48,7 @@ def monitor(
     state: Annotated[Path | None, option("Save all in this file, and go on from it.")] = None,
     audit: Annotated[Path | None, option("Write an audit log to this file.")] = None,
     episode: Annotated[
-        str | None, option("Rows of an episode at most; of a log columns. [default: 6000]")
+        str | None, option("Rows of an episode at most, 6000; or columns that tell them apart.")
     ] = None,
     socket: Annotated[Path | None, option("Listen to a UNIX socket.")] = None,
     udp: Annotated[
@@ -114,6 +114,7 @@ def monitor(
     from evofsm.cli.show import show, warn
     from evofsm.driving.cars import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
+    from evofsm.fsm.validation import positive
     from evofsm.guard import Foresight, Guard
 
     if guard is not None and brakes != options.BRAKES:
@@ -138,13 +139,11 @@ def monitor(
     defaults = options.read_with(guard or state)
     learnt_of = defaults.pop("observe", None)
     observe = observe or learnt_of
-    log_episode = defaults.pop("episode", None)
-    if is_log and episode is None:
-        episode = log_episode
-    reader = {**defaults, **reading}
-    if episode is not None and not (is_log or (episode.isdecimal() and int(episode))):
-        raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns of a log")
-    rows = EPISODE if episode is None or is_log else int(episode)
+    reader, rows = {**defaults, **reading}, EPISODE
+    if episode is not None and episode.isdecimal() and not is_log:
+        rows = int(positive("--episode", int(episode)))
+    elif episode is not None:
+        reader["episode"] = episode
     with ExitStack() as stack:
         chunks, keeper, slots = None, None, None
         if summary and file is not None and is_log:
@@ -160,7 +159,7 @@ def monitor(
                 observe = options.quoted(names)
             if alone:
                 reader["action"] = ""
-            log_format = options.reading_of(**reader, observe=observe, episode=episode)
+            log_format = options.reading_of(**reader, observe=observe)
             fewest = 1 if alone else 2  # a failure that comes at once counts as well
             notes = Noted()
             episodes = episodes_read(str(file), log_format, notes, dated=alone, fewest=fewest)
@@ -185,7 +184,7 @@ def monitor(
             how = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
             how["false_a_day"] = false_a_day
             columns = {k: v for k, v in reader.items() if k != "topics"}
-            keeper = State(state, {"guard": digest, **basics, **how, **system, **columns})
+            keeper = State(state, {"guard": digest, **columns, **basics, **how, **system})
             stack.callback(keeper.close)
         elif learn and not summary:
             warn("nothing of what is learnt is saved; --state FILE saves it")

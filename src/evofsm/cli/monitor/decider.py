@@ -65,6 +65,7 @@ class Decider:
         self._recent: deque[tuple[Message, Answer]] = deque(maxlen=_RECENT)
         self._next: int | None = None  # of the recent ones, where they are being sent again
         self._said_often = self._said_fast = self._has_failed = self._alarm = False
+        self._said_turns = False
         reviser = guard.reviser
         judge = reviser.risk if isinstance(reviser, ActionReviser) else None
         self._mode = reviser.mode if isinstance(reviser, ActionReviser) else Mode.ACT
@@ -101,10 +102,11 @@ class Decider:
             if self._next is not None:
                 return self._recent[self._next][1]
             if isinstance(message, Row):
-                if isinstance(self.latest, Row):
+                change = self.slots.change(message, self.latest)
+                if isinstance(self.latest, Row) and not change:
                     _refuse_stale(message, self.latest)
                 self.slots.refuse(message)
-                if self.slots.is_over(message):
+                if self.slots.is_over(message) and not change:
                     text = f"comes after its {self.slots.step:g} s were decided on, as nothing came"
                     raise MessageError("time", text, message.time)
                 if self.slots.step and (message.ahead or not message.observation):
@@ -170,10 +172,18 @@ class Decider:
         """Take in what was accepted, and answer it."""
         if isinstance(told, Pause):
             return dict(self._waited(early=True).get("last", {}))
-        omission = "" if self.rows or self.slots.waiting else self.slots.lacking(told)  # once
-        answer = self._ended(told) if isinstance(told, End) else self._taken(told)
-        if omission:
-            answer["note"] = "; ".join(filter(None, [answer.get("note"), omission]))
+        remark = "" if self.rows or self.slots.waiting else self.slots.lacking(told)  # once
+        last = Answer()
+        if change := self.slots.change(told, self.latest):
+            remark, last = f"{change}: a new episode", self._waited()
+            if self.rows:
+                self._end_unasked()
+            if isinstance(self._before(told), Row) and not self._said_turns:
+                self._said_turns = True
+                _log.warning("%s; rows of several in turn need a monitor for each", remark)
+        answer = last | (self._ended(told) if isinstance(told, End) else self._taken(told))
+        if remark:
+            answer["note"] = "; ".join(filter(None, [answer.get("note"), remark]))
         self._recent.append((told, answer))
         if self.rows >= self.episode and (not answer.get("alarm") or self.rows >= 2 * self.episode):
             self._end_unasked()
@@ -199,9 +209,14 @@ class Decider:
             self.end(told.failed, _numbers(told.observation))
         return self._of("end", failed=told.failed, **last)
 
+    def _before(self, row: Message) -> Message | None:
+        """What came latest; of several that take turns, what came of its own."""
+        messages = (message for message, _ in reversed(self._recent))
+        return next((m for m in messages if not self.slots.change(row, m)), None)
+
     def _taken(self, row: Row) -> Answer:
         """What a row brings, as it would in a log."""
-        slots, before = self.slots, self.latest
+        slots, before = self.slots, self._before(row)
         free, fails = self._free(row), slots.fails(row)
         counts = not free and slots.counts(row)
         if fails or not counts:

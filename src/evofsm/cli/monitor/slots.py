@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Iterator, Sequence
 from hashlib import sha256
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from operator import itemgetter
 from statistics import fmean
 from typing import Any
@@ -34,8 +34,9 @@ class Slots:
         self._conditions = {o: Condition.parse(t, o) for o, t in texts.items() if t is not None}
         every = [term for c in self._conditions.values() for term in c.terms]
         self.compared = [term.column for term in every if term.of_number]  #: with a number
-        #: Keys that rows may have beside the guard's variables, for the conditions.
-        self.keys = tuple({t.column for t in every} - {*self.names, columns.action})
+        parts = self.names, [columns.action], [t.column for t in every], columns.episode or ()
+        #: Keys that rows may have beside the guard's variables, for conditions and episodes.
+        self.keys = tuple(dict.fromkeys(chain(*parts)))[len({*self.names, columns.action}) :]
         #: Of the log: what the column of its time is called, how dates are written, or its unit.
         self.clock = columns.time, columns.units.get(columns.time, "s")
         self.waiting: list[Row] = []
@@ -53,7 +54,8 @@ class Slots:
         """What a row does not tell of what conditions name, in words."""
         pairs = zip(self.keys, row.told, strict=False) if isinstance(row, Row) else ()
         names = ", ".join(name for name, value in pairs if value is None)
-        return f"no {names} in the row, which {' or '.join(self._conditions)} names" * bool(names)
+        options = " or ".join([*self._conditions, *["--episode"] * bool(self.columns.episode)])
+        return f"no {names} in the row, which {options} names" * bool(names)
 
     def fails(self, row: Message | None) -> bool:
         """Whether a row meets what tells of failures."""
@@ -69,12 +71,23 @@ class Slots:
         """Whether a row meets the condition of an option; not where there is none."""
         if (condition := self._conditions.get(option)) is None:
             return False
-        values: dict[str, Any] = {self.columns.action: row.proposal}
-        values |= dict(zip(self.names, row.observation or (), strict=False))
-        values |= dict(zip(self.keys, row.told, strict=False))
+        values = self._values(row)
         if unknown and all(values.get(term.column) is None for term in condition.terms):
             return True
         return condition.holds_of(values)
+
+    def _values(self, row: Row) -> dict[str, Any]:
+        values: dict[str, Any] = {self.columns.action: row.proposal}
+        values |= zip(self.names, row.observation or (), strict=False)
+        return values | dict(zip(self.keys, row.told, strict=False))
+
+    def change(self, row: Message | None, before: Message | None) -> str:
+        """In words, what tells that a row is of another episode than one before it."""
+        if not (self.columns.episode and isinstance(row, Row) and isinstance(before, Row)):
+            return ""
+        now, then = self._values(row), self._values(before)
+        names = (name for name in self.columns.episode if now.get(name) != then.get(name))
+        return ", ".join(f"{name} {now.get(name)} after {then.get(name)}" for name in names)
 
     def is_over(self, row: Row) -> bool:
         """Whether its step was decided on, as nothing came for long."""
