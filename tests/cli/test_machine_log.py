@@ -288,7 +288,7 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     trips = ";1;6,0;yes", *[";1;6,0;yes"] * 5, ";0;6,0;0"
     times = [f"2025-03-10 06:{k:02}:00" for k in range(3, 10)]
     lines = *(f"{date};0; 6,0;yes" for date in dates), *map("".join, zip(times, trips, strict=True))
-    odd = "10.03.2025 06:10:00;0;Bad;1", "10.03.2025 06:10:00;0", "10.03.2025 06:11:00;0;;yes"
+    odd = "10.03.2025 06:10:00;0;Bad;1", "10.03.2025 06:10:00;0", "10.03.2025 06:11:00;0;NaN;yes"
     title, header, *in_csv = answers("Mühle;;;", "Zeit;trip;heat;runs", *lines, *odd)
     assert (title["kind"], header["kind"], in_csv[:10]) == ("waiting", "waiting", came)
     bad, short, unseen = in_csv[10:]
