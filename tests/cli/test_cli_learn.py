@@ -137,7 +137,7 @@ def own(tmp_path):
     for trip in range(6):
         for k in range(60):
             gap, lead = 22.0 - (0.4 * k if trip % 2 else 0.0), 72.0 - 15.0 * (trip % 2)
-            rows.append(f"{trip},{k / 10:.1f},{gap:.2f},72,{lead},0.0,{int(gap <= 0.0)}")
+            rows.append(f"{trip},{k / 10:.1f},{gap:.2f},72,{lead},{k % 2 / 100},{int(gap <= 0.0)}")
     path.write_text("\n".join([*rows, ""]))
     return path
 
@@ -199,7 +199,7 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
 def test_columns_that_are_named_in_another_order_are_what_they_are_called(evofsm, tmp_path, names):
     path, guard = tmp_path / "log.csv", tmp_path / "car.evofsm"
     fields = ("time", *names, "a", "hit")
-    rows = [f"{k / 10:.1f},{30 - 0.4 * k:.2f},20,16,0.0,{int(k > 75)}" for k in range(80)]
+    rows = [f"{k / 10:.1f},{30 - 0.4 * k:.2f},20,16,{k % 2 / 100},{int(k > 75)}" for k in range(80)]
     path.write_text("\n".join([",".join(fields), *rows, ""]))
     asked = "--action", "a", "--failed", "hit", "--observe"
     judge = "--judge", "kinematic" if names[0] == "gap" else "learnt"
@@ -245,6 +245,18 @@ def test_a_guard_that_could_not_be_taught_is_refused_before_the_work(refused, ow
     assert "--observe has to name the three columns" in refused(*options[:2], *two, *options[-2:])
     discrete = ("--observe", "dist [m],hit=0/1", "--failed", "hit")
     assert "numbers alone" in refused(*options[:2], *discrete, *options[-2:])
+
+
+def test_what_no_action_tried_is_said_and_of_one_that_never_moved_there_is_no_guard(
+    evofsm, refused, tmp_path
+):
+    rows = [f"{k},{k % 20},{(40, 55)[k % 3 > 0]},7,{int(k % 20 > 18)}" for k in range(200)]
+    (path := tmp_path / "log.csv").write_text("\n".join(["time,level,valve,fixed,hit", *rows]))
+    read = "learn", path, "--observe", "level", "--failed", "hit", "--action-range", "0:100:10"
+    said = "it was in 2, 40 to 60: what others do is extrapolated"
+    assert said in " ".join(evofsm(*read, "--action", "valve").stdout.split())
+    guard = "--guard", tmp_path / "guard.evofsm"
+    assert "fixed is always the same, so" in refused(*read, "--action", "fixed", *guard)
 
 
 # -- What goes wrong ------------------------------------------------------------------------------

@@ -89,6 +89,9 @@ def learn(
         chunks = list(chunks) if guard is not None and not columns.acts else chunks
         units_of = partial(notes.si_units, encoder.names)
         lesson = learning.learn_traces(chunks, machine, actions, encoder.names, units_of)
+    if kind == "learnt" and columns.acts and len(lesson.levels) < 2:
+        fault = "is always the same, so that nothing tells what others would do (--action '')"
+        raise ValueError(f"--guard: {columns.action} {fault}")
     model = lesson.model
     provenance = {
         "files": [{"name": n, "bytes": size} for n, size in zip(files, sizes, strict=True)],

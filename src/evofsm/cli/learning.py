@@ -432,6 +432,9 @@ def read_of(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
         text += f"; {learning.clipped_below:,} below and {learning.clipped_above:,} above "
         text += f"({n_beyond / learning.rows:.1%} of rows) were put into the end intervals"
     text = text if n_beyond else f"{text}; none was beyond"
+    if 0 < len(indices := np.flatnonzero(learning.model.uses)) < actions.n_actions:
+        low, high = actions.edges[[indices[0], indices[-1] + 1]].tolist()
+        text += f"; it was in {len(indices)}, {low:g} to {high:g}: what others do is extrapolated"
     numbers = sorted(learning.levels) if len(learning.levels) <= MOST_LEVELS else []
     places = [actions.encode(number) for number in numbers]
     meanings = [f"{n:g} is a({k + 1})" for n, k in zip(numbers, places, strict=True)]
