@@ -145,8 +145,9 @@ def test_what_is_repeated_or_missing_changes_no_alarm(surge):
     assert guard.decide(near, 0, 0.0).risk_proposed > 0.3
     assert guard.decide([0.6, 0.6], 0, 0.0).risk_proposed > 0.3  # as old as before: nothing new
     assert guard.decide([np.nan, np.nan], 0, DT).reason.startswith("not seen: pressure, flow")
-    blind = [guard.decide([np.nan, np.nan], 0, (2 + k) * DT).risk_proposed for k in range(40)]
-    assert min(blind) > 0.3  # whoever loses sight clears no alarm
+    blind = [guard.decide([np.nan, np.nan], 0, (2 + k) * DT) for k in range(40)]
+    assert min(one.risk_proposed for one in blind) > 0.3  # whoever loses sight clears no alarm
+    assert "stays on until all is seen again; after" in blind[-1].reason
     guard.end()
     first = guard.decide([np.nan, np.nan], 0, 0.0)
     assert np.isnan(first.risk_proposed)

@@ -463,7 +463,10 @@ class Foresight(LearningJudge):
         rate = self.alarm
         assert rate is not None
         right, false, *_ = self.held_out[rate].tolist()
-        limits, why = self.of_rate(rate), "the alarm stays on for a while"
+        limits = self.of_rate(rate)
+        of, when = limits[:, [_OF, _WHEN]].T.astype(int)
+        is_unseen = np.isnan(column.reshape(len(_AHEAD), -1)[when, of]).any()
+        why = f"the alarm stays on {'until all is seen again' if is_unseen else 'for a while'}"
         if len(limits := limits[self._passed(column[:, None], limits)[:, 0]]):
             name, there = self._words(limits[0])
             why = f"{name} {self._value(limits[0], z):.4g}: {there}"

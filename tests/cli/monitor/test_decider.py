@@ -5,6 +5,7 @@ import pytest
 
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.slots import Slots
+from evofsm.cli.monitor.summary import Text
 from evofsm.driving import EnvelopeReviser, guard_for_cars, measures
 from evofsm.driving.cars import guard_of_monitor, guard_of_traffic
 from evofsm.guard import AuditLog, Guard, Mode, audit
@@ -72,6 +73,12 @@ def test_time_that_stands_or_goes_backward():
     assert anew["note"] == "time went back from 50 s: a new episode"
     assert "note" not in decider.answer(line(row | {"time": 0.1}))
     assert decider.answer(line(row))["n"] == 4  # newer than the latest, it is not sent again
+
+
+def test_in_words_it_is_said_where_the_risk_is_not_known():
+    text, told = Text(), {"kind": "decision", "alarm": False, "reason": "not seen: heat", "time": 3}
+    lines = [text.line({**told, "risk_proposed": risk}) for risk in (0.0, None, None, 0.0)]
+    assert lines == [b"", b"3  not seen: heat\n", b"", b"3  the risk is known again\n"]
 
 
 def test_gaps_in_time_and_rows_that_come_too_often_are_noted():

@@ -27,10 +27,11 @@ _WORST, _MOST_VARIABLES, _MOMENT = 10, 4, 5.0
 
 
 class Text:
-    """Answers in words: when an alarm begins and ends, when it failed, and what was refused."""
+    """Answers in words: when an alarm begins, ends or is not known, failures, and refusals."""
 
     def __init__(self) -> None:
         self._since: float | None = None  # when the alarm began that is on [s]
+        self._is_blind = False  # whether the risk is not known
 
     def line(self, answer: Answer) -> bytes:
         """What there is to say of one; mostly nothing."""
@@ -55,6 +56,11 @@ class Text:
         elif part["kind"] == "decision" and not part["alarm"] and since is not None:
             self._since = None
             yield f"{when}over, after{after}"
+        if part["kind"] == "decision":
+            is_blind = part["risk_proposed"] is None and part.get("ahead", "") is not None
+            if is_blind != self._is_blind:
+                yield f"{when}{part['reason'] if is_blind else 'the risk is known again'}"
+            self._is_blind = is_blind
 
 
 Answers = Iterable[tuple[Answer, Row | None]]
