@@ -122,6 +122,23 @@ def test_where_nothing_foresees_a_failure_there_is_no_alarm_and_without_failures
     assert judge.told_by_experience == for_all  # nor does anything hold where it fails
 
 
+@pytest.mark.parametrize(
+    ("changed", "fault"),
+    [
+        ({"failed": ["False", "True"]}, "of each of 2 episodes: 2 labels, 'False', and 9 rows"),
+        ({"failed": [1.0, np.nan]}, "2 labels, nan, and"),
+        ({"failed": [True]}, "of each of 2 episodes: 1 labels, and 9"),
+        ({"episodes": [[[1.0]], []]}, "and 0 rows or more in an episode"),
+        ({"dt": 0.0}, "dt is 0.0; it must be a positive"),
+        ({"names": ["heat", "load"]}, "names are 2, of 1 variables"),
+    ],
+)
+def test_what_it_cannot_learn_from_is_named(changed, fault):
+    usual = {"episodes": [np.zeros(9), np.arange(9.0)], "failed": [False, True], "dt": 1.0}
+    with pytest.raises(ValueError, match=fault):
+        Foresight.learn_log(**usual | changed)
+
+
 def test_a_guard_alarms_row_by_row_as_the_log_was_judged_also_from_its_file(surge, reloaded):
     reviser = ActionReviser(surge, Choices(1), tolerance=1e-6)
     guard = reloaded(Guard.of(reviser, interval=DT, learn=False))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -20,8 +21,9 @@ from evofsm.driving import SAFETY_RULE
 from evofsm.driving.cars import guard_of_monitor
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, Novelty, ObservationEncoder
+from evofsm.fsm.proportions import outward, poisson_bounds
 from evofsm.fsm.rules import describe_rule, rule_named
-from evofsm.fsm.validation import positive
+from evofsm.fsm.validation import counted, positive
 from evofsm.guard import ActionReviser, Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.foresight import span
 from evofsm.io import Chunk, LogColumns, episodes_of, read_traces
@@ -385,18 +387,21 @@ def told_of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float)
     """Where it is, what it takes, and what it reckons with."""
     assert guard.judge is not None
     names = map(guard.judge.labels.variable, range(len(guard.variables)))
-    keys = ", ".join(["time [s]", *names])
     also = "" if isinstance(guard.judge, Foresight) else ", and proposal, the action"
-    takes = f"evofsm monitor --guard {path} takes rows of {keys}{also}."
+    takes = f"evofsm monitor --guard {path} takes rows of {', '.join(['time [s]', *names])}{also}."
     yield f"The guard was saved to {path}. {takes}"
     if isinstance(guard.judge, Foresight):
         soon = f"up to {span(guard.judge.horizon * guard.judge.dt)} before a failure (--horizon)"
-        words = guard.judge.alarm_in_words
-        if guard.judge.alarm is None:
-            hint = " (fewer columns, or a longer --horizon?)" * ("chance" in words)
+        words, days = guard.judge.alarm_in_words, guard.judge.days
+        if (rate := guard.judge.alarm) is None:
+            text = f"one in {days:.2g} days is {1.0 / max(days, 1e-9):.2g} a day; fewer columns, or"
+            hint = f" ({text} a longer log or --horizon?)" * ("chance" in words)
             yield f"It never alarms: {words}{hint}."
         else:
-            yield f"{words.capitalize()} (--false-a-day), {soon}."
+            n = int(guard.judge.held_out[rate, 1])
+            bound = outward(math.ceil, poisson_bounds(n)[1] / days, 2)
+            text = f"{n:,} false in {days:.2g} days: it may be up to {bound:,g} a day (95 %)"
+            yield f"{words.capitalize()} (--false-a-day), {soon}; {text}."
         judges = "evofsm monitor LOG --summary, with the same options, judges such alarms held out"
         yield f"{judges}; evofsm inspect {path} prints its states."
         return
@@ -423,9 +428,7 @@ def read_of(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     """What was read, and the actions and the rule that it was learnt with."""
     actions = learning.actions
     yield "rows", f"{learning.rows:,}, one every {learning.model.dt:g} s"
-    minutes = learning.seconds / 60.0
-    together = f"{learning.seconds:.1f} s" if minutes < 2.0 else f"{minutes:,.1f} min"
-    yield "episodes", f"{learning.episodes:,}, together {together}"
+    yield "episodes", f"{learning.episodes:,}, together {span(learning.seconds)}"
     yield "transitions", f"{learning.transitions:,}"
     text = f"{actions.n_actions} intervals of {action} from {actions.low:g} to {actions.high:g}"
     if n_beyond := learning.clipped_below + learning.clipped_above:
@@ -459,8 +462,7 @@ def read_otherwise(
     if columns.failed is None:
         yield "failures", "not known; --failed COLUMN or --failed 'gap<=0' says them"
     else:
-        several = "" if learning.failures == 1 else "s"
-        text = f"{learning.failures:,} episode{several} ended with {columns.failed}"
+        text = f"{counted(learning.failures, 'episode')} ended with {columns.failed}"
         left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
         yield "failures", text + (left_out if noted.after_failure else "")
     hole = columns.longest_hole

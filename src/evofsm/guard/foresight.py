@@ -114,8 +114,12 @@ class Runs(NamedTuple):
     @classmethod
     def of(cls, episodes: Sequence[ArrayLike], failed: ArrayLike) -> Runs:
         """Those, (T,) or (T, m) each."""
+        lengths = np.array([np.shape(run)[0] for run in episodes])
+        odd = "".join([f", {x!r}" for x in np.ravel(failed).tolist() if x not in (True, False)][:1])
+        if odd or np.size(failed) != len(lengths) or not lengths.all():
+            text = f"{np.size(failed)} labels{odd}, and {lengths.min()} rows or more in an episode"
+            raise ValueError(f"failed is a truth value of each of {len(lengths)} episodes: {text}")
         rows = [np.asarray(run, np.float64).reshape(np.shape(run)[0], -1) for run in episodes]
-        lengths = np.array([*map(len, rows)])
         return cls(np.concatenate(rows), np.cumsum(lengths) - lengths, np.array(failed, np.bool_))
 
     def part(self, which: Flags) -> Runs:
@@ -177,6 +181,7 @@ class Foresight(LearningJudge):
         log: Runs | None = None,
         asked: float | None = None,
         stated: float = RATE,
+        days: float = math.nan,
     ) -> None:
         self.dt = positive("dt", dt)
         self.horizon, self.hold = horizon, hold  #: [rows]
@@ -189,6 +194,7 @@ class Foresight(LearningJudge):
         self.log = log  #: what it learns from, if it does as it goes
         self.asked = asked  #: horizon that was asked for, if any [s]
         self.stated = stated  #: false alarms a day
+        self.days = days  #: in which `held_out` counts them, where it has just learnt
         self._seen: list[Floats] = []  # of the episode under way
         self._learnt = (0, 0) if log is None else (int(log.failed.sum()), len(log.rows))
         self.start_episode()
@@ -223,10 +229,12 @@ class Foresight(LearningJudge):
         names, units : sequence of str
             Of the variables.
         """
-        if not np.any(failed):
+        log, dt = Runs.of(episodes, failed), positive("dt", dt)
+        if not log.failed.any():
             raise ValueError("no episode failed, so there is nothing to foresee")
-        log = Runs.of(episodes, failed)
         refuse_unusable("observations", log.rows)
+        if len(names) not in (0, m := log.rows.shape[1]):
+            raise ValueError(f"names are {len(names)}, of {m} variables")
         labels = Labels(names=tuple(names), units=tuple(units))
         return cls._of_log(log, dt, horizon, 1 + round(hold / dt), labels)
 
@@ -294,7 +302,7 @@ class Foresight(LearningJudge):
             score = right, false, float(log.failed.sum()), kind  # one of each limits
             scores.append(score_of.setdefault((kind, parts[kind % 2].tobytes()), score))
         tables = judge.forms, np.concatenate(limits), np.array(scores, np.float64)
-        return cls(dt, ahead, held, *tables, names, labels.units)
+        return cls(dt, ahead, held, *tables, names, labels.units, days=float(days.min()))
 
     def _fitted(self, log: Runs) -> tuple[Self, Floats]:
         """With forms and limits of both kinds, for all prices; and the `columns` of the log."""
@@ -502,7 +510,7 @@ class Foresight(LearningJudge):
         if self.held_out[0, 2] == 1.0:
             return "with one failure nothing can be cross-validated"
         if self.alarm is None:
-            return "cross-validated, no alarm was better than chance"
+            return f"cross-validated, no alarm with at most {RATES[-1]:g} false a day beats chance"
         fewest = ", as none is for fewer" * (RATES[self.alarm] > self.stated)
         return f"it alarms as for {RATES[self.alarm]:g} false alarms a day{fewest}"
 

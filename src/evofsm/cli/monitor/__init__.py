@@ -152,8 +152,7 @@ def monitor(
             from evofsm.io.logs import Noted
 
             sentry = fresh() if guard else None
-            alone = reader.get("action") == ""
-            alone |= isinstance(sentry and sentry.judge, Foresight)
+            alone = reader.get("action") == "" or isinstance(sentry and sentry.judge, Foresight)
             names = sentry.variables if sentry else VARIABLES
             if observe is None or {*options.split_names(observe)} == {*names}:  # in its own order
                 observe = options.quoted(names)

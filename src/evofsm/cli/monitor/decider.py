@@ -64,8 +64,7 @@ class Decider:
         self.decided_on: Row | None = None  #: latest
         self._recent: deque[tuple[Message, Answer]] = deque(maxlen=_RECENT)
         self._next: int | None = None  # of the recent ones, where they are being sent again
-        self._said_often = self._said_fast = self._has_failed = self._alarm = False
-        self._said_turns = False
+        self._said_often = self._said_fast = self._has_failed = self._alarm = self._turns = False
         reviser = guard.reviser
         judge = reviser.risk if isinstance(reviser, ActionReviser) else None
         self._mode = reviser.mode if isinstance(reviser, ActionReviser) else Mode.ACT
@@ -178,8 +177,8 @@ class Decider:
             remark, last = f"{change}: a new episode", self._waited()
             if self.rows:
                 self._end_unasked()
-            if isinstance(self._before(told), Row) and not self._said_turns:
-                self._said_turns = True
+            if isinstance(self._before(told), Row) and not self._turns:
+                self._turns = True  # once
                 _log.warning("%s; rows of several in turn need a monitor for each", remark)
         answer = last | (self._ended(told) if isinstance(told, End) else self._taken(told))
         if remark:
@@ -417,9 +416,7 @@ def _moving(row: Row, before: Row | None) -> NDArray[np.float64]:
 
 def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None:
     """With NaN where a variable was not seen."""
-    if observation is None:
-        return None
-    return [math.nan if value is None else value for value in observation]
+    return None if observation is None else [math.nan if z is None else z for z in observation]
 
 
 # -- Its guard ------------------------------------------------------------------------------------
