@@ -283,9 +283,26 @@ def test_who_sets_the_speed_of_a_guarded_car_is_told_that_it_is_not_guarded(road
             sumo.vehicle.setSpeed("ego", 20.0)
             drive(sumo, 0.1)
 
-    with pytest.warns(RuntimeWarning, match="car ego drove faster than its guard had set"):
+    with pytest.warns(RuntimeWarning, match="car ego drove otherwise than its guard"):
         script()
     assert guards.guarding.overruled > 5
+
+
+def test_a_car_that_a_script_stops_stays_stopped_until_the_script_lets_it_go(road):
+    sumo = road(*NO_GAP)
+    guards = attach(sumo, ["ego"])
+    while sumo.vehicle.getSpeedMode("ego") == 31:
+        drive(sumo, 0.1)
+    sumo.vehicle.setSpeed("ego", 0.0)
+    with pytest.warns(RuntimeWarning, match="a script"):
+        speeds = drive(sumo, 15.0, brakes_at=np.inf)
+    assert speeds[-1] == 0.0
+    assert sumo.vehicle.getSpeedMode("ego") == 31
+    overruled, now = guards.guarding.overruled, sumo.simulation.getTime()
+    sumo.vehicle.setSpeed("ego", -1.0)
+    assert max(drive(sumo, 25.0, brakes_at=now + 5.0)) > 10.0
+    assert guards.guarding.overruled < overruled + 5
+    assert guards.collisions == []
 
 
 # -- Watching --------------------------------------------------------------------------------------

@@ -47,11 +47,12 @@ _SKIPPED = (
     "guard looked or acted and no collision was counted; cars begin anew. Go on step by step"
 )
 _OVERRULED = (
-    "car {} drove faster than its guard had set, in {} steps by now: does something else set its "
-    "speed (setSpeed, slowDown)? Then what the guard decides comes to nothing"
+    "car {} drove otherwise than its guard, or its own driver, had it: a script (setSpeed, "
+    "slowDown) or a device of SUMO set its speed. It is left to that until it drives faster, "
+    "unguarded, and so is every such car"
 )
-# So much faster than was set [m/s], in so many steps.
-_FASTER, _OFTEN = 0.05, 5
+# Speeds that differ by more are not the same [m/s].
+_DIFFERS = 1e-3
 _MESOSCOPIC = (
     "this is SUMO's mesoscopic simulation (--mesosim), in which no car has a leader, so that a "
     "guard would see nobody. Attach to a microscopic one, without --mesosim"
@@ -214,6 +215,7 @@ class _Car:
     speed: float = 0.0
     limit: float = 0.0  # the speed that was set
     wish: float = 0.0  # the speed that its model wants instead
+    script: float = math.nan  # the speed that something else set, as far as that shows
     time: float = 0.0
     seen: Floats | None = None  # what is decided on
     around: tuple[Neighbour | None, Neighbour | None] = (None, None)
@@ -265,7 +267,7 @@ class Guarding:
         #: than 0.1 m/s²; in shadow, would have. Who stands, and goes on standing, is not counted.
         self.revised = 0
         self.limited = 0  #: steps in which a guard set a limit to the speed of a car
-        self.overruled = 0  #: steps in which a car drove faster than its guard had set
+        self.overruled = 0  #: steps in which a car was left to a script that set its speed
 
     def begin_anew(self) -> None:
         """Another simulation, or another moment of it, begins."""
@@ -339,6 +341,9 @@ class Guarding:
     def _act(self, car: _Car, speed: float) -> None:
         """Set the speed, where the guard allows less than the car might want."""
         revision = car.revision
+        is_old = car.time and not (revision is None and car.mode is None)
+        if is_old and self._is_overruled(car, speed):
+            return
         if revision is None or revision.executed >= car.high:
             self._hand_back(car)
             return
@@ -356,6 +361,22 @@ class Guarding:
             self._vehicle.setSpeedMode(car.id, car.mode & ~_OFF | _ON)
         self.limited += 1
         self._vehicle.setSpeed(car.id, car.limit)
+
+    def _is_overruled(self, car: _Car, speed: float) -> bool:
+        """Whether a script set its speed, which SUMO would forget; then it is left to it."""
+        limit = math.inf if car.mode is None else car.limit
+        if speed > limit + _DIFFERS:
+            car.script = math.inf
+        elif speed < min(limit, self._vehicle.getSpeedWithoutTraCI(car.id)) - _DIFFERS:
+            car.script = speed
+        elif not speed <= car.script + _DIFFERS:
+            car.script = math.nan
+            return False
+        if not self.overruled:
+            warnings.warn(_OVERRULED.format(car.id), RuntimeWarning, stacklevel=5)
+        self.overruled += 1
+        self._hand_back(car)
+        return True
 
     def _is_exactly_safe(self, car: _Car, speed: float) -> bool:
         """Whether what its model wants is survived, if that is what it does in SUMO's step.
@@ -375,17 +396,14 @@ class Guarding:
 
     def _hand_back(self, car: _Car) -> None:
         if car.mode is not None:
-            self._vehicle.setSpeed(car.id, -1.0)
+            if math.isnan(car.script):
+                self._vehicle.setSpeed(car.id, -1.0)
             self._vehicle.setSpeedMode(car.id, car.mode)
             car.mode = None
 
     def _look_back(self, car: _Car, speed: float) -> None:
         """What the driver wanted, now that it shows; in shadow it is what is judged."""
         desired_speed = speed
-        if car.mode is not None and speed > car.limit + _FASTER:
-            self.overruled += 1
-            if self.overruled == _OFTEN:
-                warnings.warn(_OVERRULED.format(car.id, _OFTEN), RuntimeWarning, stacklevel=4)
         # Slower than the limit is what SUMO itself wanted, such as to stop at a red light.
         if car.mode is not None and speed >= car.limit - _SAME_SPEED:
             desired_speed = max(car.wish, speed)
@@ -717,7 +735,9 @@ def attach(
     -----
     Where a guard acts, the speed mode has "safe speed" and the limit of acceleration on and that of
     braking off. It is put back as it was, with ``setSpeed(-1)``, as soon as the guard allows all
-    that the car can do. Where you set a car's speed yourself, ask a `Guard` before you do instead.
+    that the car can do. A car that is seen to drive at another speed than its guard, or its own
+    driver, had set (a script's) is left alone until it drives faster. Where you set a car's speed
+    yourself, ask a `Guard` before you do instead.
     After ``load``, or ``close`` and ``start``, an attachment goes on with the new cars, and what it
     counts goes on; whoever attaches anew ends those of earlier simulations.
 
