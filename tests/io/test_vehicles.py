@@ -219,6 +219,18 @@ def test_who_is_beside_is_nobody_s_leader_among_objects(tmp_path, turned):
     assert set(chunk.names) == {"c behind a", "d behind b"}
 
 
+def test_who_comes_towards_one_is_nobody_s_leader(tmp_path):
+    ways = {"a": (50.0, 90.0), "oncoming": (35.0, 270.0), "b": (20.0, 90.0)}
+    seen = [
+        dict(zip((*FIELDS[:4], "angle"), (name, "e", along, 5.0, angle), strict=True))
+        for name, (along, angle) in ways.items()
+    ]
+    rows = [(name, 0.0, x, 0, 180.0 - angle, 0, 4, 1) for name, (x, angle) in ways.items()]
+    for path in (write(tmp_path / "a.xml", xml({0.0: seen})), objects(tmp_path / "a.csv", rows)):
+        (chunk,) = read_traces([path])
+        assert list(chunk.names) == ["b behind a"]
+
+
 @pytest.mark.parametrize(
     "header",
     [

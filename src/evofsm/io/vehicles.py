@@ -226,7 +226,7 @@ def _car(place: Place, told: Mapping[str, str], lengths: VehicleLengths) -> _Car
 
 
 def _queues(cars: Sequence[_Car], lengths: VehicleLengths) -> Iterator[Following]:
-    """Each vehicle and the next one ahead on its lane that is not beside its way."""
+    """Each vehicle and the next one ahead on its lane, not beside its way nor towards it."""
     for place, car in enumerate(cars):
         for leader in cars[place + 1 :]:
             if leader.lane != car.lane:
@@ -234,7 +234,8 @@ def _queues(cars: Sequence[_Car], lengths: VehicleLengths) -> Iterator[Following
             aside = abs(leader.lateral - car.lateral)
             if aside != aside and leader.along - car.along < _BESIDE_WITHIN:
                 aside = float(_across(leader.place - car.place, car.heading + leader.heading))
-            if not aside >= 0.5 * (car.width + leader.width):
+            is_oncoming = abs(car.heading + leader.heading) < 1.0
+            if not (is_oncoming or aside >= 0.5 * (car.width + leader.width)):
                 gap = leader.along - leader.length - car.along
                 if gap <= 0.0 and aside > _IN_LINE:
                     lengths.overlaps[leader.kind] += 1
@@ -487,7 +488,8 @@ def _following(scene: Scene, lane: Sequence[Object]) -> Iterator[Following]:
     leader_headings = np.where(np.isnan(headings), headings[:, None], headings)
     mean = np.exp(1j * headings[:, None]) + np.exp(1j * leader_headings)
     beside = _across(dx + 1j * dy, mean) >= 0.5 * (widths[:, None] + widths)
-    ahead = (along > 0.0) & ~(beside & (along < _BESIDE_WITHIN))
+    left_out = (beside & (along < _BESIDE_WITHIN)) | (abs(mean) < 1.0)  # or oncoming
+    ahead = (along > 0.0) & ~left_out
     apart = np.where(ahead, np.hypot(dx, dy), np.inf)
     for follower, nearest, distance in zip(lane, apart.argmin(1), apart.min(1), strict=True):
         leader = lane[int(nearest)]
