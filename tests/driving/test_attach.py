@@ -347,6 +347,16 @@ def test_sumo_as_referee_measures_the_same(road, tmp_path):
         np.testing.assert_allclose(both[:, 0], both[:, 1], rtol=1e-5, atol=2e-6)
 
 
+def test_who_comes_towards_one_is_measured_with_a_negative_speed(road):
+    sumo = road(*NO_GAP)
+    watch = attach(sumo, ["ego"], mode="watch").watching
+    angles = {"ego": 90.0, "lead": 270.0}  # as it overtakes on the oncoming lane
+    watch._seeing._vehicle = SimpleNamespace(**vars(sumo.vehicle) | {"getAngle": angles.get})
+    drive(sumo, 1.0)
+    assert watch.observations[0, 2] == -sumo.vehicle.getSpeed("lead")
+    assert watch.ttc[0] < 3.0
+
+
 # -- What is refused -------------------------------------------------------------------------------
 
 

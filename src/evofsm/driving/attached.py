@@ -143,10 +143,15 @@ class Seeing:
         return self._bodies[car]
 
     def pair(self, car: str) -> tuple[float, float, float] | None:
-        """Gap from bumper to bumper [m], its speed and that of whoever is ahead [m/s]."""
-        speed = self._vehicle.getSpeed(car)
-        leader = self.neighbour(car, speed)
-        return None if leader is None else (leader.gap, speed, leader.speed)
+        """Gap from bumper to bumper [m], its speed and that of whoever is ahead [m/s].
+
+        Negative is the speed of who comes towards it, where either of them overtakes.
+        """
+        speed, angle = self._vehicle.getSpeed(car), self._vehicle.getAngle
+        if (leader := self.neighbour(car, speed)) is None:
+            return None
+        is_oncoming = math.cos(math.radians(angle(car) - angle(leader.id))) < -0.5
+        return leader.gap, speed, -leader.speed if is_oncoming else leader.speed
 
     def neighbour(self, car: str, speed: float, *, is_ahead: bool = True) -> Neighbour | None:
         """Whoever is ahead on its route, or behind, if near enough to matter."""
