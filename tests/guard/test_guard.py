@@ -230,7 +230,7 @@ def test_proposals_that_are_all_outside_the_range_are_told_of_once():
     guard = Guard(low=0.0, high=1.0, interval=1.0)
     for k in range(300):  # in percent
         with (
-            pytest.warns(UserWarning, match=r"is outside \[0, 1\] by far")
+            pytest.warns(UserWarning, match=r"is outside \[0, 1\] by far, as 100")
             if k == 99
             else nullcontext()
         ):

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import os
+import re
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -323,17 +324,18 @@ def run_configuration(
     """Run it to its end, or until all cars have arrived, and print `Attachment.summary` of it."""
     if mode not in ("act", "shadow"):
         raise ValueError(f"--mode is {mode!r}; for a configuration it is act or shadow")
-    by_ids = not (vehicles == "all" or vehicles.startswith("type:") or vehicles.endswith("%"))
+    by_ids = not re.match(r"all$|type:|[0-9.]+%?$", vehicles)
     choice = split_names(vehicles) if by_ids else vehicles
 
     def driven(how: str) -> dict[str, Any]:
         with progress("Driving") as move, _running(file) as (sumo, steps):
             cars = driving.attach(sumo, choice, mode=how, tolerance=tolerance)
+            begin = float(sumo.simulation.getTime())
             for seconds in steps:
                 if seconds == int(seconds):
                     collisions = f"{len(cars.collisions)} collisions"
                     move(description=f"Driving, {how} ({seconds:,.0f} s, {collisions})")
-            seconds, kinds = float(sumo.simulation.getTime()), sumo.vehicletype.getIDList()
+            seconds, kinds = sumo.simulation.getTime() - begin, sumo.vehicletype.getIDList()
             cars.detach()  # else they guard what is simulated next
         if not cars.ever:
             types = ", ".join(kind for kind in kinds if not kind.startswith("DEFAULT_"))
@@ -414,9 +416,9 @@ def _running(file: Path, *options: str) -> Iterator[tuple[Any, Iterator[float]]]
         raise ValueError(f"{file}: SUMO refuses it: {str(error).strip()}") from error
 
     def steps() -> Iterator[float]:
-        end = sumo.simulation.getEndTime()
+        end, calibrators = sumo.simulation.getEndTime(), sumo.calibrator.getIDList()
         while not 0.0 <= end <= sumo.simulation.getTime():
-            if sumo.simulation.getMinExpectedNumber() <= 0:
+            if sumo.simulation.getMinExpectedNumber() <= 0 and not calibrators:
                 return
             sumo.simulationStep()
             yield sumo.simulation.getTime()

@@ -599,8 +599,12 @@ class Attachment:
     def detach(self) -> None:
         """Hand every car back to SUMO, and listen no longer."""
         self._listen_no_more()
-        for car in self.cars:
+        self._hand_back()
+
+    def _hand_back(self) -> None:
+        for car in set(self._sumo.vehicle.getIDList() if self.cars else ()).intersection(self.cars):
             self._cars.remove(car)
+        self._cars.cars.clear()
 
     def _listen_no_more(self) -> None:
         if self._listener is not None:
@@ -670,9 +674,7 @@ class Attachment:
 
     def _begin_anew(self) -> None:
         """Forget the cars, which are other ones, or are elsewhere; who is here is handed back."""
-        for car in set(self._sumo.vehicle.getIDList()).intersection(self.cars):
-            self._cars.remove(car)
-        self._cars.cars.clear()
+        self._hand_back()
         self._ride.latest.clear()
         self._known.clear()
         self._met.clear()

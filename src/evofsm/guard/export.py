@@ -220,7 +220,7 @@ def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any
         constants |= {
             "centers": model.centers,
             "centre_weights": weights_of(model.rule, m),
-            "STATE_REACH": reach(model.rule, model.width),
+            "STATE_REACH": reach(model.rule, model.settings, model.width),
             "time_seen": model.visits * guard.interval,
         }
     return sizes, constants

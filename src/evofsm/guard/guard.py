@@ -374,8 +374,7 @@ class Guard:
 
         An episode that is under way is broken off: nothing more is learnt from it. Where it steps
         back, or guarded episodes seem to fail sooner than those of the controller alone, proposals
-        pass. It warns of that, of a guard that refuses nearly everything, and of a function
-        ``failed`` that does not cover what was told to be a failure.
+        pass. It warns of that, of one that refuses nearly all, and where ``failed`` misses some.
         """
         self.learn = False
         if why := self._why_passing():
@@ -618,10 +617,10 @@ class Guard:
             self._observing.observe(z)
         if machine is not None and state is not None:
             learnt, settings = opened(machine)  # frozen, it stays as it is
+            near = {"radius": settings.radius}
             offset = (latest_row - learnt.centers[:, state]) * settings.weights
-            is_beyond = offset.dot(offset) > reach(machine.rule, machine.width) ** 2
-            visits = 0.0 if is_beyond else float(learnt.sums[VISITS, state])
-            state_time = visits * self.interval
+            is_beyond = offset.dot(offset) > reach(machine.rule, near, machine.width) ** 2
+            state_time = 0.0 if is_beyond else float(learnt.sums[VISITS, state]) * self.interval
         return Situation(z, belief, state, surprise, time, intake, state_time)
 
     @transaction

@@ -159,10 +159,10 @@ class ActionReviser:
         self.mode = Mode(mode)
         #: Why proposals pass in this episode although it might act; empty where they need not.
         self.passing = ""
-        self._clipped = 0  # proposals since one was not far outside
         self._searches = isinstance(risk, SearchingJudge)
         self._lowest, self._highest = nearest_bounds(actions)
         self._low, self._high = limits(actions)
+        self._far, self._clipped = _CLEARLY * (self._high - self._low), 0
         self.start_episode()
 
     def start_episode(self) -> None:
@@ -189,13 +189,10 @@ class ActionReviser:
         """What to execute instead of the proposal, which is first made usable (`make_usable`)."""
         acts = self.acts
         action, remark = make_usable(proposal, self.actions, self.risk.fallback)
-        is_far = remark.startswith("proposal ") and np.any(
-            abs(proposal.action - action) > _CLEARLY * (self._high - self._low)
-        )
+        is_far = remark[:8] == "proposal" and np.any(abs(proposal.action - action) > self._far)
         self._clipped = self._clipped + 1 if is_far else 0
         if self._clipped == _CLIPPED:
-            text = f"{remark} by far, as {_CLIPPED} on end were; another unit?"
-            warnings.warn(text, stacklevel=6)
+            warnings.warn(f"{remark} by far, as {_CLIPPED} on end are (a unit?)", stacklevel=6)
         if not acts:
             self._trial = 0
         if self.mode is Mode.OFF:

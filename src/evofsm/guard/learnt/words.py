@@ -217,8 +217,8 @@ def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "
 
     Examples
     --------
-    >>> region(["x", "y"], [0, 1, 1.0, 2.0, 1.0, 0.5, 4.0, 0.0, 0.0, -1.0, 0.0, -1.0], 3)
-    'inside an ellipse of x and y around (1, 2), 4 wide and 8 high (3 failures)'
+    >>> region(["x", "y"], [0, 1, 101325.0, 2.0, 1.0, 0.5, 4.0, 0.0, 0.0, -1.0, 0.0, -1.0], 3)
+    'inside an ellipse of x and y around (101325, 2), 4 wide and 8 high (3 failures)'
     >>> region(["x", "y"], [0, 1, 0.0, 0.0, 1.0, 1.0, -5.0, 3.0, 4.0, 0.0, 0.0, 0.0], 1)
     'where 0.6 x + 0.8 y is above 1 (1 failure)'
     """
@@ -227,31 +227,39 @@ def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "
     x, y = names[int(i)], names[int(j)]
     if i == j:
         if p == 0.0 and b != 0.0:
-            return f"where {x} is {'above' if b > 0.0 else 'below'} {at - c / (b * sx):.4g} {note}"
+            beyond = _figures(at - c / (b * sx), sx, 4)
+            return f"where {x} is {'above' if b > 0.0 else 'below'} {beyond} {note}"
         spare = b * b - 4.0 * p * c
         if p == 0.0 or spare < 0.0:
-            return f"where {x} is near {at:.3g} {note}"
-        low, high = sorted(at + (-b + sign * math.sqrt(spare)) / (2.0 * p * sx) for sign in (1, -1))
+            return f"where {x} is near {_figures(at, sx)} {note}"
+        ends = sorted(at + (-b + sign * math.sqrt(spare)) / (2.0 * p * sx) for sign in (1, -1))
+        first, last = (_figures(end, sx) for end in ends)
         if p < 0.0:
-            return f"where {x} is between {low:.3g} and {high:.3g} {note}"
-        return f"where {x} is below {low:.3g} or above {high:.3g} {note}"
+            return f"where {x} is between {first} and {last} {note}"
+        return f"where {x} is below {first} or above {last} {note}"
     if p == q == r == 0.0:
         length = math.hypot(b * sx, d * sy)
         u, v = b * sx / length, d * sy / length
-        beyond = u * at + v * to - c / length
-        sign = "+" if v >= 0.0 else "-"
-        return f"where {u:.3g} {x} {sign} {abs(v):.3g} {y} is above {beyond:.3g} {note}"
+        per, sign = length / math.hypot(b, d), "+" if v >= 0.0 else "-"
+        text = f"{_figures(u, per * abs(at))} {x} {sign} {_figures(abs(v), per * abs(to))} {y}"
+        return f"where {text} is above {_figures(u * at + v * to - c / length, per)} {note}"
     inner = p * r - 0.25 * q * q
     if inner > 0.0:
         u, v = (0.25 * q * d - 0.5 * r * b) / inner, (0.25 * q * b - 0.5 * p * d) / inner
         most = c + 0.5 * (b * u + d * v)
         if most * p < 0.0:
             wide, high = (2.0 * math.sqrt(-most * k / inner) for k in (r, p))
-            where = f"around ({at + u / sx:.3g}, {to + v / sy:.3g})"
+            where = f"around ({_figures(at + u / sx, sx)}, {_figures(to + v / sy, sy)})"
             size = f"{wide / sx:.3g} wide and {high / sy:.3g} high"
             side = "inside" if p < 0.0 else "outside"
             return f"{side} an ellipse of {x} and {y} {where}, {size} {note}"
-    return f"beyond a curve of {x} and {y}, as at ({at:.3g}, {to:.3g}) {note}"
+    return f"beyond a curve of {x} and {y}, as at ({_figures(at, sx)}, {_figures(to, sy)}) {note}"
+
+
+def _figures(value: float, inverse: float, least: int = 3) -> str:
+    """A number of so many figures or more, rounded by at most a quarter of a unit (its inverse)."""
+    texts = [f"{value:.{n}g}" for n in range(least, 10)]
+    return next((text for text in texts if abs(float(text) - value) * inverse <= 0.25), texts[-1])
 
 
 def harm(known: Harm, *, learning: bool) -> str:
