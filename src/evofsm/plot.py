@@ -327,7 +327,7 @@ def history(
     if np.ptp(when) > 2e5 or is_dated:
         unit, size = "days", 86400.0
     step = float(np.median(steps)) if len(steps) else 0.0
-    holes = np.flatnonzero(steps > 3.0 * step) + 1  # before each a row without numbers ends lines
+    holes = np.flatnonzero((steps > 3.0 * step) | (steps < 0.0)) + 1  # there NaN ends lines
     x = (when - when[0] * (not is_dated)) / size
     line_x = np.insert(x, holes, x[holes - 1] + step / size)
     on = np.insert(np.asarray(alarms), holes, 0)

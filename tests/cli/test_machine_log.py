@@ -162,6 +162,11 @@ def test_a_first_look_says_what_is_odd_in_a_log(evofsm, refused):
     found = evofsm("learn", "km.csv").stdout
     assert "km: never comes back" in found
     assert "--observe level " in found
+    Path("late.csv").write_text(
+        "\n".join(["t,heat", "0,5", "99999,5", *(f"{k},{k % 7}" for k in range(1, 400))])
+    )
+    found = evofsm("learn", "late.csv").stdout
+    assert ("399, after a row of 9" in found, "--skip-bad" in found) == (True, False)
     Path("bare.csv").write_text("10.03.2025 06:00:00;6,5;on\n10.03.2025 06:00:10;6,6;on\n")
     assert "is no header" in refused("learn", "bare.csv")
     read = "learn", "odd.csv", "--action", "", "--time", "t"

@@ -376,8 +376,7 @@ def check_out(out: Path | None, option: str = "--out") -> None:
         try:
             store.read_header(out)
         except (ValueError, OSError):
-            fault = "exists and is no file of evofsm; it was left alone"
-            raise ValueError(f"{option} {out}: {fault}") from None
+            raise ValueError(f"{option} {out} is no file of evofsm; it was left alone") from None
 
 
 # -- What came of it ------------------------------------------------------------------------------
@@ -483,7 +482,6 @@ def read_otherwise(
     if noted.elsewhere:
         why = f"--where {columns.where} does not hold; there an episode ends"
         yield "left out", f"{noted.elsewhere:,} rows: {why}"
-    conversions = {name: unit for name, unit in noted.units.items() if UNITS.get(unit, 1.0) != 1.0}
-    if conversions:
-        texts = (f"{name} from {unit}" for name, unit in conversions.items())
-        yield "converted", f"{', '.join(texts)} to units of the SI"
+    units = (f"{name} from {u}" for name, u in noted.units.items() if UNITS.get(u, 1.0) != 1.0)
+    if text := ", ".join(units):
+        yield "converted", f"{text} to units of the SI"

@@ -294,6 +294,10 @@ def _of_steps(at: Floats, segments: Floats, facts: Pairs, lacking: int) -> tuple
     parts = np.split(at, np.flatnonzero(~within) + 1)
     latest = np.concatenate([np.fmax.accumulate(part) for part in parts])
     n_twice, n_earlier = int((steps == 0.0).sum()), int((at < latest).sum())
+    if 20 * n_earlier > len(at):  # one time is wrong, not so many
+        when = tables.date(float(np.median(latest[at < latest])))
+        facts.append(("late rows", f"{n_earlier:,}, after a row of {when}: is its time right?"))
+        n_earlier = 0
     if odd.sum() + lacking < max(_MANY, _ODD * len(steps)):
         return [], n_twice + n_earlier
     if odd.any():
