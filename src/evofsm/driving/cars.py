@@ -80,7 +80,7 @@ def guard_for_cars(
     --------
     >>> guard = guard_for_cars(low=-4.0, high=2.5)
     >>> guard.decide([150.0, 20.0, 20.0], proposal=0.5).reason
-    'never seen before; risk is within the tolerance'
+    'never seen before, as far as the states tell; risk is within the tolerance'
     >>> guard = guard_for_cars(low=-4.0, high=2.5, judge="learnt")
     >>> guard.decide([9.0, 20.0, 20.0], proposal=0.5).reason
     'nothing was learnt yet'
