@@ -165,6 +165,8 @@ def test_who_is_behind_and_cannot_be_spared_is_braked_for_softly_unless_it_is_su
     revision = decide(scene(ahead(27.0, 0.0), behind(0.5, 15)))
     assert -DECEL <= revision.executed < 0.0
     assert "the softest for ahead" in revision.reason
+    me, others = Object("me", 0.0, 0.0, 0.0), [ahead(0.3, 0.0), behind(1.0, 5.0)]
+    assert -0.1 < decide(Scene(me, others).rows(most=2)).executed <= 0.0  # who stands stays
 
 
 def test_who_stands_and_goes_on_standing_is_not_changed():

@@ -266,8 +266,8 @@ class TrafficRisk(ActionJudge):
             # Of several that are survived as well the hardest braking.
             rank = np.lexsort((options, -judged.critical, ~bearable))
             return int(rank[0]), "nothing can, the least risky that who is behind survives"
-        if avoids.any():
-            softest = int(np.where(avoids, options, -np.inf).argmax())
+        if (brakes := avoids & (options <= 0.0)).any():  # who stands does not creep on
+            softest = int(np.where(brakes, options, -np.inf).argmax())
             return softest, "nothing can, the softest for ahead"
         return int(options.argmin()), "nothing can, the hardest braking"
 
