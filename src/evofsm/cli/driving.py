@@ -324,7 +324,7 @@ def run_configuration(
     """Run it to its end, or until all cars have arrived, and print `Attachment.summary` of it."""
     if mode not in ("act", "shadow"):
         raise ValueError(f"--mode is {mode!r}; for a configuration it is act or shadow")
-    by_ids = not re.match(r"all$|type:|[0-9.]+%?$", vehicles)
+    by_ids = not re.match(r"all$|type:|[0-9.]+$|.*%$", vehicles)
     choice = split_names(vehicles) if by_ids else vehicles
 
     def driven(how: str) -> dict[str, Any]:
