@@ -38,6 +38,8 @@ def load_model(place: Path) -> tuple[FSMModel, store.Header, Guard | None]:
     header, guard = store.read_header(place), None
     if header.kind == "guard":
         guard = Guard.load(place, failed=lambda seen: False)
+        if isinstance(guard.judge, LearntRisk):
+            guard.failed = guard.judge.failed = None  # it only stood in
         machine = guard.machine
         if machine is None:
             raise ValueError(f"{place}: this guard has no machine")
