@@ -84,9 +84,10 @@ def test_a_state_goes_on_over_runs_and_may_be_the_guards_own_file(tmp_path):
     first, second = (evofsm(*options, lines=part) for part in (rows[:90], rows[90:]))
     assert [*told(first), *told(second)] == by_hand
     assert "goes on after decision 90 (90 rows taken in again)" in second.stderr
-    refused = evofsm("--guard", state, "--state", state, lines=rows)
+    refused = evofsm("--guard", state, "--state", state, "--episode", "lane", lines=rows)
     assert refused.exit_code == 2
     assert "learn was true and is now false" in refused.stderr
+    assert 'episode was 6000 and is now [6000, "lane"]' in refused.stderr
 
 
 def test_a_file_is_taken_in_once_and_as_it_grows_what_is_new_of_it(tmp_path):
@@ -199,7 +200,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
     ("arguments", "said"),
     [
         (("--summary",), "--summary needs FILE"),
-        (("--episode", "0"), "--episode is 0; it must be a positive"),
+        (("--episode", "0"), "--episode is '0'; it is a number of"),
         (("--mode", "drive"), "'drive' is not one of 'off', 'shadow', 'act'"),
         (("--udp", 0, "--socket", "x"), "give one of FILE, --socket, --udp and --zenoh"),
         (("--guard", "nowhere"), "nowhere: no such file or directory"),

@@ -125,10 +125,11 @@ def test_where_nothing_foresees_a_failure_there_is_no_alarm_and_without_failures
 @pytest.mark.parametrize(
     ("changed", "fault"),
     [
-        ({"failed": ["False", "True"]}, "of each of 2 episodes: 2 labels, 'False', and 9 rows"),
-        ({"failed": [1.0, np.nan]}, "2 labels, nan, and"),
-        ({"failed": [True]}, "of each of 2 episodes: 1 labels, and 9"),
-        ({"episodes": [[[1.0]], []]}, "and 0 rows or more in an episode"),
+        ({"failed": ["False", "True"]}, "of each of 2 episodes: 2 labels, 'False'"),
+        ({"failed": [1.0, np.nan]}, "2 labels, nan"),
+        ({"failed": [True]}, "of each of 2 episodes: 1 labels"),
+        ({"episodes": [[[1.0]], []]}, "and one has no rows"),
+        ({"episodes": [], "failed": []}, "of each of 0 episodes"),
         ({"dt": 0.0}, "dt is 0.0; it must be a positive"),
         ({"names": ["heat", "load"]}, "names are 2, of 1 variables"),
     ],

@@ -116,8 +116,8 @@ class Runs(NamedTuple):
         """Those, (T,) or (T, m) each."""
         lengths = np.array([np.shape(run)[0] for run in episodes])
         odd = "".join([f", {x!r}" for x in np.ravel(failed).tolist() if x not in (True, False)][:1])
-        if odd or np.size(failed) != len(lengths) or not lengths.all():
-            text = f"{np.size(failed)} labels{odd}, and {lengths.min()} rows or more in an episode"
+        if odd or not 0 < len(lengths) == np.size(failed) or 0 in lengths:
+            text = f"{np.size(failed)} labels{odd}" + ", and one has no rows" * (0 in lengths)
             raise ValueError(f"failed is a truth value of each of {len(lengths)} episodes: {text}")
         rows = [np.asarray(run, np.float64).reshape(np.shape(run)[0], -1) for run in episodes]
         return cls(np.concatenate(rows), np.cumsum(lengths) - lengths, np.array(failed, np.bool_))

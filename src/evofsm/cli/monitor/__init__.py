@@ -114,8 +114,8 @@ def monitor(
     from evofsm.cli.show import show, warn
     from evofsm.driving.cars import assumptions, guard_of_monitor, guard_of_traffic
     from evofsm.driving.naming import VARIABLES
-    from evofsm.fsm.validation import positive
     from evofsm.guard import Foresight, Guard
+    from evofsm.io.tables import is_number
 
     if guard is not None and brakes != options.BRAKES:
         raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
@@ -140,8 +140,10 @@ def monitor(
     learnt_of = defaults.pop("observe", None)
     observe = observe or learnt_of
     reader, rows = {**defaults, **reading}, EPISODE
-    if episode is not None and episode.isdecimal() and not is_log:
-        rows = int(positive("--episode", int(episode)))
+    if episode is not None and is_number(episode) and not is_log:
+        if not (episode.isdecimal() and int(episode)):
+            raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns")
+        rows = int(episode)
     elif episode is not None:
         reader["episode"] = episode
     with ExitStack() as stack:
@@ -180,7 +182,8 @@ def monitor(
             is_other = guard is not None and guard.resolve() != state.resolve()
             digest = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
             basics = {"interval": interval, "brakes": brakes} if guard is None else {}
-            how = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": rows}
+            ends = [rows, reader["episode"]] if "episode" in reader else rows
+            how = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": ends}
             how["false_a_day"] = false_a_day
             columns = {k: v for k, v in reader.items() if k != "topics"}
             keeper = State(state, {"guard": digest, **columns, **basics, **how, **system})
