@@ -17,6 +17,7 @@ from evofsm.extras import needs
 from evofsm.fsm.clusters import NOVELTY
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import usual_range
+from evofsm.fsm.rules import reach, weights_of
 from evofsm.fsm.validation import check_index
 from evofsm.guard import Guard, LearntRisk
 from evofsm.guard.foresight import DATES
@@ -124,13 +125,13 @@ def states(
         look = {"markersize": 5.0, "color": COLORS["dead end"], "zorder": 4.0}
         ax.plot(*dots[fails].T, "x", label="failed", **look)
     if ways and model.rule.table["rule"] == NOVELTY:
-        scales = np.resize(list(model.rule.scales) or 1.0, model.n_variables)[pair]
-        reach = model.nearest(model.centers[0]).reach * scales
+        weights = weights_of(model.rule, model.n_variables)[pair]
+        radii = reach(model.rule, model.settings, model.width) / weights
         look = {"color": COLORS["leader"], "alpha": 0.1, "linewidth": 0.0, "zorder": 0.4}
         for k, center in enumerate(centers[in_view]):
             label = "" if k else "where a state reaches"
-            ax.add_patch(Ellipse(center, *2.0 * reach, label=label, **look))
-        ends = np.vstack([ends, centers[in_view] - reach, centers[in_view] + reach])
+            ax.add_patch(Ellipse(center, *2.0 * radii, label=label, **look))
+        ends = np.vstack([ends, centers[in_view] - radii, centers[in_view] + radii])
     ax.dataLim.set(Bbox.union([*box, Bbox([ends.min(0), ends.max(0)])]))
     ax.margins(0.1)
     ax.autoscale_view()

@@ -99,6 +99,7 @@ def test_a_guard_that_saves_drives_nearly_always(wrong):
     assert "in shadow where in doubt" in str(guard)
     assert " (0 of the latest 20 guarded), states" in str(guard)
     assert "it refuses nearly everything: 0% of proposals pass, others are executed" in str(guard)
+    assert "; that is no filter" in str(guard)
     with pytest.warns(UserWarning, match="refuses nearly everything: 0% of proposals pass"):
         guard.freeze()
 

@@ -134,15 +134,14 @@ def export(
     if names := [name for name, value in unfit.items() if value is not None]:
         raise ValueError(f"{names[0]} is of other formats than --to {to}")
     if is_code:
-        from evofsm.guard import Foresight, Guard, LearntRisk, Mode
+        from evofsm.cli.models import load_guard
+        from evofsm.guard import Foresight, Mode
         from evofsm.guard.export import write_c99, write_fmu
 
         if out is None:
             raise ValueError(f"--to {to} prints nothing: name a file, of c99 a folder, by --out")
         path = file / "guard.evofsm" if file.is_dir() else file
-        guard = Guard.load(path, failed=lambda seen: False)
-        if isinstance(guard.judge, LearntRisk):
-            guard.failed = guard.judge.failed = None  # it only stood in
+        guard = load_guard(path)
         if isinstance(guard.judge, Foresight):
             why = "a guard where nobody acts (--action '') cannot be exported"
             raise ValueError(f"{file}: {why}; run `evofsm monitor` beside the machine")

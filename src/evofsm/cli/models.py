@@ -28,6 +28,14 @@ _STATES_LISTED, _PASSAGES = 20, 12
 _ROWS_SHOWN = 20_000  # of a longer log so many rows are drawn
 
 
+def load_guard(path: Path) -> Guard:
+    """A guard that learns no more: a function of failures that it knew is not asked."""
+    guard = Guard.load(path, failed=lambda seen: False)
+    if isinstance(guard.judge, LearntRisk):
+        guard.failed = guard.judge.failed = None  # it only stood in
+    return guard
+
+
 def load_model(place: Path) -> tuple[FSMModel, store.Header, Guard | None]:
     """A model from wherever one was left, what its file says of itself, and the guard it is of."""
     if place.is_dir():
@@ -37,9 +45,7 @@ def load_model(place: Path) -> tuple[FSMModel, store.Header, Guard | None]:
         return load_model(path)
     header, guard = store.read_header(place), None
     if header.kind == "guard":
-        guard = Guard.load(place, failed=lambda seen: False)
-        if isinstance(guard.judge, LearntRisk):
-            guard.failed = guard.judge.failed = None  # it only stood in
+        guard = load_guard(place)
         machine = guard.machine
         if machine is None:
             raise ValueError(f"{place}: this guard has no machine")

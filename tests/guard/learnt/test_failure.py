@@ -1,6 +1,7 @@
 """Where a system fails."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -234,10 +235,11 @@ def test_what_refused_for_long_without_a_failure_is_tried_by_its_smallest_rival(
 @pytest.mark.parametrize("ends", [[], [(0.5, 1.3), (0.6, 1.3)]])
 def test_frozen_a_threshold_counts_on_for_a_while_that_fewer_took_the_place_of(ends):
     guard = Guard(-1.0, 1.0, interval=0.1)
+    nothing_tried = replace(guard.judge.settings, tries=0)
+    guard.judge.state = guard.judge.state._replace(settings=nothing_tried)
 
     def drive(to, last, **how):
-        for z in np.linspace(0.0, to, 30):
-            guard.decide(z, 0.0)
+        assert all(guard.decide(z, 0.0).executed == 0.0 for z in np.linspace(0.0, to, 30))
         guard.end(observation=last, **how)
 
     drive((1.0, 1.0), (1.2, 2.4), failed=True)

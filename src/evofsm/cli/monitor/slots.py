@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Iterator, Sequence
 from hashlib import sha256
-from itertools import chain, zip_longest
+from itertools import zip_longest
 from operator import itemgetter
 from statistics import fmean
 from typing import Any
@@ -34,9 +34,9 @@ class Slots:
         self._conditions = {o: Condition.parse(t, o) for o, t in texts.items() if t is not None}
         every = [term for c in self._conditions.values() for term in c.terms]
         self.compared = [term.column for term in every if term.of_number]  #: with a number
-        parts = self.names, [columns.action], [t.column for t in every], columns.episode or ()
+        extra = dict.fromkeys([*(t.column for t in every), *(columns.episode or ())])
         #: Keys that rows may have beside the guard's variables, for conditions and episodes.
-        self.keys = tuple(dict.fromkeys(chain(*parts)))[len({*self.names, columns.action}) :]
+        self.keys = tuple(name for name in extra if name not in (*self.names, columns.action))
         #: Of the log: what the column of its time is called, how dates are written, or its unit.
         self.clock = columns.time, columns.units.get(columns.time, "s")
         self.waiting: list[Row] = []
