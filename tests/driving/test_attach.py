@@ -106,10 +106,14 @@ def test_shadow_changes_nothing(road):
 
 
 @pytest.mark.parametrize(
-    "step",  # where it lasts as long as they keep, at the edge
-    [pytest.param(0.1, marks=pytest.mark.slow), 1.0],
+    ("step", "options"),  # where a step lasts as long as they keep, at the edge
+    [
+        pytest.param(0.1, (), marks=pytest.mark.slow),
+        (0.5, ("--default.action-step-length", "1")),
+        (1.0, ()),
+    ],
 )
-def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step):
+def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step, options):
     usual = (
         '<vTypeDistribution id="mix"><vType id="usual" speedDev="0.1" probability="0.7"/>'
         '<vType id="truck" vClass="truck" probability="0.15"/>'
@@ -120,7 +124,7 @@ def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step):
     found = []
     for mode in ("watch", "act"):
         sumo = road(others=usual)
-        sumo.load([*road.options[:-1], str(step), "--seed", "1"])
+        sumo.load([*road.options[:-1], str(step), "--seed", "1", *options])
         sumo.simulationStep()
         sumo.vehicle.setType("ego", "usual")  # nobody is hasty
         cars = attach(sumo, "all", mode=mode)

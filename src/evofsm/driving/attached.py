@@ -90,7 +90,7 @@ class _Facts(NamedTuple):
     min_gap: float  #: [m]
     decel: float  #: [m/s²]
     tau: float  #: [s]
-    late: bool  #: whether it decides less often than in each step, and goes on in between
+    late: bool  #: whether it decides less often than in each step, and than its ``tau``
 
 
 class Seeing:
@@ -137,9 +137,10 @@ class Seeing:
         """Of a car; that its type changes is not noticed."""
         if car not in self._bodies:
             vehicle = self._vehicle
-            late = vehicle.getActionStepLength(car) > self.dt + _TICK
+            tau = vehicle.getTau(car)
+            late = vehicle.getActionStepLength(car) > max(self.dt, tau) + _TICK
             facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car)
-            self._bodies[car] = _Facts(*facts, vehicle.getTau(car), late)
+            self._bodies[car] = _Facts(*facts, tau, late)
         return self._bodies[car]
 
     def pair(self, car: str) -> tuple[float, float, float] | None:
