@@ -292,6 +292,28 @@ def test_who_sets_the_speed_of_a_guarded_car_is_told_that_it_is_not_guarded(road
     assert guards.guarding.overruled > 5
 
 
+def test_a_car_that_sumo_teleports_begins_anew(tmp_path):
+    cars = tmp_path / "cars.rou.xml"
+    cars.write_text(
+        '<routes><vType id="late" actionStepLength="2"/><route id="way" edges="A1B1 B1C1 C1D1"/>'
+        '<vehicle id="ahead" route="way" depart="0" departPos="60">'
+        '<stop lane="A1B1_0" endPos="80" duration="100"/></vehicle>'
+        '<vehicle id="ego" type="late" route="way" depart="0" departPos="40"/></routes>'
+    )
+    network = ["-n", str(EXAMPLE / "grid.net.xml.gz"), "-r", str(cars), "--time-to-teleport", "9"]
+    libsumo.start(["sumo", *network, "--no-step-log", "--no-warnings"])
+    guards, speeds = attach(libsumo, ["ego"]), []
+    while "ego" not in libsumo.simulation.getStartingTeleportIDList():
+        libsumo.simulationStep()
+        libsumo.vehicle.setLaneChangeMode("ego", 0)
+    assert guards.guarding.limited > 0
+    for _ in range(5):
+        libsumo.simulationStep()
+        speeds.append(libsumo.vehicle.getSpeed("ego"))
+    assert min(speeds) > 5.0
+    assert guards.guarding.overruled == 0
+
+
 def test_a_car_that_a_script_stops_stays_stopped_until_the_script_lets_it_go(road):
     sumo = road(*NO_GAP)
     guards = attach(sumo, ["ego"])

@@ -404,7 +404,8 @@ class Guarding:
         if car.mode is not None:
             if math.isnan(car.script):
                 self._vehicle.setSpeed(car.id, -1.0)
-            self._vehicle.setSpeedMode(car.id, car.mode)
+            if self._vehicle.getSpeedMode(car.id) == car.mode & ~_OFF | _ON:  # no script's
+                self._vehicle.setSpeedMode(car.id, car.mode)
             car.mode = None
 
     def _look_back(self, car: _Car, speed: float) -> None:
@@ -684,15 +685,19 @@ class Attachment:
             self.guarding.begin_anew()
 
     def _count_cars(self) -> None:
-        """Cars that are inserted, or come back from a teleport; and those that leave."""
-        here = set(self._sumo.vehicle.getIDList())
-        for car in sorted(here - self._known):
+        """Cars that are inserted, or leave; who is teleported begins anew."""
+        simulation, here = self._sumo.simulation, set(self._sumo.vehicle.getIDList())
+        jumps = here & set(simulation.getStartingTeleportIDList())
+        for car in jumps.intersection(self._cars.cars):
+            self._cars.remove(car)
+        here -= jumps - set(simulation.getEndingTeleportIDList())  # on their way
+        for car in self._known - here | jumps:
+            self._cars.cars.pop(car, None)
+            self._seeing.forget(car)
+        for car in sorted(here - (self._known - jumps)):
             if self._chosen(self._sumo, car):
                 self._cars.add(car)
                 self.ever.add(car)
-        for car in self._known - here:
-            self._cars.cars.pop(car, None)
-            self._seeing.forget(car)
         self._known = here
 
 
