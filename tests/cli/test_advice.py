@@ -143,6 +143,7 @@ def at(minutes):
 
 LOOKED_AT = {
     "ts,machine": (lambda k: f"{1_700_000_000 + k // 3 * 60},{'ABC'[k % 3]}", "each machine, but"),
+    "Frame_ID,id": (lambda k: f"{k // 3},{k % 3}", "each id, but mixed"),
     "Date": (lambda k: f"{at(k * 60):%m/%d/%Y %H:%M}", "--unit 'Date=%m/%d/%Y %H:%M'"),
     "Date,Time": (lambda k: f"{at(k):%d/%m/%Y,%H:%M}", "--time Date,Time"),
     "time": (lambda k: 600 - k, "time runs backwards"),
@@ -166,6 +167,14 @@ def test_what_a_first_look_proposes_reads_all_rows(evofsm, names):
     found = said(evofsm(*shlex.split(command.replace("\\\n", ""))))
     assert "rows 600, one every" in found
     assert "1 episode ended with f==True" in found
+
+
+def test_a_row_of_each_signal_becomes_a_column_as_it_is_advised(evofsm):
+    rows = (f"{k // 2},{('level', 'flow')[k % 2]},{k % 7}" for k in range(200))
+    Path("tags.csv").write_text("\n".join(["time,tag,value", *rows]))
+    command, again = evofsm("learn", "tags.csv").stdout.splitlines()[-2:]
+    shell(command.strip())
+    assert "--observe level,flow" in evofsm(*again.split()[1:]).stdout
 
 
 def test_a_first_look_names_the_cause(evofsm):

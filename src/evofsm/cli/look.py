@@ -35,6 +35,7 @@ _NEAR = 3  # rows before a failure that are never proposed to be left out
 # A larger share of steps, and so many, that are no usual one make no clock.
 _ODD, _MANY = 0.001, 10
 _TIME = re.compile("(ts?|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
+_FRAME = re.compile("frame([^a-z]|$)", re.IGNORECASE)  # it counts steps of the same length
 # Dates with slashes: the year first, or the day or the month.
 _SLASHES = re.compile(r"(\d{1,4})/\d\d?/(\d\d|\d{4}),? \d\d?:\d\d(:\d\d)?( [AP]M)?$")
 _SET = re.compile("acc|action|valve|ventil|soll|set|^u$|cmd|throttle", re.IGNORECASE)
@@ -43,6 +44,7 @@ _FAILURE = re.compile(
     re.IGNORECASE,
 )
 _TRUTH = re.compile("true|false|yes|no|ja|nein|wahr|falsch|", re.IGNORECASE)
+_TAG = re.compile("tag|signal|sensor|variable|channel|kanal|param|messstelle|name", re.IGNORECASE)
 _WHO = re.compile("ma(sch|ch)ine|device|ger(ä|ae)t|asset|unit|anlage|pump|motor|(^|_)id$", re.I)
 _CODE = re.compile(f"{_FAILURE.pattern}|stat|zustand|code", re.IGNORECASE)
 _LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 30min 1h 5h 10h 1d"
@@ -56,12 +58,12 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
     if len(files) > 1:
         title += f", the first of {len(files):,} files; the others were not looked at"
     show(facts(title, contents))
-    if not options:
+    if not (options or before):
         texts = (explained(table.first(n)) for n in table.columns if table.holds(n) == "text")
         why = next((f": {text}" for text in texts if "thousands" in text), "")
         raise ValueError(f"{file} has no column of numbers that change{why}")
     to_file = "--guard" if any(name == "--failed" for name, _ in options) else "--out"
-    options.append((to_file, f"{to_file[2:]}.evofsm"))
+    options += [(to_file, f"{to_file[2:]}.evofsm")] if options else []
     print("\nA way to learn from it:")
     if before and len(files) == 1:
         kind = "csv" if isinstance(table, CsvTable) else "parquet"
@@ -125,9 +127,11 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     if is_mixed and not group:
         asides.append(("time runs", "backwards; turn the rows round first, as below"))
     facts += [*asides, ("rows looked at", f"{len(frame):,}")]
-    options = [("--time", clock) if clock else ("--dt", "1"), *([("--unit", form)] if form else [])]
+    options = [("--time", clock), *([("--unit", form)] if form else [])]
+    if counts := not clock or _FRAME.match(clock) is not None:
+        options = [("--dt", "1")]
     bad = max(n_partial, sum(n for n, _ in skips.values()) + sum(odd.values()))
-    if clock:
+    if not counts:
         further, n_late = _of_steps(frame[clock].to_numpy()[order], segments, facts, n_partial)
         options, bad = options + further, bad + n_late
     if bad > SKIPPED:
@@ -135,6 +139,10 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     if still:
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
+    if clock and group in texts and _TAG.search(group) and len(values) == 1:
+        facts.append(("a row?", f"of each {group} its own: make columns of them, and look again"))
+        pivot = f"{group!r}, index={clock.split(',')}, values={[*values]}"
+        return facts, [], f".pivot({pivot}, aggregate_function='last')"
     facts += [("a failure?", f"{text} {frequency}") for _, text, frequency, _ in rare]
     untold = "no column tells of one; docs/logs.md makes one of times, or of the last rows of runs"
     facts += [] if rare else [("a failure?", untold)]
@@ -212,6 +220,7 @@ def _first_rows(
             when = datetime.fromtimestamp(at[row], UTC)
             asides.append(("summer time", f"ends or begins {when:%Y-%m-%d}; time runs on there"))
         frame = frame.with_columns(polars.Series(clock, at + 3600.0 * hours))
+    since = ", a number of steps (--dt)" if _FRAME.match(clock) else since
     asides.insert(0, ("the clock", clock + since or "no column (--dt)"))
     return frame, clock, form
 
@@ -227,7 +236,7 @@ def _clock_of(frame: polars.DataFrame, names: Sequence[str]) -> tuple[str, str, 
             epochs |= zip([name], fit, strict=False)
     for name in (*filter(_TIME.match, epochs), *epochs):
         return name, epochs[name], f", {epochs[name]} since 1970"
-    clock = next(filter(_TIME.match, names), "")
+    clock = next((n for like in (_TIME, _FRAME) for n in filter(like.match, names)), "")
     most = float(str(frame[clock].abs().max())) if clock else 0.0
     return clock, next((unit for unit, n in _EPOCHS.items() if most > 1e8 * n), "s"), ""
 
