@@ -182,9 +182,6 @@ static double leader_braking(const evofsm_state *s) {
 /* _interpolated: how likely a leader brakes harder, by the table. At most TABLE halvings. */
 static double harder_than(double x) {
   int low = 0, high = TABLE - 1;
-  if (x <= harder[0][low]) {
-    return harder[1][low];
-  }
   if (x >= harder[0][high]) {
     return harder[1][high];
   }

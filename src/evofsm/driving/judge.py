@@ -527,10 +527,8 @@ def _judge(
 
 @inner_kernel
 def _interpolated(x: float, table: Floats) -> float:
-    """What `numpy.interp` returns for a number, which takes long to compile."""
+    """What `numpy.interp` returns for 0 or more, which takes long to compile."""
     low, high = 0, table.shape[1] - 1
-    if x <= table[0, low]:
-        return float(table[1, low])
     if x >= table[0, high]:
         return float(table[1, high])
     while high - low > 1:

@@ -307,16 +307,12 @@ static int rollout(evofsm_state *s, const double *action, const double policy[A]
   *left = INFINITY;
   s->worth = 0.0;
   for (l = 0; l < K; l++) {
-    const double share = (double)(s->survived[l] < STEPS ? s->survived[l] : STEPS) / (double)STEPS;
-    double distance = s->near[l];
+    const int lasted = s->survived[l];
+    const double share = (double)(lasted < STEPS ? lasted : STEPS) / (double)STEPS;
+    const double distance = lasted == STEPS ? 0.5 * (s->near[l] + s->far[l]) : s->near[l];
+    s->value[l] = lasted < STEPS ? (double)(lasted - STEPS) - 1.0 : s->near[l];
     if (s->near[l] >= enough) {
       *left = lesser(*left, s->near[l]);
-    }
-    s->value[l] = s->near[l];
-    if (s->survived[l] == STEPS) {
-      distance = 0.5 * (s->near[l] + s->far[l]);
-    } else if (s->survived[l] < STEPS) {
-      s->value[l] = (double)(s->survived[l] - STEPS) - 1.0;
     }
     s->worth += share + DISTANCE * lesser(1.0, greater(-1.0, FAR * distance));
   }
@@ -415,15 +411,13 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
    without any. At most JUDGED rollouts. */
 static int foresee(evofsm_state *s, const double action[A]) {
   double best[L], left;
-  int l, r, count = 0, all = 0;
+  int l, r, count = K;
   fill(best, -INFINITY);
-  for (r = 0; r < JUDGED && !all; r++) {
+  for (r = 0; r < JUDGED && count > 0; r++) {
     rollout(s, action, policies[s->ranks[r]], 1.0, 0.0, K, &left);
-    all = 1;
     count = 0;
     for (l = 0; l < K; l++) {
       best[l] = greater(best[l], s->value[l]);
-      all &= best[l] >= 0.0;
       count += best[l] < 0.0;
     }
   }
