@@ -567,8 +567,9 @@ class Guard:
     def _checked(self, observation: ArrayLike) -> NDArray[np.float64]:
         """An observation that judge and machine can take in; NaN stays."""
         z = real_array("observation", observation, 1)
-        count = len(self.variables) or (0 if self.machine is None else self.machine.n_variables)
-        count = count or len(self._held)
+        judge, machine = getattr(self.reviser, "risk", self.judge), self.machine
+        count = len(self.variables) or getattr(judge, "n_variables", 0)
+        count = count or (0 if machine is None else machine.n_variables) or len(self._held)
         if count and len(z) != count:
             names = f" ({', '.join(self.variables)})" if self.variables else ""
             raise ValueError(f"observation has {len(z)} variables; it must have {count}{names}")

@@ -103,12 +103,12 @@ def test_a_judge_of_other_actions_or_variables_is_refused(points, snapshot):
     box, plane = (points[name].taught(3) for name in ("box", "plane"))
     files = [BytesIO(snapshot(guard)) for guard in (box, plane)]
     (told, own), (_, others) = (store.read(file, GUARD) for file in files)
-    mixed = BytesIO()
-    store.write(mixed, GUARD, told, own | {"judge": others["judge"]})
+    store.write(mixed := BytesIO(), GUARD, told, own | {"judge": others["judge"]})
     with pytest.raises(ValueError, match=r"made for BoxActions\(.*, but the guard has Interval"):
         Guard.load(BytesIO(mixed.getvalue()))
     with pytest.raises(ValueError, match=r"made for BoxActions\(.*, but the guard has Choices"):
         Guard(n_actions=2, interval=0.1, judge=LearntRisk(0.1, 0.0, 1.0))
-    guard = Guard(low=-1.0, high=1.0, interval=0.1, judge=box.judge)
-    with pytest.raises(ValueError, match="observation has 3 variables, but the judge learnt of 2"):
+    guard = Guard(low=-1.0, high=1.0, interval=0.1, judge=box.judge).copy(states=False)
+    guard.learn = False
+    with pytest.raises(ValueError, match="observation has 3 variables; it must have 2"):
         guard.decide([0.0, 0.0, 0.0], 0.0)

@@ -463,18 +463,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         return rollback
 
     def observe(self, observation: Floats) -> None:
-        """Take in an observation, NaN where something was not seen.
-
-        Raises
-        ------
-        ValueError
-            If it has another number of variables than before, or too many.
-        """
-        m = len(self._z[0]) if self._z else self.n_variables
-        if m not in (0, len(observation)):
-            has = f"observation has {len(observation)} variables"
-            raise ValueError(f"{has}, but the judge learnt of {m}")
-        if not m:
+        """Take in an observation, NaN where something was not seen; a ValueError if too long."""
+        if not self.n_variables:
             rollout.refuse_too_many(len(observation), self.size, box=not self.choices)
         if len(self._z) > len(self._u):  # nothing was executed: it does not follow
             self._study(failed=False, terminated=False)
