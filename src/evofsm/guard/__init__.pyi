@@ -20,6 +20,7 @@ from .audit_log import audit as audit
 from .foresight import Foresight as Foresight
 from .guard import DecisionLogger as DecisionLogger
 from .guard import Guard as Guard
+from .guard import warm as warm
 from .gym import RevisedActions as RevisedActions
 from .gym import RevisedVectorActions as RevisedVectorActions
 from .learnt.judge import LearntRisk as LearntRisk
@@ -32,4 +33,3 @@ from .reviser import Mode as Mode
 from .reviser import is_spoken as is_spoken
 from .reviser import make_usable as make_usable
 from .scene import SceneRisk as SceneRisk
-from .warming import warm as warm

@@ -19,6 +19,7 @@ from evofsm import store
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.arrays import VISITS
 from evofsm.fsm.explanation import explain
+from evofsm.fsm.kernels import COMPILES, announce_compiling
 from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
@@ -52,7 +53,6 @@ from evofsm.guard.api import (
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.parts import outline, rebuild, settings_of
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken, make_usable
-from evofsm.guard.warming import warm_machine
 from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
 
 # Intervals that a range of actions is divided into for the machine.
@@ -325,7 +325,7 @@ class Guard:
         if hasattr(action_judge, "warm"):
             action_judge.warm()
         if machine is not None:
-            warm_machine()
+            _warm_machine()
         self._observing = judge if isinstance(judge, ObservingJudge) else None
         self.reviser = reviser
         self.machine = machine
@@ -915,6 +915,32 @@ class Guard:
             elif model or backup:
                 raise ValueError(f"{type(guard.judge).__name__} asks no model and no backup")
             return guard
+
+
+def warm() -> None:
+    """Compile now what machines and guards need; say so where it takes long.
+
+    Compiled code is kept on disk, so that this is quick from the second time on. A guard that is
+    made compiles what it needs itself, what follows a first failure too: nobody expects to wait
+    then.
+
+    Examples
+    --------
+    >>> from evofsm import warm
+    >>> warm()
+    """
+    Guard(-1.0, 1.0, interval=1.0)
+
+
+@cache
+def _warm_machine() -> None:
+    """Compile what machines need."""
+    if not COMPILES:
+        return
+    announce_compiling()
+    machine = EvolvingFSM(1)
+    machine.learn_many([[0.0, 0.0], [9.0, 0.0]], [0, 0])
+    machine.observe([np.nan, 0.0], partial=True, failed=True)
 
 
 def ends_of(judge: ActionJudge | None, m: int) -> NDArray[np.float64]:
