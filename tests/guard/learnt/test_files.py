@@ -65,8 +65,8 @@ def within(of, name, value):
     [
         ({"n_actions": 127}, "at most 126 actions"),
         ({"given_horizon": 1e9}, "looks at most 10,000 ahead"),
-        ({"state": []}, r"state is \[\]"),
-        (within("state", "luck", 1), "luck"),
+        ({"settings": []}, r"settings is \[\]"),
+        (within("settings", "luck", 1), "luck"),
         (within("settings", "margin", "3"), "margin is '3'"),
     ],
 )

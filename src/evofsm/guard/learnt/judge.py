@@ -615,7 +615,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
-        numbers, arrays = self.state.packed()
         settings = {
             **{name: getattr(self, name) for name in ("dt", "seed", "given_horizon")},
             **{name: getattr(self, name).tolist() for name in ("low", "high")},
@@ -623,9 +622,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
             "n_actions": self.choices or None,
             "harm": {name: getattr(self.harm, name) for name in SETTINGS},
             "settings": asdict(self.settings),
-            "state": numbers,
         }
-        arrays["harm"] = self.harm.rows
+        arrays = {**self.state.packed(), "harm": self.harm.rows}
         store.write(path, KIND, settings, arrays, provenance)
 
     @classmethod
@@ -639,7 +637,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
                 keywords |= {"low": settings["low"], "high": settings["high"]}
             keywords |= {"horizon": settings["given_horizon"]}
             judge = cls(settings["dt"], settings=LearntSettings(**settings["settings"]), **keywords)
-            judge.state = unpacked(settings["state"], arrays, judge.state)
+            judge.state = unpacked(arrays, judge.state)
             judge.harm = Harm.restored(settings["harm"], arrays["harm"])
             judge.remake()
         return judge

@@ -228,10 +228,9 @@ class State(NamedTuple):
         most = settings.caution_again if len(self.drifts) else settings.caution_max
         return 1.0 + min(most, settings.caution / max(1, self.n_scanned))
 
-    def packed(self) -> tuple[dict[str, Any], dict[str, Floats]]:
-        """Numbers and arrays, by name."""
-        fields = self._asdict()
-        return {name: fields[name] for name in _NUMBERS}, {name: fields[name] for name in _ARRAYS}
+    def packed(self) -> dict[str, Floats]:
+        """What was learnt, by name, as a file holds it."""
+        return {name: np.asarray(getattr(self, name), np.float64) for name in _FIELDS}
 
 
 def sizes(state: State) -> Survived:
@@ -356,12 +355,10 @@ _FIELDS = {
     for name, hint in get_type_hints(State, include_extras=True).items()
     if name != "settings"  # they stand beside it
 }
-_ARRAYS = {name: numbers for name, (kind, numbers) in _FIELDS.items() if kind == Floats}
-_NUMBERS = {name: numbers for name, (_, numbers) in _FIELDS.items() if name not in _ARRAYS}
 _SETTING = {int: COUNT._replace(most=1e6), float: Numbers(least=SMALLEST)}
 KIND = Kind(
     "learntrisk",
-    {"harm": OUTCOMES, **_ARRAYS},
+    {"harm": OUTCOMES, **{name: numbers for name, (_, numbers) in _FIELDS.items()}},
     {
         "dt": SIZE,
         "given_horizon": SIZE._replace(optional=True),
@@ -371,23 +368,26 @@ KIND = Kind(
         **dict.fromkeys(("names", "units"), list[str]),
         "harm": SETTINGS,
         "settings": {name: _SETTING[kind] for name, kind in get_type_hints(LearntSettings).items()},
-        "state": _NUMBERS,
     },
 )
 
 
-def unpacked(numbers: Mapping[str, Any], arrays: Mapping[str, Any], blank: State) -> State:
+def unpacked(arrays: Mapping[str, Any], blank: State) -> State:
     """Make a state of what `State.packed` gave, of actions as of a ``blank`` one.
 
     A ValueError if sizes or indices contradict each other, or the actions: kernels trust them.
     """
-    state = State(blank.settings, **numbers, **{name: arrays[name] for name in _ARRAYS})
+    fields: dict[str, Any] = {
+        name: arrays[name] if kind == Floats else kind(arrays[name])
+        for name, (kind, _) in _FIELDS.items()
+    }
+    state = State(blank.settings, **fields)
     m, a, choices = len(state.origin), len(state.used), state.choices
     if (choices, a) != (blank.choices, len(blank.used)):
         raise ValueError(f"it is of actions of {a} numbers, but they have {len(blank.used)}")
     rollout.refuse_too_many(m, a, box=not choices)
     right = State.none(state.settings, m, a, choices, None)
-    for name in _ARRAYS:
+    for name in _FIELDS:
         shape, rows = np.shape(getattr(state, name)), int(name != "squares")
         if shape[rows:] != np.shape(getattr(right, name))[rows:]:
             raise ValueError(
