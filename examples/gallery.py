@@ -36,7 +36,7 @@ def of_a_machine() -> Iterator[str]:
     learnt = actions.encode(episode.accelerations)
     machine.learn_many(episode.observations, learnt)
     model = machine.model(actions=actions, **VARIABLES)
-    dead_ends = dead_ends_of(model, LatentRisk.given(-4.0, decel=4.0, leader_decel=9.0))
+    dead_ends = dead_ends_of(model, LatentRisk(-4.0, decel=4.0, leader_decel=9.0))
 
     _, ax = plt.subplots(figsize=(5.0, 3.2))
     ax.plot(*episode.observations[:, :2].T, color=plot.COLORS["follower"])

@@ -9,14 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evofsm.driving import (
-    Draw,
-    EnvelopeReviser,
-    Family,
-    LatentRisk,
-    Unrevised,
-    measures,
-)
+from evofsm.driving import Draw, EnvelopeReviser, Family, LatentRisk, Unrevised, measures
 from evofsm.fsm import EvolvingFSM, wilson_bounds
 from evofsm.guard import (
     ActionReviser,
@@ -69,7 +62,8 @@ def envelope(name: str, group: Group, measure: RiskMeasure) -> Policy:
 
 def _told(family: Family, leader_decel: float) -> Reviser:
     """Ours, told limits instead of learning them; the oracle, those of this very leader."""
-    risk = LatentRisk.given(family.actions.low, family.decel, leader_decel, family.interval)
+    low, brakes = family.actions.low, family.decel
+    risk = LatentRisk(low, family.interval, decel=brakes, leader_decel=leader_decel)
     return ActionReviser(risk, family.actions)
 
 

@@ -205,7 +205,7 @@ OWN = {
     "of a scene": guard_for_traffic(-9.0, 3.5, 4.5, interval=0.2),
     "of a formula": Guard.of(EnvelopeReviser(REACTS, ACTIONS, 0.1), interval=0.1, learn=False),
     "of one leader": guard_for_cars(
-        -4.5, 3.5, interval=0.1, judge=LatentRisk.given(-4.5, 4.5, 9.0, 0.1)
+        -4.5, 3.5, interval=0.1, judge=LatentRisk(-4.5, 0.1, decel=4.5, leader_decel=9.0)
     ),
 }
 

@@ -207,7 +207,7 @@ def test_settings_that_cannot_be_right_are_refused(name, wrong):
 
 
 def cars(worst):
-    return guard_for_cars(low=-4.0, high=2.5, judge=LatentRisk.given(-4.0, 4.0, worst))
+    return guard_for_cars(low=-4.0, high=2.5, judge=LatentRisk(-4.0, decel=4.0, leader_decel=worst))
 
 
 @pytest.mark.parametrize("ahead", [18.0, 20.0, 22.0])
@@ -312,7 +312,7 @@ def test_a_risk_that_saw_jumps_and_odd_numbers_is_kept_and_read_again(tmp_path):
 def test_states_are_judged_at_their_centres():
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)))
     machine.learn_many([[80.0, 5.0, 5.0], [3.0, 25.0, 25.0]], [0, 0])
-    risk = LatentRisk.given(-4.0, 4.0, 8.0)
+    risk = LatentRisk(-4.0, decel=4.0, leader_decel=8.0)
     assert dead_ends_of(machine.model(), risk) == [1]
     brink = EvolvingFSM(n_actions=1)
     brink.observe([7.0, 10.0, 10.0])  # full braking saves, keeping the speed does not
@@ -324,7 +324,7 @@ def test_states_are_judged_at_their_centres():
 
 def test_with_a_table_of_real_drives_a_tolerance_can_be_met_at_once():
     cautious, begun = (
-        LatentRisk.given(-8.0, decel=7.0, leader_decel=10.0, leaders=leaders)
+        LatentRisk(-8.0, decel=7.0, leader_decel=10.0, leaders=leaders)
         for leaders in (None, REAL_DRIVES)
     )
     here = situation(10.0, 20.0, 20.0)  # survived only up to some 9 m/s² of the leader

@@ -53,7 +53,7 @@ def test_rows_hold_the_closest_and_zeros_where_there_is_none():
 
 
 def judge():
-    return TrafficRisk(LatentRisk.given(-DECEL, DECEL, 9.0, INTERVAL))
+    return TrafficRisk(LatentRisk(-DECEL, INTERVAL, decel=DECEL, leader_decel=9.0))
 
 
 def scene(*others):
@@ -77,7 +77,7 @@ def behind(gap, speed):
 
 
 def test_one_leader_is_judged_as_by_the_kinematic_judge():
-    alone = LatentRisk.given(-DECEL, DECEL, 9.0, INTERVAL)
+    alone = LatentRisk(-DECEL, INTERVAL, decel=DECEL, leader_decel=9.0)
     expected = alone.judge(at([22.0, 15.0, 12.0]), ACTIONS)
     found = judge().judge(at(scene(ahead(22, 12))), ACTIONS)
     np.testing.assert_array_equal(found.risk, expected.risk)

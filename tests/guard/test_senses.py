@@ -44,7 +44,7 @@ def machine():
 
 
 def guard(learn=True, **options):
-    risk = LatentRisk.given(-4.0, 4.0, 8.0)
+    risk = LatentRisk(-4.0, decel=4.0, leader_decel=8.0)
     reviser = ActionReviser(risk, ACTIONS)
     return Guard.of(reviser, machine=machine(), learn=learn, interval=0.25, **options)
 
@@ -149,7 +149,7 @@ def test_whatever_is_seen_is_decided_in_time_or_refused_by_name(kind, data, ends
 def test_the_reviser_keeps_its_promise_with_a_gap_sensor_that_fails_half_the_time():
     hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
     leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=8.0, brake_time=12.0)
-    risk = LatentRisk.given(-4.0, 4.0, 8.0)
+    risk = LatentRisk(-4.0, decel=4.0, leader_decel=8.0)
     guard = Flickering.of(ActionReviser(risk, ACTIONS), learn=False, interval=0.25)
     driven = drive(guard, Scenario(leader, initial_gap=5.0), controller=hasty)
     seen = [decision.situation.intake is Intake.WHOLE for decision in driven.decisions]

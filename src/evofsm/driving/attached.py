@@ -452,8 +452,8 @@ class Guarding:
         mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
             decel, dt = self._vehicle.getDecel(car), self.interval
-            how = {"margin": _MARGIN, "regain": self._regain}
-            risk = LatentRisk.given(-decel, decel, decel, dt, **how)
+            how: Any = {"decel": decel, "margin": _MARGIN, "regain": self._regain}
+            risk = LatentRisk(-decel, dt, leader_decel=decel, **how)
             low, judge = -max(self._vehicle.getEmergencyDecel(car), decel), TrafficRisk(risk)
             limits = low, high, decel, dt
             return guard_for_traffic(*limits, judge=judge, tolerance=self._tolerance, mode=mode)

@@ -162,4 +162,4 @@ def assumptions(brakes: float, tolerance: float) -> str:
 
 def _ahead(interval: float, brakes: float) -> LatentRisk:
     braking, step = positive("brakes", brakes), positive("interval", interval)
-    return LatentRisk.given(-braking, braking, _FULL, step, leaders=LEADERS)
+    return LatentRisk(-braking, step, decel=braking, leader_decel=_FULL, leaders=LEADERS)

@@ -96,6 +96,8 @@ class LatentRisk(Retraced, LearningJudge):
         The hardest braking that can be commanded [m/s²], negative.
     dt : float
         Time between decisions [s].
+    decel : float, optional
+        The hardest braking of the follower [m/s²], positive, where it is given instead of learnt.
     leader_decel : float
         Until enough was seen, leaders are assumed to brake so hard [m/s²].
     own_brakes : float
@@ -129,6 +131,7 @@ class LatentRisk(Retraced, LearningJudge):
         lowest: float,
         dt: float = 0.25,
         *,
+        decel: float | None = None,
         leader_decel: float = 10.0,
         own_brakes: float = 0.6,
         margin: float = 0.5,
@@ -150,29 +153,13 @@ class LatentRisk(Retraced, LearningJudge):
             self.manoeuvres.remember(*leaders.decels)
             self.manoeuvres.gentle += leaders.gentle
         self.brakes = OwnBrakes(lowest, own_brakes, dt)
+        if decel is not None:
+            self.brakes.trust(positive("decel", decel))
         self.perception = Perception(dt)
         self._watch = BrakeWatch(dt)
         self._own_watch = BrakeWatch(dt)  # of the car itself, where someone else drives it
         self._watched = False  # the latest decision
         self._commands = (0.0, 0.0)  # the latest two
-
-    @classmethod
-    def given(
-        cls, lowest: float, decel: float, leader_decel: float, dt: float = 0.25, **settings: Any
-    ) -> Self:
-        """Given the limits instead of learning them: the best that could be learnt.
-
-        Parameters
-        ----------
-        lowest, dt, **settings
-            As in the class.
-        decel, leader_decel : float
-            The hardest braking of the follower and of leaders [m/s²], positive; with a table of
-            ``leaders``, not each is taken to be the hardest.
-        """
-        risk = cls(lowest, dt, leader_decel=leader_decel, **settings)
-        risk.brakes.trust(positive("decel", decel))
-        return risk
 
     def learn(self, observation: ArrayLike, acceleration: float, *, watched: bool = False) -> None:
         """Take in an observation and the acceleration commanded after it [m/s²].

@@ -201,7 +201,7 @@ class TrafficRisk(ActionJudge):
     def __init__(self, ahead: LatentRisk) -> None:
         self.ahead = ahead
         # Judges the one that follows, of which oneself is the leader.
-        self._behind = LatentRisk.given(-_BEHIND, _BEHIND, _BEHIND, _REACTION)
+        self._behind = LatentRisk(-_BEHIND, _REACTION, decel=_BEHIND, leader_decel=_BEHIND)
         self.labels = _SceneLabels(dt=ahead.dt)
         #: The worst pair of the first action that was judged last; None where there is none.
         self.worst: Pair | None = None
@@ -323,7 +323,8 @@ def guard_for_traffic(
         Highest risk that is accepted, in (0, 1).
     mode : Mode
     """
-    judge = judge or TrafficRisk(LatentRisk.given(-decel, decel, LEADER_DECEL, interval))
+    if judge is None:
+        judge = TrafficRisk(LatentRisk(-decel, interval, decel=decel, leader_decel=LEADER_DECEL))
     actions = IntervalActions(low, high, _INTERVAL_WIDTH, outside="clip")
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, learn=False)
