@@ -44,13 +44,11 @@ def _read(path):
 
     for chunk in read_traces([str(path)]):
         rows = len(chunk.times)
-        assert len(chunk.observations) == len(chunk.actions) == rows > 0
+        assert len(chunk.observations) == len(chunk.actions) == len(chunk.begins) == rows > 0
         assert np.isfinite(chunk.observations).all()
         assert np.isfinite(chunk.times).all()
         assert not np.isinf(chunk.actions).any()
-        assert (np.diff(chunk.starts) > 0).all()
         assert math.isnan(chunk.dt) or chunk.dt > 0.0
-        assert all(0 <= start < rows for start in chunk.starts)
 
 
 def seeds(name):

@@ -52,9 +52,10 @@ def together(*paths, noted=None, **columns):
     """Of all chunks as one: gaps, starts, failures."""
     chunks = read(*paths, noted=noted, **columns)
     gaps = np.concatenate([chunk.observations[:, 0] for chunk in chunks])
-    begins = [np.isin(np.arange(len(chunk.times)), chunk.starts) for chunk in chunks]
-    fails = np.concatenate([chunk.fails for chunk in chunks])
-    return gaps.tolist(), *(np.flatnonzero(x).tolist() for x in (np.concatenate(begins), fails))
+    begins, fails = (
+        np.concatenate(x) for x in zip(*((c.begins, c.fails) for c in chunks), strict=True)
+    )
+    return gaps.tolist(), *(np.flatnonzero(x).tolist() for x in (begins, fails))
 
 
 def refusal(*paths, **columns):
@@ -82,7 +83,7 @@ def test_a_log_becomes_observations_actions_times_and_episodes(tmp_path):
     assert chunk.observations[1].tolist() == [1.5, 10.0, 11.0]
     assert (chunk.actions == -0.25).all()
     assert chunk.times.tolist() == [0.0, 0.1, 0.2, 0.0, 0.1, 0.2, 0.3]
-    assert (chunk.starts.tolist(), chunk.dt, chunk.jumps) == ([0, 3], 0.1, 0)
+    assert (np.flatnonzero(chunk.begins).tolist(), chunk.dt, chunk.jumps) == ([0, 3], 0.1, 0)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +102,7 @@ def test_what_spreadsheets_do_to_a_csv_changes_nothing(tmp_path, change):
     other = tmp_path / "wrong.parquet"  # a file is known by its content and not by its name
     other.write_bytes(changed if isinstance(changed, bytes) else changed.encode())
     (plain,), (changed,) = read(path), read(str(other))
-    for field in ("observations", "actions", "times", "starts"):
+    for field in ("observations", "actions", "times", "begins"):
         assert np.array_equal(getattr(plain, field), getattr(changed, field))
 
 
@@ -395,7 +396,7 @@ def test_any_name_of_a_column_can_be_said(tmp_path, name):
     columns = reading_of(*asked, [f"{quoted}=cm"], None, None, None, 0, None)
     (chunk,) = read_traces([str(path)], replace(columns, episode=None))
     assert chunk.observations[:, 0].tolist() == [0.03, 0.01, 0.0]
-    assert chunk.failures.tolist() == [2]
+    assert np.flatnonzero(chunk.fails).tolist() == [2]
     assert columns.episode == [name]
 
 
@@ -498,7 +499,7 @@ def test_the_first_row_in_which_it_holds_ends_the_episode(tmp_path, pieces, cond
     assert starts == [0, 3, 5, 6, 7, 8]
     assert failures == [2, 4, 5, 9]
     assert noted.after_failure == 3
-    assert read(path)[0].failures is None  # nothing tells of them
+    assert not read(path)[0].tells  # nothing tells of them
 
 
 def test_what_only_tells_of_failures_may_be_infinite_but_must_be_there(tmp_path):
@@ -559,7 +560,7 @@ def taken(tmp_path, rows, noted=None, **columns):
     return [
         (
             *(one.tolist() for one in (e.times, e.observations[:, 0], e.actions)),
-            [] if e.failures is None else e.failures.tolist(),
+            np.flatnonzero(e.fails).tolist(),
         )
         for e in episodes_of(read(path, noted=noted, **settings))
     ]
@@ -667,7 +668,7 @@ def test_times_may_be_dates(tmp_path, texts, point):
     for one in (path, str(tmp_path / "text.parquet"), str(tmp_path / "typed.parquet")):
         (chunk,) = read(one)
         assert chunk.times == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-12)
-        assert (chunk.dt, chunk.starts.tolist()) == (0.1, [0])
+        assert (chunk.dt, np.flatnonzero(chunk.begins).tolist()) == (0.1, [0])
     if texts is not ZONED:
         (chunk,) = read(path, units={"time": f"%Y-%m-%d %H:%M:%S{point}%f"})
         assert chunk.times[-1] == pytest.approx(0.4)

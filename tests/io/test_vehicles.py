@@ -63,7 +63,7 @@ def test_an_episode_ends_when_somebody_cuts_in_or_a_pair_is_away(tmp_path):
     times = sorted(times.tolist() for _, _, times in episodes(path))
     assert times == [[0.0, 0.1], [0.2], [0.2], [0.3], [0.5]]
     (chunk,) = read_traces([path], LogColumns(failed="gap<=35"))
-    assert chunk.observations[chunk.failures, 0].tolist() == [35.0, 35.0]
+    assert chunk.observations[chunk.fails, 0].tolist() == [35.0, 35.0]
 
 
 def test_lengths_are_those_of_the_leader_s_type(tmp_path):
@@ -94,12 +94,12 @@ def test_so_many_waiting_rows_are_handed_on_before_the_pairs_part(tmp_path, monk
     path = write(tmp_path / "a.xml", xml({k / 10: PAIR for k in range(250)}))
     (chunk,) = read_traces([path])
     assert len(chunk.times) == 250
-    assert chunk.starts.tolist() == [0, 101, 202]
+    assert np.flatnonzero(chunk.begins).tolist() == [0, 101, 202]
     assert np.isnan(chunk.actions).sum() == 3
     beside = [("c", "f_0", 50.0, 1.0), ("d", "f_0", 20.0, 2.0)]
     apart = {k / 10: [*beside, *(PAIR if k % 10 else [])] for k in range(80)}
     (chunk,) = read_traces([write(tmp_path / "b.xml", xml(apart))])
-    assert len(chunk.starts) == 1 + 8  # what has ended does not wait
+    assert chunk.begins.sum() == 1 + 8  # what has ended does not wait
     monkeypatch.setattr(vehicles, "_ROWS_AT_ONCE", 100)
     assert [len(chunk.times) for chunk in read_traces([path])] == [101, 101, 48]
 
@@ -212,7 +212,7 @@ def test_who_is_beside_is_nobody_s_leader_among_objects(tmp_path, turned):
     ]
     (chunk,) = read_traces([objects(tmp_path / "a.csv", rows, OBJECTS + ",width")])
     assert set(chunk.names) == BEHIND
-    first = dict(zip(chunk.names, chunk.observations[chunk.starts].tolist(), strict=True))
+    first = dict(zip(chunk.names, chunk.observations[chunk.begins].tolist(), strict=True))
     assert first["c behind a"] == pytest.approx([12.0 - 1.6, 5.0, 5.0], abs=1e-3)
     rows = [row[:-1] for row in rows if row[0] in "abcd"]  # of no width, as wide as a car
     (chunk,) = read_traces([objects(tmp_path / "b.csv", rows)])

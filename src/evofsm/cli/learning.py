@@ -79,13 +79,13 @@ class Learning:
         learn_chunk(self.machine, chunk, self.actions)
         self.dt = chunk.dt
         steps = np.diff(chunk.times, prepend=self.last_time)
-        steps[chunk.starts] = 0.0
+        steps[chunk.begins] = 0.0
         self.last_time = float(chunk.times[-1])
         self.seconds += float(steps.sum())
         self.rows += len(steps)
-        self.episodes += len(chunk.starts)
+        self.episodes += int(chunk.begins.sum())
         self.jumps += chunk.jumps
-        self.failures += 0 if chunk.failures is None else len(chunk.failures)
+        self.failures += int(chunk.fails.sum())
         self.clipped_below += int((chunk.actions < self.actions.low).sum())
         self.clipped_above += int((chunk.actions > self.actions.high).sum())
         if len(self.levels) <= MOST_LEVELS:
@@ -265,7 +265,8 @@ def learn_chunk(machine: EvolvingFSM, chunk: Chunk, actions: Any) -> None:
     indices = np.full(len(chunk.times), -1)
     is_known = ~np.isnan(chunk.actions)
     indices[is_known] = actions.encode(chunk.actions[is_known])
-    machine.learn_many(chunk.observations, indices, chunk.starts, chunk.failures)
+    failures = np.flatnonzero(chunk.fails) if chunk.tells else None
+    machine.learn_many(chunk.observations, indices, np.flatnonzero(chunk.begins), failures)
 
 
 def range_of(levels: Sequence[float]) -> str:

@@ -79,39 +79,26 @@ class Chunk(NamedTuple):
     observations: Floats  #: (T, m)
     actions: Floats  #: (T,) action taken after each, NaN where none is known
     times: Floats  #: (T,) [s]
-    starts: NDArray[np.int64]  #: (E,) rows at which an episode begins
+    begins: Bools  #: (T,) whether an episode begins with it
+    fails: Bools  #: (T,) whether an episode ended with it in failure
     dt: float  #: usual time from a row to the next [s]; NaN while no two rows belong together
     jumps: int = 0  #: episodes that begin because of a hole in time
-    #: (K,) rows with which an episode ended in failure; None where nothing tells of failures
-    failures: NDArray[np.int64] | None = None
-    names: Sequence[str] = ()  #: (E,) who followed whom in them, in a recording of many vehicles
+    tells: bool = False  #: whether anything tells of failures
+    names: Sequence[str] = ()  #: of its episodes: who followed whom, in a recording of vehicles
 
     @property
     def failed(self) -> bool:
         """Whether an episode of it ended in failure."""
-        return self.failures is not None and len(self.failures) > 0
-
-    @property
-    def fails(self) -> Bools:
-        """(T,) with which rows an episode failed."""
-        fails = np.zeros(len(self.times), np.bool_)
-        fails[[] if self.failures is None else self.failures] = True
-        return fails
+        return bool(self.fails.any())
 
     def rows(self, first: int, end: int) -> Chunk:
         """Some of its rows."""
+        before, within = self.begins[:first].sum(), self.begins[:end].sum()
+        parts = {name: getattr(self, name)[first:end] for name in _BY_ROW}
+        return self._replace(**parts, names=self.names[before:within])
 
-        def within(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-            return rows[(rows >= first) & (rows < end)] - first
 
-        return self._replace(
-            observations=self.observations[first:end],
-            actions=self.actions[first:end],
-            times=self.times[first:end],
-            starts=within(self.starts),
-            failures=None if self.failures is None else within(self.failures),
-            names=[n for n, k in zip(self.names, self.starts, strict=False) if first <= k < end],
-        )
+_BY_ROW = ("observations", "actions", "times", "begins", "fails")
 
 
 @dataclass
@@ -161,17 +148,15 @@ class Noted:
                 self.below[name] = value if (below == value).all() else 0.0, rows + len(below)
         if chunk.dt > _LONGEST_USUAL:
             self.longest_step = max(chunk.dt, self.longest_step)
-        if chunk.failures is not None:
-            self.failed += len(chunk.failures)
-            for row in np.intersect1d(chunk.failures, chunk.starts):
-                here = dict(zip(names, chunk.observations[row].tolist(), strict=True))
-                constants = self.at_once.items() & here.items() if self.failed_at_once else here
-                self.at_once, self.failed_at_once = dict(constants), self.failed_at_once + 1
+        self.failed += int(chunk.fails.sum())
+        for row in chunk.observations[chunk.fails & chunk.begins].tolist():
+            here = dict(zip(names, row, strict=True))
+            constants = self.at_once.items() & here.items() if self.failed_at_once else here
+            self.at_once, self.failed_at_once = dict(constants), self.failed_at_once + 1
 
     def _compare_rates(self, chunk: Chunk, gap: int, follower: int, leader: int) -> None:
         """The gap changes as speeds differ, and the own speed as the action says."""
-        within = np.diff(chunk.times) > 0.0
-        within[chunk.starts[1:] - 1] = False
+        within = (np.diff(chunk.times) > 0.0) & ~chunk.begins[1:]
         steps = np.diff(chunk.times)[within]
         observations, changes = chunk.observations, np.diff(chunk.observations, axis=0)[within]
         gap_rates = observations[:, leader] - observations[:, follower]
@@ -392,6 +377,13 @@ class LogColumns:
         """Up to which a hole costs no episode [s]."""
         return self.hole or (self.resample and _HOLE * self.resample.step)
 
+    @property
+    def conditions(self) -> dict[str, Condition]:
+        """Those that tell of rows, by their options."""
+        nobody = None if self.no_leader == "end" else self.no_leader
+        texts = {"--failed": self.failed, "--where": self.where, "--no-leader": nobody}
+        return {o: Condition.parse(text, o) for o, text in texts.items() if text is not None}
+
 
 # -- Reading --------------------------------------------------------------------------------------
 
@@ -530,15 +522,16 @@ def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
 
     Examples
     --------
-    >>> chunk = Chunk("a", np.zeros((5, 1)), np.zeros(5), np.arange(5.0), np.array([0, 3]), 1.0)
+    >>> t = np.arange(5.0)
+    >>> chunk = Chunk("a", t[:, None], 0.0 * t, t, begins=t % 3.0 == 0.0, fails=t < 0.0, dt=1.0)
     >>> [episode.times.tolist() for episode in episodes_of([chunk.rows(0, 1), chunk.rows(1, 5)])]
     [[0.0, 1.0, 2.0], [3.0, 4.0]]
     """
     parts: list[Chunk] = []
     for chunk in chunks:
-        begins = chunk.starts.tolist()
-        for first, end in pairwise([*([] if 0 in begins else [0]), *begins, len(chunk.times)]):
-            if first in begins and parts:
+        inner = 1 + np.flatnonzero(chunk.begins[1:])
+        for first, end in pairwise([0, *inner.tolist(), len(chunk.times)]):
+            if chunk.begins[first] and parts:
                 yield _joined(parts)
                 parts = []
             parts.append(chunk.rows(first, end))
@@ -546,49 +539,11 @@ def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         yield _joined(parts)
 
 
-class LoggedRow(NamedTuple):
-    """A row of a trace, for whoever decides on each."""
-
-    begins: bool  #: an episode
-    time: float  #: [s]
-    values: dict[str, float]  #: of the variables, by their names
-    action: float  #: taken after it, NaN where none is known
-    failed: bool  #: whether the episode ended with it in failure
-
-
-def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterator[LoggedRow]:
-    """The rows of chunks, one by one; names are ``columns.observe.names``.
-
-    >>> z, u = np.array([[9.0, 20.0, 19.0]]), np.array([-1.0])
-    >>> chunk = Chunk("a.csv", z, u, np.zeros(1), np.zeros(1, np.int64), dt=0.1)
-    >>> next(rows_of([chunk])).values
-    {'gap': 9.0, 'v_follower': 20.0, 'v_leader': 19.0}
-    """
-    for chunk in chunks:
-        begins = np.zeros(len(chunk.times), np.bool_)
-        begins[chunk.starts] = True
-        columns = (begins, chunk.times, chunk.observations, chunk.actions, chunk.fails)
-        for first, time, values, *rest in zip(*(a.tolist() for a in columns), strict=True):
-            yield LoggedRow(first, time, dict(zip(names, values, strict=True)), *rest)
-
-
 def _joined(parts: Sequence[Chunk]) -> Chunk:
     """Chunks as one; ``jumps`` are those of the last one."""
-    before = np.cumsum([0, *(len(part.times) for part in parts[:-1])])
-
-    def joined(name: str, rows: int = 0) -> NDArray[Any]:
-        pairs = zip(parts, rows * before, strict=True)
-        return np.concatenate([getattr(part, name) + first for part, first in pairs])
-
-    return parts[-1]._replace(
-        source=parts[0].source,
-        observations=joined("observations"),
-        actions=joined("actions"),
-        times=joined("times"),
-        starts=joined("starts", 1),
-        failures=None if parts[0].failures is None else joined("failures", 1),
-        names=[name for part in parts for name in part.names],
-    )
+    arrays: Any = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _BY_ROW}
+    names = [name for part in parts for name in part.names]
+    return parts[-1]._replace(source=parts[0].source, names=names, **arrays)
 
 
 def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) -> Iterator[Chunk]:
@@ -613,8 +568,8 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
         noted.resampled += 0 if chunk is None else len(chunk.times)
         whole = _joined(parts)
         times, fails = whole.times, whole.fails
-        begins, places, usual = fails | (not step), times, whole.dt
-        begins[whole.starts] = begins[0] = True
+        begins, places, usual = whole.begins | fails | (not step), times, whole.dt
+        begins[0] = True
         if step:
             offset = noted.began % step  # steps are those of the clock
             places, usual = np.floor((times + offset) / step + 1e-9), 1.0
@@ -625,24 +580,22 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
         rows = rows.fill_nan(None).with_columns(step=np.cumsum(begins))  # what lacks does not count
         become = (getattr(polars.nth(k), how)() for k, how in enumerate(hows))
         rows = rows.group_by("step", maintain_order=True).agg(become).drop("step")
-        starts, is_whole = np.searchsorted(first, whole.starts), np.ones(len(first), np.bool_)
+        is_whole = np.ones(len(first), np.bool_)
         if step:
-            is_whole[:-1] = ~fails[first[1:]] | (np.diff(places[first]) > 0.0)
-            is_whole[starts[starts > 0] - 1] = True
+            goes_on = ~whole.begins[first[1:]]
+            is_whole[:-1] = ~(fails[first[1:]] & (np.diff(places[first]) <= 0.0) & goes_on)
         *observations, actions = rows.to_numpy()[is_whole].T.copy()
         keeps = int(is_whole.sum()) - (chunk is not None and not fails[-1])
         last, first = first[-1], first[is_whole]
-        starts = np.searchsorted(first, whole.starts)
-        steps = np.diff(places[first])
-        holes = are_unusual(steps, usual)
-        holes[starts[starts > 0] - 1] = False
+        starts = np.diff(np.cumsum(whole.begins)[first], prepend=0) > 0
+        holes = are_unusual(np.diff(places[first]), usual) & ~starts[1:]
         actions[:-1][holes] = np.nan
         step_rows = whole._replace(
             observations=np.column_stack(observations),
             actions=actions,
             times=times[first],
-            starts=starts,
-            failures=None if whole.failures is None else np.flatnonzero(fails[first]),
+            begins=starts,
+            fails=fails[first],
         )
         noted.crossed += int(holes[:keeps].sum())
         remainder = None
@@ -802,9 +755,7 @@ class _Reader:
         self._observed = [v for v in self._variables if isinstance(v, str)]
         usual = [name for name in USUAL_EPISODE if name in table.columns]
         self._episode = usual if columns.episode is None else list(columns.episode)
-        texts = {"--failed": columns.failed, "--where": columns.where}
-        texts |= {} if columns.no_leader == "end" else {"--no-leader": columns.no_leader}
-        self._conditions = {o: Condition.parse(t, o) for o, t in texts.items() if t is not None}
+        self._conditions = columns.conditions
         self._failed = self._conditions.get("--failed")
         self._before = 0  # rows
         self._first_date = self._last_date = np.nan
@@ -851,9 +802,8 @@ class _Reader:
             self._before += piece.rows
             observations = np.column_stack([_encoded(piece, v) for v in self._variables])
             is_kept, fails = self._sift(piece, anew, starts, late)
-            if self._failed_before and last_chunk is not None and last_chunk.failures is not None:
-                last = len(last_chunk.times) - 1
-                last_chunk = last_chunk._replace(failures=np.append(last_chunk.failures, last))
+            if self._failed_before and last_chunk is not None:
+                last_chunk.fails[-1] = True
             if not is_kept.any():
                 continue
             if last_chunk is not None:
@@ -866,10 +816,11 @@ class _Reader:
                 observations=observations[rows],
                 actions=piece.numbers[action][rows],
                 times=times[rows],
-                starts=np.flatnonzero(starts[rows]),
+                begins=starts[rows],
+                fails=fails[rows],
                 dt=clock.dt,
                 jumps=int(holes[rows].sum()),
-                failures=None if self._failed is None else np.flatnonzero(fails[rows]),
+                tells=self._failed is not None,
                 names=[piece.names[k] for k in episodes] if piece.names else (),
             )
         if last_chunk is not None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from evofsm.cli.monitor.messages import LONGEST, NO_ROW, Message, MessageError, Row
 from evofsm.io import LogColumns, tables
-from evofsm.io.logs import Condition, units_of
+from evofsm.io.logs import units_of
 from evofsm.io.tables import Dialect, decoded, explained, is_date, is_number, is_value
 
 _BECOME: dict[str, Any] = {"mean": fmean, "last": itemgetter(-1), "max": max, "min": min}
@@ -29,9 +29,7 @@ class Slots:
         self.hole = columns.longest_hole  #: up to which a hole costs no episode [s]
         self.names = columns.observe.names
         self._how = {} if scheme is None else scheme.how
-        nobody = None if columns.no_leader == "end" else columns.no_leader
-        texts = {"--failed": columns.failed, "--where": columns.where, "--no-leader": nobody}
-        self._conditions = {o: Condition.parse(t, o) for o, t in texts.items() if t is not None}
+        self._conditions = columns.conditions
         every = [term for c in self._conditions.values() for term in c.terms]
         self.compared = [term.column for term in every if term.of_number]  #: with a number
         extra = dict.fromkeys([*(t.column for t in every), *(columns.episode or ())])

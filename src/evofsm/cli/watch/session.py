@@ -488,8 +488,8 @@ def _stretches(episode: Chunk, collisions: Sequence[float]) -> Iterator[tuple[Ch
         if contacts[last]:
             fails = "Collision (by SUMO)" if episode.observations[last, 0] > 0.0 else "Collision"
         rows = episode.rows(first, last + 1)
-        failures = np.array([last - first] if fails else [], np.int64)
-        yield rows._replace(starts=np.zeros(1, np.int64), failures=failures), fails
+        rows.begins[0], rows.fails[-1] = True, bool(fails)
+        yield rows._replace(tells=True), fails
 
 
 # -- A run ----------------------------------------------------------------------------------------
