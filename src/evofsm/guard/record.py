@@ -16,7 +16,7 @@ from evofsm.guard.api import Intake
 class Column(NamedTuple):
     """One number or text of a decision."""
 
-    kind: type[int] | type[float] | type[str]
+    kind: type[int] | type[float] | type[str] | type[list[Any]]
     about: str  #: with its unit in brackets, and where it is not known
     read: Callable[[Any], Any]  #: from a decision
     in_table: bool = True  #: whether ``decisions.parquet`` has it

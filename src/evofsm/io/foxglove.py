@@ -39,48 +39,48 @@ _SECOND = 1_000_000_000  # [ns]
 _PAUSE = _SECOND  # from the end of an episode to the start of the next
 
 
-def columns_by_topic(names: Sequence[str] = VARIABLES) -> dict[str, tuple[str, ...]]:
-    """The columns of decisions by channel; the channel of risks has them without ``risk_``."""
+def _belief(decision: Decision) -> list[float]:
+    situation = decision.situation
+    return [] if situation.state is None else situation.belief.tolist()
+
+
+def columns_by_topic(
+    names: Sequence[str] = VARIABLES, units: Sequence[str] = ()
+) -> dict[str, dict[str, Column]]:
+    """The columns of decisions by channel, for cars or for variables of these names and units.
+
+    The channel of risks has them without ``risk_``.
+    """
     of_cars = tuple(names) == VARIABLES
+    suffixes = [f" [{unit}]" if unit else "" for unit in units] + [""] * len(names)
+    columns = DECISION_COLUMNS if of_cars else dict(RECORD)
+    columns = {**columns, "belief": Column(list, "probability of each state, from 0", _belief)}
+    for k, name in enumerate(() if of_cars else names):
+        about = f"as observed{suffixes[k]}; left out where missing"
+        columns[name] = observed(about, itemgetter(k))
     risks = "risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen"
-    return {
+    topics = {
         "/observation": ("time", *names, "intake"),
         "/belief": ("state", "belief", "surprise", "n_states"),
         "/risk": (*risks, *(("time_to_collision", "time_headway") if of_cars else ())),
         "/decision": ("proposed", "executed", "advised", "reason", "explanation"),
     }
-
-
-def field_of(topic: str, name: str) -> str:
-    """What a column is called in a channel."""
-    return name.removeprefix("risk_") if topic == "/risk" else name
-
-
-def columns_of(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[str, Column]:
-    """The columns of decisions by name, for cars or for variables of these names and units."""
-    if tuple(names) == VARIABLES:
-        return DECISION_COLUMNS
-    suffixes = [f" [{unit}]" if unit else "" for unit in units] + [""] * len(names)
-    return dict(RECORD) | {
-        name: observed(f"as observed{unit}; left out where missing", itemgetter(k))
-        for k, (name, unit) in enumerate(zip(names, suffixes, strict=False))
-    }
+    by_topic = {topic: {name: columns[name] for name in topics[topic]} for topic in topics}
+    by_topic["/risk"] = {n.removeprefix("risk_"): c for n, c in by_topic["/risk"].items()}
+    return by_topic
 
 
 def schemas_of(
     names: Sequence[str] = VARIABLES, units: Sequence[str] = ()
 ) -> dict[str, dict[str, Any]]:
     """The JSON schema of each channel, by its topic."""
-    columns = columns_of(names, units)
-    fields = {
-        topic: {field_of(topic, name): _schema(columns.get(name)) for name in of_topic}
-        for topic, of_topic in columns_by_topic(names).items()
-    }
+    columns = columns_by_topic(names, units)
+    fields = {topic: {n: _schema(c) for n, c in columns[topic].items()} for topic in columns}
     fields["/event"] = {
         "kind": _of("string", "episode started, collision or failure, episode ended"),
         "episode": _of("integer", "number of the episode, from 0"),
         "time": _of("number", "since the start of the episode [s]"),
-        **{name: _schema(columns[name]) for name in names},
+        **{name: fields["/observation"][name] for name in names},
     }
     return {
         topic: {"title": f"evofsm.{topic[1:].capitalize()}", "type": "object", "properties": of_it}
@@ -92,11 +92,10 @@ def _of(kind: str, about: str) -> dict[str, Any]:
     return {"type": kind, "description": about}
 
 
-def _schema(column: Column | None) -> dict[str, Any]:
-    if column is None:  # the belief, which is no number
-        items = _of("number", "probability")
-        return {**_of("array", "probability of each state, from 0"), "items": items}
-    return _of({float: "number", int: "integer", str: "string"}[column.kind], column.about)
+def _schema(column: Column) -> dict[str, Any]:
+    kinds: dict[type, str] = {float: "number", int: "integer", str: "string", list: "array"}
+    items = {"items": _of("number", "probability")} if column.kind is list else {}
+    return {**_of(kinds[column.kind], column.about), **items}
 
 
 class _File(io.BufferedWriter):
@@ -176,7 +175,7 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
         if port is None and file is None:
             raise ValueError("a sink needs a port, a file, or both")
         self._names = tuple(names)
-        self._columns, self._topics = columns_of(names, units), columns_by_topic(names)
+        self._columns = columns_by_topic(names, units)
         context = self._context = foxglove.Context()  # its channels close with it
         self._channels = {
             topic: foxglove.Channel(topic, schema=schema, context=context)
@@ -225,11 +224,8 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
         """A decision was made."""
         decision = Decision(situation, revision)
-        belief = situation.belief.tolist() if situation.state is not None else []
-        for topic, names in self._topics.items():
-            read = {name: self._columns[name].read for name in names if name != "belief"}
-            message = {field_of(topic, name): get(decision) for name, get in read.items()}
-            self._send(topic, message | ({"belief": belief} if topic == "/belief" else {}))
+        for topic, columns in self._columns.items():
+            self._send(topic, {name: column.read(decision) for name, column in columns.items()})
         is_changed = not same_action(revision.executed, revision.proposed)
         if is_changed or not same_action(revision.advised, revision.executed):
             verb = "executed" if is_changed else "would advise"
