@@ -133,20 +133,18 @@ def file_kind(path: str) -> Kind:
     return next((kind for mark, kind in marks.items() if head.startswith(mark)), "csv")
 
 
+@dataclass
 class Skips:
     """Rows of a file that cannot be right: so many are left out, and counted; more are refused."""
 
-    def __init__(
-        self,
-        most: int = 0,
-        kinds: dict[str, tuple[int, str]] | None = None,
-        told: list[str] | None = None,
-        on_read: OnRead = lambda count: None,
-    ) -> None:
-        self.told, self.on_read = [] if told is None else told, on_read
-        self._left = self._most = most
-        self._kinds = {} if kinds is None else kinds  # of all files: how many, and the first
-        self._first: dict[str, str] = {}  # of this file
+    most: int = 0
+    kinds: dict[str, tuple[int, str]] = field(default_factory=dict)  #: how many, and the first
+    told: list[str] = field(default_factory=list)  #: what else is to be said
+    on_read: OnRead = lambda count: None
+    _first: dict[str, str] = field(default_factory=dict, init=False)  # of this file
+
+    def __post_init__(self) -> None:
+        self._left = self.most
 
     def leave_out(self, kind: str, why: str | Callable[[], str], rows: int = 1) -> None:
         """Leave a row out, or raise where that is one too many; ``why`` begins with its place."""
@@ -154,10 +152,10 @@ class Skips:
             self._first[kind] = why if isinstance(why, str) else why()
         self._left -= rows
         if self._left < 0:
-            more = f"--skip-bad {self._most} leaves out so many bad rows, and there are more"
+            more = f"--skip-bad {self.most} leaves out so many bad rows, and there are more"
             raise ValueError(f"{self._first[kind]}; {more}")
-        count, first = self._kinds.get(kind, (0, self._first[kind]))
-        self._kinds[kind] = count + 1, first
+        count, first = self.kinds.get(kind, (0, self._first[kind]))
+        self.kinds[kind] = count + 1, first
 
     @contextmanager
     def leaving_out(self, kind: str) -> Iterator[None]:
@@ -290,38 +288,33 @@ def _mcap_records(path: str | os.PathLike[str], largest: int, skips: Skips) -> I
     with open(path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
         reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
-        records = reader.records
-        while True:
-            try:
-                record = next(records, None)
-            except (EndOfFile, RecordLengthLimitExceeded, struct.error) as error:
-                why = f"it ends within a record, or is damaged there {error}".strip()
-                skips.leave_out("cut", f"{os.fspath(path)}, byte {file.tell():,}: {why}")
-                return
-            if record is None:
-                return
-            if not isinstance(record, Chunk):
-                yield record
-                continue
-            data = _mcap_chunk(record, largest)
-            if len(data) > largest:
-                raise ValueError(f"a chunk unpacks to more than the {largest:,} bytes it may have")
-            yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
+        try:
+            for record in reader.records:
+                if isinstance(record, Chunk):
+                    yield from breakup_chunk(_unpacked(record, largest), validate_crc=True)
+                else:
+                    yield record
+        except (EndOfFile, RecordLengthLimitExceeded, struct.error) as error:
+            why = f"it ends within a record, or is damaged there {error}".strip()
+            skips.leave_out("cut", f"{os.fspath(path)}, byte {file.tell():,}: {why}")
 
 
-def _mcap_chunk(chunk: Chunk, largest: int) -> bytes:
-    """What is in a chunk, or at least the beginning of what is too large."""
+def _unpacked(chunk: Chunk, largest: int) -> Chunk:
+    """The chunk as it is without compression; of one that is too large no more is unpacked."""
     from lz4.frame import LZ4FrameDecompressor
     from zstandard import ZstdDecompressor
 
+    data = chunk.data
     if chunk.compression == "zstd":
         unpacker = ZstdDecompressor(max_window_size=largest)
-        return bytes(unpacker.stream_reader(chunk.data).read(largest + 1))
-    if chunk.compression == "lz4":
-        return bytes(LZ4FrameDecompressor().decompress(chunk.data, max_length=largest + 1))
-    if chunk.compression:
+        data = unpacker.stream_reader(data).read(largest + 1)
+    elif chunk.compression == "lz4":
+        data = LZ4FrameDecompressor().decompress(data, max_length=largest + 1)
+    elif chunk.compression:
         raise ValueError(f"its chunks are packed as {chunk.compression!r}, which is not known")
-    return chunk.data
+    if len(data) > largest:
+        raise ValueError(f"a chunk unpacks to more than the {largest:,} bytes it may have")
+    return replace(chunk, compression="", data=bytes(data))
 
 
 # -- Pieces of tables -----------------------------------------------------------------------------
