@@ -225,17 +225,15 @@ class Term(NamedTuple):
             values = piece.numbers[self.column]
             return np.asarray(_SIGNS[self.sign](values, self.value) & ~np.isnan(values))
         texts = piece.texts[self.column].str.strip_chars()
-        if self.sign:
-            return ((texts != "") & ((texts == self.value) == (self.sign == "=="))).to_numpy()
-        values = texts.str.to_lowercase().replace_strict(_TRUTHS, default=-1).to_numpy()
-        if (values < 0).any():
+        if not self.sign:
             piece.leave_out(
                 self.column,
-                values < 0,
+                ~texts.str.to_lowercase().is_in([*_TRUTHS]).to_numpy(),
                 "{!r} is no truth value; here a column of 0 and 1, true and false or yes and no is "
                 f"needed, or a comparison such as '{self.column}>0' or \"{self.column}=='on'\"",
             )
-        return np.asarray(values > 0)
+        kinds = texts.unique().to_list()
+        return texts.is_in([kind for kind in kinds if self.holds_of(kind)]).to_numpy()
 
     def may_end(self, piece: Piece) -> bool:
         """Whether it holds in the last row, perhaps, only as a number was cut off there."""

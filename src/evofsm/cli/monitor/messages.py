@@ -59,7 +59,7 @@ class Row(msgspec.Struct, frozen=True, tag="row"):
     proposal: float | int | tuple[float, ...] | None  #: None where nothing was proposed
     ahead: str | int | None = None  #: id of the object that is followed, in a scene
     objects: tuple[str, ...] = ()  #: ids of all objects, where all are judged: number 1 first
-    told: tuple[Any, ...] = ()  #: what other keys say, of `Form.others`
+    told: dict[str, Any] = {}  #: what other keys say, None where they are not there
 
 
 class End(msgspec.Struct, frozen=True, tag="end"):
@@ -152,7 +152,7 @@ class Form:
             if (time := self._when(fields)) is None:
                 clocks = "".join(f", or {name!r}" for name in self._clocks)
                 raise MessageError("time", f"is missing{clocks}; every message of its kind has it")
-            also = tuple(map(fields.get, self._others))
+            also = {name: fields.get(name) for name in self._others}
             return Row(time, self._seen(fields), _frozen(fields.get("proposal", 0)), told=also)
         except MessageError as error:
             error.time = _time(body)

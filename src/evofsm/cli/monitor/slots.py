@@ -42,16 +42,15 @@ class Slots:
 
     def refuse(self, row: Row) -> None:
         """Raise where a row tells of what a condition names what cannot be compared with it."""
-        fields = dict(zip(self.keys, row.told, strict=False))
         for option, condition in self._conditions.items():
             for term in condition.terms:
-                if fault := term.fault(fields.get(term.column)):
+                if fault := term.fault(row.told.get(term.column)):
                     raise MessageError(term.column, f"{fault} ({option})", row.time)
 
     def lacking(self, row: Message) -> str:
         """What a row does not tell of what conditions name, in words."""
-        pairs = zip(self.keys, row.told, strict=False) if isinstance(row, Row) else ()
-        names = ", ".join(name for name, value in pairs if value is None)
+        fields = row.told if isinstance(row, Row) else {}
+        names = ", ".join(name for name, value in fields.items() if value is None)
         options = " or ".join([*self._conditions, *["--episode"] * bool(self.columns.episode)])
         return f"no {names} in the row, which {options} names" * bool(names)
 
@@ -75,9 +74,8 @@ class Slots:
         return condition.holds_of(values)
 
     def _values(self, row: Row) -> dict[str, Any]:
-        values: dict[str, Any] = {self.columns.action: row.proposal}
-        values |= zip(self.names, row.observation or (), strict=False)
-        return values | dict(zip(self.keys, row.told, strict=False))
+        variables = dict(zip(self.names, row.observation or (), strict=False))
+        return {self.columns.action: row.proposal, **variables, **row.told}
 
     def change(self, row: Message | None, before: Message | None) -> str:
         """In words, what tells that a row is of another episode than one before it."""
