@@ -2,8 +2,9 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.driving.test_judge import smallest_gap
 
 from evofsm.driving.measures import (
     FIXED_MEASURES,
@@ -153,19 +154,11 @@ def test_cfs_trusts_braking_that_is_under_way_up_to_the_comfortable():
 # -- Dead ends --------------------------------------------------------------------------------
 
 
-def smallest_gap(gap, speed, leader_speed, decel, leader_decel):
-    """Gap when both brake, on a fine grid of time."""
-    time = np.linspace(0.0, 45.0, 200_001)
-    travelled = [
-        np.where(time < v / b, v * time - b * time**2 / 2, v**2 / (2 * b))
-        for v, b in ((speed, decel), (leader_speed, leader_decel))
-    ]
-    return (gap + travelled[1] - travelled[0]).min()
-
-
+@settings(max_examples=500)
 @given(st.floats(0.1, 100.0), SPEEDS, SPEEDS, DECELS, DECELS)
 def test_the_oracle_agrees_with_driving_it_out(gap, speed, leader_speed, decel, leader_decel):
-    smallest = smallest_gap(gap, speed, leader_speed, decel, leader_decel)
+    brakes = -decel, -decel, decel, 0.0
+    smallest = smallest_gap(gap, speed, leader_speed, *brakes, leader_decel)
     dead_end = is_dead_end(np.array([gap, speed, leader_speed]), decel, leader_decel)
     if abs(smallest) > 1e-4:
         assert dead_end == (smallest < 0.0)
