@@ -85,15 +85,11 @@ def test_a_pendulum_that_is_decided_every_5_ms_is_held_by_looking_ahead_in_longe
 
 
 def test_it_learns_beside_a_variable_that_rests_at_an_end(point):
-    guard, failures = point.guard(shadow=False), []
-    for episode in range(7):  # then it doubts the wall
-        steps = point.walk(episode)
-        z, proposal, failed = next(steps)
-        while proposal is not None:
-            seen = [*z, 0.0, float(z[0] > 0.9)]  # a constant, and a contact
-            z, proposal, failed = steps.send(guard.decide(seen, proposal).executed)
-        guard.end(failed=failed, observation=[*z, 0.0, float(z[0] > 0.9)])
-        failures.append(failed)
+    def seen(k, z):
+        return [*z, 0.0, float(z[0] > 0.9)]  # a constant, and a contact
+
+    guard = point.guard(shadow=False)
+    failures = [point.play(guard, k, seen=seen)[1] for k in range(7)]  # then it doubts the wall
     assert np.abs(guard.judge.parts.model.weights).max() > 0.0
     assert sum(failures) <= 2
     assert not any(failures[-4:])
