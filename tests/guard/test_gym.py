@@ -24,7 +24,6 @@ import evofsm.guard  # noqa: E402
 from evofsm.driving import CarFollowing, guard_for_cars  # noqa: E402
 from evofsm.fsm import Labels  # noqa: E402
 from evofsm.guard import (  # noqa: E402
-    ActionJudge,
     AuditLog,
     Fallback,
     Guard,
@@ -34,6 +33,7 @@ from evofsm.guard import (  # noqa: E402
     Search,
     run_episode,
 )
+from evofsm.guard.api import LearningJudge  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:nobody says which episodes failed")
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -73,7 +73,7 @@ class Script(gymnasium.Env):
         return self.seen[self.row], 1.5, last and self.terminates, False, info
 
 
-class Spy(ActionJudge):
+class Spy(LearningJudge):
     """A judge of any system: some actions are dangerous, and what it is told it remembers."""
 
     labels, fallback, dt = Labels(), Fallback(0.0, "nothing"), 0.1
@@ -93,9 +93,6 @@ class Spy(ActionJudge):
         action = np.atleast_1d(np.float32(action))  # as an environment takes it
         self.rows.append((tuple(observation), tuple(action)))
 
-    def follow(self, observation, action):
-        pass
-
     def start_episode(self):
         self.rows = []
 
@@ -103,13 +100,6 @@ class Spy(ActionJudge):
         last = None if observation is None else tuple(observation)
         self.episodes.append((self.rows, last, failed))
         self.rows = []
-
-    def save(self, path, provenance=None):
-        pass
-
-    @classmethod
-    def load(cls, path):
-        return cls()
 
 
 def guard_for(space, judge=None, **others):

@@ -148,8 +148,6 @@ class Cautious(ObservingJudge):
     def refuse_unfit(self, actions):
         assert (actions.low, actions.high) == (-1.0, 1.0)
 
-    def learn(self, observation, action, *, watched): ...
-
     def observe(self, observation):
         self.seen.append(float(observation[0]))
 
