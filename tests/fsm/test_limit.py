@@ -62,19 +62,3 @@ def test_a_tolerant_belief_is_that_close_to_the_exact_one(rule, tolerance):
     np.testing.assert_allclose(b.belief.sum(axis=1), 1.0)
     if isinstance(rule, Novelty):  # most states take no part
         assert (b.belief > 0).sum(axis=1).mean() < 0.6 * exact.n_states
-
-
-@pytest.mark.parametrize("rule", [Novelty(radius=0.5), Paper()])
-@pytest.mark.parametrize("most", [1, 3])
-def test_at_the_limit_a_batch_and_a_loop_are_the_same(rule, most, snapshot):
-    rng = np.random.default_rng(1)
-    Z, I = np.cumsum(rng.normal(size=(300, 2)), axis=0), rng.integers(0, 3, 300)
-    batch = EvolvingFSM(3, rule=rule, max_states=most, belief_tolerance=1e-6)
-    loop = batch.copy()
-    batch.learn_many(Z, I)
-    for z, i in zip(Z, I, strict=True):
-        loop.learn_one(z, i)
-    assert snapshot(batch) == snapshot(loop)
-    assert batch.n_states <= most
-    for rows in (batch.belief, batch.transition_matrices, batch.marginal_matrix):
-        np.testing.assert_allclose(rows.sum(axis=-1), 1.0, atol=1e-9)
