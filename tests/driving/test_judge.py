@@ -76,7 +76,7 @@ def test_the_critical_deceleration_agrees_with_driving_it_out(
     gap, speed, leader_speed, action, before, decel, lag
 ):
     hardest = critical(gap, speed, leader_speed, action, before=before, decel=decel, lag=lag)
-    stays = speed == 0.0 and max(action, before) <= 0.0
+    stays = speed == 0.0 and action <= 0.0 and (before <= 0.0 or lag == 0.0)
     kept = 0.0 if stays else MARGIN
 
     def left(leader_decel):
@@ -124,6 +124,13 @@ def test_a_sensor_that_shows_a_standing_car_as_rolling_back_changes_nothing(
 
 def situation(gap, speed, leader_speed, belief=(1.0,)):
     return Situation(np.array([gap, speed, leader_speed]), np.array(belief), 0, math.nan, 0.0)
+
+
+def test_who_stands_may_stay_however_long_the_leader_is_not_seen():
+    risk, away = LatentRisk(lowest=-6.0, dt=0.1), (math.nan, 0.0, math.nan)
+    for seen in [(3.0, 0.0, 0.0)] * 3 + [away] * 80:
+        risk.learn(seen, 0.0)
+    assert risk.judge(situation(*away), [0.0, 1.0]).risk.tolist() == [0.0, 1.0]
 
 
 @given(GAPS, SPEEDS, SPEEDS)

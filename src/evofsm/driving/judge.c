@@ -97,7 +97,8 @@ static void be_cautious(const evofsm_state *s, double cautious[3]) {
       variance += weights[i] * weights[j] * s->around[i][j];
     }
   }
-  cautious[0] -= CAUTION * sqrt(greater(variance, 0.0));
+  cautious[0] = greater(s->here[0] - CAUTION * sqrt(greater(variance, 0.0)),
+                        lesser(s->here[0], TOUCHING));
 }
 
 /* -- Rehearsal: survives and critical_decelerations ---------------------------------------------- */
@@ -116,7 +117,7 @@ static int survives(const double here[3], double acceleration, double before, do
   const double caution = -DECEL;
   double speed = greater(here[1], 0.0) - (here[2] < ONCOMING ? here[2] : 0.0);
   double gap = here[0] - clearance, leader = greater(here[2], 0.0);
-  double asked = greater(acceleration, caution), last = greater(before, caution);
+  double asked = greater(acceleration, caution), last = LAG > 0.0 ? greater(before, caution) : asked;
   double left, closing;
   int t;
   if (speed <= 0.0 && greater(asked, last) <= 0.0) {

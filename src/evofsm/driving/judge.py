@@ -335,7 +335,8 @@ class LatentRisk(Retraced, LearningJudge):
         # What is wrong about a speed adds up while both brake.
         decel = self.brakes.decel
         doubt = here.deviation((1.0, -speed / decel, leader_speed / decel))
-        return gap - _CAUTION * doubt, speed, leader_speed
+        # Who stands may stay: nobody is run into by what is not sure alone.
+        return max(gap - _CAUTION * doubt, min(gap, rehearsal._TOUCHING)), speed, leader_speed
 
     def _estimate(self, observation: ArrayLike) -> Estimate:
         triple = _three_finite(observation, whole=False)

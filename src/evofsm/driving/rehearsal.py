@@ -107,7 +107,7 @@ def survives(
     speed, leader_speed = _speeds(observation)
     caution = -body.decel
     demand = max(acceleration, caution)
-    last = max(body.before, caution)
+    last = max(body.before, caution) if body.lag > 0.0 else demand
     if speed <= 0.0 and max(demand, last) <= 0.0:
         return bool(observation[0] > 0.0)  # who stands, and stays, may be closer than the margin
     for _ in range(2):  # until full braking rules alone

@@ -1,6 +1,7 @@
 import itertools
 import json
 
+import numpy as np
 import pytest
 
 from evofsm.cli.monitor.decider import Decider
@@ -270,6 +271,7 @@ def test_in_traffic_the_worst_object_is_named_and_who_is_behind_counts():
     assert (free["alarm"], free["object"], free["role"]) == (False, None, None)
     stuck = seen(0.1, beside, ahead)
     assert (stuck["alarm"], stuck["object"], stuck["role"]) == (True, "lorry", "ahead")
+    assert "object lorry, ahead" in stuck["reason"]
     braking = seen(0.2, close, proposal=-6.0)
     assert (braking["alarm"], braking["object"], braking["role"]) == (True, "7", "behind")
     assert braking["executed"] == -6.0  # in the shadow
@@ -277,5 +279,12 @@ def test_in_traffic_the_worst_object_is_named_and_who_is_behind_counts():
     refused = seen(0.3, flat | {"lane": 1}, ahead)
     assert (refused["kind"], refused["about"]) == ("error", "objects[0].lane")
     assert (decider.warm(), seen(0.4)["alarm"]) == (None, False)  # by a copy
-    roles = [seen(0.5 + 0.1 * k, beside | {"y": y})["role"] for k, y in enumerate((3.5, 3.4, 6.9))]
-    assert roles == [None, "cutting in", None]  # without vy; the last one leaps
+
+    def roles_at(time, *places):
+        cars = (beside | {"id": f"{time}", "y": y} for y in places)
+        return [seen(time + 0.1 * k, car)["role"] for k, car in enumerate(cars)]
+
+    # Without vy. The last one leaps.
+    assert roles_at(0.5, 3.5, 3.4, 3.3, 3.2, 6.9) == [None, None, None, "cutting in", None]
+    noise = 0.05 * np.random.default_rng(0).standard_normal(50)
+    assert {*roles_at(2.0, *(3.5 + noise).tolist())} == {None}

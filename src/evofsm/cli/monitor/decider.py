@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
@@ -43,6 +44,7 @@ _LATE = 1.0  # what is older by less is late, by more from a sender that began a
 HOLE, _OFTEN = 1.5, 0.5  #: a gap in time, and rows that come too often, in intervals
 _AX, _VX, _VY, _Y = map(COLUMNS.index, ("ax", "vx", "vy", "y"))
 _CHANGES = (_AX, _VX, 0.0, RATES[1]), (_VY, _Y, 0.5, 20.0)  # less is noise, more a leap
+_LATELY = 0.5  # over so long places tell a speed across, which noise would from scene to scene [s]
 _NOBODY = "gap and v_leader are null: nobody is taken to be ahead"
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
 
@@ -269,7 +271,7 @@ class Decider:
             body |= {"alarm": False, "mode": self._mode.value}
             return self._of("decision", time=row.time, ahead=None, **body, **note)
         try:
-            revision = self._revision(row, before)
+            revision = self._revision(row)
         except Exception as error:  # whatever a judge of somebody's own raises
             if not self._has_failed:  # once, as it may fail at each row
                 _log.exception("the guard failed at %s s", row.time)
@@ -280,7 +282,9 @@ class Decider:
         parts = {**revision._asdict(), "risk_low": low, "risk_high": high}
         body = {name: plain(parts[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
         self._alarm = self._is_alarm(revision)
-        body |= {"reason": revision.reason, "alarm": self._alarm, "mode": self._mode.value}
+        names = ("", *row.objects)
+        reason = re.sub(r"(?<=\bobject )\d+", lambda k: names[int(k[0])], revision.reason)
+        body |= {"reason": reason, "alarm": self._alarm, "mode": self._mode.value}
         return self._of("decision", time=row.time, **leader, **self._worst(row), **body, **note)
 
     def _free(self, row: Row) -> str:
@@ -340,13 +344,13 @@ class Decider:
         was_said, self._said_fast = self._said_fast, self._said_fast or bool(fast)
         return [f"{fast[0]} is above {_FAST:g} m/s: is that km/h?"] if fast and not was_said else []
 
-    def _revision(self, row: Row, before: Row | None) -> Revision:
+    def _revision(self, row: Row) -> Revision:
         proposal: Any = 0 if self._is_alone else row.proposal
         if isinstance(self.guard.actions, BoxActions) and proposal is not None:
             proposal = np.array(proposal)
         observation: Any = _numbers(row.observation)
         if self.form.scenes:
-            observation = _moving(row, before if isinstance(self.latest, Row) else None)
+            observation = _moving(row, (message for message, _ in reversed(self._recent)))
         return self._without_lost_audit(lambda: self.guard.decide(observation, proposal, row.time))
 
     def _without_lost_audit(self, call: Callable[[], _T]) -> _T:
@@ -398,20 +402,30 @@ def _refuse_stale(row: Row, latest: Row) -> None:
         raise MessageError("time", f"{date(row.time, ' s')} {text}", row.time)
 
 
-def _moving(row: Row, before: Row | None) -> NDArray[np.float64]:
-    """A scene with the rates that were not sent: since the scene before, else 0."""
-    rows = np.array(_numbers(row.observation)).reshape(-1, len(COLUMNS))
-    latest, step = {}, math.nan
-    if before is not None and before.time < row.time:
-        step = row.time - before.time
-        last_rows = np.array(_numbers(before.observation)).reshape(-1, len(COLUMNS))
-        latest = dict(zip(("", *before.objects), last_rows, strict=False))
+def _moving(row: Row, recent: Iterator[Message]) -> NDArray[np.float64]:
+    """A scene with the rates that were not sent: since scenes before, latest first, else 0."""
+    rows = _table(row)
+    scenes: list[tuple[float, dict[str, NDArray[np.float64]]]] = []
+    for scene in recent:
+        if not isinstance(scene, Row) or scene.time >= row.time or scene.observation is None:
+            break
+        objects = zip(("", *scene.objects), _table(scene), strict=False)
+        scenes.append((row.time - scene.time, dict(objects)))
+        if row.time - scene.time >= _LATELY:
+            break
     for name, values in zip(("", *row.objects), rows, strict=False):
         for rate, number, least, most in _CHANGES:
             if math.isnan(values[rate]):
-                change = (values - latest[name])[number] / step if name in latest else 0.0
+                past = [(step, z[name][number]) for step, z in scenes if name in z]
+                step, then = past[0 if rate == _AX else -1] if past else (1.0, math.nan)
+                change = (values[number] - then) / (step if rate == _AX else max(step, _LATELY))
                 values[rate] = change if least <= abs(change) <= most else 0.0
     return rows.ravel()
+
+
+def _table(row: Row) -> NDArray[np.float64]:
+    """Numbers of oneself and of the objects of a scene, a row each."""
+    return np.array(_numbers(row.observation)).reshape(-1, len(COLUMNS))
 
 
 def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None:
