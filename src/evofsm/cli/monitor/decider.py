@@ -416,8 +416,8 @@ def _moving(row: Row, recent: Iterator[Message]) -> NDArray[np.float64]:
     for name, values in zip(("", *row.objects), rows, strict=False):
         for rate, number, least, most in _CHANGES:
             if math.isnan(values[rate]):
-                past = [(step, z[name][number]) for step, z in scenes if name in z]
-                step, then = past[0 if rate == _AX else -1] if past else (1.0, math.nan)
+                track = [(step, z[name][number]) for step, z in scenes if name in z]
+                step, then = track[0 if rate == _AX else -1] if track else (1.0, math.nan)
                 change = (values[number] - then) / (step if rate == _AX else max(step, _LATELY))
                 values[rate] = change if least <= abs(change) <= most else 0.0
     return rows.ravel()
