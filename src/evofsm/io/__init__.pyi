@@ -6,5 +6,6 @@ from .logs import Chunk as Chunk
 from .logs import LogColumns as LogColumns
 from .logs import episodes_of as episodes_of
 from .logs import read_traces as read_traces
+from .logs import rows_of as rows_of
 from .rosbag import Topics as Topics
 from .vehicles import VehicleLengths as VehicleLengths

@@ -537,6 +537,29 @@ def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         yield _joined(parts)
 
 
+class LoggedRow(NamedTuple):
+    """A row of a trace, for whoever decides on each."""
+
+    begins: bool  #: an episode
+    time: float  #: [s]
+    values: dict[str, float]  #: of the variables, by their names
+    action: float  #: taken after it, NaN where none is known
+    failed: bool  #: whether the episode ended with it in failure
+
+
+def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterator[LoggedRow]:
+    """The rows of chunks, one by one; names are ``columns.observe.names``.
+
+    >>> z, u, no = np.array([[9.0, 20.0, 19.0]]), np.array([-1.0]), np.zeros(1, np.bool_)
+    >>> next(rows_of([Chunk("a.csv", z, u, np.zeros(1), ~no, no, dt=0.1)])).values
+    {'gap': 9.0, 'v_follower': 20.0, 'v_leader': 19.0}
+    """
+    for chunk in chunks:
+        columns = (chunk.begins, chunk.times, chunk.observations, chunk.actions, chunk.fails)
+        for first, time, values, *rest in zip(*(a.tolist() for a in columns), strict=True):
+            yield LoggedRow(first, time, dict(zip(names, values, strict=True)), *rest)
+
+
 def _joined(parts: Sequence[Chunk]) -> Chunk:
     """Chunks as one; ``jumps`` are those of the last one."""
     arrays: Any = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _BY_ROW}
