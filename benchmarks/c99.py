@@ -440,9 +440,9 @@ def _learnt(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str
     remembered = remembered._replace(spared=allowed)
     if kind == 0:
         return words.kept(backup, remembered, number["left"])
-    why = words.refused(code["unsurvived"], remembered, judge.margin, judge.parts.scale)
+    why = words.refused(code["unsurvived"], remembered, judge.state.margin, judge.parts.scale)
     if kind == 1:
-        return f"{why}; {words.changed(backup, remembered, judge.margin)}"
+        return f"{why}; {words.changed(backup, remembered, judge.state.margin)}"
     if kind == 3 and code["passes"]:
         return f"{why}; {words.NO_LONGER}"
     return f"{why}; {words.lasting(backup, cut=kind == 2)}"

@@ -229,9 +229,9 @@ def test_a_controller_of_which_much_more_is_kept_is_another_one_until_it_fails()
     assert (other.passing(learning=True), other.passing(learning=False)) == ("shadow", "")
     same = other.after((0, 30, 0), failed=True)
     assert not same.is_on_trial
-    assert len(same.lately) == 4
+    assert len(same.alone()) == 4
     good = other.after((0, 80, 0), failed=False, ended=True)
-    assert len(good.lately) == 1
+    assert len(good.alone()) == 1
     assert good.passing(learning=True)
 
 

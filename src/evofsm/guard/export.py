@@ -244,7 +244,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "PAIRED": m if len(rollout.pairs(m)[0]) else 0,
         "FORMS": len(model.forms),
         "SCALE": parts.scale,
-        "MARGIN": risk.margin,
+        "MARGIN": state.margin,
         "ALLOWED": risk._allowed(reviser.tolerance, memory),
         "ASKED": n_queries,
         "JUDGED": min(parts.n_judged, n_queries),

@@ -100,12 +100,7 @@ class Harm(NamedTuple):
         """Whether another controller seems to have come with the latest episode."""
         return 0 < self.changed == self.n_episodes
 
-    @property
-    def lately(self) -> list[Outcome]:
-        """Of the controller alone, as far as it seems to be this one."""
-        return self._alone(learning=True)
-
-    def _alone(self, *, learning: bool) -> list[Outcome]:
+    def alone(self, *, learning: bool = True) -> list[Outcome]:
         """Of the controller alone: of this one; frozen, in the system as it moves now."""
         since = self.changed if learning else self.moved
         return [o for o in self.outcomes if o.episode > since and not o.guarded]
@@ -131,7 +126,7 @@ class Harm(NamedTuple):
         does one that fails more than half as often per step as the controller alone; down to a
         tenth, the more it refuses: one that refuses all would fly any controller's craft so.
         """
-        guarded, alone = self.guarded, self._alone(learning=learning)
+        guarded, alone = self.guarded, self.alone(learning=learning)
         if _all_failed(guarded, max(_CAREFUL, len(guarded))):
             return False
         if not guarded or not alone:
@@ -152,7 +147,7 @@ class Harm(NamedTuple):
         """
         well = Outcome(0, _FOREVER, failed=False, guarded=False, ended=self.ends)
         ideal = well._replace(ended=self.ends or self._replaces_most)
-        arms = [[*self.guarded, well], [*self.lately, ideal]]
+        arms = [[*self.guarded, well], [*self.alone(), ideal]]
         random = np.random.default_rng([self.n_episodes, draws])
         guarded, alone = (
             random.gamma(
@@ -181,9 +176,9 @@ class Harm(NamedTuple):
             return "shadow"
         if _all_failed(self.guarded):
             turn_is_over = all(outcome.guarded for outcome in self.outcomes[-_TURN:])
-            if turn_is_over or not _all_failed(self.lately, 1):
+            if turn_is_over or not _all_failed(self.alone(), 1):
                 return "shadow"
-            if _all_failed(self.lately) and len(self.guarded) < _TRIES:
+            if _all_failed(self.alone()) and len(self.guarded) < _TRIES:
                 return ""
         fails = any(outcome.failed for outcome in self.outcomes[-1:])
         is_due = fails or (self._replaces_most and self._is_new) or self._long_ago
@@ -193,7 +188,7 @@ class Harm(NamedTuple):
     @property
     def _is_new(self) -> bool:
         """Whether hardly anything is known of the controller alone."""
-        return len(self.lately) < _CAREFUL
+        return len(self.alone()) < _CAREFUL
 
     @property
     def _replaces_most(self) -> bool:
@@ -203,7 +198,7 @@ class Harm(NamedTuple):
     @property
     def _long_ago(self) -> bool:
         """Whether it is long ago that the controller drove alone."""
-        n = self.n_episodes - (self.lately[-1].episode if self.lately else self.changed)
+        n = self.n_episodes - (self.alone()[-1].episode if self.alone() else self.changed)
         return n > 0 and n % _RARELY == 0
 
     @property
@@ -214,7 +209,7 @@ class Harm(NamedTuple):
 
     def told(self, *, learning: bool) -> str:
         """How both arms ended, where it is not beyond doubt that the guard helps; else nothing."""
-        guarded, alone = self.guarded, self._alone(learning=learning)
+        guarded, alone = self.guarded, self.alone(learning=learning)
         if not guarded or not alone:
             return ""
         in_doubt = learning and (1.0 - self.drives(_DRAWS)) ** self._draws > 1.0 - _SAID

@@ -154,6 +154,7 @@ class ActionReviser:
     ) -> None:
         risk.refuse_unfit(actions)
         self.risk = risk
+        self.fallback = risk.fallback  #: what is done without a usable proposal
         self.actions = actions
         self.tolerance = probability("tolerance", tolerance)
         self.mode = Mode(mode)
@@ -176,11 +177,6 @@ class ActionReviser:
         return partial(vars(self).update, now)
 
     @property
-    def fallback(self) -> Fallback:
-        """What is done without a usable proposal."""
-        return self.risk.fallback
-
-    @property
     def acts(self) -> bool:
         """Whether what it decides is executed."""
         return self.mode is Mode.ACT and not self.passing
@@ -188,7 +184,7 @@ class ActionReviser:
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """What to execute instead of the proposal, which is first made usable (`make_usable`)."""
         acts = self.acts
-        action, remark = make_usable(proposal, self.actions, self.risk.fallback)
+        action, remark = make_usable(proposal, self.actions, self.fallback)
         is_far = remark[:8] == "proposal" and np.any(abs(proposal.action - action) > self._far)
         self._clipped = self._clipped + 1 if is_far else 0
         if self._clipped == _CLIPPED:

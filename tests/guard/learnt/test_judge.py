@@ -61,7 +61,7 @@ def test_it_looks_far_ahead_in_steps_of_several_decisions(point):
     guard = point.guard(horizon=30.0, shadow=False)
     assert sum(point.play(guard, k)[1] for k in range(12)) <= 4
     assert sum(point.play(guard, 100 + k)[1] for k in range(5)) <= 1
-    assert guard.judge.horizon >= 300
+    assert guard.judge.state.horizon * guard.judge.state.stride >= 300
     assert "in steps of 4 decisions" in guard.judge.told_by_experience
 
 
@@ -81,7 +81,7 @@ def test_a_pendulum_that_is_decided_every_5_ms_is_held_by_looking_ahead_in_longe
         guard.end(failed=failed[-1], observation=[angle, rate])
     assert sum(failed) <= 12
     assert sum(failed[-8:]) <= 1
-    assert guard.judge.horizon * dt > 0.8
+    assert guard.judge.state.horizon * guard.judge.state.stride * dt > 0.8
 
 
 def test_it_learns_beside_a_variable_that_rests_at_an_end(point):
@@ -389,12 +389,12 @@ def test_weaker_brakes_are_noticed_said_and_followed():
     for _ in range(30):
         drive(0.02)
     assert "otherwise" not in guard.judge.told_by_experience
-    margin = guard.judge.margin
+    margin = guard.judge.state.margin
     for _ in range(8):
         drive(0.01)
     since = re.search(r"since episode (\d+) variable 2 moves", guard.judge.told_by_experience)
     assert 30 <= int(since[1]) <= 34
-    assert guard.judge.margin > margin  # it is not known how far the model is to be trusted
+    assert guard.judge.state.margin > margin  # it is not known how far the model is to be trusted
     effect = guard.judge.parts.model.weights[[5], 1]  # of the action on the speed
     assert effect == pytest.approx(0.01, abs=0.003)
 

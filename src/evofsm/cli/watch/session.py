@@ -639,7 +639,7 @@ class Session(AbstractContextManager["Session"]):
             quantile = judge.manoeuvres.exceeded_by
             return {"needed": quantile(self._tolerance), "usual": quantile(0.5), "why": why}
         assert isinstance(judge, LearntRisk)
-        return {"needed": judge.margin, "why": why}
+        return {"needed": judge.state.margin, "why": why}
 
     def _end(self, frame: shown.Frame) -> shown.Frame:
         system, before = self.system, self.known()

@@ -218,16 +218,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         return self.state.settings
 
     @property
-    def margin(self) -> float:
-        """What has to be left of the distance to failure [typical steps]."""
-        return self.state.margin
-
-    @property
-    def horizon(self) -> int:
-        """Decisions that it looks ahead."""
-        return self.state.horizon * self.state.stride
-
-    @property
     def fallback(self) -> Fallback:
         """What is done without a usable proposal, and then revised like any."""
         if self.choices:
@@ -350,7 +340,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
         scale = 1.0 if self.parts is None else self.parts.scale
-        why = words.refused(self._unsurvived, self.remembered, self.margin, scale)
+        why = words.refused(self._unsurvived, self.remembered, self.state.margin, scale)
         return words.alone(why) if self.choices == 1 else why
 
     def _foresee(self, here: Floats, action: Floats, policies: Floats) -> Consequence:
