@@ -311,17 +311,12 @@ def guard_for_traffic(
 
     Parameters
     ----------
-    low, high : float
-        The hardest braking that can be commanded, negative, and the hardest acceleration [m/s²].
+    low, high, interval, tolerance, mode
+        As in `guard_for_cars`.
     decel : float
         Braking that is counted on [m/s²], positive; softer than ``low``, it is begun earlier.
-    interval : float
-        Time between two decisions [s].
     judge : TrafficRisk, optional
         Without one it is given these limits, and leaders who brake by 9 m/s² at most.
-    tolerance : float
-        Highest risk that is accepted, in (0, 1).
-    mode : Mode
     """
     if judge is None:
         judge = TrafficRisk(LatentRisk(-decel, interval, decel=decel, leader_decel=LEADER_DECEL))

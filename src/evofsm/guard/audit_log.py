@@ -275,22 +275,7 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
     -----
     Between the episodes of a log anything may teach machine or judge, during one nothing else may.
     What a guard takes back is taken back here, too. Where a process forks, the log stays with the
-    parent.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> from evofsm.driving import guard_for_cars
-    >>> from evofsm.guard import audit
-    >>> with TemporaryDirectory() as folder:
-    ...     path = Path(folder) / "audit.jsonl"
-    ...     with AuditLog(path) as log:
-    ...         guard = guard_for_cars(low=-2.5, high=2.5, audit=log)
-    ...         revision = guard.decide([9.0, 20.0, 10.0], proposal=1.0)
-    ...         guard.end(observation=[7.0, 19.0, 10.0])
-    ...     found = audit(path, log.head)
-    >>> revision.executed, found.head.number, found.replayed, found.is_good
-    (-2.5, 4, 1, True)
+    parent. The example of `audit` writes a log.
     """
 
     def __init__(self, path: Path, *, sync: Literal["record", "episode"] = "record") -> None:
@@ -629,11 +614,15 @@ def audit(path: Path, kept: Head | None = None, *, failed: _Failed | None = None
     ...     with AuditLog(path) as log:
     ...         guard = guard_for_cars(low=-2.5, high=2.5, audit=log)
     ...         revision = guard.decide([9.0, 20.0, 10.0], proposal=1.0)
+    ...         guard.end(observation=[7.0, 19.0, 10.0])
+    ...     found = audit(path, log.head)
     ...     forged = path.read_text().replace('"executed":-2.5', '"executed":2.5')
     ...     _ = path.write_text(forged)
     ...     audit(path).finding
     Finding(record=3, explanation='record 3 was altered: its hash is not that of what it says', \
 fields=())
+    >>> revision.executed, found.head.number, found.replayed, found.is_good
+    (-2.5, 4, 1, True)
     """
     chain, counts, player = Chain(path, kept), Counter[str](), _Player(failed)
     fault = difference = None

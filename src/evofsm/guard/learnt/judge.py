@@ -74,10 +74,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     ----------
     dt : float
         Time between two decisions [s].
-    low, high : float or (d,) array_like, optional
-        Range of the action, or of each of its components.
-    n_actions : int, optional
-        Number of actions, where an action is an index from 0.
+    low, high, n_actions, model, backup
+        As in `Guard`.
     horizon : float, optional
         How far it looks ahead [s]. Without it, half as far again as it takes to fail where failure
         can no longer be avoided, from 32 to 144 steps. If that is too short a step lasts several
@@ -88,8 +86,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         Of the variables, for what people read; nothing is decided by them.
     settings : LearntSettings, optional
         Its numbers.
-    model, backup : callable, optional
-        As in `Guard`.
 
     Raises
     ------
