@@ -137,17 +137,19 @@ _FULL = 10.0
 LEADERS = REAL_DRIVES._replace(counts=(*REAL_DRIVES.counts, *(0,) * 14, 4))
 
 
-def guard_of_monitor(interval: float, brakes: float, tolerance: float = TOLERANCE) -> Guard:
-    """A guard of car following that is given how hard its car brakes, in shadow mode."""
-    settings: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW}
-    return guard_for_cars(-brakes, HIGHEST, interval, judge=_ahead(interval, brakes), **settings)
+def guard_of_monitor(
+    interval: float, brakes: float, tolerance: float = TOLERANCE, *, traffic: bool = False
+) -> Guard:
+    """A guard of car following that is given how hard its car brakes, in shadow mode.
 
-
-def guard_of_traffic(interval: float, brakes: float, tolerance: float = TOLERANCE) -> Guard:
-    """The same among any number of objects, who is behind included; it learns nothing."""
-    judge = TrafficRisk(_ahead(interval, brakes))
-    settings: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW}
-    return guard_for_traffic(-brakes, HIGHEST, brakes, interval, judge=judge, **settings)
+    In ``traffic`` one of any number of objects, who is behind included, that learns nothing.
+    """
+    lowest, dt = -positive("brakes", brakes), positive("interval", interval)
+    ahead = LatentRisk(lowest, dt, decel=brakes, leader_decel=_FULL, leaders=LEADERS)
+    how: dict[str, Any] = {"tolerance": tolerance, "mode": Mode.SHADOW}
+    if traffic:
+        return guard_for_traffic(lowest, HIGHEST, brakes, dt, judge=TrafficRisk(ahead), **how)
+    return guard_for_cars(lowest, HIGHEST, dt, judge=ahead, **how)
 
 
 def assumptions(brakes: float, tolerance: float) -> str:
@@ -158,8 +160,3 @@ def assumptions(brakes: float, tolerance: float) -> str:
         f"leaders' hard brakes are in full ({_FULL:g} m/s²), the others as in public drives; "
         f"a risk of {tolerance:.3g} is accepted (--tolerance)"
     )
-
-
-def _ahead(interval: float, brakes: float) -> LatentRisk:
-    braking, step = positive("brakes", brakes), positive("interval", interval)
-    return LatentRisk(-braking, step, decel=braking, leader_decel=_FULL, leaders=LEADERS)

@@ -8,7 +8,7 @@ from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.slots import Slots
 from evofsm.cli.monitor.summary import Text
 from evofsm.driving import EnvelopeReviser, guard_for_cars, measures
-from evofsm.driving.cars import guard_of_monitor, guard_of_traffic
+from evofsm.driving.cars import guard_of_monitor
 from evofsm.guard import AuditLog, Guard, Mode, audit
 from evofsm.io import LogColumns
 from monitor_rows import closing_in as rows
@@ -257,7 +257,7 @@ def test_a_reviser_without_risks_alarms_where_it_differs():
 
 
 def test_in_traffic_the_worst_object_is_named_and_who_is_behind_counts():
-    decider = Decider(guard_of_traffic(interval=0.1, brakes=6.0))
+    decider = Decider(guard_of_monitor(0.1, 6.0, traffic=True))
     ego = {"x": 0.0, "y": 0.0, "vx": 14.0, "length": 5.0}
     ahead = {"id": "lorry", "x": 16.0, "y": 0.2, "vx": 9.0, "length": 10.0, "width": 2.5}
     beside = ahead | {"id": "bus", "y": 3.5}

@@ -112,7 +112,7 @@ def monitor(
     from evofsm.cli.monitor.summary import Text
     from evofsm.cli.monitor.transports import Server, Stream, json_line, transport_of
     from evofsm.cli.show import show, warn
-    from evofsm.driving.cars import assumptions, guard_of_monitor, guard_of_traffic
+    from evofsm.driving.cars import assumptions, guard_of_monitor
     from evofsm.driving.naming import VARIABLES
     from evofsm.guard import Foresight, Guard
     from evofsm.io.tables import is_number
@@ -127,8 +127,7 @@ def monitor(
             return Guard.load(guard)
         if new_guard is not None:
             return new_guard
-        maker = guard_of_traffic if traffic else guard_of_monitor
-        return maker(interval or _INTERVAL, brakes, accepted_risk)
+        return guard_of_monitor(interval or _INTERVAL, brakes, accepted_risk, traffic=traffic)
 
     parts = {"low": low, "high": high, "n_actions": n_actions, "observe": observe}
     system, new_guard = {name: part for name, part in parts.items() if part is not None}, None
