@@ -35,7 +35,7 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.sharing import Retraced, step
-from evofsm.fsm.validation import Floats, positive, real_array, refuse_unusable
+from evofsm.fsm.validation import Floats, positive, real_array, refuse_unusable, usable_array
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import ActionSet, BoxActions, nearest_bounds
 from evofsm.guard.api import LearningJudge, Trial
@@ -180,7 +180,7 @@ class LatentRisk(Retraced, LearningJudge):
         self, observation: ArrayLike, acceleration: float, *, learn: bool, watched: bool = False
     ) -> None:
         triple = _three_finite(observation, whole=False)
-        (command,) = _finite("acceleration", [acceleration]).tolist()
+        (command,) = usable_array("acceleration", [acceleration]).tolist()
         self._keep_up(triple, command, learn and is_whole(triple), watched)
 
     @step
@@ -246,7 +246,7 @@ class LatentRisk(Retraced, LearningJudge):
         higher the risk. Where nothing was seen before either, every risk is 1.
         """
         here = self._cautious(situation.observation)
-        actions = _finite("accelerations", accelerations)
+        actions = usable_array("accelerations", accelerations)
         table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
         if not is_whole(here):  # where one is cannot be told: nothing can be survived for sure
             sure = np.ones(len(actions))
@@ -347,7 +347,7 @@ class LatentRisk(Retraced, LearningJudge):
 
         0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where none is.
         """
-        triple, actions = _three_finite(observation), _finite("accelerations", accelerations)
+        triple, actions = _three_finite(observation), usable_array("accelerations", accelerations)
         critical = np.empty(len(actions))
         critical_decelerations(triple, actions, self.body, critical)
         return critical
@@ -490,12 +490,6 @@ def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     if not math.isfinite(gap + speed + leader_speed):  # looked at closely only where it has to be
         refuse_unusable("observation", numbers if whole else numbers[~np.isnan(numbers)])
     return gap, speed, leader_speed
-
-
-def _finite(name: str, values: ArrayLike) -> Floats:
-    array = real_array(name, values, 1)
-    refuse_unusable(name, array)
-    return array
 
 
 @compiled

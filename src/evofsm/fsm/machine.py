@@ -169,7 +169,7 @@ class EvolvingFSM(Retraced):
             vector = valid.real_array("observation", z, ndim=1)
             if (absent := np.isnan(vector)).any():
                 return self._observe_partly(vector, absent, failed)
-        return self._step(self._checked(z), NO_ACTION, failed)
+        return self._step(valid.usable_array("observation", z), NO_ACTION, failed)
 
     @alone
     @step
@@ -194,7 +194,8 @@ class EvolvingFSM(Retraced):
         z, i
             As `observe` and `act` take them.
         """
-        return self._step(self._checked(z), valid.check_action(i, self.n_actions), None)
+        vector = valid.usable_array("observation", z)
+        return self._step(vector, valid.check_action(i, self.n_actions), None)
 
     @alone
     def learn_many(
@@ -538,8 +539,7 @@ class EvolvingFSM(Retraced):
             gaps = np.flatnonzero(absent).tolist()
             raise ValueError(f"variables {gaps} of a machine's first observation are missing")
         self._fit(len(z))
-        vector = np.where(absent, 0.0, z)
-        valid.refuse_unusable("observation", vector)
+        vector = valid.usable_array("observation", np.where(absent, 0.0, z))
         action = int(now["action"])
         forecast = self.predict(action) if now["chained"] and action >= 0 else np.empty(0)
         if absent.all():
@@ -557,12 +557,6 @@ class EvolvingFSM(Retraced):
             learnt.now["failures_told"] = 1
         self._learnt = learnt
         return Step(int(belief.argmax()), belief, Event.NONE, forecast, surprise)
-
-    def _checked(self, z: ArrayLike) -> Floats:
-        """An observation as a vector of its own."""
-        vector = valid.real_array("observation", z, ndim=1)
-        valid.refuse_unusable("observation", vector)
-        return vector
 
     def _fit(self, m: int) -> None:
         """Make room for observations of ``m`` variables; raise where the first had others."""

@@ -138,6 +138,12 @@ def refuse_unusable(name: str, values: Floats) -> None:
     raise ValueError(f"{name}, {where}: {values[place]} cannot be used; {need}")
 
 
+def usable_array(name: str, values: ArrayLike) -> Floats:
+    """Real numbers in a new array with one axis, none of them infinite, NaN or too large."""
+    refuse_unusable(name, array := real_array(name, values, 1))
+    return array
+
+
 def refuse_unless_distribution(name: str, rows: Floats) -> None:
     """Raise unless every row, along the last axis, has no entry below 0 and sums to 1."""
     if not ((rows >= 0.0).all() and (np.abs(rows.sum(axis=-1) - 1.0) < 1e-6).all()):

@@ -25,7 +25,7 @@ from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.rules import reach
 from evofsm.fsm.sharing import Rollback, alone, share, transaction
-from evofsm.fsm.validation import function, number, positive, real_array, refuse_unusable
+from evofsm.fsm.validation import function, number, positive, real_array, usable_array
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -745,8 +745,7 @@ class Guard:
             return
         failed, terminated = truth("failed", failed), truth("terminated", terminated)
         if score is not None:
-            refuse_unusable("score", real_array("score", [score], 1))
-            score = float(score)
+            score = float(usable_array("score", [score])[0])
         z = None if observation is None else self._checked(observation)
         if not self._under_way:
             self._begin()
