@@ -78,7 +78,6 @@ def pieces(request, monkeypatch):
 def test_a_log_becomes_observations_actions_times_and_episodes(tmp_path):
     path = write(tmp_path / "a.csv", [*log(3, "v1-v2"), *log(4, "v2-v3")])
     (chunk,) = read(path)
-    assert chunk.source == path
     assert chunk.observations.shape == (7, 3)
     assert chunk.observations[1].tolist() == [1.5, 10.0, 11.0]
     assert (chunk.actions == -0.25).all()

@@ -75,7 +75,6 @@ _TRUTHS = {"true": 1, "yes": 1, "1": 1, "1.0": 1, "false": 0, "no": 0, "0": 0, "
 class Chunk(NamedTuple):
     """T consecutive rows of a trace, m variables each."""
 
-    source: str  #: file they come from
     observations: Floats  #: (T, m)
     actions: Floats  #: (T,) action taken after each, NaN where none is known
     times: Floats  #: (T,) [s]
@@ -521,7 +520,7 @@ def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
     Examples
     --------
     >>> t = np.arange(5.0)
-    >>> chunk = Chunk("a", t[:, None], 0.0 * t, t, begins=t % 3.0 == 0.0, fails=t < 0.0, dt=1.0)
+    >>> chunk = Chunk(t[:, None], 0.0 * t, t, begins=t % 3.0 == 0.0, fails=t < 0.0, dt=1.0)
     >>> [episode.times.tolist() for episode in episodes_of([chunk.rows(0, 1), chunk.rows(1, 5)])]
     [[0.0, 1.0, 2.0], [3.0, 4.0]]
     """
@@ -551,7 +550,7 @@ def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterat
     """The rows of chunks, one by one; names are ``columns.observe.names``.
 
     >>> z, u, no = np.array([[9.0, 20.0, 19.0]]), np.array([-1.0]), np.zeros(1, np.bool_)
-    >>> next(rows_of([Chunk("a.csv", z, u, np.zeros(1), ~no, no, dt=0.1)])).values
+    >>> next(rows_of([Chunk(z, u, np.zeros(1), ~no, no, dt=0.1)])).values
     {'gap': 9.0, 'v_follower': 20.0, 'v_leader': 19.0}
     """
     for chunk in chunks:
@@ -564,7 +563,7 @@ def _joined(parts: Sequence[Chunk]) -> Chunk:
     """Chunks as one; ``jumps`` are those of the last one."""
     arrays: Any = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _BY_ROW}
     names = [name for part in parts for name in part.names]
-    return parts[-1]._replace(source=parts[0].source, names=names, **arrays)
+    return parts[-1]._replace(names=names, **arrays)
 
 
 def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) -> Iterator[Chunk]:
@@ -638,12 +637,12 @@ def open_table(path: str, columns: LogColumns, skips: Skips) -> Table:
         from evofsm.io.rosbag import BagTable
 
         return BagTable(path, columns.topics, skips)
-    steps, scenes = None, None
     if kind in ("osi", "mcap"):
         read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap
-        scenes = read(path, skips)
+        moments = vehicles.pairs_of_scenes(path, read(path, skips), skips)
     elif kind == "xml":
         steps = vehicles.fcd_of_xml(path, skips)
+        moments = vehicles.pairs_of_fcd(path, steps, columns.lengths, skips)
     else:
         log_names = {*columns.observe.names, columns.action, columns.time}
         names = log_names.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
@@ -653,14 +652,12 @@ def open_table(path: str, columns: LogColumns, skips: Skips) -> Table:
         )
         if {*columns.observe.names} <= {*table.columns}:
             return table
-        steps = vehicles.fcd_of_table(table)
-        if steps is None and not {*vehicles.OBJECT_COLUMNS} <= {*table.columns}:
+        if rows := vehicles.fcd_of_table(table):
+            moments = vehicles.pairs_of_fcd(path, rows, columns.lengths, skips)
+        elif {*vehicles.OBJECT_COLUMNS} <= {*table.columns}:
+            moments = vehicles.pairs_of_scenes(path, vehicles.scenes_of_table(table), skips)
+        else:
             return table
-        scenes = vehicles.scenes_of_table(table)
-    if steps is not None:
-        moments = vehicles.pairs_of_fcd(path, steps, columns.lengths, skips)
-    else:
-        moments = vehicles.pairs_of_scenes(path, scenes or (), skips)
     return PairTable(path, moments, skips)
 
 
@@ -833,7 +830,6 @@ class _Reader:
             episodes = np.searchsorted(piece.starts or (), first_rows, "right") - 1
             rows = slice(None) if is_kept.all() else is_kept  # a slice copies nothing
             last_chunk = Chunk(
-                source=self._table.path,
                 observations=observations[rows],
                 actions=piece.numbers[action][rows],
                 times=times[rows],
