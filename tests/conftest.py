@@ -113,13 +113,12 @@ def in_a_child():
 @pytest.fixture(scope="session")
 def compiled():
     """All that a watched run needs is compiled, for tests that wait for some seconds only."""
-    from evofsm.cli.watch.session import OnRoads, Session, learn_first, watched_guard
+    from evofsm.cli.watch.session import OnRoads, Session, learn_first
     from evofsm.driving import KinematicWorld, load_family
 
-    family = load_family("paper")
-    guard, roads = watched_guard(family), OnRoads(family, KinematicWorld())
-    learn_first(guard, roads, 2)
-    with Session(roads, guard) as session:
+    roads = OnRoads(load_family("paper"), KinematicWorld())
+    learn_first(roads, 2)
+    with Session(roads) as session:
         while not session.step().over:
             session.graph()
 

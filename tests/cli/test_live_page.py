@@ -24,7 +24,6 @@ from evofsm.cli.watch.session import (
     Session,
     learn_first,
     read_simulated,
-    watched_guard,
     watched_log,
 )
 from evofsm.driving import KinematicWorld, load_family
@@ -57,9 +56,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("compiled")]
 
 @contextmanager
 def cars():
-    guard, roads = watched_guard(PAPER), OnRoads(PAPER, KinematicWorld())
-    learn_first(guard, roads, 6)
-    with Session(roads, guard) as opened:
+    roads = OnRoads(PAPER, KinematicWorld())
+    learn_first(roads, 6)
+    with Session(roads) as opened:
         yield opened
 
 
@@ -67,8 +66,8 @@ def environment(what):
     @contextmanager
     def session():
         system = read_simulated(what)
-        learn_first(system.guard, system, 12)
-        with Session(system, system.guard) as opened:
+        learn_first(system, 12)
+        with Session(system) as opened:
             yield opened
 
     return session

@@ -15,7 +15,7 @@ pytest.importorskip("websockets")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from evofsm.cli.watch.session import OnRoads, Session, watched_guard
+from evofsm.cli.watch.session import OnRoads, Session
 from evofsm.driving import KinematicWorld, load_family
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -32,7 +32,7 @@ def page(shown):
 
 @contextmanager
 def session():
-    with Session(OnRoads(PAPER, KinematicWorld()), watched_guard(PAPER)) as opened:
+    with Session(OnRoads(PAPER, KinematicWorld())) as opened:
         yield opened
 
 

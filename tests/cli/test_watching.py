@@ -13,7 +13,6 @@ from evofsm.cli.watch.session import (
     Session,
     learn_first,
     read_simulated,
-    watched_guard,
     watched_log,
 )
 from evofsm.cli.watch.words import introduce, tell
@@ -27,13 +26,15 @@ EMERGENCY = load_family("emergency")
 
 @cache
 def taught(family=PAPER, episodes=6, judge="kinematic"):
-    guard = watched_guard(family, judge=judge)
-    learn_first(guard, OnRoads(family, KinematicWorld()), episodes)
-    return guard
+    roads = OnRoads(family, KinematicWorld(), judge=judge)
+    learn_first(roads, episodes)
+    return roads.guard
 
 
 def opened(family=PAPER, guard=None, **settings):
-    return Session(OnRoads(family, KinematicWorld()), guard or taught().copy(), **settings)
+    roads = OnRoads(family, KinematicWorld())
+    roads.guard = guard or taught().copy()
+    return Session(roads, **settings)
 
 
 def drive(session):
@@ -77,9 +78,9 @@ def test_the_same_run_is_shown_the_same_and_restarting_begins_anew():
 @pytest.mark.slow
 def test_any_environment_is_watched_by_a_guard_that_is_given_nothing_but_which_episodes_failed():
     system = read_simulated("CartPole-v1")
-    learn_first(system.guard, system, 12)
+    learn_first(system, 12)
     assert 6 < system.guard.n_episodes <= 12
-    with Session(system, system.guard, on=False) as session:
+    with Session(system, on=False) as session:
         *_, alone = drive(session)
         assert alone.failed
         assert alone.time == pytest.approx(alone.story.alone)
@@ -100,7 +101,7 @@ def test_any_environment_is_watched_by_a_guard_that_is_given_nothing_but_which_e
 @pytest.mark.parametrize("on", [True, False])
 def test_the_first_failure_of_a_kind_is_called_so_and_no_other_one(on):
     system, said = read_simulated("CartPole-v1"), []
-    with Session(system, system.guard, on=on) as session:
+    with Session(system, on=on) as session:
         for case in (0, 0, 2):  # the pole falls to the left, again, and to the right
             session.restart(case)
             last = drive(session)[-1]
@@ -124,7 +125,7 @@ def test_a_file_holds_an_environment_of_ones_own(tmp_path):
         "variables = ('cos', 'sin', 'speed')\n"
     )
     system = read_simulated(str(path))
-    with Session(system, system.guard) as session:
+    with Session(system) as session:
         assert (session.start.system, session.start.names) == ("own", ("cos", "sin", "speed"))
         for frame in drive(session)[:-1]:
             assert 0.0 <= frame.proposed[0] <= 2.0

@@ -67,15 +67,10 @@ _ENV_NAMES = {
 }
 
 
-def watched_guard(family: driving.Family, **settings: Any) -> Guard:
-    """A guard for cars that has seen nothing, with few enough states to look at."""
-    return driving.guard_for_family(family, rule=WATCHED_RULE, **settings)
-
-
 def learn_first(
-    guard: Guard, system: System, episodes: int, show: Callable[[int], None] = lambda done: None
+    system: System, episodes: int, show: Callable[[int], None] = lambda done: None
 ) -> None:
-    """Drive a system for a while, in draws that are not watched, to learn.
+    """Drive a system for a while, in draws that are not watched, so that its guard learns.
 
     In the first half an environment's controller drives alone: it fails more often. Then the guard
     acts, until it prevented all of some in a row.
@@ -84,8 +79,9 @@ def learn_first(
     for index in range(episodes):
         acts = 2 * index >= episodes
         if isinstance(system, Simulated):
-            guard.reviser.mode = Mode.ACT if acts else Mode.SHADOW  # type: ignore[attr-defined]
-        system.teach(guard, index)
+            mode = Mode.ACT if acts else Mode.SHADOW
+            system.guard.reviser.mode = mode  # type: ignore[attr-defined]
+        system.teach(index)
         show(index + 1)
         streak = streak + 1 if acts and isinstance(system, Simulated) and not system.failed else 0
         if streak == _LASTED:
@@ -96,20 +92,26 @@ def learn_first(
 
 
 class OnRoads:
-    """A family of scenarios for cars in some world; what is learnt first is in closed form."""
+    """A family of scenarios for cars in some world; what is learnt first is in closed form.
+
+    Its guard has seen nothing, and few enough states to look at.
+    """
 
     of_cars = True
 
-    def __init__(self, family: driving.Family, world: World, seed: int = 0) -> None:
+    def __init__(
+        self, family: driving.Family, world: World, seed: int = 0, **settings: Any
+    ) -> None:
         self.family, self.world, self.seed = family, world, seed
+        self.guard = driving.guard_for_family(family, rule=WATCHED_RULE, **settings)
         self.name, self.about, self.interval = family.name, family.about, family.interval
         self.labels = family.labels
         self.cases = family.variants if family.cases > 1 else _DRAWS
         self._closing = ExitStack()
 
-    def teach(self, guard: Guard, index: int) -> None:
-        """Let a guard learn from a draw that nobody watches."""
-        driving.teach(guard, [self.family.draw(self.seed + 1, index)])
+    def teach(self, index: int) -> None:
+        """Let the guard learn from a draw that nobody watches."""
+        driving.teach(self.guard, [self.family.draw(self.seed + 1, index)])
 
     def begin(self, case: int) -> None:
         """Put the cars on the road."""
@@ -234,9 +236,9 @@ class Simulated:
             observations.append(self.observation)
         return observations
 
-    def teach(self, guard: Guard, index: int) -> None:
-        """Let a guard learn from an episode that nobody watches, by looking on."""
-        env = self._gym.RevisedActions(self._env, guard, failed=self._failed or "terminated")
+    def teach(self, index: int) -> None:
+        """Let the guard learn from an episode that nobody watches, by looking on."""
+        env = self._gym.RevisedActions(self._env, self.guard, failed=self._failed or "terminated")
         self._run(env, _APART + index)
         env.reset()  # which ends what did not end by itself
 
@@ -337,11 +339,12 @@ class Logged:
     alone, terminated = math.nan, True
 
     def __init__(
-        self, path: str, played: Sequence[Played], labels: Labels, *, acts: bool, of_cars: bool
+        self, path: str, played: Sequence[Played], guard: Guard, *, acts: bool, of_cars: bool
     ) -> None:
-        self.name, self.interval = Path(path).name, float(played[0].rows.dt)
+        self.name, self.interval, self.guard = Path(path).name, float(played[0].rows.dt), guard
         self.about = "row by row."
-        self.labels, self.of_cars = labels._replace(dt=self.interval), of_cars
+        units, self.of_cars = UNITS if of_cars else (), of_cars
+        self.labels = Labels(names=guard.variables, units=units, dt=self.interval)
         shows = [(len(p.rows.times) >= _SHOWS, p.alarms, bool(p.fails)) for p in played]
         self.first = shows.index(max(shows))  #: that is worth a look
         self._played = played
@@ -413,7 +416,6 @@ def watched_log(
     if not stretches:
         why = f"nobody follows anybody for {_SHOWS}" if of_cars else "no episode has two"
         raise ValueError(f"{path}: {why} rows")
-    labels = Labels(names=VARIABLES, units=UNITS) if of_cars else Labels(names=tuple(names))
     rows = [stretch.rows for stretch in stretches]
     refuse_other_limit(columns.acts, None, tolerance)
     if guard is None:
@@ -433,8 +435,8 @@ def watched_log(
     guard.learn = False
     if isinstance(guard.judge, Foresight):
         stretches = list(_alarmed(guard.judge, guard.judge.alarm, stretches))
-    system = Logged(path, stretches, labels, acts=columns.acts, of_cars=of_cars)
-    return Session(system, guard, case=system.first if case is None else case - 1, on=False)
+    system = Logged(path, stretches, guard, acts=columns.acts, of_cars=of_cars)
+    return Session(system, case=system.first if case is None else case - 1, on=False)
 
 
 def watched_simulation(path: str, columns: LogColumns, *choices: Any, brakes: float) -> Session:
@@ -500,10 +502,8 @@ System = OnRoads | Simulated
 class Session(AbstractContextManager["Session"]):
     """One run of a system after another, each driven decision by decision."""
 
-    def __init__(
-        self, system: System | Logged, guard: Guard, *, case: int = 0, on: bool = True
-    ) -> None:
-        self.system, self.case = system, case
+    def __init__(self, system: System | Logged, *, case: int = 0, on: bool = True) -> None:
+        self.system, self.case, guard = system, case, system.guard
         self.machine, self.judge = driving.learners_of(guard)
         self._guard, self._reviser = guard, guard.reviser
         self._tolerance = float(self._reviser.tolerance)  # type: ignore[attr-defined]
@@ -655,13 +655,10 @@ def watched_run(
 ) -> Session:
     """Cars in a world of their own, or an environment, after so many episodes to learn from."""
     system: System | None = read_simulated(what, seed=seed, tolerance=tolerance)
-    if isinstance(system, Simulated):
-        guard = system.guard
-    else:
+    if system is None:
         require_world(world)
-        family = driving.load_family(what)
-        system = OnRoads(family, open_world(world), seed)
-        guard = watched_guard(family, judge=judge, tolerance=tolerance)
+        family, roads = driving.load_family(what), open_world(world)
+        system = OnRoads(family, roads, seed, judge=judge, tolerance=tolerance)
     with progress("Learning first", learnt) as move:
-        learn_first(guard, system, learnt, move)
-    return Session(system, guard, case=case - 1)
+        learn_first(system, learnt, move)
+    return Session(system, case=case - 1)
