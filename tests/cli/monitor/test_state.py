@@ -41,44 +41,37 @@ def opened(tmp_path):
         abandoned(state)
 
 
+def slotted():
+    """Settings under which rows wait for their slot; each decider has its own."""
+    columns = LogColumns(resample=Resample(0.3), failed="gap<=0", where="gap<300")
+    return {"episode": 30, "slots": Slots(columns)}
+
+
 @pytest.mark.parametrize(
-    ("learn", "mode"),
+    ("learn", "mode", "settings"),
     [
-        (True, Mode.SHADOW),
-        pytest.param(False, Mode.SHADOW, marks=pytest.mark.slow),
-        pytest.param(True, Mode.ACT, marks=pytest.mark.slow),
+        (True, Mode.SHADOW, dict),
+        (True, Mode.SHADOW, slotted),
+        pytest.param(False, Mode.SHADOW, dict, marks=pytest.mark.slow),
+        pytest.param(True, Mode.ACT, dict, marks=pytest.mark.slow),
     ],
 )
-def test_it_goes_on_bit_for_bit_wherever_it_is_killed(opened, learn, mode):
-    plain = Decider(made(learn, mode), episode=700)
-    decider, state = opened(learn=learn, fresh=lambda: made(learn, mode))
+def test_it_goes_on_bit_for_bit_wherever_it_is_killed(opened, learn, mode, settings):
+    plain = Decider(made(learn, mode), **{"episode": 700, **settings()})
+    told = {"learn": learn, "fresh": lambda: made(learn, mode)}
+    (decider, state), kinds = opened(**told, **settings()), set()
     for k, row in enumerate(traffic(1600)):
-        if k in (3, 4, 690, 701, 1399, 1400, 1402):
+        if k in (3, 4, 601, 690, 701, 1399, 1400, 1402, 1403):
             abandoned(state)
-            decider, state = opened(learn=learn)
+            decider, state = opened(**told, **settings())
         if k % 50 == 0:
             assert decider.answer(JUNK[k // 50 % len(JUNK)])["kind"] == "error"
-        assert decider.answer(line(row)) == plain.answer(line(row)), k
-
-
-def test_rows_that_wait_for_their_slot_go_on_waiting(opened):
-    def settings():  # each its own slots
-        columns = LogColumns(resample=Resample(0.3), failed="gap<=0", where="gap<300")
-        return {"episode": 30, "slots": Slots(columns)}
-
-    plain = Decider(made(learn=True), **settings())
-    decider, state = opened(**settings())
-    kinds = set()
-    for k, row in enumerate(traffic(1600)):
-        if k in (3, 4, 601, 690, 1401, 1402, 1403):
-            abandoned(state)
-            decider, state = opened(**settings())
         answer = decider.answer(line(row))
         assert answer == plain.answer(line(row)), k
         kinds.add(answer["kind"])
-        if k % 100 == 50:
+        if settings is slotted and k % 100 == 50:
             assert decider.lapse() == plain.lapse() is not None
-    assert kinds >= {"waiting", "decision", "error"}
+    assert kinds >= ({"waiting", "decision", "error"} if settings is slotted else {"decision"})
 
 
 def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path, opened):
