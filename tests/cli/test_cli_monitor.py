@@ -284,47 +284,34 @@ def test_a_reader_that_vanishes_ends_it_in_a_line():
 
 @posix
 @pytest.mark.slow
-def test_the_client_in_cpp_gets_its_alarm_by_udp(tmp_path):
-    if (compiler := shutil.which("g++")) is None:
-        pytest.skip("there is no C++ compiler")
-    source, client = tmp_path / "client.cpp", tmp_path / "client"
-    code = (EXAMPLES / "client.cpp").read_text("utf-8")
-    with started("--warm", "--udp", 0) as process:
-        said = iter(process.stderr.readline, b"")
-        port = next(one for one in said if b"listens" in one).decode().split()[-1]
-        source.write_text(code.replace("4444", port))
-        build = [compiler, "-Wall", "-Wextra", "-Werror", "-o", client, source]
-        subprocess.run(build, check=True)
-        done = subprocess.run([client], capture_output=True, timeout=PATIENCE)
-        process.terminate()
-        ended(process)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["alarm"]
-    assert subprocess.run([client], capture_output=True).returncode == 2  # it is gone
-
-
-@posix
-@pytest.mark.slow
-def test_the_client_in_c_gets_its_alarm(tmp_path):
-    compiler = os.environ.get("CC") or shutil.which("cc")
-    if compiler is None:
-        pytest.skip("there is no C compiler")
-    flags = ("-std=c99", "-D_POSIX_C_SOURCE=200809L", "-Wall", "-Wextra", "-Werror")
-    client, path = tmp_path / "client", tmp_path / "monitor.sock"
-    build = [*shlex.split(compiler), *flags, "-o", client, EXAMPLES / "client.c"]
-    subprocess.run(build, check=True)
-    with started("--warm", "--socket", path) as process:
-        while b"listens" not in process.stderr.readline():
-            assert process.poll() is None
-        done = subprocess.run([client, path], capture_output=True, text=True, timeout=PATIENCE)
+@pytest.mark.parametrize(
+    ("name", "compiler", "flags"),
+    [
+        ("client.c", os.environ.get("CC", "cc"), ("-std=c99", "-D_POSIX_C_SOURCE=200809L")),
+        ("client.cpp", "g++", ()),
+    ],
+)
+def test_a_client_in_c_gets_its_alarm_by_a_socket_and_one_in_cpp_by_udp(
+    tmp_path, name, compiler, flags
+):
+    if shutil.which(shlex.split(compiler)[0]) is None:
+        pytest.skip("there is no such compiler")
+    source, path = tmp_path / name, tmp_path / "monitor.sock"
+    client = [tmp_path / "client", *[path] * (name == "client.c")]
+    with started("--warm", *(("--socket", path) if path in client else ("--udp", 0))) as process:
+        listens = next(one for one in iter(process.stderr.readline, b"") if b"listens" in one)
+        code = (EXAMPLES / name).read_text("utf-8")
+        source.write_text(code.replace("4444", listens.decode().split()[-1]))
+        build = [*shlex.split(compiler), *flags, "-Wall", "-Wextra", "-Werror"]
+        subprocess.run([*build, "-o", client[0], source], check=True)
+        done = subprocess.run(client, capture_output=True, text=True, timeout=PATIENCE)
         process.terminate()
         status, _, said = ended(process)
     assert (status, said, path.exists()) == (0, "", False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("alarm at ")
-    assert json.loads(done.stdout.partition(": ")[2])["alarm"]
-    nowhere = subprocess.run([client, "nowhere"], capture_output=True, text=True)
-    assert nowhere.returncode == 2
+    assert done.stdout.startswith("alarm at " if path in client else "{")
+    assert json.loads(done.stdout[done.stdout.index("{") :])["alarm"]
+    assert subprocess.run(client, capture_output=True).returncode == 2  # it is gone
 
 
 # -- Where nobody acts ----------------------------------------------------------------------------
