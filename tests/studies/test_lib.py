@@ -1,14 +1,11 @@
 """What all studies share: commands, work over processes, intervals, scores."""
 
 import json
-import os
 import pickle
-import subprocess
-import sys
-import textwrap
 import time
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
@@ -94,27 +91,12 @@ def test_every_study_asks_a_question_has_a_short_form_and_stands_in_the_evidence
 
 
 @pytest.mark.slow
-def test_the_study_of_the_readme_runs(tmp_path):
+def test_the_study_of_the_readme_runs(tmp_path, monkeypatch):
     text = (ROOT / "studies" / "README.md").read_text("utf-8")
-    code = text.split("```python\n")[1].split("```")[0]
-    (tmp_path / "coin.py").write_text(code, encoding="utf-8")
-    run = """
-        import sys, typer
-        from coin import Coin
-        from studies import lib
-        app = typer.Typer()
-        app.command()(lib.command(Coin))
-        sys.argv = ["coin", "--short", "--out", "out", "--workers", "2"]
-        app()
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(run)],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(["", str(ROOT), *sys.path])},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    (tmp_path / "coin.py").write_text(text.split("```python\n")[1].split("```")[0], "utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    coin = import_module("coin").Coin
+    done = invoke("--short", "--out", tmp_path / "out", "--workers", 2, kind=coin)
     assert "Is the coin fair?" in done.stdout
     assert {path.suffix for path in (tmp_path / "out").iterdir()} >= {".html", ".parquet"}
 
