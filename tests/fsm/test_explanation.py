@@ -9,12 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.explanation import Tally
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.naming import Labels
 from evofsm.fsm.rules import Novelty, register_rule
 
 COUNTS = ("episodes", "failed_soon", "tried", "failed_after")
@@ -81,25 +78,18 @@ def test_where_states_were_joined_there_is_no_interval():
 
 
 @pytest.fixture
-def crash():
-    """Ten episodes from a far place to a close one; after throttle there eight of nine fail."""
-    actions = IntervalActions(-2.0, 2.0, 2.0, outside="clip")
-    machine = EvolvingFSM(2, rule=Novelty(radius=5.0), failure_horizon=2)
-    far, close = [60.0, 20.0, 20.0], [5.0, 20.0, 20.0]
-    for episode in range(12):
-        machine.start_episode()
-        machine.learn_one(far, 1)
-        machine.learn_one(close, 0 if episode < 3 else 1)
-        machine.observe(close, failed=episode > 3)
-    return machine, Labels(actions, VARIABLES, UNITS, 0.5)
+def machine():
+    """It learnt of two places, a far one and a close one."""
+    machine = EvolvingFSM(2, rule=Novelty(radius=5.0))
+    machine.learn_many([[60.0, 20.0, 20.0], [5.0, 20.0, 20.0]] * 3, [1, 0] * 3, [0, 2], [5])
+    return machine
 
 
-def test_what_is_new_is_said_to_be(crash):
-    machine, labels = crash
+def test_what_is_new_is_said_to_be(machine):
     machine.start_episode()
     assert machine.explain().text == "Nothing was observed yet in this episode."
     machine.observe([200.0, 5.0, 5.0])
-    found = machine.explain(labels=labels)
+    found = machine.explain()
     assert "Never seen but in one observation." in found.text
     assert found.here == Tally(0, 0)
     machine.observe([200.0, 5.0, 5.0])
@@ -118,9 +108,9 @@ def test_what_is_new_is_said_to_be(crash):
         (0, 2, ValueError, "action is 2"),
     ],
 )
-def test_what_cannot_be_explained_is_refused(crash, situation, action, error, says):
+def test_what_cannot_be_explained_is_refused(machine, situation, action, error, says):
     with pytest.raises(error, match=says):
-        crash[0].model().explain(situation, action)
+        machine.model().explain(situation, action)
 
 
 # -- Failures that nobody told of ------------------------------------------------------------------
