@@ -81,15 +81,16 @@ def test_what_is_impossible_is_refused_by_name(what, change, word):
         replace(ours.get(what) or getattr(SETTINGS.scenario, what), **change)
 
 
-@pytest.mark.parametrize("dt", [0.0125, 0.0005])
-def test_a_step_that_sumos_clock_cannot_count_is_refused(dt):
-    with pytest.raises(ValueError, match="whole milliseconds"):
-        SumoWorld().run(replace(SETTINGS.scenario, dt=dt), SETTINGS.drivers[1])
-
-
-def test_a_road_that_may_be_too_short_is_refused():
-    with pytest.raises(ValueError, match="beyond the road"):
-        SumoWorld().run(replace(SETTINGS.scenario, duration=5000.0), SETTINGS.drivers[1])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        *(({"dt": dt}, "whole milliseconds") for dt in (0.0125, 0.0005)),
+        ({"duration": 5000.0}, "beyond the road"),
+    ],
+)
+def test_what_sumos_clock_or_road_cannot_hold_is_refused(change, words):
+    with pytest.raises(ValueError, match=words):
+        SumoWorld().run(replace(SETTINGS.scenario, **change), SETTINGS.drivers[1])
 
 
 def test_after_a_run_that_was_closed_from_outside_another_one_starts():

@@ -502,18 +502,13 @@ def test_environments_that_take_turns_may_share_a_guard(monkeypatch):
     monkeypatch.setattr(Recorder, "ended", [])
     guard = guard_for(Discrete(2))
     envs = [RevisedActions(Recorder(cart(steps=15)), guard) for _ in range(3)]
-
-    def step(env):
-        *_, terminated, truncated, _ = env.step(env.action_space.sample())
-        if terminated or truncated:
-            env.reset()
-
     for k, env in enumerate(envs):
         env.reset(seed=k)
         env.action_space.seed(k)
-    for _ in range(60):
-        for env in envs:
-            step(env)
+    for env in envs * 60:
+        *_, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            env.reset()
     assert guard.judge.episodes == Recorder.ended
     assert len(Recorder.ended) > 9
 
