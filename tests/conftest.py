@@ -1,11 +1,9 @@
 import faulthandler
 import hashlib
 import json
-import os
 import re
 import shutil
 import signal
-import warnings
 from contextlib import contextmanager
 from html import unescape
 from html.parser import HTMLParser
@@ -21,18 +19,6 @@ from evofsm.fsm.machine import EvolvingFSM
 # The same examples in every run, so that a red build is red again on the next machine.
 hypothesis.settings.register_profile("evofsm", deadline=None, derandomize=True, database=None)
 hypothesis.settings.load_profile("evofsm")
-
-
-@pytest.fixture(scope="session")
-def spiral():
-    """Observations that close in on their mean, so that every second one founds a state."""
-
-    def make(rows):
-        t = np.arange(rows)
-        radius = 8.0 * (1.0 - t / rows) * (-1.0) ** t
-        return np.column_stack([radius, 0.5 * radius])
-
-    return make
 
 
 @pytest.fixture(scope="session")
@@ -86,28 +72,6 @@ def full_at():
             signal.signal(signal.SIGXFSZ, handler)
 
     return full
-
-
-@pytest.fixture(scope="session")
-def in_a_child():
-    """Does it in a process that inherits everything: whether it raised nothing."""
-    if not hasattr(os, "fork"):
-        pytest.skip("nothing can fork here")
-
-    def run(do):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # threads are what is asked for
-            child = os.fork()
-        if child == 0:
-            code = 1
-            try:
-                do()
-                code = 0
-            finally:
-                os._exit(code)
-        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-
-    return run
 
 
 @pytest.fixture(scope="session")
@@ -172,11 +136,11 @@ def forge():
 
 
 @pytest.fixture
-def grown(spiral):
+def grown():
     """A machine in mid-episode, with an action pending and every array in use."""
-    machine = EvolvingFSM(n_actions=3, radius=0.01)
-    Z = spiral(40)
-    machine.learn_many(Z, np.arange(40) % 3, [0, 25])
+    machine, row = EvolvingFSM(n_actions=3, radius=0.01), np.arange(40)
+    radius = 8.0 * (1.0 - row / 40) * (-1.0) ** row  # so that every second one founds a state
+    machine.learn_many(np.column_stack([radius, 0.5 * radius]), row % 3, [0, 25])
     assert machine.n_states > 8
     return machine
 
