@@ -88,15 +88,3 @@ def point(request):
 def points():
     """All of them, by name."""
     return POINTS
-
-
-@pytest.fixture(scope="session")
-def exactly():
-    """All that revisions say, to compare them bit for bit."""
-
-    def bits(value):
-        if isinstance(value, tuple):
-            return tuple(bits(each) for each in value)
-        return value if isinstance(value, str) else np.asarray(value).tobytes()
-
-    return lambda said: [bits(one) for one in said]

@@ -201,20 +201,21 @@ def test_too_many_variables_are_refused_before_anything_is_allocated(point, snap
 
 
 @pytest.mark.parametrize("how", ["a file", lambda one: one.copy(), copy.deepcopy, pickle.dumps])
-def test_a_copy_goes_on_the_same_by_itself_until_it_is_frozen(
-    point, exactly, snapshot, reloaded, how
-):
+def test_a_copy_goes_on_the_same_by_itself_until_it_is_frozen(point, snapshot, reloaded, how):
+    def said(guard, *episodes):
+        return [pickle.dumps(point.play(guard, episode)[0]) for episode in episodes]
+
     guard = point.taught(3)
     before = snapshot(guard)
     twin = reloaded(guard) if how == "a file" else how(guard)
     twin = pickle.loads(twin) if isinstance(twin, bytes) else twin
     assert snapshot(twin) == before
-    ahead = [exactly(point.play(twin, 60 + k)[0]) for k in range(2)]
+    ahead = said(twin, 60, 61)
     assert snapshot(guard) == before
-    assert [exactly(point.play(guard, 60 + k)[0]) for k in range(2)] == ahead
+    assert said(guard, 60, 61) == ahead
     assert snapshot(guard) == snapshot(twin)
     guard.freeze()
-    first, _, again = (exactly(point.play(guard, k)[0]) for k in (50, 51, 50))
+    first, _, again = said(guard, 50, 51, 50)
     assert first == again
     assert snapshot(guard.judge) == snapshot(twin.judge)
 
