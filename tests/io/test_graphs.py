@@ -18,16 +18,14 @@ def model():
     rng = np.random.default_rng(3)
     machine = EvolvingFSM(n_actions=3, radius=0.05)
     actions = rng.integers(0, 3, 400)
-    place, rows, failures, starts = 0.0, [], [], [0]
+    place, rows, failures = 0.0, [], []
     for row, action in enumerate(actions):
         place = float(np.clip(place + 0.6 * (action - 0.8) + 0.1 * rng.normal(), 0.0, 6.0))
         rows.append([place, 2.0 * place])
         if place > 5.0:
             failures.append(row)
-            starts.append(row + 1)
             place = 0.0
-    starts = [start for start in starts if start < len(rows)]
-    machine.learn_many(rows, actions, starts, failures=failures)
+    machine.learn_many(rows, actions, failures=failures)
     assert machine.n_states >= 4
     assert len(failures) >= 4
     named = IntervalActions(-1.5, 1.5, 1.0)
