@@ -18,24 +18,16 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 
 
-def blocks(title):
-    """The code of a recipe: file name, or none, and text."""
-    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
-    chapter = text.split(f"\n## {title}\n")[1].split("\n## ")[0]
-    found = re.findall(r"^ *```python\n(.*?)^ *```", chapter, re.DOTALL | re.MULTILINE)
-    for code in map(textwrap.dedent, found):
-        named = re.match(r"# (\w+\.py)\n", code)
-        yield (named[1] if named else None), code
-
-
 def write(title, folder):
     """Put the files of a recipe into a folder; returns the code that has no file."""
-    loose = []
-    for name, code in blocks(title):
-        if name is None:
-            loose.append(code)
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    chapter, loose = text.split(f"\n## {title}\n")[1].split("\n## ")[0], []
+    found = re.findall(r"^ *```python\n(.*?)^ *```", chapter, re.DOTALL | re.MULTILINE)
+    for code in map(textwrap.dedent, found):
+        if named := re.match(r"# (\w+\.py)\n", code):
+            (folder / named[1]).write_text(code, encoding="utf-8")
         else:
-            (folder / name).write_text(code, encoding="utf-8")
+            loose.append(code)
     return "\n".join(loose)
 
 
@@ -63,8 +55,8 @@ def test_a_judge(tmp_path):
     assert "0 failed" in python(tmp_path, "-m", "evofsm", "check", "my_judge:Kettle")
 
 
-def test_a_column():
-    [(_, line)] = blocks("Add a column to decisions.parquet")
+def test_a_column(tmp_path):
+    line = write("Add a column to decisions.parquet", tmp_path)
     [(name, column)] = eval(f"{{{line}}}", {"Column": Column}).items()
     assert name not in DECISION_COLUMNS
     decision = SimpleNamespace(situation=SimpleNamespace(observation=(20.0, 15.0, 12.0)))
