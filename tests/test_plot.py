@@ -1,6 +1,7 @@
 """The plots show what models, guards and logs hold, on any axes, and set no style."""
 
 import importlib
+from itertools import product
 from pathlib import Path
 
 import matplotlib
@@ -36,11 +37,14 @@ def model():
     return machine.model(names=["gap", "speed"], units=["m", "m/s"], actions=actions)
 
 
-def test_they_answer_with_the_axes_they_were_given_and_leave_the_style(model):
-    before = dict(matplotlib.rcParams)
-    for draw in OF_A_MODEL:
+def test_few_states_and_many_are_drawn_on_the_axes_that_are_given_and_leave_the_style(model):
+    before, machine = dict(matplotlib.rcParams), EvolvingFSM(n_actions=1, rule=Novelty(radius=0.5))
+    Z = np.column_stack([np.arange(30), np.arange(30) ** 2])
+    machine.learn_many(Z, np.zeros(30, np.int64))
+    for draw, drawn in product(OF_A_MODEL, (model, machine.model())):
         ax = new()
-        assert draw(model, ax) is ax
+        assert draw(drawn, ax, dead_ends=[0]) is ax
+        FigureCanvasAgg(ax.figure).draw()
     assert dict(matplotlib.rcParams) == before
 
 
@@ -117,14 +121,6 @@ def test_what_a_model_does_not_have_is_named(model):
         plot.states(machine.model(), new())
     with pytest.raises(ValueError, match="variable is 2; there are variables 0 to 1"):
         plot.states(model, new(), variables=(0, 2))
-
-
-def test_many_states_can_be_drawn():
-    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=0.5))
-    Z = np.column_stack([np.arange(30), np.arange(30) ** 2])
-    machine.learn_many(Z, np.zeros(30, np.int64))
-    for draw in OF_A_MODEL:
-        FigureCanvasAgg(draw(machine.model(), new(), dead_ends=[0]).figure).draw()
 
 
 @pytest.fixture(scope="module")
