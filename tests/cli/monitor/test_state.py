@@ -110,8 +110,8 @@ def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path,
         abandoned(state)
 
 
-@pytest.mark.parametrize("moment", ["before the guard is saved", "after it"])
-def test_killed_as_the_guard_is_saved_it_goes_on(opened, moment, monkeypatch):
+@pytest.mark.parametrize("is_saved", [False, True])
+def test_killed_as_the_guard_is_saved_it_goes_on(opened, is_saved, monkeypatch):
     rows = [line(row) for row in traffic(702)]
     plain = Decider(made(learn=True), episode=700)
     expected = [plain.answer(row) for row in rows]
@@ -120,8 +120,8 @@ def test_killed_as_the_guard_is_saved_it_goes_on(opened, moment, monkeypatch):
     def killed(*_):
         raise SystemExit
 
-    whose = decider.guard if moment == "before the guard is saved" else state._journal
-    monkeypatch.setattr(whose, "save" if whose is decider.guard else "begin_anew", killed)
+    last = (state._journal, "begin_anew") if is_saved else (decider.guard, "save")
+    monkeypatch.setattr(*last, killed)
     with pytest.raises(SystemExit):
         any(decider.answer(row) is None for row in rows)
     abandoned(state)
