@@ -17,14 +17,8 @@ import numpy as np
 from pathlib import Path
 from evofsm import EvolvingFSM, FSMModel, Novelty
 
-folder = Path(sys.argv[1])
-
-
-def machine(**settings):
-    return EvolvingFSM(1, rule=Novelty(radius=1.0), **settings)
-
-
-one = machine()
+folder, rule = Path(sys.argv[1]), Novelty(radius=1.0)
+one = EvolvingFSM(1, rule=rule)
 one.learn_many([[0.0], [3.0], [3.1], [3.0], [0.0], [0.1]], [0] * 6, episode_starts=[0, 3])
 assert one.begun.tolist() == [1.0, 1.0], one.begun  # it counts
 assert one.model().begun.tolist() == [1.0, 1.0]
@@ -33,7 +27,7 @@ one.model().save(folder / "model")
 assert EvolvingFSM.load(folder / "machine").begun.tolist() == [1.0, 1.0]
 assert FSMModel.load(folder / "model").begun.tolist() == [1.0, 1.0]
 
-full = machine(max_states=2)
+full = EvolvingFSM(1, rule=rule, max_states=2)
 full.learn_many([[0.0], [1.5], [9.0]], [0] * 3, episode_starts=[0, 1])
 assert full.begun.tolist() == [2.0, 0.0], full.begun  # two were joined, and an index is free
 """
