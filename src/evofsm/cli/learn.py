@@ -112,6 +112,8 @@ def learn(
             new_guard = learning.guard_of_log(kind, model, machine, brakes, tolerance)
             with progress("Teaching the guard", lesson.rows) as move:
                 share = learning.teach(new_guard, read_traces(files, columns), move)
+            if new_guard.machine is not None:
+                new_guard.machine.tell_of_failures(told=model.failures_told)
             if refusal := learning.refusing(share):
                 warn(f"warning: in the later half of the log the guard {refusal}")
         else:

@@ -263,12 +263,13 @@ class EvolvingFSM(Retraced):
 
     @alone
     @step
-    def tell_of_failures(self) -> None:
+    def tell_of_failures(self, *, told: bool = True) -> None:
         """Say that failures are told: an episode that ends without one is known to have had none.
 
-        So does ``failed=False``. Without it `explain` does not take silence for safety.
+        So does ``failed=False``. Without it, or if not ``told``, `explain` does not take silence
+        for safety.
         """
-        self._learnt.now["failures_told"] = 1
+        self._learnt.now["failures_told"] = told
 
     # -- Asking ---------------------------------------------------------------------------------
 
