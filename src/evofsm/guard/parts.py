@@ -50,10 +50,9 @@ def outline(guard: _Guard) -> dict[str, Any]:
     reviser, judge = guard.reviser, None if guard.judge is None else part_name(guard.judge)
     description: dict[str, Any] | None = None
     if type(reviser) is ActionReviser:
-        # Whom it asks, if that is who learns.
-        is_known = judge is not None and reviser.risk is guard.judge
-        description = {"judge": {"class": judge} if is_known else None}
-        description |= {"class": "ActionReviser", "settings": settings_of(reviser)}
+        asks = judge is not None and reviser.risk is guard.judge  # a known one that learns
+        settings = settings_of(reviser)
+        description = {"class": "ActionReviser", "asks_judge": asks, "settings": settings}
     elif name := part_name(reviser):
         made_of = reviser.described()
         description = None if made_of is None else {"class": name, **made_of}
@@ -65,7 +64,7 @@ def can_be_made_again(guard: _Guard) -> bool:
     parts = outline(guard)
     knows_judge = guard.judge is None or parts["judge"] is not None
     reviser: Any = parts["reviser"]
-    return knows_judge and reviser is not None and reviser.get("judge", {}) is not None
+    return knows_judge and reviser is not None and reviser.get("asks_judge", True)
 
 
 def rebuild(
@@ -92,9 +91,8 @@ def rebuild(
     parts = {"machine": machine, "judge": risk}
     if reviser["class"] != "ActionReviser":
         return parts | {"reviser": part_class(reviser["class"]).restored(reviser, actions)}
-    description = reviser["judge"]
-    if description is not None and part_class(description["class"]) is not type(risk):
-        raise ValueError(f"what its {description['class']} has learnt is missing")
+    if reviser["asks_judge"] and risk is None:
+        raise ValueError(f"what its {told['judge']} has learnt is missing")
     if action_judge is None:
         raise ValueError("no installed package declares its judge; give the judge as it is")
     again = ActionReviser(action_judge, actions)
