@@ -159,6 +159,7 @@ def test_what_is_wrong_with_a_scene_is_named():
     assert refused(FORM, b'{"time": 0, "objects": [], "proposal": 0}')[0] == "ego"
     assert refused(FORM, b'{"time": 0, "ego": {}, "objects": {}, "proposal": 0}')[0] == "ego.x"
     assert refused(FORM, scene(TRUCK, vx=-20.0))[0] == "ego.vx"
+    assert refused(FORM, scene(TRUCK).replace(b": 2.0", b": 2e12", 1))[0] == "time"  # in ms
     assert refused(FORM, scene(3)) == ("objects[0]", "is 3; it must be object")
     assert refused(Form(Guard(low=-1.0, high=1.0, interval=0.1)), scene(TRUCK))[0] == "objects"
 

@@ -112,8 +112,6 @@ class Decider:
                     raise MessageError("time", text, message.time)
                 if self.slots.step and (message.ahead or not message.observation):
                     raise MessageError("objects", "are not resampled; send rows of the variables")
-                if not message.time < message.time + self.guard.interval:
-                    raise MessageError("time", "is too large to tell rows apart", message.time)
         except MessageError as error:
             place = self.csv.place if self.csv.in_csv or error.about == "line" else ""
             return self.error(error.about, f"{place}{error}", error.time)

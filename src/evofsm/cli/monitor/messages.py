@@ -147,11 +147,11 @@ class Form:
                 raise _refused(body, str(error)) from None
             if kind is self._end:
                 return self._of_end(fields)
-            if kind is self._scene:
-                return self._of_scene(fields)
             if (time := self._when(fields)) is None:
                 clocks = "".join(f", or {name!r}" for name in self._clocks)
                 raise MessageError("time", f"is missing{clocks}; every message of its kind has it")
+            if kind is self._scene:
+                return self._of_scene(fields, time)
             also = {name: fields.get(name) for name in self._others}
             return Row(time, self._seen(fields), _frozen(fields.get("proposal", 0)), told=also)
         except MessageError as error:
@@ -169,8 +169,8 @@ class Form:
                 fault = f"is {_shown(time)}; it must be float [s], or a date as logs have them"
                 raise MessageError(name, fault) from None
         seconds = time if time is None or name == "time" else time * self._unit
-        if seconds is not None and seconds >= _LATEST:
-            raise MessageError(name, f"is {time:.15g}: milliseconds? It must be in seconds", time)
+        if seconds is not None and abs(seconds) >= _LATEST:
+            raise MessageError(name, f"is {time:.15g}: milliseconds? It must be in seconds")
         return seconds
 
     def _seen(self, told: dict[str, Any]) -> tuple[float | None, ...]:
@@ -185,12 +185,12 @@ class Form:
         observation = None if omissions else self._seen(told)
         return End(told.get("failed", False), observation, self._when(told))
 
-    def _of_scene(self, told: dict[str, Any]) -> Row:
+    def _of_scene(self, told: dict[str, Any], time: float) -> Row:
         if not (self.scenes or self.variables == VARIABLES):
             raise MessageError(
                 "objects", "are for guards of car following; send a row of this guard's variables"
             )
-        ego, time, cars = told["ego"], told["time"], told["objects"]
+        ego, cars = told["ego"], told["objects"]
         _refuse_nowhere(ego, "ego")
         if ego.vx < REVERSE:
             raise MessageError("ego.vx", f"is {ego.vx:g}; x counts along its direction of travel")
