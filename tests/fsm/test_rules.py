@@ -14,14 +14,6 @@ from evofsm.fsm.rules import Novelty, Paper, describe_rule, register_rule
 from evofsm.fsm.step import Event
 from evofsm.guard.check import check_results
 
-RULES = {"paper": Paper(), "novelty": Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7)}
-
-
-@pytest.fixture(params=RULES.values(), ids=RULES.keys())
-def rule(request):
-    return request.param
-
-
 # -- All rules -------------------------------------------------------------------------------------
 
 
