@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from evofsm.fsm.machine import EvolvingFSM
+from one_machine import saved
 
 NAN, INF = float("nan"), float("inf")
 RAGGED = [[1.0, 2.0], [3.0]]
@@ -49,31 +50,26 @@ def machine(request):
     return EvolvingFSM(n_actions=3) if request.param == "new" else request.getfixturevalue("grown")
 
 
-@pytest.fixture
-def refuses(snapshot):
+def refuses(machine, call, error, words):
     """Check that a call fails as it should and that the machine then goes on as if never asked."""
-
-    def check(machine, call, error, words):
-        twin, before = machine.copy(), snapshot(machine)
-        with pytest.raises(error, match=words):
-            call(machine)
-        assert snapshot(machine) == before
-        Z = np.random.default_rng(5).normal(size=(30, 2))
-        traces = [m.learn_many(Z, np.arange(30) % 3, belief=True) for m in (machine, twin)]
-        for a, b in zip(*traces, strict=True):
-            assert a.tobytes() == b.tobytes()
-        assert snapshot(machine) == snapshot(twin)
-
-    return check
+    twin, before = machine.copy(), saved(machine)
+    with pytest.raises(error, match=words):
+        call(machine)
+    assert saved(machine) == before
+    Z = np.random.default_rng(5).normal(size=(30, 2))
+    traces = [m.learn_many(Z, np.arange(30) % 3, belief=True) for m in (machine, twin)]
+    for a, b in zip(*traces, strict=True):
+        assert a.tobytes() == b.tobytes()
+    assert saved(machine) == saved(twin)
 
 
 @pytest.mark.parametrize(("z", "error", "words"), cases(OBSERVATIONS))
-def test_an_observation_that_cannot_be_right(machine, refuses, z, error, words):
+def test_an_observation_that_cannot_be_right(machine, z, error, words):
     refuses(machine, lambda m: m.observe(z), error, words)
     refuses(machine, lambda m: m.learn_one(z, 1), error, words)
 
 
-def test_an_observation_or_a_batch_of_another_length(grown, refuses):
+def test_an_observation_or_a_batch_of_another_length(grown):
     words = "observation has 3 variables.*started with 2"
     for z in ([1.0, 2.0, 3.0], np.ones(3)):
         refuses(grown, lambda m, z=z: m.observe(z), ValueError, words)
@@ -81,24 +77,24 @@ def test_an_observation_or_a_batch_of_another_length(grown, refuses):
 
 
 @pytest.mark.parametrize(("i", "error", "words"), cases(ACTIONS))
-def test_an_action_that_cannot_be_right(machine, refuses, i, error, words):
+def test_an_action_that_cannot_be_right(machine, i, error, words):
     refuses(machine, lambda m: m.act(i), error, words)
     refuses(machine, lambda m: m.learn_one([0.0, 1.0], i), error, words)
     refuses(machine, lambda m: m.predict(i), error, words)
 
 
 @pytest.mark.parametrize(("Z", "I", "starts", "error", "words"), cases(BATCHES))
-def test_a_batch_that_cannot_be_right(machine, refuses, Z, I, starts, error, words):
+def test_a_batch_that_cannot_be_right(machine, Z, I, starts, error, words):
     refuses(machine, lambda m: m.learn_many(Z, I, starts), error, words)
 
 
-def test_failures_of_a_batch_that_cannot_be_right(grown, refuses):
+def test_failures_of_a_batch_that_cannot_be_right(grown):
     for failures, error in (([0, 3], ValueError), ([-1], ValueError), ([True] * 3, TypeError)):
         words = "failures (names row|has dtype bool)"
         refuses(grown, lambda m, rows=failures: m.learn_many(ROWS, [0] * 3, [], rows), error, words)
 
 
-def test_a_failure_before_any_observation(refuses):
+def test_a_failure_before_any_observation():
     refuses(EvolvingFSM(3), EvolvingFSM.fail, ValueError, "fail before observe")
 
 
@@ -141,7 +137,7 @@ def test_a_masked_entry_is_treated_as_nan_is(grown, z):
     assert step.belief.tobytes() == expected.belief.tobytes()
 
 
-def test_a_masked_action_or_row_number_is_refused(machine, refuses):
+def test_a_masked_action_or_row_number_is_refused(machine):
     hidden = np.ma.array([0, 1], mask=[False, True])
     refuses(machine, lambda m: m.learn_many(ROWS[:2], hidden), TypeError, "actions .*masked")
     words = "failures .*masked"

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Event
+from one_machine import saved
 
 
 @st.composite
@@ -17,8 +18,8 @@ def machines(draw, m, n_actions):
         "learning_rate": draw(st.sampled_from([0.01, 0.3, 0.9])),
         "prior_frequency": draw(st.sampled_from([1e-6, 1e-3, 1.0])),
     }
-    told |= draw(st.sampled_from([{}, {"max_states": 1}, {"max_states": 2}]))
-    told["belief_tolerance"] = draw(st.sampled_from([0.0, 1e-6]))
+    limits = [{}, {"max_states": 1}, {"max_states": 2, "belief_tolerance": 1e-6}]
+    told |= draw(st.sampled_from(limits))
     radius = draw(st.sampled_from([0.05, 0.3, 2.0]))
     spread = draw(st.sampled_from([0.05, 1.0, 3.0]))
     if draw(st.booleans()):
@@ -45,27 +46,22 @@ def assert_distribution(rows):
     np.testing.assert_allclose(rows.sum(axis=-1), 1.0, rtol=0, atol=1e-9)
 
 
-@pytest.fixture(scope="session")
-def learn(snapshot):
+def learn(machine, Z, I, starts=(), failures=()):
     """Learn a batch: a loop learns the same bit for bit, and what is learnt is sound."""
-
-    def learn(machine, Z, I, starts=(), failures=()):
-        loop, steps = machine.copy(), []
-        trace = machine.learn_many(Z, I, starts, failures, belief=True)
-        for row, (z, i) in enumerate(zip(Z, I, strict=True)):
-            if row in starts:
-                loop.start_episode()
-            steps.append(loop.observe(z, failed=row in failures))
-            if i >= 0 and row not in failures:
-                loop.act(i)
-        assert snapshot(machine) == snapshot(loop)
-        assert trace.state.tolist() == [step.state for step in steps]
-        assert trace.event.tolist() == [step.event for step in steps]
-        assert trace.surprise.tobytes() == np.array([step.surprise for step in steps]).tobytes()
-        assert_sound(machine, Z, trace)
-        assert machine.endings.sum() == len(failures)
-
-    return learn
+    loop, steps = machine.copy(), []
+    trace = machine.learn_many(Z, I, starts, failures, belief=True)
+    for row, (z, i) in enumerate(zip(Z, I, strict=True)):
+        if row in starts:
+            loop.start_episode()
+        steps.append(loop.observe(z, failed=row in failures))
+        if i >= 0 and row not in failures:
+            loop.act(i)
+    assert saved(machine) == saved(loop)
+    assert trace.state.tolist() == [step.state for step in steps]
+    assert trace.event.tolist() == [step.event for step in steps]
+    assert trace.surprise.tobytes() == np.array([step.surprise for step in steps]).tobytes()
+    assert_sound(machine, Z, trace)
+    assert machine.endings.sum() == len(failures)
 
 
 def assert_sound(machine, Z, trace):
@@ -91,12 +87,12 @@ def assert_sound(machine, Z, trace):
 
 @settings(max_examples=200)
 @given(streams() | streams(numbers=st.floats(-1e100, 1e100)))
-def test_a_batch_and_a_loop_are_the_same_and_what_is_learnt_is_sound(learn, stream):
+def test_a_batch_and_a_loop_are_the_same_and_what_is_learnt_is_sound(stream):
     learn(*stream)
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-160, 1e-150, 1e-9, 1e9, 1e99])
-def test_that_holds_in_every_unit(learn, scale):
+def test_that_holds_in_every_unit(scale):
     Z = np.random.default_rng(3).normal(size=(200, 2)) * scale
     learn(EvolvingFSM(n_actions=2, radius=0.3 * scale), Z, np.arange(200) % 2)
 
@@ -105,6 +101,7 @@ def test_that_holds_in_every_unit(learn, scale):
 @given(streams(), st.sampled_from([1.0, -64.0, 2.0**20, -(2.0**40)]))
 def test_shifting_all_observations_changes_no_belief(stream, offset):
     machine, Z, I, starts, _ = stream
+    assume(machine.max_states is None)  # where states merge, centres are means, which round
     shifted = machine.copy()
     expected = machine.learn_many(Z, I, starts, belief=True)
     trace = shifted.learn_many(Z + offset, I, starts, belief=True)  # exact: a coarse grid
