@@ -902,10 +902,10 @@ def test_agents_that_take_turns_are_told_of_the_parallel_interface(crowd):
     assert [len(rows) for rows, *_ in guard.judge.episodes] == [3]
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:pettingzoo")  # of what it has itself
 def test_pettingzoo_finds_nothing_to_complain_of(crowd):
-    with warnings.catch_warnings():  # its tests import what it has deprecated itself
-        warnings.simplefilter("ignore", DeprecationWarning)
-        from pettingzoo.test import parallel_api_test
+    from pettingzoo.test import parallel_api_test
+
     parallel_api_test(evofsm.guard.RevisedAgents(crowd(9, 30), guard_for(ONE)), num_cycles=60)
 
 

@@ -18,9 +18,10 @@ PAGE = Path(__file__).parents[2] / "docs" / "judges.md"
 class Timid(Rival):
     """Always the lowest action once it has seen a failure; it writes down what it is told."""
 
-    told = "to be careful"
+    told, made = "to be careful", None
 
     def __init__(self, **given):
+        self.made.append(self)
         self.given = given
         self.frozen = self.afraid = False
         self.ended = []
@@ -43,14 +44,9 @@ class Timid(Rival):
 @pytest.fixture
 def made(monkeypatch):
     """The timid one in place of the learnt guard."""
-    every = []
-
-    def learnt_guard(**given):
-        every.append(Timid(**given))
-        return every[-1]
-
-    monkeypatch.setattr(judges, "learnt_guard", learnt_guard)
-    return every
+    monkeypatch.setattr(Timid, "made", [])
+    monkeypatch.setattr(judges, "learnt_guard", Timid)
+    return Timid.made
 
 
 def test_failures_are_counted_while_learning_and_held_out(made):
