@@ -10,6 +10,7 @@ from pathlib import Path
 from zoneinfo import ZoneInfo
 
 import pytest
+from tests.cli.test_watching import drive
 
 from evofsm import Guard
 from evofsm.cli.monitor.decider import Decider
@@ -451,9 +452,7 @@ def test_a_log_of_any_machine_is_watched(evofsm, written):
         assert (second, last[:12]) == ("episode 2, 2025-03-10 06:29", "episode 14, ")
         assert "nobody acts" in introduce(shown.start)["intro"]
         assert shown.graph().states
-        frames = [shown.step()]
-        while not frames[-1].over:
-            frames.append(shown.step())
+        frames = drive(shown)
         for frame in frames[:-1]:  # by the alarm that was chosen, and by no other one
             assert (frame.proposed_risk.risk > shown.start.tolerance) == (frame.reason[:2] != "no")
         before = [tell(frame, shown.start).headline for frame in frames[:-1]]

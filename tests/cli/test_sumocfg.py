@@ -4,6 +4,7 @@ import json
 import re
 
 import pytest
+from tests.cli.test_watching import drive
 
 pytest.importorskip("typer")
 pytest.importorskip("libsumo")
@@ -84,9 +85,7 @@ def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tm
     assert whole == [80.0, False]
     recorded = watched_log(str(log), reading_of(), collisions=collisions)
     assert recorded.start.cases[0] == "ego behind lead, from 0.0 s (collision)"
-    frames = [recorded.step()]
-    while not frames[-1].over:
-        frames.append(recorded.step())
+    frames = drive(recorded)
     met = collisions["ego behind lead"][0]  # whom SUMO takes away is not seen then
     assert frames[-1].time == pytest.approx(met - 0.1 * (afterwards == "teleport"), abs=0.01)
     told = tell(frames[-1], recorded.start)
