@@ -1,8 +1,9 @@
 """Where a system fails, or ends by itself: the fewest forms that hold what failed and nothing else.
 
-A form is a row of a table. It says something of where it is above 0: that it fails there, that an
-episode ends by itself there, or that it fails if it ends there (`FAILS`, `ENDS`, and `CRASHES` of
-the ends just before it). It is linear or quadratic in at most two variables.
+A form is a row of a table. It says something of where it is above 0: that it fails there (`FAILS`),
+that an episode ends by itself there (`ENDS`), that it fails if it ends there (`CRASHES`, of the
+ends just before it), or that what begins there is fatal (`FATAL`). It is linear or quadratic in at
+most two variables.
 
 *Sides* of the box of what was survived are tried first, and what they leave is told by *bent*
 forms: ridge logistic regressions of what failed against what was survived, made so small that what

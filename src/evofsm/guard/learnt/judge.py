@@ -259,7 +259,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         tolerance: float,
         mask: Mask | None = None,
     ) -> Search:
-        """The closest action to ``wanted`` that passes, or else that of the longest-lasting backup.
+        """An action near ``wanted`` that passes, or else that of the longest-lasting backup.
 
         Of `Choices` it is one of ``mask``, and backups do what is in it: more may be allowed later,
         or less, which nobody knows.

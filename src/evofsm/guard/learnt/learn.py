@@ -1,6 +1,9 @@
-"""Algorithm 1: what a judge knows after an episode, of what it knew before.
+"""Algorithm 1 after an episode: what a judge knows, of what it knew before.
 
-`learn` is a pure function: nothing that it is given changes.
+`learn` is a pure function: nothing that it is given changes. (`rollout.search` decides.) An episode
+that failed although it was certified not to widens the margin (`LearntRisk.learn`), leaves a dead
+end (`danger.dead_ends`), and where it failed late lengthens the horizon (`look_ahead`) or, where
+that cannot be longer, the steps (`coarser`).
 """
 
 from __future__ import annotations

@@ -474,7 +474,7 @@ def search(
     lasting: bool = True,
     longer: float = NO_LONGER,
 ) -> tuple[int, Floats, int, float]:
-    """Find the action closest to a proposal after which a backup survives by the margin.
+    """Find an action near the proposal after which a backup survives by the margin.
 
     The proposal itself if one does; else what the first of ``ranks`` does that survives, and from
     there as near to the proposal as halvings come. All disturbances have to be survived but
@@ -497,7 +497,7 @@ def search(
         amid = residuals, scale, margin, allowed, ends
         n_failures, slack, n_steps = _enter.call(model, rows, action[None], policies[backup], *amid)
         total += n_steps
-        return n_failures <= allowed and slack >= margin, slack
+        return n_failures <= allowed, slack
 
     for q in ranks:
         if total >= most:

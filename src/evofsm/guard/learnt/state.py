@@ -122,7 +122,7 @@ class State(NamedTuple):
 
     settings: LearntSettings
     choices: Annotated[int, COUNT]  #: number of actions; 0 where the action is a box
-    n_episodes: Annotated[int, COUNT]
+    n_episodes: Annotated[int, COUNT]  #: or parts of long ones
     n_failed: Annotated[int, COUNT]
     n_scanned: Annotated[int, COUNT]  #: episodes since some failure was understood
     n_seen: Annotated[int, COUNT]  #: observations
