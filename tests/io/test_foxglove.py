@@ -119,6 +119,12 @@ def test_what_is_not_known_is_left_out(tmp_path):
     assert "time_headway" not in found["/risk"][1][1]  # it stands
 
 
+def test_a_variable_may_be_called_as_a_column_of_decisions():
+    fields = {topic: schema["properties"] for topic, schema in schemas_of(["belief"]).items()}
+    kinds = [fields[topic]["belief"]["type"] for topic in ("/observation", "/belief")]
+    assert kinds == ["number", "array"]
+
+
 def test_a_full_disk_is_told(monkeypatch):
     full = SimpleNamespace(
         BufferedWriter=io.BufferedWriter, FileIO=lambda *_: io.FileIO("/dev/full", "w")

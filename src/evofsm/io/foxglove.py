@@ -55,9 +55,10 @@ def columns_by_topic(
     suffixes = [f" [{unit}]" if unit else "" for unit in units] + [""] * len(names)
     columns = DECISION_COLUMNS if of_cars else dict(RECORD)
     columns = {**columns, "belief": Column(list, "probability of each state, from 0", _belief)}
-    for k, name in enumerate(() if of_cars else names):
-        about = f"as observed{suffixes[k]}; left out where missing"
-        columns[name] = observed(about, itemgetter(k))
+    variables = {  # whose names may be those of other columns
+        name: observed(f"as observed{suffixes[k]}; left out where missing", itemgetter(k))
+        for k, name in enumerate(() if of_cars else names)
+    }
     risks = "risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen"
     topics = {
         "/observation": ("time", *names, "intake"),
@@ -65,7 +66,8 @@ def columns_by_topic(
         "/risk": (*risks, *(("time_to_collision", "time_headway") if of_cars else ())),
         "/decision": ("proposed", "executed", "advised", "reason", "explanation"),
     }
-    by_topic = {topic: {name: columns[name] for name in topics[topic]} for topic in topics}
+    of_topic = dict.fromkeys(topics, columns) | {"/observation": {**columns, **variables}}
+    by_topic = {topic: {n: of_topic[topic][n] for n in topics[topic]} for topic in topics}
     by_topic["/risk"] = {n.removeprefix("risk_"): c for n, c in by_topic["/risk"].items()}
     return by_topic
 
