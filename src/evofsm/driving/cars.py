@@ -134,7 +134,7 @@ HIGHEST = 2.5
 _FULL = 10.0
 #: Leaders' brakes where no guard is given. Nobody brakes in an emergency in public drives, which
 #: does not say that nobody does: with the one that a judge assumes anyway one in 20 is in full.
-LEADERS = REAL_DRIVES._replace(counts=(*REAL_DRIVES.counts, *(0,) * 14, 4))
+LEADERS = REAL_DRIVES._replace(counts=(*REAL_DRIVES.counts, *(0,) * 14, 3))
 
 
 def guard_of_monitor(

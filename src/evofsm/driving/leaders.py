@@ -62,11 +62,11 @@ class LeaderBrakes(NamedTuple):
         return tuple(np.repeat(ends, self.counts).tolist())
 
 
-#: Public drives: 46 waves of braking, the hardest 6.1 m/s². Hardly anyone brakes hard in them, and
+#: Public drives: 40 waves of braking, the hardest 6.1 m/s². Hardly anyone brakes hard in them, and
 #: no one in an emergency: how hard leaders brake then, they do not tell.
 REAL_DRIVES = LeaderBrakes(
-    counts=(25, 15, 14, 14, 7, 7, 3, 2, 1, 1, 1, 0, 0, 0, 2),
-    gentle=977,
+    counts=(22, 12, 14, 12, 7, 6, 3, 2, 1, 1, 1, 0, 0, 0, 2),
+    gentle=927,
     hours=16.1,
     source="OpenACC, ZalaZONE campaign (JRC; Makridis et al. 2021), NGSIM (FHWA; events of Zhu et "
     "al. 2020), one platoon of FHWA; 42 runs",
