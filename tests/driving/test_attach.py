@@ -390,6 +390,8 @@ def test_who_comes_towards_one_is_measured_with_a_negative_speed(road):
     ("options", "given", "said"),
     [
         (NO_GAP, {"mode": "brake"}, "no mode 'brake'"),
+        (NO_GAP, {"tolerance": 2.0}, "tolerance is 2"),
+        (NO_GAP, {"regain": -1.0}, "regain is -1"),
         (NO_GAP, {"guard": guard_for_traffic(-9.0, 3.5, 4.5, 0.25)}, "no multiple"),
         ((), {"mode": "watch", "guard": guard_for_traffic(-9.0, 3.5, 4.5, 0.1)}, "asks no guard"),
         (("--mesosim",), {}, "--mesosim"),  # in which there is nobody to see

@@ -255,7 +255,7 @@ class Guarding:
         report: Callable[[GuardedStep], None] | None,
     ) -> None:
         self._sumo, self._vehicle, self._seeing = sumo, sumo.vehicle, seeing
-        self._acts, self._report = acts, report
+        self._acts, self._mode, self._report = acts, Mode.ACT if acts else Mode.SHADOW, report
         self._template, self._tolerance, self._regain = guard, tolerance, regain
         self.cars: dict[str, _Car] = {}  #: by id
         self._watches: dict[str, tuple[BrakeWatch, Manoeuvres]] = {}
@@ -268,6 +268,8 @@ class Guarding:
         #: How hard leaders were seen to brake, by their ``decel`` [m/s²].
         self.leaders: dict[float, Manoeuvres] = {}
         self.begin_anew()
+        if guard is None:
+            self._given(1.0, 1.0, 1.0)  # what it refuses it refuses now
         self.decisions = 0
         #: Steps in which a car braked harder, or accelerated less, than its driver wanted by more
         #: than 0.1 m/s²; in shadow, would have. Who stands, and goes on standing, is not counted.
@@ -449,19 +451,21 @@ class Guarding:
         return self.leaders[decel]
 
     def _guard_for(self, car: str, high: float) -> Guard:
-        mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
-            decel, dt = self._vehicle.getDecel(car), self.interval
-            how: Any = {"decel": decel, "margin": _MARGIN, "regain": self._regain}
-            risk = LatentRisk(-decel, dt, leader_decel=decel, **how)
-            low, judge = -max(self._vehicle.getEmergencyDecel(car), decel), TrafficRisk(risk)
-            limits = low, high, decel, dt
-            return guard_for_traffic(*limits, judge=judge, tolerance=self._tolerance, mode=mode)
+            decel, vehicle = self._vehicle.getDecel(car), self._vehicle
+            return self._given(decel, max(vehicle.getEmergencyDecel(car), decel), high)
         guard = self._template.copy()
         guard.freeze()
         if isinstance(guard.reviser, ActionReviser):
-            guard.reviser.mode = mode
+            guard.reviser.mode = self._mode
         return guard
+
+    def _given(self, decel: float, hardest: float, high: float) -> Guard:
+        """A guard that counts on one braking, of leaders too, and brakes harder if it has to."""
+        how: Any = {"decel": decel, "margin": _MARGIN, "regain": self._regain}
+        judge = TrafficRisk(LatentRisk(-decel, self.interval, leader_decel=decel, **how))
+        limits = -hardest, high, decel, self.interval
+        return guard_for_traffic(*limits, judge=judge, tolerance=self._tolerance, mode=self._mode)
 
 
 def _judge(guard: Guard) -> ActionJudge | None:
