@@ -98,7 +98,7 @@ static void be_cautious(const evofsm_state *s, double cautious[3]) {
     }
   }
   cautious[0] = greater(s->here[0] - CAUTION * sqrt(greater(variance, 0.0)),
-                        lesser(s->here[0], TOUCHING));
+                        lesser(s->here[0], ALMOST));
 }
 
 /* -- Rehearsal: survives and critical_decelerations ---------------------------------------------- */

@@ -54,6 +54,8 @@ SLIGHT = 0.1
 _STANDS = 0.1
 # Where a situation is not sure, it may be worse by so many standard deviations.
 _CAUTION = 2.5
+# Nearly no gap [m]: smaller than any that counts as no collision for who moves.
+_ALMOST = 1e-9
 
 
 # What a file may hold: no car is asked to brake harder [m/s²], decisions are no closer nor farther
@@ -335,8 +337,8 @@ class LatentRisk(Retraced, LearningJudge):
         # What is wrong about a speed adds up while both brake.
         decel = self.brakes.decel
         doubt = here.deviation((1.0, -speed / decel, leader_speed / decel))
-        # Who stands may stay: nobody is run into by what is not sure alone.
-        return max(gap - _CAUTION * doubt, min(gap, rehearsal._TOUCHING)), speed, leader_speed
+        # Not sure is not touching: who stands may stay.
+        return max(gap - _CAUTION * doubt, min(gap, _ALMOST)), speed, leader_speed
 
     def _estimate(self, observation: ArrayLike) -> Estimate:
         triple = _three_finite(observation, whole=False)
@@ -384,6 +386,7 @@ class LatentRisk(Retraced, LearningJudge):
             "WORST": self.manoeuvres.exceeded_by(reviser.tolerance),
             **{"ANOTHER_GAP": leaders._ANOTHER_GAP, "ANOTHER_SPEED": leaders._ANOTHER_SPEED},
             **{"LEADER": perception._LEADER, "UNEVEN": perception._UNEVEN, "CAUTION": _CAUTION},
+            "ALMOST": _ALMOST,
             "DOUBT": perception._OWN if self.brakes.known else perception._OWN_UNKNOWN,
             **{"ANOTHER": perception._ANOTHER_LEADER, "EXACT": not any(self.perception.noise)},
             **{"EVIDENCE": float(len(self.manoeuvres)), "ONCOMING": ONCOMING},
