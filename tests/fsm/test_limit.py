@@ -41,6 +41,11 @@ def test_merged_states_have_the_evidence_of_both():
     assert machine.state_ids.tolist() == [0, 3, 2]
 
 
+def test_who_has_a_state_for_each_observation_is_warned():
+    with pytest.warns(RuntimeWarning, match="Is a scale, or the radius, too small"):
+        learn(sharp(), range(0, 9000, 9))
+
+
 def test_a_newcomer_close_to_a_state_is_left_to_it():
     machine = sharp(max_states=2)
     learn(machine, [0, 9])

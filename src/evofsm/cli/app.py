@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable
 from io import TextIOWrapper
 from typing import Annotated, Any
@@ -96,6 +97,13 @@ def application() -> typer.Typer:
     return app
 
 
+def _say(message: Warning | str, *_: Any, **__: Any) -> None:
+    """Print a warning as a message: of which line of Python it is nobody asks."""
+    from evofsm.cli.show import warn
+
+    warn(f"warning: {message}")
+
+
 def run(make: Callable[[], typer.Typer]) -> None:
     """Run the command line that ``make`` makes."""
     for stream in (sys.stdout, sys.stderr):
@@ -105,4 +113,5 @@ def run(make: Callable[[], typer.Typer]) -> None:
         from evofsm.fsm.kernels import announce_compiling
 
         announce_compiling()
+    warnings.showwarning = _say
     make()()

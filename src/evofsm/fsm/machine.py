@@ -12,6 +12,7 @@ vehicle control system via online recognition of latent risks", arXiv:1908.10823
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Self, SupportsIndex
 
@@ -43,6 +44,12 @@ _OPTIONS = {**_LIMITS, "belief_tolerance": 0.0}
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
 # What of a snapshot a machine answers with, beside what is its own.
 _ASKED = {*arrays.OF_MODEL, "averaged_matrix", "joint_frequency", "marginal_matrix"}
+# So many states, of observations not twice as many, tell nothing.
+_MANY_STATES = 500
+_TOO_FINE = (
+    "{:,} states of {:,} observations: nearly each makes one of its own, which tells nothing and "
+    "is slow. Is a scale, or the radius, too small, or is a variable noise, or a clock?"
+)
 # Compiled code of a step.
 _LEARN_ROWS = Entry(stepping.learn_rows)
 
@@ -574,6 +581,9 @@ class EvolvingFSM(Retraced):
         """Make room for what the next step may need."""
         room = room_for(self._learnt, self._settings)
         if room != (self._capacity, len(self._learnt.matrices)):
+            n, n_observations = self.n_states, int(self._learnt.now["n_observations"][0])
+            if _MANY_STATES <= n < 1.5 * _MANY_STATES and n_observations < 2 * n:  # once
+                warnings.warn(_TOO_FINE.format(n, n_observations), RuntimeWarning, stacklevel=4)
             self._learnt = arrays.resized(self._learnt, *room)
 
 
