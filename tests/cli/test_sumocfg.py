@@ -19,6 +19,7 @@ CARS = """<routes>
     <vType id="calm" sigma="0" speedFactor="0.4" speedDev="0"/>
     <vType id="hasty" tau="0.2" minGap="0.5" accel="3.5" sigma="0" speedDev="0"
            actionStepLength="1.5"/>
+    <vTypeDistribution id="any" vTypes="calm hasty"/>
     <route id="along" edges="road"/>
     <vehicle id="lead" type="calm" route="along" depart="0" departPos="400"/>
     <vehicle id="ego" type="hasty" route="along" depart="0" departPos="0" departSpeed="20"/>
@@ -52,8 +53,9 @@ def test_guards_act_where_they_are_told_to(evofsm, configuration):
     assert found["act"]["speed"] > 0.9 * found["shadow"]["speed"]
     assert found["act"]["alone"]["collisions"] == found["shadow"]["collisions"]
     assert found["shadow"]["revised"] > 0
-    text = evofsm("drive", configuration, "--vehicles", "type:hasty").output
-    assert re.search(r"collisions +[1-9] +0\n", text)
+    some = evofsm("drive", configuration, "--vehicles", "ego,eg")
+    assert re.search(r"collisions +[1-9] +0\n", some.stdout)
+    assert some.stderr.endswith("never came: eg\n")
 
 
 @pytest.mark.parametrize(
@@ -62,7 +64,9 @@ def test_guards_act_where_they_are_told_to(evofsm, configuration):
         (["--mode", "off"], "act or shadow"),
         (["--vehicles", "lots%"], "vehicles is"),
         (["--out", "folder"], "--out is for families"),
-        (["--vehicles", "type:hatsy"], "nothing was guarded; types are calm, hasty"),
+        (["--vehicles", "type:hatsy"], "types are calm, hasty, ids lead, ego"),
+        (["--vehicles", "eg"], "nothing was guarded"),
+        (["--vehicles", "0.1%"], "it takes none of 2 cars in 80 s"),
     ],
 )
 def test_what_does_not_hold_for_a_configuration_is_refused(refused, configuration, options, said):

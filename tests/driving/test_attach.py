@@ -421,7 +421,9 @@ def test_all_some_those_of_a_type_or_a_share_which_is_the_same_in_every_run():
     assert chosen("type:bus") == {"7", "8"}
     assert chosen("type:bu") == set()
     assert chosen(0.1) == chosen("10%")
-    assert 150 < len(chosen(0.1)) < 250
+    for name in ("", "car.", "flow_0."):
+        half = sum(choose(0.5)(TYPES, f"{name}{k}") for k in range(1000))
+        assert half == pytest.approx(500, abs=50)  # three standard deviations
 
 
 @pytest.mark.parametrize("vehicles", ["none", "x%", "120%", 0.0, -0.1, 1.5, float("nan")])

@@ -23,7 +23,7 @@ from typing import Any
 from evofsm import driving, store
 from evofsm.cli.journal import Journal, asked_to_stop
 from evofsm.cli.options import split_names
-from evofsm.cli.show import Advance, plain, print_json, progress, show, table
+from evofsm.cli.show import Advance, plain, print_json, progress, show, table, warn
 from evofsm.driving.cars import TOLD, name_judge
 from evofsm.driving.naming import DECISION_COLUMNS
 from evofsm.driving.sumo import open_world
@@ -330,19 +330,23 @@ def run_configuration(
     def driven(how: str) -> dict[str, Any]:
         with progress("Driving") as move, _running(file) as (sumo, steps):
             cars = driving.attach(sumo, choice, mode=how, tolerance=tolerance)
-            begin = float(sumo.simulation.getTime())
+            begin, kinds = float(sumo.simulation.getTime()), dict[str, str]()
             for seconds in steps:
+                for car in sorted({*sumo.vehicle.getIDList()}.difference(kinds)):
+                    kinds[car] = sumo.vehicle.getTypeID(car).partition("@")[0]
                 if seconds == int(seconds):
                     collisions = f"{len(cars.collisions)} collisions"
                     move(description=f"Driving, {how} ({seconds:,.0f} s, {collisions})")
-            seconds, kinds = sumo.simulation.getTime() - begin, sumo.vehicletype.getIDList()
+            seconds = sumo.simulation.getTime() - begin
             cars.detach()  # else they guard what is simulated next
         if not cars.ever:
-            types = ", ".join(kind for kind in kinds if not kind.startswith("DEFAULT_"))
+            types, ids = (", ".join(names[:9]) for names in (sorted({*kinds.values()}), [*kinds]))
             raise ValueError(
-                f"--vehicles {vehicles}: in {seconds:,.0f} s there was no such car, so nothing was "
-                f"guarded; types are {types or 'those of SUMO alone'}"
+                f"--vehicles {vehicles}: it takes none of {len(kinds):,} cars in {seconds:,.0f} s, "
+                f"so nothing was guarded; a larger share takes more, types are {types}, ids {ids}"
             )
+        if how == mode and by_ids and (absent := sorted({*choice} - cars.ever)):
+            warn(f"--vehicles: never came: {', '.join(absent)}")
         return {"seconds": seconds, **cars.summary()}
 
     alone = driven("watch") if mode == "act" else None

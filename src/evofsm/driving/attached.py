@@ -15,9 +15,9 @@ import math
 import time as clock
 import warnings
 import weakref
-import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from importlib import import_module
 from itertools import chain, count
 from typing import Any, NamedTuple
@@ -492,7 +492,9 @@ def choose(vehicles: str | float | Iterable[str]) -> Callable[[Any, str], bool]:
                 f"vehicles is {vehicles!r}; it is 'all', 'type:NAME', a share above 0 up to 1, "
                 "such as 0.1 or '10%', or a list of ids"
             )
-        return lambda _, car: zlib.crc32(f"0:{car}".encode()) < share * 2.0**32
+        most = share * 2.0**64
+        # No checksum, which has numbered ids in or out together.
+        return lambda _, car: int.from_bytes(blake2b(car.encode(), digest_size=8).digest()) < most
     ids = frozenset(vehicles)
     return lambda _, car: car in ids
 
