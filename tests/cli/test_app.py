@@ -68,6 +68,7 @@ def test_help_loads_nothing_heavy(command):
         (["drive", "paper", "--frozen", "nothing-here"], "nothing-here"),
         (["drive", "paper", "--tolerance", "2"], "tolerance"),
         (["drive", "paper", "--mcap", "a", "--workers", "2"], "workers send no decisions"),
+        (["drive", "paper", "--vehicles", "10%"], "--vehicles: only for a configuration"),
     ],
 )
 def test_a_command_that_is_called_wrongly_says_so_in_one_line(refused, words, says):

@@ -40,8 +40,8 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c(tmp_path, arg
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
-        (["paper", "--case", "5"], "case is 5; paper has 1 to 4"),
-        (["paper", "--unit", "v=km/h"], "options of columns are for a log, and paper is none"),
+        (["paper", "--case", "5", "--learn-first", "1"], "case is 5; paper has 1 to 4"),
+        (["paper", "--brakes", "6", "--unit", "v=km/h"], "--brakes, --unit: only for a log"),
         (["CartPole-v9"], "CartPole-v9: Environment version `v9` for environment `CartPole`"),
         (["missing.mcap"], "missing.mcap: no such file or directory"),
         (["CartPole"], "named with its version: CartPole-v1"),
@@ -51,7 +51,7 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c(tmp_path, arg
             ["rows.csv"],
             "no column 'gap'; it has t, heat (--observe names the right one). Is it no log",
         ),
-        (["paper", "--guard", "learnt"], "--guard and options of columns are for a log"),
+        (["rows.csv", "--learn-first", "9"], "--learn-first: only for what is driven"),
         (["empty.py"], "it defines neither environment() nor a Family called family"),
     ],
 )
@@ -61,4 +61,4 @@ def test_what_cannot_be_watched_is_said_in_a_line(refused, tmp_path, monkeypatch
     (tmp_path / "empty.py").touch()
     (tmp_path / "rows.csv").write_text("t,heat\n0,1\n1,2\n")
     EvolvingFSM(n_actions=2).save("learnt")
-    assert error in refused("watch", *arguments, "--no-browser", "--learn-first", "1")
+    assert error in refused("watch", *arguments, "--no-browser")

@@ -63,8 +63,8 @@ def test_guards_act_where_they_are_told_to(evofsm, configuration):
     [
         (["--mode", "off"], "act or shadow"),
         (["--vehicles", "lots%"], "vehicles is"),
-        (["--out", "folder"], "--out is for families"),
-        (["--vehicles", "type:hatsy"], "types are calm, hasty, ids lead, ego"),
+        (["--seed", "0", "--reviser", "none"], "--reviser, --seed: only for families"),
+        (["--vehicles", "type:hatsy"], "types are calm, hasty, ids ego, lead"),
         (["--vehicles", "eg"], "nothing was guarded"),
         (["--vehicles", "0.1%"], "it takes none of 2 cars in 80 s"),
     ],

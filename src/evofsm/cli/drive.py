@@ -10,6 +10,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Literal
 
+from typer import Context
+
 from evofsm.cli import options
 from evofsm.cli.options import argument, option
 
@@ -44,6 +46,7 @@ def paper(
 
 
 def drive(
+    ctx: Context,
     family: Annotated[
         str, argument("Scenarios (emergency, paper+noise, ...), your own file, or a .sumocfg.")
     ],
@@ -87,15 +90,13 @@ def drive(
     from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
     if family.endswith(".sumocfg"):
-        parts = {"frozen": frozen, "workers": workers, "out": out, "audit": audit, "mcap": mcap}
-        for name, value in parts.items():
-            if value is not None:
-                text = "is for families of scenarios, not for a configuration"
-                raise ValueError(f"--{name} {text}")
+        common = {"family", "vehicles", "mode", "tolerance", "as_json"}
+        options.refuse_typed(ctx, sorted(ctx.params.keys() - common), "families of scenarios")
         from evofsm.cli import driving
 
         driving.run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
+    options.refuse_typed(ctx, ["vehicles"], "a configuration of SUMO")
     if workers is not None and (audit or mcap):
         raise ValueError("--audit and --mcap go with no --workers: workers send no decisions")
     needs_table = out is not None and workers is None

@@ -320,6 +320,13 @@ def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
+def refuse_typed(context: typer.Context, names: Iterable[str], kind: str) -> None:
+    """Raise if options were typed that hold for something of another kind only."""
+    sources = {f"--{name.replace('_', '-')}": context.get_parameter_source(name) for name in names}
+    if excess := [name for name, source in sources.items() if "COMMANDLINE" in str(source)]:
+        raise ValueError(f"{', '.join(excess)}: only for {kind}")
+
+
 def units_given(texts: Iterable[str]) -> dict[str, str]:
     """Units by the column, or the beginning of columns, from what --unit was given."""
     from evofsm.io.tables import UNITS, quoted_name

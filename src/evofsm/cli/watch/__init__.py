@@ -10,12 +10,15 @@ from pathlib import Path
 from shlex import quote
 from typing import Annotated, Any
 
+from typer import Context
+
 from evofsm.cli import options
 from evofsm.cli.options import argument, option
 
 
 @options.reads_logs
 def watch(
+    ctx: Context,
     what: Annotated[
         str,
         argument(
@@ -63,8 +66,8 @@ def watch(
             await asyncio.Event().wait()  # it broke off; the page says why
 
     is_log = _is_log(what)
-    if not is_log and (reading or guard):
-        raise ValueError(f"--guard and options of columns are for a log, and {what} is none")
+    names = ("world", "judge", "seed", "learn_first") if is_log else ("guard", "brakes", *reading)
+    options.refuse_typed(ctx, names, "what is driven" if is_log else f"a log, and {what} is none")
     with suppress(KeyboardInterrupt):
         if is_log:
             risk = None if tolerance == options.TOLERANCE else tolerance
