@@ -156,6 +156,9 @@ def test_the_notebook_prints_what_it_shows(capsys):
                 assert printed.startswith("proposed 1.0, executed ")
             else:
                 assert printed == "".join(shown)
+    n_failures = names["failures"](names["learning"])
+    gallery = (ROOT / "docs" / "gallery.md").read_text("utf-8")
+    assert f"20 other flights, {n_failures} of which failed" in gallery
 
 
 def test_commands_that_are_not_run_would_be_understood():
