@@ -163,17 +163,18 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
         more += "decides"
     if state.is_doubted:
         fails, ends, _ = _where(state.rivals, names)
-        more += "; much was refused without a failure: while it learns it tries whether it "
-        more += f"ends by itself {' or '.join(ends)}, and " if ends else ""
-        more += f"only fails {' or '.join(fails)}"
+        clauses = [f"it only fails {fails}"] * bool(fails)
+        clauses += [f"it ends by itself {' or '.join(ends)}"] * bool(ends)
+        more += "; tried while it learns, as much was refused without a failure: "
+        more += ", and ".join(clauses)
     if len(state.dropped):
         until, *_ = _where(state.dropped, names)
-        more += f"; frozen it refuses, too, {until[0]}, as what took its place is new"
+        more += f"; frozen it refuses, too, {until}, as what took its place is new"
     test = f"{remembered}, to be survived by {changes(state.margin)}"
-    return f"fails {' or '.join(there)}; {test}{more}{dead_ends(state.counts.astype(int).tolist())}"
+    return f"fails {there}; {test}{more}{dead_ends(state.counts.astype(int).tolist())}"
 
 
-def _where(table: Floats, names: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
+def _where(table: Floats, names: Sequence[str]) -> tuple[str, list[str], list[str]]:
     """Where it fails, where it ends by itself, and where nothing survives what begins."""
     places: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: [], FATAL: []}
     sides = []
@@ -183,9 +184,9 @@ def _where(table: Floats, names: Sequence[str]) -> tuple[list[str], list[str], l
             sides.append(text.removeprefix("where ").partition(" (")[0])
         else:
             places[int(row[SAYS])].append(text)
-    there = [f"where {' or '.join(sides)}"] if sides else []
-    there += places[FAILS] + [f"if it ends {place}" for place in places[CRASHES]]
-    return there, places[ENDS], places[FATAL]
+    there = [" or ".join([f"where {' or '.join(sides)}"] * bool(sides) + places[FAILS])]
+    there += [f"if it ends {' or '.join(places[CRASHES])}"] * bool(places[CRASHES])
+    return ", or ".join(filter(None, there)), places[ENDS], places[FATAL]
 
 
 def here(
