@@ -76,7 +76,8 @@ def environment(what):
 @contextmanager
 def logged():
     """A machine that heats up until it trips, now and then."""
-    rows = [(run, k, 20 + k * (run % 2), math.sin(k)) for run in range(8) for k in range(60)]
+    times = [(run, k, f"2026-03-0{run + 1} 06:{k:02}:00") for run in range(8) for k in range(60)]
+    rows = [(run, time, 20 + k * (run % 2), math.sin(k)) for run, k, time in times]
     with TemporaryDirectory() as folder:
         path = Path(folder) / "log.csv"
         lines = ["run,t,a variable of a long name,load", *(",".join(map(str, r)) for r in rows)]
@@ -220,7 +221,7 @@ def test_states_and_help_are_shown_and_the_theme_changes(seen):
 def test_words_never_touch_and_nothing_is_larger_than_the_screen(seen, session):
     page = seen(session=session, speed=math.inf)
     status = page.locator("#status")
-    for width, height in ((1280, 800), (900, 700), (390, 844)):
+    for width, height in ((1280, 800), (900, 700), (360, 800)):
         page.set_viewport_size({"width": width, "height": height})
         page.reload()
         playwright.expect(status).to_have_attribute(
