@@ -237,7 +237,7 @@ class LatentRisk(Retraced, LearningJudge):
         """What was learnt so far, in words."""
         brakes = f"{self.brakes.decel:.1f} m/s²" if self.brakes.known else "not known yet"
         return (
-            f"{len(self.manoeuvres)} manoeuvres of leaders, 1 % brake harder than "
+            f"{len(self.manoeuvres)} manoeuvres of leaders, given or seen, 1 % brake harder than "
             f"{self.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {brakes}"
         )
 
