@@ -29,6 +29,15 @@ def test_without_the_extra_one_line_says_what_to_install(missing):
     )
 
 
+def test_control_c_while_it_is_loaded_is_one_line():
+    result = python(
+        "import builtins, evofsm.__main__ as program\n"
+        "def stop(*_): raise KeyboardInterrupt\n"
+        "builtins.__import__ = stop\nprogram.main()"
+    )
+    assert (result.returncode, result.stderr) == (130, "evofsm: stopped before the end\n")
+
+
 def test_all_that_a_command_lacks_is_named_at_once(evofsm, monkeypatch):
     monkeypatch.setattr(options, "find_spec", lambda name: None)
     told = evofsm("drive", "paper", "--world", "sumo").stderr
