@@ -12,7 +12,7 @@ sys.path[:0] = [str(DOCS.parent / "src"), str(DOCS)]
 from evofsm import __version__  # noqa: E402
 
 project = "evofsm"
-author = "The evofsm developers"
+author = copyright = "The evofsm developers"  # noqa: A001
 version = release = __version__
 extensions = [
     "myst_parser",

@@ -68,7 +68,7 @@ def test_states_over_rows_have_their_reach_and_their_ways_on_in_frame():
     failed = np.arange(5) == 4
     ax = plot.states(machine.model(), new(), rows=rows, failed=failed, ways=True)
     legend = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert legend == ["observed", "failed", "where a state reaches", "likeliest ways on"]
+    assert legend == ["observed", "failed", "where a state reaches", "likeliest ways on", "state"]
     ends = zip(ax.axis()[::2], rows.min(0), rows.max(0), ax.axis()[1::2], strict=True)
     assert all(low <= least <= most <= high for low, least, most, high in ends)
     arrows = [patch for patch in ax.patches if isinstance(patch, FancyArrowPatch)]
@@ -92,7 +92,10 @@ def test_a_few_spikes_do_not_set_the_axes_and_where_it_alarms_is_tinted():
     assert -5.0 < left < 2.0 < 7.6 < right < 15.0
     assert 0.0 < low < 50.0 < 97.0 < high < 150.0
     said = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert said[-1] == "not in view: 2 observed, of which 2 failed"
+    assert said[-2:] == [
+        "state (at an edge: or beyond)",
+        "not in view: 2 observed, of which 2 failed",
+    ]
     tinted = ax.collections[0].get_paths()[0]
     assert tinted.contains_points([[3.0, 99.0], [3.0, 60.0]]).tolist() == [True, False]
     alone = plot.states(machine.model(), new())  # of a model by itself, too

@@ -144,6 +144,8 @@ def states(
             if (shares[i] > shares[i, j]).sum() < _DARK:
                 _arrow(ax, centers[i], centers[j], max(_WIDEST * shares[i, j], 0.4), ink(0.5))
         ax.plot([], [], color=ink(0.5), label="likeliest ways on")
+        beyond = "" if in_view.all() else " (at an edge: or beyond)"
+        ax.plot([], [], "o", fillstyle="none", color=ink(), label=f"state{beyond}")
         inside = np.all((dots >= limits[::2]) & (dots <= limits[1::2]), axis=1)
         if outside := len(dots) - int(inside.sum()):
             beyond = f"not in view: {outside:,} observed, of which {fails[~inside].sum():,} failed"
@@ -350,7 +352,8 @@ def history(
         for value in at:
             ax.axhline(value, color=COLORS["leader"], linewidth=1.0)
             look = {"xycoords": ax.get_yaxis_transform(), "ha": "right"}
-            write(ax, f"{value:.4g}", (1.0, value), (-2.0, 5.0), **look)
+            ground = {"facecolor": ink(0.0), "alpha": 0.8, "linewidth": 0.0, "pad": 0.5}
+            write(ax, f"{value:.4g}", (1.0, value), (-2.0, 5.5), bbox=ground, **look)
         write(ax, name, (0.0, 1.0), (0.0, 5.0), size=8.0, xycoords="axes fraction")
         if beyond := int(((values < low) | (values > high)).sum()):
             look = {"ha": "right", "xycoords": "axes fraction"}

@@ -51,7 +51,9 @@ def _message(error: BaseException) -> str:
     """What an error says, in one line, and what it happened in."""
     text = str(error) or type(error).__name__
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        text = f"{error.filename}: {error.strerror.lower()}"
+        is_file = isinstance(error, FileExistsError)  # where a folder is to be made
+        what = "this is a file; name a folder" if is_file else error.strerror.lower()
+        text = f"{error.filename}: {what}"
     return " ".join(", ".join([text, *getattr(error, "__notes__", ())]).split())
 
 

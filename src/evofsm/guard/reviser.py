@@ -66,6 +66,10 @@ class Mode(Enum):
     SHADOW = "shadow"  #: proposals are executed, what it would have done is recorded
     ACT = "act"  #: what it decides is executed
 
+    @classmethod
+    def _missing_(cls, value: object) -> None:
+        raise ValueError(f"mode is {value!r}; it is one of {', '.join(m.value for m in cls)}")
+
 
 class Usable(NamedTuple):
     """A proposal that can be executed, and what had to be done to it."""
