@@ -321,11 +321,12 @@ def test_a_summary_says_where_failures_are_and_how_long_an_alarm_was_on_before(r
     asked = tmp_path / "log.csv", "--summary", "--action", "", "--observe", "heat", "--horizon", 300
     asked += ("--failed", "hit", "--episode", "run", "--split", 0.5)
 
-    def write(first):  # in minutes 36 to 39 of odd runs from there on
+    def write(first, late=0):  # in minutes 36 to 39 of odd runs from there on
         lines = ["run,time,heat,hit"]
         for run, k in product(range(30), range(40)):
             fails = run > first and run % 2
-            lines.append(f"{run},{60 * k},{k % 9 + 9 * (fails and k > 35)},{int(fails and k > 38)}")
+            here = 60 * k + late * (k > 37), k % 9 + 9 * (fails and k > 35)
+            lines.append(f"{run},{','.join(map(str, here))},{int(fails and k > 38)}")
         asked[0].write_text("\n".join([*lines, ""]))
 
     write(16)
@@ -334,6 +335,11 @@ def test_a_summary_says_where_failures_are_and_how_long_an_alarm_was_on_before(r
     write(0)
     hits = json.loads(evofsm(*asked, "--json").stdout)["listed"]
     assert {hit["lasts"] for hit in hits if hit["failed"]} == {180.0}
+    write(0, late=100)  # of which a hole is no single row
+    found = json.loads(evofsm(*asked, "--json", "--hole", 300).stdout)
+    assert {hit["lasts"] for hit in found["listed"]} == {280.0}
+    leads = [own["learnt"]["lead"] for own in found["alarms"] if own["is_own"]]
+    assert leads == pytest.approx([280.0])
 
 
 def test_where_nobody_acts_a_summary_judges_alarms_on_what_they_did_not_learn_from(pump, tmp_path):

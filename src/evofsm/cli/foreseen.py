@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -117,7 +118,7 @@ def _document(judge: Foresight, runs: Runs, times: Floats, columns: Floats) -> d
     for rate, budget in enumerate(RATES):
         row: dict[str, Any] = {"stated": budget, "is_own": rate == own_rate}
         for kind, plain in (("learnt", None), ("plain", True)):
-            tally, _ = judge.tally(runs, rate, plain=plain, columns=columns)
+            tally, _ = judge.tally(runs, rate, plain=plain, columns=columns, times=times)
             row[kind] = {**tally._asdict(), "false_a_day": tally.false / tally.days}
         alarms.append(row)
         row = {"stated": budget, "kind": ("learnt", "plain", "none")[int(judge.held_out[rate, 3])]}
@@ -144,24 +145,24 @@ def _listed(
 ) -> Iterator[dict[str, Any]]:
     """Each alarm, and each failure that none was before, which lasts for no time."""
     _, on = judge.tally(runs, rate, columns=columns)
-    horizon = judge.horizon
+    horizon = judge.horizon * judge.dt
     for k, (first, end) in enumerate(pairwise([*runs.starts.tolist(), len(times)])):
         edges = np.flatnonzero(np.diff(on[first:end], prepend=False, append=False)) + first
-        fails, why = end - 1 if runs.failed[k] else end + horizon, ""
+        fails, why = times[end - 1] if runs.failed[k] else math.inf, ""
         foreseen = not runs.failed[k]
         for onset, stop in edges.reshape(-1, 2).tolist():
-            if onset == fails:
+            began, over = times[onset], times[stop] if stop < end else times[end - 1] + judge.dt
+            if began >= fails:
                 why = "; one came with it"
                 continue
-            false = false_times(onset, stop, fails, horizon)
-            right = bool(runs.failed[k]) and false * horizon < stop - onset
+            false, right = false_times(over - began, fails - began, horizon)
             foreseen |= right
-            row = {"episode": k, "row": onset, "time": times[onset], "failed": right}
-            row |= {"lasts": (min(stop, fails) - onset) * judge.dt, "false": int(false)}
+            row = {"episode": k, "row": onset, "rows": stop - onset, "time": began}
+            row |= {"failed": right, "lasts": min(over, fails) - began, "false": int(false)}
             yield {**row, "reason": judge.reason(runs.rows[onset], columns[:, onset])}
         if not foreseen:
-            row = {"episode": k, "row": fails, "time": times[fails]}
-            yield {**row, "reason": f"no alarm within {span(horizon * judge.dt)} before it{why}"}
+            row = {"episode": k, "row": end - 1, "time": fails}
+            yield {**row, "reason": f"no alarm within {span(horizon)} before it{why}"}
 
 
 def _tables(
@@ -227,7 +228,7 @@ def alarms_of(judge: Foresight, worse: Collection[int] = ()) -> Iterator[Rendera
         is_said = rate in worse or text.startswith("plain thresholds do as well")
         beside = f"; plain thresholds would be {plain}" * bool(plain and not is_said)
         places.append((rates, f"{text}{beside}"))
-    yield facts("\nWhere they alarm, by false alarms a day", places)
+    yield facts("\nWhere they alarm, by false alarms a day, counted in rows", places)
 
 
 def _last(hits: Sequence[Any], what: str) -> str:
@@ -250,7 +251,7 @@ def _draw(
     failures[runs.last[runs.failed]] = 1
     failures[[row["row"] for row in document["missed"]]] = 2
     for hit in document["listed"]:
-        alarms[hit["row"] : hit["row"] + round(hit["lasts"] / judge.dt)] = 1 if hit["failed"] else 2
+        alarms[hit["row"] : hit["row"] + hit["rows"]] = 1 if hit["failed"] else 2
     limits = [] if judge.alarm is None else judge.thresholds(judge.alarm)
     parts = {_headline(document): slice(None)}
     for kind, word in ((1, "foreseen"), (2, "not foreseen")):

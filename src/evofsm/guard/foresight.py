@@ -423,7 +423,13 @@ class Foresight(LearningJudge):
         return [(int(v), at) for *_, v, when, _, at in limits if v < m and not when]
 
     def tally(
-        self, log: Runs, rate: int, *, plain: bool | None = None, columns: Floats | None = None
+        self,
+        log: Runs,
+        rate: int,
+        *,
+        plain: bool | None = None,
+        columns: Floats | None = None,
+        times: Floats | None = None,
     ) -> tuple[Tally, Flags]:
         """What came of the alarm for one of `RATES`, and when it was on (T,).
 
@@ -433,14 +439,15 @@ class Foresight(LearningJudge):
         rate : int
         plain : bool, optional
             Whether it is that of plain thresholds; by default of the kind that did better.
-        columns : ndarray, optional
-            The `columns` of the log, if they are known.
+        columns, times : ndarray, optional
+            The `columns` of the log, if they are known; when its rows were [s], if not evenly.
         """
         limits = self.of_rate(rate, plain=plain)
         columns = self.columns(log) if columns is None else columns
         above, on = (np.any(self._passed(columns, limits, soon=k), axis=0) for k in (False, True))
         leads, rows = np.zeros(len(log.starts)), np.flatnonzero(on)
-        false = _tally(above, on, rows, log.starts, log.failed, self._spans, leads)
+        clock = np.cumsum(np.ones(len(on))) if times is None else (times - times[0]) / self.dt
+        false = _tally(above, on, rows, (log.starts, log.failed), self._spans, clock, leads)
         n, days = int(log.failed.sum()), len(log.rows) * self.dt / _DAY
         lead = float(leads.sum()) / max(n, 1) * self.dt
         return Tally(n, int((leads > 0.0).sum()), lead, int(false), days), on
@@ -479,7 +486,8 @@ class Foresight(LearningJudge):
             name, there = self._words(limits[0])
             why = f"{name} {self._value(limits[0], z):.4g}: {there}"
         came = f"after {right:.0f} of {right + false:.0f} such alarms it failed"
-        return f"{why}; {came} within {span(self.horizon * self.dt)} ({_COUNTED})"
+        soon = span(self.horizon * self.dt) + ", holes aside" * (self.bridges > 0.0)
+        return f"{why}; {came} within {soon} ({_COUNTED})"
 
     def _value(self, limit: Floats, z: Floats) -> float:
         """What is compared with a limit, at an observation (m,), as `_words` has it."""
@@ -706,23 +714,26 @@ def _look_ahead(
 
 
 @kernel
-def false_times(begun: int, over: int, fails: int, horizon: int) -> int:
-    """How often an alarm of such rows was false: as it began, and after each horizon of it."""
-    return min(max(fails - begun - 1, 0) // horizon, (over - begun + horizon - 1) // horizon)
+def false_times(lasts: float, fails: float, horizon: float) -> tuple[float, bool]:
+    """How often an alarm was false, first and after each horizon, as it fails then; if right."""
+    count = math.ceil(lasts / horizon - 1e-6)
+    false = min(max(math.ceil(min(fails, lasts + horizon) / horizon - 1e-6) - 1, 0), count)
+    return false, false < count
 
 
 @kernel
 def _tally(
-    above: Flags, on: Flags, rows: Ints, starts: Ints, failed: Flags, spans: Ints, leads: Floats
-) -> int:
+    above: Flags, on: Flags, rows: Ints, log: Any, spans: Ints, clock: Floats, leads: Floats
+) -> float:
     """False alarms of rows (T,) above limits; on (T,) is where one stays, then is; leads (E,).
 
-    Rows (n,) are those of ``on``, which has all above; of others only how many they are counts.
+    Rows (n,) are those of ``on``, which has all above; the clock (T,) counts in rows.
     """
-    false, place, horizon, hold, stays = 0, 0, spans[0], spans[1], spans[2]
+    starts, failed = log
+    false, place, horizon, hold, stays = 0.0, 0, spans[0], spans[1], spans[2]
     for e in range(len(starts)):
         end = starts[e + 1] if e + 1 < len(starts) else len(above)
-        fails = end - 1 if failed[e] else end + horizon
+        fails = clock[end - 1] if failed[e] else np.inf
         up, onset, latest, leads[e] = 0, -1, starts[e] - 1, 0.0
         while True:
             t = rows[place] if place < len(rows) and rows[place] < end else end
@@ -731,10 +742,12 @@ def _tally(
                 over = min(latest + stays, t)
                 on[latest + 1 : over] = True
                 if over < t or t == end:
-                    wrong = false_times(onset, over, fails, horizon)
+                    lead = fails - clock[onset]
+                    lasts = (clock[over] if over < end else clock[end - 1] + 1.0) - clock[onset]
+                    wrong, is_right = false_times(lasts, lead, horizon)
                     false += wrong
-                    if failed[e] and wrong * horizon < over - onset:
-                        leads[e] = max(leads[e], min(fails - onset, horizon))
+                    if is_right:
+                        leads[e] = max(leads[e], min(lead, horizon))
                     onset = -1
             if t == end:
                 break
@@ -754,6 +767,7 @@ def _one_more(
     Thresholds rise: what passes one has passed those before.
     """
     sums, leads = np.zeros((*thresholds.shape, 2)), np.zeros(len(starts))
+    clock, log = np.cumsum(np.ones(len(above))), (starts, failed)
     on, rows = np.zeros(len(above), np.bool_), np.zeros(len(above), np.int64)
     for k in range(len(thresholds)):
         n, rows[:] = len(rows), np.arange(len(rows))
@@ -763,6 +777,6 @@ def _one_more(
                 on[t] = above[t] or x[k, t] > thresholds[k, j]
                 rows[n] = t
                 n += on[t]
-            sums[k, j, 1] = _tally(on, on, rows[:n], starts, failed, spans, leads)
+            sums[k, j, 1] = _tally(on, on, rows[:n], log, spans, clock, leads)
             sums[k, j, 0] = leads.sum()
     return sums
