@@ -142,6 +142,7 @@ def test_a_summary_says_that_rows_come_too_seldom(tmp_path):
     file.write_bytes(b"".join(line(row) + b"\n" for row in closing_in(9, dt=1.0)))
     said = " ".join(evofsm(file, "--summary").stdout.split())
     assert "; they come every 1 s, and count as 0.1 s each (--interval)" in said
+    assert "alarms 1, or " in said  # which lasts across them
 
 
 @pytest.mark.slow

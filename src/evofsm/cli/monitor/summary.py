@@ -112,7 +112,7 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
     durations = np.where(follows, steps, interval)
 
     def counted(above: NDArray[np.bool_]) -> tuple[str, str, str]:
-        count = (above & ~(np.roll(above, 1) & follows)).sum()
+        count = (above & ~(np.roll(above, 1) & (begins == 0.0))).sum()
         hourly = count * 3600.0 / durations.sum()
         return f"{count:,}", f"{hourly:,.1f}", f"{above @ durations / durations.sum():.2%}"
 
@@ -126,7 +126,7 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
         pairs.append(("beware", f"it {useless}"))
     # A moment lasts while an alarm does; the highest risk within it stands for it.
     calm = (alarms == 0.0) & (np.diff(times // _MOMENT, prepend=0.0) != 0.0)
-    moments = np.cumsum(~follows | calm | (np.diff(alarms, prepend=0.0) != 0.0))
+    moments = np.cumsum((begins > 0.0) | calm | (np.diff(alarms, prepend=0.0) != 0.0))
     long = np.bincount(moments, durations * alarms)[moments]
     if failed:
         before = long[failed]
