@@ -146,6 +146,7 @@ LOOKED_AT = {
     "Frame_ID,id": (lambda k: f"{k // 3},{k % 3}", "each id, but mixed"),
     "Date": (lambda k: f"{at(k * 60):%m/%d/%Y %H:%M}", "--unit 'Date=%m/%d/%Y %H:%M'"),
     "Date,Time": (lambda k: f"{at(k):%d/%m/%Y,%H:%M}", "--time Date,Time"),
+    "Zeit": (lambda k: f"{at(k):%Y-%m-%d %H:%M:%S}@5", "the clock Zeit"),
     "time": (lambda k: 600 - k, "time runs backwards"),
     "t": (lambda k: k + 7200 * (k > 500) + 60 * (k > 550), "rows looked at 600, one every 1 s"),
 }

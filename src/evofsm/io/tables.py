@@ -763,7 +763,9 @@ def _count(block: bytes | bytearray, byte: bytes) -> int:
 
 
 def _separator(line: str) -> str:
-    return max(",;\t|", key=line.count) if re.search("[,;\t|]", line) else " "
+    decimal = re.compile(r"[^,]*(\d,\d[^,]*)?")  # commas are, where another sign parts such fields
+    signs = [s for s in ";\t|" if s in line and all(map(decimal.fullmatch, line.split(s)))]
+    return max(signs or ",;\t|", key=line.count) if re.search("[,;\t|]", line) else " "
 
 
 def _fields(line: str, separator: str) -> list[str]:
