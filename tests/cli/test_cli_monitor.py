@@ -141,6 +141,11 @@ def test_a_summary_says_that_rows_come_too_seldom(tmp_path):
     file = tmp_path / "rows.jsonl"
     file.write_bytes(b"".join(line(row) + b"\n" for row in closing_in(9, dt=1.0)))
     said = " ".join(evofsm(file, "--summary").stdout.split())
+    sent = [{**row, "time": round(1e9 * row["time"])} for row in closing_in(9, dt=1.0)]
+    file.write_bytes(b"".join(line(row) + b"\n" for row in sent))
+    again = evofsm(file, "--summary", "--unit", "time=ns")
+    assert " ".join(again.stdout.split()) == said
+    assert "in JSON all but its column of the time is in the SI" in again.stderr
     assert "; they come every 1 s, and count as 0.1 s each (--interval)" in said
     assert "alarms 1, or " in said  # which lasts across them
 

@@ -202,6 +202,9 @@ def monitor(
             notice = f"assumed: what {guard} was given and has learnt"
         if new_guard:
             notice = f"a guard of {', '.join(sentry.variables)} learns from what comes"
+        if slots is not None and reader:
+            si = "; in JSON all but its column of the time is in the SI" * ("unit" in reader)
+            notice += f"; rows are read as in a log: {options.typed(reader)}{si}"
         if summary and file is not None:
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
 
@@ -222,9 +225,6 @@ def monitor(
         if keeper is not None and isinstance(transport, Stream) and file and file.is_file():
             transport.source.seek(keeper.pass_over(file, decider))
         warn(notice)
-        if slots is not None and reader:
-            si = "; in JSON all but its column of the time is in the SI" * ("unit" in reader)
-            warn(f"rows are read as in a log: {options.typed(reader)}{si}")
         warn(f"ready: {where}")
         try:
             server.run(transport)

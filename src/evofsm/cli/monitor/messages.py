@@ -116,6 +116,7 @@ class Form:
         clocks = dict.fromkeys([clock, *clock.split(",")])  # of date and time of day
         self._clocks = [name for name in clocks if name not in ("time", *variables, *others)]
         self._form, self._unit = unit if "%" in unit else "", TIMES.get(unit, 1.0)
+        self._own_unit = self._unit if clock == "time" else 1.0
         action = _action(guard)
         if isinstance(guard.actions, Choices) and guard.actions.n_actions == 1:  # nobody acts
             action = NotRequired[action]
@@ -145,6 +146,8 @@ class Form:
                 fields = msgspec.convert({keys[name]: body[name] for name in body}, kind)
             except msgspec.ValidationError as error:
                 raise _refused(body, str(error)) from None
+            if body is not line and isinstance(fields.get("time"), float | int):  # CSV is converted
+                fields["time"] *= self._own_unit
             if kind is self._end:
                 return self._of_end(fields)
             if (time := self._when(fields)) is None:
