@@ -94,7 +94,8 @@ def show_foreseen(
     at_once = sum(e.failed for e in episodes if len(e.times) == 1)
     episodes = _of_two_rows(episodes)
     judge = guard.judge
-    assert isinstance(judge, Foresight)
+    if not isinstance(judge, Foresight):
+        raise ValueError("--action '' says that nobody acts; this guard judges who does")
     judge.stated = judge.stated if asked[-1] is None else asked[-1]
     runs = judge.runs([e.observations for e in episodes], [e.failed for e in episodes])
     times = np.concatenate([e.times for e in episodes])

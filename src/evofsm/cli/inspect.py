@@ -28,6 +28,8 @@ def inspect(
     from evofsm.cli import models
     from evofsm.cli.show import facts, print_json, show
 
+    if log and plot is None:
+        raise ValueError(f"--log {log} is to be shown beneath a picture: --plot states.png")
     model, header, guard = models.load_model(file)
     provenance = header.provenance
     if plot is not None:
@@ -81,12 +83,8 @@ def explain(
         states = range(model.n_states) if is_each else [_index("--state", state, model.n_states)]
         explanations = [model.explain(k, index) for k in states]
     if as_json:
-        print_json(
-            {
-                "file": file,
-                "situations": [models.situation_document(model, e) for e in explanations],
-            }
-        )
+        documents = [models.situation_document(model, e) for e in explanations]
+        print_json({"file": file, "situations": documents})
         return
     if not model.failures_told:
         print(textwrap.fill(_UNTOLD, 80))

@@ -56,7 +56,9 @@ def load_model(place: Path) -> tuple[FSMModel, store.Header, Guard | None]:
     family = str(header.provenance.get("family"))
     if not machine.n_states:
         raise ValueError(f"{place} has seen nothing yet: an episode has to be over")
-    labels = getattr(guard and guard.judge, "labels", Labels())
+    labels = getattr(guard and guard.judge, "labels", Labels())._replace(
+        dt=getattr(guard, "interval", None)
+    )
     if isinstance(actions := getattr(guard and guard.reviser, "actions", None), IntervalActions):
         labels = labels._replace(actions=actions)
     if family in FAMILIES:
@@ -69,7 +71,7 @@ def logged(log: str | None, model: FSMModel, read_with: Mapping[str, Any]) -> di
     if log is None:
         return {}
     rows, failed = list[Any](), list[Any]()
-    options = {**read_with} if read_with else {"observe": quoted(model.names)}
+    options = {**read_with} if read_with else {"observe": quoted(model.names), "action": ""}
     for chunk in read_traces([log], reading_of(**options)):
         rows.append(chunk.observations)
         failed.append(chunk.fails)
@@ -194,7 +196,7 @@ def model_facts(model: FSMModel) -> list[tuple[str, str]]:
 def learnt_from(provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """What a file says of where it comes from, line by line."""
     for name, value in provenance.items():
-        if name == "monitor":  # what one goes on from
+        if name in ("monitor", "failures") or value == {}:  # what one goes on from; stands below
             continue
         text = f"{value:,}" if isinstance(value, int) else str(value)
         if name == "files":

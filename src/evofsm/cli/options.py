@@ -207,7 +207,8 @@ def reading_of(
             variables = [*VARIABLES]
         encoder = ObservationEncoder(*variables)
     except ValueError as error:
-        raise ValueError(f"--observe {observe}: {error}") from None
+        about = f"--observe {observe}" if observe else "neither --observe nor names= of a guard"
+        raise ValueError(f"{about}: {error}") from None
     return LogColumns(
         observe=encoder,
         action="".join(quoted_name(action)) or encoder.names[0],

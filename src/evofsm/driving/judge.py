@@ -394,7 +394,7 @@ class LatentRisk(Retraced, LearningJudge):
             **{"noise": self.perception.noise, "option_low": lowest, "option_high": highest},
         }
         about = (
-            f"{self.told_by_experience}\na decision: at most {len(lowest)} options times "
+            f"a decision: at most {len(lowest)} options times "
             f"{rehearsal._HALVINGS + 2} rehearsals of 2 steps\n"
         )
         return Part(Path(__file__).with_suffix(".c"), 3, {"OPTIONS": len(lowest)}, constants, about)
