@@ -298,6 +298,8 @@ def test_failures_are_learnt_and_how_often_they_came_is_said(evofsm, log, tmp_pa
     assert "failures 2 episodes ended with hit; 18 rows after them" in text
     assert "failures 2 episodes ended in one" in " ".join(evofsm("inspect", path).stdout.split())
     assert "2 of 3" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
+    evofsm("learn", log, "--failed", "gap<-99", "--out", path)  # nor does the last one fail
+    assert "0 of 3" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
 
 
 def test_a_failure_that_no_row_meets_is_said_with_the_range_of_its_column(evofsm, tmp_path):

@@ -103,6 +103,7 @@ def learn_traces(
     lesson = Learning(machine.copy(), actions)
     for chunk in chunks:
         lesson.take(chunk)
+    lesson.machine.start_episode()  # so that the last one counts, too
     dt = None if np.isnan(lesson.dt) else lesson.dt
     lesson.model = lesson.machine.model(actions=actions, names=names, units=units(), dt=dt)
     if lesson.transitions == 0:
