@@ -219,7 +219,7 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, pieces):
         (gzip.compress(b"", mtime=0), "is empty"),
         (HEADER.encode(), "has a header but no rows"),
         (b"# drive 7\n0,1\n1,2\n", "line 2: '0,1' is no header"),
-        (b"# x;y\n0;1\n1;2\n", "no column 'gap'; it has x, y"),
+        (b'# "x, m";y\n0;1\n1;2\n', "no column 'gap'; it has \"x, m\", y"),
         (b"\x89MCAP0\r\n\x01" + bytes(8) + b"\4\0\0\0ros2", "is a bag of ROS 2; --topics"),
         (b"\x00\x01\x02\xff\xfe" * 50, "not text in UTF-8"),
         (b"\xfd7zXZ\0" + bytes(50), "compressed by xz; unpack it"),

@@ -894,7 +894,8 @@ class _Reader:
         options.setdefault(columns.action, "--action")  # one that is observed, where nobody acts
         for name, option in options.items():
             if name not in table.columns:
-                names = ", ".join(name[:40] for name in table.columns[:20])
+                short = [name[:40] for name in table.columns[:20]]
+                names = ", ".join(f'"{name}"' if "," in name else name for name in short)
                 more = f" and {len(table.columns) - 20:,} more" if len(table.columns) > 20 else ""
                 how = ", and --dt stands in for a clock" if option == "--time" else ""
                 if commas := [title for title in table.columns if "," in title and name in title]:

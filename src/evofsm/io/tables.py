@@ -763,6 +763,7 @@ def _count(block: bytes | bytearray, byte: bytes) -> int:
 
 
 def _separator(line: str) -> str:
+    line = re.sub('"[^"]*"', "", line)
     decimal = re.compile(r"[^,]*(\d,\d[^,]*)?")  # commas are, where another sign parts such fields
     signs = [s for s in ";\t|" if s in line and all(map(decimal.fullmatch, line.split(s)))]
     return max(signs or ",;\t|", key=line.count) if re.search("[,;\t|]", line) else " "
