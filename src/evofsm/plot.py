@@ -150,6 +150,8 @@ def states(
         if outside := len(dots) - int(inside.sum()):
             beyond = f"not in view: {outside:,} observed, of which {fails[~inside].sum():,} failed"
             ax.plot([], [], " ", label=beyond)
+        if n_beyond := int((~in_view).sum()):
+            ax.plot([], [], " ", label=f"at the edge: {n_beyond:,} states that lie beyond it")
         _explain(ax)
     draw_centers(ax, centers, dead_ends, size=13.0)
     ax.axis(limits)
