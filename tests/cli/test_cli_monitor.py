@@ -216,6 +216,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         (("--action", "", "--interval", 1), "say what is observed, the keys of rows: --observe"),
         (("--observe", "heat", "--low", 0, "--interval", 1), "give either low and high"),
         (("--n-actions", 2, "--traffic"), "--traffic is of cars"),
+        (("a.csv", "--plot", "x.png"), "--plot draws what --summary says"),
         (("a.csv", "b.csv", "--summary"), "one FILE is read; cat joins several"),
     ],
 )

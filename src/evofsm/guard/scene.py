@@ -163,12 +163,7 @@ class SceneRisk(LearningJudge, SearchingJudge):
             )
 
     def search(
-        self,
-        situation: Situation,
-        wanted: Action,
-        *,
-        tolerance: float,
-        mask: Mask | None = None,
+        self, situation: Situation, wanted: Action, *, tolerance: float, mask: Mask | None = None
     ) -> Search:
         """The tolerable action of those in ``mask`` that is closest in effect to ``wanted``.
 

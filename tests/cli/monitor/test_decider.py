@@ -80,6 +80,10 @@ def test_in_words_it_is_said_where_the_risk_is_not_known():
     text, told = Text(), {"kind": "decision", "alarm": False, "reason": "not seen: heat", "time": 3}
     lines = [text.line({**told, "risk_proposed": risk}) for risk in (0.0, None, None, 0.0)]
     assert lines == [b"", b"3  not seen: heat\n", b"", b"3  the risk is known again\n"]
+    end = {"kind": "end", "failed": True}  # which may come without a time
+    answers = [end, {**told, "alarm": True, "risk_proposed": 0.5}, end, end]
+    assert text.line(answers[0]) == b"failure, no alarm was on\n"
+    assert [text.line(x) for x in answers[1:3]][1] == b"failure, after the alarm\n"
 
 
 def test_gaps_in_time_and_rows_that_come_too_often_are_noted():

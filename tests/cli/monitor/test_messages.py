@@ -116,7 +116,7 @@ def test_actions_that_are_vectors_or_indices():
     assert refused(box, sent(b"1")) == ("proposal", "is 1; it must be array or null")
     assert refused(box, sent(b"[1]")) == ("proposal", "is [1]; it must be array of length >= 2")
     assert refused(box, sent(b"[1, null]"))[0] == "proposal[1]"
-    assert few.read(sent(b"2")).proposal == 2
+    assert few.read(sent(b"2")).proposal == few.read(sent(b"[2]")).proposal == 2
     assert refused(few, sent(b"3")) == ("proposal", "is 3; it must be int <= 2")
     for wrong in (b"-1", b"1.0", b"true"):
         assert refused(few, sent(wrong))[0] == "proposal"

@@ -99,6 +99,8 @@ def monitor(
                 file = path
     if sum(source is not None for source in (file, socket, udp, zenoh)) > 1:
         raise ValueError("give one of FILE, --socket, --udp and --zenoh")
+    if plot is not None and not summary:
+        raise ValueError("--plot draws what --summary says, where nobody acts")
     if plot is not None:
         options.require(matplotlib="plot")
     is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
@@ -228,6 +230,8 @@ def monitor(
         warn(f"ready: {where}")
         try:
             server.run(transport)
+            if file and not decider.n:
+                warn(f"no row of {file} was decided on")
         except BrokenPipeError:
             warn("nobody reads the decisions any more")
             return 1

@@ -117,7 +117,7 @@ class Form:
         self._clocks = [name for name in clocks if name not in ("time", *variables, *others)]
         self._form, self._unit = unit if "%" in unit else "", TIMES.get(unit, 1.0)
         self._own_unit = self._unit if clock == "time" else 1.0
-        action = _action(guard)
+        action, self._is_box = _action(guard), isinstance(guard.actions, BoxActions)
         if isinstance(guard.actions, Choices) and guard.actions.n_actions == 1:  # nobody acts
             action = NotRequired[action]
         also = dict.fromkeys(others, NotRequired[float | bool | str | None])
@@ -138,7 +138,9 @@ class Form:
         body = line if isinstance(line, dict) else _parsed(line)
         kind = self._scene if self.scenes or body.keys() & {"ego", "objects"} else self._row
         kind = self._end if "end" in body else kind
-        keys = self._keys[kind]
+        keys, wish = self._keys[kind], body.get("proposal")
+        if isinstance(wish, list) and len(wish) == 1 and not self._is_box:
+            body["proposal"] = wish[0]  # as of Gymnasium's Box(1,)
         try:
             if unknown := [name for name in body if name not in keys]:
                 raise _unknown(unknown[0], keys)
@@ -146,6 +148,8 @@ class Form:
                 fields = msgspec.convert({keys[name]: body[name] for name in body}, kind)
             except msgspec.ValidationError as error:
                 raise _refused(body, str(error)) from None
+            if isinstance(wish, list) and self._is_box:
+                fields["proposal"] = tuple(fields["proposal"])
             if body is not line and isinstance(fields.get("time"), float | int):  # CSV is converted
                 fields["time"] *= self._own_unit
             if kind is self._end:
@@ -156,7 +160,7 @@ class Form:
             if kind is self._scene:
                 return self._of_scene(fields, time)
             also = {name: fields.get(name) for name in self._others}
-            return Row(time, self._seen(fields), _frozen(fields.get("proposal", 0)), told=also)
+            return Row(time, self._seen(fields), fields.get("proposal", 0), told=also)
         except MessageError as error:
             error.time = _time(body)
             raise
@@ -206,7 +210,7 @@ class Form:
             if not in_lanes and (car.y is UNSET or ego.y is UNSET):
                 fault = "is given for it or for ego, but not for both; nor is y"
                 raise MessageError(f"{where}.lane", fault)
-        proposal = _frozen(told.get("proposal", 0))
+        proposal = told.get("proposal", 0)
         if self.scenes:
             objects = [_object(car, f"objects[{k}]") for k, car in enumerate(cars)]
             scene = Scene(_object(ego, "ego"), objects)
@@ -228,10 +232,6 @@ def _action(guard: Guard) -> Any:
         components = int(np.size(actions.low))
         return Annotated[list[_Number], Meta(min_length=components, max_length=components)] | None
     return _Number | None
-
-
-def _frozen(proposal: Any) -> Any:
-    return tuple(proposal) if isinstance(proposal, list) else proposal
 
 
 # -- Scenes ---------------------------------------------------------------------------------------

@@ -49,7 +49,8 @@ class Text:
         elif part["kind"] == "end":
             self._since = None
             if part["failed"]:
-                yield f"{when}failure,{after + ' after the alarm' if after else ' no alarm was on'}"
+                text = " no alarm was on" if since is None else f"{after} after the alarm"
+                yield f"{when}failure,{text}"
         elif part["kind"] == "decision" and part["alarm"] and since is None:
             self._since = time
             yield f"{when}alarm: {part['reason']}"
@@ -156,6 +157,8 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
                 f"{v:.4g}" if isinstance(v, float) else str("" if v is None else v) for v in cells
             ]
             where = (f"{episodes[at]:.0f}", f"{times[at]:.10g}", *texts)
-            worst.append((*where, f"{risks[at]:.1%}", f"{long[at]:.1f}"))
+            star = "*" * bool(alarms[at] and risks[at] <= (tolerance or 0.0))
+            worst.append((*where, f"{risks[at]:.1%}{star}", f"{long[at]:.1f}"))
     header = ("episode", "time", *names, "proposed", "risk", "alarm lasts [s]")
-    yield table("\nThe worst moments", header, worst)
+    why = " (*: alarmed for a margin, or its risk is not known)" * any("*" in x[-2] for x in worst)
+    yield table(f"\nThe worst moments{why}", header, worst)

@@ -42,11 +42,7 @@ class Server:
     """A decider that threads share: lines in, lines out."""
 
     def __init__(
-        self,
-        decider: Decider,
-        *,
-        keeps: bool = False,
-        line: Callable[[Answer], bytes] = json_line,
+        self, decider: Decider, *, keeps: bool = False, line: Callable[[Answer], bytes] = json_line
     ) -> None:
         self.decider = decider
         self._line = line  # of an answer
