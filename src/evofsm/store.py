@@ -186,29 +186,6 @@ def _packed(kind: Kind, header: Header, arrays: Mapping[str, NDArray[Any]]) -> l
     return [len(signed_head).to_bytes(8, "little"), signed_head, *content]
 
 
-def only_writer(file: BinaryIO, path: str | os.PathLike[str], otherwise: str) -> None:
-    """Lock a file against other processes, where the system can; it is unlocked as it is closed.
-
-    Where another one has locked it, a ValueError says what to do ``otherwise``.
-    """
-    with suppress(ModuleNotFoundError):  # Windows
-        import fcntl
-
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            why = "is being written by another process; wait for its end, or"
-            raise ValueError(f"{os.fspath(path)} {why} {otherwise}") from None
-
-
-def let_others_write(file: BinaryIO) -> None:
-    """Undo `only_writer`, also where a child of this process still has the file open."""
-    with suppress(ModuleNotFoundError):  # Windows
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_UN)
-
-
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A file, open for writing and reading, that takes its place once it is whole and on the disk.

@@ -121,7 +121,7 @@ class Results:
     def _begin(self, folder: Path) -> None:
         setup = self.setup
         folder.mkdir(parents=True, exist_ok=True)
-        self._journal = Journal(folder / _JOURNAL, setup.settings)
+        self._journal = Journal(folder / _JOURNAL, "name another folder")
         try:
             self._journal.go_on(setup.settings, "run it with those, or name another folder")
             self.rows = {int(row["episode"]): row for row in self._journal.records}

@@ -27,16 +27,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
 from hashlib import sha256
-from io import BytesIO
+from io import BytesIO, FileIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numba
 import numpy as np
 
 import evofsm
-from evofsm import store
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import Floats
 from evofsm.guard.actions import checked_mask, written
@@ -56,9 +55,6 @@ SETTINGS = ("explaining", "interval", "learn", "shadow")
 # kill loses; and bytes of a line, which holds a machine at most.
 _STATES, _MOST_QUIET, _LONGEST_LINE = 3, 240, 1 << 26
 _SEAL, _LINE_END = b',"hash":"', b'"}\n'
-# How a log begins: so a half-written one is told from other people's files.
-_ABOUT = "evofsm audit log"
-_OPENING = f'{{"about":"{_ABOUT}",'.encode()
 # What a decision tells as it is recorded elsewhere, too.
 _TOLD = tuple(name for name in RECORD if name not in ("time", "n_states", "risk_low", "risk_high"))
 #: The names in a record of each kind, beside ``kind`` and ``clock``.
@@ -249,7 +245,106 @@ def _against(kept: Head, head: Head) -> Finding:
     return Finding(number, why)
 
 
-class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
+class Ledger:
+    """A chain of records in a file that no other process writes. Close it.
+
+    A half-written end is cut off. What the first record is ``about`` tells it from other files.
+    """
+
+    _about: ClassVar[str]
+    _remedy: ClassVar[str]  # where it was tampered with
+
+    def __init__(
+        self, path: Path, otherwise: str, take: Callable[[dict[str, Any]], object] = lambda _: None
+    ) -> None:
+        """Let ``take`` have the records that are there; an error says what to do ``otherwise``."""
+        self.path = path
+        #: The last record. Keep it elsewhere: it shows what is cut off or written anew later.
+        self.head = NOTHING
+        self._size = 0  # up to there [byte]
+        self._owner = os.getpid()
+        self._file = FileIO(path, "a+")
+        try:
+            self._lock(is_ours=True)
+            if os.fstat(self._file.fileno()).st_ino != os.stat(path).st_ino:  # just replaced
+                raise BlockingIOError
+            self._read(take)
+        except BlockingIOError:
+            self._file.close()
+            why = "is being written by another process; wait for its end, or"
+            raise ValueError(f"{path} {why} {otherwise}") from None
+        except BaseException:
+            self._file.close()
+            raise
+
+    def force(self) -> None:
+        """Force what was written onto the disk."""
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Let others have the file."""
+        if self._is_owner():  # also where a child of this process still has the file open
+            self._lock(is_ours=False)
+        self._file.close()
+
+    def _lock(self, *, is_ours: bool) -> None:
+        """Lock it against other processes, or unlock it, where the system can."""
+        with suppress(ModuleNotFoundError):  # Windows
+            import fcntl
+
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB if is_ours else fcntl.LOCK_UN)
+
+    def _read(self, take: Callable[[dict[str, Any]], object]) -> None:
+        """Find the last whole record; a part of one after it is cut off."""
+        chain = Chain(self.path)
+        for record in chain.records():
+            take(record.content)
+        if chain.finding is not None:
+            raise ValueError(
+                f"{self.path} was tampered with, and is left as it is: "
+                f"{chain.finding.explanation}; {self._remedy}"
+            )
+        prefix = f'{{"about":"{self._about}",'.encode()
+        self._file.seek(0)
+        if not prefix.startswith(self._file.read(len(prefix))):
+            raise ValueError(f"{self.path} is no {self._about}; it was left alone")
+        self.head, self._size = chain.head, chain.size
+        if chain.half_written:
+            self._cut()
+            _log.warning("%s: a half-written record was cut off", self.path)
+
+    def _append(self, *contents: Mapping[str, Any], sync: bool) -> None:
+        """Add records, or none of them; with ``sync`` they are then on the disk."""
+        if os.getpid() != self._owner:
+            why = "the log belongs to the process that opened it; a child of that needs its own"
+            raise PermissionError(errno.EPERM, why, str(self.path))
+        self._cut()  # what could not be cut off then
+        data, head = b"", self.head
+        for content in contents:
+            line, head = seal(content, head)
+            data += line
+        size = self._size + len(data)
+        try:
+            while data:  # a disk that gets full takes a part of it first
+                data = data[self._file.write(data) :]
+        except OSError:
+            with suppress(OSError):
+                self._cut()
+            raise
+        self.head, self._size = head, size
+        if sync:
+            self.force()
+
+    def _cut(self) -> None:
+        """Cut off what was taken back, or is half of a record."""
+        if self._is_owner() and os.fstat(self._file.fileno()).st_size > self._size:
+            self._file.truncate(self._size)
+
+    def _is_owner(self) -> bool:
+        return os.getpid() == self._owner and not self._file.closed
+
+
+class AuditLog(Ledger, AbstractContextManager["AuditLog"], DecisionLogger):
     """Logs what a guard decides, so that nobody can change it unnoticed: ``Guard(..., audit=log)``.
 
     Where the disk fails while driving, the log is broken off there, which is logged, and raised as
@@ -278,11 +373,12 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
     parent. The example of `audit` writes a log.
     """
 
+    _about = "evofsm audit log"
+    _remedy = "name another file"
+
     def __init__(self, path: Path, *, sync: Literal["record", "episode"] = "record") -> None:
-        self.path = path
+        super().__init__(path, "name another file")
         self.sync = sync
-        self._file = open(path, "a+b", buffering=0)  # noqa: SIM115
-        self._owner = os.getpid()
         self._failure: OSError | None = None
         self._guard: Guard | None = None
         self._who: tuple[Any, ...] = ()  # what the guard of the latest episode was made of
@@ -290,24 +386,18 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         self._settings: dict[str, Any] = {}
         self._before: list[list[Any]] = []
         self._known: list[str] = []  # what it holds of what a guard is now told again
-        try:
-            store.only_writer(self._file, path, "name another file")
-            self._find_end()
-        except BaseException:
-            self._file.close()
-            raise
 
     def close(self) -> None:
         """Write what was held back; an OSError if that failed, now or before."""
         if self._file.closed:
             return
         try:
-            if os.getpid() == self._owner:  # what is held back is the parent's to write
+            if self._is_owner():  # what is held back is the parent's to write
                 self._flush()
-                self._force()
-                store.let_others_write(self._file)
+                if self.sync == "episode":
+                    self._try(self.force)
         finally:
-            self._file.close()
+            super().close()
         self._raise()
 
     def __exit__(self, *error: object) -> None:
@@ -342,7 +432,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         self._guard, self._who, self._learnt = guard, parts, None
         self._settings = settings_now(guard)
         self._write("begin", settings=self._settings)
-        self._force()
         self._raise()
 
     def seen(self, observation: Floats, time: float) -> None:
@@ -382,7 +471,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
         last = None if observation is None else observation.tolist()
         how = {"failed": bool(failed), "terminated": terminated, "score": score}
         self._write("end", learnt=self._learnt, observation=last, **how)
-        self._force()
         self._guard = None
         self._raise()
 
@@ -397,33 +485,6 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
 
         return rollback
 
-    def _find_end(self) -> None:
-        """Where the last whole record ends; a part of one after it is cut off."""
-        chain = Chain(self.path)
-        for _ in chain.records():
-            pass
-        if chain.finding is not None:
-            why = chain.finding.explanation
-            raise ValueError(
-                f"{self.path} was tampered with, and is left as it is: {why}; name another file"
-            )
-        if chain.half_written:
-            with open(self.path, "rb") as file:
-                start = file.read(len(_OPENING))
-            if not chain.size and not _OPENING.startswith(start):
-                raise ValueError(f"{self.path} is no audit log; it was left alone")
-            self._file.truncate(chain.size)
-            _log.warning("%s: a half-written record was cut off", self.path)
-        #: The last record. Keep it elsewhere: it shows what is cut off or written anew later.
-        self.head: Head = chain.head
-        self._size = chain.size
-
-    def _cut(self) -> None:
-        """Cut off what was taken back, or is half of a record."""
-        is_owner = os.getpid() == self._owner and not self._file.closed
-        if is_owner and os.fstat(self._file.fileno()).st_size > self._size:
-            self._file.truncate(self._size)
-
     def _flush(self) -> None:
         if self._before:
             self._write("quiet")
@@ -433,36 +494,19 @@ class AuditLog(AbstractContextManager["AuditLog"], DecisionLogger):
             return
         if "before" in FIELDS[kind]:
             content["before"], self._before = self._before, []
-        if self._failure is not None:
-            return
-        clock = datetime.now(UTC).isoformat()
-        line, head = seal({"kind": kind, "clock": clock, **content}, self.head)
-        try:
-            if os.getpid() != self._owner:
-                why = "the log belongs to the process that opened it; a child of that needs its own"
-                raise PermissionError(errno.EPERM, why, str(self.path))
-            self._cut()  # what could not be cut off then
-            data = line
-            while data:  # a disk that gets full takes a part of it first
-                data = data[self._file.write(data) :]
-        except OSError as error:
-            with suppress(OSError):
-                self._cut()
-            self._fail(error)
-            return
-        self.head, self._size = head, self._size + len(line)
-        self._force("record")
+        record = {"kind": kind, "clock": datetime.now(UTC).isoformat(), **content}
+        sync = self.sync == "record" or kind in ("begin", "end")
+        self._try(lambda: self._append(record, sync=sync))
 
-    def _force(self, what: str = "episode") -> None:
-        if self._failure is None and self.sync == what:
+    def _try(self, write: Callable[[], None]) -> None:
+        """Write, unless that failed before; a failure is raised later."""
+        if self._failure is None:
             try:
-                os.fsync(self._file.fileno())
+                write()
             except OSError as error:
-                self._fail(error)
-
-    def _fail(self, error: OSError) -> None:
-        self._failure = error
-        _log.error("the audit log %s ends with record %s: %s", self.path, self.head.number, error)
+                self._failure = error
+                record = self.head.number
+                _log.error("the audit log %s ends with record %s: %s", self.path, record, error)
 
     def _raise(self) -> None:
         if self._failure is not None:
@@ -501,7 +545,7 @@ def _start(guard: Guard) -> dict[str, Any]:
         if not (is_replayable := file.tell() < _LONGEST_LINE // 2):
             _log.warning("the guard is too large for an audit log: it will not be replayed")
     return {
-        "about": _ABOUT,
+        "about": AuditLog._about,
         "guard": base64.b64encode(file.getvalue()).decode() if is_replayable else None,
         "made_by": made_by(),
         "reviser": type(guard.reviser).__name__,

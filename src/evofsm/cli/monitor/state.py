@@ -28,7 +28,6 @@ _log = logging.getLogger(__name__)
 _FILES = 100  # so many of the latest that were read are known again
 _EVERY = 600  # messages in the journal, from which on the guard is written as an episode ends
 _PROVENANCE = "monitor"
-_NEW = -1  # the mark of a journal that was made just now
 
 
 class State:
@@ -38,9 +37,8 @@ class State:
         self.path = path.resolve()
         self.settings = dict(settings)
         self.failure = ""  #: why nothing is saved; empty as long as it is
-        self._journal = Journal(
-            self.path.with_name(f"{self.path.name}.journal"), {"mark": _NEW}, "name another file"
-        )
+        journal = self.path.with_name(f"{self.path.name}.journal")
+        self._journal = Journal(journal, "name another file")
         self._provenance: dict[str, Any] = {}
         self._mark = 0
         self._saved: Mapping[str, Any] = {}  # what stands beside the guard
@@ -124,7 +122,7 @@ class State:
         if (self._count or self.failure) and self._decider.rows == 0:
             self._try(self._save)
         if not self.failure:
-            self._try(self._journal.sync)
+            self._try(self._journal.force)
         self._journal.close()
         if self.failure:
             raise OSError(f"{self.failure}; what came since then is lost")
