@@ -52,8 +52,8 @@ def _message(error: BaseException) -> str:
     text = str(error) or type(error).__name__
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         is_file = isinstance(error, FileExistsError)  # where a folder is to be made
-        what = "this is a file; name a folder" if is_file else error.strerror.lower()
-        text = f"{error.filename}: {what}"
+        why = "this is a file; name a folder" if is_file else error.strerror.lower()
+        text = f"{error.filename}: {why}"
     return " ".join(", ".join([text, *getattr(error, "__notes__", ())]).split())
 
 
