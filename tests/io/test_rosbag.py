@@ -234,6 +234,9 @@ def test_an_action_may_be_mapped_and_failures_be_told_of_by_a_comparison(tmp_pat
     (chunk,) = read(path, told, failed="gap<=44")
     assert (chunk.actions == 0.0).all()
     assert chunk.fails.sum() == 1
+    touch = 1.98, OTHER, odometry(0.0, 0.0)  # with which the recording ends
+    (chunk,) = read(write(tmp_path / "touch", [*drive(), touch]), told, failed="gap<0")
+    assert np.flatnonzero(chunk.fails).tolist() == [len(chunk.times) - 1]
 
 
 def test_a_bag_that_is_damaged_says_so(tmp_path):

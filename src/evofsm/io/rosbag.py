@@ -233,7 +233,8 @@ class BagTable(Table):
         first = -((stamps[0] - stamps[begins]) // interval)
         after = (stamps[ends] + oldest - stamps[0]) // interval + 1
         ticks = np.concatenate([*map(np.arange, first, after)])
-        at = stamps[0] + interval * ticks[ticks * interval <= stamps[-1] - stamps[0]]
+        # The last one is the first after all: the failure may be the last that was recorded.
+        at = stamps[0] + interval * ticks[(ticks - 1) * interval < stamps[-1] - stamps[0]]
         values: dict[str, NDArray[np.float64]] = {}
         is_known = np.ones(len(at), np.bool_)
         for field, (of_field, numbers) in found.items():
