@@ -872,6 +872,31 @@ def test_what_an_agent_is_not_told_is_optional(crowd, silent):
     assert sum(math.isnan(step.reward) for step in steps) == 2 * (silent in ("rewards", "all"))
 
 
+def test_whom_anothers_failure_ends_did_not_end_by_itself(crowd):
+    class Together(crowd):
+        def step(self, actions):
+            seen, rewards, over, cut, infos = super().step(actions)
+            over = dict.fromkeys(over, any(over.values()))
+            self.agents = [] if any(over.values()) else self.agents
+            return seen, rewards, over, cut, infos
+
+    spy, ended = Spy(), []
+    spy.end = lambda z, *, failed, terminated: ended.append((failed, terminated))
+    env = evofsm.guard.RevisedAgents(
+        Together(2, 4), guard_for(ONE, spy), failed=lambda step: step.observation[0] < 5.0
+    )
+    drive_agents(env, 0.0)
+    assert ended == [(True, False), (False, False)]
+
+
+def test_agents_that_observe_differently_are_refused(crowd):
+    sizes = iter((1, 2))
+    observe = {"observe": lambda z: z[: next(sizes)]}
+    env = evofsm.guard.RevisedAgents(crowd(2, 4), guard_for(ONE), **observe)
+    with pytest.raises(ValueError, match=r"different numbers of variables, \{'a0': 1, 'a1': 2\}"):
+        env.reset()
+
+
 def test_what_an_agent_meets_after_a_step_without_an_action_is_no_consequence(crowd):
     class Turns(crowd):
         def step(self, actions):

@@ -126,10 +126,10 @@ def test_a_variable_may_be_called_as_a_column_of_decisions():
 
 
 def test_a_sink_for_other_variables_says_so(tmp_path):
-    guard = Guard(-1.0, 1.0, interval=0.1)
-    with FoxgloveSink(None, tmp_path / "run.mcap") as guard.audit:
-        with pytest.raises(ValueError, match="is for 3 variables .* give FoxgloveSink their names"):
-            guard.decide([1.0, 2.0], proposal=0.0)
+    guard, match = Guard(-1.0, 1.0, interval=0.1), "is for 3 variables"
+    sink = FoxgloveSink(None, tmp_path / "run.mcap")
+    with sink as guard.audit, pytest.raises(ValueError, match=match):
+        guard.decide([1.0, 2.0], proposal=0.0)
 
 
 def test_a_full_disk_is_told(monkeypatch):

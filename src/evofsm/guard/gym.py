@@ -331,7 +331,7 @@ class Lane:
         self._shared, self._allowed = shared, action_masks(env)
         self._guard: Guard | None = None  # that decides, within an episode of the guard
         self._episode = 0  # the number of that
-        self._seen: Floats | None = None
+        self.seen: Floats | None = None  #: what the guard observes
         self._mask: Mask | None = None
         self._past: list[tuple[Floats, Proposal, Action]] = []
         self._score = 0.0
@@ -343,7 +343,7 @@ class Lane:
         self._look(observation, info)
 
     def _look(self, observation: Any, info: Mapping[str, Any]) -> None:
-        self._seen = self.terms.look(observation)
+        self.seen = self.terms.look(observation)
         if isinstance(self.terms.guard.actions, Choices):
             self._mask = checked_mask(self.terms.guard.actions, self._allowed(observation, info))
 
@@ -354,7 +354,7 @@ class Lane:
             terms.say_if_silent("no episode was under way: call reset()")
             decision = terms.decided(action, terms.unjudged(proposal, "no episode is under way"))
             return decision._replace(executed=action, cost=0.0)
-        if self._seen is None or self._has_failed:
+        if self.seen is None or self._has_failed:
             why = "nothing to judge: observe returned None"
             why = "it failed, and failed= still says so" if self._has_failed else why
             terms.say_if_silent(why, ever=self._has_failed)
@@ -363,9 +363,9 @@ class Lane:
         terms.say_if_silent()
         if self._guard is None:
             self._guard = self._begun()
-        self.revision = self._guard.decide(self._seen, proposal, episode=self._episode)
+        self.revision = self._guard.decide(self.seen, proposal, episode=self._episode)
         if self._guard is not terms.guard:
-            self._past.append((self._seen, proposal, self.revision.executed))
+            self._past.append((self.seen, proposal, self.revision.executed))
         return terms.decided(action, self.revision)
 
     def _begun(self) -> Guard:
@@ -403,7 +403,7 @@ class Lane:
         failed = self.terms.failed(step)
         self._score += np.sum(step.reward)
         self._look(step.observation, step.info)
-        if failed or is_over or self._seen is None:
+        if failed or is_over or self.seen is None:
             score = float(self._score) if is_over and np.isfinite(self._score) else None
             self.end(failed=failed, terminated=step.terminated, score=score)
         self.is_open, self._has_failed = not is_over, failed and not is_over
@@ -420,7 +420,7 @@ class Lane:
                 situation = guard.recognise(observation, step * guard.interval)
                 guard.revise(situation, proposal, executed)
             how: dict[str, Any] = {"terminated": terminated, "score": score}
-            guard.end(failed, self._seen, episode=self._episode, **how)
+            guard.end(failed, self.seen, episode=self._episode, **how)
         self._guard, self._past = None, []
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -85,14 +86,20 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
         executed = {agent: decision.executed for agent, decision in decisions.items()}
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         infos, rewards = dict(infos), dict(rewards)
-        alive = {*self.env.agents}
-        for agent, lane in self._lanes.items():
-            if not lane.is_open:
-                continue
+        alive, steps = {*self.env.agents}, dict[Any, StepResult]()
+        for agent in (agent for agent, lane in self._lanes.items() if lane.is_open):
             is_over, has_left = bool(terminated.get(agent)), agent not in alive
             ends = is_over, bool(truncated.get(agent)) or (has_left and not is_over)
             row, reward = observations.get(agent), rewards.get(agent, math.nan)
-            lane.follow(StepResult(row, reward, *ends, infos.get(agent, {})))
+            steps[agent] = StepResult(row, reward, *ends, infos.get(agent, {}))
+        over = [agent for agent, step in steps.items() if step.terminated]
+        if len(over) > 1:  # whom another's failure ends does not end by itself
+            fails = {agent: self._lanes[agent].terms.failed(steps[agent]) for agent in over}
+            for agent in (agent for agent in over if any(fails.values()) and not fails[agent]):
+                steps[agent] = replace(steps[agent], terminated=False, truncated=True)
+        for agent, step in steps.items():
+            lane = self._lanes[agent]
+            lane.follow(step)
             if agent not in decisions:  # what it does now follows from no action of before
                 lane.end(failed=False)
         for agent, decision in decisions.items():
@@ -108,6 +115,12 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
         for agent, observation in observations.items():
             if not (lane := self._enter(agent)).is_open:
                 lane.begin(observation, infos.get(agent, {}))
+        sizes = {a: len(lane.seen) for a, lane in self._lanes.items() if lane.seen is not None}
+        if len({*sizes.values()}) > 1:
+            raise ValueError(
+                f"agents observe different numbers of variables, {sizes}, and a guard observes one "
+                "kind: give observe= that makes them alike"
+            )
 
     def _enter(self, agent: Any) -> Lane:
         if agent not in self._lanes:
