@@ -144,8 +144,7 @@ def states(
             if (shares[i] > shares[i, j]).sum() < _DARK:
                 _arrow(ax, centers[i], centers[j], max(_WIDEST * shares[i, j], 0.4), ink(0.5))
         ax.plot([], [], color=ink(0.5), label="likeliest ways on")
-        beyond = "" if in_view.all() else " (at an edge: or beyond)"
-        ax.plot([], [], "o", fillstyle="none", color=ink(), label=f"state{beyond}")
+        ax.plot([], [], "o", fillstyle="none", color=ink(), label="state")
         inside = np.all((dots >= limits[::2]) & (dots <= limits[1::2]), axis=1)
         if outside := len(dots) - int(inside.sum()):
             beyond = f"not in view: {outside:,} observed, of which {fails[~inside].sum():,} failed"
