@@ -77,7 +77,7 @@ def test_help_loads_nothing_heavy(command):
         (["drive", "paper", "--frozen", "nothing-here"], "nothing-here"),
         (["drive", "paper", "--tolerance", "2"], "tolerance"),
         (["drive", "paper", "--mcap", "a", "--workers", "2"], "workers send no decisions"),
-        (["paper", "--world", "kinematic", "--out", __file__], "this is a file; name a folder"),
+        (["paper", "--world", "kinematic", "--out", __file__], "file exists; name a folder"),
         (["drive", "paper", "--vehicles", "10%"], "--vehicles: only for a configuration"),
     ],
 )

@@ -51,9 +51,8 @@ def _message(error: BaseException) -> str:
     """What an error says, in one line, and what it happened in."""
     text = str(error) or type(error).__name__
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        is_file = isinstance(error, FileExistsError)  # where a folder is to be made
-        why = "this is a file; name a folder" if is_file else error.strerror.lower()
-        text = f"{error.filename}: {why}"
+        folder = "; name a folder" * isinstance(error, FileExistsError)  # that was to be made
+        text = f"{error.filename}: {error.strerror.lower()}{folder}"
     return " ".join(", ".join([text, *getattr(error, "__notes__", ())]).split())
 
 

@@ -87,22 +87,19 @@ def drive(
     A SUMO configuration (my.sumocfg) is run as it is, with guards in the cars that --vehicles names
     and, to act, alone before; of all else only --mode (act or shadow), --tolerance and --json hold.
     """
+    from evofsm.cli import driving
     from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
     if family.endswith(".sumocfg"):
         common = {"family", "vehicles", "mode", "tolerance", "as_json"}
         options.refuse_typed(ctx, sorted(ctx.params.keys() - common), "families of scenarios")
-        from evofsm.cli import driving
-
         driving.run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
     options.refuse_typed(ctx, ["vehicles"], "a configuration of SUMO")
     if workers is not None and (audit or mcap):
         raise ValueError("--audit and --mcap go with no --workers: workers send no decisions")
-    needs_table = out is not None and workers is None
-    options.require_world(world, **({"polars": "tables"} if needs_table else {}))
-    options.require(**({} if mcap is None else {"mcap": "mcap"}))
-    from evofsm.cli import driving
+    extras = {"polars": "tables"} if out is not None and workers is None else {}
+    options.require_world(world, **extras, **({"mcap": "mcap"} if mcap else {}))
     from evofsm.driving import load_family
     from evofsm.guard import Mode
 

@@ -335,8 +335,7 @@ def run_configuration(
                 for car in sorted({*sumo.vehicle.getIDList()}.difference(kinds)):
                     kinds[car] = sumo.vehicle.getTypeID(car).partition("@")[0]
                 if seconds == int(seconds):
-                    collisions = f"{len(cars.collisions)} collisions"
-                    move(description=f"Driving, {how} ({seconds:,.0f} s, {collisions})")
+                    move(description=f"{how}: {seconds:,.0f} s, {len(cars.collisions)} collisions")
             seconds = sumo.simulation.getTime() - begin
             cars.detach()  # else they guard what is simulated next
         if not cars.ever:
@@ -355,12 +354,11 @@ def run_configuration(
         settings = {"configuration": str(file), "vehicles": vehicles, "mode": mode}
         print_json({**settings, **outcome, "alone": alone})
         return
-    title = f"What came of {outcome['seconds']:,.0f} s"
     runs = (outcome,) if alone is None else (alone, outcome)
     rows = [(name, *map(tell, runs)) for name, tell in _TOLD.items()]
     rows = [row for row in rows if any(row[1:])]
     header = ("", "in shadow") if alone is None else ("", "alone", "guarded")
-    show(table(title, header, rows))
+    show(table(f"What came of {outcome['seconds']:,.0f} s", header, rows))
 
 
 def _share(what: str) -> Callable[[Mapping[str, Any]], str]:

@@ -492,8 +492,7 @@ def choose(vehicles: str | float | Iterable[str]) -> Callable[[Any, str], bool]:
                 f"vehicles is {vehicles!r}; it is 'all', 'type:NAME', a share above 0 up to 1, "
                 "such as 0.1 or '10%', or a list of ids"
             )
-        most = share * 2.0**64
-        # No checksum, which has numbered ids in or out together.
+        most = share * 2.0**64  # of a hash that mixes: crc32 has numbered ids in or out together
         return lambda _, car: int.from_bytes(blake2b(car.encode(), digest_size=8).digest()) < most
     ids = frozenset(vehicles)
     return lambda _, car: car in ids

@@ -163,10 +163,8 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
         more += "decides"
     if state.is_doubted:
         fails, ends, _ = _where(state.rivals, names)
-        clauses = [f"it only fails {fails}"] * bool(fails)
-        clauses += [f"it ends by itself {' or '.join(ends)}"] * bool(ends)
-        more += "; tried while it learns, as much was refused without a failure: "
-        more += ", and ".join(clauses)
+        more += "; tried while it learns, as much was refused without a failure: it only "
+        more += f"fails {fails}" + (f", and ends by itself {' or '.join(ends)}" if ends else "")
     if len(state.dropped):
         until, *_ = _where(state.dropped, names)
         more += f"; frozen it refuses, too, {until}, as what took its place is new"
