@@ -79,6 +79,7 @@ def test_help_loads_nothing_heavy(command):
         (["drive", "paper", "--mcap", "a", "--workers", "2"], "workers send no decisions"),
         (["paper", "--world", "kinematic", "--out", __file__], "file exists; name a folder"),
         (["drive", "paper", "--vehicles", "10%"], "--vehicles: only for a configuration"),
+        (["drive", "paper", "--reviser", "none", "--mode", "act"], "--mode: only for --reviser l"),
     ],
 )
 def test_a_command_that_is_called_wrongly_says_so_in_one_line(refused, words, says):

@@ -96,6 +96,7 @@ def drive(
         driving.run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
     options.refuse_typed(ctx, ["vehicles"], "a configuration of SUMO")
+    options.refuse_typed(ctx, ["mode", "tolerance"] * (reviser == "none"), "--reviser least-risk")
     if workers is not None and (audit or mcap):
         raise ValueError("--audit and --mcap go with no --workers: workers send no decisions")
     extras = {"polars": "tables"} if out is not None and workers is None else {}
@@ -107,9 +108,8 @@ def drive(
     if frozen is not None:
         before, _ = driving.load_guard(frozen)
         digest = sha256((frozen / driving.GUARD).read_bytes()).hexdigest()
-    learns = frozen is None and workers is None
     choices = load_family(family), reviser, judge, Mode(mode), tolerance, seed, world
-    setup = driving.Setup(*choices, learns, digest)
+    setup = driving.Setup(*choices, frozen is None and workers is None, digest)
     guard = driving.make_guard(setup, before)
     with closing(driving.Results(setup, guard, out)) as results:
         if mcap is not None and results.rows:
