@@ -47,8 +47,7 @@ class Journal(Ledger):
     def __init__(self, path: Path, otherwise: str) -> None:
         contents: list[dict[str, Any]] = []
         super().__init__(path, otherwise, contents.append)
-        #: Those that it was begun with; none where it is empty.
-        self.settings: Record = contents[0]["settings"] if contents else {}
+        self.settings: Record = contents[0]["settings"] if contents else {}  #: of its header
         self.records = contents[1:]  #: those that were there
 
     def go_on(self, settings: Record, otherwise: str) -> None:
@@ -58,12 +57,16 @@ class Journal(Ledger):
             raise ValueError(f"{self.path} was begun with other settings: {changes}; {otherwise}")
         if changes:
             self.head, self._size = NOTHING, 0  # in place of another header
-            self._begin(settings)
+            self.settings = settings
+            self.append({"about": self._about, "settings": settings})
 
     def append(self, *records: Record, sync: bool = True) -> None:
         """Add records, which then survive the process, with ``sync`` a power cut too."""
         try:
-            self._append(*records, sync=sync)
+            for record in records:
+                self._append(record)
+            if sync:
+                self.force()
         except OSError as error:
             hint = "what came before is kept: make room, and run the same command again"
             raise OSError(error.errno, f"{error.strerror}; {hint}", str(self.path)) from error
@@ -73,14 +76,11 @@ class Journal(Ledger):
         fresh = self.path.with_name(f".{self.path.name}.new")
         fresh.unlink(missing_ok=True)
         journal = Journal(fresh, "try again")
-        journal._begin(settings, *records)
+        journal.go_on(settings, "try again")
+        journal.append(*records)
         os.replace(fresh, self.path)
         self.close()
         vars(self).update(vars(journal), path=self.path)
-
-    def _begin(self, settings: Record, *records: Record) -> None:
-        self.settings = settings
-        self.append({"about": self._about, "settings": settings}, *records)
 
 
 def differences(before: Record, now: Record) -> str:

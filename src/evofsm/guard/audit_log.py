@@ -313,16 +313,13 @@ class Ledger:
             self._cut()
             _log.warning("%s: a half-written record was cut off", self.path)
 
-    def _append(self, *contents: Mapping[str, Any], sync: bool) -> None:
-        """Add records, or none of them; with ``sync`` they are then on the disk."""
+    def _append(self, content: Mapping[str, Any]) -> None:
+        """Add a record, or nothing of it."""
         if os.getpid() != self._owner:
             why = "the log belongs to the process that opened it; a child of that needs its own"
             raise PermissionError(errno.EPERM, why, str(self.path))
         self._cut()  # what could not be cut off then
-        data, head = b"", self.head
-        for content in contents:
-            line, head = seal(content, head)
-            data += line
+        data, head = seal(content, self.head)
         size = self._size + len(data)
         try:
             while data:  # a disk that gets full takes a part of it first
@@ -332,8 +329,6 @@ class Ledger:
                 self._cut()
             raise
         self.head, self._size = head, size
-        if sync:
-            self.force()
 
     def _cut(self) -> None:
         """Cut off what was taken back, or is half of a record."""
@@ -495,8 +490,9 @@ class AuditLog(Ledger, AbstractContextManager["AuditLog"], DecisionLogger):
         if "before" in FIELDS[kind]:
             content["before"], self._before = self._before, []
         record = {"kind": kind, "clock": datetime.now(UTC).isoformat(), **content}
-        sync = self.sync == "record" or kind in ("begin", "end")
-        self._try(lambda: self._append(record, sync=sync))
+        self._try(lambda: self._append(record))
+        if self.sync == "record" or kind in ("begin", "end"):
+            self._try(self.force)
 
     def _try(self, write: Callable[[], None]) -> None:
         """Write, unless that failed before; a failure is raised later."""
