@@ -229,13 +229,14 @@ def test_of_mcap_that_ends_early_the_beginning_is_read(tmp_path):
 
 
 def test_an_action_may_be_mapped_and_failures_be_told_of_by_a_comparison(tmp_path):
-    told = {**TOLD, "variables": {**TOLD["variables"], "a_follower": f"{EGO}.twist.twist.linear.y"}}
-    path = write(tmp_path / "bag", drive())
+    told = {**TOLD, "variables": {**TOLD["variables"], "a_follower": "/cmd.twist.twist.linear.x"}}
+    replies = [(0.1 * k + 0.001, "/cmd", odometry(0.0, float(k))) for k in range(20)]  # to each row
+    path = write(tmp_path / "bag", [*drive(), *replies])
     (chunk,) = read(path, told, failed="gap<=44")
-    assert (chunk.actions == 0.0).all()
+    assert chunk.actions == pytest.approx(10.0 * chunk.times)
     assert chunk.fails.sum() == 1
     touch = 1.98, OTHER, odometry(0.0, 0.0)  # with which the recording ends
-    (chunk,) = read(write(tmp_path / "touch", [*drive(), touch]), told, failed="gap<0")
+    (chunk,) = read(write(tmp_path / "touch", [*drive(), touch]), failed="gap<0")
     assert np.flatnonzero(chunk.fails).tolist() == [len(chunk.times) - 1]
 
 

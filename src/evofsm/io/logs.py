@@ -636,7 +636,7 @@ def open_table(path: str, columns: LogColumns, skips: Skips) -> Table:
             )
         from evofsm.io.rosbag import BagTable
 
-        return BagTable(path, columns.topics, skips)
+        return BagTable(path, columns.topics, columns.observe.names, skips)
     if kind in ("osi", "mcap"):
         read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap
         moments = vehicles.pairs_of_scenes(path, read(path, skips), skips)

@@ -12,7 +12,7 @@ import sqlite3
 import tomllib
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from itertools import chain
@@ -197,11 +197,13 @@ class Topics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class BagTable(Table):
     """A bag as a table: ``time`` [s] from its first message on, and the variables at each tick.
 
+    Those that are not ``observed``, such as the action and what tells of failures, are those of
+    half a step later: who answers what was seen does so after it, and for the step to come.
     Where the action is not mapped it is the change of ``v_follower`` to the next row.
     """
 
-    def __init__(self, path: str, topics: Topics, skips: Skips) -> None:
-        self.path, self.skips, self._topics = path, skips, topics
+    def __init__(self, path: str, topics: Topics, observed: Container[str], skips: Skips) -> None:
+        self.path, self.skips, self._topics, self._observed = path, skips, topics, observed
         self.derives = "v_follower" in topics.variables and ACTION not in topics.variables
         self.columns = ["time", *topics.variables, *([ACTION] if self.derives else [])]
 
@@ -235,17 +237,18 @@ class BagTable(Table):
         ticks = np.concatenate([*map(np.arange, first, after)])
         # The last one is the first after all: the failure may be the last that was recorded.
         at = stamps[0] + interval * ticks[(ticks - 1) * interval < stamps[-1] - stamps[0]]
-        values: dict[str, NDArray[np.float64]] = {}
+        columns: dict[str, NDArray[np.float64]] = {}
         is_known = np.ones(len(at), np.bool_)
-        for field, (of_field, numbers) in found.items():
-            latest = np.searchsorted(of_field, at, side="right") - 1
-            is_known &= (latest >= 0) & (at - of_field[latest] <= oldest)
-            values[field] = numbers[latest]
-        rows = {"time": (at - stamps[0])[is_known] / _NANOSECONDS}
         for name, variable in topics.variables.items():
-            value = values[variable.field] - (values[variable.minus] if variable.minus else 0.0)
+            when, values = at if name in self._observed else at + interval // 2, []
+            for of_field, numbers in (found[field] for field in variable.fields):
+                latest = np.searchsorted(of_field, when, side="right") - 1
+                is_known &= (latest >= 0) & (when - of_field[latest] <= oldest)
+                values.append(numbers[latest])
             factor = 1.0 if variable.unit is None else UNITS[variable.unit]
-            rows[name] = (factor * value + variable.offset)[is_known]
+            columns[name] = factor * (values[0] - sum(values[1:])) + variable.offset
+        rows = {"time": (at - stamps[0]) / _NANOSECONDS, **columns}
+        rows = {name: column[is_known] for name, column in rows.items()}
         if self.derives:
             action = np.diff(rows["v_follower"], append=np.nan) / topics.interval
             follows = np.diff(at[is_known], append=0) == interval
