@@ -402,7 +402,7 @@ def test_what_a_search_finds_outside_is_put_into_the_set():
         *(({"low": -1.0, "high": 1.0, "tolerance": p}, "tolerance") for p in (0.0, math.nan)),
         *(({"low": -1.0, "high": 1.0, "interval": dt}, "interval") for dt in (0.0, -1.0, math.nan)),
         ({"low": -1.0, "high": 1.0, "failed": True}, r"failed is .*; it must be a function"),
-        ({"low": -1.0, "high": 1.0, "mode": "on"}, "'on' is not a valid Mode"),
+        ({"low": -1.0, "high": 1.0, "mode": "on"}, "mode is 'on'; it is one of off, shadow, act"),
         ({"low": -1.0, "high": 1.0, "audit": "log.jsonl"}, "has no method decided"),
         ({"low": -1.0, "high": 1.0, "judge": None, "names": "ab"}, "names is 'ab'; it must be"),
         ({"low": [0.0, 0.0], "high": [1.0], "judge": None}, "low has 2 components and high has 1"),
