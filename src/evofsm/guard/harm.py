@@ -115,9 +115,9 @@ class Harm(NamedTuple):
         """What is said of a guard that keeps hardly a proposal; empty of one that keeps more."""
         if self.decided < _FEWEST_DECISIONS or self.kept >= 0.05 * self.decided:
             return ""
-        share = f"{self.kept / self.decided:.0%}"
+        share = f"where it drives {self.kept / self.decided:.0%} of proposals pass"
         rest = "others are executed only where nothing lasts longer"
-        return f"refuses nearly everything: {share} of proposals pass, {rest}; that is no filter"
+        return f"refuses nearly everything: {share}, {rest}; that is no filter"
 
     def helps(self, *, learning: bool) -> bool:
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
