@@ -239,13 +239,6 @@ def test_a_guard_that_refuses_most_of_the_time_is_said_to(evofsm, tmp_path):
     assert "\nBy risk of what was proposed\n" in summed
 
 
-def test_a_guard_of_a_log_that_tells_of_no_failures_counts_none(evofsm, own, tmp_path):
-    path = tmp_path / "car.evofsm"
-    evofsm("learn", own, *OWN, "--judge", "kinematic", "--guard", path)
-    said = evofsm("explain", path, "--state", 1).stdout
-    assert "how many failed is not known" in " ".join(said.split())
-
-
 def test_a_guard_that_could_not_be_taught_is_refused_before_the_work(refused, own, tmp_path):
     options = ("learn", own, *OWN, "--guard", tmp_path / "car.evofsm")
     assert "which there were is not known: --failed" in refused(*options)
@@ -300,6 +293,8 @@ def test_failures_are_learnt_and_how_often_they_came_is_said(evofsm, log, tmp_pa
     assert "2 of 3" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
     evofsm("learn", log, "--failed", "gap<-99", "--out", path)  # nor does the last one fail
     assert "0 of 3" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
+    evofsm("learn", log, "--guard", path)  # nor does anything tell of failures
+    assert "not known" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
 
 
 def test_a_failure_that_no_row_meets_is_said_with_the_range_of_its_column(evofsm, tmp_path):

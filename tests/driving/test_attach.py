@@ -302,14 +302,12 @@ def test_a_car_that_sumo_teleports_begins_anew(tmp_path):
     )
     network = ["-n", str(EXAMPLE / "grid.net.xml.gz"), "-r", str(cars), "--time-to-teleport", "9"]
     libsumo.start(["sumo", *network, "--no-step-log", "--no-warnings"])
-    guards, speeds = attach(libsumo, ["ego"]), []
+    guards = attach(libsumo, ["ego"])
     while "ego" not in libsumo.simulation.getStartingTeleportIDList():
         libsumo.simulationStep()
         libsumo.vehicle.setLaneChangeMode("ego", 0)
     assert guards.guarding.limited > 0
-    for _ in range(5):
-        libsumo.simulationStep()
-        speeds.append(libsumo.vehicle.getSpeed("ego"))
+    speeds = [(libsumo.simulationStep(), libsumo.vehicle.getSpeed("ego"))[1] for _ in range(5)]
     assert min(speeds) > 5.0
     assert guards.guarding.overruled == 0
 

@@ -875,10 +875,10 @@ def test_what_an_agent_is_not_told_is_optional(crowd, silent):
 def test_whom_anothers_failure_ends_did_not_end_by_itself(crowd):
     class Together(crowd):
         def step(self, actions):
-            seen, rewards, over, cut, infos = super().step(actions)
-            over = dict.fromkeys(over, any(over.values()))
-            self.agents = [] if any(over.values()) else self.agents
-            return seen, rewards, over, cut, infos
+            seen, rewards, over, *others = super().step(actions)
+            if any(over.values()):
+                self.agents, over = [], dict.fromkeys(over, True)
+            return seen, rewards, over, *others
 
     spy, ended = Spy(), []
     spy.end = lambda z, *, failed, terminated: ended.append((failed, terminated))
@@ -890,9 +890,8 @@ def test_whom_anothers_failure_ends_did_not_end_by_itself(crowd):
 
 
 def test_agents_that_observe_differently_are_refused(crowd):
-    sizes = iter((1, 2))
-    observe = {"observe": lambda z: z[: next(sizes)]}
-    env = evofsm.guard.RevisedAgents(crowd(2, 4), guard_for(ONE), **observe)
+    sizes, observe = iter((1, 2)), lambda z: z[: next(sizes)]
+    env = evofsm.guard.RevisedAgents(crowd(2, 4), guard_for(ONE), observe=observe)
     with pytest.raises(ValueError, match=r"different numbers of variables, \{'a0': 1, 'a1': 2\}"):
         env.reset()
 
