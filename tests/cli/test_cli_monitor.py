@@ -155,9 +155,9 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
     decider = Decider(guard_of_monitor(0.1, 5.0, 0.05))
     decider.guard.learn = False
     risky = [decider.answer(line(row))["risk_proposed"] > 0.05 for row in traffic(2000)]
-    cut = next(k for k in range(9, 1990) if all(risky[k - 5 : k + 5]))
-    rows = list(traffic(2000))
-    trips = [rows[: cut + 1], rows[cut - 4 :]]  # it is risky where one ends and one begins
+    cut, rows = next(k for k in range(9, 1990) if all(risky[k - 5 : k + 5])), [*traffic(2000)]
+    late = [{**row, "time": row["time"] + 900.0} for row in rows[cut - 4 :]]  # not sent again
+    trips = [rows[: cut + 1], late]  # it is risky where one ends and one begins
     answers = []
     for trip in trips:
         decider.answer(b'{"end": true}')
