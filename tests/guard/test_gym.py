@@ -637,6 +637,20 @@ def test_only_what_the_environment_allows_is_executed(host, how, judge):
     assert {0.0, 2.0} <= set(executed)
 
 
+def test_a_mask_of_each_component_is_one_of_their_combinations():
+    def executed(mask, sizes=(3, 2)):
+        env = Script(FAR, FAR, action_space=MultiDiscrete(sizes))
+        env.action_masks = lambda: mask
+        drive(RevisedActions(env, guard_for(env.action_space)), lambda seen, info: np.array([0, 0]))
+        return env.executed[0].tolist()
+
+    assert executed(np.array([0, 1, 0, 1, 0])) == [1, 0]
+    assert executed(([0, 1, 1], [0, 1])) == executed(np.arange(6) == 3) == [1, 1]
+    for mask, sizes in ((np.arange(4) == 3, (2, 2)), (([0, 1], [0, 1, 1]), (3, 2))):
+        with pytest.raises(ValueError, match=r"MultiDiscrete.*tuple"):
+            executed(mask, sizes)
+
+
 # -- Many at once ------------------------------------------------------------------------------
 
 

@@ -345,7 +345,8 @@ class Lane:
     def _look(self, observation: Any, info: Mapping[str, Any]) -> None:
         self.seen = self.terms.look(observation)
         if isinstance(self.terms.guard.actions, Choices):
-            self._mask = checked_mask(self.terms.guard.actions, self._allowed(observation, info))
+            mask = _of_combinations(self.terms.space, self._allowed(observation, info))
+            self._mask = checked_mask(self.terms.guard.actions, mask)
 
     def decide(self, action: Any) -> Decided:
         """What to execute; the action itself where there is nothing to judge, or to decide."""
@@ -450,8 +451,7 @@ class Terms:
             function("failed", failed, _FAILED)
         if not isinstance(guard, Guard):
             raise TypeError(f"guard is {guard!r}; it must be a Guard, as Guard.load(path) reads it")
-        self.guard = guard
-        self.penalty = penalty
+        self.guard, self.space, self.penalty = guard, actions, penalty
         self._silent, self._has_decided = 0, False
         self._observe, self._failed = observe or _flat(observations), failed
         keys = tuple(observations.keys()) if isinstance(observations, Dict) else ()
@@ -532,29 +532,42 @@ def _flat(space: Space[Any]) -> Observe:
     )
 
 
+def _sizes(space: Any) -> list[int]:
+    """How many values each component of an action has, where that is what there is."""
+    many = isinstance(space, MultiDiscrete | MultiBinary)
+    return np.ravel(getattr(space, "nvec", np.full(space.shape, 2))).tolist() if many else []
+
+
+def _of_combinations(space: Space[Any], mask: Any) -> Any:
+    """A mask of all combinations; where it is one of each component, as MaskablePPO's, of them."""
+    if mask is None or not (sizes := _sizes(space)):
+        return mask
+    count, is_parted = math.prod(sizes), isinstance(mask, tuple | list) and any(map(np.ndim, mask))
+    if not is_parted and np.shape(mask) in {(count,)} - {(sum(sizes),)} | {tuple(sizes)}:
+        return np.ravel(mask)
+    parts = mask if is_parted else np.split(np.ravel(mask), np.cumsum(sizes)[:-1])
+    if [*map(np.size, parts)] == sizes and (is_parted or count != sum(sizes)):
+        return np.all(np.meshgrid(*parts, indexing="ij"), axis=0).ravel()
+    wants = f"a tuple of arrays of {sizes} entries, or one of shape {tuple(sizes)}, of combinations"
+    raise ValueError(f"the mask of allowed actions is {mask!r}, of {space}; it must be {wants}")
+
+
 def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Convert]:
     """From an action of the environment to one of the guard, and back."""
+    sizes, start = _sizes(space), getattr(space, "start", 0)
     if isinstance(space, Discrete) and actions == Choices(int(space.n)):
-        first = int(space.start)
-        return (
-            lambda action: float(np.asarray(action).item()) - first,
-            lambda action: first + int(action),
-        )
-    if isinstance(space, MultiDiscrete | MultiBinary):
-        sizes: Any = getattr(space, "nvec", np.full(space.shape, 2))
-        start = getattr(space, "start", 0)
-        if actions == Choices(math.prod(sizes.flat)):
-            flat_sizes = sizes.ravel()
+        return lambda a: float(np.asarray(a).item()) - int(start), lambda a: int(start) + int(a)
+    if sizes and actions == Choices(math.prod(sizes)):
 
-            def index(action: Any) -> float:
-                row = np.ravel(action - start)
-                return float(np.ravel_multi_index(row, flat_sizes)) if action in space else -1.0
+        def index(action: Any) -> float:
+            row = np.ravel(action - start)
+            return float(np.ravel_multi_index(row, sizes)) if action in space else -1.0
 
-            def combination(index: Action) -> NDArray[Any]:
-                row = np.array(np.unravel_index(int(index), flat_sizes), space.dtype)
-                return np.asarray(row.reshape(space.shape) + start, space.dtype)
+        def combination(index: Action) -> NDArray[Any]:
+            row = np.array(np.unravel_index(int(index), sizes), space.dtype)
+            return np.asarray(row.reshape(space.shape) + start, space.dtype)
 
-            return index, combination
+        return index, combination
     shape = actions.half.shape if isinstance(actions, BoxActions) else ()
     is_range = not isinstance(actions, Choices)
     if not (isinstance(space, Box) and is_range and math.prod(space.shape) == math.prod(shape)):
@@ -564,7 +577,6 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
             "combinations) and arrays low and high of Box, or wrap the environment first "
             "(RescaleAction, TransformAction of gymnasium.wrappers)"
         )
-
     low, high = (np.reshape(end, space.shape) for end in (actions.low, actions.high))
     slack = 1e-6 * (high - low)  # what a float32 may round
     if (low < space.low - slack).any() or (high > space.high + slack).any():
