@@ -226,6 +226,9 @@ def test_of_mcap_that_ends_early_the_beginning_is_read(tmp_path):
     assert 5 < len(chunk.times) < len(whole.times)
     assert (chunk.observations == whole.observations[: len(chunk.times)]).all()
     assert "it ends within a record" in " ".join(warnings_of(noted))
+    path.write_bytes(path.read_bytes()[:3000])
+    with pytest.raises(ValueError, match=r"byte .*: it ends .* before .* it has no message"):
+        read(str(path), TOLD)
 
 
 def test_an_action_may_be_mapped_and_failures_be_told_of_by_a_comparison(tmp_path):

@@ -295,7 +295,9 @@ class BagTable(Table):
                         stamps.append(stamp)
                         numbers.append(number)
         if lack := sorted(topics - there):
-            raise RefusedError(f"it has no topic {lack[0]!r}; it has {', '.join(sorted(there))}")
+            cut, has = self.skips.first.get("cut"), ", ".join(sorted(there)) or "no message"
+            begins = f"{cut}; before that" if cut else f"{self.path}:"
+            raise ValueError(f"{begins} it has no topic {lack[0]!r}; it has {has}")
         if self._topics.stamp == "received":
             self._compare(spans)
         series: dict[str, _Values] = {}

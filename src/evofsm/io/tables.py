@@ -141,20 +141,20 @@ class Skips:
     kinds: dict[str, tuple[int, str]] = field(default_factory=dict)  #: how many, and the first
     told: list[str] = field(default_factory=list)  #: what else is to be said
     on_read: OnRead = lambda count: None
-    _first: dict[str, str] = field(default_factory=dict, init=False)  # of this file
+    first: dict[str, str] = field(default_factory=dict, init=False)  #: of each kind, in this file
 
     def __post_init__(self) -> None:
         self._left = self.most
 
     def leave_out(self, kind: str, why: str | Callable[[], str], rows: int = 1) -> None:
         """Leave a row out, or raise where that is one too many; ``why`` begins with its place."""
-        if kind not in self._first:
-            self._first[kind] = why if isinstance(why, str) else why()
+        if kind not in self.first:
+            self.first[kind] = why if isinstance(why, str) else why()
         self._left -= rows
         if self._left < 0:
             more = f"--skip-bad {self.most} leaves out so many bad rows, and there are more"
-            raise ValueError(f"{self._first[kind]}; {more}")
-        count, first = self.kinds.get(kind, (0, self._first[kind]))
+            raise ValueError(f"{self.first[kind]}; {more}")
+        count, first = self.kinds.get(kind, (0, self.first[kind]))
         self.kinds[kind] = count + 1, first
 
     @contextmanager
@@ -167,7 +167,7 @@ class Skips:
 
     def refuse_nothing(self, otherwise: str) -> NoReturn:
         """Raise where no row is left, for what was left out first."""
-        raise ValueError(next(iter(self._first.values()), otherwise))
+        raise ValueError(next(iter(self.first.values()), otherwise))
 
 
 class Source(AbstractContextManager["Source"]):
@@ -295,7 +295,7 @@ def _mcap_records(path: str | os.PathLike[str], largest: int, skips: Skips) -> I
                 else:
                     yield record
         except (EndOfFile, RecordLengthLimitExceeded, struct.error) as error:
-            why = f"it ends within a record, or is damaged there {error}".strip()
+            why = f"it ends within a record, or is damaged there: {error}".removesuffix(": ")
             skips.leave_out("cut", f"{os.fspath(path)}, byte {file.tell():,}: {why}")
 
 
