@@ -129,8 +129,12 @@ def test_a_file_holds_an_environment_of_ones_own(tmp_path):
         assert (session.start.system, session.start.names) == ("own", ("cos", "sin", "speed"))
         for frame in drive(session)[:-1]:
             assert 0.0 <= frame.proposed[0] <= 2.0
-    path.write_text("def environment():\n    return 1 / 0\n")
-    with pytest.raises(ValueError, match=r"own\.py: ZeroDivisionError: division by zero"):
+    (tmp_path / "beside.py").write_text("def environment():\n    return 1 / 0\n")
+    path.write_text("import beside\ndef environment():\n    return beside.environment()\n")
+    with pytest.raises(ValueError, match=r"own\.py, line 3, in environment: ZeroDivisionError: "):
+        read_simulated(str(path))
+    path.write_text("def environment():\n    return [1]\n")
+    with pytest.raises(ValueError, match=r"returns list, not one gymnasium\.Env"):
         read_simulated(str(path))
 
 

@@ -13,11 +13,14 @@ from __future__ import annotations
 import math
 import operator
 import runpy
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
+from traceback import extract_tb
 from typing import Any, NamedTuple, SupportsIndex
 from zlib import crc32
 
@@ -535,25 +538,37 @@ def load_family(name: str | PathLike[str]) -> Family:
     if base in FAMILIES:
         return FAMILIES[base]().with_switches(switches)
     if not base.endswith(".py") or not Path(base).is_file():
-        raise ValueError(
-            f"there is no family {base!r}; there are {', '.join(FAMILIES)}, or name a file of "
-            "Python that exists"
-        )
+        raise ValueError(f"no family or .py file is {base!r}; there are {', '.join(FAMILIES)}")
     return read_family(base, switches)
 
 
 def read_family(path: str | Path, switches: Sequence[str] = ()) -> Family:
     """The ``family`` that a file of Python defines; a ValueError names the file."""
-    try:
-        definition = runpy.run_path(str(path)).get("family")
+    with definitions_of(path) as definitions:
+        definition = definitions.get("family")
         if not isinstance(definition, Family):
             raise ValueError("it defines no Family that is called family")
         family = replace(definition, source=str(path)).with_switches(switches)
         for version in filter(None, (family, family.shifted)):
             for variant in range(max(1, len(version.variants))):
                 version.draw_by(Numbers(0, 0), variant)  # so that a mistake shows at once
-    except Exception as error:
-        text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-        where = "" if text.startswith(f"{path}: ") else f"{path}: "
-        raise ValueError(f"{where}{text}") from error
     return family
+
+
+@contextmanager
+def definitions_of(path: str | Path) -> Iterator[dict[str, Any]]:
+    """What a file of Python defines, which may import what lies beside it.
+
+    An error, also in what is done with that, names the file, and its line where it has one.
+    """
+    sys.path.insert(0, folder := str(Path(path).resolve().parent))
+    try:
+        yield runpy.run_path(str(path))
+    except Exception as error:
+        frames = [f for f in extract_tb(error.__traceback__) if f.filename == str(path)]
+        line = "".join(f", line {frame.lineno}, in {frame.name}" for frame in frames[-1:])
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        text = str(error).removeprefix(f"{path}: ")
+        raise ValueError(f"{path}{line}: {kind}{text}") from error
+    finally:
+        sys.path.remove(folder)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import runpy
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
@@ -22,6 +21,7 @@ from evofsm.cli.options import BRAKES, refuse_other_limit, require_world
 from evofsm.cli.show import progress, warn
 from evofsm.cli.watch import shown
 from evofsm.driving.cars import assumptions, guard_of_monitor, name_judge
+from evofsm.driving.family import definitions_of
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.driving.sumo import open_world
 from evofsm.driving.world import GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
@@ -79,8 +79,7 @@ def learn_first(
     for index in range(episodes):
         acts = 2 * index >= episodes
         if isinstance(system, Simulated):
-            mode = Mode.ACT if acts else Mode.SHADOW
-            system.guard.reviser.mode = mode  # type: ignore[attr-defined]
+            system.guard.reviser.mode = Mode.ACT if acts else Mode.SHADOW  # type: ignore[attr-defined]
         system.teach(index)
         show(index + 1)
         streak = streak + 1 if acts and isinstance(system, Simulated) and not system.failed else 0
@@ -189,6 +188,8 @@ class Simulated:
     ) -> None:
         with needs("gymnasium", "gym", "an environment of Gymnasium"):
             from evofsm.guard import gym
+        if not isinstance(env, gym.gymnasium.Env):  # type: ignore[attr-defined]
+            raise TypeError(f"environment() returns {type(env).__name__}, not one gymnasium.Env")
         self.name, self.seed, self.cases = name, seed, _DRAWS
         self._gym, self._env, self._controller, self._failed = gym, env, controller, failed
         self.interval = 1.0 / float(env.metadata.get("render_fps") or _STEPS_PER_SECOND)
@@ -200,8 +201,7 @@ class Simulated:
         names, units = [parts[0] for parts in titles], [parts[2].rstrip("]") for parts in titles]
         judge = LearntRisk(self.interval, **ends, names=names, units=units, seed=seed)
         guard = Guard(**ends, interval=self.interval, judge=judge, tolerance=tolerance)
-        spaces = env.observation_space, env.action_space
-        self._terms = gym.Terms(guard, *spaces, None, failed, 0.0)
+        self._terms = gym.Terms(guard, env.observation_space, env.action_space, None, failed, 0.0)
         observations = np.array([z for k in range(_LOOKED_AT) for z in self._run(env, -1 - k)])
         machine = system_machine(guard.actions.n_actions, observations)
         self.guard = Guard.of(guard.reviser, interval=self.interval, machine=machine)
@@ -256,8 +256,7 @@ class Simulated:
     def propose(self) -> Action:
         """What the controller wants."""
         self._wanted = self._wish()
-        action: Action = self._terms.to_guard(self._wanted)
-        return action
+        return self._terms.to_guard(self._wanted)
 
     def advance(self, revision: Revision) -> None:
         """Take a step."""
@@ -294,16 +293,13 @@ def _ends(name: str, space: Any) -> dict[str, Any]:
 def read_simulated(what: str, **settings: Any) -> Simulated | None:
     """An environment by its id, or as a file of Python defines it (docs/watch.md); None of none."""
     if what.endswith(".py"):
-        try:
-            definitions = runpy.run_path(what)
+        with definitions_of(what) as definitions:
             if "environment" not in definitions:
                 if "family" in definitions:
                     return None
                 raise ValueError("it defines neither environment() nor a Family called family")
             parts = {name: definitions[name] for name in _PARTS if name in definitions}
             return Simulated(Path(what).stem, definitions["environment"](), **parts, **settings)
-        except Exception as error:  # of somebody's own
-            raise ValueError(f"{what}: {type(error).__name__}: {error}") from error
     if not re.search(r"-v\d+$", what):
         return None
     with needs("gymnasium", "gym", "an environment of Gymnasium"):
@@ -644,9 +640,8 @@ class Session(AbstractContextManager["Session"]):
     def _end(self, frame: shown.Frame) -> shown.Frame:
         system, before = self.system, self.known()
         self._guard.end(system.failed, system.observation, terminated=system.terminated)
-        novel = ""
-        if system.failed:
-            novel = shown.first_of_its_kind(frame.observation, before, self.known())
+        now = self.known()
+        novel = shown.first_of_its_kind(frame.observation, before, now) if system.failed else ""
         return frame._replace(over=True, failed=system.failed, novel=novel)
 
 
