@@ -136,6 +136,11 @@ def test_a_file_holds_an_environment_of_ones_own(tmp_path):
     path.write_text("def environment():\n    return [1]\n")
     with pytest.raises(ValueError, match=r"returns list, not one gymnasium\.Env"):
         read_simulated(str(path))
+    path.write_text(
+        "from gymnasium import make, spaces, wrappers\ndef environment():\n    return wrappers."
+        "TransformAction(make('CartPole-v1'), lambda a: int(a[0]), spaces.MultiDiscrete([2, 3]))"
+    )
+    assert read_simulated(str(path)).guard.actions.n_actions == 6
 
 
 @pytest.mark.parametrize(

@@ -279,14 +279,13 @@ def _names_of(env: Any) -> list[str]:
 
 def _ends(name: str, space: Any) -> dict[str, Any]:
     """Of actions, as a guard takes them."""
-    if hasattr(space, "n") and not space.shape:
-        return {"n_actions": int(space.n)}
+    if hasattr(space, "n") or hasattr(space, "nvec"):  # where there are several all combinations
+        sizes = getattr(space, "nvec", np.full(space.shape, 2 if space.shape else space.n))
+        return {"n_actions": int(np.prod(sizes))}
     low, high = (np.ravel(getattr(space, end, math.nan)).astype(float) for end in ("low", "high"))
     if not np.isfinite([low, high]).all():
-        raise ValueError(
-            f"{name}: its actions are {space}, neither Discrete nor a Box with finite ends; wrap "
-            "it first (gymnasium.wrappers.RescaleAction, FlattenObservation, ...)"
-        )
+        text = f"{name}: its actions are {space}, neither discrete nor a Box with finite ends"
+        raise ValueError(f"{text}; wrap it first (gymnasium.wrappers.TransformAction)")
     return {"low": low, "high": high} if len(low) > 1 else {"low": low[0], "high": high[0]}
 
 
