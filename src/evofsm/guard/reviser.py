@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.sharing import Rollback
-from evofsm.fsm.validation import probability
+from evofsm.fsm.validation import action_name, probability
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -109,8 +109,9 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
     action, words = put_into(actions, fallback.action), fallback.doing
     if mask is not None and not mask[int(action)]:
         action, words = float(mask.argmax()), "the first that is allowed"
-    note = ", not allowed here" if is_usable(actions, request) else ""
-    return Usable(action, f"no usable proposal ({action_text(request)}{note}): {words}")
+    is_barred = is_usable(actions, request)
+    name = f"{action_name(int(request))}, not allowed here" if is_barred else action_text(request)
+    return Usable(action, f"no usable proposal ({name}): {words}")
 
 
 class ActionReviser:

@@ -252,7 +252,7 @@ def test_only_what_a_mask_allows_is_executed_and_a_log_replays_it(points, tmp_pa
             mask = random.permutation([True, True, guard.n_episodes == 0 or random.random() < 0.5])
             said.append(decide(z, Proposal(proposal, mask)))
             assert mask[said[-1].executed]
-            assert ("not allowed here" in said[-1].reason) == (not mask[proposal])
+            assert (f"a({proposal + 1:.0f}), not all" in said[-1].reason) == (not mask[proposal])
             return said[-1]
 
         guard.decide = masked
