@@ -8,13 +8,7 @@ import pytest
 
 from evofsm.cli.options import reading_of
 from evofsm.cli.watch.server import Player
-from evofsm.cli.watch.session import (
-    OnRoads,
-    Session,
-    learn_first,
-    read_simulated,
-    watched_log,
-)
+from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_log
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, load_family, teach
 
@@ -46,8 +40,7 @@ def drive(session):
 
 
 def test_danger_shows_long_before_time_to_collision_notices_and_is_told_from_when_it_began():
-    session = opened(on=False)
-    frames = drive(session)
+    frames = drive(opened(on=False))
     story = frames[-1].story
     risky = next(frame for frame in frames if frame.proposed_risk.risk > 0.02)
     assert story.first == story.danger.began.time == risky.time
@@ -118,15 +111,12 @@ def test_the_first_failure_of_a_kind_is_called_so_and_no_other_one(on):
 def test_a_file_holds_an_environment_of_ones_own(tmp_path):
     path = tmp_path / "own.py"
     path.write_text(
-        "import gymnasium\n"
-        "def environment():\n    return gymnasium.make('Pendulum-v1')\n"
+        "import gymnasium\ndef environment():\n    return gymnasium.make('Pendulum-v1')\n"
         "def controller(seen, random):\n    return [2.0 * random.random()]\n"
-        "def failed(step):\n    return step.observation[0] < -0.9\n"
-        "variables = ('cos', 'sin', 'speed')\n"
+        "def failed(step):\n    return step.observation[0] < -0.9\nvariables = 'cos', 'sin', 's'\n"
     )
-    system = read_simulated(str(path))
-    with Session(system) as session:
-        assert (session.start.system, session.start.names) == ("own", ("cos", "sin", "speed"))
+    with Session(read_simulated(str(path))) as session:
+        assert (session.start.system, session.start.names) == ("own", ("cos", "sin", "s"))
         for frame in drive(session)[:-1]:
             assert 0.0 <= frame.proposed[0] <= 2.0
     (tmp_path / "beside.py").write_text("def environment():\n    return 1 / 0\n")

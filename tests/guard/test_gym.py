@@ -350,8 +350,7 @@ def test_a_failure_that_lasts_is_one_and_what_comes_after_it_another_episode():
 
 def test_who_does_not_say_which_episodes_failed_is_told_both_ways_to():
     def warned(guard, **settings):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:
             RevisedActions(Script(FAR), guard, **settings)
         return [str(one.message) for one in caught]
 
@@ -409,8 +408,7 @@ def test_a_wrapper_under_which_nothing_can_be_learnt_is_named(name, given, told,
     def below():
         return wrappers.TimeLimit(getattr(wrappers, name)(cart(), *given), 9)
 
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as heard:
         guard, how = guard_for(Discrete(2)), {"failed": lambda step: step.reward < 0.0}
         if many:
             RevisedVectorActions(SyncVectorEnv([below] * 2), guard, **how)
@@ -466,8 +464,7 @@ def test_episodes_that_an_environment_begins_by_itself_are_learnt(monkeypatch, w
     env = RevisedActions(env, guard_for(Discrete(2)))
     env.reset(seed=0)
     env.action_space.seed(0)
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as heard:
         for _ in range(90):
             env.step(env.action_space.sample())
     assert len(Recorder.ended) > 3
@@ -641,14 +638,13 @@ def test_a_mask_of_each_component_is_one_of_their_combinations():
     def executed(mask, sizes=(3, 2)):
         env = Script(FAR, FAR, action_space=MultiDiscrete(sizes))
         env.action_masks = lambda: mask
-        drive(RevisedActions(env, guard_for(env.action_space)), lambda seen, info: np.array([0, 0]))
+        drive(RevisedActions(env, guard_for(env.action_space)), lambda *_: np.array([0, 0]))
         return env.executed[0].tolist()
 
     assert executed(np.array([0, 1, 0, 1, 0])) == [1, 0]
     assert executed(([0, 1, 1], [0, 1])) == executed(np.arange(6) == 3) == [1, 1]
-    for mask, sizes in ((np.arange(4) == 3, (2, 2)), (([0, 1], [0, 1, 1]), (3, 2))):
-        with pytest.raises(ValueError, match=r"MultiDiscrete.*tuple"):
-            executed(mask, sizes)
+    with pytest.raises(ValueError, match=r"MultiDiscrete.*tuple"):
+        executed(np.arange(4) == 3, (2, 2))
 
 
 # -- Many at once ------------------------------------------------------------------------------

@@ -557,10 +557,7 @@ def read_family(path: str | Path, switches: Sequence[str] = ()) -> Family:
 
 @contextmanager
 def definitions_of(path: str | Path) -> Iterator[dict[str, Any]]:
-    """What a file of Python defines, which may import what lies beside it.
-
-    An error, also in what is done with that, names the file, and its line where it has one.
-    """
+    """What a file of Python defines; it may import what is beside it, and errors name its line."""
     sys.path.insert(0, folder := str(Path(path).resolve().parent))
     try:
         yield runpy.run_path(str(path))

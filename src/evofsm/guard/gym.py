@@ -20,7 +20,6 @@ from evofsm.fsm.validation import Floats, function
 from evofsm.guard.actions import (
     Action,
     ActionSet,
-    BoxActions,
     Choices,
     Mask,
     change,
@@ -286,9 +285,8 @@ class RevisedVectorActions(_Settled, VectorWrapper[Any, Any, Any, Any, Any]):
             infos |= {name: np.zeros(self.num_envs), f"_{name}": np.zeros(self.num_envs, bool)}
         for k, (decision, was_open) in enumerate(zip(decisions, were_open, strict=True)):
             infos = self._add_info(infos, decision.info, k)
-            if not was_open:
-                for name in decision.info:
-                    infos[f"_{name}"][k] = False
+            for name in () if was_open else decision.info:
+                infos[f"_{name}"][k] = False
         return observations, rewards, terminated, truncated, infos
 
 
@@ -334,7 +332,6 @@ class Lane:
         self.seen: Floats | None = None  #: what the guard observes
         self._mask: Mask | None = None
         self._past: list[tuple[Floats, Proposal, Action]] = []
-        self._score = 0.0
 
     def begin(self, observation: Any, info: Mapping[str, Any]) -> None:
         """An episode of the environment begins."""
@@ -568,14 +565,12 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
             return np.asarray(row.reshape(space.shape) + start, space.dtype)
 
         return index, combination
-    shape = actions.half.shape if isinstance(actions, BoxActions) else ()
-    is_range = not isinstance(actions, Choices)
+    shape, is_range = np.shape(actions.low), not isinstance(actions, Choices)
     if not (isinstance(space, Box) and is_range and math.prod(space.shape) == math.prod(shape)):
         raise ValueError(
             f"the environment's actions are {space}, but the guard's are {actions}: make a guard "
             "of such actions, n_actions of Discrete (of MultiDiscrete and MultiBinary all their "
-            "combinations) and arrays low and high of Box, or wrap the environment first "
-            "(RescaleAction, TransformAction of gymnasium.wrappers)"
+            "combinations) and arrays low and high of Box, or wrap the environment (RescaleAction)"
         )
     low, high = (np.reshape(end, space.shape) for end in (actions.low, actions.high))
     slack = 1e-6 * (high - low)  # what a float32 may round

@@ -358,11 +358,10 @@ class Logged:
         times = self._rows.times - self._rows.times[0]
         self._times, self._fails = times.tolist(), fails
         self._cars = list(shown.cars_of(times, self._rows.observations)) if self.of_cars else None
-        begins = self._times[max(len(times) - _PLAYED, 0)]
         began = float(self._rows.times[0])
         clock = math.nan if self.of_cars or self.interval < 1.0 else 0.0
         clock = began if began >= DATES else clock
-        self.told |= {"begins": begins, "fails": fails, "began": clock}
+        self.told |= {"begins": self._times[-_PLAYED:][0], "fails": fails, "began": clock}
         self._go_to(0)
 
     def _go_to(self, row: int) -> None:
