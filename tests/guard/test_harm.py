@@ -98,14 +98,10 @@ def test_a_guard_that_saves_drives_nearly_always(wrong):
     assert sum(row == (60, "") for row in rows[1:]) >= 37
     assert "in shadow where in doubt" in str(guard)
     assert " (0 of the latest 20 guarded), states" in str(guard)
-    assert (
-        "it refuses nearly everything: where it drives 0% of proposals pass, others are executed"
-        in str(guard)
-    )
+    nearly_all = "it refuses nearly everything: where it drives 0% of proposals pass, others are"
+    assert nearly_all in str(guard)
     assert "; that is no filter" in str(guard)
-    with pytest.warns(
-        UserWarning, match="refuses nearly everything: where it drives 0% of proposals pass"
-    ):
+    with pytest.warns(UserWarning, match=nearly_all.removeprefix("it ")):
         guard.freeze()
 
 

@@ -119,19 +119,6 @@ def test_what_is_not_known_is_left_out(tmp_path):
     assert "time_headway" not in found["/risk"][1][1]  # it stands
 
 
-def test_a_variable_may_be_called_as_a_column_of_decisions():
-    fields = {topic: schema["properties"] for topic, schema in schemas_of(["belief"]).items()}
-    assert fields["/observation"]["belief"]["type"] == "number"
-    assert fields["/belief"]["belief"]["type"] == "array"
-
-
-def test_a_sink_for_other_variables_says_so(tmp_path):
-    guard = Guard(-1.0, 1.0, interval=0.1)
-    guard.audit = FoxgloveSink(None, tmp_path / "run.mcap")
-    with pytest.raises(ValueError, match="is for 3 variables"), guard.audit:
-        guard.decide([1.0, 2.0], proposal=0.0)
-
-
 def test_a_full_disk_is_told(monkeypatch):
     full = SimpleNamespace(
         BufferedWriter=io.BufferedWriter, FileIO=lambda *_: io.FileIO("/dev/full", "w")
@@ -166,15 +153,16 @@ def test_a_small_log_that_unpacks_to_hundreds_of_megabytes_is_refused(packing, t
 
 def test_any_system_is_shown_by_its_own_names_and_vectors_are_left_to_the_log(tmp_path):
     guard = Guard(low=[-1.0, -1.0], high=[1.0, 1.0], interval=0.1)
-    with FoxgloveSink(None, tmp_path / "a.mcap", names=["angle"], units=["rad"]) as guard.audit:
+    with FoxgloveSink(None, tmp_path / "a.mcap", names=["belief"], units=["rad"]) as guard.audit:
         guard.decide([0.1], proposal=[0.5, 0.5])
         guard.end(failed=True)
     found = messages(tmp_path / "a.mcap")
-    assert found["/observation"][0][1] == {"time": 0.0, "angle": 0.1, "intake": 0}
+    assert found["/observation"][0][1] == {"time": 0.0, "belief": 0.1, "intake": 0}
     assert [one["kind"] for _, one in found["/event"]][1] == "failure"
     assert "executed" not in found["/decision"][0][1]
-    fields = schemas_of(["angle"], ["rad"])
-    assert "as observed [rad]" in fields["/observation"]["properties"]["angle"]["description"]
+    fields = schemas_of(["belief"], ["rad"])  # a channel has such a column, too
+    assert "as observed [rad]" in fields["/observation"]["properties"]["belief"]["description"]
+    assert fields["/belief"]["properties"]["belief"]["type"] == "array"
     assert "time_to_collision" not in fields["/risk"]["properties"]
 
 
@@ -216,7 +204,10 @@ def test_the_layout_names_only_what_there_is():
     assert layout["configById"]["RosOut!log"]["topicToRender"] == "/log"
 
 
-def test_what_cannot_be_shown_is_refused():
+def test_what_cannot_be_shown_is_refused(tmp_path):
+    guard = Guard(-1.0, 1.0, interval=0.1, audit=FoxgloveSink(None, tmp_path / "run.mcap"))
+    with guard.audit, pytest.raises(ValueError, match="is for 3 variables"):
+        guard.decide([1.0, 2.0], proposal=0.0)
     with pytest.raises(ValueError, match="needs a port, a file, or both"):
         FoxgloveSink(None)
     with FoxgloveSink(0) as sink, pytest.raises(RuntimeError):
