@@ -205,13 +205,14 @@ def test_frozen_it_acts_where_episodes_ended_better(guarded, alone, helps):
 
 
 @pytest.mark.parametrize(
-    ("failed", "kept", "helps"),
-    [(18, 400.0, False), (8, 400.0, True), (8, 30.0, False), (8, 0.0, False), (4, 0.0, True)],
+    ("failed", "kept", "alone", "helps"),
+    [(18, 400, 0, 0), (8, 400, 0, 1), (8, 30, 0, 0), (8, 0, 0, 0), (4, 0, 0, 1), (2, 0, 12, 1)],
 )
-def test_frozen_it_acts_where_it_prevents_most_failures(failed, kept, helps):
-    """A lander's guard: later crashes count for little; one that flies by itself has to do more."""
+def test_frozen_it_acts_where_it_prevents_most_failures(failed, kept, alone, helps):
+    """Later crashes count for little; who flies by itself has to do more, but one may be chance."""
     guarded = [(150, "f", None)] * failed + [(300, "", None)] * (20 - failed)
-    harm = arms(guarded, [(110, "f", None)] * 6)._replace(decided=500.0, kept=kept)
+    survived = [(110, "", None)] * alone
+    harm = arms(guarded, [(110, "f", None)] * 6 + survived)._replace(decided=500.0, kept=kept)
     assert harm.helps(learning=False) == helps
 
 

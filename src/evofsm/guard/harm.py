@@ -123,7 +123,8 @@ class Harm(NamedTuple):
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
 
         Of three episodes at least, a guard that failed in all prevents nothing, however late; nor
-        does one that fails more than half as often per step as the controller alone; down to a
+        does one that fails more than half as often per step as the controller alone, frozen but for
+        one failure, as after leaders that brake harder than when the controller drove; down to a
         tenth, the more it refuses: one that refuses all would fly any controller's craft so.
         """
         guarded, alone = self.guarded, self.alone(learning=learning)
@@ -134,6 +135,8 @@ class Harm(NamedTuple):
         (g, rate), (a, rate_alone) = (self._record(arm, learning) for arm in (guarded, alone))
         change = 1.0 - self.kept / self.decided if self.decided >= _FEWEST_DECISIONS else 0.0
         most = _LEFT + (_LEFT_BY_ITSELF - _LEFT) * change
+        count = sum(outcome.failed for outcome in guarded)
+        rate *= 1.0 if learning else max(0, count - 1) / max(1, count)  # one may be chance
         if len(guarded) >= _CAREFUL and rate > most * rate_alone:
             return False
         if rate_alone and not learning:  # who survived alone had it easier: scores tell nothing
