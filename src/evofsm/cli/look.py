@@ -127,9 +127,9 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     if is_mixed and not group:
         asides.append(("time runs", "backwards; turn the rows round first, as below"))
     facts += [*asides, ("rows looked at", f"{len(frame):,}")]
-    options = [("--time", clock), *([("--unit", form)] if form else [])]
-    if counts := not clock or _FRAME.match(clock) is not None:
-        options = [("--dt", "1")]
+    counts = not clock or _FRAME.match(clock) is not None
+    options = [("--dt", "1")] if counts else [("--time", clock)]
+    options += [("--unit", form)] if form and not counts else []
     bad = max(n_partial, sum(n for n, _ in skips.values()) + sum(odd.values()))
     if not counts:
         further, n_late = _of_steps(frame[clock].to_numpy()[order], segments, facts, n_partial)

@@ -695,7 +695,8 @@ class Attachment:
         jumps = here & set(simulation.getStartingTeleportIDList())
         for car in jumps.intersection(self._cars.cars):
             self._cars.remove(car)
-        here -= jumps - set(simulation.getEndingTeleportIDList())  # on their way
+        if jumps:  # who does not end it at once is on its way
+            here -= jumps.difference(simulation.getEndingTeleportIDList())
         for car in self._known - here | jumps:
             self._cars.cars.pop(car, None)
             self._seeing.forget(car)

@@ -95,8 +95,9 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
         over = [agent for agent, step in steps.items() if step.terminated]
         if len(over) > 1:  # whom another's failure ends does not end by itself
             fails = {agent: self._lanes[agent].terms.failed(steps[agent]) for agent in over}
-            for agent in (agent for agent in over if any(fails.values()) and not fails[agent]):
-                steps[agent] = replace(steps[agent], terminated=False, truncated=True)
+            for agent in over if any(fails.values()) else ():
+                if not fails[agent]:
+                    steps[agent] = replace(steps[agent], terminated=False, truncated=True)
         for agent, step in steps.items():
             lane = self._lanes[agent]
             lane.follow(step)
@@ -112,10 +113,11 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
         return observations, rewards, terminated, truncated, infos
 
     def _begin(self, observations: _Each, infos: _Each) -> None:
-        for agent, observation in observations.items():
-            if not (lane := self._enter(agent)).is_open:
-                lane.begin(observation, infos.get(agent, {}))
-        sizes = {a: len(lane.seen) for a, lane in self._lanes.items() if lane.seen is not None}
+        agents = [agent for agent in observations if not self._enter(agent).is_open]
+        for agent in agents:
+            self._lanes[agent].begin(observations[agent], infos.get(agent, {}))
+        lanes = self._lanes.items() if agents else ()
+        sizes = {agent: len(lane.seen) for agent, lane in lanes if lane.seen is not None}
         if len({*sizes.values()}) > 1:
             raise ValueError(
                 f"agents observe different numbers of variables, {sizes}, and a guard observes one "

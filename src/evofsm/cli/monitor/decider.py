@@ -43,8 +43,10 @@ _FAST = 60.0  # nothing on a road is faster [m/s]
 _LATE = 1.0  # what is older by less is late, by more from a sender that began anew [s]
 HOLE, _OFTEN = 1.5, 0.5  #: a gap in time, and rows that come too often, in intervals
 _AX, _VX, _VY, _Y = map(COLUMNS.index, ("ax", "vx", "vy", "y"))
-_CHANGES = (_AX, _VX, 0.0, RATES[1]), (_VY, _Y, 0.5, 20.0)  # less is noise, more a leap
-_LATELY = 0.5  # over so long places tell a speed across, which noise would from scene to scene [s]
+# A rate, of what it is, which less is noise, and more a leap, and over how long it is told [s]: a
+# speed across from scene to scene would be noise.
+_LATELY = 0.5
+_CHANGES = (_AX, _VX, 0.0, RATES[1], 0.0), (_VY, _Y, 0.5, 20.0, _LATELY)
 _NOBODY = "gap and v_leader are null: nobody is taken to be ahead"
 _RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
 
@@ -412,11 +414,11 @@ def _moving(row: Row, recent: Iterator[Message]) -> NDArray[np.float64]:
         if row.time - scene.time >= _LATELY:
             break
     for name, values in zip(("", *row.objects), rows, strict=False):
-        for rate, number, least, most in _CHANGES:
+        for rate, number, least, most, lasts in _CHANGES:
             if math.isnan(values[rate]):
                 track = [(step, z[name][number]) for step, z in scenes if name in z]
-                step, then = track[0 if rate == _AX else -1] if track else (1.0, math.nan)
-                change = (values[number] - then) / (step if rate == _AX else max(step, _LATELY))
+                step, then = track[-1 if lasts else 0] if track else (1.0, math.nan)
+                change = (values[number] - then) / max(step, lasts)
                 values[rate] = change if least <= abs(change) <= most else 0.0
     return rows.ravel()
 
