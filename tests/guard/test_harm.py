@@ -210,7 +210,7 @@ def test_frozen_it_acts_where_episodes_ended_better(guarded, alone, helps):
 )
 def test_frozen_it_acts_where_it_prevents_most_failures(failed, kept, alone, helps):
     """Later crashes count for little; who flies by itself has to do more, but one may be chance."""
-    guarded = [(150, "f", None)] * failed + [(300, "", None)] * (20 - failed)
+    guarded = [(150, "f", None) if failed * k % 20 < failed else (300, "", None) for k in range(20)]
     survived = [(110, "", None)] * alone
     harm = arms(guarded, [(110, "f", None)] * 6 + survived)._replace(decided=500.0, kept=kept)
     assert harm.helps(learning=False) == helps

@@ -32,16 +32,17 @@ from numpy.typing import NDArray
 from evofsm.store import COUNT, Numbers
 
 # Episodes of each arm that are kept, the latest; what is left of the weight of one an episode
-# later, alone and guarded; and the weights of those that ended well, with which guarded and alone
-# begin: who drives alone until the first refusal is known already.
-_KEPT, _FADES, _HOPES = 20, (0.9, 0.98), (0.5, 0.25)
+# later, where who drives may be another one by then, and else; and the weights of those that ended
+# well, with which guarded and alone begin: who drives alone until the first refusal is known.
+_KEPT, _FADES, _HOPES = 20, (0.98, 0.9), (0.5, 0.25)
 # So many episodes after the latest of the controller alone one is drawn, and then as often.
 _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
 _SOONER = 0.3
 # The largest share of the controller's failures per step that a guard leaves which helps, if it
-# keeps all proposals, and if it replaces them all.
-_LEFT, _LEFT_BY_ITSELF = 0.5, 0.1
+# keeps all proposals, and if it replaces them all; frozen, who fails in a smaller share of episodes
+# than the last is not asked for more than to end better.
+_LEFT, _LEFT_BY_ITSELF, _FEW = 0.5, 0.1, 0.2
 # Scores that differ by less than this share are equal.
 _SAME_SCORE = 0.05
 # The latest guarded episodes, if all failed, are reason enough for one draw to decide; else it
@@ -54,8 +55,8 @@ _TURN, _TRIES = 2, 12
 _DRAWS, _SAID = 300, 0.5
 # Decisions over which the share of proposals that are kept is counted; fewer do not tell.
 _DECISIONS, _FEWEST_DECISIONS = 500, 100
-# Where in an episode of so many decisions so much more is kept than before, although none of the
-# latest guarded episodes failed, of which it would have learnt, it is another controller.
+# Where in an episode of so many decisions so much more is kept than before, although neither it nor
+# the latest guarded ones failed, of which it would have learnt, it is another controller.
 _NOTED, _ANOTHER, _SETTLED = 20, 0.25, 4
 # Steps of who never fails.
 _FOREVER = 1 << 52
@@ -123,9 +124,9 @@ class Harm(NamedTuple):
         """Whether guarded episodes end no worse than those alone, or of one kind none is known.
 
         Of three episodes at least, a guard that failed in all prevents nothing, however late; nor
-        does one that fails more than half as often per step as the controller alone, frozen but for
-        one failure, as after leaders that brake harder than when the controller drove; down to a
-        tenth, the more it refuses: one that refuses all would fly any controller's craft so.
+        does one that fails more than half as often per step as the controller alone, down to a
+        tenth, the more it refuses: one that refuses all would fly any controller's craft so. Frozen
+        it is as it became of late, and few failures may be of a system that moves otherwise.
         """
         guarded, alone = self.guarded, self.alone(learning=learning)
         if _all_failed(guarded, max(_CAREFUL, len(guarded))):
@@ -135,9 +136,8 @@ class Harm(NamedTuple):
         (g, rate), (a, rate_alone) = (self._record(arm, learning) for arm in (guarded, alone))
         change = 1.0 - self.kept / self.decided if self.decided >= _FEWEST_DECISIONS else 0.0
         most = _LEFT + (_LEFT_BY_ITSELF - _LEFT) * change
-        count = sum(outcome.failed for outcome in guarded)
-        rate *= 1.0 if learning else max(0, count - 1) / max(1, count)  # one may be chance
-        if len(guarded) >= _CAREFUL and rate > most * rate_alone:
+        fails_much = learning or g @ [outcome.failed for outcome in guarded] > _FEW * g.sum()
+        if len(guarded) >= _CAREFUL and fails_much and rate > most * rate_alone:
             return False
         if rate_alone and not learning:  # who survived alone had it easier: scores tell nothing
             guarded, alone = ([o._replace(score=math.nan) for o in arm] for arm in (guarded, alone))
@@ -162,7 +162,8 @@ class Harm(NamedTuple):
         return float((won >= 0.0).mean())
 
     def _weights(self, outcomes: Sequence[Outcome], *, learning: bool) -> NDArray[np.float64]:
-        fades = [_FADES[o.guarded or not (self.ends and learning)] for o in outcomes]
+        changes = {True: not learning, False: learning and self.ends}  # guarded, alone
+        fades = [_FADES[changes[o.guarded]] for o in outcomes]
         return np.power(fades, [self.n_episodes - o.episode for o in outcomes])
 
     def _record(self, arm: Sequence[Outcome], learning: bool) -> tuple[NDArray[np.float64], float]:
@@ -263,7 +264,7 @@ class Harm(NamedTuple):
         if bool(n_acted) == bool(n_watched):
             return now
         latest = [outcome.failed for outcome in self.guarded[-_SETTLED:]]
-        is_settled = len(latest) == _SETTLED and not any(latest) and n_acted >= _NOTED
+        is_settled = len(latest) == _SETTLED and not any((*latest, failed)) and n_acted >= _NOTED
         if is_settled and n_kept / n_acted > self.kept / self.decided + _ANOTHER:
             now = now._replace(changed=n, decided=float(n_acted), kept=float(n_kept))
         elif self.is_on_trial and failed:
