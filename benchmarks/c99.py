@@ -14,6 +14,7 @@ import math
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -291,8 +292,9 @@ class Asked(NamedTuple):
 
 
 def ask(learnt: Learnt, decisions: int, seed: int = 1) -> Asked:
-    """Drive held-out episodes, in which senses and controllers fail now and then."""
-    found = list(_asked(learnt, decisions, np.random.default_rng(seed)))
+    """Drive held-out episodes, in which senses, clocks and controllers fail now and then."""
+    with warnings.catch_warnings(action="ignore"):
+        found = list(_asked(learnt, decisions, np.random.default_rng(seed)))
     rows, codes, numbers, actions, said = zip(*found, strict=True)
     return Asked(np.array(rows), np.array(codes), np.array(numbers), np.array(actions), list(said))
 
@@ -302,11 +304,12 @@ def _asked(learnt: Learnt, decisions: int, chance: np.random.Generator) -> Itera
     labels = guard.reviser.risk.labels  # type: ignore[attr-defined]
     nothing = np.atleast_1d(no_action(guard.actions))
     low, high = (np.atleast_1d(end) for end in limits(guard.actions))
-    episode, over, time, spread, blind = 0, True, 0.0, np.zeros(1), 0
+    episode, over, time, spread, blind, begun, stands = 0, True, 0.0, np.zeros(1), 0, 0, 0
     for _ in range(decisions):
         if begins := over:
             episode, time = episode + 1, -guard.interval
             seen, over = system.reset(1_000_000 + episode), False
+            begun = 6 * (episode % 3 == 0)  # senses come one by one
             guard.end()
         spread = np.maximum(spread, np.abs(seen))
         z, wanted = seen.copy(), np.atleast_1d(np.asarray(system.propose(), np.float64))
@@ -315,6 +318,8 @@ def _asked(learnt: Learnt, decisions: int, chance: np.random.Generator) -> Itera
         if blind:
             z[chance.random(len(z)) < 0.5] = math.nan
             z[0] = math.nan
+        elif (begun := max(begun - 1, 0)) > 0:
+            z[chance.random(len(z)) < 0.5] = math.nan
         elif kind == 1:
             z[chance.integers(len(z))] = chance.choice([math.inf, -math.inf, 1e31])
         elif kind == 2:
@@ -325,7 +330,9 @@ def _asked(learnt: Learnt, decisions: int, chance: np.random.Generator) -> Itera
             wanted = wanted + chance.choice([math.nan, math.inf, -math.inf], len(wanted))
         elif kind == 4:
             wanted = chance.uniform(low - (high - low), high + (high - low))
-        time += guard.interval * (chance.choice([-1.0, 0.0, 3.0]) if kind == 5 else 1.0)
+        stands = 8 if kind == 8 else max(stands - 1, 0)
+        step = chance.choice([-8.0, -1.0, 0.0, 3.0]) if kind == 5 else float(stands == 0)
+        time += guard.interval * step
         when = (math.inf, -math.inf, math.nan, 1e300)[episode % 4] if kind == 7 else time
         proposal: Any = wanted if isinstance(guard.actions, BoxActions) else float(wanted[0])
         row = np.concatenate([[begins, when], z, wanted])
@@ -438,9 +445,12 @@ def _learnt(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str
     remembered, backup = judge.remembered, judge.backup_text(code["backup"])
     allowed = judge._allowed(reviser.tolerance, remembered)
     remembered = remembered._replace(spared=allowed)
+    alone = words.BY_MODEL if math.isnan(number["risk_proposed"]) else ""
     if kind == 0:
-        return words.kept(backup, remembered, number["left"])
-    why = words.refused(code["unsurvived"], remembered, judge.state.margin, judge.parts.scale)
+        return alone + words.kept(backup, remembered, number["left"])
+    why = alone + words.refused(
+        code["unsurvived"], remembered, judge.state.margin, judge.parts.scale
+    )
     if kind == 1:
         return f"{why}; {words.changed(backup, remembered, judge.state.margin)}"
     if kind == 3 and code["passes"]:

@@ -171,6 +171,41 @@ def test_what_is_not_new_changes_nothing(time, flag, snapshot):
     assert snapshot(watch.machine) == before
 
 
+@pytest.mark.parametrize("kind", ["learnt", "cars"])
+@pytest.mark.parametrize("shift", [-3600.0, 0.0])
+def test_a_clock_that_goes_back_is_followed_and_one_that_stands_still_sees_nothing(kind, shift):
+    taught, usual = odd(kind)
+    twin, dt = taught.copy(), taught.interval
+    for k in range(3):
+        twin.decide(usual, 0.0, 3600.0 + k * dt)
+    others = [3600.0 + 2 * dt + (shift + k * dt if shift else 0.0) for k in range(12)]
+    stale = [twin.decide(usual, 0.0, time).reason for time in others[:5]]
+    assert all("nothing new was seen" in reason for reason in stale)
+    with pytest.warns(UserWarning, match="was set back" if shift else "stands still"):
+        then = [twin.recognise(usual, time) for time in others[5:6]]
+    for time in others[6:]:
+        revision = twin.decide(usual, 0.0, time)
+        then.append(twin.situation)
+    if shift:
+        assert [one.intake for one in then] == [Intake.GAP, *[Intake.WHOLE] * 6]
+        assert not math.isnan(revision.risk_proposed)
+    else:
+        assert all(one.intake is Intake.PARTIAL and np.isnan(one.observation).all() for one in then)
+        assert math.isnan(revision.risk_proposed) == (kind == "learnt")
+        assert twin.recognise(usual, others[-1] + 2 * dt).intake is Intake.GAP
+
+
+def test_sensors_that_take_turns_are_put_together():
+    taught, usual = odd("learnt")
+    twin = taught.copy()
+    twin.learn = False
+    first, second = [usual[0], NAN], [NAN, usual[1]]
+    assert "not each variable was observed yet" in twin.decide(first, 0.0).reason
+    risks = [twin.decide(z, 0.0).risk_proposed for z in (second, first, second, first, second)]
+    assert np.isnan(risks).tolist() == [False] * 3 + [True] * 2  # none was whole for long
+    assert "lasts longest" in twin.decide(first, 0.0).reason
+
+
 def test_after_a_gap_in_time_no_transition_is_learnt():
     watch = guard()
     for time in (0.0, 0.25):

@@ -211,6 +211,7 @@ def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any
     constants: dict[str, Any] = {
         "ACTS": reviser.acts,
         "LONGEST_GAP": looping._GAP * guard.interval,
+        "MOST_STALE": looping._STALE,
         "TOLERANCE": reviser.tolerance,
         **{name: getattr(revising, f"_{name}") for name in ("NEW", "RELEASE", "TRIAL")},
         **{"action_low": low, "action_high": high, "seen_from": seen_from, "seen_to": seen_to},
@@ -256,6 +257,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "dead_ends": model.dead_ends if len(model.dead_ends) else np.zeros((1, m + 2)),
         "residuals": rest[:, :, [*range(count), *[0] * (lanes - count)]],  # others are undisturbed
         "policies": state.policies,
+        "usual": risk.usual,
         "risks": [risk._risk(n, soon) for n in (math.inf, *map(float, range(count)))],
         "middle": risk.middle,
         "half": risk.half,

@@ -26,7 +26,7 @@ enum {
   EVOFSM_CHANGED = 1,        /* it does not; this is the closest that passes */
   EVOFSM_CUT_SHORT = 2,      /* none passed within the bound of the search */
   EVOFSM_NOTHING_PASSES = 3, /* the one that lasts longest, or is least risky */
-  EVOFSM_NOTHING_SEEN = 4,   /* nothing of this episode was observed yet: the proposal */
+  EVOFSM_NOTHING_SEEN = 4,   /* not each variable was observed yet in this episode */
   EVOFSM_TRIED = 5,          /* cars: own brakes are not known yet, so it brakes in full */
   EVOFSM_TRYING = 6,         /* and goes on with it for a while */
   EVOFSM_REGAINS = 7,        /* cars: the proposal regains a safe gap in time */
@@ -42,8 +42,8 @@ enum { EVOFSM_AS_PROPOSED = 0, EVOFSM_OUTSIDE = 1, EVOFSM_NO_PROPOSAL = 2 };
 enum {
   EVOFSM_PARTIAL = 1,  /* entries are NaN */
   EVOFSM_GAP = 4,      /* it came long after the one before */
-  EVOFSM_REPEATED = 8, /* as old as the one before: that one stands */
-  EVOFSM_LATE = 16     /* older than that */
+  EVOFSM_REPEATED = 8, /* as old as the one before: that one stands; after five nothing is seen */
+  EVOFSM_LATE = 16     /* older than that; after five the clock was set back: EVOFSM_GAP */
 };
 
 typedef struct {
@@ -67,7 +67,7 @@ typedef struct {
   double held[EVOFSM_VARIABLES], observation[EVOFSM_VARIABLES];
   double time, decisions, seen;
   double proposal[EVOFSM_ACTIONS], best[EVOFSM_ACTIONS];
-  int state;
+  int state, stale;
 UNIT_STATE} evofsm_state;
 
 /* An episode begins with the next decision. To be called before the first one, too. */
@@ -190,13 +190,15 @@ static void recognise(evofsm_state *s) {
 
 /* What is wrong with an observation. */
 static int take(evofsm_state *s, const double observation[EVOFSM_VARIABLES], double time) {
-  int j, found = time - s->time > LONGEST_GAP ? EVOFSM_GAP : 0;
-  if (time <= s->time) {
-    return time < s->time ? EVOFSM_LATE : EVOFSM_REPEATED;
+  const int is_back = time < s->time, stands = time == s->time;
+  int j, found = is_back || time - s->time > LONGEST_GAP ? EVOFSM_GAP : 0;
+  s->stale = is_back || stands ? s->stale + 1 : 0;
+  if (s->stale > 0 && s->stale <= MOST_STALE) {
+    return is_back ? EVOFSM_LATE : EVOFSM_REPEATED;
   }
   for (j = 0; j < EVOFSM_VARIABLES; j++) {
-    s->observation[j] = observation[j];
-    if (isnan(observation[j])) {
+    s->observation[j] = stands ? NAN : observation[j];
+    if (isnan(s->observation[j])) {
       found |= EVOFSM_PARTIAL;
     } else {
       s->held[j] = observation[j];

@@ -61,8 +61,9 @@ _INTERVALS = 17
 _MOST_STATES = 200
 # So many observations on end that lack something are told of.
 _MANY = 100
-# Longer than so many intervals is a gap in time.
-_GAP = 1.5
+# Longer than so many intervals is a gap in time; where more observations on end than the other come
+# no later than one before, its clock was set back, or stands still.
+_GAP, _STALE = 1.5, 5
 # Fourth powers of larger observations, summed over a long run, would lose all others.
 _LARGEST_VALUE = 1e30
 
@@ -442,6 +443,7 @@ class Guard:
         """Nothing was observed yet."""
         self._latest: Situation | None = None
         self._time = math.nan  # of the latest observation [s]
+        self._stale = 0  # observations since one that was later than the one before
         # The latest value of each variable; NaN of one that was never seen.
         self._held: NDArray[np.float64] = np.empty(0)
 
@@ -512,7 +514,8 @@ class Guard:
         """The first half of `decide`: where the system is; machine and judge learn from it.
 
         An observation that is no newer than the one before changes nothing: the situation is still
-        that one.
+        that one. After five such the clock was set back, and goes on from there as after a gap; or
+        it stands still, and nothing is seen.
 
         Parameters
         ----------
@@ -522,7 +525,8 @@ class Guard:
         z, time = self._checked(observation), self._seconds(time)
         if not self._under_way:
             self._begin()
-        step, intake = time - self._time, self._take(z, time)
+        before, row = self._time, z
+        intake, z = self._take(z, time)
         if intake and intake & STALE and self._latest is not None:
             situation = self._latest._replace(intake=intake)
         else:
@@ -531,28 +535,41 @@ class Guard:
             if intake and intake & Intake.GAP:
                 if self.machine is not None and self._learn:
                     self.machine.start_episode()
-                if self.judge is not None and not step <= getattr(self.judge, "bridges", 0.0):
+                bridges = getattr(self.judge, "bridges", 0.0)
+                if self.judge is not None and not 0.0 < time - before <= bridges:
                     if self._learn:
                         self.judge.end(None, failed=False)
                     self.judge.start_episode()
             situation = self._latest = self._recognised(z, time, intake)
         if self.audit is not None:
-            self.audit.seen(z, time)
+            self.audit.seen(row, time)
         return situation
 
-    def _take(self, z: NDArray[np.float64], time: float) -> Intake:
-        """What is wrong with an observation, which is held unless it comes too late."""
-        if time <= self._time:
-            return Intake.REPEATED if time == self._time else Intake.LATE
+    def _take(self, z: NDArray[np.float64], time: float) -> tuple[Intake, NDArray[np.float64]]:
+        """What is wrong with an observation, which is held unless it comes too late; and itself."""
+        stands = time == self._time
+        self._stale = self._stale + 1 if time <= self._time else 0
+        if 0 < self._stale <= _STALE:
+            return Intake.REPEATED if stands else Intake.LATE, z
+        if self._stale == _STALE + 1:
+            clock = (
+                "stands still: nothing is seen" if stands else "was set back: it goes on from here"
+            )
+            warnings.warn(
+                f"times of {self._stale} observations on end were no later than {self._time:g} s, "
+                f"the time of the one before: the clock {clock}",
+                stacklevel=6,
+            )
+        z = np.full(len(z), math.nan) if stands else z
         intake, latest_row = Intake.WHOLE, z
         if is_missing(z):
             intake = Intake.PARTIAL
             if len(self._held) == len(z):  # what was seen of them before is still held
                 latest_row = np.where(np.isnan(z), self._held, z)
-        if time - self._time > _GAP * self.interval:
+        if time < self._time or time - self._time > _GAP * self.interval:
             intake |= Intake.GAP
         self._held, self._time = latest_row.copy(), time
-        return intake
+        return intake, z
 
     def _seconds(self, time: float) -> float:
         """A time after which another is later by an interval."""

@@ -128,6 +128,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     _fails_after: float  # steps after which what was refused fails, at the latest
     _unsurvived: int
     _n_blind: int  # observations on end, up to the latest one, that lack something
+    _first: Floats  # before one was whole: what was seen of each variable last
     _ranks: Ints  # of backups, those first that passed last
 
     def __init__(
@@ -267,7 +268,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         """
         if not self.n_variables:
             rollout.refuse_too_many(len(situation.observation), self.size, box=not self.choices)
-        here, options, parts = self._here(situation.observation), np.array([wanted]), self.parts
+        z, options, parts = situation.observation, np.array([wanted]), self.parts
+        here = self._here(z)
         if parts is None or here is None or not len(self.state.forms):
             self._certified = False
             why = words.NOTHING_SEEN if parts and here is None else self._no_threshold
@@ -303,13 +305,14 @@ class LearntRisk(ObservingJudge, SearchingJudge):
             outcomes.append(Consequence(0.0, slack, 0.0))
         else:
             outcomes.append(self._foresee(here, action, policies))
+        alone = words.BY_MODEL if self._is_beyond(z) or self._is_blind(z) else ""
         self._lost = math.isinf(outcomes[-1].unsurvived)
         self._fails_after = max(self._fails_after, *(outcome.fails_after for outcome in outcomes))
         judgement = self._judged(situation, outcomes)
         backup = self.backup_text(best, policies)
         if not self._refused:
-            return Search(options, judgement, 0, words.kept(backup, memory, slack))
-        why = words.refused(self._unsurvived, memory, margin, scale)
+            return Search(options, judgement, 0, alone + words.kept(backup, memory, slack))
+        why = alone + words.refused(self._unsurvived, memory, margin, scale)
         why += "" if mask is None else words.IF_NO_MORE
         if passes:
             instead = words.changed(backup, memory, margin)
@@ -357,12 +360,30 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         counts = [outcome.unsurvived for outcome in outcomes]
         self._unsurvived = -1 if math.isinf(counts[0]) else int(counts[0])
         memory = self.remembered
-        if self._n_blind + 1 >= self.BLIND and is_missing(situation.observation):
+        if self._is_beyond(situation.observation):
+            return _unjudged(len(counts))._replace(seen=0.0)
+        if self._is_blind(situation.observation):
             return _unjudged(len(counts))
         soon = self._soon(memory.seconds)
         risk, low, high = np.array([self._risk(n, soon) for n in counts]).T
         distances = np.array([outcome.left for outcome in outcomes])
         return Judgement(risk, low, high, distances, float(memory.number), situation.seen)
+
+    def _is_blind(self, z: Floats) -> bool:
+        """Whether it was not seen whole for long."""
+        return self._n_blind + 1 >= self.BLIND and is_missing(z)
+
+    def _is_beyond(self, z: Floats) -> bool:
+        """Whether it is far from all that was seen."""
+        least, most = self.usual
+        return bool(((z < least) | (z > most)).any())
+
+    @property
+    def usual(self) -> Floats:
+        """(2, m) what is beyond was never seen: half as far again as two episodes came."""
+        least, most = self.state.lowest[1], self.state.highest[1]
+        room = np.where(most >= least, 0.5 * (most - least), math.inf)
+        return np.array([np.minimum(least, most) - room, np.maximum(least, most) + room])
 
     def _soon(self, exposure: float) -> float:
         """The horizon, as a share of the time in which all that is remembered was seen."""
@@ -390,19 +411,22 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def _here(self, z: Floats) -> Floats | None:
         """The situation, if that is seen; what was not is taken to be as was expected."""
         row, m, stride = z, len(z), self.state.stride
+        if not self._step:
+            row = self._merged(z)
+            return None if is_missing(row) else np.append(row, np.zeros(m + self.size))
         if is_missing(z):
-            if not self._step:
-                return None
             situation, action = self._step[-1]
             row = situation[:m]
             if self.parts is not None:
                 row = row + (rollout.expected(self.parts.model, situation, action) - row) / stride
             row = np.where(np.isnan(z), row, z)
-        if not self._step:
-            return np.append(row, np.zeros(m + self.size))
         situations, actions = zip(*self._step, strict=True)
         change = (row - situations[0][:m]) * (stride / len(actions))
         return np.concatenate([row, change, sum(actions) / len(actions)])
+
+    def _merged(self, z: Floats) -> Floats:
+        """An observation, before one was whole: what is not seen as it was last."""
+        return np.where(np.isnan(z), self._first, z) if len(self._first) else z
 
     def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
@@ -490,7 +514,9 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         z = np.array(observation, np.float64)
         here = self._here(z)
         self._n_blind = self._n_blind + 1 if is_missing(z) else 0
-        if here is not None:
+        if here is None:
+            self._first = self._merged(z)
+        else:
             self._step = [*self._step, (here, self.encode(action))][-self.state.stride :]
 
     def end(self, observation: Floats | None, *, failed: bool, terminated: bool = False) -> None:
@@ -557,6 +583,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self._step, self._z, self._u, self._notes = [], [], [], []
         self._certified = self._holds = self._refused = self._lost = False
         self._unsurvived, self._n_blind, self._fails_after = 0, 0, 0.0
+        self._first = np.empty(0)
         self._used, self._ranks = np.zeros((self.size, 2)), np.arange(len(self.state.policies))
 
     # -- For people, and in a file --------------------------------------------------------------

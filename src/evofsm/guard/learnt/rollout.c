@@ -433,7 +433,7 @@ static void situate(evofsm_state *s) {
   for (j = 0; j < M; j++) {
     const double z = s->observation[j], times = n > 0 ? (double)EVOFSM_STRIDE / n : 0.0;
     s->lacks |= isnan(z) != 0;
-    s->here[j] = n > 0 && isnan(z) ? s->next[j] : z;
+    s->here[j] = isnan(z) ? s->next[j] : z; /* before one was whole: as it was last */
     s->here[M + j] = n > 0 ? (s->here[j] - s->past[0][j]) * times : 0.0;
     s->is_placed &= !isnan(s->here[j]);
   }
@@ -450,6 +450,9 @@ static void forget(evofsm_state *s) {
   int i;
   s->n_past = 0;
   s->is_placed = s->n_blind = 0;
+  for (i = 0; i < M; i++) {
+    s->next[i] = NAN;
+  }
   for (i = 0; i < EVOFSM_BACKUPS; i++) {
     s->ranks[i] = i;
   }
@@ -458,10 +461,13 @@ static void forget(evofsm_state *s) {
 /* LearntRisk.search: what to execute of s->proposal, into s->best, and how risky that is. */
 static void revise(evofsm_state *s, evofsm_decision *out) {
   double proposal[A], action[A];
-  int r, is_known, unsurvived = 0;
+  int j, r, is_known, is_new = 0, unsurvived = 0;
   memcpy(s->best, s->proposal, sizeof s->best);
   situate(s);
-  is_known = s->is_placed && !(s->lacks && s->n_blind + 1 >= BLIND);
+  for (j = 0; j < M; j++) { /* far from all that was seen */
+    is_new |= s->observation[j] < usual[0][j] || s->observation[j] > usual[1][j];
+  }
+  is_known = s->is_placed && !is_new && !(s->lacks && s->n_blind + 1 >= BLIND);
   out->evidence = is_known ? EVIDENCE : 0.0;
   if (!is_known) {
     out->reason = EVOFSM_NOTHING_SEEN;
@@ -470,6 +476,7 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   if (!s->is_placed) {
     return;
   }
+  out->seen = is_new ? 0.0 : out->seen;
   encode(s->proposal, proposal);
   out->reason = search(s, proposal, action, &out->backup, &out->left);
   for (r = 0; s->ranks[r] != out->backup; r++) { /* at most EVOFSM_BACKUPS: it is one of them */
@@ -500,7 +507,9 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
 static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
   int j;
   s->n_blind = s->lacks ? s->n_blind + 1 : 0;
-  if (s->is_placed) {
+  if (!s->is_placed) {
+    memcpy(s->next, s->here, sizeof s->next);
+  } else {
     if (s->n_past == EVOFSM_STRIDE) {
       memmove(s->past, s->past + 1, sizeof s->past - sizeof s->past[0]);
       memmove(s->acted, s->acted + 1, sizeof s->acted - sizeof s->acted[0]);

@@ -37,7 +37,9 @@ from evofsm.guard.learnt.state import State
 #: Said as long as there is nothing to judge by.
 NOTHING_LEARNT = "nothing was learnt yet"
 NEVER_WHOLE = "nothing was learnt: no episode had three observations in a row without NaN"
-NOTHING_SEEN = "nothing of this episode was observed yet"
+NOTHING_SEEN = "not each variable was observed yet in this episode"
+#: Said where it is far from all that was seen, or was not seen whole for long.
+BY_MODEL = "by the model alone, so its risk is not known: "
 NO_FAILURE = "no failure is known yet, so nothing is refused"
 #: What is done where all backups look alike and another action was hardly used.
 TRIED = "no action passes; what this one does is hardly known, so it is tried"
