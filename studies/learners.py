@@ -347,14 +347,15 @@ class ExecutedBuffer(ReplayBuffer):  # type: ignore[misc]
     def add(
         self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[Any]
     ) -> None:
-        """Of a single environment, whose actions are scaled to [-1, 1]."""
+        """Of a single environment; actions of a box are scaled to [-1, 1]."""
         size = infos[0].get("reviser/penalty", 0.0)
         if size > 0.0:
             if self.penalty > 0.0:
                 super().add(obs, next_obs, action, reward, done, infos)
-            low, high = self.action_space.low, self.action_space.high
-            executed = np.asarray(infos[0]["reviser/executed_action"])
-            action = (2.0 * (executed - low) / (high - low) - 1.0).reshape(np.shape(action))
+            executed, space = np.asarray(infos[0]["reviser/executed_action"]), self.action_space
+            if hasattr(space, "low"):
+                executed = 2.0 * (executed - space.low) / (space.high - space.low) - 1.0
+            action = executed.reshape(np.shape(action))
         super().add(obs, next_obs, action, reward + self.penalty * size, done, infos)
 
 

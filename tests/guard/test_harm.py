@@ -260,6 +260,15 @@ def test_a_controller_that_became_good_drives_on_alone_under_a_guard_that_always
     assert not harm.helps(learning=False)
 
 
+def test_where_the_guard_fails_now_and_then_it_is_soon_asked_whether_another_controller_came():
+    harm, alone = arms([(60, "", None)] * 22, [(30, "f", None)] * 13), 0
+    for episode in range(60):
+        drives = not harm.passing(learning=True)
+        driven = (60, 0, 0) if drives else (0, 60, 0)
+        harm, alone = harm.after(driven, failed=drives and episode % 8 == 7), alone + (not drives)
+    assert alone >= 20
+
+
 @pytest.mark.parametrize(("kept", "least", "most"), [(3, 1, 8), (57, 30, 30)])
 def test_a_controller_that_failed_by_bad_luck_is_soon_alone_if_most_is_replaced(kept, least, most):
     """One failure is all that is known of it; the guard keeps so many of 60 proposals."""

@@ -162,7 +162,8 @@ class Harm(NamedTuple):
         return float((won >= 0.0).mean())
 
     def _weights(self, outcomes: Sequence[Outcome], *, learning: bool) -> NDArray[np.float64]:
-        changes = {True: not learning, False: learning and self.ends}  # guarded, alone
+        is_open = self.ends or any(o.failed for o in self.guarded[-_RARELY:])
+        changes = {True: not learning, False: learning and is_open}  # guarded, alone
         fades = [_FADES[changes[o.guarded]] for o in outcomes]
         return np.power(fades, [self.n_episodes - o.episode for o in outcomes])
 

@@ -9,6 +9,7 @@ import pytest
 from evofsm import Guard
 from evofsm.guard.learnt.failure import (
     AT,
+    HELD,
     SAYS,
     TO,
     B,
@@ -112,6 +113,12 @@ def sides(failures, rows, unit, blur):
 def test_failures_are_explained_by_ends_of_what_was_survived(failures, blur, ends):
     rows = np.linspace([0.0, 0.0], [10.0, 10.0], 40)
     assert sides(np.array(failures), rows, np.ones(2), blur) == ends
+
+
+def test_of_flags_those_failures_count_in_which_they_were_set():
+    failures = np.repeat(np.eye(3), [5, 2, 1], axis=0)
+    found = sides_of(FAILS, failures, survived_as(np.zeros((40, 3)), np.ones(3)))
+    assert found[:, HELD].tolist() == [5.0, 2.0, 1.0]
 
 
 # -- As guards learn them -----------------------------------------------------------------------
@@ -252,6 +259,9 @@ def test_frozen_a_threshold_counts_on_for_a_while_that_fewer_took_the_place_of(e
     if not ends:
         drive((0.9, 3.0), None)
     assert "frozen it refuses" not in str(guard)  # that refuted it
+    if not ends:
+        drive((1.0, 0.5), (0.5, 0.25), failed=True)  # amid what was survived
+        assert "(and elsewhere: 1 of the 3 failures are in none of these)" in str(guard)
 
 
 def test_where_there_is_no_rival_nothing_is_doubted():

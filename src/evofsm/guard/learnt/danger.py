@@ -84,7 +84,7 @@ def _explained(state: State, *, failed: bool) -> State:
     is_told = not len(failures) or failure.inside(rows, failures).any(0).all()
     if failed or not is_told:
         rows = failure.explain(FAILS, failures, survival)
-    rows = failure.counted(rows, failures)
+    rows = failure.counted(rows, failures, survival)
     ends, fatal = failure.saying(table, ENDS, CRASHES), failure.saying(table, FATAL)
     forms = np.concatenate([ends, rows, fatal])
     state = state._replace(dropped=_dropped(state, was, forms, survival))

@@ -118,9 +118,13 @@ def crashed(table: Floats, z: Floats) -> Flags:
     return np.asarray(is_end & inside(saying(table, CRASHES), z, 0.0).any(0))
 
 
-def counted(table: Floats, failures: Floats) -> Floats:
-    """Forms, with how many failures each holds."""
-    table[:, HELD] = inside(table, failures).sum(1)
+def counted(table: Floats, failures: Floats, survived: Survived) -> Floats:
+    """Forms, with how many failures each holds: beyond what was survived, if it ends there."""
+    i = table[:, I].astype(int)
+    ends = np.where(table[:, B] < 0.0, survived.lowest[0, i], survived.highest[0, i])
+    at_end = are_sides(table) & (table[:, AT] == ends)
+    holds = inside(table, failures) & ~(at_end[:, None] & (distances(table, failures) == 0.0))
+    table[:, HELD] = holds.sum(1)
     return table
 
 
@@ -298,7 +302,7 @@ def explain(says: int, failures: Floats, survived: Survived) -> Floats:
             bent, strong = alone, np.zeros(len(strong), bool)
     within: Flags = np.asarray(inside(bent, failures).any(0))
     keep = [bool(s or not within[holds].all()) for s, holds in zip(strong, by, strict=True)]
-    return counted(np.concatenate([stay[keep], bent]), failures)
+    return counted(np.concatenate([stay[keep], bent]), failures, survived)
 
 
 def sides_of(says: int, failures: Floats, survived: Survived) -> Floats:
@@ -339,7 +343,7 @@ def sides_of(says: int, failures: Floats, survived: Survived) -> Floats:
         _of_one(says, k % m, at, unit[k % m], b=-1.0 if k < m else 1.0)
         for k, at in thresholds.items()
     ]
-    return counted(np.array(rows).reshape(-1, SIZE), failures)
+    return counted(np.array(rows).reshape(-1, SIZE), failures, survived)
 
 
 def _most_telling(explained: Flags, perhaps: Flags, beyond: Floats) -> tuple[list[int], int]:

@@ -170,6 +170,11 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
     if len(state.dropped):
         until, *_ = _where(state.dropped, names)
         more += f"; frozen it refuses, too, {until}, as what took its place is new"
+    elsewhere = ~failure.crashed(state.forms, state.failures)
+    elsewhere &= ~failure.inside(failure.saying(state.forms, FAILS), state.failures).any(0)
+    if elsewhere.any():
+        n_failures = counted(len(elsewhere), "failure")
+        there += f" (and elsewhere: {elsewhere.sum():,} of the {n_failures} are in none of these)"
     test = f"{remembered}, to be survived by {changes(state.margin)}"
     return f"fails {there}; {test}{more}{dead_ends(state.counts.astype(int).tolist())}"
 
