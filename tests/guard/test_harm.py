@@ -224,6 +224,14 @@ def test_frozen_scores_count_only_where_the_controller_alone_never_failed():
     assert not arms([arrived] * 7, [sooner] * 20).helps(learning=False)
 
 
+def test_a_guard_under_which_hardly_any_episode_reaches_its_goal_is_told_of():
+    alone = [*[(50, "e", None)] * 4, *[(30, "f", None)] * 5]
+    assert arms([(60, "", None)] * 19 + [(60, "e", None)], alone).spoiling == (
+        "keeps what it guards from ending by itself: 1 of 20 guarded episodes, alone 4 of 9"
+    )
+    assert "itself" not in arms([(60, "", None)] * 15 + [(60, "e", None)] * 5, alone).spoiling
+
+
 def test_a_controller_of_which_much_more_is_kept_is_another_one_until_it_fails():
     harm = arms([(100, "", None)] * 9, [(30, "f", None)] * 3)  # of which nothing was kept
     assert not any(harm._replace(n_episodes=n).passing(learning=True) for n in (12, 13, 14))

@@ -376,12 +376,13 @@ class Guard:
 
         An episode that is under way is broken off: nothing more is learnt from it. Where it steps
         back, or guarded episodes seem to fail sooner than those of the controller alone, proposals
-        pass. It warns of that, of one that refuses nearly all, and where ``failed`` misses some.
+        pass. It warns of that, of one that refuses nearly all, or keeps it from its goal, and where
+        ``failed`` misses some.
         """
         self.learn = False
         if why := self._why_passing():
             warnings.warn(f"this guard {why}: frozen so, proposals pass", stacklevel=3)
-        elif self._observing is not None and (why := self._observing.harm.replacing):
+        elif self._observing is not None and (why := self._observing.harm.spoiling):
             warnings.warn(f"this guard {why}; learn on, or look at print(guard)", stacklevel=3)
         elif why := getattr(self.judge, "uncovered", ""):
             warnings.warn(f"{why}; it has to cover each kind (another unit?)", stacklevel=3)

@@ -112,8 +112,13 @@ class Harm(NamedTuple):
         return [outcome for outcome in self.outcomes if outcome.guarded]
 
     @property
-    def replacing(self) -> str:
-        """What is said of a guard that keeps hardly a proposal; empty of one that keeps more."""
+    def spoiling(self) -> str:
+        """What is said of a guard that keeps hardly a proposal, or from ending well; or nothing."""
+        arms = self.guarded, self.alone()
+        (n, well), (n_alone, well_alone) = ((len(arm), sum(o.ended for o in arm)) for arm in arms)
+        if min(n, n_alone) >= _CAREFUL and 2 * well * n_alone < well_alone * n:
+            by_themselves = f"{well} of {n} guarded episodes, alone {well_alone} of {n_alone}"
+            return f"keeps what it guards from ending by itself: {by_themselves}"
         if self.decided < _FEWEST_DECISIONS or self.kept >= 0.05 * self.decided:
             return ""
         share = f"where it drives {self.kept / self.decided:.0%} of proposals pass"

@@ -272,7 +272,7 @@ def harm(known: Harm, *, learning: bool) -> str:
     """What is said of a guard that was not shown to help, or that is no filter any more."""
     text = known.told(learning=learning)
     text = f"; {text}" if text else ""
-    return f"{text}; it {known.replacing}" if known.replacing else text
+    return f"{text}; it {known.spoiling}" if known.spoiling else text
 
 
 def constant(values: Sequence[float]) -> str:
